@@ -1,0 +1,52 @@
+"""The shop window of sparsedp: every public name, imported when it is first used.
+
+``import sparsedp as dp`` loads nothing else, so a scene pays only for what it names.
+A new public name is one word in ``_WINDOW`` and one in ``__init__.pyi``, the copy that type checkers read.
+"""
+
+from importlib import import_module as _import_module
+
+_WINDOW = {
+    "grid": "Grid",
+    "space": "Space",
+    "conditions": "dirichlet neumann robin",
+    "tape": "differentiable",
+    "derivative": "value_and_grad",
+    "operator": "Operator",
+    "operators.given": "from_functions from_linear_operator from_matrix",
+    "operators.difference": "curl divergence gradient laplacian upwind",
+    "operators.transfer": "average embed part prolong restrict sample",
+    "operators.harmonic": "harmonic_average",
+    "operators.boundary": "diagonal identity interior lift mask",
+    "solvers.choose": "inverse",
+    "solvers.parametric": "elliptic_solver",
+    "solvers.spectral": "exponential power",
+    "optimise.loop": "minimise",
+    "kernels": "set_threads",
+    "report.plots": "plot",
+}
+_ROOMS = ("check", "errors")
+_HOME = {name: module for module, names in _WINDOW.items() for name in names.split()}
+
+__all__ = sorted([*_HOME, *_ROOMS])
+
+
+def __getattr__(name):
+    if name in _HOME:
+        value = getattr(_import_module(f"{__name__}.{_HOME[name]}"), name)
+    elif name in _ROOMS:
+        value = _import_module(f"{__name__}.{name}")
+    elif name == "__version__":
+        metadata = _import_module("importlib.metadata")
+        try:
+            value = metadata.version(__name__)
+        except metadata.PackageNotFoundError:
+            value = "0+unknown"  # run from a tree that was never installed
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value  # the next look-up does not come here
+    return value
+
+
+def __dir__():
+    return sorted({*globals(), *__all__, "__version__"})

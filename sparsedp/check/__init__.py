@@ -1,0 +1,13 @@
+"""The side room of checks: is the transpose the transpose, are two forms one operator, is a gradient right?
+
+Nothing else in the package imports it. Every check returns a value with `.verdict` (agrees, disagrees,
+inconclusive), is true only when it agrees, and prints its table.
+"""
+
+from sparsedp.check.adjointness import transpose
+from sparsedp.check.audit import gradient
+from sparsedp.check.cards import operator
+from sparsedp.check.refinement import order
+from sparsedp.check.twins import twin
+
+__all__ = ["gradient", "operator", "order", "transpose", "twin"]

@@ -1,0 +1,160 @@
+"""The audit of a gradient: differences over many step sizes, Taylor rates, determinism, forward against reverse."""
+
+import math
+
+import numpy as np
+
+from sparsedp.check.plateau import ROUNDING, judge
+from sparsedp.check.point import Point
+from sparsedp.check.probes import generator
+from sparsedp.check.sweep import Line, Trials, default_steps, dot
+from sparsedp.check.verdict import Audit, decide
+from sparsedp.derivative import pushforward, value_and_grad
+from sparsedp.errors import DerivativeError
+
+__all__ = ["gradient"]
+
+FEWEST_STEPS = 8
+GOAL = 1e-5  # error bar, relative, above which a sweep is extended
+APART = 1e-4  # forward and reverse mode may differ by what loose solves leave
+UNDERFLOW = 1e-303  # differences of a loss that changes by less are not normal numbers
+COARSER = tuple(2.0**k for k in range(1, 38, 3))
+FINER = tuple(2.0**-k for k in range(33, 46, 3))
+
+
+def gradient(loss, x, grad=None, steps=None, directions=3, rng=None):
+    """Audit the gradient of a loss at x: does it agree with what the loss does?
+
+    Parameters
+    ----------
+    loss : callable
+        ``loss(x) -> real scalar``. Any function: of this library, of autograd, or foreign.
+    x : array, number, or any nesting of them in tuples, lists and dicts
+        At least one floating leaf, real or complex, float32 or float64. Never modified.
+    grad : callable or tree, optional
+        ``grad(x)``, or its value, with the structure of `x`. Default: reverse mode through the tape. For a
+        complex leaf it is dL/dRe - i dL/dIm, as the tape has it.
+    steps : sequence of float, optional
+        Step sizes in units of x (the root mean square of each leaf), at least eight. Default: ten over
+        eight decades, and more on a line where they leave the derivative open.
+    directions : int
+        Random directions. Structured ones come on top: each leaf alone, constant, the gradient itself,
+        its largest entry.
+    rng : None, int or numpy Generator
+        Source of the directions; default a fixed seed of its own.
+
+    Returns
+    -------
+    Audit
+        `.verdict` is "agrees" (with `.digits`), "disagrees" or "inconclusive" (with `.reason`); true only
+        for "agrees", so that ``assert dp.check.gradient(loss, x)`` works. `.rows` are the numbers,
+        `.lines` the judgement of each direction, str() the table, `.to_dict()` plain data.
+
+    Raises
+    ------
+    ValueError
+        If `steps` are fewer than eight, or not positive.
+    DerivativeError
+        If x has no floating leaf, or the gradient does not have the structure of x.
+    NonFiniteError
+        If x holds NaN or infinity.
+
+    Notes
+    -----
+    Everything is relative: a loss times 1e-200 or 1e200 is judged the same. A loss that refuses a trial
+    point (unstable step, no convergence, not finite, a ValueError) makes that step unusable. At a kink
+    central differences prove nothing, and the verdict is inconclusive.
+
+    Examples
+    --------
+    >>> import autograd.numpy as anp
+    >>> x = np.array([1.0, 2.0])
+    >>> gradient(lambda u: anp.sum(u**3), x).verdict
+    'agrees'
+    >>> gradient(lambda u: np.sum(u**3), x, grad=lambda u: 3.003 * u**2).verdict
+    'disagrees'
+    """
+    point, trials = Point(x), Trials(loss)
+    chosen = default_steps(point.eps) if steps is None else _checked(steps)
+    base = trials.value(point.tree())
+    leaves, doubts = _own_gradient(loss, point, trials, base, grad)
+    lines, judged = [], []
+    if math.isfinite(base) and all(np.all(np.isfinite(g)) for g in leaves):
+        for name, direction in point.directions(leaves, directions, generator(rng)):
+            lines.append(Line(name, direction, point, leaves, trials, base))
+            judged.append(_judged(lines[-1], chosen, point, trials, extend=steps is None))
+        if grad is None:
+            doubts += _forward_mode(loss, point, lines[:directions], judged)
+        if _bits(trials.value(point.tree())) != _bits(base):
+            doubts.append(("inconclusive", "the loss gives another value after the audit: it keeps a state"))
+    verdict, reason = decide(judged, doubts)
+    notes = [reason for word, reason in doubts if not word]
+    return Audit(verdict, reason, judged, lines, base, trials.count, point.size, notes)
+
+
+def _checked(steps):
+    steps = tuple(float(step) for step in steps)
+    if len(set(steps)) < FEWEST_STEPS or not all(0 < step < math.inf for step in steps):
+        raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {steps}")
+    return steps
+
+
+def _judged(line, steps, point, trials, extend):
+    """Sweep, judge, and where the derivative stays open go on: finer if there may be finer features.
+
+    Noise at the level of rounding asks for coarser steps: x may be small beside the scale of the loss.
+    """
+    line.sweep(steps)
+    found = judge(line, trials.eps, point.eps)
+    if extend and found.word != "vanishes" and found.resolution > max(GOAL, 1e4 * point.eps):
+        unknown = math.isnan(found.jitter) and not line.silent
+        line.sweep(COARSER + FINER if unknown else FINER if found.jitter > ROUNDING else COARSER)
+        found = min(judge(line, trials.eps, point.eps), found, key=lambda one: one.resolution)
+    return found
+
+
+def _own_gradient(loss, point, trials, base, grad):
+    """Leaves of the gradient, and the doubts that come before any difference."""
+    doubts = []
+    if not math.isfinite(base):
+        doubts.append(("inconclusive", f"the loss is {base} at x"))
+    elif _bits(trials.value(point.tree())) != _bits(base):
+        doubts.append(("inconclusive", "two evaluations of the loss differ: it is not deterministic"))
+    if grad is not None and not callable(grad):
+        return point.leaves_of(grad), doubts
+    evaluate = (lambda x: value_and_grad(loss)(x)[1]) if grad is None else grad
+    with np.errstate(all="ignore"):
+        first, second = (point.leaves_of(evaluate(point.tree())) for _ in range(2))
+    if any(a.tobytes() != b.tobytes() for a, b in zip(first, second, strict=True)):
+        doubts.append(("inconclusive", "two evaluations of the gradient differ: it is not deterministic"))
+    largest = max(np.max(np.abs(g), initial=0.0) * unit for g, unit in zip(first, point.units, strict=True))
+    if 0 < largest < UNDERFLOW:
+        doubts.append(("inconclusive", f"the loss changes by less than {UNDERFLOW:g}: it underflows, scale it"))
+    for name, g in zip(point.names, first, strict=True):
+        if not np.all(np.isfinite(g)):
+            doubts.append(("disagrees", f"the gradient of {name} holds NaN or infinity"))
+    return first, doubts
+
+
+def _forward_mode(loss, point, lines, judged):
+    """Forward mode against reverse mode along the random directions, where every rule has a JVP."""
+    worst, text = 0.0, ""
+    for line, found in zip(lines, judged, strict=False):
+        tangent = [d.astype(x.dtype) for d, x in zip(line.direction, point.values, strict=True)]
+        try:
+            with np.errstate(all="ignore"):
+                _, slope = pushforward(loss, point.tree(), point.tree(tangent))
+        except (DerivativeError, NotImplementedError):
+            return [("", "forward mode: not available, a rule has no JVP")]
+        wanted = dot(line.gradient, tangent)
+        scale = max(found.scale, abs(wanted), line.typical)
+        gap = 0.0 if slope == wanted else abs(float(slope) - wanted) / scale
+        if not gap <= worst:
+            worst, text = gap, f"{float(slope):.9g} beside {wanted:.9g} along {line.name}"
+    if not worst <= max(APART, 300 * point.eps):
+        return [("disagrees", f"forward and reverse mode differ: {text}; the JVP or the VJP of a rule is wrong")]
+    return [("", f"forward mode: agrees with reverse mode to {worst:.0e}")]
+
+
+def _bits(value):
+    return np.float64(value).tobytes()

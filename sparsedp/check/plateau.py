@@ -1,0 +1,207 @@
+"""What a sweep of differences proves about the derivative along one direction.
+
+Everything is judged on the gap m(t) = (f(x + t d) - f(x - t d)) / 2t - g . d, with the displacement that
+rounding left of t d. For a right gradient m(t) = c t^2 + noise / t; for a wrong one it has a plateau.
+
+Estimates of the plateau: each m(t) and each Richardson extrapolation of two neighbours. The error bar of
+an estimate is its largest distance from the two estimates beside it, plus the noise of the loss divided by
+the step. The estimate with the smallest bar counts.
+
+Source: the extrapolation is that of C. J. F. Ridders, Advances in Engineering Software 4, 1982.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = ["ROUNDING", "Judgement", "judge"]
+
+RESOLVED = 1e-3  # an error bar above this share of the derivative proves nothing
+AGREED = 1e-6  # a gap below this share is agreement, whatever the bar: solves inside leave as much
+FAR, NEAR = 10.0, 3.0  # gap over bar: beyond FAR it is wrong, below NEAR it is right
+NEARBY = 70.0  # Taylor rates are read at steps up to this multiple of the step of the plateau
+FINEST = 5  # levels that tell the noise of the loss
+TINY = np.finfo(float).tiny
+ROUNDING = 1e3  # noise above this many roundings has another cause: a solver, chaos, a staircase
+CURVED = 1.7  # below this order of the second Taylor remainder f is not twice differentiable
+
+
+class Judgement(NamedTuple):
+    """The verdict along one direction, in a word.
+
+    agrees, disagrees; vanishes: both derivatives are 0 to rounding; kink: the one-sided derivatives differ;
+    rough: not twice differentiable; noise, few: nothing is proved, by noise or for want of usable steps;
+    constant: the loss does not change, as the gradient says.
+    """
+
+    direction: str
+    word: str
+    difference: float  # best estimate of the derivative, from differences
+    slope: float  # g . d
+    gap: float
+    bar: float
+    scale: float  # what gap and bar are compared with
+    step: float  # where the plateau is
+    rate1: float  # order of f(x + t d) - f, without the gradient
+    rate2: float  # order of f(x + t d) - f - t g . d; infinite when it is rounding on all levels
+    digits: float
+    jitter: float  # noise of the loss, in units of its rounding
+    note: str
+
+    @property
+    def resolution(self):
+        """Error bar relative to the derivative."""
+        return self.bar / self.scale if self.scale > 0 else np.inf
+
+
+class Gaps:
+    """The usable levels of a line as arrays, with their noise and their estimates."""
+
+    def __init__(self, line, eps, spread):
+        levels = line.usable
+        self.t = np.array([level.step for level in levels])
+        plus, minus, ahead, behind, self.m = np.array(
+            [(le.plus, le.minus, le.ahead, le.behind, le.difference - le.slope) for le in levels]
+        ).T
+        self.first, self.second = np.abs(plus - line.base), np.abs(plus - line.base - ahead)
+        # The gap of the one-sided differences, with the part that comes from unequal displacements taken out.
+        self.kinks = (plus + minus - 2 * line.base - (ahead + behind)) / self.t
+        sizes = np.maximum(np.maximum(np.abs(plus), np.abs(minus)), abs(line.base))
+        # What the finest levels vary by, as a share of the loss. Rounding does that, or a solver inside.
+        fine = slice(-FINEST, None)
+        share = np.abs(np.diff(self.m[fine])) * self.t[fine][1:] / np.maximum(sizes[fine][1:], TINY)
+        self.jitter = float(np.max(share, initial=0.0)) / eps
+        self.noise = max(2.0, self.jitter) * eps * sizes
+        self.agreed = max(AGREED, 300 * spread)
+        self.curvature = float(np.median(np.abs(self.kinks / self.t)[:3]))
+        self.floor = 8 * spread * self.curvature + 4 * spread * line.typical
+
+    def estimates(self, values, power, noise):
+        """Plateau estimates of values(t) = v0 + c t^power: (estimate, bar, index of its finest level)."""
+        found = []
+        ratio = (self.t[:-1] / self.t[1:]) ** power
+        extrapolated = (ratio * values[1:] - values[:-1]) / (ratio - 1)
+        for series, offset in ((values, 0), (extrapolated, 1)):
+            for j in range(1, len(series) - 1):
+                spread = max(abs(series[j] - series[j - 1]), abs(series[j] - series[j + 1]))
+                found.append((series[j], spread + 2 * noise[j + offset] / self.t[j + offset], j + offset))
+        return found
+
+    def lasts(self, estimate, bar, index):
+        """Whether all finer levels agree with an estimate: a derivative is a limit, not a passing plateau."""
+        finer = slice(index + 1, None)
+        return bool(np.all(np.abs(self.m[finer] - estimate) <= bar + 6 * self.noise[finer] / self.t[finer]))
+
+    def kink(self, index, scale):
+        """The jump of the one-sided derivatives seen around a level, and its bar; 0 if it goes to 0."""
+        near = [e for e in self.estimates(self.kinks, 1, 2 * self.noise) if abs(e[2] - index) <= 1]
+        jump, bar, _ = min(near, key=lambda e: e[1], default=(0.0, 0.0, 0))
+        return (abs(jump), bar) if abs(jump) > FAR * bar and abs(jump) > self.agreed * scale else (0.0, bar)
+
+    def rate(self, remainder, threshold, index):
+        """Median order of a remainder over its finest pairs that stand out of the noise, near a level."""
+        clear = (remainder >= 50 * threshold) & (remainder > 0) & (self.t <= NEARBY * self.t[index])
+        pairs = [j for j in range(len(self.t) - 1) if clear[j] and clear[j + 1]][-3:]
+        if len(pairs) < 2:
+            return np.nan
+        rates = [np.log(remainder[j] / remainder[j + 1]) / np.log(self.t[j] / self.t[j + 1]) for j in pairs]
+        return float(np.median(rates))
+
+
+@np.errstate(all="ignore")  # losses near the limits of the floating point numbers are judged like others
+def judge(line, eps, spread):
+    """Line -> Judgement.
+
+    Parameters
+    ----------
+    line : Line
+    eps : float
+        Rounding of the loss.
+    spread : float
+        Rounding of x.
+    """
+    if line.silent:
+        return _silent(line, eps)
+    if len(line.usable) < 4:
+        notes = {level.note for level in line.levels if level.note} or {"the sweep has too few steps"}
+        return _unknown(
+            line, "few", f"{len(line.usable)} usable steps, at least 4 are needed ({'; '.join(sorted(notes))})"
+        )
+    gaps = Gaps(line, eps, spread)
+    gap, bar, index, jump = _plateau(gaps, line)
+    bar += gaps.floor
+    scale = max(abs(line.slope), abs(line.slope + gap), line.typical)
+    word, note = _word(gaps, line, (gap, bar, scale), jump)
+    tolerated = gaps.noise + gaps.t * (max(bar, abs(gap)) if word in ("agrees", "vanishes") else bar)
+    rate2 = gaps.rate(gaps.second, tolerated, index)
+    if np.isnan(rate2) and np.all(gaps.second <= 50 * tolerated):
+        rate2 = np.inf
+    # The symmetric remainder f(x + t d) + f(x - t d) - 2 f is cleaner than the one-sided one: no odd powers.
+    smooth = gaps.rate(np.abs(gaps.kinks) * gaps.t, 2 * gaps.noise, index)
+    if word in ("agrees", "vanishes") and rate2 < CURVED and smooth < CURVED:
+        word, note = "rough", f"the second Taylor remainder is of order {rate2:.2f}: not twice differentiable here"
+    reference = gaps.curvature if word == "vanishes" else scale
+    share = max(abs(gap), bar) / reference if reference > 0 else np.inf
+    digits = float(np.clip(-np.log10(share), 0, 16)) if share > 0 else 16.0
+    return Judgement(
+        line.name, word, line.slope + gap, line.slope, gap, bar, scale, gaps.t[index],
+        gaps.rate(gaps.first, gaps.noise, index), rate2, digits, gaps.jitter, note,
+    )  # fmt: skip
+
+
+def _plateau(gaps, line):
+    """The estimate with the smallest bar that no finer level contradicts, away from kinks if there is such a place."""
+    ranked = sorted(gaps.estimates(gaps.m, 2, gaps.noise), key=lambda e: e[1])
+    lasting = [estimate for estimate in ranked if gaps.lasts(*estimate)] or ranked[-1:]
+    best = None
+    for gap, bar, index in lasting:
+        scale = max(abs(line.slope), abs(line.slope + gap), line.typical)
+        jump = gaps.kink(index, scale)
+        best = best or (gap, bar, index, jump)
+        if bar > RESOLVED * scale:
+            break
+        if not jump[0]:
+            return gap, bar, index, jump
+    return best
+
+
+def _word(gaps, line, measured, jump):
+    """The verdict, before the Taylor rates have a say."""
+    gap, bar, scale = measured
+    size, (split, uncertain) = abs(gap), jump
+    if split:
+        # Between the two one-sided derivatives every value is a matter of convention.
+        outside = size - split / 2
+        if outside > FAR * (bar + uncertain) and outside > RESOLVED * scale:
+            return "disagrees", f"outside the one-sided derivatives by {outside / scale:.1e}"
+        return "kink", f"a kink: the one-sided derivatives differ by {split / max(scale, split):.1e}"
+    far = FAR if gaps.jitter < ROUNDING else 3 * FAR
+    if size > far * bar and size > gaps.agreed * max(scale, 1e-4 * gaps.curvature):
+        # Noise that swallows the whole difference may be a chaotic loss with a right gradient.
+        if gaps.jitter < ROUNDING or abs(line.slope + gap) > FAR * bar:
+            return "disagrees", f"off by {size / scale:.1e}, {size / bar:.1e} error bars"
+        return "noise", "the loss is noisy or chaotic: differences see no derivative at all"
+    if bar <= RESOLVED * scale:
+        if size <= max(min(NEAR * bar, RESOLVED * scale - bar), gaps.agreed * scale):
+            return "agrees", ""
+        return "noise", f"off by {size / scale:.1e}, {size / bar:.1f} error bars: not enough to tell"
+    if size <= NEAR * bar and scale + bar <= gaps.agreed * gaps.curvature:
+        return "vanishes", "the derivative is 0 to rounding, beside the curvature"
+    return "noise", f"noise of {bar / scale if scale else np.inf:.1e} of the derivative hides it"
+
+
+def _silent(line, eps):
+    """The loss is the same number on all levels."""
+    if line.slope == 0:
+        return _unknown(line, "constant", "the loss does not change along this direction")
+    visible = 2 * eps * abs(line.base) / max(level.step for level in line.levels if level.plus == line.base)
+    if abs(line.slope) > FAR * visible:
+        return _unknown(line, "disagrees", "the loss does not change along this direction, the gradient says it does")
+    return _unknown(line, "noise", "the rounding of the loss hides the derivative")
+
+
+def _unknown(line, word, note):
+    scale = max(abs(line.slope), line.typical)
+    return Judgement(
+        line.name, word, np.nan, line.slope, np.nan, np.inf, scale, np.nan, np.nan, np.nan, 0.0, np.nan, note
+    )

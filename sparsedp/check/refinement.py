@@ -1,0 +1,135 @@
+"""Order of accuracy: how the error falls when the grid is refined."""
+
+import math
+
+import numpy as np
+
+from sparsedp.check.findings import table
+
+__all__ = ["Refinement", "order"]
+
+
+def order(error_at, sizes=(16, 32, 64, 128), expected=None):
+    """Function from a grid size to an error -> the observed order of accuracy.
+
+    Parameters
+    ----------
+    error_at : callable
+        ``error_at(n) -> float``: builds the problem with n cells along an axis and returns the norm of
+        the error against the exact answer.
+    sizes : sequence of int
+        At least three, increasing. The step is 1 / n.
+    expected : float or (low, high), optional
+        What the order should be: an interval, or a number with 0.1 on both sides.
+
+    Returns
+    -------
+    Refinement
+        `.order` is the slope of log(error) over log(1 / n) through the last three sizes, `.orders` the
+        slope of each pair. `.verdict`: agrees or disagrees with `expected`; inconclusive when nothing was
+        expected, or when an error is 0 or not finite. str() is the table.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than three sizes, or they do not increase.
+
+    Examples
+    --------
+    >>> from math import cos, sin
+    >>> result = order(lambda n: abs((sin(1 + 1 / n) - sin(1 - 1 / n)) * n / 2 - cos(1)), expected=2)
+    >>> result.verdict, round(result.order, 2)
+    ('agrees', 2.0)
+    """
+    sizes = tuple(int(n) for n in sizes)
+    if len(sizes) < 3 or any(a >= b for a, b in zip(sizes, sizes[1:])) or sizes[0] < 1:
+        raise ValueError(f"order needs at least three increasing sizes, got {sizes}")
+    if expected is not None and np.ndim(expected) == 0:
+        expected = expected - 0.1, expected + 0.1
+    return Refinement(sizes, tuple(float(error_at(n)) for n in sizes), expected)
+
+
+class Refinement:
+    """Errors over sizes, and the order they show. Frozen.
+
+    Attributes
+    ----------
+    sizes, errors : tuples
+    expected : (low, high) or None
+    """
+
+    sizes: tuple[int, ...]
+    errors: tuple[float, ...]
+    expected: tuple[float, float] | None
+
+    def __init__(self, sizes, errors, expected=None):
+        interval = None if expected is None else (float(expected[0]), float(expected[1]))
+        self.__dict__.update(sizes=sizes, errors=errors, expected=interval)
+
+    def __setattr__(self, name, value):
+        raise AttributeError(f"a refinement is frozen; {name} cannot be set")
+
+    @property
+    def orders(self):
+        """Observed order between neighbouring sizes; NaN where it cannot be told."""
+        pairs = zip(self.sizes, self.sizes[1:], self.errors, self.errors[1:], strict=False)
+        return tuple(_slope((n, m), (e, f)) for n, m, e, f in pairs)
+
+    @property
+    def order(self):
+        """Least-squares slope through the last three sizes."""
+        return _slope(self.sizes[-3:], self.errors[-3:])
+
+    @property
+    def reason(self):
+        """Why the verdict is what it is."""
+        if math.isnan(self.order):
+            return "an error is 0 or not finite: no slope"
+        if self.expected is None:
+            return "no order was expected"
+        low, high = self.expected
+        return f"expected {low:g} to {high:g}"
+
+    @property
+    def verdict(self):
+        """agrees, disagrees or inconclusive."""
+        if self.expected is None or math.isnan(self.order):
+            return "inconclusive"
+        return "agrees" if self.expected[0] <= self.order <= self.expected[1] else "disagrees"
+
+    @property
+    def ok(self):
+        """Whether the verdict is "agrees"."""
+        return self.verdict == "agrees"
+
+    def __bool__(self):
+        return self.ok
+
+    def __float__(self):
+        return self.order
+
+    def to_dict(self):
+        """The refinement as plain numbers, strings and lists."""
+        return {
+            "sizes": list(self.sizes),
+            "errors": list(self.errors),
+            "orders": list(self.orders),
+            "order": self.order,
+            "expected": None if self.expected is None else list(self.expected),
+            "verdict": self.verdict,
+            "reason": self.reason,
+        }
+
+    def __str__(self):
+        orders = ["", *(f"{slope:.2f}" for slope in self.orders)]
+        lines = [(n, f"{error:.3e}", slope) for n, error, slope in zip(self.sizes, self.errors, orders, strict=True)]
+        head = f"order {self.order:.2f} over the last three sizes: {self.verdict} ({self.reason})"
+        return head + "\n" + table(lines, ("n", "error", "order"))
+
+    __repr__ = __str__
+
+
+def _slope(sizes, errors):
+    if not all(error > 0 and math.isfinite(error) for error in errors):
+        return math.nan
+    return float(-np.polyfit(np.log(sizes), np.log(errors), 1)[0])

@@ -1,0 +1,131 @@
+"""Differences of a loss along one direction, over a sweep of step sizes."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sparsedp.check.point import root_sum_squares
+from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
+
+__all__ = ["Level", "Line", "Trials", "default_steps", "dot"]
+
+REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # what a loss may raise away from x
+
+
+class Trials:
+    """A loss with its count of evaluations. Away from x it may refuse; then there is a note and no value."""
+
+    def __init__(self, loss):
+        self.loss = loss
+        self.count = 0
+        self.eps = float(np.finfo(float).eps)
+
+    def value(self, tree):
+        """The loss as a float; the coarsest dtype that it returns is remembered."""
+        self.count += 1
+        with np.errstate(all="ignore"):
+            value = np.asarray(self.loss(tree))
+        if value.shape != ():
+            raise ShapeError(f"the loss must be a scalar, got an array of shape {value.shape}; sum it")
+        if value.dtype.kind == "c":
+            raise DerivativeError(
+                "the loss must be real, got a complex number; take its real part or its absolute value"
+            )
+        if value.dtype.kind == "f":
+            self.eps = max(self.eps, float(np.finfo(value.dtype).eps))
+        return float(value)
+
+    def attempt(self, tree):
+        """(value, note): NaN and the reason where there is no finite value."""
+        try:
+            value = self.value(tree)
+        except REFUSALS as error:
+            return np.nan, f"{type(error).__name__}: {error}"
+        return (value, "") if np.isfinite(value) else (np.nan, "the loss overflows")
+
+
+class Level(NamedTuple):
+    """One step size: the losses on both sides, and what the gradient says about the way there."""
+
+    step: float
+    plus: float
+    minus: float
+    ahead: float  # g . (x+ - x)
+    behind: float  # g . (x- - x)
+    note: str  # why the level cannot be used; empty if it can
+
+    @property
+    def difference(self):
+        """Central difference quotient."""
+        return (self.plus - self.minus) / (2 * self.step)
+
+    @property
+    def slope(self):
+        """What the gradient says the difference quotient is, for the displacement that was realised."""
+        return (self.ahead - self.behind) / (2 * self.step)
+
+
+def default_steps(eps):
+    """Step sizes in units of x, over at least eight decades, from coarse to fine.
+
+    Powers of two, so that x + step * d loses as few digits as it can. Single precision leaves fewer
+    decades, so they lie closer.
+    """
+    return tuple(2.0**-k for k in range(2, 31, 3)) if eps < 1e-10 else tuple(2.0**-k for k in range(-2, 27, 2))
+
+
+class Line:
+    """A sweep along one direction, which can be extended.
+
+    Parameters
+    ----------
+    name : str
+    direction : list of arrays
+        Displacement of each leaf for step 1.
+    point : Point
+    gradient : list of arrays
+    trials : Trials
+    base : float
+        The loss at the point.
+    """
+
+    def __init__(self, name, direction, point, gradient, trials, base):
+        self.name, self.direction, self.base = name, direction, base
+        self.gradient = gradient
+        self._point, self._trials = point, trials
+        self._length = root_sum_squares(direction)
+        self.slope = dot(gradient, direction)
+        self.typical = root_sum_squares([g * d for g, d in zip(gradient, direction, strict=True)])
+        self.levels = []
+
+    def sweep(self, steps):
+        """Evaluate the loss at x + t d and x - t d for every t of `steps`."""
+        self.levels = sorted([*self.levels, *map(self._level, steps)], key=lambda level: -level.step)
+
+    def _level(self, step):
+        ends = [self._point.moved(self.direction, sign * step) for sign in (1, -1)]
+        there, back = map(self._point.away, ends)
+        length = root_sum_squares([a - b for a, b in zip(there, back, strict=True)]) / (2 * step)
+        ahead, behind = dot(self.gradient, there), dot(self.gradient, back)
+        if not abs(length / self._length - 1) < 0.1:
+            return Level(step, np.nan, np.nan, ahead, behind, "the step is lost in the rounding of x")
+        plus, note = self._trials.attempt(self._point.tree(ends[0]))
+        minus, other = self._trials.attempt(self._point.tree(ends[1]))
+        if plus == minus == self.base:
+            note = "the loss does not change"
+        return Level(step, plus, minus, ahead, behind, note or other)
+
+    @property
+    def usable(self):
+        """Levels with finite losses that differ from the loss at x."""
+        return [level for level in self.levels if not level.note]
+
+    @property
+    def silent(self):
+        """Whether the loss never changed: constant along this direction, to rounding."""
+        return not self.usable and any(level.note == "the loss does not change" for level in self.levels)
+
+
+def dot(gradient, direction):
+    """g . d, for complex leaves the real part of the plain product, as the tape defines the gradient."""
+    return float(sum(np.sum((g * d).real) for g, d in zip(gradient, direction, strict=True)))

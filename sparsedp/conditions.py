@@ -1,0 +1,126 @@
+"""Boundary conditions: one for each side of each bounded axis.
+
+All conditions are one form, a u + b du/dn = value at the wall, n pointing outwards:
+dirichlet is (1, 0), neumann is (0, 1), robin(a, b) the rest. With u_c the value in the cell next
+to the wall and h its width, the wall value and the slope follow from (u_w - u_c) / (h / 2) = du/dn:
+
+    du/dn = (value - a u_c) / (a h / 2 + b),        u_w = (b u_c + value h / 2) / (a h / 2 + b).
+"""
+
+import numpy as np
+
+from sparsedp.spacing import AXES
+
+__all__ = ["Condition", "dirichlet", "neumann", "resolve", "robin"]
+
+
+class Condition:
+    """a u + b du/dn = value on a wall. Frozen, equal by value. Use dirichlet, neumann or robin."""
+
+    __slots__ = ("a", "b")
+    a: float
+    b: float
+
+    def __init__(self, a, b):
+        object.__setattr__(self, "a", a)
+        object.__setattr__(self, "b", b)
+
+    def __setattr__(self, name, value):
+        raise AttributeError(f"Condition is frozen; make a new one instead of setting {name}")
+
+    def __eq__(self, other):
+        return (self.a, self.b) == (other.a, other.b) if isinstance(other, Condition) else NotImplemented
+
+    def __hash__(self):
+        return hash((self.a, self.b))
+
+    def __reduce__(self):
+        return Condition, (self.a, self.b)
+
+    def __repr__(self):
+        return {(1.0, 0.0): "dirichlet", (0.0, 1.0): "neumann"}.get((self.a, self.b), f"robin({self.a:g}, {self.b:g})")
+
+
+dirichlet = Condition(1.0, 0.0)
+neumann = Condition(0.0, 1.0)
+
+
+def robin(a, b):
+    """Two weights -> the condition a u + b du/dn = value, n outwards.
+
+    Parameters
+    ----------
+    a, b : float
+        Finite, >= 0, not both 0; `b` carries [length] relative to `a`.
+
+    Returns
+    -------
+    Condition
+
+    Raises
+    ------
+    ValueError
+        If a weight is negative or not finite, or both are 0: the problem would not be well posed.
+
+    Examples
+    --------
+    >>> robin(2, 1)
+    robin(2, 1)
+    >>> robin(1, 0)
+    dirichlet
+    """
+    a, b = float(a), float(b)
+    if not (np.isfinite(a) and np.isfinite(b) and a >= 0 and b >= 0 and a + b > 0):
+        raise ValueError(f"robin needs finite a, b >= 0, not both 0, got a = {a:g}, b = {b:g}")
+    return Condition(a, b)
+
+
+def resolve(grid, boundary):
+    """Boundary argument -> for each axis (lower, upper), or None where the axis is periodic.
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary : Condition or dict
+        One condition for all bounded sides, or a dict with keys "x", "y", "z", each a condition
+        or a pair (lower, upper). Axes that are not named are neumann.
+
+    Returns
+    -------
+    tuple
+
+    Raises
+    ------
+    ValueError
+        If a periodic axis or an axis the grid does not have is named.
+    TypeError
+        If an entry is not a condition.
+
+    Examples
+    --------
+    >>> from sparsedp.grid import Grid
+    >>> resolve(Grid((2, 2), periodic=(True, False)), {"y": (dirichlet, neumann)})
+    (None, (dirichlet, neumann))
+    """
+    named = boundary if isinstance(boundary, dict) else dict.fromkeys(AXES, boundary)
+    if isinstance(boundary, dict):
+        _check_names(grid, boundary)
+    return tuple(
+        None if periodic else _sides(axis, named.get(axis, neumann))
+        for axis, periodic in zip(AXES, grid.periodic, strict=False)
+    )
+
+
+def _check_names(grid, boundary):
+    for name in boundary:
+        if name not in grid.axes:
+            raise ValueError(f"boundary names axis {name!r}, but {grid} has {', '.join(grid.axes)}")
+        if grid.periodic[AXES.index(name)]:
+            raise ValueError(f"axis {name} is periodic and takes no boundary condition; leave it out")
+
+
+def _sides(axis, entry):
+    sides = (entry, entry) if isinstance(entry, Condition) else entry
+    if not (isinstance(sides, (tuple, list)) and len(sides) == 2 and all(isinstance(s, Condition) for s in sides)):
+        raise TypeError(f"boundary on {axis} needs dirichlet, neumann, robin(a, b) or a pair of them, got {entry!r}")
+    return tuple(sides)

@@ -1,0 +1,291 @@
+"""Grid: where cells, faces, nodes and edges are. The conventions of the library, stated once.
+
+* Axis 0 is x, axis 1 is y, axis 2 is z: `field[i, j]` is the cell i along x and j along y.
+* Cells are numbered from the lower end; cell i of an axis lies between nodes i and i + 1.
+* Face i of an axis is the LOWER face of cell i. A bounded axis of n cells has n + 1 faces, the two
+  walls included; a periodic axis has n, and its face 0 lies between cell n - 1 and cell 0.
+* A face field is one flat array: all x-faces, then all y-faces, then all z-faces. Edges alike:
+  an x-edge runs along a cell in x and sits on nodes in the other axes.
+* Nodes sit on the corners: n + 1 along a bounded axis, n along a periodic one.
+* Lengths carry whatever unit the user chose; every docstring says [length].
+"""
+
+from functools import cached_property
+from math import prod
+
+import numpy as np
+
+from sparsedp.space import Space
+from sparsedp.spacing import AXES, cell_widths, finite_number, lengths, per_axis
+
+__all__ = ["Grid"]
+
+
+class Grid:
+    """A box of cells in 1-D, 2-D or 3-D, with uniform or stretched spacing. Frozen, equal by value.
+
+    Parameters
+    ----------
+    shape : int or tuple of int
+        Number of cells along each axis.
+    size : float or sequence of float, optional
+        Extent of each axis [length]. Give `size` or `spacing`, not both; default unit cells.
+    spacing : float, sequence or array, optional
+        Cell width of each axis [length]; an entry may be an array of widths (stretched axis).
+    origin : float or sequence of float
+        Coordinate of the lower corner [length].
+    periodic : bool or sequence of bool
+        Whether the last cell of an axis is followed by the first.
+
+    Raises
+    ------
+    ShapeError
+        If the shape is not one to three lengths >= 0, or an argument does not fit it.
+    ValueError
+        If a width is not positive and finite, or both `size` and `spacing` are given.
+
+    Examples
+    --------
+    >>> grid = Grid((4, 3), size=(2.0, 3.0))
+    >>> print(grid)
+    Grid(4 x 3 cells, size 2 x 3)
+    >>> grid.faces.size
+    31
+    """
+
+    shape: tuple[int, ...]
+    dim: int
+    axes: tuple[str, ...]
+    periodic: tuple[bool, ...]
+    origin: tuple[float, ...]
+    widths: tuple[np.ndarray, ...]
+
+    def __init__(self, shape, size=None, spacing=None, origin=0.0, periodic=False):
+        shape = lengths(shape)
+        if size is not None and spacing is not None:
+            raise ValueError("a grid takes size or spacing, not both; leave one out")
+        put = self.__dict__.__setitem__
+        put("shape", shape)
+        put("dim", len(shape))
+        put("axes", AXES[: len(shape)])
+        put("periodic", tuple(bool(flag) for flag in per_axis(periodic, shape, "periodic")))
+        put("origin", tuple(finite_number(entry, "origin") for entry in per_axis(origin, shape, "origin")))
+        put("widths", cell_widths(shape, size, spacing))
+
+    def __setattr__(self, name, value):
+        raise AttributeError(f"Grid is frozen; make a new one instead of setting {name}")
+
+    @cached_property
+    def cells(self):
+        """Space of cell fields; their shape is `grid.shape`."""
+        return Space(self.shape, "cells", self)
+
+    @cached_property
+    def nodes(self):
+        """Space of node fields."""
+        return Space(tuple(map(self.node_count, range(self.dim))), "nodes", self)
+
+    @cached_property
+    def faces(self):
+        """Space of face fields, flat: x-faces, then y-faces, then z-faces."""
+        return self._stacked("faces", [self.face_shape(axis) for axis in range(self.dim)])
+
+    @cached_property
+    def edges(self):
+        """Space of edge fields, flat: x-edges, then y-edges, then z-edges."""
+        return self._stacked("edges", [self._edge_shape(axis) for axis in range(self.dim)])
+
+    def _stacked(self, kind, parts):
+        return Space(sum(map(prod, parts)), kind, self, parts)
+
+    def node_count(self, axis):
+        """Number of nodes (and of faces) along one axis."""
+        return self.shape[axis] + (not self.periodic[axis])
+
+    def face_shape(self, axis):
+        """Shape of the component of a face field that crosses `axis`."""
+        return tuple(self.node_count(a) if a == axis else n for a, n in enumerate(self.shape))
+
+    def _edge_shape(self, axis):
+        return tuple(n if a == axis else self.node_count(a) for a, n in enumerate(self.shape))
+
+    @cached_property
+    def volumes(self):
+        """Cell volumes [length^dim], shape `grid.shape`, read-only."""
+        return self.cells.volumes
+
+    @cached_property
+    def size(self):
+        """Extent of each axis [length]."""
+        return tuple(float(widths.sum()) for widths in self.widths)
+
+    @cached_property
+    def uniform(self):
+        """For each axis, whether all cells have the same width."""
+        return tuple(bool(np.all(widths == widths[:1])) for widths in self.widths)
+
+    def spacings(self, axis):
+        """Distance between the neighbouring centres at each face of an axis [length].
+
+        At a wall it is the distance from the centre to the wall: half a cell.
+        """
+        h = self.widths[axis]
+        if self.periodic[axis]:
+            return 0.5 * (h + np.roll(h, 1))
+        return 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
+
+    def control_volumes(self, kind, axis):
+        """Volumes that belong to one component of a space; they sum to the volume of the box."""
+        on_nodes = {"cells": (), "nodes": range(self.dim), "faces": (axis,)}.get(kind)
+        if on_nodes is None:  # edges sit on nodes across their own axis
+            on_nodes = tuple(a for a in range(self.dim) if a != axis)
+        lengths = [self.spacings(a) if a in on_nodes else self.widths[a] for a in range(self.dim)]
+        return _outer(lengths)
+
+    def split(self, v):
+        """Face field (or 3-D edge field) -> tuple of components. Differentiable.
+
+        Parameters
+        ----------
+        v : array, shape (faces.size,) or (edges.size,)
+
+        Returns
+        -------
+        tuple of arrays
+            Component a of a face field has shape `face_shape(a)`.
+
+        Raises
+        ------
+        ShapeError
+            If `v` is neither.
+
+        Examples
+        --------
+        >>> grid = Grid((2, 1))
+        >>> [part.shape for part in grid.split(np.zeros(7))]
+        [(3, 1), (2, 2)]
+        """
+        on_edges = self.dim == 3 and np.shape(v) == self.edges.shape
+        return (self.edges if on_edges else self.faces).split(v)
+
+    def join(self, *parts):
+        """Components -> face field (or 3-D edge field), one flat array. Differentiable.
+
+        Parameters
+        ----------
+        *parts : arrays, one for each axis
+            Read-only arrays and arrays that broadcast to the component shapes are fine.
+
+        Returns
+        -------
+        array, shape (faces.size,) or (edges.size,)
+
+        Raises
+        ------
+        ShapeError
+            If the number of components or a shape does not fit.
+
+        Examples
+        --------
+        >>> Grid(2).join(np.array([1.0, 2.0, 3.0]))
+        array([1., 2., 3.])
+        """
+        on_edges = self.dim == 3 and tuple(map(np.shape, parts)) == self.edges.parts
+        return (self.edges if on_edges else self.faces).join(*parts)
+
+    @cached_property
+    def _node_coordinates(self):
+        ends = [np.concatenate([[0.0], np.cumsum(widths)]) for widths in self.widths]
+        return tuple(start + end for start, end in zip(self.origin, ends, strict=True))
+
+    def coordinates(self, axis, at="cells"):
+        """1-D coordinates along one axis [length]: of the `cells` (centres) or of the `nodes`.
+
+        Parameters
+        ----------
+        axis : int
+        at : "cells" or "nodes"
+
+        Returns
+        -------
+        array, shape (n,)
+        """
+        nodes = self._node_coordinates[axis]
+        if at == "nodes":
+            return nodes[: self.node_count(axis)].copy()
+        return 0.5 * (nodes[:-1] + nodes[1:])
+
+    def centres(self):
+        """Coordinates of the cell centres: a tuple of `dim` full arrays, also in 1-D.
+
+        Returns
+        -------
+        tuple of arrays, shape `grid.shape` [length]
+
+        Examples
+        --------
+        >>> Grid(2, size=1.0).centres()
+        (array([0.25, 0.75]),)
+        """
+        return self._mesh(["cells"] * self.dim)
+
+    def face_centres(self, axis):
+        """Coordinates of the centres of the faces that cross `axis`: a tuple of `dim` full arrays.
+
+        Parameters
+        ----------
+        axis : int
+
+        Returns
+        -------
+        tuple of arrays, shape `face_shape(axis)` [length]
+
+        Raises
+        ------
+        ValueError
+            If the grid has no such axis.
+        """
+        axis = self.axis(axis)
+        return self._mesh(["nodes" if a == axis else "cells" for a in range(self.dim)])
+
+    def _mesh(self, places):
+        lines = [self.coordinates(axis, at) for axis, at in enumerate(places)]
+        return tuple(np.array(full) for full in np.meshgrid(*lines, indexing="ij"))
+
+    def axis(self, axis):
+        """Check an axis number or name ("x") and return the number."""
+        number = AXES.index(axis) if axis in AXES else axis
+        if isinstance(number, (int, np.integer)) and 0 <= number < self.dim:
+            return int(number)
+        raise ValueError(f"{self} has axes 0 to {self.dim - 1}, got {axis!r}")
+
+    @cached_property
+    def _key(self):
+        return self.shape, self.periodic, self.origin, tuple(widths.tobytes() for widths in self.widths)
+
+    def __eq__(self, other):
+        if not isinstance(other, Grid):
+            return NotImplemented
+        return self is other or self._key == other._key
+
+    def __hash__(self):
+        return hash(self._key)
+
+    def __repr__(self):
+        words = [" x ".join(map(str, self.shape)) + " cells", "size " + " x ".join(f"{size:.6g}" for size in self.size)]
+        if any(self.origin):
+            words.append("origin " + ", ".join(f"{start:.6g}" for start in self.origin))
+        if any(self.periodic):
+            words.append("periodic in " + ", ".join(a for a, flag in zip(AXES, self.periodic, strict=False) if flag))
+        if not all(self.uniform):
+            words.append(
+                "stretched in " + ", ".join(a for a, flag in zip(AXES, self.uniform, strict=False) if not flag)
+            )
+        return f"Grid({', '.join(words)})"
+
+
+def _outer(lines):
+    volumes = np.ones(())
+    for line in lines:
+        volumes = np.multiply.outer(volumes, line)
+    return volumes

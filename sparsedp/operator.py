@@ -1,0 +1,295 @@
+"""Operator: a constant linear map between two spaces that knows its transpose."""
+
+import weakref
+from functools import cached_property
+from numbers import Number
+
+import numpy as np
+
+from sparsedp import kernels
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
+from sparsedp.fields import check_out, field_array
+from sparsedp.ledger import active
+from sparsedp.space import Space, fits
+from sparsedp.structure import algebra
+from sparsedp.structure.base import Structure, result_dtype
+from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.lazy import Diagonal
+from sparsedp.tape import apply_operator, isbox
+
+__all__ = ["Operator"]
+
+# Largest number of unknowns for which the explicit form is chosen. Measured by benchmarks/apply.py:
+# below it one sparse product costs less than the set-up of a stencil pass.
+EXPLICIT_BELOW_COMPILED = 4096
+EXPLICIT_BELOW_PLAIN = 262144
+
+
+class Operator:
+    """A constant linear map from fields on `domain` to fields on `codomain`. Frozen.
+
+    Make one with a builder (`gradient`, `from_matrix`, ...), combine with ``@ + - *``, apply with
+    ``op(u)``. The VJP of ``op(u)`` is ``op.T(g)``.
+
+    Parameters
+    ----------
+    structure : Structure
+        How it acts on flat arrays.
+    domain, codomain : Space
+    name : str
+    form : "explicit" or "matrix-free", optional
+        Default: by a fixed rule, from the size, the structure and whether numba is installed.
+
+    Raises
+    ------
+    ShapeError
+        If the structure does not fit the spaces.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp.operators.given import from_matrix
+    >>> double = 2 * from_matrix(np.eye(3), name="copy")
+    >>> double(np.array([1.0, 2.0, 3.0]))
+    array([2., 4., 6.])
+    """
+
+    structure: Structure
+    domain: Space
+    codomain: Space
+    name: str
+    form: str
+
+    def __init__(self, structure, domain, codomain, name, form=None):
+        if structure.shape != (codomain.size, domain.size):
+            raise ShapeError(f"{name} maps {domain} to {codomain}, but its matrix has shape {structure.shape}")
+        put = self.__dict__.__setitem__
+        put("structure", structure)
+        put("domain", domain)
+        put("codomain", codomain)
+        put("name", name)
+        put("form", form or _chosen_form(structure))
+
+    def __setattr__(self, name, value):
+        raise AttributeError(f"Operator is frozen; make a new one instead of setting {name}")
+
+    def __reduce__(self):
+        return Operator, (self.structure, self.domain, self.codomain, self.name, self.form)
+
+    # ------------------------------------------------------------ application
+
+    def __call__(self, u):
+        """Apply to a field of exactly the shape of the domain; differentiable; the result is fresh."""
+        return apply_operator(self, u) if active or isbox(u) else self.apply(u)
+
+    def apply(self, u, out=None):
+        """Apply to a plain array, without the tape.
+
+        Parameters
+        ----------
+        u : array, shape `domain.shape`
+        out : array, shape `codomain.shape`, optional
+            Reused for the result: contiguous, of the dtype of the result, no overlap with `u`.
+
+        Returns
+        -------
+        array, shape `codomain.shape`
+
+        Raises
+        ------
+        ShapeError
+            If `u` or `out` has another shape.
+        TypeError
+            If `u` does not hold numbers, or `out` has another dtype.
+        ValueError
+            If `out` overlaps `u` or is not contiguous.
+        """
+        u = field_array(self, u)
+        dtype = u.dtype if self._real else result_dtype(self.structure, u.dtype)
+        if out is None:
+            out = np.empty(self.codomain.shape, dtype)
+        else:
+            check_out(self, out, u, dtype)
+        self._acting.apply(u.reshape(-1), out.reshape(-1))
+        return out
+
+    @cached_property
+    def _real(self):
+        return self.structure.dtype.kind != "c"
+
+    @cached_property
+    def _acting(self):
+        """The structure that does the work in this form."""
+        return self._matrix_structure if self.form == "explicit" else self.structure
+
+    @cached_property
+    def _matrix_structure(self):
+        if isinstance(self.structure, Matrix):
+            return self.structure
+        origin = self.__dict__.get("_origin", lambda: None)()
+        # Turned entry by entry, so that the two matrices hold the same bits.
+        return origin._matrix_structure.transpose() if origin is not None else Matrix(self.structure.explicit())
+
+    # ------------------------------------------------------------ transpose and algebra
+
+    @property
+    def T(self):
+        """The plain transpose (for complex entries too), from codomain to domain."""
+        origin = self.__dict__.get("_origin")
+        known = origin() if origin is not None else self.__dict__.get("_transposed")
+        return known if known is not None else self._make_transpose()
+
+    def _make_transpose(self):
+        name = self.name[:-2] if self.name.endswith(".T") else f"{_bracket(self.name)}.T"
+        turned = Operator(self.structure.transpose(), self.codomain, self.domain, name, self.form)
+        if self.tangent is self:  # else the way back is the twin that checks nothing, as derivatives need it
+            # Weak: a cycle would keep large matrices alive until the collector runs.
+            turned.__dict__["_origin"] = weakref.ref(self)
+        self.__dict__["_transposed"] = turned
+        return turned
+
+    @property
+    def tangent(self):
+        """The operator that carries tangents: this one, without checks of primal data."""
+        structure = self.structure.tangent()
+        same = structure is self.structure  # not kept: an operator that refers to itself would never be freed
+        return self if same else Operator(structure, self.domain, self.codomain, self.name, self.form)
+
+    def __matmul__(self, other):
+        if isinstance(other, Operator):
+            return self._compose(other)
+        if isbox(other) or isinstance(other, np.ndarray):
+            if np.shape(other) != (self.domain.size,):
+                raise ShapeError(
+                    f"{self.name} @ x takes a flat x of shape ({self.domain.size},); for a field write op(u)"
+                )
+            return self._flat(other)
+        return NotImplemented
+
+    def __rmatmul__(self, other):
+        if isbox(other) or isinstance(other, np.ndarray):
+            return self.T @ other
+        return NotImplemented
+
+    def _compose(self, other):
+        if not fits(self.domain, other.codomain):
+            raise ShapeError(f"{self.name} takes {self.domain}, but {other.name} gives {other.codomain}")
+        name = f"{_bracket(self.name)} @ {_bracket(other.name)}"
+        return Operator(algebra.compose(self.structure, other.structure), other.domain, self.codomain, name)
+
+    @cached_property
+    def _flat(self):
+        """The same map on flat arrays."""
+        return Operator(self._acting, Space(self.domain.size), Space(self.codomain.size), self.name, self.form)
+
+    def __add__(self, other):
+        if not isinstance(other, Operator):
+            return NotImplemented
+        if not (fits(self.domain, other.domain) and fits(self.codomain, other.codomain)):
+            mine, theirs = f"{self.domain} to {self.codomain}", f"{other.domain} to {other.codomain}"
+            raise ShapeError(f"{self.name} maps {mine}, but {other.name} maps {theirs}")
+        structure = algebra.total(self.structure, other.structure)
+        return Operator(structure, self.domain, self.codomain, f"{self.name} + {other.name}")
+
+    def __sub__(self, other):
+        return self + (-other) if isinstance(other, Operator) else NotImplemented
+
+    def __neg__(self):
+        return self * -1.0
+
+    def __mul__(self, factor):
+        if isbox(factor):
+            raise DerivativeError(f"a traced number cannot scale an operator; write nu * {self.name}(u)")
+        if not (isinstance(factor, Number) or (isinstance(factor, np.ndarray) and factor.shape == ())):
+            return NotImplemented
+        number = complex(factor)  # type: ignore[arg-type]
+        if not np.isfinite(number):
+            raise NonFiniteError(f"{self.name} can be scaled by a finite number only, got {factor}")
+        label = "-" if number == -1 else f"{factor:g} * "
+        structure = self.structure.scaled(number if _is_complex(factor) else number.real)
+        return Operator(structure, self.domain, self.codomain, f"{label}{_bracket(self.name)}")
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, number):
+        return self * (1.0 / complex(number) if _is_complex(number) else 1.0 / number)
+
+    def __array_ufunc__(self, ufunc, method, *inputs, **options):
+        """Let NumPy numbers scale an operator, and name the mistake when anything else is tried."""
+        if any(map(isbox, inputs)):
+            raise DerivativeError(f"a traced number cannot scale an operator; write nu * {self.name}(u)")
+        if method == "__call__" and ufunc is np.multiply and np.shape(inputs[0]) == ():
+            return self * inputs[0]
+        if method == "__call__" and ufunc is np.matmul:
+            return self.__rmatmul__(inputs[0])
+        raise TypeError(f"numpy.{ufunc.__name__} does not take an operator; write {self.name}(u) for a field u")
+
+    # ------------------------------------------------------------ forms and borders
+
+    @property
+    def shape(self):
+        """(codomain.size, domain.size)."""
+        return self.structure.shape
+
+    @property
+    def dtype(self):
+        """float64, or complex128 when the entries are complex."""
+        return self.structure.dtype
+
+    @property
+    def matrix(self):
+        """The entries as a csr_array with 32-bit indices, or None in the matrix-free form."""
+        return self._matrix_structure.matrix if self.form == "explicit" else None
+
+    @property
+    def separable(self):
+        """Whether it is a Kronecker sum: one 1-D factor for each axis."""
+        return getattr(self.structure, "separable", False)
+
+    def explicit(self):
+        """The same operator, applied through its matrix."""
+        return self if self.form == "explicit" else self._in_form("explicit")
+
+    def matrix_free(self):
+        """The same operator, applied without a matrix. One that was given as a matrix stays as it is."""
+        if self.form == "matrix-free" or isinstance(self.structure, Matrix):
+            return self
+        return self._in_form("matrix-free")
+
+    def _in_form(self, form):
+        return Operator(self.structure, self.domain, self.codomain, self.name, form)
+
+    def matvec(self, x):
+        """Flat product A x, as SciPy calls it."""
+        return self @ np.asarray(x).reshape(self.domain.size)
+
+    def rmatvec(self, y):
+        """Flat product A^H y: conjugated, as SciPy wants it (`.T` is not)."""
+        return np.conj(self.T @ np.conj(np.asarray(y).reshape(self.codomain.size)))
+
+    def to_scipy(self):
+        """The operator as a scipy.sparse.linalg.LinearOperator on flat arrays."""
+        from scipy.sparse.linalg import LinearOperator
+
+        return LinearOperator(self.shape, matvec=self.matvec, rmatvec=self.rmatvec, dtype=self.dtype)
+
+    def __repr__(self):
+        return f"<{self.name}: {self.domain} -> {self.codomain}, {self.form}>"
+
+
+def _chosen_form(structure):
+    """A fixed rule, never a timing: the same program gives the same bits everywhere."""
+    if isinstance(structure, Matrix):
+        return "explicit"
+    if isinstance(structure, Diagonal) or not structure.has_entries:
+        return "matrix-free"
+    limit = EXPLICIT_BELOW_COMPILED if kernels.compiled() else EXPLICIT_BELOW_PLAIN
+    return "explicit" if max(structure.shape) <= limit else "matrix-free"
+
+
+def _is_complex(number):
+    return np.asarray(number).dtype.kind == "c"
+
+
+def _bracket(name):
+    return f"({name})" if " + " in name or " - " in name else name

@@ -1,0 +1,208 @@
+"""Walls, obstacles and pointwise factors: lift, mask, interior, identity, diagonal."""
+
+import numpy as np
+
+from sparsedp.conditions import resolve
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
+from sparsedp.operator import Operator
+from sparsedp.operators.stencils import along, wall_slopes
+from sparsedp.space import Space
+from sparsedp.structure.kronecker import Kronecker
+from sparsedp.structure.lazy import Diagonal, Mask
+from sparsedp.tape import isbox
+
+__all__ = ["diagonal", "identity", "interior", "lift", "mask"]
+
+
+def lift(grid, boundary):
+    """Boundary values -> faces: what inhomogeneous values add to the gradient, G(u) + B(values).
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary : condition, or dict of conditions
+        The same as for the gradient. dirichlet: the value of u [unit]; neumann: the outward slope
+        [unit / length]; robin: the right-hand side of a u + b du/dn = value.
+
+    Returns
+    -------
+    Operator
+        in: one flat array of wall values, x-lower, x-upper, y-lower, ... (periodic axes have none);
+        ``op.domain.join(...)`` builds it from one array or number for each wall. out: faces [unit / length].
+
+    Raises
+    ------
+    ValueError
+        If `boundary` names a periodic axis.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid, dirichlet
+    >>> lift(Grid(3), dirichlet)(np.array([1.0, 5.0]))
+    array([-2.,  0.,  0., 10.])
+    """
+    parts: list[tuple[int, ...]] = []
+    blocks = {}
+    for axis, sides in enumerate(resolve(grid, boundary)):
+        for side, condition in enumerate(sides or ()):
+            blocks[axis, len(parts)] = along(axis, grid.dim, wall_slopes(grid, axis, side, condition))
+            parts.append(tuple(1 if a == axis else n for a, n in enumerate(grid.shape)))
+    walls = Space(sum(int(np.prod(part)) for part in parts), "walls", grid, parts)
+    return Operator(Kronecker(grid.faces.parts, parts, blocks), walls, grid.faces, "lift")
+
+
+def mask(space, keep):
+    """Space -> the same space: the field where `keep` is true, exactly 0 elsewhere.
+
+    Parameters
+    ----------
+    space : Space
+    keep : bool array, shape `space.shape`
+
+    Returns
+    -------
+    Operator
+
+    Raises
+    ------
+    ShapeError
+        If `keep` has another shape.
+    TypeError
+        If `keep` is not boolean.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> mask(Grid(3).cells, np.array([True, False, True]))(np.array([1.0, np.nan, 3.0]))
+    array([1., 0., 3.])
+    """
+    return Operator(Mask(_boolean(keep, space, "keep")), space, space, "mask")
+
+
+def interior(grid, solid=None):
+    """Faces -> faces: 0 on walls and on faces that touch a solid cell, unchanged elsewhere.
+
+    Parameters
+    ----------
+    grid : Grid
+    solid : bool array, shape `grid.shape`, optional
+
+    Returns
+    -------
+    Operator
+
+    Raises
+    ------
+    ShapeError
+        If `solid` has another shape than the grid.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> interior(Grid(3))(np.ones(4))
+    array([0., 1., 1., 0.])
+    """
+    keep = [np.ones(part, dtype=bool) for part in grid.faces.parts]
+    for axis, inner in enumerate(keep):
+        if not grid.periodic[axis]:
+            np.moveaxis(inner, axis, 0)[[0, -1]] = False
+    flat = np.concatenate([part.ravel() for part in keep])
+    if solid is not None:
+        below, above = solid_faces(grid, check_solid(grid, solid))
+        flat &= ~(below | above)
+    return Operator(Mask(flat), grid.faces, grid.faces, "interior")
+
+
+def identity(space):
+    """Space -> the same space: a fresh copy of the field.
+
+    Parameters
+    ----------
+    space : Space
+
+    Returns
+    -------
+    Operator
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> identity(Grid(2).cells)(np.array([1.0, 2.0]))
+    array([1., 2.])
+    """
+    parts = space.parts if space.grid is not None else ((space.size,),)
+    return Operator(Kronecker.identity(parts), space, space, "identity")
+
+
+def diagonal(space, values):
+    """Space -> the same space: pointwise multiplication by constant values.
+
+    Parameters
+    ----------
+    space : Space
+    values : array that broadcasts to `space.shape`
+
+    Returns
+    -------
+    Operator
+
+    Raises
+    ------
+    ShapeError
+        If the values do not fit.
+    NonFiniteError
+        If a value is NaN or infinite.
+    DerivativeError
+        If the values are traced: an Operator is constant; write ``values * u``.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> diagonal(Grid(2).cells, np.array([2.0, 3.0]))(np.array([1.0, 1.0]))
+    array([2., 3.])
+    """
+    if isbox(values):
+        raise DerivativeError("diagonal needs constant values, got traced ones; write values * u instead")
+    try:
+        values = np.broadcast_to(np.asarray(values), space.shape)
+    except ValueError:
+        raise ShapeError(f"diagonal on {space} needs values of shape {space.shape}, got {np.shape(values)}") from None
+    if not np.all(np.isfinite(values)):
+        raise NonFiniteError(
+            f"diagonal on {space} needs finite values, got {np.count_nonzero(~np.isfinite(values))} others"
+        )
+    return Operator(Diagonal(values), space, space, "diagonal")
+
+
+def check_solid(grid, solid):
+    """Solid argument -> boolean array of the shape of the grid."""
+    return _boolean(solid, grid.cells, "solid")
+
+
+def _boolean(flags, space, name):
+    if isbox(flags):
+        raise DerivativeError(f"{name} needs a constant boolean array, got a traced one")
+    flags = np.asarray(flags)
+    if flags.dtype != bool:
+        raise TypeError(f"{name} needs a boolean array, got dtype {flags.dtype}; write {name}.astype(bool)")
+    if flags.shape != space.shape:
+        raise ShapeError(f"{name} needs one flag for each value on {space}, got an array of shape {flags.shape}")
+    return flags
+
+
+def solid_faces(grid, solid):
+    """Cell mask -> two flat face masks: the cell below the face is solid, the cell above is.
+
+    Beyond a wall there is no cell, so nothing solid.
+    """
+    below, above = [], []
+    for axis in range(grid.dim):
+        if grid.periodic[axis]:
+            below.append(np.roll(solid, 1, axis).ravel())
+            above.append(solid.ravel())
+        else:
+            pad = [(0, 0)] * grid.dim
+            pad[axis] = (1, 0)
+            below.append(np.pad(solid, pad).ravel())
+            above.append(np.pad(solid, [side[::-1] for side in pad]).ravel())
+    return np.concatenate(below), np.concatenate(above)

@@ -1,0 +1,212 @@
+"""Differences on the staggered grid: gradient, divergence, laplacian, curl, upwind."""
+
+from sparsedp.conditions import neumann, resolve
+from sparsedp.operator import Operator
+from sparsedp.operators.boundary import check_solid, solid_faces
+from sparsedp.operators.stencils import along, differences, one_sided, pick, slopes
+from sparsedp.structure.algebra import compose, total
+from sparsedp.structure.kronecker import Kronecker
+from sparsedp.structure.lazy import Mask
+
+__all__ = ["curl", "divergence", "gradient", "laplacian", "upwind"]
+
+
+def gradient(grid, boundary=neumann, solid=None, solid_boundary=neumann):
+    """Cells -> faces: the slope (u[i] - u[i - 1]) / d[i] on every face.
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary : condition, or dict of conditions
+        Enters on the wall faces with value 0; other values enter through `lift`.
+    solid : bool array, shape `grid.shape`, optional
+        Cells that are not part of the domain. A face between two solid cells gets 0.
+    solid_boundary : condition
+        Holds with value 0 on every face between a solid and an open cell.
+
+    Returns
+    -------
+    Operator
+        in: cells [unit]; out: faces [unit / length].
+
+    Raises
+    ------
+    ShapeError
+        If `solid` has another shape than the grid.
+    TypeError
+        If `solid` is not boolean.
+
+    Notes
+    -----
+    Order 2 inside on uniform grids and on smooth maps of them. Transpose: with volumes V, W and
+    inner faces I, V D I = -(W G I)^T. Null space: constants, when all sides are neumann or periodic.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp import Grid, dirichlet
+    >>> gradient(Grid(3))(np.array([1.0, 2.0, 4.0]))
+    array([0., 1., 2., 0.])
+    >>> gradient(Grid(3), {"x": (dirichlet, neumann)})(np.array([1.0, 2.0, 4.0]))
+    array([2., 1., 2., 0.])
+    """
+    sides = resolve(grid, boundary)
+    blocks = {(a, 0): along(a, grid.dim, slopes(grid, a, sides[a])) for a in range(grid.dim)}
+    structure = Kronecker(grid.faces.parts, grid.cells.parts, blocks)
+    if solid is not None:
+        structure = _around(grid, structure, check_solid(grid, solid), solid_boundary)
+    return Operator(structure, grid.cells, grid.faces, "gradient")
+
+
+def _around(grid, structure, solid, condition):
+    """Close the faces of solid cells; a one-sided slope there unless the condition is neumann."""
+    below, above = solid_faces(grid, solid)
+    found = compose(Mask(~(below | above)), structure)
+    if condition.a == 0:
+        return found
+    for upper, faces in ((True, below & ~above), (False, above & ~below)):
+        blocks = {(a, 0): along(a, grid.dim, one_sided(grid, a, upper, condition)) for a in range(grid.dim)}
+        from_one_side = Kronecker(grid.faces.parts, grid.cells.parts, blocks)
+        found = total(found, compose(Mask(faces), from_one_side))
+    return found
+
+
+def divergence(grid):
+    """Faces -> cells: the net outflow per volume, sum over axes of (v[i + 1] - v[i]) / h[i].
+
+    Parameters
+    ----------
+    grid : Grid
+
+    Returns
+    -------
+    Operator
+        in: faces [unit]; out: cells [unit / length].
+
+    Notes
+    -----
+    Exact for the finite-volume balance on any grid: sum(volumes * D(v)) is the flow through the walls.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp import Grid
+    >>> divergence(Grid(3))(np.array([0.0, 1.0, 3.0, 3.0]))
+    array([1., 2., 0.])
+    """
+    blocks = {(0, a): along(a, grid.dim, differences(grid, a)) for a in range(grid.dim)}
+    return Operator(Kronecker(grid.cells.parts, grid.faces.parts, blocks), grid.faces, grid.cells, "divergence")
+
+
+def laplacian(grid, boundary=neumann, solid=None, solid_boundary=neumann):
+    """Cells -> cells: divergence(grid) @ gradient(grid, boundary, solid, solid_boundary).
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary : condition, or dict of conditions
+    solid : bool array, shape `grid.shape`, optional
+    solid_boundary : condition
+
+    Returns
+    -------
+    Operator
+        in: cells [unit]; out: cells [unit / length^2].
+
+    Raises
+    ------
+    ShapeError
+        If `solid` has another shape than the grid.
+
+    Notes
+    -----
+    Order 2 inside; next to a wall the truncation error is of order 1 (neumann) or 0 (dirichlet),
+    yet solutions are of order 2. The values in solid cells do not matter; what it gives there is the
+    flux into the solid, and solves leave these cells out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp import Grid
+    >>> laplacian(Grid(3))(np.array([1.0, 2.0, 4.0]))
+    array([ 1.,  1., -2.])
+    """
+    product = divergence(grid) @ gradient(grid, boundary, solid, solid_boundary)
+    return Operator(product.structure, grid.cells, grid.cells, "laplacian")
+
+
+def curl(grid):
+    """Nodes -> faces in 2-D (stream function), edges -> faces in 3-D; its divergence is 0 exactly.
+
+    Parameters
+    ----------
+    grid : Grid
+        2-D or 3-D.
+
+    Returns
+    -------
+    Operator
+        in: nodes or edges [unit]; out: faces [unit / length]. In 2-D v_x = d psi/dy, v_y = -d psi/dx.
+
+    Raises
+    ------
+    ValueError
+        If the grid is 1-D.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp import Grid
+    >>> grid = Grid((1, 1))
+    >>> curl(grid)(np.array([[0.0, 1.0], [0.0, 0.0]]))
+    array([1., 0., 0., 1.])
+    """
+    if grid.dim == 1:
+        raise ValueError(f"curl needs a 2-D or 3-D grid, got {grid}")
+    if grid.dim == 2:
+        blocks = {(0, 0): along(1, 2, differences(grid, 1)), (1, 0): along(0, 2, differences(grid, 0), -1.0)}
+        return Operator(Kronecker(grid.faces.parts, grid.nodes.parts, blocks), grid.nodes, grid.faces, "curl")
+    blocks = {}
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        blocks[a, c] = along(b, 3, differences(grid, b))
+        blocks[a, b] = along(c, 3, differences(grid, c), -1.0)
+    return Operator(Kronecker(grid.faces.parts, grid.edges.parts, blocks), grid.edges, grid.faces, "curl")
+
+
+def upwind(grid, axis=0, direction=1, boundary=neumann):
+    """Cells -> cells: the one-sided slope on the side that the wind comes from.
+
+    Parameters
+    ----------
+    grid : Grid
+    axis : int or "x", "y", "z"
+    direction : 1 or -1
+        Sign of the velocity: 1 takes (u[i] - u[i - 1]) / d, -1 takes (u[i + 1] - u[i]) / d.
+    boundary : condition, or dict of conditions
+        Says what the slope on a wall face is.
+
+    Returns
+    -------
+    Operator
+        in: cells [unit]; out: cells [unit / length]. Order 1.
+
+    Raises
+    ------
+    ValueError
+        If the grid has no such axis, or `direction` is not 1 or -1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp import Grid
+    >>> upwind(Grid(3, periodic=True))(np.array([1.0, 2.0, 4.0]))
+    array([-3.,  1.,  2.])
+    """
+    axis = grid.axis(axis)
+    if direction not in (1, -1):
+        raise ValueError(f"upwind needs direction 1 or -1, got {direction!r}")
+    sides = resolve(grid, boundary)[axis]
+    factor = pick(grid, axis, direction == -1) @ slopes(grid, axis, sides)
+    structure = Kronecker(grid.cells.parts, grid.cells.parts, {(0, 0): along(axis, grid.dim, factor)})
+    return Operator(structure, grid.cells, grid.cells, "upwind")

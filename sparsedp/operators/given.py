@@ -1,0 +1,145 @@
+"""Operators that the user brings: a matrix, a LinearOperator, or two functions."""
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
+from sparsedp.operator import Operator
+from sparsedp.space import Space
+from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.lazy import Functions
+
+__all__ = ["from_functions", "from_linear_operator", "from_matrix"]
+
+
+def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
+    """Matrix -> Operator in explicit form.
+
+    Parameters
+    ----------
+    matrix : scipy.sparse matrix or array, or 2-D ndarray, shape (codomain.size, domain.size)
+        Any format, real or complex. Copied.
+    domain, codomain : Space, int or tuple of int, optional
+        Default: flat spaces of the matrix's sizes.
+    name : str
+
+    Returns
+    -------
+    Operator
+
+    Raises
+    ------
+    ShapeError
+        If the matrix is not 2-D or does not fit the spaces.
+    NonFiniteError
+        If an entry is NaN or infinite.
+
+    Examples
+    --------
+    >>> rows = from_matrix([[1.0, 2.0], [0.0, 3.0]])
+    >>> rows(np.array([1.0, 1.0]))
+    array([3., 3.])
+    >>> rows.T(np.array([1.0, 0.0]))
+    array([1., 2.])
+    """
+    entries = matrix if sp.issparse(matrix) else np.asarray(matrix)
+    if entries.ndim != 2:
+        raise ShapeError(f"{name} needs a 2-D matrix, got an array of shape {entries.shape}")
+    if entries.dtype.kind not in "biufc":
+        raise TypeError(f"{name} needs a matrix of numbers, got dtype {entries.dtype}")
+    structure = Matrix(sp.csr_array(entries, copy=True))
+    if not np.all(np.isfinite(structure.matrix.data)):
+        raise NonFiniteError(f"{name} needs finite entries, got NaN or infinity")
+    return Operator(structure, _space(domain, structure.shape[1]), _space(codomain, structure.shape[0]), name)
+
+
+def from_linear_operator(linop, domain=None, codomain=None, name="operator"):
+    """scipy.sparse.linalg.LinearOperator -> Operator.
+
+    Parameters
+    ----------
+    linop : LinearOperator, or any object with shape, matvec and rmatvec
+        `rmatvec` is the conjugate transpose, as SciPy defines it.
+    domain, codomain : Space, int or tuple of int, optional
+    name : str
+
+    Returns
+    -------
+    Operator
+        In matrix-free form.
+
+    Raises
+    ------
+    ShapeError
+        If the operator does not fit the spaces.
+    DerivativeError
+        On use of `.T`, if the LinearOperator has no rmatvec.
+
+    Examples
+    --------
+    >>> from scipy.sparse.linalg import aslinearoperator
+    >>> op = from_linear_operator(aslinearoperator(np.array([[1.0, 2.0], [0.0, 3.0]])))
+    >>> op.T(np.array([1.0, 0.0]))
+    array([1., 2.])
+    """
+    rows, columns = linop.shape
+
+    def forward(x):
+        return np.asarray(linop.matvec(x.reshape(-1)))
+
+    def backward(g):
+        try:
+            return np.conj(np.asarray(linop.rmatvec(np.conj(g.reshape(-1)))))
+        except (NotImplementedError, TypeError, AttributeError):
+            raise DerivativeError(f"{name} has no transpose: its LinearOperator lacks rmatvec; give it one") from None
+
+    structure = Functions(forward, backward, (columns,), (rows,), _kind(getattr(linop, "dtype", None)))
+    return Operator(structure, _space(domain, columns), _space(codomain, rows), name)
+
+
+def from_functions(forward, transpose, domain, codomain, name="operator", dtype=float):
+    """Two functions, the product and the transposed product -> Operator.
+
+    Parameters
+    ----------
+    forward : callable
+        ``forward(u)``: array of shape `domain.shape` -> array of shape `codomain.shape`, linear.
+    transpose : callable or None
+        ``transpose(g)``, the plain transpose: sum(g * forward(u)) == sum(transpose(g) * u).
+        None when it is not known; then only `op(u)` works.
+    domain, codomain : Space, int or tuple of int
+    name : str
+    dtype : float or complex
+        complex when the functions make complex values from real fields.
+
+    Returns
+    -------
+    Operator
+        In matrix-free form. `dp.check.operator(op)` tells whether the two functions agree.
+
+    Raises
+    ------
+    ShapeError
+        On use, if a function returns an array of another shape.
+    DerivativeError
+        On use of the transpose when there is none.
+
+    Examples
+    --------
+    >>> ends = from_functions(lambda u: u[[0, -1]], lambda g: np.array([g[0], 0.0, g[1]]), 3, 2, name="ends")
+    >>> ends(np.array([5.0, 6.0, 7.0]))
+    array([5., 7.])
+    """
+    domain, codomain = _space(domain, None), _space(codomain, None)
+    structure = Functions(forward, transpose, domain.shape, codomain.shape, _kind(dtype))
+    return Operator(structure, domain, codomain, name)
+
+
+def _space(given, size):
+    if isinstance(given, Space):
+        return given
+    return Space(size if given is None else given)
+
+
+def _kind(dtype):
+    return complex if dtype is not None and np.dtype(dtype).kind == "c" else float

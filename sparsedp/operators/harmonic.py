@@ -1,0 +1,99 @@
+"""The harmonic average of a coefficient: nonlinear, so a rule and not an Operator.
+
+On the face between cells l and r, with the shares w_l = h_l / (h_l + h_r), w_r = 1 - w_l:
+
+    k_f = k_l k_r / (w_l k_r + w_r k_l),   dk_f/dk_l = w_l (k_r / den)^2,   dk_f/dk_r = w_r (k_l / den)^2.
+
+This is the flux-exact conductivity of two layers in series (Patankar, Numerical Heat Transfer and
+Fluid Flow, 1980). Where both are 0 the ratios are taken as 1, their value on k_l = k_r.
+"""
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.errors import NonFiniteError
+from sparsedp.operator import Operator
+from sparsedp.operators.stencils import along, cell_beside
+from sparsedp.structure.kronecker import Kronecker
+from sparsedp.tape import differentiable, plain
+
+__all__ = ["harmonic_average"]
+
+
+def harmonic_average(grid):
+    """Grid -> function from a cell coefficient to its harmonic average on faces, differentiable.
+
+    Parameters
+    ----------
+    grid : Grid
+
+    Returns
+    -------
+    callable
+        in: k on cells, finite and >= 0 [unit]; out: faces [unit]. A wall face takes the value of its cell.
+
+    Raises
+    ------
+    ValueError
+        On use, if a coefficient is negative.
+    NonFiniteError
+        On use, if a coefficient is NaN or infinite.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> harmonic_average(Grid(2))(np.array([1.0, 3.0]))
+    array([1. , 1.5, 3. ])
+    """
+    below, above = (_beside(grid, upper) for upper in (False, True))
+    widths = grid.join(*(_full_widths(grid, axis, upper=False) for axis in range(grid.dim)))
+    others = grid.join(*(_full_widths(grid, axis, upper=True) for axis in range(grid.dim)))
+    pair = _pair_rule(widths / (widths + others))
+
+    def average(k):
+        values = plain(k)
+        if not np.all(np.isfinite(values)):
+            raise NonFiniteError("harmonic_average needs a finite coefficient, got NaN or infinity")
+        if np.any(np.less(values, 0)):
+            raise ValueError(f"harmonic_average needs a coefficient >= 0, got {np.min(values):g}")
+        return pair(below(k), above(k))
+
+    return average
+
+
+def _beside(grid, upper):
+    blocks = {(a, 0): along(a, grid.dim, cell_beside(grid, a, upper)) for a in range(grid.dim)}
+    structure = Kronecker(grid.faces.parts, grid.cells.parts, blocks)
+    return Operator(structure, grid.cells, grid.faces, "cell above" if upper else "cell below")
+
+
+def _full_widths(grid, axis, upper):
+    line = cell_beside(grid, axis, upper).matrix @ grid.widths[axis]
+    return line.reshape([-1 if a == axis else 1 for a in range(grid.dim)])
+
+
+def _pair_rule(share):
+    """The rule of the module's formula, for fixed shares of the lower cell."""
+
+    def ratios(low, high):
+        total = share * high + (1 - share) * low
+        empty = plain(total) == 0
+        total = anp.where(empty, 1.0, total)
+        return anp.where(empty, 1.0, low / total), anp.where(empty, 1.0, high / total)
+
+    def forward(low, high):
+        return low * ratios(low, high)[1]
+
+    def slopes(low, high):
+        from_low, from_high = ratios(low, high)
+        return share * from_high**2, (1 - share) * from_low**2
+
+    def vjp(nums, ans, low, high):
+        both = slopes(low, high)
+        return lambda g: tuple(g * both[num] for num in nums)
+
+    def jvp(nums, tangents, ans, low, high):
+        both = slopes(low, high)
+        return sum(both[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
+
+    return differentiable("harmonic_average", forward, vjp, jvp)

@@ -1,0 +1,240 @@
+"""From one place to another: average, sample, restrict, prolong, embed, part, harmonic_average."""
+
+from itertools import product
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.conditions import neumann, resolve
+from sparsedp.errors import ShapeError
+from sparsedp.grid import Grid
+from sparsedp.operator import Operator
+from sparsedp.operators.interpolation import linear_weights
+from sparsedp.operators.stencils import along, means, single
+from sparsedp.space import Space
+from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.factor import Factor
+from sparsedp.structure.kronecker import Kronecker
+
+__all__ = ["average", "embed", "part", "prolong", "restrict", "sample"]
+
+
+def average(grid, boundary=neumann):
+    """Cells -> faces: linear interpolation between the two cells of a face.
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary : condition, or dict of conditions
+        At a wall: the value that the condition with value 0 implies (neumann: that of the cell).
+
+    Returns
+    -------
+    Operator
+        in: cells [unit]; out: faces [unit]. Linear fields are reproduced between cells.
+
+    Examples
+    --------
+    >>> average(Grid(3))(np.array([1.0, 2.0, 4.0]))
+    array([1. , 1.5, 3. , 4. ])
+    """
+    sides = resolve(grid, boundary)
+    blocks = {(a, 0): along(a, grid.dim, means(grid, a, sides[a])) for a in range(grid.dim)}
+    return Operator(Kronecker(grid.faces.parts, grid.cells.parts, blocks), grid.cells, grid.faces, "average")
+
+
+def sample(grid, points):
+    """Cells -> values at points, by linear interpolation between cell centres.
+
+    Parameters
+    ----------
+    grid : Grid
+    points : array, shape (m, dim) [length]
+        One point for each row; in 1-D shape (m,) will do. Points must lie in the box; a periodic
+        axis takes any coordinate.
+
+    Returns
+    -------
+    Operator
+        in: cells [unit]; out: shape (m,) [unit]. Order 2; linear fields exact.
+
+    Raises
+    ------
+    ShapeError
+        If `points` has another shape.
+    NonFiniteError
+        If a coordinate is NaN or infinite.
+    ValueError
+        If a point lies outside the box.
+
+    Examples
+    --------
+    >>> sample(Grid(3), [0.5, 1.25])(np.array([1.0, 2.0, 4.0]))
+    array([1.  , 1.75])
+    """
+    points = np.asarray(points, dtype=float)
+    if points.ndim == 1 and grid.dim == 1:
+        points = points[:, None]
+    if points.ndim != 2 or points.shape[1] != grid.dim:
+        raise ShapeError(f"sample needs points of shape (m, {grid.dim}), got an array of shape {points.shape}")
+    if not grid.cells.size:
+        raise ShapeError(f"sample needs a grid with cells, got {grid}")
+    corners = [linear_weights(grid, axis, points[:, axis]) for axis in range(grid.dim)]
+    count = np.arange(len(points))
+    rows, columns, values = [], [], []
+    for sides in product((0, 1), repeat=grid.dim):
+        cells = [corner[side] for corner, side in zip(corners, sides, strict=True)]
+        weights = [corner[2] if side else 1 - corner[2] for corner, side in zip(corners, sides, strict=True)]
+        rows.append(count)
+        columns.append(np.ravel_multi_index(cells, grid.shape))
+        values.append(np.prod(weights, axis=0))
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    matrix = sp.coo_array(entries, shape=(len(points), grid.cells.size))
+    return Operator(Matrix(matrix), grid.cells, Space(len(points)), "sample")
+
+
+def restrict(grid, factor):
+    """Cells -> cells of a coarser grid: the mean over each block, weighted by volume.
+
+    Parameters
+    ----------
+    grid : Grid
+        The fine grid.
+    factor : int or tuple of int
+        How many cells of each axis become one; must divide the shape.
+
+    Returns
+    -------
+    Operator
+        in: cells [unit]; out: cells of the coarse grid (``op.codomain.grid``) [unit]. Conserves the integral.
+
+    Raises
+    ------
+    ShapeError
+        If the factor is not a whole number >= 1 that divides the shape.
+
+    Examples
+    --------
+    >>> restrict(Grid(4), 2)(np.array([1.0, 3.0, 5.0, 9.0]))
+    array([2., 7.])
+    """
+    coarse, factors = _coarse(grid, factor)
+    lines = []
+    for h, size in zip(grid.widths, factors, strict=True):
+        fine = np.arange(h.size)
+        weights = h / np.repeat(h.reshape(-1, size).sum(axis=1), size)
+        lines.append(Factor.from_diagonals((h.size // size, h.size), (fine // size, fine, weights)))
+    return Operator(single(grid.cells, coarse.cells, lines), grid.cells, coarse.cells, "restrict")
+
+
+def prolong(grid, factor, interpolation="constant"):
+    """Cells of a coarser grid -> cells: the way back of `restrict`.
+
+    Parameters
+    ----------
+    grid : Grid
+        The fine grid.
+    factor : int or tuple of int
+        How many cells of each axis become one; must divide the shape.
+    interpolation : "constant" or "linear"
+        constant: each block takes the coarse value; restrict @ prolong is the identity, and the
+        integral is conserved. linear: order 2, linear fields exact.
+
+    Returns
+    -------
+    Operator
+        in: cells of the coarse grid (``op.domain.grid``) [unit]; out: cells [unit].
+
+    Raises
+    ------
+    ShapeError
+        If the factor is not a whole number >= 1 that divides the shape.
+    ValueError
+        If `interpolation` is another word.
+
+    Examples
+    --------
+    >>> prolong(Grid(4), 2)(np.array([2.0, 7.0]))
+    array([2., 2., 7., 7.])
+    >>> prolong(Grid(4), 2, "linear")(np.array([1.0, 3.0]))
+    array([0.5, 1.5, 2.5, 3.5])
+    """
+    if interpolation not in ("constant", "linear"):
+        raise ValueError(f"prolong needs interpolation 'constant' or 'linear', got {interpolation!r}")
+    coarse, factors = _coarse(grid, factor)
+    lines = []
+    for axis, size in enumerate(factors):
+        fine = np.arange(grid.shape[axis])
+        shape = (fine.size, fine.size // size)
+        if interpolation == "constant":
+            lines.append(Factor.from_diagonals(shape, (fine, fine // size, np.ones(fine.size))))
+        else:
+            lower, upper, weight = linear_weights(coarse, axis, grid.coordinates(axis))
+            lines.append(Factor.from_diagonals(shape, (fine, lower, 1 - weight), (fine, upper, weight)))
+    return Operator(single(coarse.cells, grid.cells, lines), coarse.cells, grid.cells, "prolong")
+
+
+def _coarse(grid, factor):
+    factors = (factor,) * grid.dim if isinstance(factor, (int, np.integer)) else tuple(factor)
+    whole = len(factors) == grid.dim and all(isinstance(f, (int, np.integer)) and f >= 1 for f in factors)
+    if not whole or any(n % f for n, f in zip(grid.shape, factors, strict=True)):
+        raise ShapeError(f"a factor must be a whole number >= 1 that divides {grid.shape}, got {factor}")
+    spacing = [h.reshape(-1, f).sum(axis=1) for h, f in zip(grid.widths, factors, strict=True)]
+    shape = tuple(n // f for n, f in zip(grid.shape, factors, strict=True))
+    return Grid(shape, spacing=spacing, origin=grid.origin, periodic=grid.periodic), factors
+
+
+def embed(grid, axis):
+    """One component of a face field -> faces, zero in the other components.
+
+    Parameters
+    ----------
+    grid : Grid
+    axis : int or "x", "y", "z"
+
+    Returns
+    -------
+    Operator
+        in: shape `grid.face_shape(axis)` [unit]; out: faces [unit]. Its transpose is `part`.
+
+    Raises
+    ------
+    ValueError
+        If the grid has no such axis.
+
+    Examples
+    --------
+    >>> embed(Grid((1, 1)), "x")(np.array([[1.0], [2.0]]))
+    array([1., 2., 0., 0.])
+    """
+    axis = grid.axis(axis)
+    component = Space(grid.face_shape(axis), f"{grid.axes[axis]}-faces", grid)
+    blocks = {(axis, 0): along(axis, grid.dim, None)}
+    return Operator(Kronecker(grid.faces.parts, component.parts, blocks), component, grid.faces, "embed")
+
+
+def part(grid, axis):
+    """Faces -> one component of the face field, in its own shape.
+
+    Parameters
+    ----------
+    grid : Grid
+    axis : int or "x", "y", "z"
+
+    Returns
+    -------
+    Operator
+        in: faces [unit]; out: shape `grid.face_shape(axis)` [unit]. Its transpose is `embed`.
+
+    Raises
+    ------
+    ValueError
+        If the grid has no such axis.
+
+    Examples
+    --------
+    >>> part(Grid((1, 1)), "y")(np.array([1.0, 2.0, 3.0, 4.0]))
+    array([[3., 4.]])
+    """
+    turned = embed(grid, axis)
+    return Operator(turned.structure.transpose(), turned.codomain, turned.domain, "part")

@@ -1,0 +1,1 @@
+"""Optimisation over any nesting of arrays: minimise() and its methods."""

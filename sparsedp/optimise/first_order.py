@@ -1,0 +1,155 @@
+"""Gradient descent and Adam, as steps from one state to the next.
+
+A state is a named tuple of plain arrays and numbers: everything that the next step depends on.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sparsedp.optimise.trials import Trial, norm
+
+__all__ = ["Adam", "AdamState", "Descent", "DescentState", "Stuck"]
+
+HALVINGS = 60
+ENOUGH = 1e-4  # share of the predicted decrease that a line search asks for (Armijo)
+
+
+class Stuck(Exception):
+    """No admissible point was found; the message says why."""
+
+
+class DescentState(NamedTuple):
+    """State of gradient descent: the point, the last step, the rate of the next one and the share to try first."""
+
+    trial: Trial
+    velocity: np.ndarray
+    rate: float
+    share: float
+
+
+class Descent:
+    """Gradient descent: v <- momentum v - rate g, x <- x + v.
+
+    Parameters
+    ----------
+    rate : float or None
+        Step per gradient. None: found by backtracking.
+    momentum : float
+        In [0, 1).
+    line_search : None or "backtracking"
+        Halve the step until the loss falls (Armijo), and try twice the length next time.
+    """
+
+    def __init__(self, rate=None, momentum=0.0, line_search=None):
+        if rate is not None and not 0 < rate < np.inf:
+            raise ValueError(f"gd needs a positive rate, got {rate}")
+        if not 0 <= momentum < 1:
+            raise ValueError(f"gd needs a momentum from 0 to below 1, got {momentum}")
+        if line_search not in (None, "backtracking"):
+            raise ValueError(f"gd has no line search {line_search!r}; write line_search='backtracking' or leave it out")
+        self.rate, self.momentum = rate, momentum
+        self.searching = line_search is not None or rate is None
+
+    def begin(self, first):
+        """State at the start. Without a rate the first step would bring a linear loss to 0."""
+        rate = self.rate
+        if rate is None:
+            size = norm(first.slope)
+            rate = (abs(first.value) / size / size or 1.0 / size) if size > 0 else 1.0
+        return DescentState(first, np.zeros_like(first.vector), rate, 1.0)
+
+    def advance(self, state, trials):
+        """One iteration. Raises Stuck when no admissible point is found."""
+        slope = state.trial.slope
+        step = self.momentum * state.velocity - state.rate * slope
+        if self.searching and np.dot(step, slope) >= 0:
+            step = -state.rate * slope  # momentum that goes uphill is dropped
+        if not self.searching:
+            trial, share = admissible(state.trial.vector, step, state.share, trials)
+            return DescentState(trial, share * step, state.rate, min(1.0, 2 * share))
+        return self._search(state, step, trials)
+
+    def _search(self, state, step, trials):
+        """Halve the step until the loss falls; a full step that does is tried at twice the length next time."""
+        fall, refused = -float(np.dot(step, state.trial.slope)), False
+        for halvings in range(HALVINGS):
+            share = 0.5**halvings
+            trial = trials(state.trial.vector + share * step)
+            refused |= trial.refused
+            if not trial.refused and _lower(trial, state.trial, ENOUGH * share * fall):
+                return DescentState(trial, share * step, state.rate * (share if halvings else 2.0), 1.0)
+            if share * fall <= state.trial.rounding:
+                break
+        hopeless = not refused and fall <= 100 * state.trial.rounding
+        raise Stuck("rounding" if hopeless else "no lower point along the gradient")
+
+
+def admissible(point, step, share, trials):
+    """The trial at point + share * step, and the share; halved until the loss has a value there.
+
+    The next iteration tries twice the share, so that a wall does not cost all halvings every time.
+    """
+    for _ in range(HALVINGS):
+        trial = trials(point + share * step)
+        if not trial.refused:
+            return trial, share
+        share *= 0.5
+    raise Stuck("no admissible point along the step")
+
+
+def _lower(trial, other, fall):
+    return trial.value < other.value and trial.value <= other.value - fall
+
+
+class AdamState(NamedTuple):
+    """State of Adam: point, the two means, count of steps, size of the first gradient, share to try first."""
+
+    trial: Trial
+    mean: np.ndarray
+    square: np.ndarray
+    steps: int
+    scale: float
+    share: float
+
+
+class Adam:
+    """Adam: steps of about `rate` in every entry, from running means of the gradient and its square.
+
+    Parameters
+    ----------
+    rate : float
+    betas : pair of float
+        Memory of the mean and of the square.
+    epsilon : float
+        Smallest root mean square that divides, relative to the first gradient, so that a loss times
+        1e-12 takes the same steps.
+
+    Notes
+    -----
+    Source: D. P. Kingma, J. Ba, Adam: a method for stochastic optimization, ICLR 2015.
+    """
+
+    def __init__(self, rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8):
+        if not 0 < rate < np.inf:
+            raise ValueError(f"adam needs a positive rate, got {rate}")
+        if len(betas) != 2 or not all(0 <= beta < 1 for beta in betas):
+            raise ValueError(f"adam needs two betas from 0 to below 1, got {betas}")
+        self.rate, self.betas, self.epsilon = rate, tuple(betas), epsilon
+
+    def begin(self, first):
+        """State at the start."""
+        largest = float(np.max(np.abs(first.slope), initial=0.0))
+        scale = 2.0 ** np.frexp(largest)[1] if largest > 0 else 1.0  # a power of two changes no digits
+        zero = np.zeros_like(first.vector)
+        return AdamState(first, zero, zero, 0, float(scale), 1.0)
+
+    def advance(self, state, trials):
+        """One iteration. A step to a refused point is halved until the loss has a value."""
+        (b1, b2), count = self.betas, state.steps + 1
+        slope = state.trial.slope / state.scale
+        mean = b1 * state.mean + (1 - b1) * slope
+        square = b2 * state.square + (1 - b2) * slope**2
+        step = -self.rate * (mean / (1 - b1**count)) / (np.sqrt(square / (1 - b2**count)) + self.epsilon)
+        trial, share = admissible(state.trial.vector, step, state.share, trials)
+        return AdamState(trial, mean, square, count, state.scale, min(1.0, 2 * share))

@@ -1,0 +1,94 @@
+"""A tree of arrays as one flat vector of doubles, and back."""
+
+import numpy as np
+
+from sparsedp.errors import DerivativeError
+from sparsedp.tape import is_variable
+from sparsedp.tree import flatten
+
+__all__ = ["Packing"]
+
+
+class Packing:
+    """How the floating leaves of a tree lie in one vector.
+
+    Leaves that are not floating (int, bool, None, str) are kept as they are. A complex leaf takes two
+    numbers for each entry, the real and the imaginary part.
+
+    Parameters
+    ----------
+    tree : tree of arrays
+
+    Raises
+    ------
+    DerivativeError
+        If the tree holds no floating leaf.
+
+    Examples
+    --------
+    >>> packing = Packing({"a": 2.0, "n": 3, "z": 1.0 + 4.0j})
+    >>> packing.pack({"a": 2.0, "n": 3, "z": 1.0 + 4.0j})
+    array([2., 1., 4.])
+    >>> packing.unpack(np.array([5.0, 6.0, 7.0]))
+    {'a': 5.0, 'n': 3, 'z': (6+7j)}
+    """
+
+    def __init__(self, tree):
+        self._found, self._rebuild = flatten(tree)
+        self._places = [place for place, leaf in enumerate(self._found) if is_variable(leaf)]
+        if not self._places:
+            raise DerivativeError("minimise needs floating values in start, and found none; write start.astype(float)")
+        leaves = [np.asarray(self._found[place]) for place in self._places]
+        self.size = sum(map(self._width, leaves))
+        self.eps = max(float(np.finfo(leaf.dtype).eps) for leaf in leaves)
+
+    @staticmethod
+    def _width(leaf):
+        return np.size(leaf) * (2 if np.iscomplexobj(leaf) else 1)
+
+    def pack(self, tree):
+        """Tree of the same structure -> flat vector of doubles."""
+        leaves = flatten(tree)[0]
+        return np.concatenate([_parts(np.asarray(leaves[place])) for place in self._places])
+
+    def pack_gradient(self, tree):
+        """Gradient of the same structure -> flat gradient with respect to the packed vector.
+
+        For a complex leaf the tape gives dL/dRe - i dL/dIm, so its imaginary part changes sign.
+        """
+        leaves = flatten(tree)[0]
+        if len(leaves) != len(self._found):
+            raise DerivativeError(f"the gradient has {len(leaves)} leaves where start has {len(self._found)}")
+        parts = []
+        for place in self._places:
+            g, leaf = np.asarray(leaves[place]), self._found[place]
+            if g.shape != np.shape(leaf):
+                raise DerivativeError(f"a leaf of the gradient has shape {g.shape} where {np.shape(leaf)} is needed")
+            parts.append(_parts(np.conj(g).astype(complex) if np.iscomplexobj(leaf) else g.real))
+        return np.concatenate(parts)
+
+    def unpack(self, vector):
+        """Flat vector -> fresh tree; every leaf has the type, shape and dtype of its original."""
+        leaves, start = list(self._found), 0
+        for place in self._places:
+            leaf = self._found[place]
+            stop = start + self._width(leaf)
+            leaves[place] = _leaf(leaf, vector[start:stop])
+            start = stop
+        return self._rebuild(leaves)
+
+
+def _parts(values):
+    if values.dtype.kind != "c":
+        return values.reshape(-1).astype(float)
+    return np.stack([values.real, values.imag], axis=-1).reshape(-1).astype(float)
+
+
+def _leaf(leaf, numbers):
+    shape, dtype = np.shape(leaf), np.asarray(leaf).dtype
+    if dtype.kind == "c":
+        numbers = numbers[0::2] + 1j * numbers[1::2]
+    values = numbers.reshape(shape).astype(dtype)
+    if isinstance(leaf, np.ndarray):
+        return values
+    return values.dtype.type(values) if isinstance(leaf, np.generic) else type(leaf)(values)

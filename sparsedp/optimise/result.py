@@ -1,0 +1,79 @@
+"""What an optimisation gives back: the best point, the history, and the reason it stopped."""
+
+from typing import Any, NamedTuple
+
+from sparsedp.optimise.trials import Failure
+
+__all__ = ["Minimum", "Record"]
+
+SHOWN = 6  # lines of the history at each end
+
+
+class Record(NamedTuple):
+    """One iteration; number 0 is the start.
+
+    `seconds` and `evaluations` count from the start of the run; `failed` lists the trial points that the
+    loss refused in this iteration, as (error, message).
+    """
+
+    iteration: int
+    value: float
+    gradient_norm: float
+    seconds: float
+    evaluations: int
+    failed: tuple[Failure, ...] = ()
+
+
+class Minimum:
+    """The result of `minimise`. Frozen.
+
+    Attributes
+    ----------
+    x : tree
+        The best point seen, with the structure, shapes and dtypes of the start.
+    value : float
+        The loss there.
+    history : tuple of Record
+    method : str
+    message : str
+        Why it stopped.
+    converged : bool
+        Whether the tolerance was met, or the loss cannot fall further in floating point numbers.
+    evaluations : int
+        Evaluations of loss and gradient, refused ones included.
+    """
+
+    x: Any
+    value: float
+    history: tuple[Record, ...]
+    method: str
+    message: str
+    converged: bool
+    evaluations: int
+
+    def __init__(self, x, value, history, method, message, converged, evaluations):
+        self.__dict__.update(x=x, value=value, history=tuple(history), method=method)
+        self.__dict__.update(message=message, converged=converged, evaluations=evaluations)
+
+    def __setattr__(self, name, value):
+        raise AttributeError(f"the result of minimise is frozen; {name} cannot be set")
+
+    def __str__(self):
+        last = self.history[-1]
+        head = f"{self.method}: loss {self.value:.6g} after {last.iteration} iterations, {self.evaluations} evaluations"
+        lines = [f"{'n':>6}  {'loss':>13}  {'gradient':>9}  {'seconds':>8}  evaluations"]
+        cut = len(self.history) > 2 * SHOWN + 1
+        shown = self.history[:SHOWN] + self.history[-SHOWN:] if cut else self.history
+        lines += [_line(record) for record in shown]
+        if cut:
+            lines.insert(SHOWN + 1, f"{'...':>6}")
+        return "\n".join([head, *lines, self.message])
+
+    __repr__ = __str__
+
+
+def _line(record):
+    text = f"{record.iteration:6d}  {record.value:13.6e}  {record.gradient_norm:9.2e}  {record.seconds:8.2f}"
+    words = sorted({failure.error for failure in record.failed})
+    refused = f"  {len(record.failed)} refused: {', '.join(words)}" if record.failed else ""
+    return f"{text}  {record.evaluations:11d}{refused}"

@@ -1,0 +1,212 @@
+"""Pictures of fields. The only file of the package that imports matplotlib (extra `plot`)."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sparsedp.errors import ShapeError
+from sparsedp.tape import plain
+
+__all__ = ["curves", "figure", "plot", "read_picture", "sample_file", "save"]
+
+ARROWS = 24  # arrows along an axis of a face field, at most
+
+
+def plot(grid, u, ax=None, title=None, label=None, limits=None, colours="viridis", at=None):
+    """Field on a grid -> picture in which axis 0 is x, axis 1 is y, lengths are to scale.
+
+    Parameters
+    ----------
+    grid : Grid
+    u : array, a field on cells, faces or nodes [unit]
+        1-D: a line. 2-D: a map; a face field is its magnitude, with arrows. 3-D: the three middle slices.
+    ax : matplotlib Axes, optional
+        Where to draw. Default: the current axes of pyplot.
+    title, label : str, optional
+        Above the picture; beside the colour bar (in 1-D: the vertical axis).
+    limits : (float, float), optional
+        The values at the ends of the colour bar. Give two pictures the same limits to compare them.
+    colours : str
+        Name of a matplotlib colour map.
+    at : "cells", "faces" or "nodes", optional
+        Where the numbers live, when the shape alone does not tell (cells before faces before nodes).
+
+    Returns
+    -------
+    matplotlib Axes
+
+    Raises
+    ------
+    ShapeError
+        If `u` is not a field on the cells, faces or nodes of the grid.
+    TypeError
+        If `u` is complex.
+    ImportError
+        If matplotlib is not installed.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> picture = plot(Grid((2, 3)), np.ones((2, 3)), ax=figure().add_subplot(), title="flat")
+    >>> picture.get_xlabel(), picture.get_ylabel(), picture.get_title()
+    ('x', 'y', 'flat')
+    """
+    u = np.asarray(plain(u))
+    if np.iscomplexobj(u):
+        raise TypeError(f"plot draws real fields, got dtype {u.dtype}; plot its real part or its absolute value")
+    kind = _kind(grid, u.shape, at)
+    if ax is None:
+        ax = _matplotlib("pyplot").gca()
+    arrows = None
+    if kind == "faces" and grid.dim > 1:
+        arrows = _at_centres(grid, u)
+        u, kind = np.sqrt(sum(part**2 for part in arrows)), "cells"
+    if title is not None:
+        ax.set_title(title)
+    if grid.dim == 1:
+        return _line(grid, u, kind, ax, label)
+    shared = {"limits": limits or _range(u), "colours": colours, "label": label}
+    if grid.dim == 3:
+        return _slices(grid, u, kind, ax, shared)
+    _map(grid, u, kind, (0, 1), ax, shared)
+    if arrows is not None:
+        _arrows(grid, arrows, ax)
+    return ax
+
+
+def _kind(grid, shape, at):
+    fitting = [kind for kind in ("cells", "faces", "nodes") if shape == getattr(grid, kind).shape]
+    if at is None and fitting:
+        return fitting[0]
+    if at in fitting:
+        return at
+    places = at or "cells, faces or nodes"
+    raise ShapeError(f"plot takes a field on the {places} of {grid}, got an array of shape {shape}")
+
+
+def _range(u):
+    finite = u[np.isfinite(u)]
+    return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+
+
+def _places(grid, axis, kind):
+    return grid.coordinates(axis, "cells" if kind == "cells" else "nodes")
+
+
+def _line(grid, u, kind, ax, label):
+    ax.plot(_places(grid, 0, kind), u, marker="." if u.size <= 64 else None)
+    ax.set_xlim(grid.origin[0], grid.origin[0] + grid.size[0])
+    ax.set_xlabel("x")
+    ax.set_ylabel(label or "")
+    return ax
+
+
+def _map(grid, u, kind, axes, ax, shared, bar=True):
+    """One map of a 2-D array over two axes of the grid."""
+    if kind == "cells":  # the mesh of pcolormesh is the corners of the cells
+        lines = [np.append(0.0, np.cumsum(grid.widths[a])) + grid.origin[a] for a in axes]
+    else:
+        lines = [grid.coordinates(a, "nodes") for a in axes]
+    low, high = shared["limits"]
+    # pcolormesh wants rows along y, so the array is turned here and nowhere else.
+    image = ax.pcolormesh(*lines, u.T, vmin=low, vmax=high, cmap=shared["colours"], shading="auto", rasterized=True)
+    ax.set_aspect("equal")
+    ax.set_xlabel(grid.axes[axes[0]])
+    ax.set_ylabel(grid.axes[axes[1]])
+    if bar:
+        beside = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the map, whatever its shape
+        ax.figure.colorbar(image, cax=beside, label=shared["label"] or "")
+    return image
+
+
+def _slices(grid, u, kind, ax, shared):
+    """The three middle slices of a 3-D field, side by side inside one pair of axes."""
+    ax.set_axis_off()
+    for place, across in enumerate((2, 1, 0)):
+        inset = ax.inset_axes((place * 0.33, 0.0, 0.2, 1.0))
+        along = [axis for axis in range(3) if axis != across]
+        middle = u.shape[across] // 2
+        image = _map(grid, np.take(u, middle, axis=across), kind, along, inset, shared, bar=False)
+        inset.set_title(f"{grid.axes[across]} = {_places(grid, across, kind)[middle]:.3g}", fontsize="medium")
+    bar = ax.inset_axes((0.93, 0.15, 0.02, 0.7))
+    ax.figure.colorbar(image, cax=bar, label=shared["label"] or "")
+    return ax
+
+
+def _at_centres(grid, v):
+    """Components of a face field, each averaged from the two faces of a cell to its centre."""
+    parts = grid.split(v)
+    above = [np.roll(p, -1, a) if grid.periodic[a] else np.delete(p, 0, a) for a, p in enumerate(parts)]
+    below = [p if grid.periodic[a] else np.delete(p, -1, a) for a, p in enumerate(parts)]
+    return [0.5 * (low + high) for low, high in zip(below, above, strict=True)]
+
+
+def _arrows(grid, arrows, ax):
+    steps = tuple(slice(n // ARROWS // 2, None, max(1, -(-n // ARROWS))) for n in grid.shape)
+    x, y = (centre[steps] for centre in grid.centres())
+    ax.quiver(x, y, arrows[0][steps], arrows[1][steps], color="white", pivot="mid")
+
+
+# ---------------------------------------------------------------- figures and files
+
+
+def figure(width=5.5, height=4.4):
+    """Size [inch] -> empty figure that belongs to no window."""
+    return _matplotlib("figure").Figure(figsize=(width, height), layout="constrained")
+
+
+def save(picture, stream):
+    """Write a figure as PNG to an open binary stream."""
+    picture.savefig(stream, format="png", dpi=150, bbox_inches="tight", pad_inches=0.15)
+
+
+def curves(lines, ax, x_label, y_label):
+    """Named curves -> one log-log picture; the best points reached at any time are marked.
+
+    Parameters
+    ----------
+    lines : dict
+        Name -> (x, y), two sequences of positive numbers.
+    ax : matplotlib Axes
+    x_label, y_label : str
+    """
+    best = _pareto([point for x, y in lines.values() for point in zip(x, y, strict=True)])
+    ax.plot(*zip(*best, strict=True), color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
+    for name, (x, y) in lines.items():
+        ax.plot(x, y, marker=".", markersize=4, linewidth=1, label=name)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel(x_label)
+    ax.set_ylabel(y_label)
+    ax.grid(visible=True, which="both", color="0.93")
+    ax.legend(frameon=False)
+
+
+def _pareto(points):
+    """Points that no other point beats in both coordinates, from left to right."""
+    kept: list = []
+    for x, y in sorted(points):
+        if not kept or y < kept[-1][1]:
+            kept.append((x, y))
+    return kept
+
+
+def sample_file(name):
+    """Name of a file in matplotlib's sample data -> its Path."""
+    return Path(_matplotlib().get_data_path(), "sample_data", name)
+
+
+def read_picture(path):
+    """Picture file -> grey values, shape (rows, columns), rows from the top."""
+    colours = _matplotlib("image").imread(path).astype(float)
+    return colours if colours.ndim == 2 else colours[:, :, : min(3, colours.shape[2])].mean(axis=2)
+
+
+def _matplotlib(part=None):
+    """matplotlib or one of its modules, imported when a picture is asked for."""
+    try:
+        import matplotlib
+
+        return __import__(f"matplotlib.{part}", fromlist=[part]) if part else matplotlib
+    except ImportError as error:
+        raise ImportError('pictures need matplotlib; install the extra: pip install "sparsedp[plot]"') from error

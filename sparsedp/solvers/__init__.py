@@ -1,0 +1,1 @@
+"""Solvers: every public function turns an Operator into another one, its inverse."""

@@ -1,0 +1,173 @@
+"""1-D factors diagonalised: by a sine, cosine or Fourier transform when uniform, by eigenvectors when not.
+
+A factor F of n cells is written F = S^-1 Q diag(eigenvalues) Q^-1 S with S diagonal and Q orthogonal
+(or the discrete Fourier transform). For a stretched grid S is the square root of the cell widths.
+Sources: Lynch, Rice, Thomas, Numer. Math. 6 (1964), direct solution by tensor products;
+Strang, SIAM Review 41 (1999), the discrete cosine transform.
+"""
+
+from functools import cached_property
+
+import numpy as np
+import scipy.fft as fft
+import scipy.linalg
+
+__all__ = ["Axis", "diagonalise"]
+
+ROUNDING = 16 * np.finfo(float).eps  # entries that should be equal may differ by this share
+WIDEST = 1e4  # largest ratio of scalings that keeps the digits of the eigenvectors
+
+
+class Axis:
+    """One axis of a separable operator in its eigenvectors.
+
+    Attributes
+    ----------
+    kind : str
+        "identity", "dct-2", "dst-2", "dct-4", "dst-4", "fourier" or "eigenvectors".
+    eigenvalues : array, shape (n,)
+    """
+
+    def __init__(self, kind, eigenvalues, scaling=None, vectors=None):
+        self.kind = kind
+        self.eigenvalues = eigenvalues
+        self.scaling = scaling
+        self.vectors = vectors
+
+    @cached_property
+    def _transforms(self):
+        function = {"c": (fft.dct, fft.idct), "s": (fft.dst, fft.idst)}[self.kind[1]]
+        return *function, int(self.kind[-1])
+
+    def forward(self, x, axis, transposed, workers):
+        """Field along `axis` -> coefficients. May overwrite x."""
+        if self.kind in ("identity", "fourier"):  # Fourier axes are transformed together, see separable.py
+            return x
+        if self.kind == "eigenvectors":
+            return self._turn(x, axis, self._scale(transposed), self.vectors.T, None)
+        there, _, number = self._transforms
+        return there(x, number, axis=axis, norm="ortho", overwrite_x=True, workers=workers)
+
+    def backward(self, y, axis, transposed, workers):
+        """Coefficients along `axis` -> field. May overwrite y."""
+        if self.kind in ("identity", "fourier"):
+            return y
+        if self.kind == "eigenvectors":
+            return self._turn(y, axis, None, self.vectors, self._scale(not transposed))
+        _, back, number = self._transforms
+        return back(y, number, axis=axis, norm="ortho", overwrite_x=True, workers=workers)
+
+    def _scale(self, inverse):
+        if self.scaling is None:
+            return None
+        return 1 / self.scaling if inverse else self.scaling
+
+    @staticmethod
+    def _turn(x, axis, before, matrix, after):
+        if before is not None:
+            matrix = matrix * before
+        if after is not None:
+            matrix = after[:, None] * matrix
+        n, tail = x.shape[axis], x.shape[axis + 1 :]
+        flat = x.reshape(-1, n, int(np.prod(tail)))
+        return (np.matmul(matrix, flat) if tail else flat[:, :, 0] @ matrix.T).reshape(x.shape)
+
+
+def diagonalise(factor):
+    """Square 1-D factor -> Axis, or None when it cannot be diagonalised with all its digits.
+
+    Parameters
+    ----------
+    factor : Factor
+
+    Returns
+    -------
+    Axis or None
+    """
+    n = factor.shape[0]
+    bands = factor.tridiagonal
+    if n == 1:
+        return Axis("identity", np.array([factor.matrix[0, 0]]))
+    if bands is None:
+        return _by_eigenvectors(factor.matrix.toarray(), np.ones(n)) if _symmetric(factor.matrix) else None
+    return _by_transform(bands) or _by_scaling(factor)
+
+
+def _by_transform(bands):
+    """A sine, cosine or Fourier transform, if the entries are those of a uniform axis."""
+    n = bands.centre.size
+    if n < 3:
+        return None
+    lower, upper, side, middle = bands.lower, bands.upper, bands.lower[1], bands.centre[n // 2]
+    inner = np.concatenate([lower[1:] - side, upper[:-1] - side, bands.centre[1:-1] - middle])
+    if side == 0 or np.any(np.abs(inner) > ROUNDING * np.abs(side)):
+        return None
+    angle = np.arange(n)
+    ends = tuple(_end(bands.centre[i] - middle, side, link) for i, link in ((0, lower[0]), (-1, upper[-1])))
+    if ends == ("linked", "linked"):
+        return Axis("fourier", _cosines(middle, side, 2 * angle / n))
+    kind, shift = {
+        ("neumann", "neumann"): ("dct-2", 0.0),
+        ("dirichlet", "dirichlet"): ("dst-2", 1.0),
+        ("neumann", "dirichlet"): ("dct-4", 0.5),
+        ("dirichlet", "neumann"): ("dst-4", 0.5),
+    }.get(ends, (None, 0.0))
+    return None if kind is None else Axis(kind, _cosines(middle, side, (angle + shift) / n))
+
+
+def _cosines(middle, side, turns):
+    """middle + 2 side cos(pi turns), written so that no digits cancel where middle = -2 side."""
+    return (middle + 2 * side) - 4 * side * np.sin(0.5 * np.pi * turns) ** 2
+
+
+def _end(extra, side, link):
+    """What the wall adds to the diagonal: side mirrors the neighbour, -side mirrors it with its sign changed."""
+    if link != 0:
+        return "linked" if abs(link - side) + abs(extra) <= ROUNDING * abs(side) else None
+    for kind, wanted in (("neumann", side), ("dirichlet", -side)):
+        if abs(extra - wanted) <= ROUNDING * abs(side):
+            return kind
+    return None
+
+
+def _by_scaling(factor):
+    """Symmetric after scaling the rows by weights w, w[i] F[i, i+1] = w[i+1] F[i+1, i]."""
+    up, down = factor.matrix.diagonal(1), factor.matrix.diagonal(-1)
+    linked = up != 0
+    if np.any(linked != (down != 0)) or np.any(up * down < 0):
+        return None
+    ratio = np.where(linked, up / np.where(linked, down, 1.0), 1.0)
+    weights = np.cumprod(np.concatenate([[1.0], ratio]))
+    if not np.all(np.isfinite(weights)) or weights.max() > WIDEST**2 * weights.min():
+        return None
+    scaling = np.sqrt(weights / weights.max())
+    dense = factor.matrix.toarray() * scaling[:, None] / scaling
+    if not np.allclose(dense, dense.T, rtol=1e-13, atol=0):
+        return None  # the link around a periodic axis does not fit the weights
+    return _by_eigenvectors(dense, scaling, factor)
+
+
+def _by_eigenvectors(dense, scaling, factor=None):
+    dense = 0.5 * (dense + dense.T)
+    n = len(dense)
+    cyclic = n > 2 and (dense[0, -1] != 0 or np.count_nonzero(dense) > 3 * n - 2)
+    if cyclic or n <= 2:
+        values, vectors = scipy.linalg.eigh(dense, driver="evd")
+    else:
+        values, vectors = scipy.linalg.eigh_tridiagonal(np.diag(dense), np.diag(dense, 1))
+    if factor is not None:
+        values = _exact_zero(factor, values)
+    return Axis("eigenvectors", values, scaling, vectors)
+
+
+def _exact_zero(factor, values):
+    """Round-off gives 1e-10 for the eigenvalue 0 of constants; a factor that drops constants has 0."""
+    rows, sizes = factor.matrix.sum(axis=1), abs(factor.matrix).sum(axis=1)
+    if np.all(np.abs(rows) <= 8 * np.finfo(float).eps * sizes):
+        values[np.argmin(np.abs(values))] = 0.0
+    return values
+
+
+def _symmetric(matrix):
+    difference = abs(matrix - matrix.T)
+    return difference.nnz == 0 or difference.max() <= 1e-14 * abs(matrix).max()

@@ -1,0 +1,192 @@
+"""inverse(op): which method solves, by a fixed rule, with its reason in words."""
+
+import inspect
+from time import perf_counter
+
+import numpy as np
+
+from sparsedp.errors import ConvergenceError, ShapeError
+from sparsedp.ledger import active as recordings
+from sparsedp.ledger import count
+from sparsedp.operator import Operator
+from sparsedp.solvers.contract import Nothing, Solver
+from sparsedp.solvers.direct import direct_engine
+from sparsedp.solvers.krylov import krylov_engine
+from sparsedp.solvers.multigrid import multigrid_engine
+from sparsedp.solvers.record import SolveLog, failure
+from sparsedp.solvers.separable import separable_engine, spectrum
+from sparsedp.solvers.solution import Inverse
+from sparsedp.solvers.system import System
+from sparsedp.space import fits
+
+__all__ = ["METHODS", "build", "check_settings", "inverse"]
+
+# word -> function (system, **options) -> engine; see contract.py. Options are keyword-only.
+METHODS = {
+    "separable": separable_engine,
+    "direct": direct_engine,
+    "multigrid": multigrid_engine,
+    "krylov": krylov_engine,
+}
+
+# Transforms win from this number of unknowns on, in 2-D and 3-D, while the axes that need dense
+# eigenvectors are not longer than this.
+SEPARABLE_FROM, LONGEST_EIGENVECTORS = 1024, 2048
+
+# Largest number of unknowns for which a kept LU is chosen, by dimension (0: no grid known): when one
+# set-up serves many solves, and when it serves two. Measured: at 512^2 LU costs 5 times the set-up of
+# multigrid and a sixth of its solve; in 3-D the two meet at 32^3.
+DIRECT_UP_TO = {
+    "many": {0: 50_000, 1: 10_000_000, 2: 262_144, 3: 13_824},
+    "few": {0: 10_000, 1: 10_000_000, 2: 16_384, 3: 2_000},
+}
+
+
+def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **options):
+    """Operator -> its inverse, an Operator: x = inv(b) solves op(x) = b, inv.T(g) the transposed system.
+
+    Parameters
+    ----------
+    op : Operator
+        Square: its domain and its codomain hold the same fields.
+    method : str
+        "auto" chooses by a fixed rule; ``print(inv)`` says why. Else one of METHODS.
+    rtol : float
+        Tolerance on the true residual relative to the right-hand side, 0 < rtol < 1, forward and adjoint.
+    maxiter : int, optional
+        Most iterations of one solve. Default: enough for the method.
+    nullspace : "raise" or "project"
+        What to do with data outside the range of a singular operator: refuse it, or take that part out.
+    **options
+        Of the method: see `multigrid_engine`, `krylov_engine`.
+
+    Returns
+    -------
+    Inverse
+        in: b on the codomain of `op`; out: x on its domain. `inv.info` holds the records of the last
+        forward and adjoint solve. The set-up is done here, once.
+
+    Raises
+    ------
+    ShapeError
+        If `op` is not square.
+    TypeError
+        If `op` is not an Operator, or the method does not take an option.
+    ValueError
+        If `rtol`, `maxiter`, `nullspace` or `method` is out of range.
+    ConvergenceError
+        If the set-up fails, and on use, when a solve does not meet `rtol`.
+    IncompatibleError
+        On use, if the operator is singular, the right-hand side out of its range, and nullspace="raise".
+    NonFiniteError
+        On use, if the right-hand side holds NaN or infinity, or the solution cannot be represented.
+
+    Notes
+    -----
+    Null space: one vector for each connected component, found from the entries. Data are projected
+    with it, and the solution has volume-weighted mean 0 on each singular component; see nullspace.py.
+    Transpose: `inv.T` uses the same set-up, is exact to rtol, and never refuses.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp import from_matrix
+    >>> inv = inverse(from_matrix([[2.0, 0.0], [1.0, 4.0]]))
+    >>> inv(np.array([2.0, 5.0]))
+    array([1., 1.])
+    >>> inv.T(np.array([2.0, 4.0]))
+    array([0.5, 1. ])
+    """
+    if not isinstance(op, Operator):
+        raise TypeError(f"inverse takes an Operator, got {type(op).__name__}; write dp.from_matrix(...) first")
+    if not fits(op.domain, op.codomain):
+        raise ShapeError(f"inverse takes a square operator, got one from {op.domain} to {op.codomain}")
+    check_settings(method, rtol, maxiter, nullspace)
+    return build(op, method, rtol, maxiter, nullspace, options)
+
+
+def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, solves="many"):
+    """The set-up behind `inverse`, for callers that name it, keep its log, or expect "few" solves of it."""
+    clock = perf_counter()
+    system = System(op, rtol, None if maxiter is None else int(maxiter))
+    word, reason = (method, "as asked") if method != "auto" else _chosen(system, solves)
+    _check_options(word, options)
+    if system.complex and word != "direct":
+        raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct'")
+    engine = _engine(system, word, options)
+    log = SolveLog() if log is None else log
+    log.setup_seconds, log.hierarchy = perf_counter() - clock, engine.hierarchy
+    name = name or f"inverse({op.name})"
+    if recordings:
+        count(name, "setup")
+    recipe = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
+    return Inverse(Solver(system, engine, nullspace, log, name, recipe), reason)
+
+
+def check_settings(method, rtol, maxiter, nullspace):
+    """Refuse settings that no method can take."""
+    if method != "auto" and method not in METHODS:
+        raise ValueError(f"method must be auto, {', '.join(METHODS)}, got {method!r}")
+    if not (np.ndim(rtol) == 0 and np.isrealobj(rtol) and 0 < rtol < 1):
+        raise ValueError(f"rtol must be between 0 and 1, got {rtol!r}")
+    if maxiter is not None and not (np.ndim(maxiter) == 0 and maxiter == int(maxiter) and maxiter >= 1):
+        raise ValueError(f"maxiter must be a whole number >= 1 or None, got {maxiter!r}")
+    if nullspace not in ("raise", "project"):
+        raise ValueError(f"nullspace must be 'raise' or 'project', got {nullspace!r}")
+
+
+def _check_options(word, options):
+    known = [name for name, p in inspect.signature(METHODS[word]).parameters.items() if p.kind == p.KEYWORD_ONLY]
+    for name in options:
+        if name not in known:
+            raise TypeError(f"method {word} takes the options {', '.join(known) or '(none)'}, got {name!r}")
+
+
+def _engine(system, word, options):
+    if system.unknowns == 0:
+        return Nothing()
+    if system.empty_row is not None:
+        raise ConvergenceError(
+            f"row {system.empty_row} of {system.given} has no entries, but its unknown is used in other rows; "
+            "give it an equation",
+            info=failure("empty_row"),
+        )
+    try:
+        engine = METHODS[word](system, **options)
+        return engine if system.null_space is not None else None
+    except ArithmeticError as error:
+        message = f"{system.given} is singular and cannot be projected: {error}; add a shift"
+        raise ConvergenceError(message, info=failure("setup_failed")) from None
+
+
+# ------------------------------------------------------------ the rule
+
+
+def _chosen(system, solves):
+    """The word of a method and why. Depends on structure and size only, so that bits repeat."""
+    size, grid = system.unknowns, system.op.domain.grid
+    dimension = 0 if grid is None else grid.dim
+    if system.complex:
+        return "direct", "complex entries"
+    if not system.op.structure.has_entries:
+        return "krylov", "only products with the operator are known"
+    if _transforms(system, dimension):
+        return "separable", f"{size} unknowns in {dimension}-D, a sum of 1-D factors: transforms solve it exactly"
+    limit = DIRECT_UP_TO[solves][dimension]
+    where = f"{size} unknowns in {dimension}-D" if dimension else f"{size} unknowns without a grid"
+    if size <= limit:
+        return "direct", f"{where}; up to {limit}, for {solves} solves, kept LU factors are fastest"
+    if system.sign:
+        return "multigrid", f"{where}; above {limit}, for {solves} solves, LU costs more; the diagonal has one sign"
+    return "direct", f"{where}; the diagonal has no single sign, which rules multigrid out"
+
+
+def _transforms(system, dimension):
+    """Whether the operator is a sum of 1-D factors, and transforms along them are cheap."""
+    structure = system.op.structure
+    if dimension < 2 or system.size < SEPARABLE_FROM or not getattr(structure, "separable", False):
+        return False
+    found = spectrum(structure) if system.active is None else None
+    return found is not None and all(
+        axis.kind != "eigenvectors" or axis.eigenvalues.size <= LONGEST_EIGENVECTORS for axis in found.axes
+    )

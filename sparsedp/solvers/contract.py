@@ -1,0 +1,258 @@
+"""The adjoint contract: the one place that every solve goes through, forward and backward.
+
+1. A right-hand side near an end of the range of floats is scaled by a power of two, the solution
+   scaled back. Between, scaling would change no bit, because every method is homogeneous.
+2. A solve is judged by its true residual r = b - A x, recomputed: |r| <= rtol |b| (converged), or
+   |r| <= 8 eps (|A| |x| + |b|), the attainable accuracy (converged_at_roundoff). Never absolutely.
+3. inv.T solves with the true transpose of the same set-up. 4. A derivative rule calls it once.
+5. Data and solution are projected on both sides of a singular system (see nullspace.py); primal data
+   that are not compatible are refused unless nullspace="project"; derivatives are never refused.
+6. A solve meets its tolerance or raises; the best iterate rides on the exception.
+7. `inv.info` keeps the record.
+
+An engine is what solves inside the contract. It is any object with
+
+    solve(b, goal, transposed) -> (x, iterations, word)
+
+on flat float64 arrays (complex128 for the direct method, when the operator is complex). `b` is
+compatible, 0 on what is not an unknown, of a norm between 2^-200 and 2^200. Stop when |b - A x| <= goal
+(2-norm), or when |b - A x| is below rounding; `word` is "" when that was met, else a status word. An
+engine is homogeneous: no absolute thresholds. `x` is a fresh array; its part along the null space, and
+its values on what is not an unknown, do not matter. The engine
+need not be exact: the contract refines with further calls on the residual. Attributes of an engine:
+
+    method           word that the user writes, such as "direct"
+    unit             what an iteration is called in messages: "iterations", "cycles"
+    hierarchy        one line: levels, unknowns, entries
+    overwrites       False: `b` is left as it is, so that the contract need not copy it
+    refines          False: one call, no refinement and no error (fixed numbers of iterations)
+    unrolled         True: inv(b) is engine.unroll(b, start, transposed), differentiated as it runs
+
+Its builder is a function (system, **options) -> engine; `system` is a System (system.py).
+"""
+
+import numpy as np
+
+from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
+from sparsedp.ledger import active as recordings
+from sparsedp.ledger import count
+from sparsedp.solvers.record import Run, merged
+from sparsedp.solvers.scaling import in_range, largest, norm, shifted
+
+__all__ = ["Engine", "Solver", "norm"]
+
+EPS = np.finfo(float).eps
+COMPATIBLE = 1e-6  # largest relative defect of primal data that is taken for rounding
+ROUNDS = 8  # refinements; each must halve the residual
+
+
+class Engine:
+    """Defaults of the engine protocol. `solve(b, goal, transposed)` is the engine's own."""
+
+    method = "engine"
+    unit = "iterations"
+    hierarchy = ""
+    overwrites = True
+    refines = True
+    unrolled = False
+
+
+class Nothing(Engine):
+    """The engine of a system without unknowns: it is never called."""
+
+    method = "none"
+    hierarchy = "no unknowns"
+
+
+class Solver:
+    """An engine inside the contract.
+
+    Parameters
+    ----------
+    system : System
+    engine : Engine
+    nullspace : "raise" or "project"
+    log : SolveLog
+    name : str
+    recipe : (function, arguments)
+        What makes the same inverse again.
+    """
+
+    def __init__(self, system, engine, nullspace, log, name, recipe):
+        self.recipe = recipe
+        self.system, self.engine = system, engine
+        self.nullspace, self.log, self.name = nullspace, log, name
+
+    def solve(self, b, transposed=False, checked=True, start=None):
+        """Flat b (float64 or complex128) -> flat x. `checked`: primal data, refused when not compatible."""
+        if b.dtype.kind == "c" and not self.system.complex:
+            return self._in_parts(b, transposed, checked, start)
+        if self.system.complex:
+            b = b.astype(complex)
+        if recordings:
+            count(self.name, "adjoint" if transposed else "solve")
+        run = Run()
+        try:
+            return self._scaled(b, run, transposed, checked and not transposed, start)
+        finally:
+            self.log.note(run.info(), transposed)
+
+    def _in_parts(self, b, transposed, checked, start):
+        """A real operator acts on the real and on the imaginary part."""
+        parts, infos = [], []
+        for take in (np.real, np.imag):
+            begin = None if start is None else np.ascontiguousarray(take(start))
+            parts.append(self.solve(np.ascontiguousarray(take(b)), transposed, checked, begin))
+            infos.append(self.log.adjoint if transposed else self.log.forward)
+        self.log.note(merged(*infos), transposed)
+        return parts[0] + 1j * parts[1]
+
+    def _scaled(self, b, run, transposed, checked, start):
+        size, exponent = norm(b), 0
+        if not in_range(size):
+            top = largest(b)
+            if not np.isfinite(top):
+                run.status = "nonfinite_input"
+                raise NonFiniteError(_not_finite(self.name, b, self.system, transposed))
+            if top == 0:
+                run.status = "exact_zero_rhs"
+                return np.zeros_like(b)
+            exponent = int(np.frexp(top)[1])
+            b = shifted(b, -exponent)
+            size = norm(b)
+        exponent -= self.system.exponent
+        if start is not None:
+            start = shifted(start, -exponent).astype(b.dtype)
+        x = self._compatible(b, size, run, transposed, checked, start)
+        return self._unscaled(x, exponent, run) if exponent else x
+
+    def _unscaled(self, x, exponent, run):
+        x = shifted(x, exponent)
+        if not np.isfinite(largest(x)):
+            run.status = "not_representable"
+            raise NonFiniteError(f"the solution of {self.name} is beyond 1.8e308; scale the right-hand side down")
+        return x
+
+    # ------------------------------------------------------------ null space
+
+    def _compatible(self, b, raw, run, transposed, checked, start):
+        """Project, refuse what must be refused, solve. `raw` is the norm of b."""
+        space, size = self.system.null_space, raw
+        if self.system.active is not None:
+            b, run.defect = self._on_unknowns(b, raw, run, checked)
+            size = norm(b)
+        if space.count:
+            sums = space.sums(b, transposed)
+            defect, worst = space.defect(b, sums, size, self.system.rtol * raw, transposed)
+            run.defect = max(run.defect, defect)
+            if checked and self.nullspace == "raise" and defect > COMPATIBLE:
+                self._refuse_defect(run, defect, worst)
+            b = space.project(b, transposed, sums=sums)
+            before, size = size, norm(b)
+            if size < 0.7 * before:  # most of it was taken out: what is left needs its own digits
+                b = space.project(b, transposed, into=b)
+                size = norm(b)
+        if size <= 8 * EPS * raw and start is None:
+            run.status = "converged_at_roundoff" if size else "exact_zero_rhs"
+            return np.zeros_like(b)
+        return self._refined(b, size, run, transposed, start)
+
+    def _on_unknowns(self, b, raw, run, checked):
+        outside = np.where(self.system.active, 0.0, b)
+        share = norm(outside) / raw if raw else 0.0
+        if checked and self.nullspace == "raise" and share > 8 * EPS:
+            run.defect, run.status = share, "incompatible_rhs"
+            cell = _place(int(np.argmax(np.abs(outside))), self.system.op.codomain.shape)
+            raise IncompatibleError(
+                f"{self.name}: the right-hand side must be 0 where there is no unknown (solid or isolated cells, "
+                f"coefficient 0), but is not in cell {cell}; set it to 0 or write nullspace='project'",
+                info=run.info(),
+            )
+        return np.where(self.system.active, b, 0.0), share
+
+    def _refuse_defect(self, run, defect, worst):
+        run.status = "incompatible_rhs"
+        space = self.system.null_space
+        cells = space.cells(worst)
+        first = _place(int(cells[0]), self.system.op.codomain.shape)
+        raise IncompatibleError(
+            f"{self.name} is singular and the right-hand side is not in its range: on component {worst + 1} of "
+            f"{space.count} ({cells.size} cells from {first}) the defect is {defect:.1e}, allowed is {COMPATIBLE:g}; "
+            "subtract the weighted mean or write nullspace='project'",
+            info=run.info(),
+        )
+
+    # ------------------------------------------------------------ accuracy
+
+    def _refined(self, b, data, run, transposed, start):
+        """Call the engine on the residual until the true residual is accepted, or does not fall."""
+        system, goal = self.system, self.system.rtol * data
+        x, r, residual, length = self._begun(b, data, transposed, start)
+        word = "" if x is None else system.accepts(residual, goal, length, data, transposed)
+        for _ in range(ROUNDS if not word else 0):
+            step, used, trouble = self._correction(r, r is b, residual, goal, transposed)
+            run.iterations += used
+            trial = step if x is None else np.add(x, step, out=step)
+            trial = system.null_space.project(trial, transposed, into=trial)
+            r_trial = system.residual(trial, b, transposed)
+            reached = norm(r_trial)
+            fell = reached <= 0.5 * residual
+            if not np.isfinite(reached):
+                trouble = "nonfinite_output"
+            elif reached <= residual or x is None:
+                x, r, residual, length = trial, r_trial, reached, norm(trial)
+                word = system.accepts(residual, goal, length, data, transposed)
+            if trouble or not fell or not self.engine.refines or self._is_enough(word, residual, x, data, transposed):
+                break
+        x = np.zeros_like(b) if x is None else x
+        return self._verdict(x, length, run, word or trouble or "stagnated", residual, data, transposed)
+
+    def _is_enough(self, word, residual, x, data, transposed):
+        """Attainable by the norm of A is not the end where rows differ in size: go on to their own rounding."""
+        if word != "converged_at_roundoff":
+            return bool(word)
+        return residual <= 2 * self.system.rounding(x, data, transposed)
+
+    def _begun(self, b, data, transposed, start):
+        """(x, residual, its norm, norm of x) before the first call of the engine."""
+        if start is None:
+            return None, b, data, 0.0
+        r = self.system.null_space.project(self.system.residual(start, b, transposed), transposed)
+        return start, r, norm(r), norm(start)
+
+    def _correction(self, r, is_data, residual, goal, transposed):
+        """One call of the engine, on a residual in the middle of the range of floats."""
+        exponent = 0 if in_range(residual) else int(np.frexp(largest(r))[1])
+        if exponent:
+            r, goal = shifted(r, -exponent), float(np.ldexp(goal, -exponent))
+        elif is_data and self.engine.overwrites:
+            r = r.copy()
+        step, used, trouble = self.engine.solve(r, goal, transposed)
+        if self.system.active is not None:
+            step[~self.system.active] = 0.0
+        return (shifted(step, exponent) if exponent else step), used, trouble
+
+    def _verdict(self, x, length, run, word, residual, data, transposed):
+        size = self.system.norm(transposed) * length + data
+        run.status, run.residual, run.backward_error = word, residual / data if data else 0.0, residual / size
+        if word.startswith("converged") or not self.engine.refines:
+            return x
+        op = self.system.given.T if transposed else self.system.given
+        raise ConvergenceError(
+            f"{self.engine.method} on {op}: relative residual {run.residual:.1e} after {run.iterations} "
+            f"{self.engine.unit}, wanted {self.system.rtol:g} ({word})",
+            info=run.info(),
+            best=x.reshape(op.domain.shape),
+        )
+
+
+def _place(index, shape):
+    found = np.unravel_index(index, shape)
+    return tuple(map(int, found)) if len(found) > 1 else int(found[0])
+
+
+def _not_finite(name, b, system, transposed):
+    wrong = ~np.isfinite(b)
+    space = system.op.domain if transposed else system.op.codomain
+    first, many = _place(int(np.argmax(wrong)), space.shape), np.count_nonzero(wrong)
+    return f"{name} takes finite numbers, got {many} that are NaN or infinite, the first at {first}"

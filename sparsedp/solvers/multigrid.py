@@ -1,0 +1,218 @@
+"""Algebraic multigrid: hierarchies by PyAMG (Ruge-Stueben), our own cycle, so that it has a transpose.
+
+One cycle is a linear map M ~ A^-1. With pre-smoothing sweeps s_1 ... s_m, prolongation P, restriction R
+and post-smoothing sweeps t_1 ... t_n, its transpose is the cycle on A^T with prolongation R^T,
+restriction P^T, pre-smoothing t_n^T ... t_1^T and post-smoothing s_m^T ... s_1^T; the transpose of a
+forward Gauss-Seidel sweep on A is a backward sweep on A^T.
+"""
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+from scipy.sparse import csr_array, csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from sparsedp.solvers.krylov import Krylov
+
+__all__ = ["Multigrid", "multigrid_engine"]
+
+CYCLES = {"V": 1, "W": 2}
+SWEEPS = {"forward": "backward", "backward": "forward"}  # each with its mirror image
+COARSEST = 100  # unknowns that are solved densely
+MAXITER = 200
+
+
+def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), ("backward",)), levels=25):
+    """System -> Multigrid: conjugate gradients (GMRES when not symmetric) around one multigrid cycle.
+
+    Parameters
+    ----------
+    system : System
+        With entries, and a diagonal of one sign.
+    cycle : "V" or "W"
+        W costs more for each iteration and needs fewer where coefficients jump. The F cycle is not
+        offered: its transpose is another cycle.
+    strength : float
+        A coefficient counts as strong from this share of the largest in its row, 0 <= strength < 1.
+    sweeps : pair of tuples of "forward" and "backward"
+        Gauss-Seidel sweeps before and after the coarse correction.
+    levels : int
+        Most levels.
+
+    Returns
+    -------
+    Multigrid
+
+    Raises
+    ------
+    ValueError
+        If the diagonal has both signs or a zero, there are no entries, or an option is out of range.
+
+    Notes
+    -----
+    Set-up: deterministic. Source: Ruge and Stueben, Algebraic Multigrid, in Multigrid Methods, SIAM, 1987;
+    PyAMG, Bell, Olson and Schroder, J. Open Source Software 7, 2022.
+    """
+    if cycle not in CYCLES:
+        raise ValueError(f"cycle must be 'V' or 'W', got {cycle!r}; the F cycle has no transpose of its own kind")
+    if not (isinstance(strength, (int, float)) and 0 <= strength < 1):
+        raise ValueError(f"strength must be in [0, 1), got {strength!r}")
+    if len(sweeps) != 2 or not all(sweep in SWEEPS for side in sweeps for sweep in side) or not any(sweeps):
+        raise ValueError(f"sweeps must be two tuples of 'forward' and 'backward', got {sweeps!r}")
+    if not system.op.structure.has_entries:
+        raise ValueError(f"multigrid needs the entries, {system.given} only knows its products; write method='krylov'")
+    if not system.sign:
+        ends = system.diagonal if system.active is None else system.diagonal[system.active]
+        raise ValueError(
+            f"multigrid needs a diagonal of one sign; {system.given} has {ends.min():.1e} and {ends.max():.1e}"
+        )
+    return Multigrid(system, CYCLES[cycle], float(strength), tuple(map(tuple, sweeps)), int(levels))
+
+
+class Multigrid(Krylov):
+    """The engine: a kept hierarchy, its cycle and the transposed cycle."""
+
+    method = "multigrid"
+    unit = "cycles"
+
+    def __init__(self, system, visits, strength, sweeps, levels):
+        mirrored = sweeps[0] == tuple(SWEEPS[sweep] for sweep in reversed(sweeps[1]))
+        use_symmetric = system.symmetric and mirrored
+        super().__init__(system, of_symmetric=use_symmetric, maxiter=MAXITER)
+        self.symmetric = use_symmetric
+        matrix = system.matrix
+        if use_symmetric:
+            scale = np.broadcast_to(system.sign * system.weights, system.size)
+            matrix = csr_array(matrix * scale[:, None])
+        built = _ruge_stueben(matrix if use_symmetric else matrix * system.sign, strength, levels)
+        self.forward = Hierarchy(built, visits, *sweeps)
+        self._transposed: Any = None
+        self.hierarchy = self.forward.words
+        self._flip = 1 if use_symmetric else system.sign
+
+    def precondition(self, r, transposed):
+        """One cycle, or one transposed cycle."""
+        if transposed and self._transposed is None:
+            self._transposed = self.forward.transpose()
+        z = (self._transposed if transposed else self.forward).cycle(r)
+        z *= self._flip
+        return z
+
+
+class Level(NamedTuple):
+    """A matrix with the way down to the next level (None on the coarsest)."""
+
+    A: Any
+    P: Any
+    R: Any
+
+
+class Hierarchy:
+    """Levels, sweeps, and a dense solve on the coarsest level that drops the null modes."""
+
+    def __init__(self, levels, visits, before, after, coarse=None):
+        self.levels, self.visits = levels, visits
+        self.before, self.after = before, after
+        self._coarse = coarse or CoarseSolve(levels[-1].A)
+
+    def transpose(self):
+        """The hierarchy of the transposed cycle."""
+        levels = [Level(_turned(level.A), _turned(level.R), _turned(level.P)) for level in self.levels]
+        before, after = (tuple(SWEEPS[sweep] for sweep in reversed(side)) for side in (self.after, self.before))
+        return Hierarchy(levels, self.visits, before, after, self._coarse.transpose())
+
+    def cycle(self, b, number=0):
+        """One cycle from 0: M b, as a fresh array."""
+        level = self.levels[number]
+        if number == len(self.levels) - 1:
+            return self._coarse(b)
+        x = np.zeros_like(b)
+        self._smooth(level.A, x, b, self.before)
+        rest = level.R @ (b - level.A @ x)
+        correction = self.cycle(rest, number + 1)
+        for _ in range(self.visits - 1 if number + 2 < len(self.levels) else 0):
+            correction += self.cycle(rest - self.levels[number + 1].A @ correction, number + 1)
+        x += level.P @ correction
+        self._smooth(level.A, x, b, self.after)
+        return x
+
+    def _smooth(self, A, x, b, sweeps):
+        for sweep in sweeps:
+            self._gauss_seidel(A, x, b, sweep)
+
+    @staticmethod
+    def _gauss_seidel(A, x, b, sweep):
+        from pyamg import amg_core
+
+        ends = (0, x.size, 1) if sweep == "forward" else (x.size - 1, -1, -1)
+        amg_core.gauss_seidel(A.indptr, A.indices, A.data, x, b, *ends)
+
+    @property
+    def words(self):
+        """Levels, unknowns and operator complexity in one line."""
+        sizes = " > ".join(str(level.A.shape[0]) for level in self.levels)
+        entries = [level.A.nnz for level in self.levels]
+        return f"{len(self.levels)} levels, unknowns {sizes}, operator complexity {sum(entries) / entries[0]:.2f}"
+
+
+def _turned(matrix):
+    return None if matrix is None else csr_array(matrix.T.tocsr())
+
+
+def _ruge_stueben(matrix, strength, levels):
+    """The levels that PyAMG builds; NumPy's global random state is left as it was."""
+    from pyamg import ruge_stuben_solver
+
+    state = np.random.get_state()  # noqa: NPY002
+    np.random.seed(0)  # noqa: NPY002
+    try:
+        built = ruge_stuben_solver(
+            csr_matrix(matrix),  # PyAMG asks for the matrix class, not the array class
+            strength=("classical", {"theta": strength}),
+            CF=("RS", {"second_pass": True}),  # with random jumps the first pass alone does not converge
+            max_levels=levels,
+            max_coarse=COARSEST,
+        )
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+    return [Level(csr_array(one.A), csr_array(one.P), csr_array(one.R)) for one, _ in pairwise(built.levels)] + [
+        Level(csr_array(built.levels[-1].A), None, None)
+    ]
+
+
+class CoarseSolve:
+    """Dense LU of the coarsest matrix. Its null modes, constants on a component, are dropped.
+
+    A component whose rows sum to 0 is made regular by adding the mean, scaled to its entries: for
+    compatible data the solution is the one with mean 0, and that of the transposed system likewise.
+    Other singular matrices (null vectors that are not constant) get the pseudo-inverse.
+    """
+
+    def __init__(self, matrix, solve=None, transposed=False):
+        self._transposed = transposed
+        self._solve = solve or _coarse_solver(matrix)
+
+    def __call__(self, b):
+        return self._solve(b, self._transposed)
+
+    def transpose(self):
+        return CoarseSolve(None, self._solve, not self._transposed)
+
+
+def _coarse_solver(matrix):
+    dense, size = matrix.toarray(), matrix.shape[0]
+    count, labels = connected_components(matrix, directed=False)
+    sums, sizes = matrix @ np.ones(size), abs(matrix) @ np.ones(size)
+    for number in range(count):
+        cells = np.flatnonzero(labels == number)
+        if np.all(np.abs(sums[cells]) <= 1e-9 * sizes[cells]):
+            scale = np.max(sizes[cells]) or 1.0
+            dense[np.ix_(cells, cells)] += scale / cells.size
+    factors = la.lu_factor(dense, check_finite=False)
+    pivots = np.abs(np.diag(factors[0]))
+    if np.all(pivots > 1e-14 * np.max(np.abs(dense), axis=1)):
+        return lambda b, transposed: la.lu_solve(factors, b, trans=int(transposed), check_finite=False)
+    inverse = la.pinv(dense, rtol=1e-10)
+    return lambda b, transposed: b @ inverse if transposed else inverse @ b

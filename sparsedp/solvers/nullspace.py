@@ -1,0 +1,175 @@
+"""The null space of a singular operator: one pair of vectors for each connected component.
+
+With A r = 0 and l^T A = 0 on a component, the oblique projection P b = b - r (l.b) / (l.r) makes data
+compatible, and the solution is the one with l.x = 0: inv = P A+ P. The transposed system has l and r
+exchanged, so inv.T = P^T A+^T P^T, exactly. On a pure Neumann problem r is ones and l the cell volumes.
+"""
+
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import eye_array
+from scipy.sparse.linalg import splu
+
+__all__ = ["NullSpace", "find_null_space"]
+
+EPS = np.finfo(float).eps
+ROUNDING = 8 * EPS  # a row whose entries sum to less than this share of their magnitudes sums to 0
+POWER_STEPS = 3
+
+
+class NullSpace:
+    """Right and left null vectors of the singular components.
+
+    Parameters
+    ----------
+    labels : int array, shape (n,), or None
+        Component of each unknown, -1 where the operator is regular; None: one component, everywhere.
+    right, left : arrays, shape (n,)
+        r and l of all components in one array each, 0 where the operator is regular.
+    count : int
+    """
+
+    def __init__(self, labels, right, left, count):
+        self.labels = labels
+        self.right, self.left = right, left
+        self.count = count
+        self._products = self._sums(right, left)
+        self._sides = (_thin(labels, right), _thin(labels, left))
+
+    def _sums(self, left, values):
+        """Sum of left * values over each component."""
+        if self.labels is None:
+            return np.array([left * values.sum() if np.isscalar(left) else np.einsum("i,i->", left, values)])
+        if values.dtype.kind == "c" or self.left.dtype.kind == "c":  # bincount is real
+            product = left * values
+            return self._binned(product.real) + 1j * self._binned(product.imag)
+        return self._binned(left * values)
+
+    def _binned(self, values):
+        return np.bincount(self.labels + 1, values, self.count + 1)[1:]
+
+    def sums(self, b, transposed=False):
+        """l.b on each component."""
+        return self._sums(self._sides[not transposed], b)
+
+    def project(self, b, transposed=False, into=None, sums=None):
+        """Take out, component by component, the part along the null space. The same map for b and x.
+
+        `into`: array for the result; `sums`: what `sums(b)` gave, when it is known.
+        """
+        if not self.count:
+            return b
+        right = self._sides[transposed]
+        shares = (self.sums(b, transposed) if sums is None else sums) / self._products
+        part = right * (shares[0] if self.labels is None else np.append(shares, 0.0)[self.labels])
+        return np.subtract(b, part, out=into)
+
+    def defect(self, b, sums, size, floor, transposed=False):
+        """The largest |l.b| / (|l| |b|) over the components, and the number of that component.
+
+        `size` is the norm of b, `floor` a size below which |b| on a component counts as noise.
+        """
+        lengths = np.sqrt(self._lengths[not transposed])
+        sizes = np.array([size]) if self.labels is None else np.sqrt(self._sums(np.conj(b), b).real)
+        sizes = np.maximum(sizes, floor)
+        shares = np.abs(sums) / np.where(sizes > 0, sizes * lengths, 1.0)
+        worst = int(np.argmax(shares))
+        return float(shares[worst]), worst
+
+    @cached_property
+    def _lengths(self):
+        return tuple(self._sums(np.conj(side), side).real for side in (self.right, self.left))
+
+    def cells(self, number):
+        """Indices of the unknowns of one component."""
+        return np.arange(self.right.size) if self.labels is None else np.flatnonzero(self.labels == number)
+
+    def anchors(self):
+        """One unknown for each component, where it can be pinned: the largest |l r|."""
+        weight = np.abs(self.right * self.left)
+        if self.labels is None:
+            return np.array([int(np.argmax(weight))]) if self.count else np.array([], dtype=int)
+        order = np.lexsort((-weight, self.labels))
+        _, first = np.unique(self.labels[order], return_index=True)
+        found = order[first]
+        return found[self.labels[found] >= 0]
+
+
+def _thin(labels, side):
+    """A null vector that is one number everywhere, as that number: one pass less for each projection."""
+    return side[0].item() if labels is None and side.size and np.all(side == side[0]) else side
+
+
+def find_null_space(system):
+    """System -> NullSpace of its active part.
+
+    Candidates are tried first, relative to the magnitudes of the rows: ones, volumes. Where only one
+    side is known, the other is computed by solves with the component alone.
+
+    Raises
+    ------
+    ArithmeticError
+        If a null vector of the other side cannot be found, or is orthogonal to this one.
+    """
+    labels, count = system.components
+    if system.active is not None:  # what is not active goes into a bin of its own
+        labels = np.where(system.active, 0 if labels is None else labels, count)
+    right, has_right = _candidates(system, labels, count, transposed=False)
+    left, has_left = _candidates(system, labels, count, transposed=True)
+    for number in np.flatnonzero(has_right != has_left):
+        cells = np.arange(system.size) if labels is None else np.flatnonzero(labels == number)
+        if has_right[number]:
+            left[cells] = _computed(system.entries[cells][:, cells].T)
+        else:
+            right[cells] = _computed(system.entries[cells][:, cells])
+    return _assembled(labels, right, left, has_right | has_left)
+
+
+def _candidates(system, labels, count, transposed):
+    """The first of the candidates that the operator maps to 0, component by component."""
+    found, known = np.zeros(system.size, system.op.dtype), np.zeros(count, dtype=bool)
+    candidates = [np.ones(system.size)]
+    if np.any(system.volumes != system.volumes[:1]):
+        candidates.insert(0 if transposed else 1, system.volumes)
+    active = 1.0 if system.active is None else system.active
+    for candidate in candidates:
+        candidate = candidate * active
+        wrong = np.abs(system.product(candidate, transposed)) > ROUNDING * system.magnitude(candidate, transposed)
+        if labels is None:
+            fresh = np.array([system.size > 0 and not wrong.any()]) & ~known
+            chosen = slice(None) if fresh[0] else slice(0)
+        else:
+            failures, members = (np.bincount(labels, values, count + 1)[:count] for values in (wrong, None))
+            fresh = (failures == 0) & (members > 0) & ~known
+            chosen = np.append(fresh, False)[labels]
+        found[chosen] = candidate[chosen]
+        known |= fresh
+    return found, known
+
+
+def _computed(matrix):
+    """The null vector of a singular matrix, by inverse iteration with a shift at rounding level."""
+    size = matrix.shape[0]
+    norm = abs(matrix).sum(axis=1).max()
+    vector = np.ones(size, matrix.dtype)
+    try:
+        factors = splu((matrix + 4 * EPS * norm * eye_array(size)).tocsc())
+    except RuntimeError:  # exactly singular in spite of the shift
+        raise ArithmeticError("the null vector of the other side was not found") from None
+    for _ in range(POWER_STEPS):
+        vector = factors.solve(vector)
+        vector = vector / np.max(np.abs(vector))
+    if not np.max(np.abs(matrix @ vector)) <= 1e-10 * norm:
+        raise ArithmeticError("the null vector of the other side was not found")
+    return vector / vector[np.argmax(np.abs(vector))]  # of one sign where it can be, and positive then
+
+
+def _assembled(labels, right, left, singular):
+    numbers = np.append(np.where(singular, np.cumsum(singular) - 1, -1), -1)
+    count = int(np.count_nonzero(singular))
+    labels = None if labels is None or not count else numbers[labels]
+    space = NullSpace(None if count == 1 and np.all(labels == 0) else labels, right, left, count)
+    if count and np.any(np.abs(space._products) <= 1e-10 * np.sqrt(space._lengths[0] * space._lengths[1])):
+        raise ArithmeticError("the right and the left null vector are orthogonal")
+    return space

@@ -1,0 +1,261 @@
+"""Solves whose operator depends on a parameter: x of (shift - D diag(k) G) x = b, differentiable in k, b and shift.
+
+With A = shift - D diag(k) G and A x = b, a change of the data gives
+
+    A dx = db - x dshift + D (dk * G x),
+
+so with the adjoint solve A^T y = g, one for all arguments,
+
+    cotangent of b: y,    of shift: -y.x,    of k: (D^T y) * (G x).
+
+The transposed solve is a rule of the same form with D, G exchanged for G^T, D^T: each is the other's
+helper, and derivatives of every order follow.
+"""
+
+from functools import cached_property
+from math import prod
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.operator import Operator
+from sparsedp.operators.boundary import identity
+from sparsedp.solvers.assembly import Assembly
+from sparsedp.solvers.choose import build, check_settings
+from sparsedp.solvers.record import SolveLog
+from sparsedp.space import fits
+from sparsedp.structure.base import Structure
+from sparsedp.tape import cast, differentiable, dtype_of, isbox, plain
+
+__all__ = ["EllipticSolver", "elliptic_solver"]
+
+KEPT = 2  # set-ups: a forward and a backward pass of one step, or two alternating coefficients
+
+
+def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **options):
+    """Divergence and gradient -> solve(k, b, shift=0.0): x of (shift - D diag(k) G) x = b.
+
+    Parameters
+    ----------
+    D : Operator, faces -> cells
+    G : Operator, cells -> faces
+        Boundary conditions and obstacles are part of it.
+    method, rtol, maxiter, nullspace, **options
+        As in `inverse`; options go to the method.
+
+    Returns
+    -------
+    EllipticSolver
+        Call it as ``solve(k, b, shift=0.0)``: k a number or one value for each face, finite and >= 0;
+        b a field on the cells; shift a finite number. Differentiable in all three, to every order.
+        The set-up depends on the content of (k, shift); the last two are kept.
+
+    Raises
+    ------
+    TypeError
+        If D or G is not an Operator.
+    ShapeError
+        If D and G do not fit, and on use, if k or b has another shape.
+    ValueError
+        On use, if k is negative or complex.
+    NonFiniteError
+        On use, if k, b or shift holds NaN or infinity.
+    ConvergenceError
+        On use, as for `inverse`.
+
+    Notes
+    -----
+    Cost: one solve; its derivative in any of k, b, shift one more, with the transpose of the same
+    set-up. Null space: where shift is 0 and no wall holds the level (pure Neumann), as for `inverse`;
+    derivatives are projected, never refused.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid, dirichlet, divergence, gradient, value_and_grad
+    >>> grid = Grid(2)
+    >>> solve = elliptic_solver(divergence(grid), gradient(grid, dirichlet))
+    >>> solve(1.0, np.array([2.0, 2.0]))
+    array([1., 1.])
+    >>> value_and_grad(lambda k: anp.sum(solve(k, np.array([2.0, 2.0]))))(1.0)
+    (2.0, -2.0)
+    """
+    for name, op in (("D", D), ("G", G)):
+        if not isinstance(op, Operator):
+            raise TypeError(f"elliptic_solver takes Operators, got {type(op).__name__} for {name}")
+    if not (fits(D.domain, G.codomain) and fits(D.codomain, G.domain)):
+        raise ShapeError(
+            f"elliptic_solver needs D @ G to be square: {D.name} maps {D.domain} to {D.codomain}, "
+            f"{G.name} {G.domain} to {G.codomain}"
+        )
+    check_settings(method, rtol, maxiter, nullspace)
+    return EllipticSolver(D, G, dict(method=method, rtol=rtol, maxiter=maxiter, nullspace=nullspace, options=options))
+
+
+class EllipticSolver:
+    """solve(k, b, shift=0.0), made by `elliptic_solver`.
+
+    Attributes
+    ----------
+    info : SolveLog
+        Records of the last forward and the last adjoint solve, and of the last set-up.
+    """
+
+    def __init__(self, D, G, settings):
+        self.D, self.G = D, G
+        self.info = SolveLog()
+        self._settings = settings
+        self._kept: list = []  # (k, shift, Inverse), last used first; plain values only
+        self._assembly = Assembly(D, G)
+
+    def __reduce__(self):
+        return EllipticSolver, (self.D, self.G, self._settings)  # what is kept is set up again
+
+    def __call__(self, k, b, shift=0.0):
+        """Solve (shift - D diag(k) G) x = b.
+
+        Parameters
+        ----------
+        k : float, or array of the shape of a field on the faces
+        b : array, a field on the cells
+        shift : float
+
+        Returns
+        -------
+        array, a field on the cells, of the dtype of b
+        """
+        k = self._coefficient(k)
+        _check_shift(plain(shift))
+        return self._rule(False, True)(k, b if isbox(b) else np.asarray(b), shift)
+
+    def _coefficient(self, k):
+        values, space = np.asarray(plain(k)), self.D.domain
+        if values.shape not in ((), space.shape):
+            raise ShapeError(f"k takes a number or a field on {space}, got an array of shape {values.shape}")
+        if values.dtype.kind not in "biuf":
+            raise ValueError(f"k must hold real numbers, got dtype {values.dtype}")
+        wrong = ~np.isfinite(values)
+        if wrong.any():
+            many, first = np.count_nonzero(wrong), np.argmax(wrong)
+            raise NonFiniteError(f"k must be finite, got {many} values that are NaN or infinite, the first at {first}")
+        if np.any(values < 0):
+            raise ValueError(f"k must be >= 0, got {values.min():g} at {np.argmin(values)}")
+        return k * np.ones(space.shape) if values.ndim == 0 else k if isbox(k) else values
+
+    # ------------------------------------------------------------ rules
+
+    def _rule(self, transposed, checked=False):
+        """The solve (or the transposed solve) as a rule in (k, b, shift). Not kept: it holds this solver."""
+
+        def forward(k, b, shift):
+            inv = self._inverse(k, float(shift))
+            return (inv.T if transposed else inv if checked else inv.tangent).apply(b)
+
+        def vjp(nums, ans, k, b, shift):
+            def pull(g):
+                other = self._rule(not transposed)(k, g, shift)
+                x, y = (other, ans) if transposed else (ans, other)
+                slopes = {0: lambda: self.D.T(y) * self.G(x), 1: lambda: other, 2: lambda: -anp.sum(y * x)}
+                return tuple(_real(slopes[num](), (k, b, shift)[num]) for num in nums)
+
+            return pull
+
+        def jvp(nums, tangents, ans, k, b, shift):
+            first, second = (self.D.T, self.G.T) if transposed else (self.G, self.D)
+            change = {0: lambda t: second(t * first(ans)), 1: lambda t: t, 2: lambda t: -t * ans}
+            total = sum(change[num](t) for num, t in zip(nums, tangents, strict=True))
+            return self._rule(transposed)(k, total, shift)
+
+        return differentiable("elliptic_solver.T" if transposed else "elliptic_solver", forward, vjp, jvp)
+
+    # ------------------------------------------------------------ set-up
+
+    def _inverse(self, k, shift):
+        """The set-up for this content, from the last two or new."""
+        for place, (known, known_shift, inv) in enumerate(self._kept):
+            if shift == known_shift and np.array_equal(k, known):
+                self._kept.insert(0, self._kept.pop(place))
+                return inv
+        k = np.array(k, dtype=float)
+        inv = build(self._operator(k, shift), name="elliptic_solver", log=self.info, solves="few", **self._settings)
+        self._kept = [(k, shift, inv), *self._kept[: KEPT - 1]]
+        return inv
+
+    def _operator(self, k, shift):
+        name = f"{shift:g} - {self.D.name} @ diag(k) @ {self.G.name}"
+        if k.size and np.all(k == k[0]) and self._product.separable and self._settings["method"] != "direct":
+            # A constant coefficient keeps the operator a sum of 1-D factors.
+            op = -k[0] * self._product + shift * identity(self.G.domain)
+            return Operator(op.structure, self.G.domain, self.D.codomain, name)
+        return Operator(Elliptic(self._assembly, k, shift), self.G.domain, self.D.codomain, name)
+
+    @cached_property
+    def _product(self):
+        return self.D @ self.G
+
+    def __repr__(self):
+        return f"<elliptic_solver: shift - {self.D.name} @ diag(k) @ {self.G.name} on {self.G.domain}>"
+
+    def __str__(self):
+        if not self._kept:
+            return f"{self!r}, not set up yet"
+        return f"{self!r}, {len(self._kept)} of {KEPT} set-ups kept, the last one:\n{self._kept[0][2]}"
+
+
+def _real(cotangent, value):
+    """The cotangent of a real argument of a complex solve is the real part."""
+    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent
+
+
+def _check_shift(shift):
+    if np.shape(shift) != ():
+        raise ShapeError(f"shift takes one number, got an array of shape {np.shape(shift)}")
+    if not np.isrealobj(shift):
+        raise ValueError(f"shift must be real, got {shift}")
+    if not np.isfinite(shift):
+        raise NonFiniteError(f"shift must be finite, got {shift}")
+
+
+class Elliptic(Structure):
+    """shift - D diag(k) G as a structure: applied without a matrix, assembled by one product.
+
+    Parameters
+    ----------
+    assembly : Assembly
+        D, G and the map from k to the entries.
+    k : array, shape (faces,)
+    shift : float
+    """
+
+    def __init__(self, assembly, k, shift, transposed=False):
+        self.assembly, self.k, self.shift = assembly, k.reshape(-1), shift
+        self.transposed = transposed
+        self.shape = (prod(assembly.D.codomain.shape),) * 2
+        self.dtype = np.result_type(assembly.D.dtype, assembly.G.dtype)
+        self.has_entries = assembly.has_entries
+
+    def _members(self):
+        D, G = self.assembly.D.structure, self.assembly.G.structure
+        return (D.transpose(), G.transpose()) if self.transposed else (G, D)
+
+    def apply(self, x, out):
+        first, second = self._members()
+        wide = x.astype(np.result_type(x.dtype, np.float64), copy=False)
+        flux = first.product(wide)
+        flux *= self.k
+        np.copyto(out, self.shift * wide - second.product(flux), casting="same_kind")
+
+    def magnitude(self):
+        first, second = self.assembly.magnitudes[self.transposed]
+        return lambda x: abs(self.shift) * x + second(self.k * first(x))
+
+    def transpose(self):
+        return Elliptic(self.assembly, self.k, self.shift, not self.transposed)
+
+    @cached_property
+    def _entries(self):
+        matrix = self.assembly.matrix(self.k, self.shift)
+        return matrix.T.tocsr() if self.transposed else matrix
+
+    def explicit(self):
+        return self._entries

@@ -1,0 +1,286 @@
+"""System: what an engine may know about the operator it inverts. Every fact is found on first use."""
+
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.operator import Operator
+from sparsedp.solvers import facts
+from sparsedp.solvers.nullspace import ROUNDING, find_null_space
+from sparsedp.space import Space
+from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.kronecker import Kronecker
+
+__all__ = ["System"]
+
+FAR = 200  # binary exponents of |A| beyond this are scaled away: squares of solutions must not overflow
+
+
+class System:
+    """The square operator of a solve, and its facts.
+
+    Parameters
+    ----------
+    op : Operator
+    rtol : float
+    maxiter : int or None
+
+    Attributes
+    ----------
+    op : Operator
+        The operator to be inverted. Where the one given has entries beyond 2^+-200 it is that one
+        times 2^-exponent, exactly; the contract scales the solution back.
+    exponent : int
+    """
+
+    def __init__(self, op, rtol=1e-10, maxiter=None):
+        self.given = self.op = op
+        self.size = op.domain.size
+        self.rtol, self.maxiter = rtol, maxiter
+        self.exponent = 0
+        exponent = int(np.frexp(self.norm(False))[1])
+        if abs(exponent) > FAR:
+            self.exponent = int(np.clip(exponent, -1000, 1000))
+            self.op = op * 2.0**-self.exponent
+            for name in ("_magnitudes", "_sums"):
+                self.__dict__.pop(name, None)
+
+    # ------------------------------------------------------------ products
+
+    @cached_property
+    def _acting(self):
+        return self.op._flat, self.op._flat.T
+
+    def product(self, x, transposed=False):
+        """A x or A^T x for the unknowns (x is 0 elsewhere), flat and fresh. Not counted as an application."""
+        if "entries" in self.__dict__ and not isinstance(self.op.structure, Kronecker):
+            y = self._assembled[transposed].apply(x)  # one pass; a chain takes several
+        else:
+            y = self._acting[transposed].apply(x)
+        if self.active is not None:
+            y[~self.active] = 0.0
+        return y
+
+    @cached_property
+    def _assembled(self):
+        form = Operator(Matrix(self.entries), Space(self.size), Space(self.size), self.op.name)
+        return form, form.T
+
+    def residual(self, x, b, transposed=False):
+        """b - A x for the unknowns, as a fresh array; b is 0 elsewhere."""
+        r = self.product(x, transposed)
+        return np.subtract(b, r, out=r)
+
+    @cached_property
+    def complex(self):
+        """Whether the entries are complex."""
+        return self.op.dtype.kind == "c"
+
+    # ------------------------------------------------------------ sizes
+
+    @cached_property
+    def _magnitudes(self):
+        structure = self.op.structure
+        return facts.magnitude(structure), facts.magnitude(structure.transpose())
+
+    @cached_property
+    def _sums(self):
+        ones = np.ones(self.size)
+        return tuple(magnitude(ones) for magnitude in self._magnitudes)
+
+    def magnitude(self, x, transposed=False):
+        """An upper bound of |A| x for x >= 0."""
+        return self._magnitudes[transposed](x)
+
+    def norm(self, transposed=False):
+        """|A|_inf (|A^T|_inf), or an upper bound of it."""
+        return float(np.max(self._sums[transposed], initial=0.0))
+
+    # ------------------------------------------------------------ unknowns
+
+    @cached_property
+    def active(self):
+        """Boolean array of the unknowns; None when all are.
+
+        What no row reads (a column without entries: solid cells, coefficients that are 0) is not an
+        unknown: it is 0 in every solution, and its equation is left out.
+        """
+        read = self._sums[True] > 0
+        return None if read.all() else read
+
+    @cached_property
+    def unknowns(self):
+        """Number of unknowns."""
+        return self.size if self.active is None else int(np.count_nonzero(self.active))
+
+    @cached_property
+    def empty_row(self):
+        """The first unknown whose row has no entries, or None."""
+        sums = self._sums[False] if self.active is None else self.magnitude(self.active.astype(float))
+        empty = sums == 0 if self.active is None else (sums == 0) & self.active
+        return int(np.argmax(empty)) if empty.any() else None
+
+    @cached_property
+    def components(self):
+        """(labels, count) of the connected components of the unknowns; labels None: one, everywhere.
+
+        An engine builder that knows them better than the entries do sets them first.
+        """
+        structure = self.op.structure
+        if self.active is None and facts.is_sum_of_factors(structure):
+            return facts.components_of_factors(structure)
+        return facts.components_of_entries(self.entries, self.active) if structure.has_entries else (None, 1)
+
+    @cached_property
+    def null_space(self):
+        """The null vectors of the singular components. An engine builder may set it."""
+        return find_null_space(self)
+
+    # ------------------------------------------------------------ symmetry
+
+    @cached_property
+    def volumes(self):
+        """Cell volumes as a flat array; ones where there is no grid."""
+        domain, codomain = self.op.domain, self.op.codomain
+        return (domain if domain.grid is not None else codomain).volumes.reshape(-1)
+
+    @cached_property
+    def weights(self):
+        """Positive w such that diag(w) A is symmetric: 1.0, an array, or None when no such w is known.
+
+        Tried are ones, the cell volumes and their inverses. A Kronecker sum is examined factor by
+        factor, an assembled matrix entry by entry, the rest with random vectors.
+        """
+        candidates = [1.0]
+        if np.any(self.volumes != self.volumes[:1]):
+            candidates += [self.volumes, 1.0 / self.volumes]
+        if facts.is_sum_of_factors(self.op.structure):
+            return self._weights_of_factors()
+        for weights in candidates:
+            if self._symmetric_with(weights):
+                return weights
+        return None
+
+    @property
+    def symmetric(self):
+        """Whether A is symmetric after scaling its rows by `weights`."""
+        return self.weights is not None
+
+    def _weights_of_factors(self):
+        grid = (self.op.domain if self.op.domain.grid is not None else self.op.codomain).grid
+        for power in (0.0, 1.0, -1.0):
+            widths = None if grid is None else grid.widths
+            if all(_factor_symmetric(term, widths, power) for term in self.op.structure.blocks.get((0, 0), ())):
+                uniform = power == 0 or np.all(self.volumes == self.volumes[:1])
+                return 1.0 if uniform else self.volumes**power
+        return None
+
+    def _symmetric_with(self, weights):
+        if isinstance(self.op.structure, Matrix) or "entries" in self.__dict__:
+            scaled = self.matrix * (weights if np.isscalar(weights) else weights[:, None])
+            return _matrix_symmetric(sp.csr_array(scaled))
+        return self._symmetric_to_probes(weights)
+
+    def _symmetric_to_probes(self, weights):
+        x, y = (self._kept(probe) for probe in facts.probes(self.size)[:2])
+        left, right = y @ (weights * self.product(x)), x @ (weights * self.product(y))
+        size = np.abs(y) @ (weights * self.magnitude(np.abs(x)))
+        return abs(left - right) <= 1e-13 * size
+
+    def _kept(self, x):
+        return x if self.active is None else np.where(self.active, x, 0.0)
+
+    # ------------------------------------------------------------ entries
+
+    @cached_property
+    def entries(self):
+        """The operator as a csr_array with 32-bit indices, as it is."""
+        structure = self.op.structure
+        return structure.matrix if isinstance(structure, Matrix) else self.op.explicit().matrix
+
+    @cached_property
+    def diagonal(self):
+        """The diagonal on all unknowns (0 on what is not one), or None when only products are known."""
+        structure = self.op.structure
+        if facts.is_sum_of_factors(structure):
+            return self._kept(facts.diagonal_of_factors(structure))
+        return self._kept(self.entries.diagonal()) if structure.has_entries else None
+
+    @cached_property
+    def sign(self):
+        """1 or -1: the sign of the diagonal; 0 when it is mixed or not known."""
+        if self.diagonal is None or self.complex:
+            return 0
+        values = self.diagonal if self.active is None else self.diagonal[self.active]
+        return 1 if np.all(values > 0) else -1 if np.all(values < 0) else 0
+
+    @cached_property
+    def matrix(self):
+        """The entries with every row that is not an unknown replaced by one of the identity (scaled).
+
+        Square of size `size`, so an engine needs no renumbering: the contract gives it right-hand
+        sides that are 0 there.
+        """
+        matrix = self.entries
+        if self.active is not None:
+            matrix = pinned(matrix, ~self.active)
+        if np.any(matrix.data == 0):
+            matrix = matrix.copy()
+            matrix.eliminate_zeros()
+        return matrix
+
+    @cached_property
+    def regular_matrix(self):
+        """`matrix` with one unknown of each singular component pinned: it can be factored.
+
+        With compatible data, 0 in place of those at the anchors, it has a solution of the singular system.
+        """
+        anchors = self.null_space.anchors()
+        if not anchors.size:
+            return self.matrix
+        flags = np.zeros(self.size, dtype=bool)
+        flags[anchors] = True
+        return pinned(self.matrix, flags)
+
+    # ------------------------------------------------------------ the test of a solution
+
+    def accepts(self, residual, goal, solution, data, transposed=False):
+        """Whether norms meet the tolerance ("converged"), the attainable accuracy, or neither ("")."""
+        if residual <= goal:
+            return "converged"
+        attainable = ROUNDING * (self.norm(transposed) * solution + data)
+        return "converged_at_roundoff" if residual <= attainable else ""
+
+    def rounding(self, x, data, transposed=False):
+        """The residual that rounding leaves, row by row: well below the bound with |A|_inf on stretched grids."""
+        rows = self.magnitude(np.abs(x), transposed)
+        return np.finfo(float).eps * (float(np.sqrt(rows @ rows)) + data)
+
+
+def pinned(matrix, flags):
+    """Matrix -> copy whose flagged rows and columns are those of the identity, scaled to its entries."""
+    row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    keep = ~(flags[row] | flags[matrix.indices])
+    size = matrix.diagonal()[~flags]
+    largest = size[np.argmax(np.abs(size))] if size.size and np.any(size) else 1.0
+    kept = sp.csr_array((matrix.data * keep, matrix.indices, matrix.indptr), shape=matrix.shape)
+    result = sp.csr_array(kept + sp.diags_array(np.where(flags, largest, 0.0), format="csr"))
+    result.eliminate_zeros()
+    return result
+
+
+def _factor_symmetric(term, widths, power):
+    for axis in term.axes:
+        factor = term.factors[axis].matrix
+        scale = np.ones(factor.shape[0]) if widths is None else widths[axis] ** power
+        if not _matrix_symmetric(sp.csr_array(factor * scale[:, None])):
+            return False
+    return True
+
+
+def _matrix_symmetric(matrix):
+    """Whether the entries equal their mirror images up to rounding."""
+    turned = matrix.T.tocsr()
+    excess = abs(matrix - turned) - ROUNDING * (abs(matrix) + abs(turned))
+    return excess.nnz == 0 or float(excess.max()) <= 0

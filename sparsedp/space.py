@@ -1,0 +1,174 @@
+"""Space: where the numbers of a field live, as a value. No numbers are stored here."""
+
+from functools import cached_property
+from math import prod
+from typing import Any
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.errors import ShapeError
+from sparsedp.tape import dtype_of, isbox, linear
+
+__all__ = ["Space", "fits"]
+
+
+class Space:
+    """The place of a field: the cells, faces, nodes or edges of a grid, or a plain shape.
+
+    Parameters
+    ----------
+    shape : int or tuple of int
+        For a space without a grid: ``Space(7)`` holds 7 numbers.
+    kind, grid, parts
+        Filled in by Grid: a word, the grid, and the shapes of the components.
+
+    Notes
+    -----
+    `shape` is the shape of a field. Cells and nodes have the shape of the grid of cells or nodes;
+    faces and edges are ONE flat array, component after component (x, then y, then z), each
+    component in C order with shape `parts[axis]`.
+
+    Raises
+    ------
+    ShapeError
+        If the shape has a negative entry.
+
+    Examples
+    --------
+    >>> Space((2, 3)).size
+    6
+    >>> print(Space(7))
+    space(7)
+    """
+
+    shape: tuple[int, ...]
+    kind: str
+    grid: Any
+    parts: tuple[tuple[int, ...], ...]
+
+    def __init__(self, shape, kind="space", grid=None, parts=None):
+        shape = (shape,) if isinstance(shape, (int, np.integer)) else tuple(shape)
+        if any(n < 0 for n in shape):
+            raise ShapeError(f"a space needs lengths >= 0, got {shape}")
+        self.__dict__["shape"] = tuple(int(n) for n in shape)
+        self.__dict__["kind"] = kind
+        self.__dict__["grid"] = grid
+        self.__dict__["parts"] = (self.shape,) if parts is None else tuple(parts)
+
+    def __setattr__(self, name, value):
+        raise AttributeError(f"Space is frozen; make a new one instead of setting {name}")
+
+    @cached_property
+    def size(self):
+        """Count of numbers in a field."""
+        return prod(self.shape)
+
+    @cached_property
+    def offsets(self):
+        """Where each component starts in the flat array, and where the last one ends."""
+        return (0, *np.cumsum([prod(part) for part in self.parts]).tolist())
+
+    @cached_property
+    def volumes(self):
+        """Control volume of each value [length^dim]; ones in a space without a grid."""
+        if self.grid is None:
+            return np.ones(self.shape)
+        flat = [self.grid.control_volumes(self.kind, axis).ravel() for axis in range(len(self.parts))]
+        volumes = np.concatenate(flat).reshape(self.shape)
+        volumes.flags.writeable = False
+        return volumes
+
+    def split(self, v):
+        """Flat field -> tuple of its components, each of shape `parts[axis]`. Differentiable.
+
+        Parameters
+        ----------
+        v : array, shape `shape`
+
+        Returns
+        -------
+        tuple of arrays
+
+        Raises
+        ------
+        ShapeError
+            If `v` has another shape.
+        """
+        if np.shape(v) != self.shape:
+            raise ShapeError(f"split takes a field on {self}, got an array of shape {np.shape(v)}")
+        if isbox(v):
+            return tuple(_part(self, axis)(v) for axis in range(len(self.parts)))
+        flat = np.asarray(v).reshape(-1)
+        spans = zip(self.offsets, self.offsets[1:], self.parts, strict=False)
+        return tuple(flat[start:stop].reshape(part) for start, stop, part in spans)
+
+    def join(self, *parts):
+        """Components -> one field of shape `shape`. Differentiable; inverse of `split`.
+
+        Parameters
+        ----------
+        *parts : arrays that can be broadcast to the shapes in `self.parts`
+
+        Returns
+        -------
+        array
+
+        Raises
+        ------
+        ShapeError
+            If the number of components or a shape does not fit.
+        """
+        if len(parts) != len(self.parts):
+            raise ShapeError(f"join on {self} takes {len(self.parts)} components, got {len(parts)}")
+        flat = []
+        for part, shape in zip(parts, self.parts, strict=True):
+            if np.shape(part) != shape:
+                part = _broadcast(self, part, shape)
+            flat.append(anp.reshape(part, (-1,)))
+        return anp.reshape(anp.concatenate(flat), self.shape)
+
+    def __eq__(self, other):
+        if not isinstance(other, Space):
+            return NotImplemented
+        return self is other or (self.shape, self.kind, self.grid) == (other.shape, other.kind, other.grid)
+
+    def __hash__(self):
+        return hash((self.shape, self.kind, self.grid))
+
+    def __str__(self):
+        shape = self.grid.shape if self.grid is not None else self.shape
+        return f"{self.kind}({', '.join(map(str, shape))})"
+
+    __repr__ = __str__
+
+
+def fits(one, other):
+    """Whether two spaces hold the same fields: equal, or of one size when one has no grid."""
+    if one.grid is None or other.grid is None:
+        return one.size == other.size
+    return one == other
+
+
+def _broadcast(space, part, shape):
+    try:
+        np.broadcast_shapes(np.shape(part), shape)
+        # autograd cannot broadcast_to into more dimensions; a product with ones can.
+        return part * np.ones(shape, dtype_of(part)) if isbox(part) else np.broadcast_to(part, shape)
+    except ValueError:
+        raise ShapeError(f"join on {space} needs components {space.parts}, got one of shape {np.shape(part)}") from None
+
+
+def _part(space, axis):
+    """The rule that takes one component out of a traced field; its transpose puts it back."""
+    start, stop, shape = space.offsets[axis], space.offsets[axis + 1], space.parts[axis]
+
+    def take(v):
+        return v.reshape(-1)[start:stop].reshape(shape)
+
+    def put(g):
+        v = np.zeros(space.size, dtype=g.dtype)
+        v[start:stop] = g.reshape(-1)
+        return v.reshape(space.shape)
+
+    return linear(f"part of {space.kind}", take, put)[0]

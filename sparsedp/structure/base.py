@@ -1,0 +1,111 @@
+"""Structure: the common part of everything that acts linearly on flat arrays."""
+
+import numpy as np
+import scipy.sparse as sp
+
+__all__ = ["INT32_LIMIT", "Scaled", "Structure", "compact", "result_dtype"]
+
+INT32_LIMIT = 2**31
+
+
+class Structure:
+    """A linear map on flat contiguous arrays. Frozen.
+
+    Attributes
+    ----------
+    shape : (rows, columns)
+    dtype : numpy dtype
+        float64 or complex128: the field the entries live in.
+    has_entries : bool
+        Whether `explicit()` can list the entries without applying the map to every unit vector.
+    """
+
+    shape: tuple[int, int]
+    dtype = np.dtype(float)
+    has_entries = True
+    is_identity = False
+
+    def apply(self, x, out):
+        """Write A x into `out`. Both flat and contiguous, out of dtype result_dtype(self, x.dtype)."""
+        raise TypeError(f"{type(self).__name__} does not say how it acts")
+
+    def transpose(self):
+        """The plain transpose, as a Structure."""
+        raise TypeError(f"{type(self).__name__} has no transpose")
+
+    def explicit(self):
+        """The entries as a csr_array with 32-bit indices."""
+        return columns_by_application(self)
+
+    def scaled(self, factor):
+        """factor * A."""
+        return Scaled(self, factor)
+
+    def tangent(self):
+        """The same map inside derivative rules: without checks that only primal data must meet."""
+        return self
+
+    def product(self, x):
+        """A x as a fresh array."""
+        out = np.empty(self.shape[0], result_dtype(self, x.dtype))
+        self.apply(x, out)
+        return out
+
+
+class Scaled(Structure):
+    """A number times a structure that cannot take the number in."""
+
+    def __init__(self, inner, factor):
+        self.inner = inner
+        self.factor = factor
+        self.shape = inner.shape
+        self.dtype = np.result_type(inner.dtype, complex if np.iscomplexobj(factor) else float)
+        self.has_entries = inner.has_entries
+
+    def apply(self, x, out):
+        np.multiply(self.inner.product(x), self.factor, out=out, casting="same_kind")
+
+    def transpose(self):
+        return Scaled(self.inner.transpose(), self.factor)
+
+    def explicit(self):
+        return compact(self.inner.explicit() * self.factor)
+
+    def scaled(self, factor):
+        return Scaled(self.inner, self.factor * factor)
+
+    def tangent(self):
+        inner = self.inner.tangent()
+        return self if inner is self.inner else Scaled(inner, self.factor)
+
+
+def result_dtype(structure, dtype):
+    """Dtype of A x for x of `dtype`: the dtype of x, complex when A is."""
+    if structure.dtype.kind == "c" and dtype.kind != "c":
+        return np.dtype(np.complex64 if dtype.itemsize <= 4 else np.complex128)
+    return dtype
+
+
+def compact(matrix):
+    """Any sparse matrix -> canonical csr_array with 32-bit indices; refuses what needs more."""
+    if matrix.nnz >= INT32_LIMIT or max(matrix.shape) >= INT32_LIMIT:
+        raise ValueError(f"an explicit matrix of {matrix.nnz} entries needs 64-bit indices; use the matrix-free form")
+    matrix = sp.csr_array(matrix)
+    matrix.sum_duplicates()
+    matrix.sort_indices()
+    if matrix.indices.dtype != np.int32 or matrix.indptr.dtype != np.int32:
+        arrays = matrix.data, matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32)
+        matrix = sp.csr_array(arrays, shape=matrix.shape)
+        matrix.has_canonical_format = True
+    return matrix
+
+
+def columns_by_application(structure):
+    """Entries of a map that only knows how to act: one application for each column."""
+    rows, columns = structure.shape
+    found, unit = [], np.zeros(columns)
+    for column in range(columns):
+        unit[column] = 1.0
+        found.append(sp.csc_array(structure.product(unit)[:, None]))
+        unit[column] = 0.0
+    return compact(sp.hstack(found)) if found else sp.csr_array((rows, columns))

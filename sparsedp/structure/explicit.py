@@ -1,0 +1,44 @@
+"""Matrix: a linear map given by its entries."""
+
+import numpy as np
+from scipy.sparse._sparsetools import csr_matvec
+
+from sparsedp.structure.base import Structure, compact
+
+__all__ = ["Matrix"]
+
+
+class Matrix(Structure):
+    """The explicit form: a csr_array with 32-bit indices, owned and never changed.
+
+    Parameters
+    ----------
+    matrix : sparse matrix or array
+        Copied when it is not already compact.
+    """
+
+    def __init__(self, matrix):
+        self.matrix = compact(matrix)
+        if self.matrix.dtype not in (np.float64, np.complex128):
+            wide = np.complex128 if self.matrix.dtype.kind == "c" else np.float64
+            self.matrix = self.matrix.astype(wide)
+        self.shape = self.matrix.shape
+        self.dtype = self.matrix.dtype
+
+    def apply(self, x, out):
+        m = self.matrix
+        if x.dtype == m.dtype == out.dtype:
+            # SciPy's own product spends four times as long on checks as on a small row.
+            out.fill(0)
+            csr_matvec(*self.shape, m.indptr, m.indices, m.data, x, out)
+        else:
+            np.copyto(out, m @ x.astype(np.result_type(x.dtype, np.float64)), casting="same_kind")
+
+    def transpose(self):
+        return Matrix(self.matrix.T.tocsr())
+
+    def explicit(self):
+        return self.matrix
+
+    def scaled(self, factor):
+        return Matrix(self.matrix * factor)

@@ -1,0 +1,119 @@
+"""Factor: a small sparse matrix along one axis. The only thing a catalogue operator defines."""
+
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.errors import NonFiniteError
+from sparsedp.kernels.layout import Rows, Tridiagonal
+
+__all__ = ["Factor"]
+
+MOST_DIAGONALS = 8  # more than this and the row form is at least as fast
+TINY = 2.0**-1000  # products below this would lose digits to underflow
+
+
+class Factor:
+    """A 1-D matrix. Frozen; products and sums give new ones.
+
+    Parameters
+    ----------
+    matrix : sparse matrix or array, shape (rows, columns)
+        Real and finite.
+    """
+
+    def __init__(self, matrix):
+        matrix = sp.csr_array(matrix, dtype=float)
+        matrix.sum_duplicates()
+        matrix.eliminate_zeros()
+        matrix.sort_indices()
+        if not np.all(np.isfinite(matrix.data)):
+            raise NonFiniteError("coefficients overflow: the spacing is too small; rescale the lengths of the grid")
+        self.matrix = matrix
+
+    @classmethod
+    def from_diagonals(cls, shape, *diagonals):
+        """Triples (rows, columns, values) of index arrays -> Factor."""
+        rows, columns, values = (np.concatenate(part) for part in zip(*diagonals, strict=True))
+        return cls(sp.coo_array((values, (rows, columns)), shape=shape))
+
+    @property
+    def shape(self):
+        return self.matrix.shape
+
+    @cached_property
+    def T(self):
+        turned = Factor(self.matrix.T)
+        turned.__dict__["T"] = self
+        return turned
+
+    def __matmul__(self, other):
+        product = Factor(self.matrix @ other.matrix)
+        mine, theirs = self.largest, other.largest
+        if mine > 0 and theirs > 0 and mine * theirs < TINY:
+            raise NonFiniteError("coefficients underflow: the spacing is too large; rescale the lengths of the grid")
+        return product
+
+    def __add__(self, other):
+        return Factor(self.matrix + other.matrix)
+
+    def scaled(self, factor):
+        """factor * matrix."""
+        return self if factor == 1 else Factor(self.matrix * factor)
+
+    @cached_property
+    def largest(self):
+        """Largest magnitude of an entry."""
+        return float(np.max(np.abs(self.matrix.data), initial=0.0))
+
+    @cached_property
+    def key(self):
+        """Content: equal factors have equal keys."""
+        m = self.matrix
+        return m.shape, m.indptr.tobytes(), m.indices.tobytes(), m.data.tobytes()
+
+    @cached_property
+    def rows(self):
+        """The record that the kernels read (see kernels/layout.py)."""
+        m = self.matrix
+        row = np.repeat(np.arange(m.shape[0]), np.diff(m.indptr))
+        offset = m.indices - row
+        offsets = np.unique(offset)
+        if offsets.size > MOST_DIAGONALS:
+            offsets = offsets[:0]
+        values = np.zeros((offsets.size, m.shape[0]))
+        spans = np.zeros((2, offsets.size), dtype=np.int64)
+        for d, shift in enumerate(offsets):
+            here = row[offset == shift]
+            values[d, here] = m.data[offset == shift]
+            spans[:, d] = here[0], here[-1] + 1
+        lists = m.indptr.astype(np.int64), m.indices.astype(np.int64), m.data
+        return Rows(m.shape[0], m.shape[1], *lists, offsets.astype(np.int64), spans[0], spans[1], values)
+
+    @cached_property
+    def tridiagonal(self):
+        """The three-point record of the fused kernel, or None when a row reaches further."""
+        n, columns = self.shape
+        m = self.matrix
+        row = np.repeat(np.arange(n), np.diff(m.indptr))
+        if n != columns or not np.all(np.isin((m.indices - row) % max(n, 1), [0, 1, max(n, 1) - 1])):
+            return None
+        bands = np.zeros((3, n))
+        # With one or two cells the neighbours coincide: what is not centre counts as upper, then lower.
+        side = np.select([m.indices == row, m.indices == (row + 1) % max(n, 1)], [1, 2], default=0)
+        bands[side, row] = m.data
+        first, last = _uniform_rows(bands)
+        return Tridiagonal(bands[0], bands[1], bands[2], first, last)
+
+
+def _uniform_rows(bands):
+    """Longest run of rows with identical coefficients, looked for around the middle."""
+    n = bands.shape[1]
+    if n == 0:
+        return 0, 0
+    different = np.flatnonzero(np.any(bands != bands[:, n // 2, None], axis=0))
+    below, above = different[different < n // 2], different[different > n // 2]
+    first = int(below[-1]) + 1 if below.size else 0
+    last = int(above[0]) if above.size else n
+    return (first, last) if last - first > n // 2 else (0, 0)

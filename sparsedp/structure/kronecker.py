@@ -1,0 +1,248 @@
+"""Kronecker: blocks of sums of Kronecker products of 1-D factors. One definition, every form."""
+
+from functools import cached_property, reduce
+from math import prod
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp import kernels
+from sparsedp.structure.base import Structure, compact
+
+__all__ = ["Kronecker", "Term"]
+
+
+class Term(NamedTuple):
+    """scale * (factor of axis 0) x (factor of axis 1) x ...; a factor None is the identity."""
+
+    scale: float
+    factors: tuple[Any, ...]
+
+    @property
+    def axes(self):
+        """Axes whose factor is not the identity."""
+        return tuple(axis for axis, factor in enumerate(self.factors) if factor is not None)
+
+    def transpose(self):
+        return Term(self.scale, tuple(factor and factor.T for factor in self.factors))
+
+    def __matmul__(self, other):
+        pairs = zip(self.factors, other.factors, strict=True)
+        return Term(self.scale * other.scale, tuple(_product(a, b) for a, b in pairs))
+
+
+def _product(a, b):
+    return b if a is None else a if b is None else a @ b
+
+
+class Kronecker(Structure):
+    """A matrix of blocks, one for each pair (component of the result, component of the field).
+
+    Parameters
+    ----------
+    out_parts, in_parts : tuples of shapes
+        Shapes of the components, all of one dimension.
+    blocks : dict
+        (row, column) -> tuple of Terms; a missing pair is a zero block.
+    """
+
+    def __init__(self, out_parts, in_parts, blocks):
+        self.out_parts = tuple(out_parts)
+        self.in_parts = tuple(in_parts)
+        merged = {key: _merge(terms) for key, terms in blocks.items()}
+        self.blocks = {key: terms for key, terms in sorted(merged.items()) if terms}
+        self.shape = (sum(map(prod, self.out_parts)), sum(map(prod, self.in_parts)))
+
+    @classmethod
+    def identity(cls, parts):
+        """The identity on components of the given shapes."""
+        term = (Term(1.0, (None,) * len(parts[0])),)
+        return cls(parts, parts, {(c, c): term for c in range(len(parts))})
+
+    @property
+    def is_identity(self):  # type: ignore[override]
+        """Whether this is the identity, exactly."""
+        count = len(self.out_parts)
+        one = {(c, c): (Term(1.0, (None,) * len(self.out_parts[0])),) for c in range(count)}
+        return self.out_parts == self.in_parts and self.blocks == one
+
+    @cached_property
+    def separable(self):
+        """Whether it is a Kronecker sum on one component: one factor along one axis in each term."""
+        one = len(self.out_parts) == len(self.in_parts) == 1 and self.out_parts == self.in_parts
+        return one and all(len(term.axes) <= 1 for term in self.blocks.get((0, 0), ()))
+
+    # ------------------------------------------------------------ algebra
+
+    def transpose(self):
+        turned = {(c, r): tuple(term.transpose() for term in terms) for (r, c), terms in self.blocks.items()}
+        return Kronecker(self.in_parts, self.out_parts, turned)
+
+    def scaled(self, factor):
+        if np.iscomplexobj(factor):
+            return super().scaled(factor)
+        scale = {
+            key: tuple(Term(factor * term.scale, term.factors) for term in terms) for key, terms in self.blocks.items()
+        }
+        return Kronecker(self.out_parts, self.in_parts, scale)
+
+    def composed(self, other):
+        """self @ other, both Kronecker with matching components."""
+        blocks: dict = {}
+        for (r, k), mine in self.blocks.items():
+            for (j, c), theirs in other.blocks.items():
+                if k == j:
+                    products = tuple(a @ b for a in mine for b in theirs)
+                    blocks[r, c] = blocks.get((r, c), ()) + products
+        return Kronecker(self.out_parts, other.in_parts, blocks)
+
+    def added(self, other):
+        """self + other, both Kronecker with the same components."""
+        blocks = dict(self.blocks)
+        for key, terms in other.blocks.items():
+            blocks[key] = blocks.get(key, ()) + terms
+        return Kronecker(self.out_parts, self.in_parts, blocks)
+
+    # ------------------------------------------------------------ forms
+
+    def explicit(self):
+        if not self.blocks:
+            return compact(sp.csr_array(self.shape))
+        grid = [[None] * len(self.in_parts) for _ in self.out_parts]
+        for r, out_part in enumerate(self.out_parts):
+            for c, in_part in enumerate(self.in_parts):
+                terms = self.blocks.get((r, c), ())
+                grid[r][c] = _block(terms, out_part, in_part)
+        return compact(sp.block_array(grid, format="csr"))
+
+    def apply(self, x, out):
+        if x.dtype.itemsize in (4, 8) and x.dtype.char in "fF" and not self._single_pass:
+            # Several passes would round after each; work in double and round once.
+            wide = np.empty(out.shape, np.result_type(out.dtype, np.float64))
+            self._run(x.astype(wide.dtype), wide)
+            np.copyto(out, wide, casting="same_kind")
+        else:
+            self._run(x, out)
+
+    def _run(self, x, out):
+        inputs = _components(x, self.in_parts)
+        for row, target in enumerate(_components(out, self.out_parts)):
+            steps = self._plan[row]
+            if not steps:
+                target[...] = 0
+            for number, step in enumerate(steps):
+                step(inputs[step.column], target, number > 0)
+
+    @cached_property
+    def _single_pass(self):
+        return all(len(steps) <= 1 and not any(step.several for step in steps) for steps in self._plan)
+
+    @cached_property
+    def _plan(self):
+        """For each component of the result, the passes that add up to it."""
+        plans: list[list] = [[] for _ in self.out_parts]
+        for (r, c), terms in self.blocks.items():
+            three = [t for t in terms if len(t.axes) <= 1 and all(t.factors[a].tridiagonal for a in t.axes)]
+            if three and self.out_parts[r] == self.in_parts[c] and (len(three) > 1 or not three[0].axes):
+                plans[r].append(FusedPass(c, self.in_parts[c], three))
+                terms = [t for t in terms if not any(t is u for u in three)]
+            plans[r] += [TermPass(c, term, self.in_parts[c]) for term in terms]
+        return plans
+
+
+class FusedPass:
+    """All three-point terms of a block in one pass over memory."""
+
+    several = False
+
+    def __init__(self, column, shape, terms):
+        self.column = column
+        self.view = (1,) * (3 - len(shape)) + shape
+        self.shift = sum(term.scale for term in terms if not term.axes)
+        axes: list[Any] = [None] * 3
+        for term in terms:
+            for axis in term.axes:
+                axes[axis + 3 - len(shape)] = term.factors[axis].scaled(term.scale).tridiagonal
+        self.axes = tuple(axes)
+
+    def __call__(self, u, out, accumulate):
+        u, target = u.reshape(self.view), out.reshape(self.view)
+        if accumulate:
+            target = np.empty_like(target)
+        kernels.kronecker_sum(u, target, self.axes, self.shift)
+        if accumulate:
+            out += target.reshape(out.shape)
+
+
+class TermPass:
+    """One term: its factors one axis after the other, the last one into the result."""
+
+    def __init__(self, column, term, shape):
+        self.column = column
+        self.scale = term.scale
+        self.steps = []
+        for axis in term.axes:
+            rows = term.factors[axis].rows
+            before, after = prod(shape[:axis]), prod(shape[axis + 1 :])
+            shape = shape[:axis] + (rows.rows,) + shape[axis + 1 :]
+            self.steps.append((rows, (before, rows.cols, after), (before, rows.rows, after)))
+        self.several = len(self.steps) > 1
+
+    def __call__(self, u, out, accumulate):
+        if not self.steps:
+            np.add(out, self.scale * u, out=out) if accumulate else np.multiply(u, self.scale, out=out)
+            return
+        for rows, before, after in self.steps[:-1]:
+            step = np.empty(after, u.dtype)
+            kernels.along_axis(u.reshape(before), step, rows, 1.0, False)
+            u = step
+        rows, before, after = self.steps[-1]
+        kernels.along_axis(u.reshape(before), out.reshape(after), rows, self.scale, accumulate)
+
+
+def _components(flat, parts):
+    found, start = [], 0
+    for part in parts:
+        found.append(flat[start : start + prod(part)].reshape(part))
+        start += prod(part)
+    return found
+
+
+def _block(terms, out_part, in_part):
+    if not terms or not prod(out_part) or not prod(in_part):
+        return sp.csr_array((prod(out_part), prod(in_part)))
+    return reduce(lambda a, b: a + b, (_product_matrix(term, in_part) for term in terms))
+
+
+def _product_matrix(term, in_part):
+    sides = [
+        sp.eye_array(n, format="csr") if factor is None else factor.matrix
+        for factor, n in zip(term.factors, in_part, strict=True)
+    ]
+    return term.scale * reduce(lambda a, b: sp.kron(a, b, format="csr"), sides)
+
+
+def _merge(terms):
+    """Add up terms that differ in one axis only where that is exact: one term for each axis."""
+    merged: dict = {}
+    for term in terms:
+        single = len(term.axes) == 1
+        key = term.axes if single else tuple(factor and factor.key for factor in term.factors)
+        if key not in merged:
+            merged[key] = term
+        elif single:
+            merged[key] = _sum_on_axis(merged[key], term)
+        else:
+            merged[key] = Term(merged[key].scale + term.scale, term.factors)
+    return tuple(term for term in merged.values() if not _is_zero(term))
+
+
+def _sum_on_axis(one, other):
+    (axis,) = one.axes
+    total = one.factors[axis].scaled(one.scale) + other.factors[axis].scaled(other.scale)
+    return Term(1.0, tuple(total if a == axis else None for a in range(len(one.factors))))
+
+
+def _is_zero(term):
+    return term.scale == 0 or any(f is not None and f.matrix.nnz == 0 for f in term.factors)

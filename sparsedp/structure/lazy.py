@@ -1,0 +1,145 @@
+"""Lazy structures: diagonals, products, sums and functions. Nothing is multiplied out before it is needed."""
+
+from functools import reduce
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.structure.base import Structure, compact, result_dtype
+
+__all__ = ["Chain", "Diagonal", "Functions", "Mask", "Sum"]
+
+
+class Diagonal(Structure):
+    """Multiplication by one number for each entry."""
+
+    def __init__(self, values):
+        values = np.array(values).reshape(-1)
+        self.values = values.astype(complex if values.dtype.kind == "c" else float)
+        self.values.flags.writeable = False
+        self.shape = (values.size, values.size)
+        self.dtype = self.values.dtype
+
+    def apply(self, x, out):
+        np.multiply(x, self.values, out=out, casting="same_kind")
+
+    def transpose(self):
+        return self
+
+    def explicit(self):
+        return compact(sp.diags_array(self.values, format="csr"))
+
+    def scaled(self, factor):
+        return Diagonal(self.values * factor)
+
+
+class Mask(Diagonal):
+    """Zero outside `keep`, exactly: what is masked out may be NaN."""
+
+    def __init__(self, keep):
+        self.keep = np.array(keep, dtype=bool).reshape(-1)
+        super().__init__(self.keep)
+
+    def apply(self, x, out):
+        out.fill(0)
+        np.copyto(out, x, where=self.keep)
+
+    def explicit(self):
+        kept = np.flatnonzero(self.keep)
+        return compact(sp.coo_array((np.ones(kept.size), (kept, kept)), shape=self.shape))
+
+
+class Chain(Structure):
+    """A product of structures, applied from right to left."""
+
+    def __init__(self, members):
+        self.members = tuple(members)
+        self.shape = (members[0].shape[0], members[-1].shape[1])
+        self.dtype = np.result_type(*(member.dtype for member in members))
+        self.has_entries = all(member.has_entries for member in members)
+
+    def apply(self, x, out):
+        single = x.dtype.char in "fF"
+        x = x.astype(np.result_type(x.dtype, np.float64)) if single else x
+        for member in self.members[:0:-1]:
+            x = member.product(x)
+        if single:  # intermediate results in double, one rounding at the end
+            np.copyto(out, self.members[0].product(x), casting="same_kind")
+        else:
+            self.members[0].apply(x, out)
+
+    def transpose(self):
+        return Chain([member.transpose() for member in reversed(self.members)])
+
+    def explicit(self):
+        return compact(reduce(lambda a, b: a @ b, (member.explicit() for member in self.members)))
+
+    def scaled(self, factor):
+        return Chain([self.members[0].scaled(factor), *self.members[1:]])
+
+    def tangent(self):
+        tangents = [member.tangent() for member in self.members]
+        same = all(a is b for a, b in zip(tangents, self.members, strict=True))
+        return self if same else Chain(tangents)
+
+
+class Sum(Structure):
+    """A sum of structures."""
+
+    def __init__(self, members):
+        self.members = tuple(members)
+        self.shape = members[0].shape
+        self.dtype = np.result_type(*(member.dtype for member in members))
+        self.has_entries = all(member.has_entries for member in members)
+
+    def apply(self, x, out):
+        if x.dtype.char in "fF":
+            x = x.astype(np.result_type(x.dtype, np.float64))
+            np.copyto(out, reduce(np.add, (member.product(x) for member in self.members)), casting="same_kind")
+            return
+        first, *rest = self.members
+        np.copyto(out, first.product(x)) if result_dtype(first, x.dtype) != out.dtype else first.apply(x, out)
+        for member in rest:
+            out += member.product(x)
+
+    def transpose(self):
+        return Sum([member.transpose() for member in self.members])
+
+    def explicit(self):
+        return compact(reduce(lambda a, b: a + b, (member.explicit() for member in self.members)))
+
+    def scaled(self, factor):
+        return Sum([member.scaled(factor) for member in self.members])
+
+    def tangent(self):
+        tangents = [member.tangent() for member in self.members]
+        same = all(a is b for a, b in zip(tangents, self.members, strict=True))
+        return self if same else Sum(tangents)
+
+
+class Functions(Structure):
+    """A linear map given by two functions on fields: the product and the transposed product."""
+
+    has_entries = False
+
+    def __init__(self, forward, backward, domain, codomain, dtype=float):
+        self.forward, self.backward = forward, backward
+        self.domain, self.codomain = domain, codomain  # shapes of the fields
+        self.shape = (int(np.prod(codomain)), int(np.prod(domain)))
+        self.dtype = np.dtype(dtype)
+
+    def apply(self, x, out):
+        if self.forward is None:
+            raise DerivativeError("this operator has no transpose; give from_functions its second function")
+        y = np.asarray(self.forward(x.reshape(self.domain)))
+        if y.shape != self.codomain:
+            raise ShapeError(f"the function must return an array of shape {self.codomain}, got {y.shape}")
+        if y.dtype.kind == "c" and out.dtype.kind != "c":
+            raise DerivativeError(
+                "the function returned complex values for a real field; give its operator dtype=complex"
+            )
+        np.copyto(out, y.reshape(-1), casting="same_kind")
+
+    def transpose(self):
+        return Functions(self.backward, self.forward, self.codomain, self.domain, self.dtype)

@@ -1,0 +1,297 @@
+"""The tape: rules with hand-written derivatives, and the traces that run through them.
+
+This is the only file that talks to autograd's extension interface. A `Rule` is an ordinary
+object. All rules go through one primitive (`_call`), all Operators through a second, lighter one
+(`apply_operator`). A primitive for each rule would stay in autograd's tables for ever.
+
+For complex fields, as in autograd, the cotangent is g = dL/dRe(y) - i dL/dIm(y): then the VJP of
+y = A x is the plain transpose A^T g.
+"""
+
+import inspect
+
+import autograd.numpy as anp
+import numpy as np
+from autograd.core import JVPNode, VJPNode, add_outgrads
+from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
+from autograd.tracer import getval, isbox, new_box, toposort, trace_stack
+
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.ledger import active, count
+from sparsedp.tree import flatten, leaves
+
+__all__ = [
+    "Rule",
+    "apply_operator",
+    "backward",
+    "cast",
+    "differentiable",
+    "dtype_of",
+    "fit",
+    "forward_root",
+    "is_variable",
+    "isbox",
+    "linear",
+    "plain",
+    "reverse_root",
+    "split_box",
+    "trace",
+]
+
+plain = getval  # the value below all boxes
+
+
+def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
+    """Function + hand-written derivatives -> Rule that autograd can differentiate.
+
+    Parameters
+    ----------
+    name : str
+        Appears in errors and in the counts.
+    forward : callable
+        ``forward(*args) -> ans`` on plain values; `ans` is an array or a float.
+    vjp : callable, optional
+        ``vjp(nums, ans, *args) -> pull`` with ``pull(g) -> tuple``, one cotangent for each argument
+        position in `nums`, in that order. Called once for all requested arguments.
+    jvp : callable, optional
+        ``jvp(nums, tangents, ans, *args) -> tangent of ans``.
+    keywords : tuple of str
+        Names of trailing arguments of `forward` that a caller may pass by keyword. They are moved
+        into their positions before tracing, because the tracer does not see keywords.
+
+    Returns
+    -------
+    Rule
+        Call it like `forward`. `vjp` and `jvp` must use `ans`, `args` and `g` only through other
+        rules, Operators or autograd.numpy: then derivatives of every order follow.
+
+    Raises
+    ------
+    DerivativeError
+        When a rule is called with a traced value in a place that cannot be differentiated, has no
+        derivative, or returns a cotangent of the wrong number, shape or dtype.
+
+    Examples
+    --------
+    >>> cube = differentiable("cube", lambda x: x**3, lambda nums, ans, x: lambda g: (3 * x**2 * g,))
+    >>> from sparsedp.derivative import value_and_grad
+    >>> value_and_grad(cube)(2.0)
+    (8.0, 12.0)
+    """
+    return Rule(name, forward, vjp, jvp, tuple(keywords))
+
+
+class Rule:
+    """A function with hand-written derivatives. Made by `differentiable`."""
+
+    __slots__ = ("_signature", "forward", "jvp", "keywords", "name", "vjp")
+
+    def __init__(self, name, forward, vjp, jvp, keywords):
+        self.name = name
+        self.forward = forward
+        self.vjp = vjp
+        self.jvp = jvp
+        self.keywords = keywords
+        self._signature = inspect.signature(forward)
+
+    def __call__(self, *args, **options):
+        if self.keywords or options:
+            args = self._positional(args, options)
+        return _call(self, *args)
+
+    def _positional(self, args, options):
+        for key in options:
+            if key not in self.keywords:
+                raise DerivativeError(f"{self.name} takes no keyword {key!r}; pass the value by position")
+        bound = self._signature.bind(*args, **options)
+        bound.apply_defaults()
+        return bound.args
+
+    def __repr__(self):
+        return f"<rule {self.name}>"
+
+
+@primitive
+def _call(rule, *args):
+    for arg in args:
+        if isinstance(arg, (tuple, list, dict)) and any(map(isbox, leaves(arg))):
+            raise DerivativeError(
+                f"{rule.name} got a traced value inside a {type(arg).__name__}; pass it as an argument"
+            )
+    if active:
+        count(rule.name, "forward")
+    return rule.forward(*args)
+
+
+def _call_vjp(argnums, ans, args, kwargs):
+    rule, values = args[0], args[1:]
+    if rule.vjp is None:
+        raise DerivativeError(f"{rule.name} has no VJP; give differentiable(...) a vjp")
+    nums = tuple(num - 1 for num in argnums)
+    pull = rule.vjp(nums, ans, *values)
+
+    def checked_pull(g):
+        if active:
+            count(rule.name, "vjp")
+        return _checked(rule.name, [values[num] for num in nums], pull(g), g)
+
+    return checked_pull
+
+
+def _call_jvp(argnums, tangents, ans, args, kwargs):
+    rule = args[0]
+    if rule.jvp is None:
+        raise DerivativeError(f"{rule.name} has no JVP; give differentiable(...) a jvp")
+    if active:
+        count(rule.name, "jvp")
+    nums = tuple(num - 1 for num in argnums)
+    (tangent,) = _checked(rule.name, [ans], (rule.jvp(nums, tangents, ans, *args[1:]),), tangents[0])
+    return tangent
+
+
+defvjp_argnums(_call, _call_vjp)
+defjvp_argnums(_call, _call_jvp)
+
+
+def _checked(name, values, cotangents, g):
+    """A wrong count, shape or kind of derivative is accepted silently by autograd; not here."""
+    if not isinstance(cotangents, (tuple, list)) or len(cotangents) != len(values):
+        raise DerivativeError(f"{name} must return one derivative for each of the {len(values)} values asked for")
+    return tuple(fit(name, value, back, g) for value, back in zip(values, cotangents, strict=True))
+
+
+def fit(name, value, cotangent, g):
+    """Check a derivative of `value` that was computed from `g`, and give it the dtype of `value`."""
+    shape, wanted = np.shape(plain(cotangent)), np.shape(plain(value))
+    if shape != wanted:
+        raise ShapeError(f"{name} returned a derivative of shape {shape} where {wanted} is needed")
+    kind, precise = dtype_of(cotangent), dtype_of(value)
+    if kind == precise:
+        return cotangent
+    if kind.kind == "c" != precise.kind:
+        raise DerivativeError(f"{name} returned a complex derivative of a real value; take its real part")
+    if kind.kind not in "fc" or np.finfo(kind).eps > max(np.finfo(dtype_of(x)).eps for x in (value, g)):
+        raise DerivativeError(f"{name} returned a derivative of dtype {kind} where {precise} is needed")
+    return cast(cotangent, precise)
+
+
+def dtype_of(value):
+    value = plain(value)
+    return value.dtype if isinstance(value, (np.ndarray, np.generic)) else np.asarray(value).dtype
+
+
+def cast(g, dtype):
+    """Array or traced array -> the same numbers in `dtype` (real part if `dtype` is real)."""
+    if dtype_of(g).kind == "c" and np.dtype(dtype).kind == "f":
+        g = anp.real(g)
+    return g if dtype_of(g) == dtype else anp._astype(g, dtype) if isbox(g) else np.asarray(g, dtype)
+
+
+def linear(name, forward, transpose):
+    """Linear function + its transpose -> the two rules, each the derivative of the other.
+
+    Parameters
+    ----------
+    name : str
+    forward : callable
+        ``forward(x)``, linear, on plain arrays.
+    transpose : callable
+        ``transpose(g)``, with sum(g * forward(x)) == sum(transpose(g) * x).
+
+    Returns
+    -------
+    (Rule, Rule)
+
+    Examples
+    --------
+    >>> double, _ = linear("double", lambda x: 2 * x, lambda g: 2 * g)
+    >>> double(4.0)
+    8.0
+    """
+    there = Rule(name, forward, None, None, ())
+    back = Rule(f"{name}.T", transpose, None, None, ())
+    _set_linear(there, back)
+    _set_linear(back, there)
+    return there, back
+
+
+def _set_linear(rule, transposed):
+    rule.vjp = lambda nums, ans, x: lambda g: (transposed(g),)
+    rule.jvp = lambda nums, tangents, ans, x: rule(tangents[0])
+
+
+@primitive
+def apply_operator(op, u):
+    """The second primitive: a field through an Operator. Half the cost of a general rule."""
+    if active:
+        count(op.name, "forward")
+    return op.apply(u)
+
+
+def _operator_vjp(argnums, ans, args, kwargs):
+    op, u = args
+    dtype = u.dtype
+
+    def pull(g):
+        if active:
+            count(op.name, "vjp")
+        back = apply_operator(op.T, g) if isbox(g) else op.T.apply(g)
+        return (back if back.dtype == dtype else cast(back, dtype),)
+
+    return pull
+
+
+def _operator_jvp(argnums, tangents, ans, args, kwargs):
+    op = args[0]
+    if active:
+        count(op.name, "jvp")
+    tangent = tangents[0]
+    return apply_operator(op.tangent, tangent) if isbox(tangent) else op.tangent.apply(tangent)
+
+
+defvjp_argnums(apply_operator, _operator_vjp)
+defjvp_argnums(apply_operator, _operator_jvp)
+
+
+def is_variable(leaf):
+    """Whether a leaf can carry a derivative: a floating number or array, or a traced one."""
+    kind = getattr(getattr(leaf, "dtype", None), "kind", None)
+    return isbox(leaf) or isinstance(leaf, (float, complex)) or kind in ("f", "c")
+
+
+def trace(fun, tree, roots):
+    """Run fun(tree) with one box for every root; return the tree of results and the trace number."""
+    found, rebuild = flatten(tree)
+    top = trace_stack.top
+    try:
+        with trace_stack.new_trace() as number:
+            boxed = [
+                leaf if root is None else new_box(leaf, number, root) for leaf, root in zip(found, roots, strict=True)
+            ]
+            result = fun(rebuild(boxed))
+    finally:
+        trace_stack.top = top  # autograd forgets this when `fun` raises
+    return result, number
+
+
+def split_box(value, number):
+    """The value below the box of this trace, and its node (None when it does not depend on x)."""
+    if isbox(value) and value._trace == number:
+        return value._value, value._node
+    return value, None
+
+
+def backward(end, g):
+    """Accumulate cotangents from the node `end` to the roots; return {root: cotangent}."""
+    cotangents, found = {end: (g, False)}, {}
+    for node in toposort(end):
+        g = cotangents.pop(node)[0]
+        if not node.parents:
+            found[node] = g
+        for parent, back in zip(node.parents, node.vjp(g), strict=True):
+            cotangents[parent] = add_outgrads(cotangents.get(parent), back)
+    return found
+
+
+reverse_root = VJPNode.new_root  # a fresh start of a reverse-mode trace
+forward_root = JVPNode.new_root  # a fresh start of a forward-mode trace, with its tangent

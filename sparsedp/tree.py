@@ -1,0 +1,80 @@
+"""Nested containers of arrays: taken apart into leaves, and put together again.
+
+A tree is any nesting of tuples (named ones too), lists and dicts. Everything else is a leaf.
+Dict entries keep their order.
+"""
+
+__all__ = ["flatten", "leaves"]
+
+
+def flatten(tree):
+    """Tree -> (list of leaves, function that builds the same tree from other leaves).
+
+    Parameters
+    ----------
+    tree : any nesting of tuple, list and dict
+
+    Returns
+    -------
+    found : list
+        The leaves, from left to right.
+    rebuild : callable
+        ``rebuild(found)`` is equal to ``tree``; it takes any iterable of as many leaves.
+
+    Examples
+    --------
+    >>> found, rebuild = flatten({"a": (1.0, 2.0), "b": None})
+    >>> found
+    [1.0, 2.0, None]
+    >>> rebuild([3.0, 4.0, 5.0])
+    {'a': (3.0, 4.0), 'b': 5.0}
+    """
+    found: list = []
+    _collect(tree, found)
+
+    def rebuild(values):
+        return _build(tree, iter(values))
+
+    return found, rebuild
+
+
+def leaves(tree):
+    """Tree -> list of its leaves, from left to right.
+
+    Parameters
+    ----------
+    tree : any nesting of tuple, list and dict
+
+    Returns
+    -------
+    list
+
+    Examples
+    --------
+    >>> leaves([1, (2, {"x": 3})])
+    [1, 2, 3]
+    """
+    found: list = []
+    _collect(tree, found)
+    return found
+
+
+def _collect(tree, found):
+    if isinstance(tree, (tuple, list)):
+        for branch in tree:
+            _collect(branch, found)
+    elif isinstance(tree, dict):
+        for branch in tree.values():
+            _collect(branch, found)
+    else:
+        found.append(tree)
+
+
+def _build(tree, values):
+    if isinstance(tree, dict):
+        return type(tree)((key, _build(branch, values)) for key, branch in tree.items())
+    if isinstance(tree, tuple) and hasattr(tree, "_fields"):
+        return type(tree)(*(_build(branch, values) for branch in tree))
+    if isinstance(tree, (tuple, list)):
+        return type(tree)(_build(branch, values) for branch in tree)
+    return next(values)

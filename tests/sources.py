@@ -1,0 +1,114 @@
+"""The package as text: its modules, what they import, what they define. Nothing is executed."""
+
+import ast
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "sparsedp"
+FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
+LOADERS = ("import_module", "__import__", "find_spec")
+
+
+@dataclass(frozen=True, eq=False)
+class Module:
+    """One file of the package."""
+
+    path: Path
+    text: str
+    tree: ast.Module
+
+    @property
+    def place(self):
+        """Path inside the package, such as "solvers/multigrid.py"."""
+        return self.path.relative_to(PACKAGE).as_posix()
+
+    @property
+    def name(self):
+        """Dotted name, such as "sparsedp.solvers.multigrid"."""
+        parts = self.path.relative_to(ROOT).with_suffix("").parts
+        return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+    @property
+    def package(self):
+        """Dotted name of the folder that holds the file."""
+        return ".".join(self.path.parent.relative_to(ROOT).parts)
+
+    def nodes(self, kind):
+        return [node for node in ast.walk(self.tree) if isinstance(node, kind)]
+
+
+@cache
+def modules():
+    """All modules of the package, in the order of their paths."""
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        found.append(Module(path, text, ast.parse(text, filename=str(path))))
+    return tuple(found)
+
+
+def names():
+    """Dotted names of all modules and folders of modules."""
+    return {module.name for module in modules()} | {module.package for module in modules()}
+
+
+def resolve(package, node):
+    """Absolute name of what an ImportFrom node imports from."""
+    if not node.level:
+        return node.module
+    base = package.split(".")[: len(package.split(".")) - node.level + 1]
+    return ".".join([*base, *([node.module] if node.module else [])])
+
+
+def called(node):
+    """Last name of what a Call node calls: "f" for f(x) and for a.f(x)."""
+    return getattr(node.func, "id", None) or getattr(node.func, "attr", None)
+
+
+def imports(module):
+    """Pairs (absolute dotted name, line) of all a module imports, at its top or inside functions.
+
+    ``from a import b`` counts as ``a.b``, except that a name of our own package that is no module
+    counts as the module it is taken from.
+    """
+    ours, found = names(), []
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, node.lineno) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            source = resolve(module.package, node)
+            for full in (f"{source}.{alias.name}" for alias in node.names):
+                found.append((full if full in ours or not within(source, "sparsedp") else source, node.lineno))
+        elif isinstance(node, ast.Call) and called(node) in LOADERS and node.args:
+            target = node.args[0]
+            if isinstance(target, ast.Constant) and isinstance(target.value, str):
+                name = target.value
+                found.append((f"{module.package}.{name.lstrip('.')}" if name.startswith(".") else name, node.lineno))
+    return found
+
+
+def within(name, prefix):
+    """True when a dotted name is the prefix or lies under it."""
+    return name == prefix or name.startswith(prefix + ".")
+
+
+def definitions(module):
+    """Public functions and classes at the top level of a module."""
+    return [n for n in module.tree.body if isinstance(n, (*FUNCTION, ast.ClassDef)) and not n.name.startswith("_")]
+
+
+def exported(module):
+    """Names in ``__all__`` when the module has one written out, else its public definitions."""
+    for node in module.tree.body:
+        if isinstance(node, ast.Assign) and any(getattr(t, "id", None) == "__all__" for t in node.targets):
+            if isinstance(node.value, (ast.List, ast.Tuple)):
+                return [ast.literal_eval(item) for item in node.value.elts]
+    return [node.name for node in definitions(module)]
+
+
+def body_length(function):
+    """Lines from the first statement after the docstring to the last one."""
+    body = function.body[1:] if ast.get_docstring(function) is not None else function.body
+    return body[-1].end_lineno - body[0].lineno + 1 if body else 0

@@ -1,0 +1,245 @@
+"""Checks of operators catch planted bugs and let right operators pass: transpose, twin, card, order."""
+
+import json
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+import sparsedp as dp
+from sparsedp.operator import Operator
+from sparsedp.structure.base import Structure
+
+GRID = dp.Grid((6, 5), spacing=[np.linspace(1.0, 2.0, 6), 0.3])
+CELLS = GRID.cells
+
+
+def shift(u):
+    return np.roll(u, 1, 0)
+
+
+def back(g):
+    return np.roll(g, -1, 0)
+
+
+def given(forward, transpose, name="foreign", codomain=CELLS):
+    return dp.from_functions(forward, transpose, CELLS, codomain, name=name)
+
+
+def right_operators():
+    entries = sp.random_array((5, 7), density=0.4, rng=1)
+    return {
+        "gradient": dp.gradient(GRID, dp.dirichlet),
+        "laplacian": dp.laplacian(GRID, dp.robin(1, 2)),
+        "chain": dp.interior(GRID) @ dp.gradient(GRID),
+        "sum": dp.laplacian(GRID) + 2 * dp.mask(CELLS, np.arange(30).reshape(6, 5) % 3 == 0),
+        "cancelling": dp.divergence(GRID) @ dp.curl(GRID),
+        "matrix": dp.from_matrix(entries),
+        "complex matrix": dp.from_matrix(entries * (1 + 2j)),
+        "complex factor": 2j * dp.laplacian(GRID),
+        "functions": given(shift, back),
+        "large": 2.0**600 * dp.laplacian(GRID),
+        "small": 2.0**-600 * dp.laplacian(GRID),
+        "zero": 0 * dp.laplacian(GRID),
+        "one cell": dp.gradient(dp.Grid(1)),
+        "no cells": dp.gradient(dp.Grid((0, 3))),
+    }
+
+
+RIGHT = right_operators()
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_right_operators_pass(name):
+    card = dp.check.operator(RIGHT[name])
+    assert card.ok, card
+    assert card.worst <= 10
+    assert dp.check.transpose(RIGHT[name])
+    assert dp.check.twin(RIGHT[name]).verdict == "agrees"
+
+
+def test_a_new_operator_in_five_lines():
+    weights = np.array([[0.5, 0.5, 0.0], [0.0, 0.5, 0.5]])
+    sensor = dp.from_matrix(weights, 3, 2, name="sensor")
+    blur = dp.from_functions(lambda u: u + shift(u), lambda g: g + back(g), CELLS, CELLS, name="blur")
+    assert dp.check.operator(sensor)
+    assert dp.check.operator(blur)
+
+
+def test_the_card_as_text_and_data():
+    card = dp.check.operator(RIGHT["gradient"])
+    text = str(card)
+    for word in ("gradient: cells(6, 5) -> faces(6, 5): agrees", "explicit", "120 entries", "second order"):
+        assert word in text
+    assert card.nnz == 120
+    assert card.failed == ()
+    assert json.loads(json.dumps(card.to_dict()))["domain"] == "cells(6, 5)"
+    assert {"linearity, float64", "JVP, float64", "VJP, float64", "dtypes"} <= {row.name for row in card.rows}
+    assert repr(card) == text
+
+
+def mutating(u):
+    u *= 2
+    return u
+
+
+class Reused:
+    """A function that hands out the same array again and again."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, u):
+        self.calls += 1
+        return u * (1 + 1e-3 * self.calls)
+
+
+MISTAKES = {
+    "A for the transpose": (given(shift, shift), {"transpose, float64", "VJP, float64", "second order"}),
+    "one sign": (given(lambda u: u - shift(u), lambda g: g + back(g)), {"transpose, float64"}),
+    "0.1 % in the transpose": (given(shift, lambda g: 1.001 * back(g)), {"transpose, float64", "VJP, float64"}),
+    "one entry of the transpose": (
+        given(lambda u: 3.0 * u, lambda g: g * (3.0 + 1e-9 * (np.arange(30).reshape(6, 5) == 7))),
+        {"transpose, float64", "twin, transpose, entry by entry"},
+    ),
+    "no transpose": (given(shift, None), {"transpose, float64", "twin, transposed"}),
+    "affine": (given(lambda u: u + 1, lambda g: g), {"linearity, float64"}),
+    "quadratic": (given(lambda u: u * np.abs(u), lambda g: g), {"linearity, float64", "twin, forward, float64"}),
+    "input modified": (given(mutating, lambda g: 2 * g), {"input unmodified, result fresh"}),
+    "with a state": (given(Reused(), lambda g: g), {"same bits twice"}),
+    "imaginary part dropped": (
+        given(lambda u: np.real(u) + 0 * u, lambda g: np.real(g) + 1j * np.imag(g) if np.iscomplexobj(g) else g),
+        {"transpose, complex128"},
+    ),
+    "single precision inside": (
+        given(lambda u: shift(u).astype(np.complex64 if np.iscomplexobj(u) else np.float32), back),
+        {"transpose, float64", "twin, forward, float64"},
+    ),
+    "complex for real": (given(lambda u: 1j * u, lambda g: 1j * g), {"application"}),
+    "wrong shape": (given(shift, back, codomain=(7,)), {"application"}),
+    "NaN": (given(lambda u: u * np.nan, lambda g: g), {"linearity, float64", "transpose, float64"}),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_planted_mistakes_are_named(name):
+    op, rows = MISTAKES[name]
+    card = dp.check.operator(op)
+    assert card.verdict == "disagrees"
+    assert not card
+    assert rows <= set(card.failed), card
+    assert all(f"{row}" in line and "FAILS" in line for row in rows for line in [_line(card, row)])
+
+
+def _line(card, row):
+    return next(line for line in str(card).splitlines() if line.strip().startswith(row))
+
+
+class Torn(Structure):
+    """Factor-like: a matrix, and an application that forgets the 1 / h of the last row."""
+
+    def __init__(self, matrix, factor, transposed=False):
+        self.matrix, self.factor, self.transposed = sp.csr_array(matrix), factor, transposed
+        self.shape = self.matrix.shape
+
+    def apply(self, x, out):
+        out[...] = self.matrix @ x
+        if not self.transposed:
+            out[-1] *= self.factor
+
+    def explicit(self):
+        return self.matrix.astype(float)
+
+    def transpose(self):
+        return Torn(self.matrix.T, self.factor, not self.transposed)
+
+
+def test_twins_that_differ():
+    op = Operator(Torn(np.eye(4) * 3.0, 1 + 1e-10), dp.Space(4), dp.Space(4), "torn", "matrix-free")
+    result = dp.check.twin(op)
+    assert result.verdict == "disagrees"
+    assert "forward, float64" in result.failed
+    assert not dp.check.transpose(op)
+
+
+def test_operators_with_one_form_say_so():
+    assert "given as a matrix" in dp.check.twin(RIGHT["matrix"]).rows[0].note
+    assert "compared with its columns" in dp.check.twin(RIGHT["functions"]).rows[0].note
+    large = dp.from_functions(shift, back, 1000, 1000)
+    result = dp.check.twin(large)
+    assert result.verdict == "inconclusive" and not result
+    assert "too large to list its columns" in str(result)
+    assert dp.check.operator(large)  # the other rows still decide
+
+
+def test_real_functions_may_refuse_complex_fields():
+    def triple(u):
+        if np.iscomplexobj(u):
+            raise TypeError("real fields only")
+        return 3 * u
+
+    card = dp.check.operator(given(triple, triple))
+    assert card.ok
+    assert "refused, TypeError: real fields only" in str(card)
+
+
+def test_norms_from_products_are_bounds_from_below():
+    from sparsedp.check.probes import generator, size_of
+
+    op = dp.laplacian(GRID, dp.dirichlet)
+    free = given(op.apply, op.T.apply)
+    exact, bound = size_of(op, generator(None)), size_of(free, generator(None))
+    assert 0.3 * exact <= bound <= exact * (1 + 1e-12)
+    assert size_of(given(op.apply, None), generator(None)) <= exact * (1 + 1e-12)
+
+
+def test_a_check_draws_from_its_own_generator():
+    np.random.seed(5)  # noqa: NPY002
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    one, two = dp.check.transpose(RIGHT["gradient"]), dp.check.transpose(RIGHT["gradient"])
+    assert np.array_equal(before, np.random.get_state()[1])  # noqa: NPY002
+    assert one.to_dict() == two.to_dict()
+    assert dp.check.transpose(RIGHT["gradient"], seeds=2, rng=7).ok
+
+
+def test_an_inverse_is_an_operator_too():
+    grid = dp.Grid((8, 6))
+    for op in (-dp.laplacian(grid, dp.dirichlet), -dp.laplacian(grid)):
+        card = dp.check.operator(dp.inverse(op, "direct"))
+        assert card.ok, card
+
+
+# ---- order ---------------------------------------------------------------------------------------------------------
+
+
+def laplacian_error(n):
+    grid = dp.Grid(n, size=1.0)
+    (x,) = grid.centres()
+    u = np.cos(np.pi * x)
+    return np.max(np.abs(dp.laplacian(grid)(u) + np.pi**2 * u)[2:-2])
+
+
+def test_order_of_the_laplacian():
+    result = dp.check.order(laplacian_error, expected=(1.9, 2.2))
+    assert result.ok and result.verdict == "agrees"
+    assert 1.9 < float(result) < 2.1
+    assert len(result.orders) == 3
+    assert "n" in str(result) and "expected 1.9 to 2.2" in str(result)
+    assert json.loads(json.dumps(result.to_dict()))["sizes"] == [16, 32, 64, 128]
+
+
+def test_order_that_is_wrong_unknown_or_undefined():
+    assert dp.check.order(lambda n: 1 / n, expected=2).verdict == "disagrees"
+    assert dp.check.order(lambda n: n**-2.0).verdict == "inconclusive"
+    zero = dp.check.order(lambda n: 0.0, expected=2)
+    assert zero.verdict == "inconclusive" and not zero
+    assert "an error is 0 or not finite" in zero.reason
+    with pytest.raises(ValueError, match=r"order needs at least three increasing sizes, got \(16, 8, 4\)"):
+        dp.check.order(laplacian_error, sizes=(16, 8, 4))
+
+
+def test_results_are_frozen():
+    with pytest.raises(AttributeError, match="a finding is frozen; rows cannot be set"):
+        dp.check.transpose(RIGHT["gradient"]).rows = ()
+    with pytest.raises(AttributeError, match="a refinement is frozen; errors cannot be set"):
+        dp.check.order(lambda n: 1 / n).errors = ()

@@ -1,0 +1,176 @@
+"""The demo: it recovers what it hid, it leaves its files, and it refuses what it cannot use in one sentence."""
+
+import csv
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from sources import ROOT
+
+import sparsedp as dp
+from sparsedp.__main__ import main
+from sparsedp.report.demo import outputs, scene, study, terrain
+
+PICTURES = importlib.util.find_spec("matplotlib") is not None
+WRITTEN = (*(outputs.PICTURES if PICTURES else ()), *outputs.ARRAYS)
+
+
+def relief(shape=(28, 24)):
+    x, y = np.meshgrid(np.linspace(0, 3, shape[0]), np.linspace(0, 2, shape[1]), indexing="ij")
+    return np.sin(x) * np.cos(2 * y) + 0.3 * x
+
+
+def demo(folder, *arguments, **options):
+    """The command in a process of its own, as a reader types it."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", **options}
+    command = [sys.executable, "-m", "sparsedp", "demo", *map(str, arguments)]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+# ---- a run ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """One small run with the default terrain, shared by the tests that look at it."""
+    folder = tmp_path_factory.mktemp("demo")
+    return folder / "sparsedp-demo", demo(folder, "--size", "24")
+
+
+def test_it_ends_well(finished):
+    folder, done = finished
+    assert done.returncode == 0, done.stderr
+    assert sorted(os.listdir(folder)) == sorted(WRITTEN)
+    assert "jacksboro_fault_dem.npz" in done.stdout if PICTURES else "generated" in done.stdout
+
+
+def test_it_shows_the_gradient_table_and_its_verdict(finished):
+    assert re.search(r"^verdict: agrees", finished[1].stdout, re.MULTILINE)
+
+
+def test_it_prints_a_line_for_each_iteration(finished):
+    lines = re.findall(r"^ +(\d+) +[\d.]+ +[\d.]+ +[\d.]+$", finished[1].stdout, re.MULTILINE)
+    with open(finished[0] / "table.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(lines) == sum(int(row["iterations"]) for row in rows)
+
+
+def test_table(finished):
+    with open(finished[0] / "table.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [int(row["unknowns"]) for row in rows] == [12 * 10, 18 * 15, 24 * 20]
+    for row in rows:
+        assert float(row["error"]) < 0.8
+        assert float(row["gradient_error"]) < 1e-6
+        assert int(row["solves_forward"]) == int(row["solves_adjoint"]) > 0
+        assert int(row["setups"]) * 12 == int(row["solves_forward"])
+    misfits = [float(row["misfit"]) for row in rows]
+    assert misfits[0] > misfits[-1]
+
+
+def test_recovered_field(finished):
+    found = np.load(finished[0] / "recovered.npy", allow_pickle=False)
+    assert found.shape == (24, 20) and np.all(np.isfinite(found))
+
+
+def test_nothing_is_overwritten_unasked(finished):
+    folder, _ = finished
+    before = {name: (folder / name).read_bytes() for name in os.listdir(folder)}
+    again = demo(folder.parent, "--size", "24")
+    assert again.returncode == 2 and again.stdout == ""
+    assert re.fullmatch(r"sparsedp: .* is there already; [^\n]*\n", again.stderr)
+    assert before == {name: (folder / name).read_bytes() for name in os.listdir(folder)}
+
+
+def test_own_field_and_force(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(study, "ITERATIONS", 3)
+    np.save(tmp_path / "ground.npy", relief())
+    arguments = ["demo", "--input", str(tmp_path / "ground.npy"), "--size", "12", "--out", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    first = (tmp_path / "out" / "recovered.npy").read_bytes()
+    assert "your file" in capsys.readouterr().out
+    assert main(arguments) == 2
+    assert main([*arguments, "--force"]) == 0
+    assert (tmp_path / "out" / "recovered.npy").read_bytes() == first  # the same in every run
+
+
+def test_without_matplotlib_and_tqdm(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    monkeypatch.setattr(study, "ITERATIONS", 3)
+    assert main(["demo", "--size", "12", "--out", str(tmp_path)]) == 0
+    assert sorted(os.listdir(tmp_path)) == sorted(outputs.ARRAYS)
+    printed = capsys.readouterr().out
+    assert "a generated terrain" in printed
+    assert "No pictures: pictures need matplotlib" in printed
+
+
+def test_a_wrong_gradient_is_not_a_success(tmp_path, monkeypatch, capsys):
+    class Doubt:
+        verdict, lines = "disagrees", ()
+
+    monkeypatch.setattr(study.Trial, "check_gradient", lambda self, directions: Doubt())
+    monkeypatch.setattr(study.Trial, "row", lambda self, check: dict.fromkeys(KEYS, 0))
+    monkeypatch.setattr(study, "ITERATIONS", 1)
+    assert main(["demo", "--size", "12", "--out", str(tmp_path)]) == 1
+
+
+KEYS = "grid unknowns iterations solves_forward solves_adjoint seconds misfit error".split()
+
+
+# ---- the parts -----------------------------------------------------------------------------------------------------
+
+
+def test_remap_is_the_mean_over_cells():
+    fine, coarse = dp.Grid((24, 16), size=(2.0, 1.0)), dp.Grid((6, 4), size=(2.0, 1.0))
+    u = relief((24, 16))
+    assert np.allclose(terrain.remap(fine, coarse)(u), u.reshape(6, 4, 4, 4).mean(axis=(1, 3)), rtol=1e-13)
+    x, y = fine.centres()
+    a, b = coarse.centres()
+    assert np.allclose(terrain.remap(fine, coarse)(2 * x - y), 2 * a - b, rtol=1e-13)
+    assert np.allclose(terrain.remap(coarse, fine)(2 * a - b), 2 * x - y, rtol=1e-13)
+
+
+def test_generated_terrain_is_the_same_everywhere():
+    one, other = terrain.generated((40, 32)), terrain.generated((40, 32))
+    assert one.shape == (40, 32) and np.array_equal(one, other)
+    assert one.std() > 0.2 * np.abs(one).max()
+
+
+@pytest.mark.parametrize("field", [relief() * 1e300, relief() * 1e-300, relief() + 1e6, np.eye(40)])
+def test_conductivity_has_a_sensible_contrast(tmp_path, field):
+    np.save(tmp_path / "a.npy", field)
+    logk = terrain.hidden_ground(dp.Grid((14, 12)), terrain.load(tmp_path / "a.npy"))
+    assert np.abs(logk).max() <= terrain.STEEPEST * (1 + 1e-12)
+    assert abs(logk.mean()) < 1e-9 and logk.std() > 0.3
+
+
+def test_pumps_inject_the_same_on_every_grid():
+    for n in (12, 24, 48):
+        grid = dp.Grid((n, n), size=1.0)
+        assert np.isclose(np.sum(scene.pump(grid, (0.3, 0.4)) * grid.volumes), 1.0)
+
+
+def test_one_setup_serves_all_wells_forward_and_backward():
+    from sparsedp.ledger import recording
+
+    grid = dp.Grid((8, 8), size=1.0)
+    data = scene.survey(grid, relief((8, 8)))
+    loss = scene.objective(scene.Ground(grid, data.wells, data.sensors), data)
+    with recording() as calls:
+        dp.value_and_grad(loss)(np.zeros((8, 8)))
+    counts = {kind: sum(n for (_, k), n in calls.items() if k == kind) for kind in ("setup", "solve", "adjoint")}
+    assert counts == {"setup": 1, "solve": 12, "adjoint": 12}
+
+
+def test_loss_at_the_truth_is_the_noise():
+    grid = dp.Grid((16, 16), size=1.0)
+    hidden = relief((16, 16))
+    data = scene.survey(grid, hidden)
+    loss = scene.objective(scene.Ground(grid, data.wells, data.sensors), data)
+    chi = 2 * (loss(hidden) - scene.regulariser(grid)(hidden))
+    assert 0.9 < chi < 1.1

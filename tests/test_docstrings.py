@@ -1,0 +1,119 @@
+"""What a public docstring must have, and nothing about style: first line, parameters, result, errors, an example."""
+
+import ast
+import inspect
+import re
+import textwrap
+
+import pytest
+from sources import FUNCTION, modules
+
+import sparsedp
+
+SECTION = r"(?m)^\s*(?:{numpydoc})\s*\n\s*-{{3,}}\s*$|^\s*{short}\s*:"
+
+
+def has(doc, numpydoc, short):
+    """True when the docstring has a numpydoc section, or a line that starts with the short form and a colon."""
+    return re.search(SECTION.format(numpydoc=numpydoc, short=short), doc) is not None
+
+
+def own_nodes(function):
+    """All nodes of a function's body, without those of functions and classes inside it."""
+    waiting = list(function.body)
+    while waiting:
+        node = waiting.pop()
+        if not isinstance(node, (*FUNCTION, ast.ClassDef, ast.Lambda)):
+            yield node
+            waiting += ast.iter_child_nodes(node)
+
+
+def bodies(thing):
+    """Syntax trees of the function, or of what runs when the class is called."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(inspect.unwrap(thing)))).body[0]
+    if isinstance(tree, FUNCTION):
+        return [tree]
+    return [
+        n
+        for n in getattr(tree, "body", ())
+        if isinstance(n, FUNCTION) and n.name in ("__init__", "__new__", "__post_init__")
+    ]
+
+
+def parameters(thing):
+    try:
+        found = inspect.signature(thing).parameters
+    except (TypeError, ValueError):
+        return []
+    return [name for name in found if not name.startswith("_")]
+
+
+def missing(thing):
+    """Mandatory entries that a public function or class does not have, in words."""
+    doc = inspect.getdoc(thing) or ""
+    if not doc.strip():
+        return ["a docstring"]
+    if not (inspect.isfunction(thing) or inspect.isclass(thing)):
+        return []
+    if inspect.isclass(thing) and issubclass(thing, Exception):
+        return []
+    nodes = [node for body in bodies(thing) for node in own_nodes(body)]
+    lacks = [] if doc.splitlines()[0].strip() else ["a first line"]
+    if parameters(thing) and not has(doc, "Parameters|Attributes", "in"):
+        lacks.append("Parameters (or in:)")
+    lacks += [f"the parameter {name}" for name in parameters(thing) if not re.search(rf"\b{name}\b", doc)]
+    if any(isinstance(n, ast.Return) and n.value is not None for n in nodes) and not has(doc, "Returns|Yields", "out"):
+        lacks.append("Returns (or out:)")
+    if any(isinstance(n, ast.Raise) and n.exc is not None for n in nodes) and not has(doc, "Raises", "raises"):
+        lacks.append("Raises (its body raises)")
+    if ">>>" not in doc:
+        lacks.append("an example that runs (>>>)")
+    return lacks
+
+
+@pytest.mark.parametrize("name", sorted(sparsedp._HOME))
+def test_public_docstring(name):
+    lacks = missing(getattr(sparsedp, name))
+    assert not lacks, f"dp.{name} lacks: " + "; ".join(lacks)
+
+
+@pytest.mark.parametrize("room", sparsedp._ROOMS)
+def test_docstrings_of_a_room(room):
+    module = getattr(sparsedp, room)
+    assert module.__all__, f"dp.{room} needs an __all__"
+    lacks = {f"dp.{room}.{name}": missing(getattr(module, name)) for name in module.__all__}
+    assert not any(lacks.values()), {name: what for name, what in lacks.items() if what}
+
+
+@pytest.mark.parametrize("name", sorted(sparsedp._HOME))
+def test_public_methods_have_docstrings(name):
+    thing = getattr(sparsedp, name)
+    if inspect.isclass(thing):
+        own = {
+            k: v for k, v in vars(thing).items() if not k.startswith("_") and (callable(v) or isinstance(v, property))
+        }
+        assert not [k for k, v in own.items() if not inspect.getdoc(v)]
+
+
+def test_every_module_says_what_it_is():
+    assert not [m.place for m in modules() if not ast.get_docstring(m.tree)]
+
+
+def test_the_rule_sees_what_is_missing():
+    def bare(u, b):
+        """Do something.
+
+        Parameters
+        ----------
+        u : array
+        """
+        if u is None:
+            raise ValueError("no u")
+        return b
+
+    assert missing(bare) == [
+        "the parameter b",
+        "Returns (or out:)",
+        "Raises (its body raises)",
+        "an example that runs (>>>)",
+    ]

@@ -1,0 +1,269 @@
+"""What the demo cannot use is refused in one sentence, with exit code 2, before anything is computed or written."""
+
+import io
+import os
+import pickle
+import re
+import struct
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_demo import demo, relief
+
+import sparsedp as dp
+from sparsedp.__main__ import main
+from sparsedp.report.demo import files, outputs, study, terrain
+
+
+def header(shape, descr="<f8"):
+    """A .npy header that promises what it likes."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": descr, "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def saved(field):
+    def write(path):
+        np.save(path, field)
+
+    return write
+
+
+def raw(content):
+    def write(path):
+        path.write_bytes(content)
+
+    return write
+
+
+def zipped(**arrays):
+    def write(path):
+        np.savez(path, **arrays)
+
+    return write
+
+
+def member(name, content):
+    def write(path):
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(name, content)
+
+    return write
+
+
+def sparse_file(path):
+    """101 million values that take no room on the disk."""
+    promise = header((101, 10**6), "|b1")
+    with path.open("wb") as stream:
+        stream.write(promise)
+        stream.truncate(len(promise) + 101 * 10**6)
+
+
+def with_nan(field):
+    field = field.copy()
+    field[3, 5] = field[4, 1] = np.nan
+    return field
+
+
+def png(width, height):
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", width, height) + bytes(40)
+
+
+def case(name, write, match):
+    return pytest.param(name, write, match, id=f"{name} {match[:40]}")
+
+
+BAD = [
+    case("a.npy", None, match=r"a\.npy is not there or is no plain file; give the path of a .npy, .npz or .png file"),
+    case("a.npy", Path.mkdir, match=r"a\.npy is not there or is no plain file; give the path of a .npy"),
+    case("a.tif", raw(b"II"), match=r"a\.tif is not a .npy, .npz or .png file; save the field with numpy.save"),
+    case("a.npy", saved(np.arange(30.0)), match=r"a\.npy needs a 2-D array, got shape \(30,\)"),
+    case("a.npy", saved(np.zeros((4, 4, 4))), match=r"a\.npy needs a 2-D array, got shape \(4, 4, 4\)"),
+    case("a.npy", saved(np.float64(3.0)), match=r"a\.npy needs a 2-D array, got shape \(\)"),
+    case(
+        "a.npy",
+        saved(with_nan(relief())),
+        match=r"a\.npy needs finite values, got 2 that are NaN or infinite, the first at \(3, 5\)",
+    ),
+    case("a.npy", saved(np.full((9, 9), np.inf)), match=r"needs finite values, got 81 that are NaN or inf"),
+    case(
+        "a.npy",
+        saved(np.full((9, 9), 7.0)),
+        match=r"a\.npy holds the same value everywhere \(7\); the demo needs a field that varies",
+    ),
+    case("a.npy", saved(np.zeros((9, 9))), match=r"a\.npy holds the same value everywhere \(0\)"),
+    case(
+        "a.npy",
+        lambda path: np.save(path, np.array([[1, None], [2, 3]], dtype=object), allow_pickle=True),
+        match=r"a\.npy holds Python objects, which are never unpickled here; save it as floats",
+    ),
+    case(
+        "a.npy",
+        raw(pickle.dumps(relief())),
+        match=r"a\.npy has no readable .npy header \(a pickle\?\); save the field with numpy.save",
+    ),
+    case("a.npy", raw(b""), match=r"a\.npy has no readable .npy header"),
+    case("a.npy", raw(header((9, 9))[:40]), match=r"a\.npy has no readable .npy header"),
+    case("a.npy", raw(header((-3, -3)) + bytes(800)), match=r"promises an array of shape \(-3, -3\), which cannot be"),
+    case("a.npy", raw(header((10**30, 2))), match=r"a\.npy promises an array of shape \(1000000.*, which cannot be"),
+    case(
+        "a.npy",
+        raw(header((10**9, 10**6)) + bytes(800)),
+        match=r"a\.npy promises 8000000000000000 bytes of data in its header, but holds 800",
+    ),
+    case("a.npy", raw(header((20, 20)) + bytes(3199)), match=r"promises 3200 bytes .* but holds 3199"),
+    case("a.npy", sparse_file, match=r"a\.npy holds 101000000 values, at most 100000000 are taken; thin it out first"),
+    case("a.npy", saved(relief() + 0j), match=r"a\.npy needs real numbers, got dtype complex128; save it as floats"),
+    case("a.npy", saved(np.full((9, 9), "x")), match=r"a\.npy needs real numbers, got dtype <U1; save it as floats"),
+    case("a.npy", saved(np.zeros((9, 9), [("a", float)])), match=r"a\.npy needs real numbers, got dtype \[\('a'"),
+    case("a.npy", saved(np.zeros((0, 9))), match=r"a\.npy needs at least 4 values along each axis, got shape \(0, 9\)"),
+    case("a.npy", saved(np.eye(3)), match=r"a\.npy needs at least 4 values along each axis, got shape \(3, 3\)"),
+    case("a.npy", saved(np.indices((192, 192)).sum(axis=0) % 2), match=r"is constant once averaged over Grid"),
+    case(
+        "a.npz",
+        zipped(one=relief(), two=relief(), three=np.zeros(3)),
+        match=r"a\.npz needs exactly one 2-D array, got 2 among 3 arrays \(one, two\)",
+    ),
+    case("a.npz", zipped(line=np.zeros(9)), match=r"a\.npz needs exactly one 2-D array, got 0 among 1 arrays \(line\)"),
+    case("a.npz", member("notes.txt", b"none"), match=r"needs exactly one 2-D array, got 0 among 0 arrays \(nothing\)"),
+    case("a.npz", raw(b"PK\x03\x04 cut"), match=r"a\.npz is not a whole .npz archive; save the field with numpy.savez"),
+    case("a.npz", member("u.npy", header((9, 9), "|O")), match=r"a\.npz holds Python objects, which are never"),
+    case("a.npz", member("u.npy", header((10**5, 10**5)) + bytes(999)), match=r"promises 80000000000 bytes"),
+    case("a.npz", member("u.npy", b"\x80\x04K\x01."), match=r"a\.npz has no readable .npy header"),
+    case("a.png", raw(b"GIF89a" + bytes(40)), match=r"a\.png is not a PNG picture"),
+    case("a.png", raw(png(10**5, 10**5)), match=r"a\.png holds 10000000000 values, at most 100000000 are taken"),
+]
+
+
+@pytest.mark.parametrize(("name", "write", "match"), BAD)
+def test_bad_input(tmp_path, capsys, name, write, match):
+    if write is not None:
+        write(tmp_path / name)
+    out = tmp_path / "out"
+    assert main(["demo", "--input", str(tmp_path / name), "--size", "12", "--out", str(out)]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert re.fullmatch(r"sparsedp: [^\n]*\n", printed.err) and re.search(match, printed.err)
+    assert not out.exists() or not any(out.iterdir())
+
+
+def test_bad_input_on_the_command_line(tmp_path):
+    done = demo(tmp_path, "--input", "nowhere.npy")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch(r"sparsedp: nowhere\.npy is not there [^\n]*\n", done.stderr)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (["demo", "--size", "5"], r"--size needs a whole number from 12 to 512, got 5"),
+        (["demo", "--size", "-1"], r"--size needs a whole number"),
+        (["demo", "--size", "100000"], r"--size needs a whole number from 12 to 512, got 100000"),
+    ],
+)
+def test_bad_size(tmp_path, monkeypatch, capsys, arguments, match):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert re.search(match, capsys.readouterr().err)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("arguments", [[], ["demo", "--size", "many"], ["demo", "--nonsense"], ["dance"]])
+def test_bad_command_line(capsys, arguments):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert re.fullmatch(r"sparsedp: [^\n]*; see python -m sparsedp( demo)? --help\n", capsys.readouterr().err)
+
+
+def test_refused_sizes_and_grounds():
+    with pytest.raises(ValueError, match="--size needs a whole number from 12 to 512, got 5"):
+        study.grids_for(terrain.Terrain(relief(), "field"), 5)
+    with pytest.raises(ValueError, match=r"field is constant once averaged over .*; give a field with larger features"):
+        terrain.hidden_ground(dp.Grid((12, 12)), terrain.Terrain(np.indices((192, 192)).sum(axis=0) % 2, "field"))
+
+
+def test_folder_that_cannot_be(tmp_path):
+    (tmp_path / "file").write_text("here first")
+    with pytest.raises(ValueError, match=r"file cannot be made a folder: File exists; name another with --out"):
+        outputs.claim(tmp_path / "file", False)
+    with pytest.raises(ValueError, match=r"file/out cannot be made a folder: Not a directory; name another with --out"):
+        outputs.claim(tmp_path / "file" / "out", False)
+
+
+def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(ValueError, match=r".* cannot be written to; name another with --out"):
+        outputs.claim(tmp_path, False)
+
+
+def test_a_link_into_nowhere_is_not_followed(tmp_path):
+    (tmp_path / "table.csv").symlink_to(tmp_path / "elsewhere.csv")
+    with pytest.raises(ValueError, match=r".* is there already; name another folder with --out, or write --force"):
+        outputs.claim(tmp_path, False)
+
+
+def test_file_that_cannot_be_opened(tmp_path, monkeypatch):
+    np.save(tmp_path / "a.npy", relief())
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(ValueError, match=r"a\.npy cannot be opened: Permission denied"):
+        files.read_field(tmp_path / "a.npy")
+
+
+def test_archive_that_lies_about_its_length(tmp_path):
+    path = tmp_path / "a.npz"
+    member("u.npy", header((40, 40)) + bytes(12800))(path)
+    content = bytearray(path.read_bytes())
+    where = content.rfind(b"PK\x01\x02")  # the entry of the directory, which NumPy believes
+    content[where + 24 : where + 28] = struct.pack("<I", 2**31)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.npz"):
+        files.read_field(path)
+
+
+def test_data_that_end_early(tmp_path, monkeypatch):
+    np.save(tmp_path / "a.npy", relief())
+    monkeypatch.setattr(files, "_check_promise", lambda *_: None)
+    content = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "a.npy").write_bytes(content[:-8])
+    with pytest.raises(ValueError, match=r"a\.npy ends before the data that its header promises"):
+        files.read_field(tmp_path / "a.npy")
+
+
+# ---- pictures ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def image():
+    return pytest.importorskip("matplotlib.image")
+
+
+def test_picture_is_turned(tmp_path, image):
+    rows = np.linspace(0.0, 1.0, 30).reshape(5, 6)
+    image.imsave(tmp_path / "a.png", rows, cmap="gray")
+    field = files.read_field(tmp_path / "a.png")
+    assert field.shape == (6, 5)  # axis 0 is x: the columns of the picture
+    assert field[0, 0] > field[0, -1]  # the last row of the picture is the lowest y
+    assert field[-1, 0] == field.max()
+
+
+def test_broken_picture(tmp_path, image):
+    image.imsave(tmp_path / "a.png", relief())
+    content = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(content[:200])
+    with pytest.raises(ValueError, match=r"a\.png is not a whole PNG picture"):
+        files.read_field(tmp_path / "a.png")
+
+
+def test_picture_without_the_extra(tmp_path, monkeypatch, capsys):
+    (tmp_path / "a.png").write_bytes(png(9, 9))
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main(["demo", "--input", str(tmp_path / "a.png"), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.startswith("sparsedp: pictures need matplotlib; install the extra: pip install ")

@@ -1,0 +1,121 @@
+"""Every message of the inner rooms (tape, structures, functions of separable operators), printed once."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.derivative import value_and_grad
+from sparsedp.structure.base import Structure, compact
+
+LINE = dp.Grid(3)
+SHAPE, TYPE, VALUE = dp.errors.ShapeError, TypeError, ValueError
+FINITE, DERIVATIVE = dp.errors.NonFiniteError, dp.errors.DerivativeError
+
+
+def wrong(pulled):
+    """A rule whose pullback is `pulled`, in use."""
+    bad = dp.differentiable("bad", lambda x: x * 1.0, lambda nums, ans, x: pulled)
+    return lambda: value_and_grad(lambda x: anp.sum(bad(x)))(np.ones(2))
+
+
+class Mute(Structure):
+    """A structure that says nothing."""
+
+    shape = (3, 3)
+
+
+class Crowd:
+    """As many entries as no 32-bit index can count."""
+
+    nnz, shape = 2**31, (3, 3)
+
+
+MUTE = dp.Operator(Mute(), LINE.cells, LINE.cells, "mute", "matrix-free")
+
+TABLE = [
+    # structures
+    (lambda: MUTE(np.ones(3)), TYPE, "Mute does not say how it acts"),
+    (lambda: MUTE.T, TYPE, "Mute has no transpose"),
+    (
+        lambda: compact(Crowd()),
+        VALUE,
+        "an explicit matrix of 2147483648 entries needs 64-bit indices; use the matrix-free form",
+    ),
+    (
+        lambda: dp.set_threads(1.5),
+        TYPE,
+        "set_threads got 1.5; it needs an integer, for example 1, or None for the default.",
+    ),
+    # functions of separable operators
+    (
+        lambda: dp.inverse(dp.from_matrix(np.eye(3)), "separable"),
+        VALUE,
+        "separable needs a sum of 1-D factors that can be diagonalised, got <matrix: space(3) -> space(3), explicit>",
+    ),
+    (lambda: dp.exponential(dp.laplacian(LINE), np.nan), FINITE, "exponential needs a finite time, got nan"),
+    (
+        lambda: dp.exponential(-dp.laplacian(LINE), 1e4),
+        FINITE,
+        "exp(10000 * -laplacian) is beyond 1.8e308; take a shorter time or the other sign",
+    ),
+    (
+        lambda: dp.exponential(dp.gradient(LINE)),
+        VALUE,
+        "exponential needs a separable operator that can be diagonalised, "
+        "got <gradient: cells(3) -> faces(3), explicit>",
+    ),
+    (lambda: dp.power(dp.laplacian(LINE), np.inf), FINITE, "power needs a finite exponent, got inf"),
+    (
+        lambda: dp.power(dp.laplacian(LINE), 0.5),
+        VALUE,
+        "laplacian has eigenvalues down to -3.0e+00; a fractional power needs them >= 0",
+    ),
+    (
+        lambda: dp.power(-dp.laplacian(LINE), 1000),
+        FINITE,
+        "-laplacian to the power 1000 is beyond 1.8e308; rescale the operator",
+    ),
+    # the tape
+    (wrong(lambda g: (g[:1],)), SHAPE, "bad returned a derivative of shape (1,) where (2,) is needed"),
+    (
+        wrong(lambda g: (g * 1j,)),
+        DERIVATIVE,
+        "bad returned a complex derivative of a real value; take its real part",
+    ),
+    (wrong(lambda g: (g, g)), DERIVATIVE, "bad must return one derivative for each of the 1 values asked for"),
+    (wrong(lambda g: g), DERIVATIVE, "bad must return one derivative for each of the 1 values asked for"),
+    (
+        wrong(lambda g: (g.astype(np.float32),)),
+        DERIVATIVE,
+        "bad returned a derivative of dtype float32 where float64 is needed",
+    ),
+    (
+        wrong(lambda g: (g.astype(int),)),
+        DERIVATIVE,
+        "bad returned a derivative of dtype int64 where float64 is needed",
+    ),
+    (
+        lambda: value_and_grad(lambda x: 1.0)(np.ones(2, dtype=int)),
+        DERIVATIVE,
+        "a gradient needs floating values, got int64; write x.astype(float)",
+    ),
+    (
+        lambda: value_and_grad(lambda x: x)(np.ones(2)),
+        SHAPE,
+        "the loss must be a scalar, got an array of shape (2,); sum it",
+    ),
+    (
+        lambda: value_and_grad(anp.sum)(np.ones(2, complex)),
+        DERIVATIVE,
+        "the loss must be real, got a complex number; take its real part or its absolute value",
+    ),
+]
+
+
+@pytest.mark.parametrize(("call", "error", "message"), TABLE, ids=[row[2][:50] for row in TABLE])
+def test_message(call, error, message):
+    with pytest.raises(error) as caught:
+        call()
+    assert str(caught.value) == message
+    assert caught.type is error or error in (TYPE, VALUE, AttributeError)

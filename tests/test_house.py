@@ -1,0 +1,281 @@
+"""The rules of the house: floors, doors, lengths, names, the shop window, the catalogue. See CONTRIBUTING.md."""
+
+import ast
+import importlib
+import os
+import re
+import statistics
+import subprocess
+import sys
+
+import pytest
+from sources import FUNCTION, PACKAGE, ROOT, body_length, definitions, exported, imports, modules, names, within
+
+import sparsedp
+
+FLOORS = [
+    ("errors", 0),
+    ("tree", 0),
+    ("ledger", 0),
+    ("tape", 1),
+    ("kernels", 1),
+    ("spacing", 1),
+    ("fields", 1),
+    ("derivative", 2),
+    ("space", 2),
+    ("conditions", 2),
+    ("grid", 3),
+    ("structure", 3),
+    ("operator", 4),
+    ("operators", 5),
+    ("solvers", 6),
+    ("advection", 6),
+    ("integrators", 7),
+    ("flow", 7),
+    ("trajectory", 8),
+    ("optimise", 9),
+    ("network", 9),
+    ("blackbox", 9),
+]
+FLOOR = dict(FLOORS)
+SIDE = {"check": {"check"}, "report": {"report", "check"}}  # side room: the side rooms it may import
+ROOF = {"__init__", "__main__"}
+
+# A foreign name, the places in the package that may import it, and the names under it that are open to all.
+DOORS = [
+    ("autograd", r"tape\.py", ("autograd.numpy",)),
+    ("autograd.numpy.numpy_boxes", r"tape\.py", ()),
+    ("autograd.numpy.numpy_vspaces", r"tape\.py", ()),
+    ("autograd.numpy.numpy_wrapper", r"tape\.py", ()),
+    ("pyamg", r"solvers/multigrid\.py", ()),
+    ("numba", r"kernels/.*", ()),
+    ("matplotlib", r"report/plots\.py", ()),
+    ("tqdm", r"report/.*|__main__\.py|(.*/)?progress\.py", ()),
+]
+TALKS = r"report/.*|__main__\.py"  # may print
+NOWHERE = {"utils.py", "util.py", "helpers.py", "helper.py", "misc.py", "common.py"}
+LENGTHS = {"sparsedp": 300, "tests": 300, "benchmarks": 300, "examples": 60}
+EXTRAS = ("numba", "matplotlib", "tqdm")  # foreign libraries that need not be there
+LAZY = ("pyamg", "numba", "matplotlib", "tqdm", "scipy", "autograd", "numpy")  # not touched by `import sparsedp`
+UNFINISHED = r"\b(?:TO" + r"DO|FIX" + r"ME|X" + r"XX|NotImplemented" + r"Error)\b"
+
+
+def none(wrong):
+    """Fail with one line for each thing that is wrong."""
+    wrong = list(wrong)
+    assert not wrong, "\n" + "\n".join(wrong)
+
+
+def room(name):
+    """First part of a module's name inside the package; "__init__" for the package itself."""
+    return (name.split(".") + ["__init__"])[1]
+
+
+def may_import(importer, target):
+    """Whether a module may import another module of the package, both by dotted name."""
+    here, there = room(importer), room(target)
+    if here in ROOF or here == there:
+        return True
+    if there in ROOF:
+        return there == "__init__" and here in SIDE  # the shop window is lazy: side rooms may use it as a user does
+    if there in SIDE:
+        return there in SIDE.get(here, ())
+    return here in SIDE or FLOOR.get(there, 99) < FLOOR.get(here, -1)
+
+
+def functions():
+    """Every function of the package with its module, methods and nested ones included."""
+    return [(module, node) for module in modules() for node in module.nodes(FUNCTION)]
+
+
+# ---- floors and doors ----------------------------------------------------------------------------------------------
+
+
+def test_every_module_has_a_floor():
+    none(f"{m.place}: give it a floor in FLOORS" for m in modules() if room(m.name) not in {*FLOOR, *SIDE, *ROOF})
+
+
+def test_every_folder_is_a_package():
+    folders = sorted({path.parent for path in PACKAGE.rglob("*.py")})
+    none(
+        f"{folder.relative_to(ROOT)} has no __init__.py" for folder in folders if not (folder / "__init__.py").exists()
+    )
+
+
+def test_imports_go_to_lower_floors():
+    none(
+        f"{m.place}:{line} imports {target}, which is not below it"
+        for m in modules()
+        for target, line in imports(m)
+        if within(target, "sparsedp") and not may_import(m.name, target)
+    )
+
+
+def test_no_import_cycles():
+    graph = {m.name: {target for target, _ in imports(m) if target in names()} for m in modules()}
+    while True:  # what imports nothing, or is imported by nothing, is in no cycle
+        imported = set().union(*graph.values())
+        inner = {name for name, targets in graph.items() if targets and name in imported}
+        if len(inner) == len(graph):
+            break
+        graph = {name: graph[name] & inner for name in inner}
+    none(f"{name} is in an import cycle with {', '.join(sorted(targets))}" for name, targets in graph.items())
+
+
+def test_foreign_libraries_come_through_their_door():
+    none(
+        f"{m.place}:{line} imports {target}; only {place} may"
+        for m in modules()
+        for target, line in imports(m)
+        for foreign, place, open_to_all in DOORS
+        if within(target, foreign) and not any(within(target, name) for name in open_to_all)
+        if not re.fullmatch(place, m.place)
+    )
+
+
+def test_floors_rule_sees_a_wrong_import():
+    assert not may_import("sparsedp.tape", "sparsedp.grid")
+    assert not may_import("sparsedp.solvers.choose", "sparsedp.advection")
+    assert not may_import("sparsedp.operator", "sparsedp")
+    assert not may_import("sparsedp.solvers.choose", "sparsedp.check")
+    assert not may_import("sparsedp.check.twins", "sparsedp.report.plots")
+    assert may_import("sparsedp.solvers.choose", "sparsedp.solvers.direct")
+    assert may_import("sparsedp.report.explain", "sparsedp.check.adjointness")
+
+
+# ---- files, names and lengths --------------------------------------------------------------------------------------
+
+
+def test_no_rooms_for_leftovers():
+    none(f"{path}: name it after what it does" for path in ROOT.rglob("*.py") if path.name in NOWHERE)
+
+
+def test_no_star_imports():
+    none(
+        f"{m.place}:{node.lineno} imports *"
+        for m in modules()
+        for node in m.nodes(ast.ImportFrom)
+        if any(alias.name == "*" for alias in node.names)
+    )
+
+
+def test_no_print_in_the_library():
+    none(
+        f"{m.place}:{node.lineno} prints"
+        for m in modules()
+        if not re.fullmatch(TALKS, m.place)
+        for node in m.nodes(ast.Call)
+        if getattr(node.func, "id", None) in ("print", "pprint")
+    )
+
+
+def test_nothing_unfinished():
+    texts = [(m.place, re.sub(r"except [^:]*:", "", m.text)) for m in modules()]  # SciPy's own may be caught
+    none(f"{place}: {word}" for place, text in texts for word in re.findall(UNFINISHED, text))
+
+
+def test_no_setters_and_no_caches_of_a_module():
+    decorators = [(m, d) for m in modules() for f in m.nodes((*FUNCTION, ast.ClassDef)) for d in f.decorator_list]
+    words = [(m, d, (ast.unparse(d).split("(")[0]).split(".")[-1]) for m, d in decorators]
+    # A compiled kernel belongs to the process, like the code itself; kernels/ may keep it.
+    words = [(m, d, word) for m, d, word in words if word == "setter" or room(m.name) != "kernels"]
+    none(f"{m.place}:{d.lineno} @{word}" for m, d, word in words if word in ("setter", "cache", "lru_cache"))
+
+
+def test_no_function_has_the_name_of_a_module_beside_it():
+    none(
+        f"{m.place}: {node.name} is also a module of {m.package}"
+        for m in modules()
+        for node in definitions(m)
+        if f"{m.package}.{node.name}" in names()
+    )
+
+
+def test_no_public_name_is_a_module():
+    none(f"dp.{name} is also a module" for name in sparsedp._HOME if f"sparsedp.{name}" in names())
+
+
+@pytest.mark.parametrize("folder", LENGTHS)
+def test_length_of_files(folder):
+    lengths = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in (ROOT / folder).rglob("*.py")}
+    none(
+        f"{p.relative_to(ROOT)} has {n} lines, at most {LENGTHS[folder]}"
+        for p, n in lengths.items()
+        if n > LENGTHS[folder]
+    )
+
+
+def test_length_of_bodies():
+    none(f"{m.place}:{f.lineno} {f.name} has {body_length(f)} lines" for m, f in functions() if body_length(f) > 40)
+
+
+def test_median_length_of_bodies():
+    assert statistics.median(body_length(f) for _, f in functions()) < 10
+
+
+# ---- the shop window -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sparsedp.__all__)
+def test_every_public_name_resolves(name):
+    assert getattr(sparsedp, name) is not None
+    assert name in dir(sparsedp)
+
+
+@pytest.mark.parametrize("name", sorted(m.name for m in modules() if room(m.name) != "__main__"))
+def test_every_module_imports(name):
+    try:
+        importlib.import_module(name)
+    except ImportError as error:
+        cause = error.__cause__ if isinstance(error.__cause__, ImportError) else error
+        if (cause.name or "").split(".")[0] not in EXTRAS:
+            raise
+        pytest.skip(f"{cause.name} is not installed")
+
+
+def test_stub_and_window_agree():
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
+    found = {
+        alias.asname: f"{node.module or ''}"
+        for node in ast.walk(stub)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert found == {**sparsedp._HOME, **dict.fromkeys(sparsedp._ROOMS, "")}
+
+
+def test_unknown_name():
+    with pytest.raises(AttributeError, match="module 'sparsedp' has no attribute 'nonsense'"):
+        sparsedp.nonsense
+
+
+def test_version():
+    assert re.match(r"\d+[.+]", sparsedp.__version__)
+
+
+def test_import_is_light():
+    code = f"import sys, sparsedp; print(*(name for name in {LAZY} if name in sys.modules))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+# ---- the catalogue -------------------------------------------------------------------------------------------------
+
+
+def test_every_builder_is_in_the_catalogue():
+    path = ROOT / "tests" / "catalogue.py"
+    assert path.exists(), "tests/catalogue.py is missing"
+    tree = ast.parse(path.read_text(encoding="utf-8"))  # identifiers and strings count, comments do not
+    words = {
+        getattr(n, "id", None) or getattr(n, "attr", None) or getattr(n, "value", None)
+        for n in ast.walk(tree)
+        if isinstance(n, (ast.Name, ast.Attribute)) or (isinstance(n, ast.Constant) and isinstance(n.value, str))
+    }
+    none(
+        f"{m.place}: {name} is not in tests/catalogue.py"
+        for m in modules()
+        if m.package == "sparsedp.operators"
+        for name in exported(m)
+        if name in sparsedp._HOME and name not in words  # the rest serves the builders
+    )

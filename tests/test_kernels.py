@@ -1,0 +1,262 @@
+"""The kernels against sparse matrices, and the compiled ones against NumPy: all dtypes, sizes and ends."""
+
+from functools import reduce
+from math import prod
+from threading import Barrier, Thread
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from sparsedp import kernels
+from sparsedp.kernels import plain
+from sparsedp.kernels.layout import Rows, Tridiagonal
+
+DTYPES = [np.float64, np.float32, np.complex128, np.complex64]
+SHAPES = [(1, 1, 1), (1, 1, 2), (1, 1, 3), (1, 1, 700), (1, 2, 1), (1, 31, 37), (1, 64, 130), (2, 1, 3), (2, 2, 2)]
+SHAPES += [(3, 1, 17), (7, 5, 1), (5, 7, 11), (13, 8, 64), (20, 20, 20)]
+NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
+SIDES = ["plain", pytest.param("native", marks=NUMBA)]
+
+
+@pytest.fixture
+def native():
+    """The compiled kernels."""
+    from sparsedp.kernels import native
+
+    return native
+
+
+@pytest.fixture
+def team(native, monkeypatch):
+    """The compiled kernels, with threads for every size."""
+    monkeypatch.setattr(native, "SERIAL", 0)
+    return native
+
+
+def field(rng, shape, dtype):
+    u = rng.standard_normal(shape)
+    return (u + 1j * rng.standard_normal(shape) if np.dtype(dtype).kind == "c" else u).astype(dtype)
+
+
+def line(rng, n, periodic, stretched):
+    """A tridiagonal matrix: random, or constant but for its ends."""
+    lower, centre, upper = rng.uniform(0.5, 1.5, (3, n))
+    first, last = (0, 0) if stretched else (0, n) if periodic else (1, max(1, n - 1))
+    for band, value in ((lower, 1.25), (centre, -2.5), (upper, 0.75 if n % 2 else 1.25)):
+        band[first:last] = value
+    if not periodic or n == 1:
+        lower[0] = upper[-1] = 0
+    return Tridiagonal(lower, centre, upper, first, last)
+
+
+def dense(axis, n):
+    if axis is None:
+        return np.zeros((n, n))
+    matrix, i = np.diag(axis.centre), np.arange(n)
+    np.add.at(matrix, (i, i - 1), axis.lower)
+    np.add.at(matrix, (i, (i + 1) % n), axis.upper)
+    return matrix
+
+
+def matrix_of(axes, shape, shift):
+    total = shift * sp.eye_array(prod(shape))
+    for k, axis in enumerate(axes):
+        sides = [sp.csr_array(dense(axis, n)) if a == k else sp.eye_array(n) for a, n in enumerate(shape)]
+        total = total + reduce(sp.kron, sides)
+    return sp.csr_array(total)
+
+
+def cases():
+    """Shapes with axes of all kinds."""
+    rng = np.random.default_rng(0)
+    for turn, shape in enumerate(SHAPES * 3):
+        kinds = [None if rng.random() < 0.2 else rng.random(2) < 0.5 for _ in shape]
+        yield turn, shape, tuple(kind if kind is None else line(rng, n, *kind) for kind, n in zip(kinds, shape))
+
+
+def close(found, expected, dtype, times=10):
+    scale = 1 + np.max(np.abs(expected), initial=0)
+    return np.all(np.abs(found - expected) <= times * np.finfo(dtype).eps * scale)
+
+
+def along(module, u, rows, scale, start=None):
+    """The product as a new array; added to `start` if there is one."""
+    out = np.full((len(u), rows.rows, u.shape[2]), np.nan, u.dtype) if start is None else start.copy()
+    module.along_axis(u, out, rows, scale, start is not None, *([2] if module is not plain else []))
+    return out
+
+
+def added(module, u, axes, shift, threads=2):
+    out = np.full_like(u, np.nan)
+    module.kronecker_sum(u, out, axes, shift, *([threads] if module is not plain else []))
+    return out
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("side", SIDES)
+def test_sum_of_axes_is_the_sparse_matrix(side, dtype, request, monkeypatch):
+    module = plain if side == "plain" else request.getfixturevalue("native")
+    rng = np.random.default_rng(1)
+    for turn, shape, axes in cases():
+        monkeypatch.setattr(plain, "WHOLE", 0 if turn % 2 else 10**6)
+        monkeypatch.setattr(plain, "PIECE", (40, 600, 10**5)[turn % 3])
+        u = field(rng, shape, dtype)
+        u.setflags(write=False)
+        expected = (matrix_of(axes, shape, 0.3) @ u.ravel().astype(complex)).reshape(shape)
+        assert close(added(module, u, axes, 0.3), expected, dtype), (shape, axes)
+
+
+@NUMBA
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_compiled_sum_agrees_with_numpy_and_its_bits_depend_on_nothing(dtype, team, monkeypatch):
+    rng = np.random.default_rng(2)
+    for _, shape, axes in cases():
+        u = field(rng, shape, dtype)
+        one = added(team, u, axes, -0.5, threads=1)
+        assert close(one, added(plain, u, axes, -0.5), dtype)
+        assert one.tobytes() == added(team, u, axes, -0.5, threads=2).tobytes()
+        with monkeypatch.context() as patch:
+            patch.setattr(team, "PAST_CACHE", 0)
+            patch.setattr(team, "NARROW", 0)
+            assert one.tobytes() == added(team, u, axes, -0.5).tobytes()
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_a_missing_neighbour_is_not_read_from_the_far_end(side, request):
+    module = plain if side == "plain" else request.getfixturevalue("native")
+    rng = np.random.default_rng(3)
+    shape = (6, 7, 40)
+    for axis, n in enumerate(shape):
+        axes = tuple(line(rng, n, False, True) if k == axis else None for k in range(3))
+        for end in (0, n - 1):
+            u = np.ones(shape)
+            u[tuple(end if k == axis else slice(None) for k in range(3))] = np.nan
+            bad = np.isnan(added(module, u, axes, 1.0)).any(axis=tuple(k for k in range(3) if k != axis))
+            assert np.flatnonzero(bad).tolist() == sorted({end, abs(end - 1)})
+
+
+def record(matrix, diagonals):
+    """Sparse matrix -> Rows, with or without the diagonals."""
+    m = sp.csr_array(matrix)
+    m.sum_duplicates()
+    row = np.repeat(np.arange(m.shape[0]), np.diff(m.indptr))
+    offsets = np.unique(m.indices - row) if diagonals else np.zeros(0, int)
+    values, spans = np.zeros((offsets.size, m.shape[0])), np.zeros((2, offsets.size), int)
+    for d, offset in enumerate(offsets):
+        here = row[m.indices - row == offset]
+        values[d, here] = m.data[m.indices - row == offset]
+        spans[:, d] = here[0], here[-1] + 1
+    lists = m.indptr.astype(np.int64), m.indices.astype(np.int64), m.data
+    return Rows(*m.shape, *lists, offsets.astype(np.int64), *spans, values)
+
+
+def matrices():
+    rng = np.random.default_rng(4)
+    for n, m in ((1, 1), (2, 3), (7, 7), (40, 41), (131, 130), (300, 300)):
+        yield sp.dia_array((np.ones((2, m)) * [[-1], [1]], [0, 1]), shape=(n, m))
+        yield sp.dia_array((rng.random((5, m)), [-2, -1, 0, 1, 2]), shape=(n, m))
+        yield sp.random_array((n, m), density=min(1, 2 / m), rng=rng)
+        yield sp.csr_array((n, m))
+        ring = sp.lil_array((m, m))
+        for shift, value in ((-1, 0.5), (0, -2.0), (1, 0.25)):
+            ring[np.arange(m), (np.arange(m) + shift) % m] = value
+        yield ring
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("side", SIDES)
+def test_matrix_along_an_axis_is_the_sparse_matrix(side, dtype, request, monkeypatch):
+    module = plain if side == "plain" else request.getfixturevalue("native")
+    rng = np.random.default_rng(5)
+    for turn, matrix in enumerate(matrices()):
+        monkeypatch.setattr(plain, "PIECE", (50, 10**5)[turn % 2])
+        rows = record(matrix, turn % 3)
+        for before, after in ((1, 1), (3, 1), (2, 2), (2, 5), (1, 90)):
+            u = field(rng, (before, rows.cols, after), dtype)
+            start = field(rng, (before, rows.rows, after), dtype)
+            expected = 0.7 * np.stack([matrix @ plane.astype(complex) for plane in u])
+            once, again = along(module, u, rows, 0.7), along(module, u, rows, 0.7, start)
+            assert close(once, expected, dtype), (turn, u.shape)
+            assert close(again, start + expected, dtype), (turn, u.shape)
+
+
+@NUMBA
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_compiled_product_has_bits_that_depend_on_nothing(dtype, team, monkeypatch):
+    rng = np.random.default_rng(6)
+    for turn, matrix in enumerate(matrices()):
+        rows = record(matrix, turn % 2)
+        for after in (1, 3, 100):
+            u = field(rng, (3, rows.cols, after), dtype)
+            one = np.empty((3, rows.rows, after), dtype)
+            team.along_axis(u, one, rows, -1.5, False, 1)
+            assert one.tobytes() == along(team, u, rows, -1.5).tobytes()
+            with monkeypatch.context() as patch:
+                patch.setattr(team, "PAST_CACHE", 0)
+                patch.setattr(team, "NARROW", 0)
+                assert one.tobytes() == along(team, u, rows, -1.5).tobytes()
+
+
+@pytest.mark.parametrize("shape", [(0, 3, 3), (2, 0, 3), (2, 3, 0)])
+def test_nothing_is_done_for_empty_arrays(shape):
+    axes = tuple(line(np.random.default_rng(0), n, False, False) if n else None for n in shape)
+    kernels.kronecker_sum(np.zeros(shape), np.zeros(shape), axes, 1.0)
+    rows = record(sp.csr_array((shape[1], shape[1])), True)
+    kernels.along_axis(np.zeros(shape), np.zeros(shape), rows, 1.0, False)
+
+
+def test_rows_without_columns_give_zero():
+    out = np.ones((2, 3, 4))
+    kernels.along_axis(np.zeros((2, 0, 4)), out, record(sp.csr_array((3, 0)), True), 1.0, False)
+    assert not out.any()
+
+
+@NUMBA
+def test_python_threads_may_call_at_the_same_time(team):
+    rng = np.random.default_rng(7)
+    axes = (None, line(rng, 150, False, True), line(rng, 160, True, True))
+    fields = [field(rng, (1, 150, 160), np.float64) for _ in range(4)]
+    expected = [added(team, u, axes, 0.0) for u in fields]
+    results, start = [[] for _ in fields], Barrier(len(fields))
+
+    def work(k):
+        start.wait()
+        results[k].extend(added(team, fields[k], axes, 0.0).tobytes() == expected[k].tobytes() for _ in range(30))
+
+    workers = [Thread(target=work, args=(k,)) for k in range(len(fields))]
+    for thread in workers:
+        thread.start()
+    for thread in workers:
+        thread.join()
+    assert [all(result) and len(result) == 30 for result in results] == [True] * len(fields)
+
+
+@NUMBA
+def test_a_kernel_is_compiled_without_a_place_to_keep_it(native):
+    calls = []
+
+    def compiler(**options):
+        calls.append(options.pop("cache", False))
+        if calls[-1]:
+            raise RuntimeError("cannot cache function")
+        return lambda function: function
+
+    assert native._kept(compiler, len) is len and calls == [True, False]
+
+
+@NUMBA
+def test_numpy_steps_in_where_nothing_compiles(native, monkeypatch):
+    rng = np.random.default_rng(8)
+    monkeypatch.setattr(native, "njit", lambda *args, **options: 1 / 0)
+    native._kernel.cache_clear()
+    u = field(rng, (3, 4, 5), np.float64)
+    axes, rows = tuple(line(rng, n, True, True) for n in u.shape), record(sp.eye_array(4), True)
+    try:
+        with pytest.warns(RuntimeWarning, match="NumPy is used instead"):
+            found = added(native, u, axes, 1.0)
+        with pytest.warns(RuntimeWarning, match="NumPy is used instead"):
+            product = along(native, u, rows, 2.0)
+    finally:
+        native._kernel.cache_clear()
+    assert np.array_equal(found, added(plain, u, axes, 1.0)) and np.array_equal(product, 2 * u)

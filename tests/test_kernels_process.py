@@ -1,0 +1,71 @@
+"""Kernels and the process they run in: threads, forks, and an environment without numba."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sparsedp import kernels
+
+NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
+
+
+def test_too_many_threads_are_refused(monkeypatch):
+    monkeypatch.setattr(kernels, "_available", lambda: 2)
+    with pytest.raises(
+        ValueError,
+        match="set_threads got 3; it needs 1 to 2, the processors this process may use; write None for the default.",
+    ):
+        kernels.set_threads(3)
+
+
+def test_the_number_of_threads_is_remembered_and_checked():
+    most = kernels.threads()
+    kernels.set_threads(1)
+    assert kernels.threads() == 1
+    kernels.set_threads(np.int64(most))
+    assert kernels.threads() == most
+    for bad in (0, -1, most + 1):
+        with pytest.raises(ValueError, match=f"it needs 1 to {most}, the processors this process may use") as caught:
+            kernels.set_threads(bad)
+        assert str(caught.value).startswith(f"set_threads got {bad};")
+    with pytest.raises(TypeError, match="needs an integer"):
+        kernels.set_threads(1.5)
+    kernels.set_threads(None)
+    assert kernels.threads() == most
+
+
+SCRIPT = """
+import os, sys
+import numpy as np
+from sparsedp import kernels
+from sparsedp.kernels.layout import Tridiagonal
+n = 200
+axis = Tridiagonal(np.r_[0, np.ones(n - 1)], -2 * np.ones(n), np.r_[np.ones(n - 1), 0], 1, n - 1)
+u, out = np.ones((1, n, n)), np.zeros((1, n, n))
+kernels.kronecker_sum(u, out, (None, axis, axis), 0.0)
+assert out.sum() == -4 * n
+"""
+
+
+def run(code, **environment):
+    return subprocess.run([sys.executable, "-c", SCRIPT + code], env=os.environ | environment, check=False, timeout=120)
+
+
+def test_the_environment_switches_numba_off():
+    assert run("assert 'numba' not in sys.modules and not kernels.compiled()", SPARSEDP_NUMBA="0").returncode == 0
+
+
+@NUMBA
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+def test_a_forked_child_may_use_the_kernels():
+    code = """
+child = os.fork()
+kernels.kronecker_sum(u, out, (None, axis, axis), 1.0)
+if not child:
+    os._exit(int(out.sum() != n * n - 4 * n))
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    assert run(code).returncode == 0

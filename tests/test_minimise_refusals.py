@@ -1,0 +1,87 @@
+"""What minimise() refuses, and what it says."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
+
+
+def bowl(x):
+    return anp.sum((x - 3.0) ** 2)
+
+
+def foreign(value, gradient):
+    """A run on a loss that is not traced."""
+    return dp.minimise(lambda x: value(x), np.ones(2), gradient=gradient)
+
+
+def test_errors_at_the_start_are_not_hidden():
+    def refuse(x):
+        raise UnstableStepError("beyond 0.5")
+
+    with pytest.raises(UnstableStepError, match="beyond 0.5"):
+        dp.minimise(refuse, np.ones(2))
+    with pytest.raises(KeyError):
+        dp.minimise(lambda x: {}["no such"], np.ones(2))
+    with pytest.raises(
+        NonFiniteError, match="the loss is nan; it must be finite at the start, and elsewhere it is avoided"
+    ):
+        foreign(lambda x: np.nan, lambda x: x)
+    with pytest.raises(
+        NonFiniteError, match=r"the gradient holds NaN or infinity; check it with dp.check.gradient\(loss, x\)"
+    ):
+        foreign(lambda x: 1.0, lambda x: x * np.nan)
+
+
+def test_methods_and_options():
+    with pytest.raises(ValueError, match="method must be one of lbfgs, gd, adam, got 'newton'"):
+        dp.minimise(bowl, np.ones(2), "newton")
+    with pytest.raises(TypeError, match="lbfgs has no option 'rate'; it has memory, line_search"):
+        dp.minimise(bowl, np.ones(2), rate=1.0)
+    with pytest.raises(ValueError, match="minimise needs maxiter >= 0, a whole number, got -1"):
+        dp.minimise(bowl, np.ones(2), maxiter=-1)
+    with pytest.raises(ValueError, match="minimise needs maxiter >= 0, a whole number, got True"):
+        dp.minimise(bowl, np.ones(2), maxiter=True)
+    with pytest.raises(ValueError, match="minimise needs a tolerance >= 0, got nan"):
+        dp.minimise(bowl, np.ones(2), tolerance=np.nan)
+
+
+def test_ranges_of_options():
+    with pytest.raises(ValueError, match="lbfgs needs memory >= 1 and line_search >= 2, got 0 and 20"):
+        dp.minimise(bowl, np.ones(2), memory=0)
+    with pytest.raises(ValueError, match="gd needs a positive rate, got -1"):
+        dp.minimise(bowl, np.ones(2), "gd", rate=-1)
+    with pytest.raises(ValueError, match="gd needs a momentum from 0 to below 1, got 1"):
+        dp.minimise(bowl, np.ones(2), "gd", momentum=1)
+    with pytest.raises(
+        ValueError, match="gd has no line search 'wolfe'; write line_search='backtracking' or leave it out"
+    ):
+        dp.minimise(bowl, np.ones(2), "gd", line_search="wolfe")
+    with pytest.raises(ValueError, match="adam needs a positive rate, got 0"):
+        dp.minimise(bowl, np.ones(2), "adam", rate=0)
+    with pytest.raises(ValueError, match=r"adam needs two betas from 0 to below 1, got \(1, 2\)"):
+        dp.minimise(bowl, np.ones(2), "adam", betas=(1, 2))
+
+
+def test_losses_and_gradients():
+    with pytest.raises(
+        DerivativeError, match=r"minimise needs floating values in start, and found none; write start.astype\(float\)"
+    ):
+        dp.minimise(bowl, np.arange(3))
+    with pytest.raises(ShapeError, match=r"the loss must be a scalar, got an array of shape \(2,\); sum it"):
+        foreign(lambda x: x, lambda x: x)
+    with pytest.raises(DerivativeError, match="the gradient has 2 leaves where start has 1"):
+        foreign(lambda x: 1.0, lambda x: (x, x))
+    with pytest.raises(DerivativeError, match=r"a leaf of the gradient has shape \(1,\) where \(2,\) is needed"):
+        foreign(lambda x: 1.0, lambda x: x[:1])
+
+
+def test_the_result_is_frozen_and_shares_nothing():
+    x = np.ones(3)
+    x.flags.writeable = False
+    best = dp.minimise(bowl, x)
+    assert not np.may_share_memory(best.x, x) and best.x.flags.writeable
+    with pytest.raises(AttributeError, match="the result of minimise is frozen; x cannot be set"):
+        best.x = 1

@@ -1,0 +1,205 @@
+"""The free tests: every operator of the catalogue x boundary x dimension x spacing x form."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from catalogue import CATALOGUE, LABELS, SHAPES, boundaries, grids
+from fields import Field, grid_of
+
+import sparsedp as dp
+from sparsedp.derivative import pullback, pushforward, value_and_grad
+
+EVERY = pytest.mark.parametrize("entry", CATALOGUE, ids=LABELS)
+
+
+def cases(entry, shapes=SHAPES):
+    """Operators of one entry on all grids and boundaries, with a generator of its own."""
+    rng = np.random.default_rng(1)
+    for shape in shapes:
+        if len(shape) >= entry.least_dim:
+            for grid in grids(shape, rng):
+                for boundary in boundaries(grid):
+                    yield entry.make(grid, boundary), rng
+
+
+def random_field(rng, space, dtype):
+    values = rng.standard_normal(space.shape)
+    if np.dtype(dtype).kind == "c":
+        values = values + 1j * rng.standard_normal(space.shape)
+    return values.astype(dtype)
+
+
+@EVERY
+def test_transpose_and_twin_in_every_dtype(entry):
+    """Dot test and explicit against matrix-free, in the scaling of the gates: both at most 10."""
+    worst = 0.0
+    for op, rng in cases(entry):
+        explicit, free = op.explicit(), op.matrix_free()
+        matrix = explicit.matrix
+        assert matrix.indices.dtype == matrix.indptr.dtype == np.int32
+        size = np.sqrt(abs(matrix).sum(0).max(initial=0) * abs(matrix).sum(1).max(initial=0))
+        for seed, dtype in enumerate((np.float64, np.float64, np.float32, np.complex128, np.complex64)):
+            u, v = random_field(rng, op.domain, dtype), random_field(rng, op.codomain, dtype)
+            one, other = explicit(u), free(u)
+            assert one.dtype == other.dtype == u.dtype
+            assert one.shape == other.shape == op.codomain.shape
+            eps = np.finfo(dtype).eps
+            scale = (abs(matrix) @ abs(u.astype(complex)).ravel()).reshape(one.shape)
+            gap = np.max(abs(one - other) / np.where(scale > 0, scale, 1), initial=0) / eps
+            assert not np.any(one[scale == 0]) and not np.any(other[scale == 0])
+            for form in (explicit, free):
+                left, right = np.sum(form(u) * v, dtype=complex), np.sum(u * form.T(v), dtype=complex)
+                bound = eps * size * np.linalg.norm(u) * np.linalg.norm(v)
+                assert abs(left - right) <= 10 * bound, (op, seed)
+            worst = max(worst, gap)
+    assert worst <= 10
+
+
+@EVERY
+def test_transposed_matrix_entry_by_entry(entry):
+    for op, _ in cases(entry, [(9,), (6, 4), (2, 2), (4, 3, 5)]):
+        difference = op.explicit().T.matrix - op.explicit().matrix.T
+        assert not difference.count_nonzero()
+        assert not (op.T.explicit().matrix - op.explicit().matrix.T).count_nonzero()
+
+
+@EVERY
+def test_derivatives_of_every_order(entry):
+    """JVP is the operator, VJP the transpose, and a Hessian product is A^T A, in both forms."""
+    for op, rng in cases(entry, [(9,), (6, 4), (4, 3, 5)]):
+        u, du = random_field(rng, op.domain, float), random_field(rng, op.domain, float)
+        g = random_field(rng, op.codomain, float)
+        for form in (op.explicit(), op.matrix_free()):
+            np.testing.assert_array_equal(pushforward(form, u, du)[1], form(du))
+            np.testing.assert_array_equal(pullback(form, u)[1](g), form.T(g))
+            slope = value_and_grad(lambda u, form=form: 0.5 * anp.sum(form(u) ** 2))
+            _, product = pushforward(lambda u, slope=slope: slope(u)[1], u, du)
+            np.testing.assert_allclose(product, form.T(form(du)), rtol=1e-12, atol=1e-12 * abs(product).max(initial=0))
+
+
+@EVERY
+def test_linear_and_fresh_and_untouched(entry):
+    for op, rng in cases(entry, [(9,), (6, 4)]):
+        for form in (op.explicit(), op.matrix_free()):
+            u, v = random_field(rng, op.domain, float), random_field(rng, op.domain, float)
+            kept, result = u.copy(), form(u)
+            np.testing.assert_array_equal(u, kept)
+            assert not np.shares_memory(result, u)
+            both = form(2.0 * u - v)
+            bound = 1e-13 * (abs(both).max(initial=1) + abs(result).max(initial=1))
+            np.testing.assert_allclose(both, 2.0 * result - form(v), rtol=1e-12, atol=bound)
+            out = np.empty(op.codomain.shape)
+            assert form.apply(u, out=out) is out
+            np.testing.assert_array_equal(out, result)
+
+
+@EVERY
+def test_refuses_what_does_not_fit(entry):
+    op, _ = next(cases(entry, [(6, 4)]))
+    for wrong in (np.zeros(op.domain.size + 1), np.zeros((*op.domain.shape, 1)), 1.0):
+        with pytest.raises(dp.errors.ShapeError, match="takes a field on .*, got an array of shape"):
+            op(wrong)
+    with pytest.raises(TypeError, match="takes float or complex numbers, got dtype"):
+        op(np.full(op.domain.shape, "a"))
+
+
+ORDER = [(entry, label) for entry, label in zip(CATALOGUE, LABELS) if entry.exact is not None]
+
+
+def conditions_for(periodic):
+    return (
+        [dp.neumann] if periodic else [dp.neumann, dp.dirichlet, dp.robin(1.0, 0.7), {"x": (dp.dirichlet, dp.neumann)}]
+    )
+
+
+@pytest.mark.parametrize("stretched", [False, True], ids=["uniform", "stretched"])
+@pytest.mark.parametrize("periodic", [False, True], ids=["bounded", "periodic"])
+@pytest.mark.parametrize("entry", [entry for entry, _ in ORDER], ids=[label for _, label in ORDER])
+def test_interior_order(entry, periodic, stretched):
+    """Slope of the last three refinements, two cells off the walls, max norm."""
+    wanted = (0.9, 1.1) if entry.builder == "upwind" else (1.9, 2.2)
+    for dim in range(entry.least_dim, 4):
+        sizes = {1: (128, 256, 512), 2: (64, 128, 256), 3: (32, 64, 96)}[dim]
+        if entry.builder == "upwind":
+            sizes = [2 * n for n in sizes] if dim < 3 else sizes
+        for boundary in conditions_for(periodic)[: 1 if dim == 3 else None]:
+            errors = [interior_error(entry, n, dim, periodic, stretched, boundary) for n in sizes]
+            slope = np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+            assert wanted[0] <= -slope <= wanted[1], (dim, boundary, errors)
+
+
+def interior_error(entry, n, dim, periodic, stretched, boundary):
+    grid, field = grid_of(n, dim, periodic, stretched), Field(periodic)
+    op = entry.make(grid, boundary)
+    values, wanted = entry.exact(field, grid, boundary)
+    error = abs(op(values) - wanted)
+    parts = op.codomain.split(error)
+    inner = (slice(2, -2),) * dim
+    return max(np.max(part[inner] if part.ndim == dim and part.size > 4 else part) for part in parts)
+
+
+@pytest.mark.parametrize("stretched", [False, True], ids=["uniform", "stretched"])
+@pytest.mark.parametrize("dim", [1, 2])
+@pytest.mark.parametrize("kind", ["dirichlet", "neumann"])
+def test_order_up_to_the_wall(kind, dim, stretched):
+    """Whole field, L2, boundary data by lift: the first-order wall truncation is there, and no more."""
+    boundary = getattr(dp, kind)
+    least_slope, least_laplacian = (1.4, 0.4) if kind == "dirichlet" else (1.9, 1.4)
+    errors, sizes, field = [], (32, 64, 128), Field(False)
+    for n in sizes:
+        grid = grid_of(n, dim, False, stretched)
+        slopes = dp.gradient(grid, boundary)(field(grid.centres()))
+        slopes = slopes + dp.lift(grid, boundary)(field.wall_values(grid, boundary))
+        gaps = slopes - field.on_faces(grid, 1)
+        curvature = dp.divergence(grid)(slopes) - field.laplacian(grid, boundary)[1]
+        errors.append([np.sqrt(np.sum(grid.faces.volumes * gaps**2)), np.sqrt(np.sum(grid.volumes * curvature**2))])
+    rates = -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+    assert rates[0] >= least_slope and rates[1] >= least_laplacian, rates
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_discrete_identities(shape):
+    """V D I = -(W G I)^T, zero row sums, constants and linears, D @ curl = 0."""
+    rng = np.random.default_rng(3)
+    for grid in grids(shape, rng):
+        volumes, areas = dp.diagonal(grid.cells, grid.volumes), dp.diagonal(grid.faces, grid.faces.volumes)
+        divergence, inner = dp.divergence(grid), dp.interior(grid)
+        for boundary in boundaries(grid):
+            slope = dp.gradient(grid, boundary)
+            left = (volumes @ divergence @ inner).explicit().matrix
+            right = (areas @ slope).explicit().matrix.T @ inner.explicit().matrix
+            assert abs((left + right).toarray()).max() <= 1e-13 * abs(left.toarray()).max(initial=1)
+        ones = np.ones(grid.shape)
+        pure = dp.laplacian(grid)
+        assert abs(pure(ones)).max() <= 1e-12
+        np.testing.assert_allclose(dp.average(grid)(ones), 1.0, rtol=1e-15)
+        np.testing.assert_allclose(dp.sample(grid, [np.array(grid.size) / 2 + grid.origin])(ones), 1.0, rtol=1e-15)
+        flow = rng.standard_normal(grid.faces.size)
+        total = np.sum(grid.volumes * divergence(inner(flow)))
+        assert abs(total) <= 1e-13 * np.sum(abs(grid.volumes * divergence(inner(flow)))) + 1e-300
+        if grid.dim > 1:
+            assert not (divergence @ dp.curl(grid)).explicit().matrix.count_nonzero()
+
+
+def test_linear_fields_are_exact():
+    rng = np.random.default_rng(4)
+    grid = dp.Grid((6, 5), spacing=[rng.uniform(0.5, 2, 6), rng.uniform(0.5, 2, 5)], origin=(1.0, -2.0))
+    x, y = grid.centres()
+    u, inner = 2 * x - 3 * y + 1, dp.interior(grid)
+    slopes = grid.join(np.full(grid.face_shape(0), 2.0), np.full(grid.face_shape(1), -3.0))
+    np.testing.assert_allclose(inner(dp.gradient(grid)(u)), inner(slopes), rtol=1e-12)
+    on_faces = grid.join(*(2 * a - 3 * b + 1 for a, b in map(grid.face_centres, (0, 1))))
+    np.testing.assert_allclose(inner(dp.average(grid)(u)), inner(on_faces), rtol=1e-12)
+    places = np.array(grid.origin) + rng.random((20, 2)) * np.array(grid.size)
+    np.testing.assert_allclose(dp.sample(grid, places)(u), 2 * places[:, 0] - 3 * places[:, 1] + 1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("builder", [dp.gradient, dp.laplacian])
+def test_products_and_sums_stay_factor_defined(builder):
+    grid = dp.Grid((5, 4), spacing=0.5)
+    product = -dp.divergence(grid) @ dp.gradient(grid) + 3 * dp.identity(grid.cells)
+    assert product.separable and not (dp.divergence(grid) @ dp.interior(grid) @ dp.gradient(grid)).separable
+    assert len(dp.laplacian(grid).structure.blocks[0, 0]) == grid.dim
+    assert dp.laplacian(grid, dp.dirichlet).T.separable
+    turned = builder(grid).T.T
+    np.testing.assert_array_equal(turned(np.ones(grid.shape)), builder(grid)(np.ones(grid.shape)))

@@ -1,0 +1,202 @@
+"""The adjoint contract: what every solve promises, whatever the method."""
+
+import re
+
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.solvers.contract import Engine, Solver
+from sparsedp.solvers.record import SolveLog
+from sparsedp.solvers.solution import Inverse
+from sparsedp.solvers.system import System
+
+ITERATIVE = ("multigrid", "krylov")
+METHODS = ("direct", *ITERATIVE)
+EVERY = pytest.mark.parametrize("method", METHODS)
+
+
+def stretched(*shape):
+    return dp.Grid(shape, spacing=[1.0 + 0.5 * np.sin(np.arange(n)) for n in shape])
+
+
+def wind(grid):
+    """Advection and diffusion: not symmetric."""
+    return 3.0 * dp.upwind(grid, "x", 1, dp.dirichlet) - dp.laplacian(grid, dp.dirichlet)
+
+
+PROBLEMS = {
+    "dirichlet": lambda: -dp.divergence(g := dp.Grid((26, 22), size=1.0)) @ dp.gradient(g, dp.dirichlet),
+    "negative": lambda: dp.laplacian(dp.Grid((9, 10, 8), size=1.0), dp.dirichlet),
+    "shifted": lambda: dp.identity((g := dp.Grid((24, 21), periodic=True)).cells) - dp.laplacian(g),
+    "robin, stretched": lambda: dp.laplacian(stretched(22, 24), dp.robin(1, 2)),
+    "line": lambda: -dp.laplacian(dp.Grid(401, size=1.0), {"x": (dp.dirichlet, dp.neumann)}),
+    "wind": lambda: wind(dp.Grid((24, 25), size=2.0)),
+    "wind, stretched": lambda: wind(stretched(24, 23)),
+}
+SINGULAR = {
+    "neumann": lambda: -dp.laplacian(dp.Grid((23, 22), size=1.0)),
+    "periodic": lambda: dp.laplacian(dp.Grid((9, 8, 7), periodic=True)),
+    "stretched neumann": lambda: -dp.laplacian(stretched(21, 26)),
+    "wind, periodic": lambda: dp.upwind(g := dp.Grid((26, 19), periodic=True)) - dp.laplacian(g),
+}
+ALL = {**PROBLEMS, **SINGULAR}
+
+
+@EVERY
+@pytest.mark.parametrize("problem", PROBLEMS)
+def test_solution_and_adjoint_against_dense_algebra(problem, method, rng):
+    op = PROBLEMS[problem]()
+    inv, matrix = dp.inverse(op, method), op.explicit().matrix.toarray()
+    b, g = rng.standard_normal((2, *op.domain.shape))
+    assert inv(b) == pytest.approx(np.linalg.solve(matrix, b.ravel()).reshape(b.shape), rel=1e-7, abs=1e-9)
+    assert inv.T(g) == pytest.approx(np.linalg.solve(matrix.T, g.ravel()).reshape(b.shape), rel=1e-7, abs=1e-9)
+
+
+@EVERY
+@pytest.mark.parametrize("problem", ALL)
+def test_the_adjoint_is_the_transpose(problem, method, rng):
+    """Also where the operator is singular: inv = P A+ P, so that inv.T = P^T A+^T P^T."""
+    op = ALL[problem]()
+    inv = dp.inverse(op, method, nullspace="project")
+    b, g = rng.standard_normal((2, *op.domain.shape)) + 1.0
+    x, y = inv(b), inv.T(g)
+    assert abs(np.sum(x * g) - np.sum(b * y)) <= 1e-9 * np.linalg.norm(x) * np.linalg.norm(g)
+    assert inv.info.forward.status.startswith("converged") and inv.info.adjoint.status.startswith("converged")
+
+
+@EVERY
+@pytest.mark.parametrize("problem", ["robin, stretched", "wind", "stretched neumann"])
+@pytest.mark.parametrize("exponent", [-963, -900, 17, 900, 963])
+def test_bits_do_not_depend_on_the_scale_of_the_data(problem, method, exponent, rng):
+    op = ALL[problem]()
+    inv = dp.inverse(op, method, nullspace="project")
+    b = rng.standard_normal(op.domain.shape)
+    for solve in (inv, inv.T):
+        assert np.array_equal(solve(np.ldexp(b, exponent)), np.ldexp(solve(b), exponent))
+
+
+@EVERY
+@pytest.mark.parametrize("exponent", [-960, -300, 300, 960])
+def test_bits_do_not_depend_on_the_scale_of_the_operator(method, exponent, rng):
+    op = PROBLEMS["dirichlet"]()
+    b = rng.standard_normal(op.domain.shape)
+    scaled = dp.inverse(op * 2.0**exponent, method)
+    for solve, other in ((scaled, dp.inverse(op, method)), (scaled.T, dp.inverse(op, method).T)):
+        assert np.array_equal(np.ldexp(solve(b), exponent), other(b))
+
+
+def test_what_cannot_be_represented_is_refused():
+    inv = dp.inverse(1e-10 * dp.identity(dp.Grid(3).cells))
+    with pytest.raises(
+        dp.errors.NonFiniteError, match=r"the solution of .* is beyond 1.8e308; scale the right-hand side down"
+    ):
+        inv(np.full(3, 1e300))
+    assert inv.info.forward.status == "not_representable"
+    assert inv(np.full(3, 1e-310)) == pytest.approx(np.full(3, 1e-300))  # a subnormal keeps the digits it has
+    with pytest.raises(
+        dp.errors.NonFiniteError, match=r"the solution of .* is beyond float32; give it double precision"
+    ):
+        inv(np.full(3, 1e30, dtype=np.float32))
+
+
+# ---------------------------------------------------------------- judged by the true residual
+
+
+class Scripted(Engine):
+    """An engine that says it is done, with an error of its own."""
+
+    method = "scripted"
+
+    def __init__(self, op, error, word="", refines=True):
+        self.inverse = np.linalg.inv(op.explicit().matrix.toarray())
+        self.error, self.word, self.calls = error, word, 0
+        self.refines = refines
+
+    def solve(self, b, goal, transposed):
+        self.calls += 1
+        exact = (self.inverse.T if transposed else self.inverse) @ b
+        b[:] = np.nan  # it may use the array it was given
+        return exact * (1 + self.error), 3, self.word
+
+
+def scripted(error, word="", rtol=1e-10, **options):
+    op = -dp.laplacian(dp.Grid(101, size=1.0), dp.dirichlet)
+    engine = Scripted(op, error, word, **options)
+    return Inverse(Solver(System(op, rtol), engine, "raise", SolveLog(), "inverse", None), "a test"), engine
+
+
+def test_an_inexact_method_is_refined():
+    inv, engine = scripted(1e-3)
+    x = inv(np.ones(101))
+    assert engine.calls == 4 and inv.info.forward.iterations == 12  # 1e-3, 1e-6, 1e-9, 1e-12
+    assert inv.info.forward.residual <= 1e-10
+    assert np.linalg.norm(1.0 - inv.solver.system.given(x)) <= 1e-10 * np.sqrt(101)
+
+
+@pytest.mark.parametrize("error, status", [(0.7, "stagnated"), (np.nan, "nonfinite_output")])
+def test_a_method_that_claims_to_be_done_is_not_believed(error, status):
+    inv, _ = scripted(error)
+    for solve in (inv, inv.T):
+        with pytest.raises(dp.errors.ConvergenceError, match=re.escape(f"wanted 1e-10 ({status})")) as caught:
+            solve(np.ones(101))
+        assert caught.value.info.status == status
+        assert np.all(np.isfinite(caught.value.best)) and caught.value.best.shape == (101,)
+    assert inv.info.forward.status == inv.info.adjoint.status == status
+
+
+def test_the_word_of_a_failed_method_is_reported():
+    inv, _ = scripted(0.7, "indefinite_operator")
+    with pytest.raises(dp.errors.ConvergenceError, match="indefinite_operator"):
+        inv(np.ones(101))
+
+
+def test_a_method_of_fixed_length_is_taken_as_it_is():
+    inv, engine = scripted(0.1, "max_iterations", refines=False)
+    inv(np.ones(101))
+    assert engine.calls == 1 and inv.info.forward.status == "max_iterations"
+    assert inv.info.forward.residual == pytest.approx(0.1)
+
+
+def test_the_tolerance_is_relative_and_attainable_accuracy_has_a_name():
+    inv, _ = scripted(1e-3, rtol=1e-2)
+    inv(1e-200 * np.ones(101))
+    assert inv.info.forward.status == "converged" and inv.info.forward.residual == pytest.approx(1e-3)
+    tight, _ = scripted(1e-9, rtol=1e-30)
+    tight(np.ones(101))
+    assert tight.info.forward.status == "converged_at_roundoff"
+    assert 0 < tight.info.forward.backward_error <= 8 * np.finfo(float).eps
+
+
+def test_a_right_hand_side_of_zero_is_not_solved():
+    inv, engine = scripted(0.0)
+    for solve in (inv, inv.T):
+        assert np.array_equal(solve(np.zeros(101)), np.zeros(101))
+    assert engine.calls == 0 and inv.info.forward.status == inv.info.adjoint.status == "exact_zero_rhs"
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+@pytest.mark.parametrize("transposed", [False, True])
+def test_no_silent_failure(method, transposed):
+    inv = dp.inverse(ALL["wind"](), method, maxiter=1)
+    solve = inv.T if transposed else inv
+    message = rf"{method} on <.*>: relative residual .* after 1 (cycles|iterations), wanted 1e-10 \(max_iterations\)"
+    with pytest.raises(dp.errors.ConvergenceError, match=message) as caught:
+        solve(np.ones((24, 25)))
+    assert caught.value.info.iterations == 1 and caught.value.best.shape == (24, 25)
+    record = inv.info.adjoint if transposed else inv.info.forward
+    assert record.status == caught.value.info.status == "max_iterations"
+
+
+def test_data_that_are_not_finite_are_refused():
+    inv = dp.inverse(PROBLEMS["dirichlet"]())
+    b = np.ones((26, 22))
+    b[3, 4], b[7, 1] = np.nan, np.inf
+    message = (
+        "inverse(-divergence @ gradient) takes finite numbers, got 2 that are NaN or infinite, the first at (3, 4)"
+    )
+    with pytest.raises(dp.errors.NonFiniteError, match=re.escape(message)):
+        inv(b)
+    assert inv.info.forward.status == "nonfinite_input"
+    with pytest.raises(dp.errors.NonFiniteError):
+        inv.T(np.where(np.isnan(b), 1.0, b))

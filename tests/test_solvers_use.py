@@ -1,0 +1,195 @@
+"""An inverse in use: its record, kinds of arrays, derivatives of every order, counts."""
+
+import gc
+import pickle
+import weakref
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from test_solvers import ALL, EVERY, PROBLEMS, stretched
+
+import sparsedp as dp
+from sparsedp.derivative import pullback, pushforward, value_and_grad
+from sparsedp.ledger import recording
+
+BOX = np.arange(21 * 26).reshape(21, 26) % 3 > 0
+
+# ---------------------------------------------------------------- records
+
+
+def test_the_record():
+    inv = dp.inverse(PROBLEMS["dirichlet"](), "multigrid")
+    log = inv.info
+    assert log is inv.T.info and log.forward is None and log.adjoint is None and log.setup_seconds > 0
+    assert "levels" in log.hierarchy and "setup_seconds" in repr(log)
+    inv(np.ones((26, 22)))
+    assert log.adjoint is None and log.forward.iterations > 0 and log.forward.seconds > 0
+    assert log.forward.residual <= 1e-10 and log.forward.backward_error < log.forward.residual
+    inv.T(np.ones((26, 22)))
+    assert log.adjoint.status == "converged"
+
+
+def test_an_inverse_says_what_it_is():
+    inv = dp.inverse(PROBLEMS["dirichlet"](), "multigrid")
+    text = str(inv)
+    for word in ("multigrid: as asked", "572 of 572", "1e-10", "0 singular components", "levels", "complexity"):
+        assert word in text
+    assert repr(inv) == "<inverse(-divergence @ gradient): cells(26, 22) -> cells(26, 22), multigrid>"
+
+
+def test_transposes_know_each_other():
+    inv = dp.inverse(PROBLEMS["wind"]())
+    b = np.ones((24, 25))
+    assert inv.T is inv.T and inv.T.T.T is inv.T
+    assert np.array_equal(inv.T.T(b), inv(b)) and inv.domain == inv.T.codomain
+    again = pickle.loads(pickle.dumps(inv))
+    assert np.array_equal(again(b), inv(b)) and np.array_equal(again.T(b), inv.T(b))
+
+
+# ---------------------------------------------------------------- kinds of arrays
+
+
+@EVERY
+def test_kind_and_layout_of_the_data(method, rng):
+    op = PROBLEMS["dirichlet"]()
+    inv = dp.inverse(op, method)
+    b = np.round(8 * rng.standard_normal(op.domain.shape))
+    wide = np.empty((52, 44))
+    wide[::2, ::-2] = b
+    frozen = b.copy()
+    frozen.flags.writeable = False
+    for twin in (b.astype(int), np.asfortranarray(b), wide[::2, ::-2], frozen, b.astype(np.int8), b.astype(">f8")):
+        before = twin.copy()
+        x = inv(twin)
+        assert x.dtype == np.float64 and np.array_equal(x, inv(b)) and np.array_equal(twin, before)
+    assert np.array_equal(inv(b > 0), inv((b > 0).astype(float)))
+    assert np.array_equal(inv(np.broadcast_to(2.0, b.shape)), inv(np.full(b.shape, 2.0)))
+    single = inv(b.astype(np.float32))
+    assert single.dtype == np.float32 and np.array_equal(single, inv(b).astype(np.float32))
+
+
+@EVERY
+def test_complex_data(method, rng):
+    op = ALL["stretched neumann"]()
+    inv = dp.inverse(op, method, nullspace="project")
+    b, c = rng.standard_normal((2, *op.domain.shape))
+    for solve in (inv, inv.T):
+        x = solve(b + 1j * c)
+        assert x.dtype == complex and np.array_equal(x, solve(b) + 1j * solve(c))
+    assert inv(b + 0j).imag.any() == 0 and inv.info.forward.status == "converged"
+
+
+def test_complex_operators_go_to_the_direct_method(rng):
+    matrix = rng.standard_normal((80, 80)) + 1j * rng.standard_normal((80, 80))
+    op = dp.from_matrix(matrix + 20 * np.eye(80))
+    b = rng.standard_normal(80)
+    inv = dp.inverse(op)
+    assert inv.method == "direct"
+    assert inv(b) == pytest.approx(np.linalg.solve(op.matrix.toarray(), b))
+    assert inv.T(b * 1j) == pytest.approx(np.linalg.solve(op.matrix.toarray().T, b * 1j))
+    with pytest.raises(ValueError, match=r"krylov takes real operators, <.*> is complex; write method='direct'"):
+        dp.inverse(op, "krylov")
+
+
+def test_wrong_shapes():
+    inv = dp.inverse(PROBLEMS["dirichlet"]())
+    for wrong in (np.ones(572), np.ones((22, 26)), 1.0):
+        with pytest.raises(dp.errors.ShapeError, match="takes a field on cells"):
+            inv(wrong)
+    with pytest.raises(
+        dp.errors.ShapeError, match=r".* takes a start on cells\(26, 22\), got an array of shape \(3,\)"
+    ):
+        inv(np.ones((26, 22)), start=np.ones(3))
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+@EVERY
+@pytest.mark.parametrize("problem", ["wind", "stretched neumann"])
+def test_derivatives_of_every_order(problem, method, rng):
+    """Only primal data must be compatible: no cotangent or tangent of any order is refused."""
+    op = ALL[problem]()
+    inv, free = (dp.inverse(op, method, nullspace=word) for word in ("raise", "project"))
+    b = op(rng.standard_normal(op.domain.shape))
+    d, e = rng.standard_normal((2, *op.domain.shape))
+
+    def loss(b):
+        return anp.sum(inv(b) ** 3)
+
+    x = inv(b)
+    gradient = value_and_grad(loss)(b)[1]
+    assert gradient == pytest.approx(inv.T(3 * x**2), rel=1e-12)
+    assert pushforward(inv, b, d)[1] == pytest.approx(free(d), rel=1e-12)
+    wanted = np.sum(6 * x * free(d) * free(e))
+    for reverse in (True, False):
+        slope = lambda b: anp.sum(value_and_grad(loss)(b)[1] * d)
+        found = np.sum(value_and_grad(slope)(b)[1] * e) if reverse else pushforward(slope, b, e)[1]
+        assert found == pytest.approx(wanted, rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    "wrap", [lambda inv: 2 * inv, lambda inv: inv + inv, lambda inv: dp.mask(inv.domain, BOX) @ inv]
+)
+def test_what_is_composed_with_an_inverse_refuses_no_cotangent_either(wrap, rng):
+    """The transpose of a transpose is the twin that never refuses, also inside scalings, sums and chains."""
+    op = ALL["stretched neumann"]()
+    strict, free = (wrap(dp.inverse(op, nullspace=word)) for word in ("raise", "project"))
+    b = op(rng.standard_normal(op.domain.shape))
+    d, e = rng.standard_normal((2, *op.domain.shape))
+    slope = lambda b: anp.sum(value_and_grad(lambda b: anp.sum(strict(b) ** 3))(b)[1] * d)
+    wanted = np.sum(6 * strict(b) * free(d) * free(e))
+    assert np.sum(value_and_grad(slope)(b)[1] * e) == pytest.approx(wanted, rel=1e-8)
+    with pytest.raises(dp.errors.IncompatibleError):
+        strict(d)
+
+
+def test_projection_in_a_chain_has_second_derivatives(rng):
+    """Divergences are compatible; the cotangents inside are projected, never refused."""
+    grid = stretched(6, 5)
+    G, D = dp.gradient(grid), dp.divergence(grid)
+    keep = dp.interior(grid)
+    chain = G @ dp.inverse(D @ G) @ D @ keep
+    v, d = rng.standard_normal((2, grid.faces.size))
+    gradient = lambda v: value_and_grad(lambda v: anp.sum(chain(v) ** 3))(v)[1]
+    _, second = pushforward(gradient, v, d)
+    h = 1e-5
+    assert second == pytest.approx((gradient(v + h * d) - gradient(v - h * d)) / (2 * h), rel=1e-5, abs=1e-6)
+    assert chain(chain(v)) == pytest.approx(chain(v), rel=1e-9, abs=1e-10)
+
+
+def used(method):
+    """Make and differentiate solves; weak references to all that was set up."""
+    op, grid = ALL["wind"](), stretched(20, 19)
+    inv = dp.inverse(op, method)
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), method)
+    b, k = op(np.ones((24, 25))), np.ones(grid.faces.size)
+    value_and_grad(lambda b: anp.sum(inv(b, start=0 * b) ** 2 + inv(b)))(b)
+    value_and_grad(lambda k: anp.sum(solve(k, grid.volumes)))(k + 1e-3 * np.arange(k.size))
+    kept = (inv, inv.solver.engine, inv.solver.system, solve, solve._kept[0][2])
+    return [weakref.ref(thing) for thing in kept]
+
+
+@EVERY
+def test_an_inverse_is_freed_at_once(method):
+    """Factors and hierarchies are large: no reference cycle may keep them until the collector runs."""
+    gc.disable()
+    try:
+        assert [thing() for thing in used(method)] == [None] * 5
+    finally:
+        gc.enable()
+
+
+def test_solves_are_counted():
+    inv = dp.inverse(PROBLEMS["dirichlet"]())
+    b = np.ones((26, 22))
+    with recording() as calls:
+        value, pull = pullback(lambda b: anp.sum(inv(b) ** 2), b)
+    assert calls[inv.name, "solve"] == 1 and calls[inv.name, "adjoint"] == 0
+    with recording() as calls:
+        pull(1.0)
+    assert calls[inv.name, "adjoint"] == 1 and calls[inv.name, "solve"] == 0
+    with recording() as calls:
+        dp.inverse(PROBLEMS["dirichlet"]())
+    assert calls[inv.name, "setup"] == 1
