@@ -20,6 +20,8 @@ _WINDOW = {
     "operators.boundary": "diagonal identity interior lift mask",
     "solvers.choose": "inverse",
     "solvers.parametric": "elliptic_solver",
+    "solvers.roots": "implicit",
+    "solvers.entries": "matrix_solver",
     "solvers.spectral": "exponential power",
     "optimise.loop": "minimise",
     "kernels": "set_threads",

@@ -30,7 +30,9 @@ from .operators.transfer import sample as sample
 from .optimise.loop import minimise as minimise
 from .report.plots import plot as plot
 from .solvers.choose import inverse as inverse
+from .solvers.entries import matrix_solver as matrix_solver
 from .solvers.parametric import elliptic_solver as elliptic_solver
+from .solvers.roots import implicit as implicit
 from .solvers.spectral import exponential as exponential
 from .solvers.spectral import power as power
 from .space import Space as Space

@@ -184,7 +184,10 @@ def cast(g, dtype):
     """Array or traced array -> the same numbers in `dtype` (real part if `dtype` is real)."""
     if dtype_of(g).kind == "c" and np.dtype(dtype).kind == "f":
         g = anp.real(g)
-    return g if dtype_of(g) == dtype else anp._astype(g, dtype) if isbox(g) else np.asarray(g, dtype)
+    given = dtype_of(g)
+    if given == dtype or not isbox(g):
+        return g if given == dtype else np.asarray(g, dtype)
+    return linear("cast", lambda x: np.asarray(x, dtype), lambda x: np.asarray(x, given))[0](g)
 
 
 def linear(name, forward, transpose):

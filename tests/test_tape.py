@@ -66,6 +66,18 @@ def test_a_wider_cotangent_is_rounded_to_the_dtype_of_the_field():
     assert gradient.dtype == np.float32
 
 
+def test_float32_has_second_derivatives_in_every_mode():
+    op = dp.laplacian(dp.Grid(4))
+    scale = np.arange(1.0, 5.0)  # float64 meets float32: cotangents are cast on the way back
+    f = lambda u: anp.sum(op(u * scale) ** 2)
+    u, v = np.ones(4, np.float32), np.arange(4, dtype=np.float32)
+    wanted = 2 * scale * op.T(op(scale * v))
+    slope = lambda u: value_and_grad(f)(u)[1]
+    for product in (pushforward(slope, u, v)[1], value_and_grad(lambda u: anp.sum(slope(u) * v))(u)[1]):
+        assert product.dtype == np.float32
+        np.testing.assert_allclose(product, wanted, rtol=1e-5)
+
+
 def test_missing_derivatives_and_hidden_boxes_are_named():
     bare = dp.differentiable("bare", lambda x: x)
     with pytest.raises(dp.errors.DerivativeError, match=r"^bare has no VJP; give differentiable\(...\) a vjp$"):

@@ -1,0 +1,251 @@
+"""The Jacobian J = dF/dx of a residual at a point, set up for solves: given, assembled by colours, or as products.
+
+Set-ups are kept by content, the last two: of the point (x and the parameters, for the derivative rules),
+and of the entries (a residual that is linear in x is set up once). Forward solves never look a point up.
+"""
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.derivative import pushforward
+from sparsedp.errors import ConvergenceError, DerivativeError, ShapeError
+from sparsedp.ledger import active as recordings
+from sparsedp.ledger import count
+from sparsedp.operator import Operator
+from sparsedp.operators.given import from_functions, from_matrix
+from sparsedp.solvers.choose import build
+from sparsedp.solvers.colouring import Coloured
+from sparsedp.solvers.kept import Kept
+from sparsedp.solvers.linearisation import Linearisation
+from sparsedp.solvers.sparsity import dense_pattern, find_pattern
+from sparsedp.tape import isbox
+
+__all__ = ["Jacobians"]
+
+FULL_UP_TO = 16  # unknowns: a full Jacobian takes fewer products than the search for its pattern
+FULL_AT_MOST = 2000  # unknowns: a larger Jacobian that is not sparse is left as products
+AGREES = 1e-8  # relative difference up to which two forms of one Jacobian are taken for equal
+
+
+class Jacobians:
+    """Where the Jacobians of one residual come from.
+
+    Parameters
+    ----------
+    name : str
+    jacobian : callable or None
+    sparsity : sparse matrix or None
+    settings : dict
+        Keywords of `build`.
+    """
+
+    def __init__(self, name, jacobian, sparsity, settings):
+        self.name, self.given, self.settings = name, jacobian, settings
+        self.sparsity: Any = None if sparsity is None else _pattern(sparsity)
+        self.by_rows = None  # True: the residual has no JVP
+        self.way = ""
+        self._patterns: dict = {}  # size -> Coloured, or None when only products will do
+        self._points, self._matrices = Kept(), Kept()
+
+    def __str__(self):
+        counts = {size: "" if c is None else f", {c.count} products" for size, c in self._patterns.items()}
+        lines = [f"  {size} unknowns{many}" for size, many in counts.items()]
+        return "\n".join([*lines, str(self._points.last.inv) if len(self._points) else "  not set up yet"])
+
+    # ------------------------------------------------------------ set-ups
+
+    def fresh(self, equation, x, leaves):
+        """The Jacobian at this point, made now."""
+        op = self._operator(equation, x, leaves)
+        point = equation, x.copy(), [np.array(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
+        ours = self.given is None and not op.structure.has_entries  # bare products are the derivative itself
+        return self._points.put(_key(equation, x, leaves), Linearisation(op, self._inverse(op), point, ours))
+
+    def kept(self, equation, x, leaves):
+        """The Jacobian at this point for a derivative: kept or made, and checked against the residual."""
+        known = self._points.find(_key(equation, x, leaves)) or self.fresh(equation, x, leaves)
+        return self.fresh(equation, x, leaves) if self.enlarged(known) else known
+
+    def _inverse(self, op):
+        settings = dict(self.settings, name=f"{self.name}.jacobian", solves="few")
+        if op.form != "explicit":
+            return build(op, **settings | (dict(method="krylov") if not op.structure.has_entries else {}))
+        key = (op.matrix.indptr, op.matrix.indices, op.matrix.data)
+        return self._matrices.find(key) or self._matrices.put(key, build(op, **settings))
+
+    def suspected(self, known):
+        """As `enlarged`, for a Newton step that did not do well. A Jacobian that was given may be a simpler one."""
+        return self.given is None and self.enlarged(known)
+
+    def hint(self, known):
+        """What a failed solve should say about a Jacobian that was given."""
+        if self.given is None:
+            return ""
+        defect = known.defect()[0]
+        return f"; the jacobian given differs from the derivative of the residual by {defect:.1e}" * (defect > AGREES)
+
+    def enlarged(self, known):
+        """Check a Jacobian, once. Returns True when entries were missing and its pattern has been enlarged.
+
+        Raises
+        ------
+        DerivativeError
+            When it was given, as a whole or as its sparsity, and does not fit the residual.
+        """
+        if known.checked:
+            return False
+        defect, row = known.defect()
+        known.checked = defect <= AGREES
+        if known.checked:
+            return False
+        if self.given is not None:
+            raise DerivativeError(
+                f"the jacobian given for {self.name} differs from the derivative of the residual "
+                f"by {defect:.1e} (relative) in row {row}; correct it or leave it out"
+            )
+        if self.sparsity is not None:
+            raise DerivativeError(
+                f"the sparsity given for {self.name} lacks entries in row {row}; add them or leave it out"
+            )
+        equation, x, leaves = known.point
+        self._enlarge(equation, x, leaves, row)
+        return True
+
+    # ------------------------------------------------------------ three ways to a Jacobian
+
+    def _operator(self, equation, x, leaves):
+        name = f"{self.name}.jacobian"
+        if self.given is not None:
+            self.way = "given"
+            given = self.given(equation.layout.split(x), *equation.params(leaves))
+            return self._as_operator(given, equation.size, name)
+        coloured = self._coloured(equation, x, leaves)
+        if coloured is None:
+            forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
+            return from_functions(forward, backward, equation.size, equation.size, name)
+        return from_matrix(coloured.matrix(self._product(equation, x, leaves, coloured.by_rows)), name=name)
+
+    def _as_operator(self, given, size, name):
+        if isbox(given):
+            raise DerivativeError(f"the jacobian of {self.name} uses a traced value that is not an argument")
+        if not isinstance(given, Operator):
+            given = from_matrix(given if sp.issparse(given) or np.ndim(given) else [[given]], name=name)
+        if given.shape != (size, size):
+            raise ShapeError(f"the jacobian of {self.name} must have shape {(size, size)}, got {given.shape}")
+        if given.dtype.kind == "c":
+            raise TypeError(f"the jacobian of {self.name} must be real")
+        return given
+
+    def _product(self, equation, x, leaves, transposed, purpose="jacobian"):
+        """v -> J v or J^T v, counted."""
+        key = f"{self.name}.{purpose}", "vjp" if transposed else "jvp"
+        act = (equation.transposed if transposed else equation.tangent)(x, leaves)
+
+        def product(v):
+            if recordings:
+                count(*key)
+            with np.errstate(all="ignore"):
+                return act(v)
+
+        return product
+
+    # ------------------------------------------------------------ the pattern
+
+    def _coloured(self, equation, x, leaves):
+        """The coloured pattern for this many unknowns; None: only products will do."""
+        size, method = equation.size, self.settings["method"]
+        if size not in self._patterns:
+            if self.by_rows is None:
+                self.by_rows = not _has_jvp(equation, x, leaves)
+            if self.sparsity is not None:
+                found, self.way = self._given_pattern(size), "assembled on the pattern given"
+            elif method == "krylov":
+                found, self.way = None, "products only, as asked"
+            elif size <= FULL_UP_TO:
+                found, self.way = dense_pattern(size, size), "assembled, all entries"
+            else:
+                found = self._search(equation, x, leaves)
+                found = self._not_sparse(found, size, method)
+            self._colour(found, equation)
+        return self._patterns[size]
+
+    def _given_pattern(self, size):
+        pattern = self.sparsity
+        if pattern.shape != (size, size):
+            raise ShapeError(f"the sparsity of {self.name} must have shape {(size, size)}, got {pattern.shape}")
+        return pattern
+
+    def _not_sparse(self, found, size, method):
+        if found is not None:
+            self.way = "assembled on a pattern found by probing"
+            return found
+        if method == "auto" and size > FULL_AT_MOST:
+            self.way = f"products only: {size} unknowns and a Jacobian that is not sparse"
+            return None
+        self.way = "assembled, all entries: it is not sparse"
+        return dense_pattern(size, size)
+
+    def _colour(self, pattern, equation):
+        shapes = equation.layout.shapes
+        shape = shapes[0] if len(shapes) == 1 else None
+        coloured = None if pattern is None else Coloured(pattern, shape, self.by_rows or None)
+        self._patterns[equation.size] = coloured
+
+    def _search(self, equation, x, leaves):
+        """The pattern of J near x and at two opposite random points, by columns or by rows."""
+        points = [point for point in _points(x) if _is_valid(equation, point, leaves)] or [x]
+        for transposed in (True,) if self.by_rows else (False, True):
+            products = [self._product(equation, point, leaves, transposed, "pattern") for point in points]
+            found = find_pattern(products, x.size, x.size)
+            if found is not None:
+                return found.T.tocsr() if transposed else found
+        return None
+
+    def _enlarge(self, equation, x, leaves, row):
+        """Add the entries that J has at x. When there are none, its products are not linear."""
+        old = self._patterns[equation.size].pattern
+        product = self._product(equation, x, leaves, bool(self.by_rows), "pattern")
+        found = find_pattern([product], x.size, x.size)
+        found = dense_pattern(*old.shape) if found is None else found.T.tocsr() if self.by_rows else found
+        total = sp.csr_array(old + found)
+        if total.nnz == old.nnz:
+            raise DerivativeError(f"the derivative of {self.name} is not linear in its direction in row {row}")
+        total.data[:] = 1.0
+        self._colour(total, equation)
+
+
+def _key(equation, x, leaves):
+    return (x, *leaves, *equation.statics, *equation.layout.shapes)
+
+
+def _pattern(sparsity):
+    pattern = sp.csr_array(sparsity, copy=True)
+    pattern.sum_duplicates()
+    pattern.data = np.ones(pattern.nnz)
+    return pattern
+
+
+def _points(x):
+    rng = np.random.default_rng(0)
+    scale = np.sqrt(np.mean(x**2)) or 1.0
+    far = scale * rng.standard_normal(x.size)
+    return x * (1 + 0.1 * rng.uniform(-1, 1, x.size)), far, -far  # opposite: each side of a switch is met
+
+
+def _is_valid(equation, x, leaves):
+    """A probed point is ours, not the user's: where the residual refuses it, it is left out."""
+    try:
+        with np.errstate(all="ignore"):
+            return bool(np.all(np.isfinite(equation(x, *leaves))))
+    except (ValueError, ArithmeticError, ConvergenceError):
+        return False
+
+
+def _has_jvp(equation, x, leaves):
+    try:
+        pushforward(lambda y: equation(y, *leaves), x, np.ones_like(x))
+    except (NotImplementedError, DerivativeError):
+        return False
+    return True

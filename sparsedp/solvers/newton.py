@@ -1,0 +1,204 @@
+"""Newton's method with a line search on flat unknowns, judged in a way that no scaling of the residual changes.
+
+With F and J at the last iterate, b = J x - F is the right-hand side of the linearised system J y = b. As
+for linear systems (see contract.py), x is accepted when
+
+    |F| <= rtol |b|,    or    |F| <= 8 eps (|J| |x| + |b|)    (converged_at_roundoff).
+
+Where no step lowers the residual any more, F may be rounding of terms that cancel (the 1 in exp(x) - 1).
+It is taken for that, and x for converged_at_roundoff, when |F| <= 64 eps (|J| |x| + |b| + the largest |F|
+met + |F_p p|) and J is right about F a thousand steps further: then neither J nor a kink is to blame.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
+from sparsedp.solvers.contract import norm
+from sparsedp.solvers.equation import check_finite, push
+from sparsedp.solvers.nullspace import ROUNDING
+
+__all__ = ["Newton", "length"]
+
+HALVINGS = 30
+DECREASE = 1e-4  # share of the decrease a linear residual would show that a step must reach
+SLOW = 0.25  # a residual that falls by less makes a Jacobian suspect
+FAR = 1024.0  # Newton steps: where rounding is no longer seen
+LOOSEST = 1e-2  # relative residual of the linear solve of a first step
+TINY = 1e-8  # an iterate that is smaller than the last one by this share may be on its way to 0
+
+
+class Newton:
+    """One solve of equation(x, *leaves) = 0.
+
+    Parameters
+    ----------
+    equation : Equation
+    leaves : tuple of plain arrays
+    jacobians : Jacobians
+    rtol : float
+    maxiter : int
+    run : Run
+        Its figures are filled in.
+    """
+
+    def __init__(self, equation, leaves, jacobians, rtol, maxiter, run):
+        self.equation, self.leaves, self.jacobians = equation, leaves, jacobians
+        self.rtol, self.maxiter, self.run = rtol, maxiter, run
+        self.x: np.ndarray
+        self.F: np.ndarray
+        self.J: Any = None
+        self.largest = 0.0  # residual met
+
+    def solve(self, guess):
+        """From a guess to a root. Raises ConvergenceError with the best iterate."""
+        self.x, self.F = guess, self._first(guess)
+        word, forcing = "" if self.F.any() else "converged", LOOSEST
+        if not word:
+            self._linearise()
+            word = self._accepted()
+        while not word:
+            before = length(self.F)
+            if self.run.iterations == self.maxiter:
+                self._fail("max_iterations")
+            step = self._step(forcing)
+            if self._moved(step):
+                self.run.iterations += 1
+                ratio = length(self.F) / before
+                word = self._accepted()
+                if not word:
+                    if ratio > SLOW:
+                        self.jacobians.suspected(self.J)
+                    self._linearise()
+                    forcing = float(np.clip(0.9 * ratio**2, self.rtol, LOOSEST))
+            elif self.jacobians.suspected(self.J):
+                self._linearise()
+            else:
+                word = self._rounding(step) or self._fail("stagnated")
+        self.run.status = word
+        return self.x
+
+    def _first(self, guess):
+        name = self.equation.name
+        try:
+            check_finite(f"the guess of {name}", guess)
+            self.equation.check_finite(self.leaves)
+            F = self.equation.value(guess, self.leaves)
+            check_finite(f"the residual of {name} at the guess", F)
+        except NonFiniteError:
+            self.run.status = "nonfinite_input"
+            raise
+        return F
+
+    # ------------------------------------------------------------ one step
+
+    def _linearise(self):
+        try:
+            self.J = self.jacobians.fresh(self.equation, self.x, self.leaves)
+        except ConvergenceError as error:
+            self._fail("setup_failed", f"its Jacobian has no inverse there: {error}; start from another guess")
+
+    def _step(self, forcing):
+        try:
+            return self.J.step(self.F, forcing)
+        except ConvergenceError as error:
+            self._fail("setup_failed", f"its Newton step cannot be found: {error}")
+
+    def _moved(self, step):
+        """Go along the step, half of it, a quarter ... until the residual falls. False: it never does."""
+        size, share = length(self.F), 1.0
+        for _ in range(HALVINGS):
+            x = self.x + share * step
+            if np.array_equal(x, self.x):
+                return False
+            F = self._value(x)
+            if F is not None and length(F) <= (1 - DECREASE * share) * size:
+                self.x, self.F = self._at_zero(x, F)
+                return True
+            share /= 2
+        return False
+
+    def _at_zero(self, x, F):
+        """Iterates that shrink to 0 have no scale of their own: 0 itself is tried."""
+        if F.any() and length(x) <= TINY * length(self.x):
+            at_zero = self._value(np.zeros_like(x))
+            if at_zero is not None and not at_zero.any():
+                return np.zeros_like(x), at_zero
+        return x, F
+
+    def _value(self, x):
+        """The residual at a trial point, or None where there is none."""
+        try:
+            F = self.equation.value(x, self.leaves)
+        except (UnstableStepError, NonFiniteError, ConvergenceError):
+            return None
+        return F if np.all(np.isfinite(F)) else None
+
+    # ------------------------------------------------------------ the verdict
+
+    def _accepted(self):
+        """The status word, or "" while x is not accepted."""
+        if not self.F.any():
+            self.run.residual = self.run.backward_error = 0.0
+            return "converged"
+        residual, data, size = self._sizes()
+        self.run.residual, self.run.backward_error = residual / data if data else 1.0, residual / size
+        self.largest = max(self.largest, length(self.F))
+        if not np.isfinite(size):
+            return ""
+        if residual <= self.rtol * data:
+            return "converged"
+        return "converged_at_roundoff" if residual <= ROUNDING * size else ""
+
+    def _sizes(self):
+        """|F|, |b| and |J| |x| + |b|, in a unit in which the first is near 1."""
+        unit = -_exponent(self.F)  # so that no square leaves the range of floats
+        with np.errstate(over="ignore", invalid="ignore"):
+            F = np.ldexp(self.F, unit)
+            b = np.ldexp(self.J.product(self.x), unit) - F
+            data = length(b)
+            return norm(F), data, float(np.ldexp(self.J.norm, unit)) * length(self.x) + data
+
+    def _rounding(self, step):
+        """The status word when what is left of F is rounding, else ""."""
+        residual, _, size = self._sizes()
+        unit = -_exponent(self.F)
+        size += float(np.ldexp(self.largest + length(self._terms()), unit))
+        far = self._value(self.x + FAR * step)
+        if far is None or not residual <= 8 * ROUNDING * size:
+            return ""
+        predicted = (1 - FAR) * self.F
+        if length(far - predicted) > 0.05 * length(predicted):
+            return ""
+        self.run.backward_error = residual / size
+        return "converged_at_roundoff"
+
+    def _terms(self):
+        """F_p p: the sum of the terms of F in its parameters, each as often as its degree."""
+        if not self.leaves:
+            return np.zeros_like(self.x)
+        return push(lambda leaves: self.equation(self.x, *leaves), list(self.leaves), list(self.leaves))
+
+    def _fail(self, word, reason=""):
+        run, name = self.run, self.equation.name
+        run.status = word
+        reached = f"relative residual {run.residual:.1e}, wanted {self.rtol:g} ({word})"
+        hint = self.jacobians.hint(self.J) if self.J is not None else ""
+        if word == "stagnated" and self.J.singular:
+            hint += "; its Jacobian is singular there, start from another guess"
+        raise ConvergenceError(
+            f"{name} after {run.iterations} Newton steps: {reason or reached}{hint}",
+            info=run.info(),
+            best=self.equation.layout.rounded(self.x),
+        ) from None
+
+
+def length(v):
+    """2-norm of a flat array of any magnitude."""
+    exponent = _exponent(v)
+    return float(np.ldexp(norm(np.ldexp(v, -exponent)), exponent))
+
+
+def _exponent(v):
+    return int(np.frexp(np.max(np.abs(v), initial=0.0))[1])
