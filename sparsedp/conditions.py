@@ -9,9 +9,9 @@ to the wall and h its width, the wall value and the slope follow from (u_w - u_c
 
 import numpy as np
 
-from sparsedp.spacing import AXES
+from sparsedp.spacing import AXES, real_numbers
 
-__all__ = ["Condition", "dirichlet", "neumann", "resolve", "robin"]
+__all__ = ["Condition", "check_condition", "dirichlet", "neumann", "resolve", "robin"]
 
 
 class Condition:
@@ -61,6 +61,8 @@ def robin(a, b):
     ------
     ValueError
         If a weight is negative or not finite, or both are 0: the problem would not be well posed.
+    TypeError
+        If a weight is not a real number.
 
     Examples
     --------
@@ -69,7 +71,7 @@ def robin(a, b):
     >>> robin(1, 0)
     dirichlet
     """
-    a, b = float(a), float(b)
+    a, b = (float(real_numbers(weight, "robin", "robin(1.0, 0.5)")) for weight in (a, b))
     if not (np.isfinite(a) and np.isfinite(b) and a >= 0 and b >= 0 and a + b > 0):
         raise ValueError(f"robin needs finite a, b >= 0, not both 0, got a = {a:g}, b = {b:g}")
     return Condition(a, b)
@@ -111,10 +113,16 @@ def resolve(grid, boundary):
     )
 
 
+def check_condition(name, given):
+    """Refuse what is not one condition."""
+    if not isinstance(given, Condition):
+        raise TypeError(f"{name} needs one condition, dirichlet, neumann or robin(a, b), got {given!r}")
+
+
 def _check_names(grid, boundary):
     for name in boundary:
         if name not in grid.axes:
-            raise ValueError(f"boundary names axis {name!r}, but {grid} has {', '.join(grid.axes)}")
+            raise ValueError(f"boundary names axis {name!r}, but {grid} has {', '.join(grid.axes)}; leave it out")
         if grid.periodic[AXES.index(name)]:
             raise ValueError(f"axis {name} is periodic and takes no boundary condition; leave it out")
 

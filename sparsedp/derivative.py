@@ -1,5 +1,7 @@
 """Derivatives of whole programs: any function of a tree of arrays, forward and backward."""
 
+from numbers import Number
+
 import autograd.numpy as anp
 import numpy as np
 
@@ -40,7 +42,9 @@ def pullback(fun, x):
     Raises
     ------
     DerivativeError
-        If no leaf of `x` is a floating array or number.
+        If no leaf of `x` is a floating array or number, or the value of `fun` is not one array.
+    ShapeError
+        On use of `pull`, if `g` has another shape than the value.
 
     Examples
     --------
@@ -55,18 +59,33 @@ def pullback(fun, x):
         raise DerivativeError(
             f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write x.astype(float)"
         )
-    value, node = split_box(*trace(fun, x, roots))
+    result, number = trace(fun, x, roots)
+    if not _is_array(result):
+        raise DerivativeError(
+            f"the function must return one array or number, got {type(result).__name__}; sum or join it"
+        )
+    value, node = split_box(result, number)
 
     def pull(g):
+        if np.shape(g) != np.shape(value):
+            raise ShapeError(f"the cotangent must have the shape {np.shape(value)} of the value, got {np.shape(g)}")
         cotangents = {} if node is None else backward(node, g)
+        pairs = zip(found, roots, strict=True)
         return rebuild(
-            [
-                None if root is None else _gradient(leaf, cotangents.get(root))
-                for leaf, root in zip(found, roots, strict=True)
-            ]
+            _apart([None if root is None else _gradient(leaf, cotangents.get(root)) for leaf, root in pairs])
         )
 
     return value, pull
+
+
+def _apart(gradients):
+    """autograd hands one array to both terms of a sum; a caller may write into the one without the other."""
+    seen: set[int] = set()
+    for place, g in enumerate(gradients):
+        if isinstance(g, np.ndarray) and id(g) in seen:
+            gradients[place] = g.copy()
+        seen.add(id(g))
+    return gradients
 
 
 def _gradient(leaf, cotangent):
@@ -90,13 +109,18 @@ def pushforward(fun, x, tangent):
     -------
     (value, tangent of value)
 
+    Raises
+    ------
+    ShapeError
+        If the tangent has another structure than `x`, or a leaf of it another shape.
+
     Examples
     --------
     >>> value, slope = pushforward(lambda x: x[0] * x[1], (2.0, 5.0), (1.0, 0.0))
     >>> float(value), float(slope)
     (10.0, 5.0)
     """
-    found, directions = leaves(x), leaves(tangent)
+    found, directions = leaves(x), _directions(x, tangent)
     roots = [
         forward_root(direction) if is_variable(leaf) else None
         for leaf, direction in zip(found, directions, strict=True)
@@ -106,6 +130,36 @@ def pushforward(fun, x, tangent):
     pairs = [split_box(end, number) for end in ends]
     values = rebuild(value for value, node in pairs)
     return values, rebuild(_no_tangent(value) if node is None else node.g for value, node in pairs)
+
+
+def _directions(x, tangent):
+    """Leaves of the tangent in the order of those of `x`; entries of dicts are paired by name."""
+    if isinstance(x, dict):
+        if not isinstance(tangent, dict) or tangent.keys() != x.keys():
+            raise ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
+        pairs = [(branch, tangent[name]) for name, branch in x.items()]
+    elif isinstance(x, (tuple, list)):
+        if not isinstance(tangent, (tuple, list)) or len(tangent) != len(x):
+            raise ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
+        pairs = list(zip(x, tangent, strict=True))
+    else:
+        if is_variable(x) and (not _is_array(tangent) or np.shape(tangent) != np.shape(x)):
+            raise ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
+        return [tangent]
+    return [leaf for branch, other in pairs for leaf in _directions(branch, other)]
+
+
+def _is_array(value):
+    """Whether a value is one array or number, traced or not."""
+    return isbox(value) or isinstance(value, (np.ndarray, Number))
+
+
+def _words(tree):
+    if isinstance(tree, dict):
+        return f"a dict of {', '.join(map(str, tree)) or 'nothing'}"
+    if isinstance(tree, (tuple, list)):
+        return f"a {type(tree).__name__} of length {len(tree)}"
+    return f"an array of shape {np.shape(tree)}" if _is_array(tree) else type(tree).__name__
 
 
 def _no_tangent(value):

@@ -1,10 +1,10 @@
-"""What may be given to an operator: the checks of fields and of reused result arrays."""
+"""What may be given: the checks of fields, of numbers and of reused result arrays."""
 
 import numpy as np
 
-from sparsedp.errors import ShapeError
+from sparsedp.errors import NonFiniteError, ShapeError
 
-__all__ = ["check_out", "field_array"]
+__all__ = ["check_finite", "check_out", "field_array", "is_number", "is_whole", "place"]
 
 
 def field_array(op, u):
@@ -26,9 +26,43 @@ def field_array(op, u):
 
 def check_out(op, out, u, dtype):
     """Refuse a result array of another shape or dtype, or one that shares memory with `u`."""
+    wanted = f"out=np.empty({op.codomain.shape}, {dtype.name!r})"
+    if not isinstance(out, np.ndarray):
+        raise TypeError(f"{op.name} needs an array as out, got {type(out).__name__}; write {wanted}")
     if out.shape != op.codomain.shape:
-        raise ShapeError(f"{op.name} gives a field on {op.codomain}, got out of shape {out.shape}")
+        raise ShapeError(f"{op.name} gives a field on {op.codomain}, got out of shape {out.shape}; write {wanted}")
     if out.dtype != dtype:
-        raise TypeError(f"{op.name} gives {dtype} here, got out of dtype {out.dtype}")
+        raise TypeError(f"{op.name} gives {dtype} here, got out of dtype {out.dtype}; write {wanted}")
     if not out.flags.c_contiguous or not out.flags.writeable or np.may_share_memory(out, u):
-        raise ValueError(f"{op.name} needs an out that is contiguous, writeable and apart from u")
+        raise ValueError(f"{op.name} needs an out that is contiguous, writeable and apart from u; write {wanted}")
+
+
+def check_finite(name, values, needs="must be finite", where=None):
+    """Refuse NaN and infinity in plain numbers: say how many there are and where the first one is.
+
+    `where` turns the number of a flat entry into words; default: its index in `values`.
+    """
+    finite = np.isfinite(values)
+    if np.all(finite):
+        return
+    if finite.ndim == 0:
+        raise NonFiniteError(f"{name} {needs}, got {values}; write a finite number")
+    index, many = int(np.argmin(finite)), finite.size - np.count_nonzero(finite)
+    first = place(index, finite.shape) if where is None else where(index)
+    raise NonFiniteError(f"{name} {needs}, got {many} that are NaN or infinite, the first at {first}")
+
+
+def place(index, shape):
+    """Number of an entry in C order -> its index: a number in 1-D, else a tuple."""
+    found = tuple(map(int, np.unravel_index(index, shape)))
+    return found[0] if len(found) == 1 else found
+
+
+def is_number(value):
+    """Whether a value is one real number, NaN and infinity included; a flag is none."""
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
+
+
+def is_whole(value, least):
+    """Whether a value is a whole number from `least` on; 2.0 counts."""
+    return bool(is_number(value) and value % 1 == 0 and value >= least)  # the rest of NaN and infinity is NaN

@@ -16,7 +16,7 @@ from math import prod
 import numpy as np
 
 from sparsedp.space import Space
-from sparsedp.spacing import AXES, cell_widths, finite_number, lengths, per_axis
+from sparsedp.spacing import AXES, cell_widths, finite_number, flag, lengths, per_axis
 
 __all__ = ["Grid"]
 
@@ -43,6 +43,8 @@ class Grid:
         If the shape is not one to three lengths >= 0, or an argument does not fit it.
     ValueError
         If a width is not positive and finite, or both `size` and `spacing` are given.
+    TypeError
+        If a length is not a real number, or an entry of `periodic` not True or False.
 
     Examples
     --------
@@ -68,7 +70,7 @@ class Grid:
         put("shape", shape)
         put("dim", len(shape))
         put("axes", AXES[: len(shape)])
-        put("periodic", tuple(bool(flag) for flag in per_axis(periodic, shape, "periodic")))
+        put("periodic", tuple(flag(entry, shape) for entry in per_axis(periodic, shape, "periodic")))
         put("origin", tuple(finite_number(entry, "origin") for entry in per_axis(origin, shape, "origin")))
         put("widths", cell_widths(shape, size, spacing))
 
@@ -257,7 +259,9 @@ class Grid:
         number = AXES.index(axis) if axis in AXES else axis
         if isinstance(number, (int, np.integer)) and 0 <= number < self.dim:
             return int(number)
-        raise ValueError(f"{self} has axes 0 to {self.dim - 1}, got {axis!r}")
+        raise ValueError(
+            f"{self} has axes 0 to {self.dim - 1}, got {axis!r}; write a number or a name of {', '.join(self.axes)}"
+        )
 
     @cached_property
     def _key(self):

@@ -19,8 +19,7 @@ from sparsedp.tape import apply_operator, isbox
 
 __all__ = ["Operator"]
 
-# Largest number of unknowns for which the explicit form is chosen. Measured by benchmarks/apply.py:
-# below it one sparse product costs less than the set-up of a stencil pass.
+# Most unknowns for which one sparse product costs less than a stencil pass: see benchmarks/apply.py.
 EXPLICIT_BELOW_COMPILED = 4096
 EXPLICIT_BELOW_PLAIN = 262144
 
@@ -115,7 +114,7 @@ class Operator:
 
     @cached_property
     def _real(self):
-        return self.structure.dtype.kind != "c"
+        return self.dtype.kind != "c"
 
     @cached_property
     def _acting(self):
@@ -166,11 +165,6 @@ class Operator:
             return self._flat(other)
         return NotImplemented
 
-    def __rmatmul__(self, other):
-        if isbox(other) or isinstance(other, np.ndarray):
-            return self.T @ other
-        return NotImplemented
-
     def _compose(self, other):
         if not fits(self.domain, other.codomain):
             raise ShapeError(f"{self.name} takes {self.domain}, but {other.name} gives {other.codomain}")
@@ -212,7 +206,15 @@ class Operator:
     __rmul__ = __mul__
 
     def __truediv__(self, number):
-        return self * (1.0 / complex(number) if _is_complex(number) else 1.0 / number)
+        if not (isbox(number) or isinstance(number, Number) or (isinstance(number, np.ndarray) and number.shape == ())):
+            return NotImplemented
+        if not isbox(number) and not (number != 0 and np.isfinite(number)):
+            raise NonFiniteError(f"{self.name} can be divided by a finite number other than 0 only, got {number}")
+        if isbox(number) or _is_complex(number):
+            return self * (1.0 / number)
+        share, exponent = np.frexp(float(number))  # 1 / 1e308 has lost digits, 2^-1024 has not
+        structure = self.structure.scaled(1.0 / float(share)).scaled(2.0 ** -int(exponent))
+        return Operator(structure, self.domain, self.codomain, f"{_bracket(self.name)} / {number:g}")
 
     def __array_ufunc__(self, ufunc, method, *inputs, **options):
         """Let NumPy numbers scale an operator, and name the mistake when anything else is tried."""
@@ -220,9 +222,12 @@ class Operator:
             raise DerivativeError(f"a traced number cannot scale an operator; write nu * {self.name}(u)")
         if method == "__call__" and ufunc is np.multiply and np.shape(inputs[0]) == ():
             return self * inputs[0]
-        if method == "__call__" and ufunc is np.matmul:
-            return self.__rmatmul__(inputs[0])
+        if ufunc is np.matmul:
+            raise TypeError(f"{self.name} stands on the left of @; for x @ A write {self.name}.T @ x")
         raise TypeError(f"numpy.{ufunc.__name__} does not take an operator; write {self.name}(u) for a field u")
+
+    def __array__(self, *args, **options):
+        raise TypeError(f"{self.name} is no array; write op.explicit().matrix, op.to_scipy() or {self.name}(u)")
 
     # ------------------------------------------------------------ forms and borders
 

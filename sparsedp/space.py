@@ -32,7 +32,7 @@ class Space:
     Raises
     ------
     ShapeError
-        If the shape has a negative entry.
+        If the shape has an entry that is not a whole number >= 0.
 
     Examples
     --------
@@ -48,9 +48,9 @@ class Space:
     parts: tuple[tuple[int, ...], ...]
 
     def __init__(self, shape, kind="space", grid=None, parts=None):
-        shape = (shape,) if isinstance(shape, (int, np.integer)) else tuple(shape)
-        if any(n < 0 for n in shape):
-            raise ShapeError(f"a space needs lengths >= 0, got {shape}")
+        shape = (shape,) if np.ndim(shape) == 0 else tuple(shape)
+        if not all(isinstance(n, (int, np.integer)) and n >= 0 for n in shape):
+            raise ShapeError(f"a space needs whole lengths >= 0, got {shape}; write Space(7) or Space((2, 3))")
         self.__dict__["shape"] = tuple(int(n) for n in shape)
         self.__dict__["kind"] = kind
         self.__dict__["grid"] = grid

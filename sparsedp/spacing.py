@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp.errors import ShapeError
 
-__all__ = ["AXES", "cell_widths", "finite_number", "lengths", "per_axis"]
+__all__ = ["AXES", "cell_widths", "finite_number", "flag", "lengths", "per_axis", "real_numbers"]
 
 AXES = ("x", "y", "z")
 
@@ -14,7 +14,7 @@ def lengths(shape):
     shape = (shape,) if np.ndim(shape) == 0 else tuple(shape)
     whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 0 for n in shape)
     if not (whole and 1 <= len(shape) <= 3):
-        raise ShapeError(f"a grid needs one to three whole lengths >= 0, got shape {shape}")
+        raise ShapeError(f"a grid needs one to three whole lengths >= 0, got shape {shape}; write Grid((8, 6))")
     return tuple(int(n) for n in shape)
 
 
@@ -27,11 +27,27 @@ def per_axis(value, shape, name):
     return tuple(value)
 
 
+def real_numbers(entry, name, example):
+    """Array of real numbers, or TypeError that names the argument."""
+    values = np.asarray(entry)
+    if values.dtype.kind not in "biuf":
+        raise TypeError(f"{name} needs real numbers, got {entry!r}; write for example {example}")
+    return values
+
+
 def finite_number(entry, name):
-    """One finite float, or ValueError that names the argument."""
-    if np.ndim(entry) or not np.isfinite(entry):
-        raise ValueError(f"{name} needs finite numbers, got {entry}")
+    """One finite float, or an error that names the argument."""
+    if real_numbers(entry, name, f"{name}=1.0").ndim or not np.isfinite(entry):
+        raise ValueError(f"{name} needs finite numbers, got {entry}; write one for each axis, or one for all")
     return float(entry)
+
+
+def flag(entry, shape):
+    """One entry of `periodic`: True or False, nothing that only counts as one of them."""
+    if not isinstance(entry, (bool, np.bool_)):
+        example = "True" if len(shape) == 1 else f"({', '.join(['True', *['False'] * (len(shape) - 1)])})"
+        raise TypeError(f"periodic needs True or False for each axis, got {entry!r}; write periodic={example}")
+    return bool(entry)
 
 
 def cell_widths(shape, size, spacing):
@@ -54,7 +70,7 @@ def cell_widths(shape, size, spacing):
 
 
 def _axis_widths(n, entry, axis):
-    line = np.array(entry, dtype=float)
+    line = np.array(real_numbers(entry, "spacing", "spacing=0.5"), dtype=float)
     if line.ndim == 0:
         return np.full(n, float(line))
     if line.shape != (n,):

@@ -4,8 +4,7 @@ This is the only file that talks to autograd's extension interface. A `Rule` is 
 object. All rules go through one primitive (`_call`), all Operators through a second, lighter one
 (`apply_operator`). A primitive for each rule would stay in autograd's tables for ever.
 
-For complex fields, as in autograd, the cotangent is g = dL/dRe(y) - i dL/dIm(y): then the VJP of
-y = A x is the plain transpose A^T g.
+Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A x is A^T g.
 """
 
 import inspect
@@ -162,6 +161,7 @@ def _checked(name, values, cotangents, g):
 
 def fit(name, value, cotangent, g):
     """Check a derivative of `value` that was computed from `g`, and give it the dtype of `value`."""
+    cotangent = np.asarray(cotangent) if isinstance(cotangent, list) else cotangent
     shape, wanted = np.shape(plain(cotangent)), np.shape(plain(value))
     if shape != wanted:
         raise ShapeError(f"{name} returned a derivative of shape {shape} where {wanted} is needed")

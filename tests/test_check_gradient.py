@@ -39,7 +39,7 @@ def test_a_right_gradient_agrees():
         assert line.rate2 >= 1.95
 
 
-@pytest.mark.parametrize("error", [1e-2, 1e-3, 1e-4, -1e-4])
+@pytest.mark.parametrize("error", [1e-2, 1e-3, 1e-4, -1e-4, 1e-6, -1e-6, 1e-7])
 def test_a_wrong_gradient_disagrees(error):
     result = AUDIT(smooth, X, grad=lambda u: (1 + error) * slope(u))
     assert result.verdict == "disagrees" and not result

@@ -202,11 +202,18 @@ def test_a_check_draws_from_its_own_generator():
     assert dp.check.transpose(RIGHT["gradient"], seeds=2, rng=7).ok
 
 
-def test_an_inverse_is_an_operator_too():
-    grid = dp.Grid((8, 6))
-    for op in (-dp.laplacian(grid, dp.dirichlet), -dp.laplacian(grid)):
-        card = dp.check.operator(dp.inverse(op, "direct"))
-        assert card.ok, card
+@pytest.mark.parametrize("method", ["auto", "direct", "separable", "krylov", "multigrid"])
+def test_an_inverse_is_an_operator_too(method):
+    """Judged by its rtol: what an iteration leaves is not a mistake, 0.1 % in the transpose is."""
+    stretched = dp.Grid((7, 5), spacing=[np.linspace(1.0, 2.0, 7), 0.3])
+    for grid in (dp.Grid((8, 6)), stretched):
+        implicit = dp.identity(grid.cells) - 0.1 * dp.laplacian(grid)
+        for op in (-dp.laplacian(grid, dp.dirichlet), -dp.laplacian(grid), implicit):
+            inv = dp.inverse(op, method, nullspace="project")
+            assert dp.check.operator(inv).ok, dp.check.operator(inv)
+            assert dp.check.operator(dp.divergence(grid) @ dp.gradient(grid) @ inv).ok
+            wrong = dp.from_functions(inv.apply, lambda g, inv=inv: 1.001 * inv.T.apply(g), inv.domain, inv.codomain)
+            assert "transpose, float64" in dp.check.operator(wrong).failed
 
 
 # ---- order ---------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.derivative import value_and_grad
+from sparsedp.derivative import pullback, pushforward, value_and_grad
 from sparsedp.structure.base import Structure, compact
 
 LINE = dp.Grid(3)
@@ -45,7 +45,7 @@ TABLE = [
     (
         lambda: dp.set_threads(1.5),
         TYPE,
-        "set_threads got 1.5; it needs an integer, for example 1, or None for the default.",
+        "set_threads got 1.5; it needs an integer, for example 1, or None for the default",
     ),
     # functions of separable operators
     (
@@ -110,6 +110,41 @@ TABLE = [
         DERIVATIVE,
         "the loss must be real, got a complex number; take its real part or its absolute value",
     ),
+    (
+        lambda: pullback(lambda x: (x, x), np.ones(2)),
+        DERIVATIVE,
+        "the function must return one array or number, got tuple; sum or join it",
+    ),
+    (
+        lambda: value_and_grad(lambda x: None)(np.ones(2)),
+        DERIVATIVE,
+        "the function must return one array or number, got NoneType; sum or join it",
+    ),
+    (
+        lambda: pullback(lambda x: 2 * x, np.ones(3))[1](np.ones(2)),
+        SHAPE,
+        "the cotangent must have the shape (3,) of the value, got (2,)",
+    ),
+    (
+        lambda: pushforward(lambda x: x[0] * x[1], (1.0, 2.0), (1.0,)),
+        SHAPE,
+        "the tangent must have the structure of x: a tuple of length 2, got a tuple of length 1",
+    ),
+    (
+        lambda: pushforward(lambda x: x["a"] * x["b"], {"a": 1.0, "b": 2.0}, [1.0, 2.0]),
+        SHAPE,
+        "the tangent must have the structure of x: a dict of a, b, got a list of length 2",
+    ),
+    (
+        lambda: pushforward(lambda x: 2 * x, np.ones(3), np.ones(2)),
+        SHAPE,
+        "the tangent must have the structure of x: an array of shape (3,), got an array of shape (2,)",
+    ),
+    (
+        lambda: pushforward(lambda x: 2 * x, 1.0, None),
+        SHAPE,
+        "the tangent must have the structure of x: an array of shape (), got NoneType",
+    ),
 ]
 
 
@@ -119,3 +154,7 @@ def test_message(call, error, message):
         call()
     assert str(caught.value) == message
     assert caught.type is error or error in (TYPE, VALUE, AttributeError)
+
+
+def test_tangents_of_dicts_are_paired_by_name():
+    assert pushforward(lambda x: x["a"] - x["b"], {"a": 1.0, "b": 1.0}, {"b": 1.0, "a": 5.0})[1] == 4.0

@@ -29,13 +29,7 @@ FLOORS = [
     ("operator", 4),
     ("operators", 5),
     ("solvers", 6),
-    ("advection", 6),
-    ("integrators", 7),
-    ("flow", 7),
-    ("trajectory", 8),
     ("optimise", 9),
-    ("network", 9),
-    ("blackbox", 9),
 ]
 FLOOR = dict(FLOORS)
 SIDE = {"check": {"check"}, "report": {"report", "check"}}  # side room: the side rooms it may import
@@ -93,6 +87,17 @@ def functions():
 
 def test_every_module_has_a_floor():
     none(f"{m.place}: give it a floor in FLOORS" for m in modules() if room(m.name) not in {*FLOOR, *SIDE, *ROOF})
+
+
+def test_the_floors_are_those_of_the_page():
+    """Every floor exists, and CONTRIBUTING.md and README.md name the same rooms."""
+    none(f"{name} is no room of the package" for name in FLOOR if not any(room(m.name) == name for m in modules()))
+    for page in ("CONTRIBUTING.md", "README.md"):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        none(f"{page} does not name {name}" for name in FLOOR if not re.search(rf"\b{name}\b", text))
+    rows = re.findall(r"^\| (\d) \| (.*?) \|$", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.MULTILINE)
+    told = {name: int(number) for number, names in rows for name in re.findall(r"`(\w+)/?`", names)}
+    assert told == FLOOR
 
 
 def test_every_folder_is_a_package():

@@ -16,7 +16,7 @@ def test_too_many_threads_are_refused(monkeypatch):
     monkeypatch.setattr(kernels, "_available", lambda: 2)
     with pytest.raises(
         ValueError,
-        match="set_threads got 3; it needs 1 to 2, the processors this process may use; write None for the default.",
+        match="set_threads got 3; it needs 1 to 2, the processors this process may use; write None for the default",
     ):
         kernels.set_threads(3)
 

@@ -29,10 +29,14 @@ def test_errors_at_the_start_are_not_hidden():
         NonFiniteError, match="the loss is nan; it must be finite at the start, and elsewhere it is avoided"
     ):
         foreign(lambda x: np.nan, lambda x: x)
+    hint = r"\(dp.check.gradient\(loss, x\) shows where it comes from\)"
     with pytest.raises(
-        NonFiniteError, match=r"the gradient holds NaN or infinity; check it with dp.check.gradient\(loss, x\)"
+        NonFiniteError, match=rf"^the gradient must be finite {hint}, got 2 that are NaN or infinite, the first at 0$"
     ):
         foreign(lambda x: 1.0, lambda x: x * np.nan)
+    with pytest.raises(NonFiniteError, match=r"^leaf 1 of the gradient must be finite .*, the first at \(0, 1\)$"):
+        start = {"a": 1.0, "b": np.ones((2, 2))}
+        dp.minimise(lambda x: 1.0, start, gradient=lambda x: {"a": 1.0, "b": np.array([[1, np.nan], [1, 1]])})
 
 
 def test_methods_and_options():
@@ -40,28 +44,40 @@ def test_methods_and_options():
         dp.minimise(bowl, np.ones(2), "newton")
     with pytest.raises(TypeError, match="lbfgs has no option 'rate'; it has memory, line_search"):
         dp.minimise(bowl, np.ones(2), rate=1.0)
-    with pytest.raises(ValueError, match="minimise needs maxiter >= 0, a whole number, got -1"):
+    with pytest.raises(ValueError, match="minimise needs maxiter >= 0, a whole number, got -1; the default is 100"):
         dp.minimise(bowl, np.ones(2), maxiter=-1)
-    with pytest.raises(ValueError, match="minimise needs maxiter >= 0, a whole number, got True"):
+    with pytest.raises(ValueError, match="minimise needs maxiter >= 0, a whole number, got True; the default is 100"):
         dp.minimise(bowl, np.ones(2), maxiter=True)
-    with pytest.raises(ValueError, match="minimise needs a tolerance >= 0, got nan"):
+    with pytest.raises(ValueError, match="minimise needs maxiter >= 0, a whole number, got None; the default is 100"):
+        dp.minimise(bowl, np.ones(2), maxiter=None)
+    with pytest.raises(ValueError, match="minimise needs a tolerance >= 0, got nan; the default is 1e-8"):
         dp.minimise(bowl, np.ones(2), tolerance=np.nan)
+    with pytest.raises(ValueError, match="minimise needs a tolerance >= 0, got 'a'; the default is 1e-8"):
+        dp.minimise(bowl, np.ones(2), tolerance="a")
 
 
 def test_ranges_of_options():
-    with pytest.raises(ValueError, match="lbfgs needs memory >= 1 and line_search >= 2, got 0 and 20"):
+    with pytest.raises(
+        ValueError, match="lbfgs needs memory >= 1 and line_search >= 2, got 0 and 20; write whole numbers"
+    ):
         dp.minimise(bowl, np.ones(2), memory=0)
-    with pytest.raises(ValueError, match="gd needs a positive rate, got -1"):
+    with pytest.raises(ValueError, match="gd needs a positive rate, got -1; leave it out and it is searched for"):
         dp.minimise(bowl, np.ones(2), "gd", rate=-1)
-    with pytest.raises(ValueError, match="gd needs a momentum from 0 to below 1, got 1"):
+    with pytest.raises(ValueError, match="gd needs a momentum from 0 to below 1, got 1; leave it out for none"):
         dp.minimise(bowl, np.ones(2), "gd", momentum=1)
     with pytest.raises(
         ValueError, match="gd has no line search 'wolfe'; write line_search='backtracking' or leave it out"
     ):
         dp.minimise(bowl, np.ones(2), "gd", line_search="wolfe")
-    with pytest.raises(ValueError, match="adam needs a positive rate, got 0"):
+    with pytest.raises(ValueError, match="adam needs a positive rate, got 0; the default is 1e-3"):
         dp.minimise(bowl, np.ones(2), "adam", rate=0)
-    with pytest.raises(ValueError, match=r"adam needs two betas from 0 to below 1, got \(1, 2\)"):
+    with pytest.raises(ValueError, match="adam needs a positive rate, got None; the default is 1e-3"):
+        dp.minimise(bowl, np.ones(2), "adam", rate=None)
+    with pytest.raises(ValueError, match="adam needs a positive epsilon, got 0; the default is 1e-8"):
+        dp.minimise(bowl, np.ones(2), "adam", epsilon=0)
+    with pytest.raises(
+        ValueError, match=r"adam needs two betas from 0 to below 1, got \(1, 2\); the default is \(0.9, 0.999\)"
+    ):
         dp.minimise(bowl, np.ones(2), "adam", betas=(1, 2))
 
 
@@ -72,9 +88,12 @@ def test_losses_and_gradients():
         dp.minimise(bowl, np.arange(3))
     with pytest.raises(ShapeError, match=r"the loss must be a scalar, got an array of shape \(2,\); sum it"):
         foreign(lambda x: x, lambda x: x)
-    with pytest.raises(DerivativeError, match="the gradient has 2 leaves where start has 1"):
+    with pytest.raises(DerivativeError, match="the gradient has 2 leaves where start has 1; return a tree like start"):
         foreign(lambda x: 1.0, lambda x: (x, x))
-    with pytest.raises(DerivativeError, match=r"a leaf of the gradient has shape \(1,\) where \(2,\) is needed"):
+    with pytest.raises(
+        DerivativeError,
+        match=r"a leaf of the gradient has shape \(1,\) where \(2,\) is needed; return a tree like start",
+    ):
         foreign(lambda x: 1.0, lambda x: x[:1])
 
 

@@ -9,6 +9,7 @@ from fields import Field, grid_of
 import sparsedp as dp
 from sparsedp.derivative import pullback, pushforward, value_and_grad
 
+EPS = 10 * np.finfo(float).eps
 EVERY = pytest.mark.parametrize("entry", CATALOGUE, ids=LABELS)
 
 
@@ -38,7 +39,8 @@ def test_transpose_and_twin_in_every_dtype(entry):
         matrix = explicit.matrix
         assert matrix.indices.dtype == matrix.indptr.dtype == np.int32
         size = np.sqrt(abs(matrix).sum(0).max(initial=0) * abs(matrix).sum(1).max(initial=0))
-        for seed, dtype in enumerate((np.float64, np.float64, np.float32, np.complex128, np.complex64)):
+        kinds = [np.float64] * 5 + [np.float32, np.complex128, np.complex64]  # five seeds in double precision
+        for dtype in kinds:
             u, v = random_field(rng, op.domain, dtype), random_field(rng, op.codomain, dtype)
             one, other = explicit(u), free(u)
             assert one.dtype == other.dtype == u.dtype
@@ -50,7 +52,7 @@ def test_transpose_and_twin_in_every_dtype(entry):
             for form in (explicit, free):
                 left, right = np.sum(form(u) * v, dtype=complex), np.sum(u * form.T(v), dtype=complex)
                 bound = eps * size * np.linalg.norm(u) * np.linalg.norm(v)
-                assert abs(left - right) <= 10 * bound, (op, seed)
+                assert abs(left - right) <= 10 * bound, (op, dtype)
             worst = max(worst, gap)
     assert worst <= 10
 
@@ -118,10 +120,10 @@ def conditions_for(periodic):
 def test_interior_order(entry, periodic, stretched):
     """Slope of the last three refinements, two cells off the walls, max norm."""
     wanted = (0.9, 1.1) if entry.builder == "upwind" else (1.9, 2.2)
-    for dim in range(entry.least_dim, 4):
+    for dim in range(entry.least_dim, 3 if entry.builder == "upwind" else 4):
         sizes = {1: (128, 256, 512), 2: (64, 128, 256), 3: (32, 64, 96)}[dim]
         if entry.builder == "upwind":
-            sizes = [2 * n for n in sizes] if dim < 3 else sizes
+            sizes = [4 * n for n in sizes]  # first order needs more cells to show its slope
         for boundary in conditions_for(periodic)[: 1 if dim == 3 else None]:
             errors = [interior_error(entry, n, dim, periodic, stretched, boundary) for n in sizes]
             slope = np.polyfit(np.log(sizes), np.log(errors), 1)[0]
@@ -138,14 +140,21 @@ def interior_error(entry, n, dim, periodic, stretched, boundary):
     return max(np.max(part[inner] if part.ndim == dim and part.size > 4 else part) for part in parts)
 
 
+WALLS = {  # least orders of gradient and laplacian over the whole field, L2: the wall truncation is of lower order
+    "neumann": (dp.neumann, 1.9, 1.4),
+    "dirichlet": (dp.dirichlet, 1.4, 0.4),
+    "robin": (dp.robin(1.0, 0.7), 1.4, 0.4),
+    "mixed": ({"x": (dp.dirichlet, dp.robin(2.0, 1.0))}, 1.4, 0.4),
+}
+
+
 @pytest.mark.parametrize("stretched", [False, True], ids=["uniform", "stretched"])
-@pytest.mark.parametrize("dim", [1, 2])
-@pytest.mark.parametrize("kind", ["dirichlet", "neumann"])
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("kind", WALLS)
 def test_order_up_to_the_wall(kind, dim, stretched):
-    """Whole field, L2, boundary data by lift: the first-order wall truncation is there, and no more."""
-    boundary = getattr(dp, kind)
-    least_slope, least_laplacian = (1.4, 0.4) if kind == "dirichlet" else (1.9, 1.4)
-    errors, sizes, field = [], (32, 64, 128), Field(False)
+    """Boundary data by lift: the wall truncation is there, and no more."""
+    boundary, least_slope, least_laplacian = WALLS[kind]
+    errors, sizes, field = [], (16, 24, 32) if dim == 3 else (32, 64, 128), Field(False)
     for n in sizes:
         grid = grid_of(n, dim, False, stretched)
         slopes = dp.gradient(grid, boundary)(field(grid.centres()))
@@ -168,15 +177,15 @@ def test_discrete_identities(shape):
             slope = dp.gradient(grid, boundary)
             left = (volumes @ divergence @ inner).explicit().matrix
             right = (areas @ slope).explicit().matrix.T @ inner.explicit().matrix
-            assert abs((left + right).toarray()).max() <= 1e-13 * abs(left.toarray()).max(initial=1)
+            assert abs((left + right).toarray()).max() <= EPS * abs(left.toarray()).max()
         ones = np.ones(grid.shape)
         pure = dp.laplacian(grid)
-        assert abs(pure(ones)).max() <= 1e-12
+        assert abs(pure(ones)).max(initial=0) <= EPS * (abs(pure.explicit().matrix) @ ones.ravel()).max(initial=0)
         np.testing.assert_allclose(dp.average(grid)(ones), 1.0, rtol=1e-15)
         np.testing.assert_allclose(dp.sample(grid, [np.array(grid.size) / 2 + grid.origin])(ones), 1.0, rtol=1e-15)
         flow = rng.standard_normal(grid.faces.size)
         total = np.sum(grid.volumes * divergence(inner(flow)))
-        assert abs(total) <= 1e-13 * np.sum(abs(grid.volumes * divergence(inner(flow)))) + 1e-300
+        assert abs(total) <= EPS * np.sum(abs(grid.volumes * divergence(inner(flow))))
         if grid.dim > 1:
             assert not (divergence @ dp.curl(grid)).explicit().matrix.count_nonzero()
 

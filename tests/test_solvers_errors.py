@@ -125,7 +125,7 @@ SET_UP = [
         lambda: dp.inverse(matrix([-1900, 0], [0, 400]), "multigrid"),
         ValueError,
         match="multigrid needs a diagonal of one sign; <matrix: space(2) -> space(2), explicit> "
-        "has -1.9e+03 and 4.0e+02",
+        "has -1.9e+03 and 4.0e+02; write method='direct'",
     ),
     Case(
         lambda: dp.inverse(dp.from_functions(lambda u: 2 * u, lambda u: 2 * u, 5, 5, name="double"), "multigrid"),
@@ -149,12 +149,21 @@ SETTINGS = [
     Case(
         lambda: dp.inverse(dp.gradient(GRID)),
         SHAPE,
-        match="inverse takes a square operator, got one from cells(3, 2) to faces(3, 2)",
+        match="inverse takes a square operator, got one from cells(3, 2) to faces(3, 2); write op.T @ op",
     ),
-    Case(lambda: dp.inverse(OP, rtol=0.0), ValueError, match="rtol must be between 0 and 1, got 0.0"),
-    Case(lambda: dp.inverse(OP, rtol=np.nan), ValueError, match="rtol must be between 0 and 1, got nan"),
+    Case(
+        lambda: dp.inverse(OP, rtol=0.0),
+        ValueError,
+        match="rtol must be between 0 and 1, got 0.0; the default is 1e-10",
+    ),
+    Case(
+        lambda: dp.inverse(OP, rtol=np.nan),
+        ValueError,
+        match="rtol must be between 0 and 1, got nan; the default is 1e-10",
+    ),
     Case(lambda: dp.inverse(OP, maxiter=0), ValueError, match="maxiter must be a whole number >= 1 or None, got 0"),
     Case(lambda: dp.inverse(OP, maxiter=2.5), ValueError, match="maxiter must be a whole number >= 1 or None, got 2.5"),
+    Case(lambda: dp.inverse(OP, maxiter="a"), ValueError, match="maxiter must be a whole number >= 1 or None, got 'a'"),
     Case(
         lambda: dp.inverse(OP, nullspace="drop"), ValueError, match="nullspace must be 'raise' or 'project', got 'drop'"
     ),
@@ -164,11 +173,32 @@ SETTINGS = [
         ValueError,
         match="cycle must be 'V' or 'W', got 'F'; the F cycle has no transpose of its own kind",
     ),
-    Case(lambda: dp.inverse(OP, "multigrid", strength=1.0), ValueError, match="strength must be in [0, 1), got 1.0"),
+    Case(
+        lambda: dp.inverse(OP, "multigrid", strength=1.0),
+        ValueError,
+        match="strength must be in [0, 1), got 1.0; the default is 0.25",
+    ),
     Case(
         lambda: dp.inverse(OP, "multigrid", sweeps=(("up",), ())),
         ValueError,
-        match="sweeps must be two tuples of 'forward' and 'backward', got (('up',), ())",
+        match="sweeps must be two tuples of 'forward' and 'backward', got (('up',), ()); "
+        "write for example (('forward',), ('backward',))",
+    ),
+    Case(
+        lambda: dp.inverse(OP, "multigrid", sweeps=3),
+        ValueError,
+        match="sweeps must be two tuples of 'forward' and 'backward', got 3; "
+        "write for example (('forward',), ('backward',))",
+    ),
+    Case(
+        lambda: dp.inverse(OP, "multigrid", levels=0),
+        ValueError,
+        match="levels must be a whole number >= 1, got 0; the default is 25",
+    ),
+    Case(
+        lambda: dp.inverse(OP, "multigrid", levels=2.5),
+        ValueError,
+        match="levels must be a whole number >= 1, got 2.5; the default is 25",
     ),
     Case(
         lambda: dp.inverse(OP, "krylov", diff="both"),
@@ -202,24 +232,24 @@ ELLIPTIC = [
         lambda: SOLVE(K[1:], B), SHAPE, match="k takes a number or a field on faces(3, 2), got an array of shape (16,)"
     ),
     Case(lambda: SOLVE(B, B), SHAPE, match="k takes a number or a field on faces(3, 2), got an array of shape (3, 2)"),
-    Case(lambda: SOLVE(K * 1j, B), ValueError, match="k must hold real numbers, got dtype complex128"),
+    Case(lambda: SOLVE(K * 1j, B), ValueError, match="k must hold real numbers, got dtype complex128; write k.real"),
     Case(
         lambda: SOLVE(BAD, B),
         FINITE,
-        match="k must be finite, got 2 values that are NaN or infinite, the first at 15",
+        match="k must be finite, got 2 that are NaN or infinite, the first at 15",
     ),
     Case(lambda: SOLVE(-2.0 * K, B), ValueError, match="k must be >= 0, got -2 at 0"),
     Case(lambda: value_and_grad(lambda k: anp.sum(SOLVE(k, B)))(-K), ValueError, match="k must be >= 0, got -1 at 0"),
     Case(lambda: SOLVE(K, B, K), SHAPE, match="shift takes one number, got an array of shape (17,)"),
-    Case(lambda: SOLVE(K, B, 1j), ValueError, match="shift must be real, got 1j"),
-    Case(lambda: SOLVE(K, B, np.nan), FINITE, match="shift must be finite, got nan"),
+    Case(lambda: SOLVE(K, B, 1j), ValueError, match="shift must be real, got 1j; write for example shift=1.0"),
+    Case(lambda: SOLVE(K, B, np.nan), FINITE, match="shift must be finite, got nan; write a finite number"),
     Case(
         lambda: SOLVE(K, B.T), SHAPE, match="elliptic_solver takes a field on cells(3, 2), got an array of shape (2, 3)"
     ),
     Case(
         lambda: dp.elliptic_solver(np.eye(3), G),
         TypeError,
-        match="elliptic_solver takes Operators, got ndarray for D",
+        match="elliptic_solver takes Operators, got ndarray for D; write dp.from_matrix first",
     ),
     Case(
         lambda: dp.elliptic_solver(D, D),
@@ -227,7 +257,11 @@ ELLIPTIC = [
         match="elliptic_solver needs D @ G to be square: divergence maps faces(3, 2) to cells(3, 2), "
         "divergence faces(3, 2) to cells(3, 2)",
     ),
-    Case(lambda: dp.elliptic_solver(D, G, rtol=2.0), ValueError, match="rtol must be between 0 and 1, got 2.0"),
+    Case(
+        lambda: dp.elliptic_solver(D, G, rtol=2.0),
+        ValueError,
+        match="rtol must be between 0 and 1, got 2.0; the default is 1e-10",
+    ),
 ]
 
 

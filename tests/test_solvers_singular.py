@@ -6,7 +6,7 @@ import autograd.numpy as anp
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from test_solvers import EVERY, stretched
+from test_solvers import EVERY, GENERAL, stretched
 
 import sparsedp as dp
 from sparsedp.derivative import value_and_grad
@@ -97,7 +97,7 @@ def walled(count):
     return solid
 
 
-@EVERY
+@GENERAL
 @pytest.mark.parametrize("count", [2, 3, 51])
 def test_each_region_has_its_own_mean(method, count, rng):
     solid = walled(count)
@@ -134,7 +134,7 @@ def test_noise_on_a_quiet_region_is_not_refused():
     assert inv.info.forward.defect <= 1e-6
 
 
-@EVERY
+@GENERAL
 def test_data_in_solids_and_islands(method):
     solid = walled(2)
     grid = dp.Grid(solid.shape)
@@ -151,7 +151,7 @@ def test_data_in_solids_and_islands(method):
     assert not np.any(strict.T(b))
 
 
-@EVERY
+@GENERAL
 def test_solids_with_dirichlet_faces(method, rng):
     """Rows of solid cells hold the flux into them; these cells are left out all the same."""
     grid = dp.Grid((21, 20), size=1.0)
@@ -178,7 +178,7 @@ def advection(grid, rng):
     return speed @ dp.upwind(grid) - 0.5 * dp.laplacian(grid)
 
 
-@EVERY
+@GENERAL
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_null_vector_that_is_not_known_beforehand(method, turned, rng):
     op = advection(dp.Grid((18, 17), periodic=True), rng)

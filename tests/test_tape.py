@@ -127,6 +127,15 @@ def test_gradient_keeps_shape_and_dtype_of_every_leaf():
     assert isinstance(gradient[2], float)
 
 
+def test_leaves_of_a_gradient_are_apart():
+    x = np.ones(3)
+    one, other = value_and_grad(lambda p: anp.sum(p[0] + p[1]))((x, x.copy()))[1]
+    one += 1.0
+    np.testing.assert_array_equal(other, [1, 1, 1])
+    rule = dp.differentiable("listed", lambda x: x * 1, lambda nums, ans, x: lambda g: ([1.0, 2.0, 3.0],))
+    assert isinstance(value_and_grad(lambda x: anp.sum(rule(x)))(x)[1], np.ndarray)
+
+
 def test_a_loss_that_does_not_use_x_has_a_zero_gradient():
     value, gradient = value_and_grad(lambda x: 3.0)({"a": np.ones(2), "b": 1.0})
     assert value == 3.0 and gradient["b"] == 0.0

@@ -14,23 +14,27 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp.check.remainders import taylor
+
 __all__ = ["ROUNDING", "Judgement", "judge"]
 
 RESOLVED = 1e-3  # an error bar above this share of the derivative proves nothing
-AGREED = 1e-6  # a gap below this share is agreement, whatever the bar: solves inside leave as much
+AGREED = 1e-8  # a gap below this share is agreement, whatever the bar
+NOISY = 1e-6  # the same behind a solve that the ledger shows, or in noise: what a solve leaves may be smooth
+LEFT = 1e-9  # a gap below this share of the loss may be what a solve leaves: not wrong, but not right either
+PER_NOISE = 1e4  # between the two: this multiple of the measured noise of the loss
+VANISHED = 1e-6  # a derivative and bar below this share of the curvature are 0
 FAR, NEAR = 10.0, 3.0  # gap over bar: beyond FAR it is wrong, below NEAR it is right
-NEARBY = 70.0  # Taylor rates are read at steps up to this multiple of the step of the plateau
 FINEST = 5  # levels that tell the noise of the loss
 TINY = np.finfo(float).tiny
 ROUNDING = 1e3  # noise above this many roundings has another cause: a solver, chaos, a staircase
-CURVED = 1.7  # below this order of the second Taylor remainder f is not twice differentiable
 
 
 class Judgement(NamedTuple):
     """The verdict along one direction, in a word.
 
     agrees, disagrees; vanishes: both derivatives are 0 to rounding; kink: the one-sided derivatives differ;
-    rough: not twice differentiable; noise, few: nothing is proved, by noise or for want of usable steps;
+    rough: a Taylor remainder has the wrong order; noise, few: nothing is proved, by noise or for want of usable steps;
     constant: the loss does not change, as the gradient says.
     """
 
@@ -42,8 +46,8 @@ class Judgement(NamedTuple):
     bar: float
     scale: float  # what gap and bar are compared with
     step: float  # where the plateau is
-    rate1: float  # order of f(x + t d) - f, without the gradient
-    rate2: float  # order of f(x + t d) - f - t g . d; infinite when it is rounding on all levels
+    rate1: float  # order of f(x + t d) - f, the one farthest from 1; NaN when there is none
+    rate2: float  # lowest order of f(x + t d) - f - t g . d; infinite when it is noise on all levels
     digits: float
     jitter: float  # noise of the loss, in units of its rounding
     note: str
@@ -63,7 +67,9 @@ class Gaps:
         plus, minus, ahead, behind, self.m = np.array(
             [(le.plus, le.minus, le.ahead, le.behind, le.difference - le.slope) for le in levels]
         ).T
-        self.first, self.second = np.abs(plus - line.base), np.abs(plus - line.base - ahead)
+        ahead_of, behind_of = plus - line.base, minus - line.base
+        self.first = np.hypot(ahead_of, behind_of) / np.sqrt(2)
+        self.second = np.hypot(ahead_of - ahead, behind_of - behind) / np.sqrt(2)
         # The gap of the one-sided differences, with the part that comes from unequal displacements taken out.
         self.kinks = (plus + minus - 2 * line.base - (ahead + behind)) / self.t
         sizes = np.maximum(np.maximum(np.abs(plus), np.abs(minus)), abs(line.base))
@@ -72,7 +78,8 @@ class Gaps:
         share = np.abs(np.diff(self.m[fine])) * self.t[fine][1:] / np.maximum(sizes[fine][1:], TINY)
         self.jitter = float(np.max(share, initial=0.0)) / eps
         self.noise = max(2.0, self.jitter) * eps * sizes
-        self.agreed = max(AGREED, 300 * spread)
+        least = NOISY if line.solved else AGREED
+        self.agreed = max(float(np.clip(PER_NOISE * eps * self.jitter, least, NOISY)), 300 * spread)
         self.curvature = float(np.median(np.abs(self.kinks / self.t)[:3]))
         self.floor = 8 * spread * self.curvature + 4 * spread * line.typical
 
@@ -97,15 +104,6 @@ class Gaps:
         near = [e for e in self.estimates(self.kinks, 1, 2 * self.noise) if abs(e[2] - index) <= 1]
         jump, bar, _ = min(near, key=lambda e: e[1], default=(0.0, 0.0, 0))
         return (abs(jump), bar) if abs(jump) > FAR * bar and abs(jump) > self.agreed * scale else (0.0, bar)
-
-    def rate(self, remainder, threshold, index):
-        """Median order of a remainder over its finest pairs that stand out of the noise, near a level."""
-        clear = (remainder >= 50 * threshold) & (remainder > 0) & (self.t <= NEARBY * self.t[index])
-        pairs = [j for j in range(len(self.t) - 1) if clear[j] and clear[j + 1]][-3:]
-        if len(pairs) < 2:
-            return np.nan
-        rates = [np.log(remainder[j] / remainder[j + 1]) / np.log(self.t[j] / self.t[j + 1]) for j in pairs]
-        return float(np.median(rates))
 
 
 @np.errstate(all="ignore")  # losses near the limits of the floating point numbers are judged like others
@@ -132,20 +130,15 @@ def judge(line, eps, spread):
     bar += gaps.floor
     scale = max(abs(line.slope), abs(line.slope + gap), line.typical)
     word, note = _word(gaps, line, (gap, bar, scale), jump)
-    tolerated = gaps.noise + gaps.t * (max(bar, abs(gap)) if word in ("agrees", "vanishes") else bar)
-    rate2 = gaps.rate(gaps.second, tolerated, index)
-    if np.isnan(rate2) and np.all(gaps.second <= 50 * tolerated):
-        rate2 = np.inf
-    # The symmetric remainder f(x + t d) + f(x - t d) - 2 f is cleaner than the one-sided one: no odd powers.
-    smooth = gaps.rate(np.abs(gaps.kinks) * gaps.t, 2 * gaps.noise, index)
-    if word in ("agrees", "vanishes") and rate2 < CURVED and smooth < CURVED:
-        word, note = "rough", f"the second Taylor remainder is of order {rate2:.2f}: not twice differentiable here"
+    orders = taylor(gaps, line.slope, gap if word in ("agrees", "vanishes") else 0.0, index)
+    if word == "agrees" or (word == "vanishes" and orders.word == "rough"):
+        word, note = orders.word or word, orders.note
     reference = gaps.curvature if word == "vanishes" else scale
     share = max(abs(gap), bar) / reference if reference > 0 else np.inf
     digits = float(np.clip(-np.log10(share), 0, 16)) if share > 0 else 16.0
     return Judgement(
         line.name, word, line.slope + gap, line.slope, gap, bar, scale, gaps.t[index],
-        gaps.rate(gaps.first, gaps.noise, index), rate2, digits, gaps.jitter, note,
+        orders.rate1, orders.rate2, digits, gaps.jitter, note,
     )  # fmt: skip
 
 
@@ -177,6 +170,8 @@ def _word(gaps, line, measured, jump):
         return "kink", f"a kink: the one-sided derivatives differ by {split / max(scale, split):.1e}"
     far = FAR if gaps.jitter < ROUNDING else 3 * FAR
     if size > far * bar and size > gaps.agreed * max(scale, 1e-4 * gaps.curvature):
+        if line.solved and size <= LEFT * abs(line.base):
+            return "noise", f"off by {size / scale:.1e}: solves may leave this in such a loss, tighten their rtol"
         # Noise that swallows the whole difference may be a chaotic loss with a right gradient.
         if gaps.jitter < ROUNDING or abs(line.slope + gap) > FAR * bar:
             return "disagrees", f"off by {size / scale:.1e}, {size / bar:.1e} error bars"
@@ -185,7 +180,7 @@ def _word(gaps, line, measured, jump):
         if size <= max(min(NEAR * bar, RESOLVED * scale - bar), gaps.agreed * scale):
             return "agrees", ""
         return "noise", f"off by {size / scale:.1e}, {size / bar:.1f} error bars: not enough to tell"
-    if size <= NEAR * bar and scale + bar <= gaps.agreed * gaps.curvature:
+    if size <= NEAR * bar and scale + bar <= max(VANISHED, gaps.agreed) * gaps.curvature:
         return "vanishes", "the derivative is 0 to rounding, beside the curvature"
     return "noise", f"noise of {bar / scale if scale else np.inf:.1e} of the derivative hides it"
 

@@ -31,10 +31,14 @@ def field(rng, shape, dtype):
 
 
 def unit(structure, dtype):
-    """Size of one rounding: eps of the dtype, or the `rtol` of a structure that solves, if it is larger."""
+    """Size of one rounding: eps of the dtype, or the tolerance of a structure that solves, if it is larger.
+
+    An inverse has it in `solver.system.rtol`: its residual is accepted there, whatever the method.
+    """
     members = getattr(structure, "members", None) or (getattr(structure, "inner", None),)
     inner = max((unit(member, dtype) for member in members if member is not None), default=0.0)
-    return max(float(np.finfo(dtype).eps), float(getattr(structure, "rtol", 0.0)), inner)
+    system = getattr(getattr(structure, "solver", None), "system", structure)
+    return max(float(np.finfo(dtype).eps), float(getattr(system, "rtol", 0.0)), inner)
 
 
 def representable(size, dtype):

@@ -6,25 +6,30 @@ import numpy as np
 
 from sparsedp.check.point import root_sum_squares
 from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
+from sparsedp.ledger import recording
 
 __all__ = ["Level", "Line", "Trials", "default_steps", "dot"]
 
 REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # what a loss may raise away from x
+SOLVES = ("solve", "adjoint")  # kinds under which the ledger counts solves
 
 
 class Trials:
-    """A loss with its count of evaluations. Away from x it may refuse; then there is a note and no value."""
+    """A loss with its count of evaluations. Away from x it may refuse; then there is a note and no value.
+
+    `solved`: whether the ledger showed a solve of this library in the first evaluation.
+    """
 
     def __init__(self, loss):
         self.loss = loss
-        self.count = 0
+        self.count, self.solved = 0, False
         self.eps = float(np.finfo(float).eps)
 
     def value(self, tree):
         """The loss as a float; the coarsest dtype that it returns is remembered."""
         self.count += 1
         with np.errstate(all="ignore"):
-            value = np.asarray(self.loss(tree))
+            value = np.asarray(self.loss(tree) if self.count > 1 else self._first(tree))
         if value.shape != ():
             raise ShapeError(f"the loss must be a scalar, got an array of shape {value.shape}; sum it")
         if value.dtype.kind == "c":
@@ -34,6 +39,12 @@ class Trials:
         if value.dtype.kind == "f":
             self.eps = max(self.eps, float(np.finfo(value.dtype).eps))
         return float(value)
+
+    def _first(self, tree):
+        with recording() as calls:
+            value = self.loss(tree)
+        self.solved = any(kind in SOLVES for _, kind in calls)
+        return value
 
     def attempt(self, tree):
         """(value, note): NaN and the reason where there is no finite value."""
@@ -91,7 +102,7 @@ class Line:
 
     def __init__(self, name, direction, point, gradient, trials, base):
         self.name, self.direction, self.base = name, direction, base
-        self.gradient = gradient
+        self.gradient, self.solved = gradient, trials.solved
         self._point, self._trials = point, trials
         self._length = root_sum_squares(direction)
         self.slope = dot(gradient, direction)

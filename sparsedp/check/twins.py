@@ -95,13 +95,16 @@ def _gap(op, listed, sizes, u):
         other = (listed.matrix @ flat).astype(explicit.dtype)
     else:
         other = op.matrix_free().apply(u).reshape(-1)
-    scale = _floored(op, sizes @ np.abs(flat))
+    scale = _floored(op, sizes @ np.abs(flat), sizes, np.linalg.norm(flat))
     return _largest(np.abs(other - explicit), scale * unit(op.structure, result_dtype(op.structure, u.dtype)))
 
 
-def _floored(op, scale):
-    """Functions round relative to the whole result (transforms, solves), not to each entry."""
-    return scale if op.structure.has_entries else scale + np.max(scale, initial=0.0)
+def _floored(op, scale, sizes, length):
+    """Functions round relative to the whole result (transforms, solves), not to each entry: |A| |u| in norms."""
+    if op.structure.has_entries:
+        return scale
+    one, infinite = (np.max(sizes.sum(axis=axis), initial=0.0) for axis in (0, 1))
+    return scale + np.sqrt(one) * np.sqrt(infinite) * length
 
 
 def _largest(gaps, scale):
@@ -117,6 +120,4 @@ def _entries_gap(op, sizes):
     known = sizes.tocoo()
     at = dict(zip(zip(known.row, known.col, strict=True), known.data, strict=True)) if gap.nnz else {}
     scale = np.array([at.get(place, 0.0) for place in zip(gap.row, gap.col, strict=True)])
-    if not op.structure.has_entries:
-        scale = scale + np.max(known.data, initial=0.0)
-    return _largest(gap.data, scale * unit(op.structure, float))
+    return _largest(gap.data, _floored(op, scale, sizes, 1.0) * unit(op.structure, float))

@@ -41,7 +41,9 @@ def _negligible(one, largest):
     """An open direction whose derivative, by gradient and by differences, is little beside the others."""
     if abs(one.gap) > 3 * one.bar:
         return False
-    return one.scale + one.bar <= NEGLIGIBLE * largest or (one.resolution <= 0.1 and one.bar <= SMALL * largest)
+    if one.scale + one.bar <= NEGLIGIBLE * largest:
+        return True
+    return one.word == "noise" and one.resolution <= 0.1 and one.bar <= SMALL * largest
 
 
 class Audit:
@@ -55,7 +57,8 @@ class Audit:
     digits : int or None
         Digits that are proved, in the worst direction; None unless it agrees.
     culprit : str or None
-        The operator whose own derivative is at fault, when it is known.
+        None in this release: the audit sees names of operators, not the operators. To find the one at
+        fault, write ``check.transpose(op)`` for each operator of the loss.
     lines : tuple of Judgement
         One for each direction: word, difference, slope, gap, bar, scale, step, rates, digits, note.
     value : float

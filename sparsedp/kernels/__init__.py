@@ -67,13 +67,11 @@ def set_threads(n=None):
     try:
         n = operator.index(n)
     except TypeError:
-        raise TypeError(
-            f"set_threads got {n!r}; it needs an integer, for example 1, or None for the default."
-        ) from None
+        raise TypeError(f"set_threads got {n!r}; it needs an integer, for example 1, or None for the default") from None
     if not 1 <= n <= _available():
         raise ValueError(
             f"set_threads got {n}; it needs 1 to {_available()}, the processors this process may use; "
-            "write None for the default."
+            "write None for the default"
         )
     _chosen[:] = [n]
 

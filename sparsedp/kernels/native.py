@@ -20,7 +20,9 @@ from sparsedp.kernels.sums import sum_worker
 
 __all__ = ["along_axis", "kronecker_sum"]
 
-SERIAL = 16384  # below this many numbers a second thread costs more than it brings
+SERIAL = (
+    1 << 19
+)  # below this many numbers (a few tenths of a millisecond) waiting for a busy core costs more than it brings
 PAST_CACHE = 1 << 25  # bytes of output from which stores bypass the caches
 NARROW = 64  # numbers: shorter lines are always stored the ordinary way
 

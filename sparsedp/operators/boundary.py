@@ -3,7 +3,8 @@
 import numpy as np
 
 from sparsedp.conditions import resolve
-from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.fields import check_finite
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, wall_slopes
 from sparsedp.space import Space
@@ -68,7 +69,7 @@ def mask(space, keep):
     ShapeError
         If `keep` has another shape.
     TypeError
-        If `keep` is not boolean.
+        If `space` is not a Space, or `keep` is not boolean.
 
     Examples
     --------
@@ -76,6 +77,7 @@ def mask(space, keep):
     >>> mask(Grid(3).cells, np.array([True, False, True]))(np.array([1.0, np.nan, 3.0]))
     array([1., 0., 3.])
     """
+    _check_space(space, "mask")
     return Operator(Mask(_boolean(keep, space, "keep")), space, space, "mask")
 
 
@@ -130,6 +132,7 @@ def identity(space):
     >>> identity(Grid(2).cells)(np.array([1.0, 2.0]))
     array([1., 2.])
     """
+    _check_space(space, "identity")
     parts = space.parts if space.grid is not None else ((space.size,),)
     return Operator(Kronecker.identity(parts), space, space, "identity")
 
@@ -152,6 +155,8 @@ def diagonal(space, values):
         If the values do not fit.
     NonFiniteError
         If a value is NaN or infinite.
+    TypeError
+        If `space` is not a Space, or the values are not numbers.
     DerivativeError
         If the values are traced: an Operator is constant; write ``values * u``.
 
@@ -163,15 +168,21 @@ def diagonal(space, values):
     """
     if isbox(values):
         raise DerivativeError("diagonal needs constant values, got traced ones; write values * u instead")
+    _check_space(space, "diagonal")
+    values = np.asarray(values)
+    if values.dtype.kind not in "biufc":
+        raise TypeError(f"diagonal on {space} needs numbers, got dtype {values.dtype}; write values.astype(float)")
     try:
-        values = np.broadcast_to(np.asarray(values), space.shape)
+        values = np.broadcast_to(values, space.shape)
     except ValueError:
         raise ShapeError(f"diagonal on {space} needs values of shape {space.shape}, got {np.shape(values)}") from None
-    if not np.all(np.isfinite(values)):
-        raise NonFiniteError(
-            f"diagonal on {space} needs finite values, got {np.count_nonzero(~np.isfinite(values))} others"
-        )
+    check_finite(f"diagonal on {space}", values, "needs finite values")
     return Operator(Diagonal(values), space, space, "diagonal")
+
+
+def _check_space(space, name):
+    if not isinstance(space, Space):
+        raise TypeError(f"{name} takes a Space, got {type(space).__name__}; write grid.cells or grid.faces")
 
 
 def check_solid(grid, solid):
@@ -181,7 +192,7 @@ def check_solid(grid, solid):
 
 def _boolean(flags, space, name):
     if isbox(flags):
-        raise DerivativeError(f"{name} needs a constant boolean array, got a traced one")
+        raise DerivativeError(f"{name} needs a constant boolean array, got a traced one; take it from plain numbers")
     flags = np.asarray(flags)
     if flags.dtype != bool:
         raise TypeError(f"{name} needs a boolean array, got dtype {flags.dtype}; write {name}.astype(bool)")

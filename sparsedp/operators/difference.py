@@ -1,6 +1,6 @@
 """Differences on the staggered grid: gradient, divergence, laplacian, curl, upwind."""
 
-from sparsedp.conditions import neumann, resolve
+from sparsedp.conditions import check_condition, neumann, resolve
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.stencils import along, differences, one_sided, pick, slopes
@@ -34,7 +34,7 @@ def gradient(grid, boundary=neumann, solid=None, solid_boundary=neumann):
     ShapeError
         If `solid` has another shape than the grid.
     TypeError
-        If `solid` is not boolean.
+        If `solid` is not boolean, or `solid_boundary` not one condition.
 
     Notes
     -----
@@ -51,6 +51,7 @@ def gradient(grid, boundary=neumann, solid=None, solid_boundary=neumann):
     array([2., 1., 2., 0.])
     """
     sides = resolve(grid, boundary)
+    check_condition("solid_boundary", solid_boundary)
     blocks = {(a, 0): along(a, grid.dim, slopes(grid, a, sides[a])) for a in range(grid.dim)}
     structure = Kronecker(grid.faces.parts, grid.cells.parts, blocks)
     if solid is not None:
@@ -162,7 +163,7 @@ def curl(grid):
     array([1., 0., 0., 1.])
     """
     if grid.dim == 1:
-        raise ValueError(f"curl needs a 2-D or 3-D grid, got {grid}")
+        raise ValueError(f"curl needs a 2-D or 3-D grid, got {grid}; a 1-D slope is gradient(grid)")
     if grid.dim == 2:
         blocks = {(0, 0): along(1, 2, differences(grid, 1)), (1, 0): along(0, 2, differences(grid, 0), -1.0)}
         return Operator(Kronecker(grid.faces.parts, grid.nodes.parts, blocks), grid.nodes, grid.faces, "curl")

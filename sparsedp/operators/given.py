@@ -3,7 +3,8 @@
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.fields import check_finite
 from sparsedp.operator import Operator
 from sparsedp.space import Space
 from sparsedp.structure.explicit import Matrix
@@ -44,12 +45,19 @@ def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
     """
     entries = matrix if sp.issparse(matrix) else np.asarray(matrix)
     if entries.ndim != 2:
-        raise ShapeError(f"{name} needs a 2-D matrix, got an array of shape {entries.shape}")
+        raise ShapeError(
+            f"{name} needs a 2-D matrix, got an array of shape {entries.shape}; write matrix[None] for a row"
+        )
     if entries.dtype.kind not in "biufc":
-        raise TypeError(f"{name} needs a matrix of numbers, got dtype {entries.dtype}")
+        raise TypeError(f"{name} needs a matrix of numbers, got dtype {entries.dtype}; write matrix.astype(float)")
     structure = Matrix(sp.csr_array(entries, copy=True))
-    if not np.all(np.isfinite(structure.matrix.data)):
-        raise NonFiniteError(f"{name} needs finite entries, got NaN or infinity")
+    rows, columns = structure.matrix.indptr, structure.matrix.indices
+    check_finite(
+        name,
+        structure.matrix.data,
+        "needs finite entries",
+        lambda n: (int(np.searchsorted(rows, n, side="right")) - 1, int(columns[n])),
+    )
     return Operator(structure, _space(domain, structure.shape[1]), _space(codomain, structure.shape[0]), name)
 
 
@@ -119,6 +127,8 @@ def from_functions(forward, transpose, domain, codomain, name="operator", dtype=
 
     Raises
     ------
+    TypeError
+        If a function is not callable, or a space is missing.
     ShapeError
         On use, if a function returns an array of another shape.
     DerivativeError
@@ -130,6 +140,11 @@ def from_functions(forward, transpose, domain, codomain, name="operator", dtype=
     >>> ends(np.array([5.0, 6.0, 7.0]))
     array([5., 7.])
     """
+    if domain is None or codomain is None:
+        raise TypeError("from_functions needs a domain and a codomain, got None; write from_functions(f, t, 3, 2)")
+    if not callable(forward) or not (transpose is None or callable(transpose)):
+        given = f"{type(forward).__name__} and {type(transpose).__name__}"
+        raise TypeError(f"from_functions takes two functions, got {given}; write None for a missing transpose")
     domain, codomain = _space(domain, None), _space(codomain, None)
     structure = Functions(forward, transpose, domain.shape, codomain.shape, _kind(dtype))
     return Operator(structure, domain, codomain, name)

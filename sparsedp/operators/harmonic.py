@@ -11,7 +11,8 @@ Fluid Flow, 1980). Where both are 0 the ratios are taken as 1, their value on k_
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import NonFiniteError
+from sparsedp.errors import ShapeError
+from sparsedp.fields import check_finite
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, cell_beside
 from sparsedp.structure.kronecker import Kronecker
@@ -34,6 +35,10 @@ def harmonic_average(grid):
 
     Raises
     ------
+    ShapeError
+        On use, if the coefficient has another shape.
+    TypeError
+        On use, if a coefficient is complex.
     ValueError
         On use, if a coefficient is negative.
     NonFiniteError
@@ -51,9 +56,12 @@ def harmonic_average(grid):
     pair = _pair_rule(widths / (widths + others))
 
     def average(k):
-        values = plain(k)
-        if not np.all(np.isfinite(values)):
-            raise NonFiniteError("harmonic_average needs a finite coefficient, got NaN or infinity")
+        values = np.asarray(plain(k))
+        if values.shape != grid.shape:
+            raise ShapeError(f"harmonic_average takes a field on {grid.cells}, got an array of shape {values.shape}")
+        if values.dtype.kind not in "biuf":
+            raise TypeError(f"harmonic_average takes real numbers, got dtype {values.dtype}; write k.real")
+        check_finite("harmonic_average", values, "takes a finite coefficient")
         if np.any(np.less(values, 0)):
             raise ValueError(f"harmonic_average needs a coefficient >= 0, got {np.min(values):g}")
         return pair(below(k), above(k))

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from sparsedp.errors import NonFiniteError
-
 __all__ = ["linear_weights"]
 
 
@@ -18,16 +16,13 @@ def linear_weights(grid, axis, x):
     grid : Grid
     axis : int
     x : array, shape (m,) [length]
+        Finite.
 
     Raises
     ------
-    NonFiniteError
-        If a coordinate is NaN or infinite.
     ValueError
         If a coordinate lies outside a bounded axis.
     """
-    if not np.all(np.isfinite(x)):
-        raise NonFiniteError(f"points need finite coordinates, got {x[~np.isfinite(x)][0]} along {grid.axes[axis]}")
     n, start, extent = grid.shape[axis], grid.origin[axis], grid.size[axis]
     centres = grid.coordinates(axis)
     if n < 2:

@@ -1,4 +1,4 @@
-"""From one place to another: average, sample, restrict, prolong, embed, part, harmonic_average."""
+"""From one place to another: average, sample, restrict, prolong, embed, part."""
 
 from itertools import product
 
@@ -7,11 +7,13 @@ import scipy.sparse as sp
 
 from sparsedp.conditions import neumann, resolve
 from sparsedp.errors import ShapeError
+from sparsedp.fields import check_finite, is_whole
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
 from sparsedp.operators.interpolation import linear_weights
 from sparsedp.operators.stencils import along, means, single
 from sparsedp.space import Space
+from sparsedp.spacing import real_numbers
 from sparsedp.structure.explicit import Matrix
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker
@@ -72,13 +74,15 @@ def sample(grid, points):
     >>> sample(Grid(3), [0.5, 1.25])(np.array([1.0, 2.0, 4.0]))
     array([1.  , 1.75])
     """
-    points = np.asarray(points, dtype=float)
+    given = real_numbers(points, "points", "points=[[0.5, 1.0]]").astype(float)
+    points = given
     if points.ndim == 1 and grid.dim == 1:
         points = points[:, None]
     if points.ndim != 2 or points.shape[1] != grid.dim:
         raise ShapeError(f"sample needs points of shape (m, {grid.dim}), got an array of shape {points.shape}")
     if not grid.cells.size:
         raise ShapeError(f"sample needs a grid with cells, got {grid}")
+    check_finite("points", given, "need finite coordinates")
     corners = [linear_weights(grid, axis, points[:, axis]) for axis in range(grid.dim)]
     count = np.arange(len(points))
     rows, columns, values = [], [], []
@@ -175,8 +179,8 @@ def prolong(grid, factor, interpolation="constant"):
 
 
 def _coarse(grid, factor):
-    factors = (factor,) * grid.dim if isinstance(factor, (int, np.integer)) else tuple(factor)
-    whole = len(factors) == grid.dim and all(isinstance(f, (int, np.integer)) and f >= 1 for f in factors)
+    factors = (factor,) * grid.dim if np.ndim(factor) == 0 else tuple(factor)
+    whole = len(factors) == grid.dim and all(is_whole(f, 1) and np.asarray(f).dtype.kind in "iu" for f in factors)
     if not whole or any(n % f for n, f in zip(grid.shape, factors, strict=True)):
         raise ShapeError(f"a factor must be a whole number >= 1 that divides {grid.shape}, got {factor}")
     spacing = [h.reshape(-1, f).sum(axis=1) for h, f in zip(grid.widths, factors, strict=True)]

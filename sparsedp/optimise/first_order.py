@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp.fields import is_number
 from sparsedp.optimise.trials import Trial, norm
 
 __all__ = ["Adam", "AdamState", "Descent", "DescentState", "Stuck"]
@@ -42,10 +43,10 @@ class Descent:
     """
 
     def __init__(self, rate=None, momentum=0.0, line_search=None):
-        if rate is not None and not 0 < rate < np.inf:
-            raise ValueError(f"gd needs a positive rate, got {rate}")
-        if not 0 <= momentum < 1:
-            raise ValueError(f"gd needs a momentum from 0 to below 1, got {momentum}")
+        if rate is not None and not _is_positive(rate):
+            raise ValueError(f"gd needs a positive rate, got {rate}; leave it out and it is searched for")
+        if not (is_number(momentum) and 0 <= momentum < 1):
+            raise ValueError(f"gd needs a momentum from 0 to below 1, got {momentum}; leave it out for none")
         if line_search not in (None, "backtracking"):
             raise ValueError(f"gd has no line search {line_search!r}; write line_search='backtracking' or leave it out")
         self.rate, self.momentum = rate, momentum
@@ -102,6 +103,10 @@ def _lower(trial, other, fall):
     return trial.value < other.value and trial.value <= other.value - fall
 
 
+def _is_positive(value):
+    return is_number(value) and 0 < value < np.inf
+
+
 class AdamState(NamedTuple):
     """State of Adam: point, the two means, count of steps, size of the first gradient, share to try first."""
 
@@ -131,10 +136,12 @@ class Adam:
     """
 
     def __init__(self, rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8):
-        if not 0 < rate < np.inf:
-            raise ValueError(f"adam needs a positive rate, got {rate}")
-        if len(betas) != 2 or not all(0 <= beta < 1 for beta in betas):
-            raise ValueError(f"adam needs two betas from 0 to below 1, got {betas}")
+        if not _is_positive(rate):
+            raise ValueError(f"adam needs a positive rate, got {rate}; the default is 1e-3")
+        if np.shape(betas) != (2,) or not all(is_number(beta) and 0 <= beta < 1 for beta in betas):
+            raise ValueError(f"adam needs two betas from 0 to below 1, got {betas}; the default is (0.9, 0.999)")
+        if not _is_positive(epsilon):
+            raise ValueError(f"adam needs a positive epsilon, got {epsilon}; the default is 1e-8")
         self.rate, self.betas, self.epsilon = rate, tuple(betas), epsilon
 
     def begin(self, first):

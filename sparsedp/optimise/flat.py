@@ -3,10 +3,13 @@
 import numpy as np
 
 from sparsedp.errors import DerivativeError
+from sparsedp.fields import check_finite
 from sparsedp.tape import is_variable
 from sparsedp.tree import flatten
 
 __all__ = ["Packing"]
+
+FINITE = "must be finite (dp.check.gradient(loss, x) shows where it comes from)"
 
 
 class Packing:
@@ -58,14 +61,21 @@ class Packing:
         """
         leaves = flatten(tree)[0]
         if len(leaves) != len(self._found):
-            raise DerivativeError(f"the gradient has {len(leaves)} leaves where start has {len(self._found)}")
+            raise DerivativeError(
+                f"the gradient has {len(leaves)} leaves where start has {len(self._found)}; return a tree like start"
+            )
         parts = []
         for place in self._places:
             g, leaf = np.asarray(leaves[place]), self._found[place]
             if g.shape != np.shape(leaf):
-                raise DerivativeError(f"a leaf of the gradient has shape {g.shape} where {np.shape(leaf)} is needed")
+                wanted = f"{np.shape(leaf)} is needed; return a tree like start"
+                raise DerivativeError(f"a leaf of the gradient has shape {g.shape} where {wanted}")
+            check_finite(self._gradient_name(place), g, FINITE)
             parts.append(_parts(np.conj(g).astype(complex) if np.iscomplexobj(leaf) else g.real))
         return np.concatenate(parts)
+
+    def _gradient_name(self, place):
+        return "the gradient" if len(self._found) == 1 else f"leaf {place} of the gradient"
 
     def unpack(self, vector):
         """Flat vector -> fresh tree; every leaf has the type, shape and dtype of its original."""

@@ -3,6 +3,7 @@
 import inspect
 import time
 
+from sparsedp.fields import is_number, is_whole
 from sparsedp.optimise.first_order import Adam, Descent, Stuck
 from sparsedp.optimise.flat import Packing
 from sparsedp.optimise.progress import progress_bar
@@ -71,10 +72,10 @@ def minimise(
     True
     """
     stepper = _stepper(method, options)
-    if isinstance(maxiter, bool) or int(maxiter) != maxiter or maxiter < 0:
-        raise ValueError(f"minimise needs maxiter >= 0, a whole number, got {maxiter!r}")
-    if not callable(tolerance) and not tolerance >= 0:
-        raise ValueError(f"minimise needs a tolerance >= 0, got {tolerance!r}")
+    if not is_whole(maxiter, 0):
+        raise ValueError(f"minimise needs maxiter >= 0, a whole number, got {maxiter!r}; the default is 100")
+    if not callable(tolerance) and not (is_number(tolerance) and tolerance >= 0):
+        raise ValueError(f"minimise needs a tolerance >= 0, got {tolerance!r}; the default is 1e-8")
     packing = Packing(start)
     trials = Trials(loss, gradient, packing)
     watch = Watch(trials, packing, tolerance, callback, progress_bar(progress, int(maxiter)))
@@ -92,7 +93,7 @@ def minimise(
 
 
 def _stepper(method, options):
-    if method not in METHODS:
+    if method not in tuple(METHODS):
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     known = list(inspect.signature(METHODS[method]).parameters)
     for name in options:

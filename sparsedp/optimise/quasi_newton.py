@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.optimize import minimize
 
+from sparsedp.fields import is_whole
 from sparsedp.optimise.trials import norm
 
 __all__ = ["Quasi"]
@@ -31,8 +32,10 @@ class Quasi:
     """
 
     def __init__(self, memory=10, line_search=20):
-        if memory < 1 or line_search < 2:
-            raise ValueError(f"lbfgs needs memory >= 1 and line_search >= 2, got {memory} and {line_search}")
+        if not (is_whole(memory, 1) and is_whole(line_search, 2)):
+            raise ValueError(
+                f"lbfgs needs memory >= 1 and line_search >= 2, got {memory} and {line_search}; write whole numbers"
+            )
         self.memory, self.line_search = int(memory), int(line_search)
 
     def run(self, first, trials, watch, maxiter):

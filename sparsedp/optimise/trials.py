@@ -74,8 +74,6 @@ class Trials:
         if not np.isfinite(value):
             raise NonFiniteError(f"the loss is {value}; it must be finite at the start, and elsewhere it is avoided")
         slope = self._packing.pack_gradient(gradient)
-        if not np.all(np.isfinite(slope)):
-            raise NonFiniteError("the gradient holds NaN or infinity; check it with dp.check.gradient(loss, x)")
         rounded = self._packing.pack(self._packing.unpack(vector))  # single-precision leaves round
         return Trial(rounded, value, slope, self._packing.eps * abs(value))
 

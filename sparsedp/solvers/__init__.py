@@ -1,1 +1,1 @@
-"""Solvers: every public function turns an Operator into another one, its inverse."""
+"""Solvers: from an Operator to its inverse or a function of it, and solves that are differentiable in coefficients."""

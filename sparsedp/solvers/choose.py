@@ -3,9 +3,8 @@
 import inspect
 from time import perf_counter
 
-import numpy as np
-
 from sparsedp.errors import ConvergenceError, ShapeError
+from sparsedp.fields import is_number, is_whole
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count
 from sparsedp.operator import Operator
@@ -100,7 +99,7 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     if not isinstance(op, Operator):
         raise TypeError(f"inverse takes an Operator, got {type(op).__name__}; write dp.from_matrix(...) first")
     if not fits(op.domain, op.codomain):
-        raise ShapeError(f"inverse takes a square operator, got one from {op.domain} to {op.codomain}")
+        raise ShapeError(f"inverse takes a square operator, got one from {op.domain} to {op.codomain}; write op.T @ op")
     check_settings(method, rtol, maxiter, nullspace)
     return build(op, method, rtol, maxiter, nullspace, options)
 
@@ -125,11 +124,11 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
 
 def check_settings(method, rtol, maxiter, nullspace):
     """Refuse settings that no method can take."""
-    if method != "auto" and method not in METHODS:
+    if method not in ("auto", *METHODS):
         raise ValueError(f"method must be auto, {', '.join(METHODS)}, got {method!r}")
-    if not (np.ndim(rtol) == 0 and np.isrealobj(rtol) and 0 < rtol < 1):
-        raise ValueError(f"rtol must be between 0 and 1, got {rtol!r}")
-    if maxiter is not None and not (np.ndim(maxiter) == 0 and maxiter == int(maxiter) and maxiter >= 1):
+    if not (is_number(rtol) and 0 < rtol < 1):
+        raise ValueError(f"rtol must be between 0 and 1, got {rtol!r}; the default is 1e-10")
+    if maxiter is not None and not is_whole(maxiter, 1):
         raise ValueError(f"maxiter must be a whole number >= 1 or None, got {maxiter!r}")
     if nullspace not in ("raise", "project"):
         raise ValueError(f"nullspace must be 'raise' or 'project', got {nullspace!r}")

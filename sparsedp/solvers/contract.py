@@ -34,6 +34,7 @@ Its builder is a function (system, **options) -> engine; `system` is a System (s
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
+from sparsedp.fields import check_finite, place
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count
 from sparsedp.solvers.record import Run, merged
@@ -113,7 +114,8 @@ class Solver:
             top = largest(b)
             if not np.isfinite(top):
                 run.status = "nonfinite_input"
-                raise NonFiniteError(_not_finite(self.name, b, self.system, transposed))
+                space = self.system.op.domain if transposed else self.system.op.codomain
+                check_finite(self.name, b.reshape(space.shape), "takes finite numbers")
             if top == 0:
                 run.status = "exact_zero_rhs"
                 return np.zeros_like(b)
@@ -162,7 +164,7 @@ class Solver:
         share = norm(outside) / raw if raw else 0.0
         if checked and self.nullspace == "raise" and share > 8 * EPS:
             run.defect, run.status = share, "incompatible_rhs"
-            cell = _place(int(np.argmax(np.abs(outside))), self.system.op.codomain.shape)
+            cell = place(int(np.argmax(np.abs(outside))), self.system.op.codomain.shape)
             raise IncompatibleError(
                 f"{self.name}: the right-hand side must be 0 where there is no unknown (solid or isolated cells, "
                 f"coefficient 0), but is not in cell {cell}; set it to 0 or write nullspace='project'",
@@ -174,7 +176,7 @@ class Solver:
         run.status = "incompatible_rhs"
         space = self.system.null_space
         cells = space.cells(worst)
-        first = _place(int(cells[0]), self.system.op.codomain.shape)
+        first = place(int(cells[0]), self.system.op.codomain.shape)
         raise IncompatibleError(
             f"{self.name} is singular and the right-hand side is not in its range: on component {worst + 1} of "
             f"{space.count} ({cells.size} cells from {first}) the defect is {defect:.1e}, allowed is {COMPATIBLE:g}; "
@@ -244,15 +246,3 @@ class Solver:
             info=run.info(),
             best=x.reshape(op.domain.shape),
         )
-
-
-def _place(index, shape):
-    found = np.unravel_index(index, shape)
-    return tuple(map(int, found)) if len(found) > 1 else int(found[0])
-
-
-def _not_finite(name, b, system, transposed):
-    wrong = ~np.isfinite(b)
-    space = system.op.domain if transposed else system.op.codomain
-    first, many = _place(int(np.argmax(wrong)), space.shape), np.count_nonzero(wrong)
-    return f"{name} takes finite numbers, got {many} that are NaN or infinite, the first at {first}"

@@ -11,6 +11,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ConvergenceError
+from sparsedp.fields import is_whole
 from sparsedp.operator import Operator
 from sparsedp.solvers.contract import Engine, norm
 from sparsedp.solvers.facts import probes
@@ -50,9 +51,9 @@ def krylov_engine(system, *, preconditioner=None, diff="implicit", iterations=No
     """
     if diff not in ("implicit", "unrolled"):
         raise ValueError(f"diff must be 'implicit' or 'unrolled', got {diff!r}")
-    if iterations is not None and not (np.ndim(iterations) == 0 and iterations == int(iterations) and iterations >= 1):
+    if iterations is not None and not is_whole(iterations, 1):
         raise ValueError(f"iterations must be a whole number >= 1 or None, got {iterations!r}")
-    engine = Krylov(system, _preconditioner(system, preconditioner), iterations=iterations)
+    engine = Krylov(system, _preconditioner(system, preconditioner), iterations=iterations and int(iterations))
     if diff == "unrolled":
         if system.weights is None or preconditioner is not None:
             raise ValueError("diff='unrolled' needs a symmetric operator and no preconditioner; write diff='implicit'")

@@ -14,6 +14,7 @@ import scipy.linalg as la
 from scipy.sparse import csr_array, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from sparsedp.fields import is_number, is_whole
 from sparsedp.solvers.krylov import Krylov
 
 __all__ = ["Multigrid", "multigrid_engine"]
@@ -55,20 +56,33 @@ def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), 
     Set-up: deterministic. Source: Ruge and Stueben, Algebraic Multigrid, in Multigrid Methods, SIAM, 1987;
     PyAMG, Bell, Olson and Schroder, J. Open Source Software 7, 2022.
     """
-    if cycle not in CYCLES:
+    if cycle not in tuple(CYCLES):
         raise ValueError(f"cycle must be 'V' or 'W', got {cycle!r}; the F cycle has no transpose of its own kind")
-    if not (isinstance(strength, (int, float)) and 0 <= strength < 1):
-        raise ValueError(f"strength must be in [0, 1), got {strength!r}")
-    if len(sweeps) != 2 or not all(sweep in SWEEPS for side in sweeps for sweep in side) or not any(sweeps):
-        raise ValueError(f"sweeps must be two tuples of 'forward' and 'backward', got {sweeps!r}")
+    if not (is_number(strength) and 0 <= strength < 1):
+        raise ValueError(f"strength must be in [0, 1), got {strength!r}; the default is 0.25")
+    if not _are_sweeps(sweeps):
+        raise ValueError(
+            f"sweeps must be two tuples of 'forward' and 'backward', got {sweeps!r}; "
+            "write for example (('forward',), ('backward',))"
+        )
+    if not is_whole(levels, 1):
+        raise ValueError(f"levels must be a whole number >= 1, got {levels!r}; the default is 25")
     if not system.op.structure.has_entries:
         raise ValueError(f"multigrid needs the entries, {system.given} only knows its products; write method='krylov'")
     if not system.sign:
         ends = system.diagonal if system.active is None else system.diagonal[system.active]
         raise ValueError(
-            f"multigrid needs a diagonal of one sign; {system.given} has {ends.min():.1e} and {ends.max():.1e}"
+            f"multigrid needs a diagonal of one sign; {system.given} has {ends.min():.1e} and {ends.max():.1e}; "
+            "write method='direct'"
         )
     return Multigrid(system, CYCLES[cycle], float(strength), tuple(map(tuple, sweeps)), int(levels))
+
+
+def _are_sweeps(given):
+    """Whether an argument is two tuples or lists of known words, not both empty."""
+    if not isinstance(given, (tuple, list)) or len(given) != 2 or not any(given):
+        return False
+    return all(isinstance(side, (tuple, list)) and all(sweep in tuple(SWEEPS) for sweep in side) for side in given)
 
 
 class Multigrid(Krylov):

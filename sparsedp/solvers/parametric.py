@@ -18,7 +18,8 @@ from math import prod
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.errors import ShapeError
+from sparsedp.fields import check_finite
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
 from sparsedp.solvers.assembly import Assembly
@@ -82,7 +83,9 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     """
     for name, op in (("D", D), ("G", G)):
         if not isinstance(op, Operator):
-            raise TypeError(f"elliptic_solver takes Operators, got {type(op).__name__} for {name}")
+            raise TypeError(
+                f"elliptic_solver takes Operators, got {type(op).__name__} for {name}; write dp.from_matrix first"
+            )
     if not (fits(D.domain, G.codomain) and fits(D.codomain, G.domain)):
         raise ShapeError(
             f"elliptic_solver needs D @ G to be square: {D.name} maps {D.domain} to {D.codomain}, "
@@ -133,14 +136,13 @@ class EllipticSolver:
         if values.shape not in ((), space.shape):
             raise ShapeError(f"k takes a number or a field on {space}, got an array of shape {values.shape}")
         if values.dtype.kind not in "biuf":
-            raise ValueError(f"k must hold real numbers, got dtype {values.dtype}")
-        wrong = ~np.isfinite(values)
-        if wrong.any():
-            many, first = np.count_nonzero(wrong), np.argmax(wrong)
-            raise NonFiniteError(f"k must be finite, got {many} values that are NaN or infinite, the first at {first}")
+            raise ValueError(f"k must hold real numbers, got dtype {values.dtype}; write k.real")
+        check_finite("k", values)
         if np.any(values < 0):
             raise ValueError(f"k must be >= 0, got {values.min():g} at {np.argmin(values)}")
-        return k * np.ones(space.shape) if values.ndim == 0 else k if isbox(k) else values
+        if values.ndim == 0:
+            return k * np.ones(space.shape)
+        return k if isbox(k) else values.copy()  # the caller may reuse the array before the pullback
 
     # ------------------------------------------------------------ rules
 
@@ -210,10 +212,9 @@ def _real(cotangent, value):
 def _check_shift(shift):
     if np.shape(shift) != ():
         raise ShapeError(f"shift takes one number, got an array of shape {np.shape(shift)}")
-    if not np.isrealobj(shift):
-        raise ValueError(f"shift must be real, got {shift}")
-    if not np.isfinite(shift):
-        raise NonFiniteError(f"shift must be finite, got {shift}")
+    if np.asarray(shift).dtype.kind not in "biuf":
+        raise ValueError(f"shift must be real, got {shift!r}; write for example shift=1.0")
+    check_finite("shift", shift)
 
 
 class Elliptic(Structure):

@@ -5,6 +5,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.errors import NonFiniteError
 from sparsedp.operator import Operator
 from sparsedp.solvers import facts
 from sparsedp.solvers.nullspace import ROUNDING, find_null_space
@@ -14,6 +15,7 @@ from sparsedp.structure.kronecker import Kronecker
 
 __all__ = ["System"]
 
+FAR_OFF = 0.1  # a residual beyond this share of the data is no solution, whatever the size of x
 FAR = 200  # binary exponents of |A| beyond this are scaled away: squares of solutions must not overflow
 
 
@@ -43,6 +45,7 @@ class System:
         if abs(exponent) > FAR:
             self.exponent = int(np.clip(exponent, -1000, 1000))
             self.op = op * 2.0**-self.exponent
+            _check_kept(op, self.op)
             for name in ("_magnitudes", "_sums"):
                 self.__dict__.pop(name, None)
 
@@ -249,6 +252,8 @@ class System:
         """Whether norms meet the tolerance ("converged"), the attainable accuracy, or neither ("")."""
         if residual <= goal:
             return "converged"
+        if residual > FAR_OFF * data:  # a solution that is huge along an unknown null vector has any size of rounding
+            return ""
         attainable = ROUNDING * (self.norm(transposed) * solution + data)
         return "converged_at_roundoff" if residual <= attainable else ""
 
@@ -284,3 +289,10 @@ def _matrix_symmetric(matrix):
     turned = matrix.T.tocsr()
     excess = abs(matrix - turned) - ROUNDING * (abs(matrix) + abs(turned))
     return excess.nnz == 0 or float(excess.max()) <= 0
+
+
+def _check_kept(op, scaled):
+    """Entries that vanish when the largest is scaled to 1 are too far apart for one solve."""
+    before, after = op.structure, scaled.structure
+    if isinstance(before, Matrix) and np.count_nonzero(before.matrix.data) != np.count_nonzero(after.matrix.data):
+        raise NonFiniteError(f"the entries of {op} span more than 1e308; rescale its rows or columns")

@@ -22,6 +22,8 @@ class Matrix(Structure):
         if self.matrix.dtype not in (np.float64, np.complex128):
             wide = np.complex128 if self.matrix.dtype.kind == "c" else np.float64
             self.matrix = self.matrix.astype(wide)
+        for part in (self.matrix.data, self.matrix.indices, self.matrix.indptr):
+            part.flags.writeable = False  # an Operator is constant: nobody may write into it
         self.shape = self.matrix.shape
         self.dtype = self.matrix.dtype
 

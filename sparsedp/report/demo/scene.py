@@ -16,10 +16,11 @@ from numpy.random import default_rng
 
 import sparsedp as dp
 
-__all__ = ["Ground", "Survey", "objective", "regulariser", "survey"]
+__all__ = ["RTOL", "Ground", "Survey", "objective", "regulariser", "survey"]
 
 RIVERS = {"x": dp.dirichlet, "y": dp.neumann}
 RADIUS = 0.05  # of the gravel pack around a well [longest side]
+RTOL = 1e-10  # of every solve, on its true residual
 NOISE = 0.005  # of a reading, relative to the mean square over the sensors
 SMOOTHNESS = 3e-4  # weight of the regulariser, against misfit / noise
 WELLS, SENSORS = (4, 3), (24, 20)
@@ -30,7 +31,7 @@ class Ground:
 
     def __init__(self, grid, wells, sensors):
         self.grid = grid
-        self.solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, RIVERS))
+        self.solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, RIVERS), rtol=RTOL)
         self.to_faces = dp.harmonic_average(grid)
         self.read = dp.sample(grid, sensors)
         self.pumps = [pump(grid, well) for well in wells]
