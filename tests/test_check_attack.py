@@ -18,6 +18,9 @@ U = np.sin(np.arange(30.0)).reshape(6, 5)
 DT = 0.05
 
 
+KERNEL = np.pad(X[1:], (1, 0)) - np.pad(X[1:], (0, 1))  # gradient of sum(X[1:] diff(u))
+
+
 def bits(u):
     return zlib.crc32(u.tobytes()) / 2**31 - 1
 
@@ -76,6 +79,8 @@ ATTACKS = {
     "nearly linear": (lambda u: np.sum(u + 1e-11 * u**2), lambda u: 1 + 2e-11 * u, "agrees"),
     "quadratic": (lambda u: np.sum(u**2), lambda u: 2 * u, "agrees"),
     "quadratic, 1e-6": (lambda u: np.sum(u**2), lambda u: (2 + 2e-6) * u, "disagrees"),
+    "kernel": (lambda u: np.sum(np.diff(u) * X[1:]), lambda u: KERNEL, "agrees"),
+    "kernel, 0.1 %": (lambda u: np.sum(np.diff(u) * X[1:]), lambda u: 1.001 * KERNEL, "disagrees"),
     "minimum": (lambda u: 5 + np.sum((u - X) ** 2), lambda u: 2 * (u - X), "agrees"),
     "flat minimum": (lambda u: np.sum((u - X) ** 4), lambda u: 4 * (u - X) ** 3, "agrees"),
     "near a minimum": (lambda u: 5 + np.sum((u - X - 1e-7) ** 2), lambda u: 2 * (u - X - 1e-7), "agrees"),

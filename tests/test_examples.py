@@ -10,7 +10,11 @@ import pytest
 from sources import ROOT
 
 EXAMPLES = sorted(path.name for path in (ROOT / "examples").glob("*.py"))
-SMALL = {"poisson_adjoint.py": "32", "two_families.py": "24"}  # cells; the others run with 16
+SMALL = {
+    "poisson_adjoint.py": "32",
+    "two_families.py": "24",
+    "poisson_control.py": "64",
+}  # cells; the others run with 16
 
 
 @cache
@@ -58,3 +62,13 @@ def test_new_operator():
     printed = run("new_operator.py")
     assert printed.count(": agrees") >= 3
     assert "wind that never turns: disagrees" in printed
+
+
+def test_poisson_control():
+    """Case B2: the optimum to 1e-8 within 60 iterations, as many on every grid (+-3)."""
+    rows = re.findall(r"^ +(\d+)\^2 +(\S+) +\S+ +\S+ +(\S+) +(\d+) +\d+$", run("poisson_control.py"), re.MULTILINE)
+    assert len(rows) == 6
+    for alpha in ("1e-02", "1e-04"):
+        gaps, counts = zip(*((float(gap), int(count)) for _, a, gap, count in rows if a == alpha))
+        assert max(gaps) <= 1e-8 and max(counts) <= 60
+        assert max(counts) - min(counts) <= 3

@@ -69,7 +69,8 @@ def gradient(loss, x, grad=None, steps=None, directions=3, rng=None):
     of order 1.95 or more on every pair of steps, at least three steps that stand 100 times above the noise;
     with one or two, or with a lower order, the verdict is inconclusive, however small the gap. Two cases
     have no order, and the gap alone judges them: the remainder is noise on all steps (a linear loss: order
-    2 is "exact"), and a slope so small that the loss bends before it climbs (near a minimum: no order 1).
+    2 is "exact"), and a slope so small that the loss bends before it climbs (near a minimum,
+    or in the kernel of a Laplacian: no order 1).
     Forward against reverse mode: 1e-10, and 1e-6 behind a solve or in noise.
 
     Everything is relative: a loss times 1e-200 or 1e200 is judged the same. A loss that refuses a trial

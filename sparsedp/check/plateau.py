@@ -130,7 +130,8 @@ def judge(line, eps, spread):
     bar += gaps.floor
     scale = max(abs(line.slope), abs(line.slope + gap), line.typical)
     word, note = _word(gaps, line, (gap, bar, scale), jump)
-    orders = taylor(gaps, line.slope, gap if word in ("agrees", "vanishes") else 0.0, index)
+    sharp = bar + abs(gap) <= VANISHED * scale
+    orders = taylor(gaps, line.slope, gap if word in ("agrees", "vanishes") else 0.0, index, sharp)
     if word == "agrees" or (word == "vanishes" and orders.word == "rough"):
         word, note = orders.word or word, orders.note
     reference = gaps.curvature if word == "vanishes" else scale

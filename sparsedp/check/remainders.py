@@ -33,7 +33,7 @@ class Taylor(NamedTuple):
     note: str
 
 
-def taylor(gaps, slope, gap, index):
+def taylor(gaps, slope, gap, index, sharp):
     """Gaps of a line whose gradient agrees -> Taylor.
 
     Usable for order 2: levels near the plateau with R2 >= CLEAR (noise + t |gap|), the MOST finest ones.
@@ -41,14 +41,17 @@ def taylor(gaps, slope, gap, index):
     no gap can hide, and then the same on all levels; with no usable level at all the loss is linear to
     its noise, and there is no order to judge. Usable for order 1: R1 >= CLEAR noise, and t |g . d| >= LINEAR times the
     even part (f(x + t d) + f(x - t d)) / 2 - f. Where the slope is so small that f bends before it climbs
-    (near a minimum), order 1 cannot be 1: the direction is flat and order 1 is not judged.
+    (near a minimum), order 1 cannot be 1: the direction is flat and order 1 is not judged. So it is where
+    neither the loss nor t g . d ever leaves the noise (the kernel of a Laplacian), if the sweep is `sharp`:
+    gap and bar far below the terms of g . d.
     """
     near = gaps.t <= NEARBY * gaps.t[index]
     rates2 = _second(gaps, gap, near)
     seen = near & (gaps.first >= CLEAR * gaps.noise)
     climbs = np.abs(slope) * gaps.t >= LINEAR * np.abs(gaps.kinks * gaps.t) / 2
     rates1 = _rates(gaps.t, gaps.first, seen & climbs)
-    flat = rates1.used < FEWEST and bool(np.any(seen & ~climbs))
+    still = sharp and not np.any(seen) and bool(np.all(np.abs(slope) * gaps.t < CLEAR * gaps.noise))
+    flat = rates1.used < FEWEST and (still or bool(np.any(seen & ~climbs)))
     rate1 = max(rates1.orders, key=lambda rate: abs(rate - 1), default=np.nan)
     rate2 = np.inf if not rates2.used else min(rates2.orders, default=np.nan)
     return Taylor(rate1, rate2, *_gates(rates1, rates2, flat, rate1, rate2))
@@ -73,7 +76,7 @@ def _gates(rates1, rates2, flat, rate1, rate2):
         return "few", f"the second Taylor remainder stands out of the noise on {rates2.used} steps, {FEWEST} are needed"
     if rates1.used < FEWEST and not flat:
         return "few", f"the change of the loss stands out of the noise on {rates1.used} steps, {FEWEST} are needed"
-    return "", "flat: the loss bends before it climbs, order 1 is not judged" if flat else ""
+    return "", "flat: there is no climb to judge order 1 by" if flat else ""
 
 
 class _Rates(NamedTuple):
