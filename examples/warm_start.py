@@ -49,3 +49,11 @@ for label, method, quality in (
             used.append(inv.info.forward.iterations)
         counts.append(np.mean(used))
     print(f"{label:32} {counts[0]:7.1f} {counts[1]:6.1f}")
+
+
+def largest_residual(b, steps):
+    return np.max(np.abs(b - box(dp.inverse(box, "krylov", iterations=steps, nullspace="project")(b))))
+
+
+mean = np.mean([next(k for k in range(1, 400) if largest_residual(b, k) <= 1e-3) for b in cases])
+print(f"\nPlain CG until no residual is above 1e-3: {mean:.1f}. Published, 64 x 64: 121.6, learned guess: 29.6.")

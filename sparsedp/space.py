@@ -7,7 +7,7 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import ShapeError
+from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.tape import dtype_of, isbox, linear
 
 __all__ = ["Space", "fits"]
@@ -74,8 +74,11 @@ class Space:
         """Control volume of each value [length^dim]; ones in a space without a grid."""
         if self.grid is None:
             return np.ones(self.shape)
-        flat = [self.grid.control_volumes(self.kind, axis).ravel() for axis in range(len(self.parts))]
+        with np.errstate(over="ignore"):  # what overflows is refused
+            flat = [self.grid.control_volumes(self.kind, axis).ravel() for axis in range(len(self.parts))]
         volumes = np.concatenate(flat).reshape(self.shape)
+        if not np.all(np.isfinite(volumes)):
+            raise NonFiniteError("volumes overflow: the spacing is too large; rescale the lengths of the grid")
         volumes.flags.writeable = False
         return volumes
 

@@ -14,6 +14,9 @@ SMALL = {
     "poisson_adjoint.py": "32",
     "two_families.py": "24",
     "poisson_control.py": "64",
+    "warm_start.py": "64",
+    "implicit_or_unrolled.py": "96",
+    "inexact_solves.py": "30",
 }  # cells; the others run with 16
 
 
@@ -72,3 +75,40 @@ def test_poisson_control():
         gaps, counts = zip(*((float(gap), int(count)) for _, a, gap, count in rows if a == alpha))
         assert max(gaps) <= 1e-8 and max(counts) <= 60
         assert max(counts) - min(counts) <= 3
+
+
+def test_warm_start():
+    """Case B6: plain CG 100 to 170 iterations to 1e-3; multigrid at most 5, and at most 10 to 1e-6."""
+    printed = run("warm_start.py")
+    plain = float(re.search(r"^plain CG from zero +(\S+)", printed, re.MULTILINE)[1])
+    largest = float(re.search(r"above 1e-3: (\d+\.\d)", printed)[1])
+    assert 100 <= largest <= plain <= 170
+    coarse, fine = map(float, re.search(r"^multigrid from zero +(\S+) +(\S+)", printed, re.MULTILINE).groups())
+    assert coarse <= 5 and fine <= 10
+
+
+def test_implicit_or_unrolled():
+    """Case B8: the same gradient, at least 20 times less memory, at least 5 times less time."""
+    rows = re.findall(r"^(\S.*?) +(\d+)\^2 +(\S+) +(\S+) +(\S+)$", run("implicit_or_unrolled.py"), re.MULTILINE)
+    table = {(label, int(n)): tuple(map(float, figures)) for label, n, *figures in rows}
+    assert len(table) == 10
+    for n in (48, 96):
+        taped, cut = table["CG, 200 iterations unrolled", n], table["CG, 20 iterations unrolled", n]
+        for label in ("CG, implicit", "multigrid, implicit", "chosen by itself, implicit"):
+            assert table[label, n][1] <= taped[1] / 20 and table[label, n][2] <= 1e-10
+        assert table["chosen by itself, implicit", n][0] <= taped[0] / 5
+        assert cut[2] > 0.1
+    assert table["CG, implicit", 48][0] <= table["CG, 200 iterations unrolled", 48][0] / 5
+    assert table["CG, 200 iterations unrolled", 48][2] <= 1e-10  # 200 iterations are enough here
+    assert 1e-8 <= table["CG, 200 iterations unrolled", 96][2] <= 1e-4  # and not here
+
+
+def test_inexact_solves():
+    """Case B7: the published figures, at least 80 % fewer sweeps at no larger error, and one exact step."""
+    rows = re.findall(r"^(\S.*?) +(\d+) +(?:-|\d+) +(\d\.\S+) +\S+$", run("inexact_solves.py"), re.MULTILINE)
+    (many, error), (refined, after), few, _, (certified, sure), (_, exact) = ((int(n), float(e)) for _, n, e in rows)
+    assert many == 75000 and abs(error - 1.30e-5) < 0.005e-5
+    assert refined <= 0.7 * many and after < 2e-5
+    assert certified <= 0.2 * many and sure <= error
+    assert few[1] > 100 * error  # a number of sweeps that is guessed too low says nothing
+    assert exact <= 1e-14

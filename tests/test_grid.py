@@ -98,3 +98,11 @@ def test_prints_itself():
     assert str(dp.Grid((2, 2), periodic=(False, True))) == "Grid(2 x 2 cells, size 2 x 2, periodic in y)"
     assert str(grid.faces) == "faces(2)" and str(dp.Space((2, 3))) == "space(2, 3)"
     assert repr(dp.robin(2, 3)) == "robin(2, 3)" and repr(dp.robin(0, 1)) == "neumann"
+
+
+def test_volumes_that_overflow_are_refused():
+    with pytest.raises(
+        dp.errors.NonFiniteError,
+        match="volumes overflow: the spacing is too large; rescale the lengths of the grid",
+    ):
+        dp.Grid((2, 2, 2), spacing=2.0**450).volumes

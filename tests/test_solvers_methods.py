@@ -7,6 +7,7 @@ from test_solvers import EVERY, PROBLEMS, stretched
 
 import sparsedp as dp
 from sparsedp.derivative import value_and_grad
+from sparsedp.kernels import compiled
 from sparsedp.ledger import recording
 from sparsedp.solvers.multigrid import CoarseSolve
 
@@ -251,6 +252,10 @@ def test_a_symmetric_matrix_without_a_diagonal(rng):
 # ---------------------------------------------------------------- the choice
 
 CUBE = dp.Grid((25, 25, 23))
+LAYERS = dp.harmonic_average(CUBE)(np.where(np.arange(23) % 2, 1e6, 1.0) * np.ones(CUBE.shape))
+WIND = dp.from_matrix(
+    (dp.upwind(CUBE, 0, 1.0) - dp.laplacian(CUBE, dp.dirichlet)).explicit().matrix, CUBE.cells, CUBE.cells
+)
 CHOICES = [
     (lambda: PROBLEMS["dirichlet"](), "direct", "572 unknowns in 2-D"),
     (
@@ -260,9 +265,15 @@ CHOICES = [
     ),
     (
         lambda: dp.from_matrix((-dp.laplacian(CUBE, dp.dirichlet)).explicit().matrix, CUBE.cells, CUBE.cells),
-        "multigrid",
-        "14375",
+        "structured" if compiled() else "multigrid",
+        "multigrid on the grid itself" if compiled() else "structured multigrid needs numba, which is not installed",
     ),
+    (
+        lambda: -dp.divergence(CUBE) @ dp.diagonal(CUBE.faces, LAYERS) @ dp.gradient(CUBE),
+        "multigrid",
+        "held 10 times weaker along one axis" if compiled() else "needs numba",
+    ),
+    (lambda: WIND + dp.identity(CUBE.cells), "multigrid", "not a symmetric 5- or 7-point" if compiled() else "numba"),
     (lambda: dp.from_matrix(np.eye(3)), "direct", "3 unknowns without a grid"),
     (lambda: dp.from_functions(lambda u: u, lambda u: u, 3, 3), "krylov", "only products"),
 ]

@@ -15,6 +15,7 @@ from sparsedp.solvers.multigrid import multigrid_engine
 from sparsedp.solvers.record import SolveLog, failure
 from sparsedp.solvers.separable import separable_engine, spectrum
 from sparsedp.solvers.solution import Inverse
+from sparsedp.solvers.structured import structured_engine, structured_if_suited
 from sparsedp.solvers.system import System
 from sparsedp.space import fits
 
@@ -24,6 +25,7 @@ __all__ = ["METHODS", "build", "check_settings", "inverse"]
 METHODS = {
     "separable": separable_engine,
     "direct": direct_engine,
+    "structured": structured_engine,
     "multigrid": multigrid_engine,
     "krylov": krylov_engine,
 }
@@ -39,6 +41,9 @@ DIRECT_UP_TO = {
     "many": {0: 50_000, 1: 10_000_000, 2: 262_144, 3: 13_824},
     "few": {0: 10_000, 1: 10_000_000, 2: 16_384, 3: 2_000},
 }
+
+# The same where structured multigrid is possible.
+DIRECT_BELOW_STRUCTURED = {"many": {1: 10_000_000, 2: 16_384, 3: 4_096}, "few": {1: 10_000_000, 2: 4_096, 3: 1_000}}
 
 
 def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **options):
@@ -108,11 +113,11 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
     """The set-up behind `inverse`, for callers that name it, keep its log, or expect "few" solves of it."""
     clock = perf_counter()
     system = System(op, rtol, None if maxiter is None else int(maxiter))
-    word, reason = (method, "as asked") if method != "auto" else _chosen(system, solves)
+    word, reason, engine = (method, "as asked", None) if method != "auto" else _chosen(system, solves)
     _check_options(word, options)
     if system.complex and word != "direct":
         raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct'")
-    engine = _engine(system, word, options)
+    engine = _engine(system, word, options) if engine is None or options else engine
     log = SolveLog() if log is None else log
     log.setup_seconds, log.hierarchy = perf_counter() - clock, engine.hierarchy
     name = name or f"inverse({op.name})"
@@ -162,22 +167,29 @@ def _engine(system, word, options):
 
 
 def _chosen(system, solves):
-    """The word of a method and why. Depends on structure and size only, so that bits repeat."""
+    """The word of a method, why, and its engine if it is built. Depends on the operator only, so that bits repeat."""
     size, grid = system.unknowns, system.op.domain.grid
     dimension = 0 if grid is None else grid.dim
     if system.complex:
-        return "direct", "complex entries"
+        return "direct", "complex entries", None
     if not system.op.structure.has_entries:
-        return "krylov", "only products with the operator are known"
+        return "krylov", "only products with the operator are known", None
     if _transforms(system, dimension):
-        return "separable", f"{size} unknowns in {dimension}-D, a sum of 1-D factors: transforms solve it exactly"
-    limit = DIRECT_UP_TO[solves][dimension]
+        reason = f"{size} unknowns in {dimension}-D, a sum of 1-D factors: transforms solve it exactly"
+        return "separable", reason, None
     where = f"{size} unknowns in {dimension}-D" if dimension else f"{size} unknowns without a grid"
+    limit = DIRECT_BELOW_STRUCTURED[solves].get(dimension, 0)
+    engine, unsuited = (None, "") if size <= limit else structured_if_suited(system)
+    if engine is not None:
+        reason = f"{where}, coefficients or obstacles that no transform takes: multigrid on the grid itself"
+        return "structured", reason, engine
+    limit = DIRECT_UP_TO[solves][dimension]
     if size <= limit:
-        return "direct", f"{where}; up to {limit}, for {solves} solves, kept LU factors are fastest"
+        return "direct", f"{where}; up to {limit}, for {solves} solves, kept LU factors are fastest", None
+    where = f"{where}; {unsuited}; above {limit}, for {solves} solves, LU costs more"
     if system.sign:
-        return "multigrid", f"{where}; above {limit}, for {solves} solves, LU costs more; the diagonal has one sign"
-    return "direct", f"{where}; the diagonal has no single sign, which rules multigrid out"
+        return "multigrid", f"{where}; the diagonal has one sign", None
+    return "direct", f"{where}; the diagonal has no single sign, which rules multigrid out", None
 
 
 def _transforms(system, dimension):

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from sparsedp.grid import Grid
 from sparsedp.structure.base import Scaled
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker, Term
@@ -21,6 +22,7 @@ __all__ = [
     "is_sum_of_factors",
     "magnitude",
     "probes",
+    "rescaled",
 ]
 
 PROBES = 3  # random vectors with which a map without entries is examined
@@ -76,6 +78,12 @@ def probes(size):
     """The same few vectors of random signs in every run."""
     generator = np.random.default_rng(0)
     return [generator.choice([-1.0, 1.0], size) for _ in range(PROBES)]
+
+
+def rescaled(grid):
+    """The grid with its lengths divided by powers of two, so that volumes are near 1, and so are their squares."""
+    widths = [np.ldexp(h, -int(np.frexp(np.max(h, initial=0.0))[1])) for h in grid.widths]
+    return Grid(grid.shape, spacing=widths, periodic=grid.periodic)
 
 
 def is_sum_of_factors(structure):

@@ -32,7 +32,7 @@ class Best:
         return "stagnated" if number - self.found >= self.window else ""
 
 
-def conjugate_gradients(apply, b, precondition, measure, accepted, maxiter, window):
+def conjugate_gradients(apply, b, precondition, measure, accepted, maxiter, window, best_of=True):
     """Preconditioned conjugate gradients for S x = b from 0; S symmetric and positive (semi-)definite.
 
     Parameters
@@ -49,6 +49,8 @@ def conjugate_gradients(apply, b, precondition, measure, accepted, maxiter, wind
         accepted(residual norm, x) -> bool.
     maxiter, window : int
         Most iterations; most iterations without a better iterate.
+    best_of : bool
+        Whether `maxiter` iterations give the best iterate, or the last one.
 
     Returns
     -------
@@ -76,7 +78,7 @@ def conjugate_gradients(apply, b, precondition, measure, accepted, maxiter, wind
         rz, before = dot(r, z), rz
         p *= rz / before
         p += z
-    return best.x, maxiter, "max_iterations"
+    return best.x if best_of else x, maxiter, "max_iterations"
 
 
 def _without_descent(pq, rz, p, q, r, z):

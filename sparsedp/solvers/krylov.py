@@ -127,7 +127,7 @@ class Krylov(Engine):
 
         b = sign * b if transposed else factor * b
         x, used, word = conjugate_gradients(
-            apply, b, self._for_symmetric(factor), measure, tested, self.maxiter, self.window
+            apply, b, self._for_symmetric(factor), measure, tested, self.maxiter, self.window, self.refines
         )
         return (weights * x if transposed else x), used, word
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 
-__all__ = ["NullSpace", "find_null_space"]
+__all__ = ["NullSpace", "assembled", "find_null_space"]
 
 EPS = np.finfo(float).eps
 ROUNDING = 8 * EPS  # a row whose entries sum to less than this share of their magnitudes sums to 0
@@ -123,7 +123,7 @@ def find_null_space(system):
             left[cells] = _computed(system.entries[cells][:, cells].T)
         else:
             right[cells] = _computed(system.entries[cells][:, cells])
-    return _assembled(labels, right, left, has_right | has_left)
+    return assembled(labels, right, left, has_right | has_left)
 
 
 def _candidates(system, labels, count, transposed):
@@ -165,7 +165,7 @@ def _computed(matrix):
     return vector / vector[np.argmax(np.abs(vector))]  # of one sign where it can be, and positive then
 
 
-def _assembled(labels, right, left, singular):
+def assembled(labels, right, left, singular):
     numbers = np.append(np.where(singular, np.cumsum(singular) - 1, -1), -1)
     count = int(np.count_nonzero(singular))
     labels = None if labels is None or not count else numbers[labels]

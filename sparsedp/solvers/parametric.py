@@ -18,7 +18,7 @@ from math import prod
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import ShapeError
+from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import check_finite
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
@@ -158,7 +158,8 @@ class EllipticSolver:
                 other = self._rule(not transposed)(k, g, shift)
                 x, y = (other, ans) if transposed else (ans, other)
                 slopes = {0: lambda: self.D.T(y) * self.G(x), 1: lambda: other, 2: lambda: -anp.sum(y * x)}
-                return tuple(_real(slopes[num](), (k, b, shift)[num]) for num in nums)
+                with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+                    return tuple(_real(_representable(slopes[num]()), (k, b, shift)[num]) for num in nums)
 
             return pull
 
@@ -202,6 +203,13 @@ class EllipticSolver:
         if not self._kept:
             return f"{self!r}, not set up yet"
         return f"{self!r}, {len(self._kept)} of {KEPT} set-ups kept, the last one:\n{self._kept[0][2]}"
+
+
+def _representable(cotangent):
+    """Refuse products of two solutions that overflow."""
+    if not np.all(np.isfinite(plain(cotangent))):
+        raise NonFiniteError("a gradient of elliptic_solver is beyond 1.8e308; scale the loss or the right-hand side")
+    return cotangent
 
 
 def _real(cotangent, value):

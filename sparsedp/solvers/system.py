@@ -46,7 +46,7 @@ class System:
             self.exponent = int(np.clip(exponent, -1000, 1000))
             self.op = op * 2.0**-self.exponent
             _check_kept(op, self.op)
-            for name in ("_magnitudes", "_sums"):
+            for name in ("_magnitudes", "sums"):
                 self.__dict__.pop(name, None)
 
     # ------------------------------------------------------------ products
@@ -88,7 +88,8 @@ class System:
         return facts.magnitude(structure), facts.magnitude(structure.transpose())
 
     @cached_property
-    def _sums(self):
+    def sums(self):
+        """Sums of the magnitudes of each row and of each column, or upper bounds of them."""
         ones = np.ones(self.size)
         return tuple(magnitude(ones) for magnitude in self._magnitudes)
 
@@ -98,7 +99,7 @@ class System:
 
     def norm(self, transposed=False):
         """|A|_inf (|A^T|_inf), or an upper bound of it."""
-        return float(np.max(self._sums[transposed], initial=0.0))
+        return float(np.max(self.sums[transposed], initial=0.0))
 
     # ------------------------------------------------------------ unknowns
 
@@ -109,7 +110,7 @@ class System:
         What no row reads (a column without entries: solid cells, coefficients that are 0) is not an
         unknown: it is 0 in every solution, and its equation is left out.
         """
-        read = self._sums[True] > 0
+        read = self.sums[True] > 0
         return None if read.all() else read
 
     @cached_property
@@ -120,7 +121,7 @@ class System:
     @cached_property
     def empty_row(self):
         """The first unknown whose row has no entries, or None."""
-        sums = self._sums[False] if self.active is None else self.magnitude(self.active.astype(float))
+        sums = self.sums[False] if self.active is None else self.magnitude(self.active.astype(float))
         empty = sums == 0 if self.active is None else (sums == 0) & self.active
         return int(np.argmax(empty)) if empty.any() else None
 
@@ -144,9 +145,10 @@ class System:
 
     @cached_property
     def volumes(self):
-        """Cell volumes as a flat array; ones where there is no grid."""
-        domain, codomain = self.op.domain, self.op.codomain
-        return (domain if domain.grid is not None else codomain).volumes.reshape(-1)
+        """Cell volumes as a flat array, up to a power of two; ones where there is no grid."""
+        space = self.op.domain if self.op.domain.grid is not None else self.op.codomain
+        space = space if space.grid is None else getattr(facts.rescaled(space.grid), space.kind)
+        return space.volumes.reshape(-1)
 
     @cached_property
     def weights(self):
