@@ -20,13 +20,11 @@ from sparsedp.kernels.multigrid_setup import WEAK
 __all__ = ["FINE_STEPS", "STEPS", "galerkin", "scales", "weights"]
 
 FINE_STEPS = [(0, 0, 1), (1, 0, 0), (0, 1, 0)]
-STEPS: list[tuple[int, ...]] = [(0, 0, 1)] + [
-    (d0, d1, d2) for d0, d1 in ((0, 1), (1, -1), (1, 0), (1, 1)) for d2 in (-1, 0, 1)
-]
+STEPS = [(0, 0, 1)] + [(d0, d1, d2) for d0, d1 in ((0, 1), (1, -1), (1, 0), (1, 1)) for d2 in (-1, 0, 1)]
 KINDS = sorted(product((0, 1), repeat=3), key=sum)[1:]
 FIRST: dict[tuple[int, ...], int] = dict(zip(KINDS, np.cumsum([0, *(2 ** sum(kind) for kind in KINDS)]).tolist()))
 CORNERS: list[tuple[int, ...]] = list(product((0, 1), repeat=3))
-LOCAL: list[tuple[int, ...]] = list(product((0, 1, 2), repeat=3))
+LOCAL = list(product((0, 1, 2), repeat=3))
 
 
 def _sides(kind):
@@ -66,7 +64,9 @@ def _corner_links():
     """Rows: two corners, number of the coarse link between them, place of the first one."""
     pairs = [(p, q) for p in range(8) for q in range(p + 1, 8)]
     steps = [tuple(b - a for a, b in zip(CORNERS[p], CORNERS[q])) for p, q in pairs]
-    return np.array([(p, q, STEPS.index(step), *CORNERS[p]) for (p, q), step in zip(pairs, steps)])
+    return np.array(
+        [(p, q, STEPS.index((step[0], step[1], step[2])), *CORNERS[p]) for (p, q), step in zip(pairs, steps)]
+    )
 
 
 OFFSETS = {False: _offsets(FINE_STEPS), True: _offsets(STEPS)}
