@@ -49,7 +49,7 @@ DOORS = [
 TALKS = r"report/.*|__main__\.py"  # may print
 NOWHERE = {"utils.py", "util.py", "helpers.py", "helper.py", "misc.py", "common.py"}
 LENGTHS = {"sparsedp": 300, "tests": 300, "benchmarks": 300, "examples": 60}
-EXTRAS = ("numba", "matplotlib", "tqdm")  # foreign libraries that need not be there
+EXTRAS = ("numba", "llvmlite", "matplotlib", "tqdm")  # foreign libraries that need not be there
 LAZY = ("pyamg", "numba", "matplotlib", "tqdm", "scipy", "autograd", "numpy")  # not touched by `import sparsedp`
 UNFINISHED = r"\b(?:TO" + r"DO|FIX" + r"ME|X" + r"XX|NotImplemented" + r"Error)\b"
 
