@@ -94,7 +94,8 @@ def elliptic_stencil(grid, k, walls=None, shift=0.0):
     Examples
     --------
     >>> from sparsedp.grid import Grid
-    >>> elliptic_stencil(Grid((3, 1)), np.ones(10)).links[0].ravel()
+    >>> stencil = elliptic_stencil(Grid((3, 1)), np.ones(10))
+    >>> stencil.links[0].ravel() / stencil.scale
     array([0., 1., 1., 0.])
     """
     extra = shift * grid.volumes
