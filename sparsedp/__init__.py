@@ -23,11 +23,25 @@ _WINDOW = {
     "solvers.roots": "implicit",
     "solvers.entries": "matrix_solver",
     "solvers.spectral": "exponential power",
+    "flow.momentum": "convection face_laplacian face_lift",
+    "advection.front": "transport",
+    "flow.pressure": "projection",
+    "flow.stepping": "flow_step",
+    "integrators.front": "stepper",
+    "trajectory.front": "rollout",
+    "optimise.directions": "update_direction",
     "optimise.loop": "minimise",
+    "optimise.physical": "physical_gradient",
     "kernels": "set_threads",
-    "report.plots": "plot",
+    "report.charts": "v_curve",
+    "report.plots": "animate plot",
+    "report.certificate": "certify",
+    "report.precision": "workprec",
+    "report.tolerances": "certified",
+    "report.plan": "explain",
+    "blackbox": "adopt",
 }
-_ROOMS = ("check", "errors")
+_ROOMS = ("check", "errors", "network")
 _HOME = {name: module for module, names in _WINDOW.items() for name in names.split()}
 
 __all__ = sorted([*_HOME, *_ROOMS])

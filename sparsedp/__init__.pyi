@@ -1,10 +1,19 @@
 from . import check as check
 from . import errors as errors
+from . import network as network
+from .advection.front import transport as transport
+from .blackbox import adopt as adopt
 from .conditions import dirichlet as dirichlet
 from .conditions import neumann as neumann
 from .conditions import robin as robin
 from .derivative import value_and_grad as value_and_grad
+from .flow.momentum import convection as convection
+from .flow.momentum import face_laplacian as face_laplacian
+from .flow.momentum import face_lift as face_lift
+from .flow.pressure import projection as projection
+from .flow.stepping import flow_step as flow_step
 from .grid import Grid as Grid
+from .integrators.front import stepper as stepper
 from .kernels import set_threads as set_threads
 from .operator import Operator as Operator
 from .operators.boundary import diagonal as diagonal
@@ -27,8 +36,16 @@ from .operators.transfer import part as part
 from .operators.transfer import prolong as prolong
 from .operators.transfer import restrict as restrict
 from .operators.transfer import sample as sample
+from .optimise.directions import update_direction as update_direction
 from .optimise.loop import minimise as minimise
+from .optimise.physical import physical_gradient as physical_gradient
+from .report.certificate import certify as certify
+from .report.charts import v_curve as v_curve
+from .report.plan import explain as explain
+from .report.plots import animate as animate
 from .report.plots import plot as plot
+from .report.precision import workprec as workprec
+from .report.tolerances import certified as certified
 from .solvers.choose import inverse as inverse
 from .solvers.entries import matrix_solver as matrix_solver
 from .solvers.parametric import elliptic_solver as elliptic_solver
@@ -37,5 +54,6 @@ from .solvers.spectral import exponential as exponential
 from .solvers.spectral import power as power
 from .space import Space as Space
 from .tape import differentiable as differentiable
+from .trajectory.front import rollout as rollout
 
 __version__: str

@@ -7,6 +7,7 @@ The message is one sentence: what was given, what is needed, what to write inste
 __all__ = [
     "ConvergenceError",
     "DerivativeError",
+    "GrowthWarning",
     "IncompatibleError",
     "NonFiniteError",
     "ShapeError",
@@ -33,6 +34,10 @@ class UnstableStepError(SparsedpError, ValueError):
 
 class DerivativeError(SparsedpError, TypeError):
     """A derivative was asked of something that has none, or a rule returned a wrong one."""
+
+
+class GrowthWarning(UserWarning):
+    """A gradient through a long run grew so much that it is exact and of little use."""
 
 
 class ConvergenceError(SparsedpError, RuntimeError):

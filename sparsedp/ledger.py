@@ -1,11 +1,30 @@
-"""The ledger: how often each rule, operator and solve was called. `explain` prints it."""
+"""The ledger: how often each rule, operator and solve was called, and what it told. `explain` prints it.
+
+Kinds of calls: forward, vjp, jvp; of solves: solve, adjoint, iterations, setup, reused, hierarchy, skipped
+(nothing to solve); of operators: assembled (its matrix was built). A time loop counts its steps as forward, vjp
+and recomputed (run again for the backward pass), and the bytes it keeps beside the tape.
+"""
 
 from collections import Counter
 from contextlib import contextmanager
+from time import perf_counter
+from typing import Any
 
-__all__ = ["active", "count", "recording"]
+__all__ = ["Calls", "active", "count", "observers", "recording", "spent", "tell", "timed"]
 
-active: list[Counter] = []  # the open `recording()` blocks
+active: list["Calls"] = []  # the open `recording()` blocks
+observers: list[Any] = []  # who takes part in every solve, the last one first; asked inside recordings only
+_inner: list[float] = []  # for each timed call that is under way, the seconds of the calls inside it
+
+
+class Calls(Counter):
+    """Counts by (name, kind). `seconds` by the same keys, without the calls inside; `told` and `actors` by name."""
+
+    def __init__(self, *counts):
+        super().__init__(*counts)
+        self.seconds: Counter = Counter()
+        self.told: dict[tuple, Counter] = {}
+        self.actors: dict[str, dict] = {}
 
 
 @contextmanager
@@ -14,8 +33,8 @@ def recording():
 
     Yields
     ------
-    collections.Counter
-        Keys are (name, kind) with kind "forward", "vjp" or "jvp".
+    Calls
+        A Counter; keys are (name, kind) with kind "forward", "vjp", "jvp", "solve" ...
 
     Examples
     --------
@@ -24,7 +43,7 @@ def recording():
     >>> dict(calls)
     {('gradient', 'forward'): 1}
     """
-    calls: Counter = Counter()
+    calls = Calls()
     active.append(calls)
     try:
         yield calls
@@ -33,7 +52,41 @@ def recording():
         active[:] = [other for other in active if other is not calls]
 
 
-def count(name, kind):
-    """Add one call of `name` to every open block. Callers test `active` first: it is on hot paths."""
+def count(name, kind, times=1):
+    """Add a call of `name`, or several, to every open block. Callers test `active` first: it is on hot paths."""
+    for calls in active if times else ():
+        calls[name, kind] += times
+
+
+def tell(name, what, value):
+    """Note a fact about `name`, such as the method that was chosen. Callers test `active` first."""
+    for calls in active:
+        calls.told.setdefault((name, what), Counter())[value] += 1
+
+
+def timed(name, kind, function, *args):
+    """Count one call, run it, and add its seconds. Of a method, the object it belongs to is noted too."""
+    actor = getattr(function, "__self__", None)
     for calls in active:
         calls[name, kind] += 1
+        if actor is not None:
+            calls.actors.setdefault(name, {})[id(actor)] = actor
+    _inner.append(0.0)
+    clock = perf_counter()
+    try:
+        return function(*args)
+    finally:
+        whole = perf_counter() - clock
+        _add(name, kind, whole - _inner.pop(), whole)
+
+
+def spent(name, kind, seconds):
+    """Add the seconds of something that was not called through `timed`."""
+    _add(name, kind, seconds, seconds)
+
+
+def _add(name, kind, own, whole):
+    if _inner:
+        _inner[-1] += whole
+    for calls in active:
+        calls.seconds[name, kind] += own

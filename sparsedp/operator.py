@@ -13,7 +13,7 @@ from sparsedp.ledger import active
 from sparsedp.space import Space, fits
 from sparsedp.structure import algebra
 from sparsedp.structure.base import Structure, result_dtype
-from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.explicit import Matrix, assembled
 from sparsedp.structure.lazy import Diagonal
 from sparsedp.tape import apply_operator, isbox
 
@@ -127,7 +127,7 @@ class Operator:
             return self.structure
         origin = self.__dict__.get("_origin", lambda: None)()
         # Turned entry by entry, so that the two matrices hold the same bits.
-        return origin._matrix_structure.transpose() if origin is not None else Matrix(self.structure.explicit())
+        return origin._matrix_structure.transpose() if origin is not None else assembled(self.structure, self.name)
 
     # ------------------------------------------------------------ transpose and algebra
 

@@ -8,6 +8,7 @@ Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A
 """
 
 import inspect
+from functools import partial
 
 import autograd.numpy as anp
 import numpy as np
@@ -16,26 +17,13 @@ from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
 from autograd.tracer import getval, isbox, new_box, toposort, trace_stack
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.ledger import active, count
+from sparsedp.ledger import active, count, tell, timed
 from sparsedp.tree import flatten, leaves
 
 __all__ = [
-    "Rule",
-    "apply_operator",
-    "backward",
-    "cast",
-    "differentiable",
-    "dtype_of",
-    "fit",
-    "forward_root",
-    "is_variable",
-    "isbox",
-    "linear",
-    "plain",
-    "reverse_root",
-    "split_box",
-    "trace",
-]
+    "ReverseNode", "Rule", "apply_operator", "backward", "called", "cast", "differentiable", "dtype_of", "fit",
+    "forward_root", "is_variable", "isbox", "linear", "plain", "reverse_root", "split_box", "trace", "witnesses",
+]  # fmt: skip
 
 plain = getval  # the value below all boxes
 
@@ -46,9 +34,9 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     Parameters
     ----------
     name : str
-        Appears in errors and in the counts.
+        In errors and in the counts.
     forward : callable
-        ``forward(*args) -> ans`` on plain values; `ans` is an array or a float.
+        ``forward(*args) -> ans`` on plain values; `ans` is an array, a float, or a tuple of arrays.
     vjp : callable, optional
         ``vjp(nums, ans, *args) -> pull`` with ``pull(g) -> tuple``, one cotangent for each argument
         position in `nums`, in that order. Called once for all requested arguments.
@@ -117,9 +105,7 @@ def _call(rule, *args):
             raise DerivativeError(
                 f"{rule.name} got a traced value inside a {type(arg).__name__}; pass it as an argument"
             )
-    if active:
-        count(rule.name, "forward")
-    return rule.forward(*args)
+    return timed(rule.name, "forward", rule.forward, *args) if active else rule.forward(*args)
 
 
 def _call_vjp(argnums, ans, args, kwargs):
@@ -127,14 +113,23 @@ def _call_vjp(argnums, ans, args, kwargs):
     if rule.vjp is None:
         raise DerivativeError(f"{rule.name} has no VJP; give differentiable(...) a vjp")
     nums = tuple(num - 1 for num in argnums)
+    if active:
+        _tell_unasked(rule, nums, values)
     pull = rule.vjp(nums, ans, *values)
 
     def checked_pull(g):
-        if active:
-            count(rule.name, "vjp")
-        return _checked(rule.name, [values[num] for num in nums], pull(g), g)
+        back = timed(rule.name, "vjp", pull, g) if active else pull(g)
+        return _checked(rule.name, [values[num] for num in nums], back, g)
 
     return checked_pull
+
+
+def _tell_unasked(rule, nums, values):
+    """The arguments that could have a derivative, and whose derivative nobody asks for."""
+    names = list(rule._signature.parameters)
+    for num, value in enumerate(values):
+        if num not in nums and is_variable(value):
+            tell(rule.name, "not asked", names[min(num, len(names) - 1)])
 
 
 def _call_jvp(argnums, tangents, ans, args, kwargs):
@@ -143,9 +138,9 @@ def _call_jvp(argnums, tangents, ans, args, kwargs):
         raise DerivativeError(f"{rule.name} has no JVP; give differentiable(...) a jvp")
     if active:
         count(rule.name, "jvp")
-    nums = tuple(num - 1 for num in argnums)
-    (tangent,) = _checked(rule.name, [ans], (rule.jvp(nums, tangents, ans, *args[1:]),), tangents[0])
-    return tangent
+    tangent = rule.jvp(tuple(num - 1 for num in argnums), tangents, ans, *args[1:])
+    # Several results come as a tuple, and the rule itself checks each.
+    return tangent if isinstance(plain(ans), tuple) else _checked(rule.name, [ans], (tangent,), tangents[0])[0]
 
 
 defvjp_argnums(_call, _call_vjp)
@@ -201,10 +196,6 @@ def linear(name, forward, transpose):
     transpose : callable
         ``transpose(g)``, with sum(g * forward(x)) == sum(transpose(g) * x).
 
-    Returns
-    -------
-    (Rule, Rule)
-
     Examples
     --------
     >>> double, _ = linear("double", lambda x: 2 * x, lambda g: 2 * g)
@@ -219,16 +210,13 @@ def linear(name, forward, transpose):
 
 
 def _set_linear(rule, transposed):
-    rule.vjp = lambda nums, ans, x: lambda g: (transposed(g),)
-    rule.jvp = lambda nums, tangents, ans, x: rule(tangents[0])
+    rule.vjp, rule.jvp = lambda nums, ans, x: lambda g: (transposed(g),), lambda nums, ts, ans, x: rule(ts[0])
 
 
 @primitive
 def apply_operator(op, u):
     """The second primitive: a field through an Operator. Half the cost of a general rule."""
-    if active:
-        count(op.name, "forward")
-    return op.apply(u)
+    return timed(op.name, "forward", op.apply, u) if active else op.apply(u)
 
 
 def _operator_vjp(argnums, ans, args, kwargs):
@@ -236,9 +224,8 @@ def _operator_vjp(argnums, ans, args, kwargs):
     dtype = u.dtype
 
     def pull(g):
-        if active:
-            count(op.name, "vjp")
-        back = apply_operator(op.T, g) if isbox(g) else op.T.apply(g)
+        act = partial(apply_operator, op.T) if isbox(g) else op.T.apply
+        back = timed(op.name, "vjp", act, g) if active else act(g)
         return (back if back.dtype == dtype else cast(back, dtype),)
 
     return pull
@@ -296,5 +283,18 @@ def backward(end, g):
     return found
 
 
-reverse_root = VJPNode.new_root  # a fresh start of a reverse-mode trace
+ReverseNode = VJPNode
+witnesses: list[type[VJPNode]] = []  # kinds of nodes that see what they stand for; the last one is used
+
+
+def reverse_root():
+    """A fresh start of a reverse-mode trace."""
+    return (witnesses[-1] if witnesses else VJPNode).new_root()
+
+
+def called(fun, args):
+    """The rule or Operator behind a node that called fun(*args); for autograd's own functions `fun`."""
+    return args[0] if fun in (_call, apply_operator) else fun
+
+
 forward_root = JVPNode.new_root  # a fresh start of a forward-mode trace, with its tangent

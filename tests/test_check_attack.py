@@ -90,32 +90,32 @@ ATTACKS = {
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack(name):
     loss, grad, verdict = ATTACKS[name]
-    result = AUDIT(loss, U if loss is stepped else X, grad=grad)
+    result = AUDIT(loss, U if loss is stepped else X, gradient=grad)
     assert result.verdict == verdict, result
     assert verdict == "agrees" or result.reason
 
 
 def test_a_cubic_that_is_off_by_nine_parts_in_ten_million():
-    assert AUDIT(lambda u: np.sum(u**3), X, grad=lambda u: 3 * u**2 * (1 + 9e-7)).verdict == "disagrees"
-    assert AUDIT(lambda u: np.sum(u**3), X, grad=lambda u: 3 * u**2 * (1 + 1e-9))
+    assert AUDIT(lambda u: np.sum(u**3), X, gradient=lambda u: 3 * u**2 * (1 + 9e-7)).verdict == "disagrees"
+    assert AUDIT(lambda u: np.sum(u**3), X, gradient=lambda u: 3 * u**2 * (1 + 1e-9))
 
 
 def test_taylor_orders_are_gates():
     """Agreement means: order 1 is 1, order 2 is 1.95 or more; or there is none, in the two cases of the notes."""
     for name, (loss, grad, verdict) in ATTACKS.items():
-        lines = AUDIT(loss, U if loss is stepped else X, grad=grad).lines if verdict == "agrees" else ()
+        lines = AUDIT(loss, U if loss is stepped else X, gradient=grad).lines if verdict == "agrees" else ()
         for line in lines:
             assert line.rate2 >= 1.95, name
             assert line.word == "vanishes" or math.isnan(line.rate1) or abs(line.rate1 - 1) <= 0.05, name
             assert not math.isnan(line.rate1) or line.word == "vanishes" or line.note.startswith("flat"), name
-    linear = AUDIT(*ATTACKS["linear"][:1], X, grad=ATTACKS["linear"][1])
+    linear = AUDIT(*ATTACKS["linear"][:1], X, gradient=ATTACKS["linear"][1])
     assert all(math.isinf(line.rate2) and abs(line.rate1 - 1) <= 0.05 for line in linear.lines)
 
 
 def test_too_few_usable_steps_are_inconclusive():
     """Eight steps of which one shows the second remainder: no order, no agreement."""
     steps = [2.0**-k for k in (2, 20, 22, 24, 26, 28, 30, 32)]
-    found = AUDIT(lambda u: np.sum(u + 1e-5 * u**2), X, grad=lambda u: 1 + 2e-5 * u, steps=steps)
+    found = AUDIT(lambda u: np.sum(u + 1e-5 * u**2), X, gradient=lambda u: 1 + 2e-5 * u, steps=steps)
     assert found.verdict == "inconclusive" and "stands out of the noise on 1 steps, 3 are needed" in found.reason
 
 
@@ -171,4 +171,4 @@ def test_random_scenes_with_a_wrong_gradient_do_not_agree(error):
     for seed in range(10):
         loss, x = scene(seed)
         grad = dp.value_and_grad(loss)(x)[1]
-        assert AUDIT(loss, x, grad=(1 + error) * grad, directions=1).verdict != "agrees", seed
+        assert AUDIT(loss, x, gradient=(1 + error) * grad, directions=1).verdict != "agrees", seed

@@ -42,28 +42,30 @@ def test_nested_leaves_of_different_sizes():
     assert result and result.size == 42
     assert "random in x['u'][0]" in {line.direction for line in result.lines}
     assert "random in x['pair'].k" in {line.direction for line in result.lines}
-    found = AUDIT(loss, tree, grad=wrong)
+    found = AUDIT(loss, tree, gradient=wrong)
     assert found.verdict == "disagrees"
     assert np.array_equal(before["k"], tree["k"]) and np.array_equal(before["u"], tree["u"][0])
 
 
 def test_leaves_that_do_not_matter():
     assert AUDIT(lambda t: anp.sum(t[0] ** 2), (X, X))
-    assert AUDIT(lambda t: np.sum(t[0] ** 2), (X, X), grad=lambda t: (2 * t[0], 1 + 0 * t[1])).verdict == "disagrees"
+    assert (
+        AUDIT(lambda t: np.sum(t[0] ** 2), (X, X), gradient=lambda t: (2 * t[0], 1 + 0 * t[1])).verdict == "disagrees"
+    )
 
 
 def test_single_precision():
     x = X.astype(np.float32)
     result = AUDIT(smooth, x)
     assert result and result.digits >= 3
-    assert AUDIT(smooth, x, grad=lambda u: (1.001 * slope(u)).astype(np.float32)).verdict == "disagrees"
+    assert AUDIT(smooth, x, gradient=lambda u: (1.001 * slope(u)).astype(np.float32)).verdict == "disagrees"
 
 
 def test_complex_leaves(rng):
     z = rng.standard_normal(5) + 1j * rng.standard_normal(5)
     assert AUDIT(lambda u: anp.sum(anp.abs(u) ** 2) + anp.real(anp.sum(u**3)), z)
-    assert AUDIT(lambda u: np.sum(np.abs(u) ** 2), z, grad=lambda u: 2 * np.conj(u))
-    assert AUDIT(lambda u: np.sum(np.abs(u) ** 2), z, grad=lambda u: 2 * u).verdict == "disagrees"
+    assert AUDIT(lambda u: np.sum(np.abs(u) ** 2), z, gradient=lambda u: 2 * np.conj(u))
+    assert AUDIT(lambda u: np.sum(np.abs(u) ** 2), z, gradient=lambda u: 2 * u).verdict == "disagrees"
 
 
 def test_numbers_linear_losses_and_solves():
@@ -82,14 +84,14 @@ def test_rules_without_a_jvp_and_losses_that_write_into_their_argument():
         return np.sum(u**2)
 
     x = X.copy()
-    assert AUDIT(greedy, x, grad=8 * x)
+    assert AUDIT(greedy, x, gradient=8 * x)
     assert np.array_equal(x, X)
 
 
 def test_table_and_data():
     result = AUDIT(smooth, X, directions=1)
     text = str(result)
-    assert repr(result) == text
+    assert repr(result) == f"<gradient agrees: {result.digits} digits>"
     assert text.splitlines()[-1].startswith("verdict: agrees to ")
     assert "order 2" in text and "largest entry" in text
     data = json.loads(json.dumps(result.to_dict()))
@@ -114,12 +116,12 @@ def test_own_steps_and_bad_arguments():
     ):
         AUDIT(smooth, X * np.nan)
     with pytest.raises(dp.errors.DerivativeError, match="the gradient has 2 leaves where x has 1"):
-        AUDIT(smooth, X, grad=lambda u: (u, u))
+        AUDIT(smooth, X, gradient=lambda u: (u, u))
     with pytest.raises(dp.errors.DerivativeError, match=r"the gradient of x has shape \(1,\) where \(20,\) is needed"):
-        AUDIT(smooth, X, grad=lambda u: u[:1])
+        AUDIT(smooth, X, gradient=lambda u: u[:1])
     with pytest.raises(dp.errors.ShapeError, match="the loss must be a scalar"):
-        AUDIT(lambda u: u, X, grad=lambda u: u)
+        AUDIT(lambda u: u, X, gradient=lambda u: u)
     with pytest.raises(dp.errors.DerivativeError, match="the loss must be real"):
-        AUDIT(lambda u: 1j * np.sum(u), X, grad=lambda u: u)
+        AUDIT(lambda u: 1j * np.sum(u), X, gradient=lambda u: u)
     with pytest.raises(AttributeError, match="an audit is frozen; verdict cannot be set"):
         AUDIT(smooth, X).verdict = "agrees"

@@ -41,7 +41,7 @@ def test_a_right_gradient_agrees():
 
 @pytest.mark.parametrize("error", [1e-2, 1e-3, 1e-4, -1e-4, 1e-6, -1e-6, 1e-7])
 def test_a_wrong_gradient_disagrees(error):
-    result = AUDIT(smooth, X, grad=lambda u: (1 + error) * slope(u))
+    result = AUDIT(smooth, X, gradient=lambda u: (1 + error) * slope(u))
     assert result.verdict == "disagrees" and not result
     assert result.digits is None
     assert "off by" in result.reason and "error bars" in result.reason
@@ -50,27 +50,27 @@ def test_a_wrong_gradient_disagrees(error):
 @pytest.mark.parametrize("scale", [1e-200, 1e-12, 1e12, 1e200])
 def test_the_size_of_the_loss_does_not_matter(scale):
     assert AUDIT(lambda u: scale * smooth(u), X).digits == AUDIT(smooth, X).digits
-    assert AUDIT(lambda u: scale * smooth(u), X, grad=lambda u: 1.001 * scale * slope(u)).verdict == "disagrees"
+    assert AUDIT(lambda u: scale * smooth(u), X, gradient=lambda u: 1.001 * scale * slope(u)).verdict == "disagrees"
 
 
 @pytest.mark.parametrize("scale", [1e-10, 1e-3, 1e10])
 def test_the_size_of_x_does_not_matter(scale):
     assert AUDIT(lambda u: smooth(u / scale), X * scale)
-    assert AUDIT(lambda u: np.sum(np.sin(u)), 0 * X, grad=np.cos)
-    assert AUDIT(lambda u: np.sum(np.sin(u)), 1e-10 * X, grad=np.cos)
-    assert AUDIT(lambda u: np.sum(np.sin(u)), 1e-10 * X, grad=lambda u: 1.001 * np.cos(u)).verdict == "disagrees"
-    assert AUDIT(lambda u: np.sum(np.sin(u)), 1e5 + X, grad=np.cos)
+    assert AUDIT(lambda u: np.sum(np.sin(u)), 0 * X, gradient=np.cos)
+    assert AUDIT(lambda u: np.sum(np.sin(u)), 1e-10 * X, gradient=np.cos)
+    assert AUDIT(lambda u: np.sum(np.sin(u)), 1e-10 * X, gradient=lambda u: 1.001 * np.cos(u)).verdict == "disagrees"
+    assert AUDIT(lambda u: np.sum(np.sin(u)), 1e5 + X, gradient=np.cos)
 
 
 def test_what_an_absolute_tolerance_accepts():
-    assert AUDIT(lambda u: 1 + 1e-8 * np.sum(u**2), X, grad=lambda u: 3 * 2e-8 * u).verdict == "disagrees"
-    assert AUDIT(lambda u: 1e-6 * np.sum(u), X, grad=lambda u: 1.1e-6 + 0 * u).verdict == "disagrees"
-    assert AUDIT(lambda u: 1e-6 * np.sum(u), X, grad=lambda u: 1e-6 + 0 * u)
+    assert AUDIT(lambda u: 1 + 1e-8 * np.sum(u**2), X, gradient=lambda u: 3 * 2e-8 * u).verdict == "disagrees"
+    assert AUDIT(lambda u: 1e-6 * np.sum(u), X, gradient=lambda u: 1.1e-6 + 0 * u).verdict == "disagrees"
+    assert AUDIT(lambda u: 1e-6 * np.sum(u), X, gradient=lambda u: 1e-6 + 0 * u)
 
 
 def test_one_wrong_entry_in_ten_thousand():
     x = np.linspace(0.0, 1.0, 10000)
-    wrong = AUDIT(lambda u: np.sum(np.sin(u)), x, grad=lambda u: np.cos(u) * (np.arange(10000) != 77))
+    wrong = AUDIT(lambda u: np.sum(np.sin(u)), x, gradient=lambda u: np.cos(u) * (np.arange(10000) != 77))
     assert wrong.verdict == "disagrees"
 
 
@@ -79,8 +79,8 @@ def test_a_minimum_and_a_gradient_of_zero():
     assert result and "0 to rounding" in result.reason
     assert AUDIT(lambda u: 5.0 + anp.sum((anp.sin(u) - np.sin(X)) ** 2), X)
     assert AUDIT(lambda u: anp.sum(u**2), 0 * X)
-    assert AUDIT(lambda u: anp.sum(u**2), X, grad=lambda u: 0 * u).verdict == "disagrees"
-    near = AUDIT(lambda u: np.sum((u - X) ** 2), X + 1e-8, grad=lambda u: 4 * (u - X))
+    assert AUDIT(lambda u: anp.sum(u**2), X, gradient=lambda u: 0 * u).verdict == "disagrees"
+    near = AUDIT(lambda u: np.sum((u - X) ** 2), X + 1e-8, gradient=lambda u: 4 * (u - X))
     assert near.verdict == "disagrees"
 
 
@@ -161,7 +161,7 @@ INCONCLUSIVE = {
 @pytest.mark.parametrize("name", INCONCLUSIVE)
 def test_inconclusive(name):
     loss, grad, reason = INCONCLUSIVE[name]
-    result = AUDIT(loss, X, grad=grad)
+    result = AUDIT(loss, X, gradient=grad)
     assert result.verdict == "inconclusive" and not result, result
     assert reason in result.reason
 
@@ -176,33 +176,35 @@ def test_chaos_is_inconclusive(rng):
 
 
 def test_small_noise_costs_digits_only():
-    result = AUDIT(lambda u: np.sum(u**2) + 1e-9 * hash_noise(u), X, grad=lambda u: 2 * u)
+    result = AUDIT(lambda u: np.sum(u**2) + 1e-9 * hash_noise(u), X, gradient=lambda u: 2 * u)
     assert result and 3 <= result.digits <= 8
-    rounded = AUDIT(lambda u: float(np.float32(np.sum(u**2))), X, grad=lambda u: 2 * u)
+    rounded = AUDIT(lambda u: float(np.float32(np.sum(u**2))), X, gradient=lambda u: 2 * u)
     assert rounded and rounded.digits <= 6
-    assert AUDIT(lambda u: np.sum(u**2) + 1e-9 * hash_noise(u), X, grad=lambda u: 2.02 * u).verdict == "disagrees"
+    assert AUDIT(lambda u: np.sum(u**2) + 1e-9 * hash_noise(u), X, gradient=lambda u: 2.02 * u).verdict == "disagrees"
 
 
 def test_a_gradient_outside_a_kink_is_wrong():
-    assert AUDIT(lambda u: np.sum(np.abs(u - X)), X, grad=lambda u: 3 + 0 * u).verdict == "disagrees"
+    assert AUDIT(lambda u: np.sum(np.abs(u - X)), X, gradient=lambda u: 3 + 0 * u).verdict == "disagrees"
 
 
 def test_kinks_far_enough_away_do_not_matter():
-    result = AUDIT(lambda u: np.sum(np.abs(u - X - 1e-4) + u**2), X, grad=lambda u: np.sign(u - X - 1e-4) + 2 * u)
+    result = AUDIT(lambda u: np.sum(np.abs(u - X - 1e-4) + u**2), X, gradient=lambda u: np.sign(u - X - 1e-4) + 2 * u)
     assert result and result.digits >= 5
 
 
 def test_randomness_and_states_are_seen(rng):
     calls = []
-    assert "not deterministic" in AUDIT(lambda u: np.sum(u**2) + 1e-3 * rng.random(), X, grad=lambda u: 2 * u).reason
-    noisy = AUDIT(lambda u: np.sum(u**2), X, grad=lambda u: 2 * u + 1e-12 * rng.random(20))
+    assert (
+        "not deterministic" in AUDIT(lambda u: np.sum(u**2) + 1e-3 * rng.random(), X, gradient=lambda u: 2 * u).reason
+    )
+    noisy = AUDIT(lambda u: np.sum(u**2), X, gradient=lambda u: 2 * u + 1e-12 * rng.random(20))
     assert noisy.verdict == "inconclusive" and "gradient differ" in noisy.reason
 
     def counting(u):
         calls.append(1)
         return np.sum(u**2) + (len(calls) > 10)
 
-    assert "it keeps a state" in AUDIT(counting, X, grad=lambda u: 2 * u).reason
+    assert "it keeps a state" in AUDIT(counting, X, gradient=lambda u: 2 * u).reason
 
 
 def test_nan_in_the_gradient():
@@ -220,8 +222,8 @@ def test_trial_points_that_refuse():
 
         return inside
 
-    assert AUDIT(loss(1e-3), X, grad=lambda u: 3 * u**2)
-    nowhere = AUDIT(loss(1e-15), X, grad=lambda u: 3 * u**2)
+    assert AUDIT(loss(1e-3), X, gradient=lambda u: 3 * u**2)
+    nowhere = AUDIT(loss(1e-15), X, gradient=lambda u: 3 * u**2)
     assert nowhere.verdict == "inconclusive" and "UnstableStepError: too far" in nowhere.reason
     with pytest.raises(dp.errors.UnstableStepError, match="too far"):
-        AUDIT(loss(-1.0), X, grad=lambda u: 3 * u**2)
+        AUDIT(loss(-1.0), X, gradient=lambda u: 3 * u**2)

@@ -17,7 +17,19 @@ SMALL = {
     "warm_start.py": "64",
     "implicit_or_unrolled.py": "96",
     "inexact_solves.py": "30",
-}  # cells; the others run with 16
+    "burgers.py": "128",
+    "shock.py": "64",
+    "stiff_chemistry.py": "50",
+    "pressure_projection.py": "80",
+    "plume.py": "32",
+    "plume_inverse.py": "6",
+    "taylor_green.py": "50",
+    "cavity.py": "32",
+    "convection.py": "32",
+    "obstacle.py": "10",
+    "shape.py": "12",
+    "velocity_recovery.py": "64",
+}  # cells, the end time, or gradients; the others run with 16
 
 
 @cache
@@ -112,3 +124,87 @@ def test_inexact_solves():
     assert certified <= 0.2 * many and sure <= error
     assert few[1] > 100 * error  # a number of sweeps that is guessed too low says nothing
     assert exact <= 1e-14
+
+
+def test_stiff_chemistry():
+    """Case A6: the integral and its gradient within 1e-3, in few steps."""
+    number = r"(\S+)"
+    rows = re.findall(rf"^ +(1e-0\d) +{' +'.join([number] * 8)}$", run("stiff_chemistry.py"), re.MULTILINE)
+    assert len(rows) == 3
+    for _, steps, value, *_, of_value, of_gradient, _ in rows[1:]:
+        assert int(steps) <= 40 and abs(float(value) / 10.948648481 - 1) <= 1e-3
+        assert float(of_value) <= 1e-3 and float(of_gradient) <= 1e-3
+    explicit, implicit = map(
+        int, re.search(r"rk4 takes (\d+) steps, tr_bdf2 (\d+)", run("stiff_chemistry.py")).groups()
+    )
+    assert explicit > 10 * implicit
+
+
+def test_plan():
+    """Two scenes that share a law: one forward and one adjoint solve each, different derivatives left out."""
+    pump, survey, data = run("plan.py").split("\n\n", 2)
+    assert "elliptic_solver in k, shift: not asked" in pump and "elliptic_solver in b, shift: not asked" in survey
+    assert "pump    solves 1 + 1 adjoint\nsurvey  solves 1 + 1 adjoint" in data
+
+
+def test_audit():
+    """Three verdicts; the rule at fault is named."""
+    rows = {line[:28].strip(): line[28:].split() for line in run("audit.py").splitlines()[1:-1]}
+    assert rows["right"][0] == "agrees"
+    for name in ("off by 0.1 %", "off by 0.01 %"):
+        assert rows[name][0] == "disagrees" and rows[name][2] == "radiation"
+    others = set(rows) - {"right", "off by 0.1 %", "off by 0.01 %"}
+    assert len(others) == 3 and all(rows[name][0] == "inconclusive" for name in others)
+
+
+def test_burgers():
+    """Cases A7 and A8: published forward figures; the start within 0.03 with the steepness as regulariser."""
+    printed = run("burgers.py")
+    assert "0.0057228 0.0171671 0.0286103 0.0400520 0.0514921" in printed
+    rows = re.findall(r"(50|200|L-BFGS)\b.* (\d\.\d+) +(\d\.\d+)$", printed, re.MULTILINE)
+    assert rows[0][1] == "0.0474" and rows[1][1:] == ("0.0105", "0.0443")
+    assert float(rows[2][2]) <= 0.03
+
+
+def test_shock():
+    """Case A9: cubic is nearer to the exact slope, and its profile within 1e-3."""
+    found = dict(re.findall(r"^(\w+) +1/64 .* (\S+)%", run("shock.py"), re.MULTILINE))
+    assert abs(float(found["cubic"])) < abs(float(found["linear"]))
+    profiles = re.findall(r"^cubic .*% +(\S+)", run("shock.py"), re.MULTILINE)
+    assert float(profiles[-1]) < 1e-3
+
+
+def test_certified():
+    """Estimated errors are the true ones; certified solves reach the same loss for fewer iterations."""
+    printed = run("certified.py")
+    rows = re.findall(r"^ 1e-0\d +(\S+) +(\S+) +\S+ +\S+ +(\S+) (\S+)$", printed, re.MULTILINE)
+    assert len(rows) == 4
+    for estimated, true, before, after in (map(float, row) for row in rows):
+        assert 0.8 <= estimated / true <= 1.25 and after <= max(0.1 * before, 1e-14)
+    for method in ("krylov", "multigrid"):
+        found = re.findall(rf"^{method} +\w+ +loss (\S+) +(\d+) iterations", printed, re.MULTILINE)
+        (loss, full), (other, fewer) = found
+        assert loss == other and int(fewer) <= 0.7 * int(full)
+
+
+def test_error_against_time():
+    """First order behind second order behind exponential, at equal steps; every solver of Poisson to 1.3 % and less."""
+    burgers, poisson, _ = run("error_against_time.py").split("fastest at an error of 1 %:")
+    rows = re.findall(r"^ +(euler|heun|exponential) +2 +(\d+) +(\S+) +(\S+)", burgers, re.MULTILINE)
+    error = {(name, int(steps)): float(gradient) for name, steps, _, gradient in rows}
+    counts = sorted({steps for _, steps in error})
+    for steps in counts:
+        assert error["exponential", steps] < error["heun", steps] < 0.2 * error["euler", steps]
+    assert 1.7 <= error["euler", counts[0]] / error["euler", counts[1]] <= 2.5
+    assert 3.4 <= error["heun", counts[0]] / error["heun", counts[1]] <= 5.0
+    assert poisson.count("1e-10") >= 12 and "fastest" not in poisson
+
+
+def test_velocity_recovery():
+    """Case A1: 9.30 from rest stalls; from a constant velocity loss <= 1e-6, error <= 0.1 where the marker passes."""
+    rows = re.findall(
+        r"^(rest|constant \S+) +(\w+) +(\S+) +(\S+) +\d+ +(\S+)$", run("velocity_recovery.py"), re.MULTILINE
+    )
+    table = {(start.split()[0], method): tuple(map(float, figures)) for start, method, *figures in rows}
+    assert table["rest", "lbfgs"][0] == 9.30 and all(table["rest", method][1] <= 2.5 for method in ("gd", "lbfgs"))
+    assert table["constant", "lbfgs"][1] <= 1e-6 and table["constant", "lbfgs"][2] <= 0.1

@@ -29,7 +29,13 @@ FLOORS = [
     ("operator", 4),
     ("operators", 5),
     ("solvers", 6),
+    ("advection", 6),
+    ("flow", 7),
+    ("integrators", 7),
+    ("trajectory", 8),
     ("optimise", 9),
+    ("network", 9),
+    ("blackbox", 9),
 ]
 FLOOR = dict(FLOORS)
 SIDE = {"check": {"check"}, "report": {"report", "check"}}  # side room: the side rooms it may import

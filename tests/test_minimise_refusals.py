@@ -40,7 +40,9 @@ def test_errors_at_the_start_are_not_hidden():
 
 
 def test_methods_and_options():
-    with pytest.raises(ValueError, match="method must be one of lbfgs, gd, adam, got 'newton'"):
+    with pytest.raises(
+        ValueError, match="method must be one of lbfgs, gd, adam, newton_cg, .*, physical_gradient, got 'newton'"
+    ):
         dp.minimise(bowl, np.ones(2), "newton")
     with pytest.raises(TypeError, match="lbfgs has no option 'rate'; it has memory, line_search"):
         dp.minimise(bowl, np.ones(2), rate=1.0)

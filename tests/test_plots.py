@@ -11,7 +11,7 @@ import sparsedp as dp
 
 pytest.importorskip("matplotlib")
 
-from sparsedp.report import plots
+from sparsedp.report import charts, plots
 
 
 @pytest.fixture
@@ -152,7 +152,7 @@ def test_traced_fields_can_be_drawn(ax):
 
 
 def test_curves_mark_the_best_so_far(ax):
-    plots.curves({"a": ([1.0, 4.0], [3.0, 1.0]), "b": ([2.0, 3.0], [2.0, 5.0])}, ax, "s", "error")
+    charts.curves({"a": ([1.0, 4.0], [3.0, 1.0]), "b": ([2.0, 3.0], [2.0, 5.0])}, ax, "s", "error")
     x, y = ax.lines[0].get_data()
     assert np.array_equal(x, [1.0, 2.0, 4.0]) and np.array_equal(y, [3.0, 2.0, 1.0])
 
@@ -182,3 +182,12 @@ def test_without_matplotlib(monkeypatch):
         ImportError, match=re.escape('pictures need matplotlib; install the extra: pip install "sparsedp[plot]"')
     ):
         dp.plot(dp.Grid(3), np.zeros(3))
+
+
+def test_a_film_of_a_face_field_shares_the_range_of_its_magnitude(monkeypatch):
+    grid, seen = dp.Grid((3, 3)), []
+    monkeypatch.setattr(plots, "plot", lambda *args, **options: seen.append(options["limits"]))
+    film = io.BytesIO()
+    dp.animate(grid, [grid.join(-3.0, 4.0), grid.join(0.0, 0.0)], film)
+    assert seen == [(0.0, 5.0)] * 2
+    assert film.getvalue().startswith(b"GIF")

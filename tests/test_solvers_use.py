@@ -205,3 +205,26 @@ def test_fixed_iterations_give_the_last_iterate_in_both_forms(rng):
         mine = dp.inverse(op, "krylov", iterations=k)(b)
         tape = dp.inverse(op, "krylov", iterations=k, diff="unrolled")(b)
         assert np.max(np.abs(mine)) > 0 and mine == pytest.approx(tape, rel=1e-8, abs=1e-14)
+
+
+def test_unrolled_solves_leave_a_record(rng):
+    op = PROBLEMS["negative"]()
+    inv = dp.inverse(op, "krylov", diff="unrolled")
+    b = rng.standard_normal(op.domain.shape)
+    value_and_grad(lambda b: anp.sum(inv(b)))(b)
+    record = inv.info.forward
+    assert record.status == "converged" and record.iterations > 5 and record.residual <= 1e-10
+    assert record.backward_error <= record.residual and inv.info.adjoint is None  # its derivative is no solve
+    inv.T(b)
+    assert inv.info.adjoint.status == "converged"
+    few = dp.inverse(op, "krylov", diff="unrolled", iterations=4)
+    few(b)
+    assert few.info.forward.status == "max_iterations" and few.info.forward.iterations == 4
+    few(0 * b, start=b)
+    assert few.info.forward.residual == 0 and few.info.forward.backward_error > 0
+    inv(0 * b)
+    assert inv.info.forward.status == "exact_zero_rhs"
+    short = dp.inverse(op, "krylov", diff="unrolled", maxiter=2)
+    with pytest.raises(dp.errors.ConvergenceError, match="unrolled krylov on "):
+        short(b)
+    assert short.info.forward.status == "max_iterations"

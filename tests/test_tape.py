@@ -150,7 +150,7 @@ def test_counts():
         pushforward(lambda u: SQUARE(op(u)), np.ones(4), np.ones(4))
     assert calls == {
         ("laplacian", "forward"): 3, ("laplacian", "vjp"): 2, ("laplacian", "jvp"): 1,
-        ("square", "forward"): 2, ("square", "vjp"): 1, ("square", "jvp"): 1,
+        ("square", "forward"): 2, ("square", "vjp"): 1, ("square", "jvp"): 1, ("laplacian", "assembled"): 1,
     }  # fmt: skip
     op(np.ones(4))
     assert calls["laplacian", "forward"] == 3

@@ -2,15 +2,16 @@
 
 import numpy as np
 
-from sparsedp.check.findings import Row
+from sparsedp.check.findings import Row, attempted, skipped
 from sparsedp.check.probes import field
 from sparsedp.derivative import pullback
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.structure.base import result_dtype
 
-__all__ = ["argument_rows"]
+__all__ = ["argument_rows", "scaling_rows"]
 
 FLOATING = ("float32", "float64", "complex64", "complex128")
+ORDINARY = 1e-30, 1e30  # sizes of operators that take fields near the ends of the range of floats
 WHOLE = ("int64", "bool")
 
 
@@ -24,6 +25,27 @@ def argument_rows(op, rng):
         "same bits twice": _repeats,
     }
     return [_row(name, test, op, rng) for name, test in tests.items()]
+
+
+def scaling_rows(op, size, rng):
+    """A field times 2^900 or 2^-900 gives the same digits: largest difference, relative, in roundings."""
+    if not ORDINARY[0] < size < ORDINARY[1]:
+        return [skipped("scaling by 2^+-900", f"entries of size {size:.1e} leave the range of floats then")]
+    u, g = field(rng, op.domain.shape, float), field(rng, op.codomain.shape, float)
+    return [
+        attempted("scaling by 2^+-900", 10.0, lambda: _scaled(op, u)),
+        attempted("scaling by 2^+-900, transposed", 10.0, lambda: _scaled(op.T, g)),
+    ]
+
+
+def _scaled(op, u):
+    wanted, worst = op.apply(u), 0.0
+    largest = np.max(np.abs(wanted), initial=0.0)
+    for exponent in (900, -900):
+        found = op.apply(u * 2.0**exponent) * 2.0**-exponent
+        if not np.array_equal(found, wanted):
+            worst = max(worst, float(np.max(np.abs(found - wanted)) / (np.finfo(float).eps * largest)))
+    return worst
 
 
 def _row(name, test, op, rng):

@@ -1,17 +1,23 @@
 """The card of an operator: everything that can be checked without knowing what it is for."""
 
+from functools import cached_property
+
 import numpy as np
 
 from sparsedp.check.adjointness import transpose_rows
-from sparsedp.check.arguments import argument_rows
+from sparsedp.check.arguments import argument_rows, scaling_rows
 from sparsedp.check.calculus import derivative_rows
 from sparsedp.check.findings import Findings, Row
 from sparsedp.check.probes import generator, listable, size_of
+from sparsedp.check.traits import bytes_of, costs, signs, spectrum_of
 from sparsedp.check.twins import twin_rows
 from sparsedp.operator import Operator
+from sparsedp.space import fits
 from sparsedp.structure.explicit import Matrix
 
 __all__ = ["Card", "operator"]
+
+SHOWN = ("row sums", "symmetric", "definite", "M-matrix", "null space", "spectral radius", "stable step")
 
 
 def operator(op, seeds=3, rng=None):
@@ -36,7 +42,8 @@ def operator(op, seeds=3, rng=None):
     -----
     Rows: linearity, transpose (scaled dot test in four dtypes), twin (explicit against matrix-free,
     forward, transposed and entry by entry), JVP, VJP, second order, wrong shapes refused, dtypes, memory
-    layouts, fresh results, same bits twice. Figures are in units of rounding; an inverse is judged by
+    layouts, fresh results, same bits twice, the same digits for a
+    field times 2^+-900. Figures are in units of rounding; an inverse is judged by
     the tolerance of its solve, without its check of primal data.
 
     Examples
@@ -62,7 +69,7 @@ def _card(op, acting, seeds, rng):
     rows = derivative_rows(acting, size, rng)
     rows += transpose_rows(acting, size, seeds, rng)
     rows += [row._replace(name=f"twin, {row.name}") for row in twin_rows(acting, seeds, rng)]
-    rows += argument_rows(acting, rng)
+    rows += argument_rows(acting, rng) + scaling_rows(acting, size, rng)
     return Card(op, size, rows)
 
 
@@ -74,6 +81,11 @@ class Card(Findings):
     op : Operator
     size : float or None
         sqrt(|A|_1 |A|_inf), from below when the entries are not known.
+    facts : dict
+        What the operator is: domain, codomain, form, dtype, nnz, bytes, size; seconds of one application
+        in each form; row sums, symmetry, M-matrix; of a square one spectral radius, definiteness, null space
+        and the largest stable step of u' = A u by explicit Euler. Found when they are asked for; what cannot
+        be found at a fair price is left out.
     """
 
     op: Operator
@@ -84,17 +96,25 @@ class Card(Findings):
         super().__init__(f"{op.name}: {op.domain} -> {op.codomain}", rows)
         self.__dict__.update(op=op, size=size, nnz=_count(op))
 
-    @property
+    @cached_property
     def facts(self):
-        """Dict of what the operator is: spaces, form, entries, size."""
-        return {
-            "domain": str(self.op.domain),
-            "codomain": str(self.op.codomain),
-            "form": self.op.form,
-            "dtype": str(self.op.dtype),
+        """Dict of what the operator is."""
+        op = self.op
+        found = {
+            "domain": str(op.domain),
+            "codomain": str(op.codomain),
+            "form": op.form,
+            "dtype": str(op.dtype),
             "nnz": self.nnz,
             "size": self.size,
         }
+        if self.size is None:  # it cannot even be applied
+            return found
+        with np.errstate(all="ignore"):
+            found |= {} if hasattr(op, "solver") else {"bytes": bytes_of(op)}  # factors and hierarchies are not ours
+            found |= {"seconds": costs(op.tangent, generator(None)), **signs(op)}
+            square = fits(op.domain, op.codomain) and op.dtype.kind != "c"
+            return found | (spectrum_of(op, found.get("symmetric", False)) if square and not self.failed else {})
 
     def to_dict(self):
         """The card as plain numbers, strings and lists."""
@@ -102,11 +122,25 @@ class Card(Findings):
 
     def __str__(self):
         head, rows = super().__str__().split("\n", 1)
+        op, facts = self.op, self.facts
         entries = "entries not listed" if self.nnz is None else f"{self.nnz} entries"
         size = "" if self.size is None else f", sqrt(|A|_1 |A|_inf) = {self.size:.3g}"
-        return f"{head}\n  {self.op.form}, {self.op.dtype}, {entries}{size}\n{rows}"
+        stored = f", {facts['bytes']} bytes" if "bytes" in facts else ""
+        lines = [head, f"  {op.form}, {op.dtype}, {entries}{stored}{size}"]
+        if "seconds" in facts:
+            times = ", ".join(f"{1e6 * t:.3g} us {form}" for form, t in facts["seconds"].items())
+            lines.append(f"  one application: {times}")
+        known = [f"{name} {_word(facts[name])}" for name in SHOWN if name in facts]
+        lines += [f"  {', '.join(known)}"] if known else []
+        return "\n".join([*lines, rows])
 
     __repr__ = __str__
+
+
+def _word(value):
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return value if isinstance(value, str) else f"{value:.4g}"
 
 
 def _count(op):

@@ -22,6 +22,7 @@ RESOLVED = 1e-3  # an error bar above this share of the derivative proves nothin
 AGREED = 1e-8  # a gap below this share is agreement, whatever the bar
 NOISY = 1e-6  # the same behind a solve that the ledger shows, or in noise: what a solve leaves may be smooth
 LEFT = 1e-9  # a gap below this share of the loss may be what a solve leaves: not wrong, but not right either
+LOOSE = 10.0  # the same in units of the tolerance of the solves, where that is looser
 PER_NOISE = 1e4  # between the two: this multiple of the measured noise of the loss
 VANISHED = 1e-6  # a derivative and bar below this share of the curvature are 0
 FAR, NEAR = 10.0, 3.0  # gap over bar: beyond FAR it is wrong, below NEAR it is right
@@ -35,7 +36,7 @@ class Judgement(NamedTuple):
 
     agrees, disagrees; vanishes: both derivatives are 0 to rounding; kink: the one-sided derivatives differ;
     rough: a Taylor remainder has the wrong order; noise, few: nothing is proved, by noise or for want of usable steps;
-    constant: the loss does not change, as the gradient says.
+    constant: the loss does not change, as the gradient says; ripple: coarse and fine steps see two derivatives.
     """
 
     direction: str
@@ -171,7 +172,7 @@ def _word(gaps, line, measured, jump):
         return "kink", f"a kink: the one-sided derivatives differ by {split / max(scale, split):.1e}"
     far = FAR if gaps.jitter < ROUNDING else 3 * FAR
     if size > far * bar and size > gaps.agreed * max(scale, 1e-4 * gaps.curvature):
-        if line.solved and size <= LEFT * abs(line.base):
+        if line.solved and size <= max(LEFT * abs(line.base), LOOSE * line.tolerance * max(abs(line.base), scale)):
             return "noise", f"off by {size / scale:.1e}: solves may leave this in such a loss, tighten their rtol"
         # Noise that swallows the whole difference may be a chaotic loss with a right gradient.
         if gaps.jitter < ROUNDING or abs(line.slope + gap) > FAR * bar:

@@ -37,11 +37,11 @@ class Point:
         self.size = sum(values.size for values in self.values)
         self.eps = max(float(np.finfo(values.dtype).eps) for values in self.values)
 
-    def tree(self, values=None):
-        """The tree with other floating leaves, of the types of the originals; always fresh copies."""
+    def tree(self, values=None, exact=True):
+        """The tree with other floating leaves, of the types of the originals if `exact`; always fresh copies."""
         leaves = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in self._found]
         for place, value in zip(self.places, self.values if values is None else values, strict=True):
-            leaves[place] = _like(self._found[place], value)
+            leaves[place] = _like(self._found[place], value) if exact else value
         return self._rebuild(leaves)
 
     def moved(self, direction, step):

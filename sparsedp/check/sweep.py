@@ -17,12 +17,13 @@ SOLVES = ("solve", "adjoint")  # kinds under which the ledger counts solves
 class Trials:
     """A loss with its count of evaluations. Away from x it may refuse; then there is a note and no value.
 
-    `solved`: whether the ledger showed a solve of this library in the first evaluation.
+    `solved`: whether the ledger showed a solve of this library in the first evaluation; `tolerance`: the
+    loosest relative tolerance of iterative ones.
     """
 
     def __init__(self, loss):
         self.loss = loss
-        self.count, self.solved = 0, False
+        self.count, self.solved, self.tolerance = 0, False, 0.0
         self.eps = float(np.finfo(float).eps)
 
     def value(self, tree):
@@ -44,6 +45,8 @@ class Trials:
         with recording() as calls:
             value = self.loss(tree)
         self.solved = any(kind in SOLVES for _, kind in calls)
+        solvers = [actor for found in calls.actors.values() for actor in found.values() if hasattr(actor, "engine")]
+        self.tolerance = max((solver.system.rtol for solver in solvers if solver.engine.iterative), default=0.0)
         return value
 
     def attempt(self, tree):
@@ -102,7 +105,7 @@ class Line:
 
     def __init__(self, name, direction, point, gradient, trials, base):
         self.name, self.direction, self.base = name, direction, base
-        self.gradient, self.solved = gradient, trials.solved
+        self.gradient, self.solved, self.tolerance = gradient, trials.solved, trials.tolerance
         self._point, self._trials = point, trials
         self._length = root_sum_squares(direction)
         self.slope = dot(gradient, direction)

@@ -21,10 +21,16 @@ def decide(judged, doubts):
         for verdict, reason in firm:
             if verdict == word:
                 return verdict, reason
+    rippled = next((one for one in judged if one.word == "ripple"), None)
+    if rippled:
+        return "inconclusive", f"along {rippled.direction}: {rippled.note}"
     wrong = [one for one in judged if one.word == "disagrees"]
     if wrong:
         worst = max(wrong, key=lambda one: abs(one.gap) / one.scale if one.scale else math.inf)
         return "disagrees", f"along {worst.direction}: {worst.note}"
+    for word, reason in doubts:
+        if word == "open":
+            return "inconclusive", reason
     largest = max((one.scale for one in judged), default=0.0)
     for one in judged:
         if one.word in ("kink", "rough"):
@@ -57,8 +63,9 @@ class Audit:
     digits : int or None
         Digits that are proved, in the worst direction; None unless it agrees.
     culprit : str or None
-        None in this release: the audit sees names of operators, not the operators. To find the one at
-        fault, write ``check.transpose(op)`` for each operator of the loss.
+        Name of the first operator, rule or function of autograd on the tape whose own VJP or JVP is at
+        fault, when the verdict is "disagrees"; a note says what is wrong with it. None when each is right:
+        then a value bypasses the tape, or the gradient was given.
     lines : tuple of Judgement
         One for each direction: word, difference, slope, gap, bar, scale, step, rates, digits, note.
     value : float
@@ -132,7 +139,10 @@ class Audit:
         proved = f" to {self.digits} digits" if self.digits is not None else ""
         return "\n".join([*parts, f"verdict: {self.verdict}{proved}{': ' if self.reason else ''}{self.reason}"])
 
-    __repr__ = __str__
+    def __repr__(self):
+        """One line, which is what pytest shows of an assertion that fails."""
+        words = [self.reason, *(note for note in self.notes if note.startswith("culprit"))]
+        return f"<gradient {self.verdict}: {'; '.join(filter(None, words)) or f'{self.digits} digits'}>"
 
     def _curves(self):
         """|difference - g . d| relative to the derivative, over the steps (down) and directions (across)."""

@@ -10,9 +10,26 @@ import importlib.util
 import operator
 import os
 
-from sparsedp.kernels import plain
+import numpy as np
 
-__all__ = ["along_axis", "compiled", "kronecker_sum", "set_threads", "threads"]
+from sparsedp.kernels import plain, plain_measures
+from sparsedp.kernels.layout import LOWERED, REMAINDER, SQUARES, TOTALS
+
+__all__ = [
+    "along_axis",
+    "compiled",
+    "kronecker_sum",
+    "lowered",
+    "remainder",
+    "set_threads",
+    "squares",
+    "sweep",
+    "threads",
+    "totals",
+]
+
+FEW = 16384  # numbers that are not worth a compiled sum, and not the import of numba
+_NONE = np.zeros(0)
 
 
 @functools.cache
@@ -149,3 +166,93 @@ def along_axis(u, out, rows, scale, accumulate):
         _native().along_axis(u, out, rows, scale, accumulate, threads())
     else:
         plain.along_axis(u, out, rows, scale, accumulate)
+
+
+def sweep(x, lower, upper, inverses, column, row, ends):
+    """Right-hand sides -> solutions, in place: tridiagonal systems along the first axis, eliminated before.
+
+    Down the rows x_i = (x_i - lower_i x_(i-1)) inverses_i, up x_i -= (upper_i x_(i+1) + column_i x_last)
+    inverses_i; the last row first loses the sum of row_i x_i. `column` and `row` are what elimination
+    makes of the links between the ends of a periodic axis; without rows, the axis is bounded.
+
+    Parameters
+    ----------
+    x : float64 array, shape (n, m)
+        C-contiguous; one system in each column.
+    lower, upper : float64 arrays, shape (n,)
+    inverses : float64 array, shape (n, m)
+        1 / pivots.
+    column, row : float64 arrays, shape (n, m) or (0, m)
+        Row n - 2 holds the link to the last unknown too; row n - 1 is not read.
+    ends : int64 array, shape (m,)
+        Rows from here to n - 3 of `column` and `row` hold 0 only.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> x, none, ends = np.array([[1.0], [3.0]]), np.zeros((0, 1)), np.zeros(1, int)
+    >>> sweep(x, np.array([0.0, 1.0]), np.array([1.0, 0.0]), np.array([[0.5], [2 / 3]]), none, none, ends)
+    >>> x  # 2 a + b = 1, a + 2 b = 3
+    array([[-0.33333333],
+           [ 1.66666667]])
+    """
+    if compiled():
+        _native().sweep(x, lower, upper, inverses, column, row, ends, threads())
+    else:
+        plain.sweep(x, lower, upper, inverses, column, row, ends)
+
+
+def squares(x):
+    """Flat float64 array -> the sum of its squares.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> print(squares(np.array([3.0, -4.0])))
+    25.0
+    """
+    return _measure(SQUARES, _NONE, x, 0.0, _NONE)[1]
+
+
+def totals(x):
+    """Flat float64 array -> its sum and the sum of its squares, in one pass.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> print(*totals(np.array([3.0, -4.0])))
+    -1.0 25.0
+    """
+    return _measure(TOTALS, _NONE, x, 0.0, _NONE)
+
+
+def lowered(x, number, out):
+    """out = x - number -> the sum of its squares. `out` may be `x`; all flat and float64.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> out = np.zeros(2)
+    >>> print(lowered(np.array([1.0, 3.0]), 2.0, out), out)
+    2.0 [-1.  1.]
+    """
+    return _measure(LOWERED, _NONE, x, number, out)[1]
+
+
+def remainder(b, out, x):
+    """out = b - out -> the sum of the squares of x, and that of out. All flat and float64.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> out = np.array([1.0, 2.0])
+    >>> print(*remainder(np.array([4.0, 6.0]), out, np.array([2.0, 0.0])), out)
+    4.0 25.0 [3. 4.]
+    """
+    return _measure(REMAINDER, b, x, 0.0, out)
+
+
+def _measure(mode, b, x, number, out):
+    if x.size <= FEW or not compiled() or not x.flags.c_contiguous:
+        return plain_measures.measure(mode, b, x, number, out)
+    return _native().measure(mode, b, x, number, out, threads())

@@ -4,7 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Rows", "Tridiagonal"]
+__all__ = ["CHUNK", "LOWERED", "REMAINDER", "SQUARES", "TOTALS", "Rows", "Tridiagonal"]
+
+CHUNK = 4096  # numbers whose sums are kept apart, so that they do not depend on the number of threads
+SQUARES, TOTALS, LOWERED, REMAINDER = range(4)  # what `measure` does on its way over an array
 
 
 class Rows(NamedTuple):

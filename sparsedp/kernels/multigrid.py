@@ -39,6 +39,7 @@ from sparsedp.kernels.pointers import get, pointer
 __all__ = ["NO", "black_slab", "coarser", "correct", "direction", "place", "red_row", "restrict", "slot", "update"]
 
 NO = (0.0,)
+AHEAD = (0.0, 0.0)  # rows are short in 3-D: weights are fetched ahead, which the processor does not do across rows
 
 
 @inner
@@ -72,26 +73,14 @@ def _black_row(links, red, black, i, j, grid, like, size):
     left = -((i + j) & 1) * size
     right, own, out, at = left + size, first + row * step, slot(black, i, j, grid), slot(red, i, j, grid)
     above, below = first + place(i - 1, j, grid) * step, first + place(i + 1, j, grid) * step
-    weigh(
-        like,
-        n,
-        (
-            out,
-            own + plane + left,
-            at + left,
-            own + right,
-            at + right,
-            above + 3 * plane,
-            slot(red, i - 1, j, grid),
-            below + 2 * plane,
-            slot(red, i + 1, j, grid),
-        ),
-        NO,
-    )
+    line = out, own + plane + left, at + left, own + right, at + right
+    across = above + 3 * plane, slot(red, i - 1, j, grid), below + 2 * plane, slot(red, i + 1, j, grid)
     if grid[0][1] > 1:
         above, below = first + place(i, j - 1, grid) * step, first + place(i, j + 1, grid) * step
         up, down = slot(red, i, j - 1, grid), slot(red, i, j + 1, grid)
-        weigh_onto(like, n, (out, out, above + 5 * plane, up, below + 4 * plane, down), NO)
+        weigh(like, n, line + across + (above + 5 * plane, up, below + 4 * plane, down), AHEAD)
+    else:
+        weigh(like, n, line + across, NO)
     ends(out, grid[2], like, grid[1][2])
 
 
@@ -103,25 +92,13 @@ def red_row(out, links, black, i, j, grid, like, size):
     plane = step * (grid[0][0] * grid[0][1] + 1)
     right = ((i + j) & 1) * size
     left, own, at = right - size, first + row * step, slot(black, i, j, grid)
-    weigh(
-        like,
-        n,
-        (
-            out,
-            own,
-            at + left,
-            own + plane,
-            at + right,
-            own + 2 * plane,
-            slot(black, i - 1, j, grid),
-            own + 3 * plane,
-            slot(black, i + 1, j, grid),
-        ),
-        NO,
-    )
+    line = out, own, at + left, own + plane, at + right
+    across = own + 2 * plane, slot(black, i - 1, j, grid), own + 3 * plane, slot(black, i + 1, j, grid)
     if grid[0][1] > 1:
         up, down = slot(black, i, j - 1, grid), slot(black, i, j + 1, grid)
-        weigh_onto(like, n, (out, out, own + 4 * plane, up, own + 5 * plane, down), NO)
+        weigh(like, n, line + across + (own + 4 * plane, up, own + 5 * plane, down), AHEAD)
+    else:
+        weigh(like, n, line + across, NO)
 
 
 @inner

@@ -13,7 +13,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from sparsedp.kernels.pointers import address, get, pointer, put
+from sparsedp.kernels.pointers import address, get, pointer, prefetch, put
 
 __all__ = [
     "PAD",
@@ -39,6 +39,7 @@ __all__ = [
 
 LANES = 8
 PAD = LANES  # the first cell of a row
+FETCHED = 1152  # bytes ahead, where weights are fetched before they are needed
 
 _INT, _DOUBLE = ir.IntType(64), ir.DoubleType()
 
@@ -128,7 +129,10 @@ def _products(row, total, addresses):
 
 @_operation
 def weigh(row, places, factors):
-    """(out, weight, row, weight, row, ...): out = sum of weight * row."""
+    """(out, weight, row, weight, row, ...): out = sum of weight * row. Two factors: weights are fetched ahead."""
+    for weight in places[1::2] if len(factors) > 1 else ():
+        place = row.builder.bitcast(row.place(weight, "T", None), ir.IntType(8).as_pointer())
+        prefetch(row.builder, place, _INT(FETCHED), (0, 3, 1))
     row.store(_products(row, None, places[1:]), places[0], "T")
 
 

@@ -12,13 +12,14 @@ import warnings
 import numpy as np
 from numba import cfunc, njit, prange, types
 
-from sparsedp.kernels import lanes, lines, plain, pointers, sums
+from sparsedp.kernels import lanes, lines, measures, plain, plain_measures, pointers, sums
 from sparsedp.kernels.lanes import ADD, STORE, STREAM
+from sparsedp.kernels.layout import CHUNK
 from sparsedp.kernels.lines import line_worker
 from sparsedp.kernels.pointers import address, call
-from sparsedp.kernels.sums import sum_worker
+from sparsedp.kernels.sums import sum_worker, sweep_worker
 
-__all__ = ["along_axis", "kronecker_sum"]
+__all__ = ["along_axis", "kronecker_sum", "measure", "sweep"]
 
 SERIAL = (
     1 << 19
@@ -64,6 +65,19 @@ def _line_team(stamp):
     return along_axis
 
 
+def _sweep_team(stamp):
+    def sweep(worker, x, inverses, lower, upper, column, row, ends, n, m, cyclic, parts):
+        fields = address(x), address(inverses), address(lower), address(upper), address(column), address(row)
+        rest = address(ends), n, m, cyclic + stamp * 0
+        if parts == 1:
+            call(worker, fields + rest + (parts - 1, parts))
+        else:
+            for part in prange(parts):
+                call(worker, fields + rest + (types.int64(part), parts))
+
+    return sweep
+
+
 def _constant(item):
     """Read-only, because a writable array is accepted in its place but not the other way round."""
     return types.Array(item, 1, "C", readonly=True)
@@ -84,6 +98,7 @@ _FORMS = {  # name: team, its arguments after worker, out, u; worker, its argume
         line_worker,
         (*[_int] * 14, _real, *[_int] * 3),
     ),
+    "sweep": (_sweep_team, (*[_reals] * 4, _whole, *[_int] * 4), sweep_worker, [_int] * 12),
 }
 
 
@@ -114,9 +129,21 @@ def _kernel(name, letter):
         loops = _kept(functools.partial(cfunc, types.void(*numbers)), worker(np.dtype(letter).type, _stamp()))
         run = _kept(functools.partial(njit, [signature]), team(_stamp()), nogil=True, parallel=True)
     except Exception as error:  # whatever LLVM or numba object to on this machine
-        warnings.warn(f"The compiled kernels do not work here ({error}); NumPy is used instead.", RuntimeWarning, 4)
-        return None
+        return _unable(error)
     return functools.partial(run, loops.address), loops
+
+
+@functools.cache
+def _measures():
+    """The sums of `measures`, in the form of `_kernel`."""
+    try:
+        return (_kept(functools.partial(njit, [measures.SIGNATURE]), measures.run, nogil=True, parallel=True),)
+    except Exception as error:
+        return _unable(error)
+
+
+def _unable(error):
+    warnings.warn(f"The compiled kernels do not work here ({error}); NumPy is used instead.", RuntimeWarning, 5)
 
 
 # ---------------------------------------------------------------- threads
@@ -132,10 +159,9 @@ def _run(kernel, arguments, size, threads):
     forked child does. Who finds the team taken, or is a child, works alone; the bits are the same.
     """
     if threads == 1 or size < SERIAL or os.getpid() != _home or not _lock.acquire(blocking=False):
-        kernel[0](*arguments, 1)
-        return
+        return kernel[0](*arguments, 1)
     try:
-        kernel[0](*arguments, threads)
+        return kernel[0](*arguments, threads)
     finally:
         _lock.release()
 
@@ -213,3 +239,23 @@ def along_axis(u, out, rows, scale, accumulate, threads):
         mode,
     )
     _run(kernel, arguments, max(u.size, out.size), threads)
+
+
+def sweep(x, lower, upper, inverses, column, row, ends, threads):
+    """See `sparsedp.kernels.sweep`."""
+    kernel = _kernel("sweep", "d")
+    if kernel is None:
+        plain.sweep(x, lower, upper, inverses, column, row, ends)
+        return
+    n, m = x.shape
+    numbers = [array.reshape(-1) for array in (inverses, lower, upper, column, row)]
+    _run(kernel, (x.reshape(-1), *numbers, ends, n, m, int(row.size > 0)), x.size, threads)
+
+
+def measure(mode, b, x, number, out, threads):
+    """See `sparsedp.kernels.plain_measures.measure`."""
+    kernel = _measures()
+    if kernel is None:
+        return plain_measures.measure(mode, b, x, number, out)
+    sums = np.empty((2, -(-x.size // CHUNK)))
+    return _run(kernel, (mode, b, x, number, out, sums), x.size, threads)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["along_axis", "kronecker_sum"]
+__all__ = ["along_axis", "kronecker_sum", "sweep"]
 
 PIECE = 32768  # numbers handled at a time: input, output and buffers fit in L2
 FEW = 16  # changes of a coefficient that are worth a cut; lines that are worth looking for changes
@@ -236,3 +236,40 @@ def along_axis(u, out, rows, scale, accumulate):
             np.add(target, total, out=total)
         if not exact:
             target[...] = total
+
+
+# ---------------------------------------------------------------- elimination along the first axis
+
+
+def sweep(x, lower, upper, inverses, column, row, ends):
+    """See `sparsedp.kernels.sweep`."""
+    wide = min(x.shape[1], 8192)  # columns at a time: the rows in use and the buffers stay in L2
+    buffers = np.empty((2, wide))
+    for a, b in _pieces(x.shape[1], wide):
+        here = slice(a, b)
+        end = int(np.max(ends[here], initial=0))
+        _eliminate(x[:, here], lower, upper, inverses[:, here], column[:, here], row[:, here], end, buffers[:, : b - a])
+
+
+def _eliminate(x, lower, upper, inverses, column, row, end, buffers):
+    """Down all rows, gathering the last one of a periodic axis on the way, and up again."""
+    n, cyclic = len(x), int(row.size > 0)
+    buffer, more = buffers
+    for i in range(n - cyclic):
+        if i:
+            np.multiply(x[i - 1], lower[i], out=buffer)
+            np.subtract(x[i], buffer, out=x[i])
+        np.multiply(x[i], inverses[i], out=x[i])
+        if cyclic and (i < end or i == n - 2):
+            np.multiply(row[i], x[i], out=buffer)
+            np.subtract(x[-1], buffer, out=x[-1])
+    if cyclic:
+        np.multiply(x[-1], inverses[-1], out=x[-1])
+    for i in range(n - 2, -1, -1):
+        if cyclic:
+            np.multiply(column[i], x[-1], out=more)
+        if i < n - 1 - cyclic:
+            np.multiply(x[i + 1], upper[i], out=buffer)
+            more = np.add(buffer, more, out=more) if cyclic else buffer
+        np.multiply(more, inverses[i], out=buffer)
+        np.subtract(x[i], buffer, out=x[i])

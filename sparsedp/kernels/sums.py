@@ -1,4 +1,4 @@
-"""Compiled sum of tridiagonal matrices along the axes of a field, in one pass over memory.
+"""Compiled sum of tridiagonal matrices along the axes of a field, in one pass over memory; the solve with one.
 
 Arrays come as pointers. A field has `shape` (n0, n1, n2); n2 counts the numbers of a
 row, two a cell when the field is complex. `span` is (near, half, first, last): distance of the
@@ -11,9 +11,10 @@ from numba import njit
 from sparsedp.kernels.lanes import stencil
 from sparsedp.kernels.pointers import claim, fence, get, pointer, put
 
-__all__ = ["TILE", "share", "sum_worker"]
+__all__ = ["TILE", "share", "sum_worker", "sweep_worker"]
 
 TILE = 16384  # numbers of a line handled at a time, so that neighbouring lines stay in cache
+BAND = 32768  # numbers of a band of columns that is eliminated at a time: solution and pivots stay in L2
 PLANE = 32768  # numbers of a plane handled at a time: three planes and the output fit in L2
 
 _inner = njit(error_model="numpy")
@@ -160,5 +161,77 @@ def sum_worker(like, stamp):
         axes = (_axis((l0, c0, u0, s0)), _axis((l1, c1, u1, s1)), _axis((l2, c2, u2, s2)))
         shape, span = (n0, n1, n2), (near, half, first, last)
         _slabs(pointer(out, zero), pointer(u, zero), axes, shape, span, shift, stream, p, parts)
+
+    return worker
+
+
+# ---------------------------------------------------------------- elimination along the first axis
+
+
+@_inner
+def _downwards(x, inverses, low, here, before, width):
+    """x = (x - low * x of the row before) * inverses, from one place on."""
+    for j in range(width):
+        put(x, here + j, (get(x, here + j) - low * get(x, before + j)) * get(inverses, here + j))
+
+
+@_inner
+def _gather(x, row, end, here, width):
+    """Take the filled part of the last row times a row that is done from the last one."""
+    for j in range(width):
+        put(x, end + j, get(x, end + j) - get(row, here + j) * get(x, here + j))
+
+
+@_inner
+def _upwards(x, inverses, high, here, after, width):
+    for j in range(width):
+        put(x, here + j, get(x, here + j) - high * get(x, after + j) * get(inverses, here + j))
+
+
+@_inner
+def _upwards_filled(x, inverses, column, high, here, after, end, width):
+    for j in range(width):
+        others = high * get(x, after + j) + get(column, here + j) * get(x, end + j)
+        put(x, here + j, get(x, here + j) - others * get(inverses, here + j))
+
+
+@_inlined
+def _eliminate(x, lines, inverses, fills, shape, cyclic, filled, start, width):
+    """A band of columns, from the first row to the last and back. A cyclic last row is gathered on the way."""
+    lower, upper = lines
+    column, row = fills
+    n, m = shape
+    end = (n - 1) * m + start
+    for i in range(n - cyclic):
+        here = i * m + start
+        _downwards(x, inverses, get(lower, i) if i else 0.0, here, max(here - m, start), width)
+        if cyclic and (i < filled or i == n - 2):
+            _gather(x, row, end, here, width)
+    if cyclic:
+        _downwards(x, inverses, 0.0, end, end - m, width)
+    for i in range(n - 2, -1, -1):
+        here = i * m + start
+        if cyclic and (i < filled or i == n - 2):
+            high = get(upper, i) if i < n - 2 else 0.0
+            _upwards_filled(x, inverses, column, high, here, here + m, end, width)
+        else:
+            _upwards(x, inverses, get(upper, i), here, here + m, width)
+
+
+def sweep_worker(like, stamp):
+    """C function for the numbers that `sweep` in `native` passes: some bands of columns."""
+    zero = like(stamp * 0)
+
+    def worker(x, inverses, lower, upper, column, row, ends, n, m, cyclic, part, parts):
+        lines = pointer(lower, 1.0), pointer(upper, 1.0)
+        fills = pointer(column, 1.0), pointer(row, 1.0)
+        band = share(m, max(32, BAND // n))
+        bands = -(-m // band)
+        for number in range(bands * part // parts, bands * (part + 1) // parts):
+            start = number * band
+            width, filled = min(band, m - start), 0
+            for j in range(start, start + width):
+                filled = max(filled, get(pointer(ends, n), j))
+            _eliminate(pointer(x, zero), lines, pointer(inverses, zero), fills, (n, m), cyclic, filled, start, width)
 
     return worker

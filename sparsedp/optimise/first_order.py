@@ -8,16 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import is_number
-from sparsedp.optimise.trials import Trial, norm
+from sparsedp.optimise.trials import Stuck, Trial, norm
 
-__all__ = ["Adam", "AdamState", "Descent", "DescentState", "Stuck"]
+__all__ = ["Adam", "AdamState", "Descent", "DescentState"]
 
 HALVINGS = 60
 ENOUGH = 1e-4  # share of the predicted decrease that a line search asks for (Armijo)
-
-
-class Stuck(Exception):
-    """No admissible point was found; the message says why."""
 
 
 class DescentState(NamedTuple):
@@ -42,6 +38,8 @@ class Descent:
         Halve the step until the loss falls (Armijo), and try twice the length next time.
     """
 
+    residuals = False
+
     def __init__(self, rate=None, momentum=0.0, line_search=None):
         if rate is not None and not _is_positive(rate):
             raise ValueError(f"gd needs a positive rate, got {rate}; leave it out and it is searched for")
@@ -50,7 +48,7 @@ class Descent:
         if line_search not in (None, "backtracking"):
             raise ValueError(f"gd has no line search {line_search!r}; write line_search='backtracking' or leave it out")
         self.rate, self.momentum = rate, momentum
-        self.searching = line_search is not None or rate is None
+        self.searches = line_search is not None or rate is None
 
     def begin(self, first):
         """State at the start. Without a rate the first step would bring a linear loss to 0."""
@@ -62,27 +60,29 @@ class Descent:
 
     def advance(self, state, trials):
         """One iteration. Raises Stuck when no admissible point is found."""
-        slope = state.trial.slope
+        slope = trials.downhill(state.trial)
         step = self.momentum * state.velocity - state.rate * slope
-        if self.searching and np.dot(step, slope) >= 0:
+        if self.searches and np.dot(step, slope) >= 0:
             step = -state.rate * slope  # momentum that goes uphill is dropped
-        if not self.searching:
+        if not self.searches:
             trial, share = admissible(state.trial.vector, step, state.share, trials)
             return DescentState(trial, share * step, state.rate, min(1.0, 2 * share))
         return self._search(state, step, trials)
 
     def _search(self, state, step, trials):
         """Halve the step until the loss falls; a full step that does is tried at twice the length next time."""
-        fall, refused = -float(np.dot(step, state.trial.slope)), False
+        refused = False
         for halvings in range(HALVINGS):
             share = 0.5**halvings
-            trial = trials(state.trial.vector + share * step)
+            point = trials.box.inside(state.trial.vector + share * step)
+            fall = float(np.dot(state.trial.vector - point, state.trial.slope))
+            trial = trials(point)
             refused |= trial.refused
-            if not trial.refused and _lower(trial, state.trial, ENOUGH * share * fall):
+            if not trial.refused and _lower(trial, state.trial, ENOUGH * fall):
                 return DescentState(trial, share * step, state.rate * (share if halvings else 2.0), 1.0)
-            if share * fall <= state.trial.rounding:
+            if fall <= state.trial.rounding:
                 break
-        hopeless = not refused and fall <= 100 * state.trial.rounding
+        hopeless = not refused and fall <= 100 * share * state.trial.rounding
         raise Stuck("rounding" if hopeless else "no lower point along the gradient")
 
 
@@ -92,7 +92,7 @@ def admissible(point, step, share, trials):
     The next iteration tries twice the share, so that a wall does not cost all halvings every time.
     """
     for _ in range(HALVINGS):
-        trial = trials(point + share * step)
+        trial = trials(trials.box.inside(point + share * step))
         if not trial.refused:
             return trial, share
         share *= 0.5
@@ -134,6 +134,8 @@ class Adam:
     -----
     Source: D. P. Kingma, J. Ba, Adam: a method for stochastic optimization, ICLR 2015.
     """
+
+    residuals, searches = False, False
 
     def __init__(self, rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8):
         if not _is_positive(rate):

@@ -1,5 +1,6 @@
 """A tree of arrays as one flat vector of doubles, and back."""
 
+import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import DerivativeError
@@ -43,6 +44,7 @@ class Packing:
             raise DerivativeError("minimise needs floating values in start, and found none; write start.astype(float)")
         leaves = [np.asarray(self._found[place]) for place in self._places]
         self.size = sum(map(self._width, leaves))
+        self.complex = any(map(np.iscomplexobj, leaves))
         self.eps = max(float(np.finfo(leaf.dtype).eps) for leaf in leaves)
 
     @staticmethod
@@ -51,7 +53,10 @@ class Packing:
 
     def pack(self, tree):
         """Tree of the same structure -> flat vector of doubles."""
-        leaves = flatten(tree)[0]
+        return self.pack_leaves(flatten(tree)[0])
+
+    def pack_leaves(self, leaves):
+        """Leaves of a tree of the same structure -> flat vector of doubles."""
         return np.concatenate([_parts(np.asarray(leaves[place])) for place in self._places])
 
     def pack_gradient(self, tree):
@@ -86,6 +91,23 @@ class Packing:
             leaves[place] = _leaf(leaf, vector[start:stop])
             start = stop
         return self._rebuild(leaves)
+
+    def join(self, tree):
+        """The floating leaves of a tree that may be traced, as one traced vector."""
+        leaves = flatten(tree)[0]
+        return anp.concatenate([anp.reshape(leaves[place], (-1,)) for place in self._places])
+
+    def copies(self, tree, count):
+        """Every floating leaf with a new leading axis of so many copies of itself."""
+        leaves = list(flatten(tree)[0])
+        for place in self._places:
+            leaves[place] = np.repeat(np.asarray(leaves[place])[None], count, axis=0)
+        return self._rebuild(leaves)
+
+    def pack_copies(self, tree, count):
+        """Tree as `copies` gives it -> one packed row for each copy."""
+        leaves = flatten(tree)[0]
+        return np.concatenate([np.asarray(leaves[place]).reshape(count, -1) for place in self._places], axis=1)
 
 
 def _parts(values):

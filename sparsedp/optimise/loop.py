@@ -1,47 +1,94 @@
 """minimise(): the loop around every method."""
 
 import inspect
-import time
 
+from sparsedp.errors import ShapeError
 from sparsedp.fields import is_number, is_whole
-from sparsedp.optimise.first_order import Adam, Descent, Stuck
+from sparsedp.optimise.batches import Batches
+from sparsedp.optimise.box import Box
+from sparsedp.optimise.first_order import Adam, Descent
 from sparsedp.optimise.flat import Packing
+from sparsedp.optimise.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
+from sparsedp.optimise.newton import NewtonCG
+from sparsedp.optimise.physical import PhysicalGradient
 from sparsedp.optimise.progress import progress_bar
 from sparsedp.optimise.quasi_newton import Quasi
-from sparsedp.optimise.result import Minimum, Record
-from sparsedp.optimise.trials import Trials, norm
+from sparsedp.optimise.result import Minimum
+from sparsedp.optimise.resume import Journal
+from sparsedp.optimise.trials import Stuck, Trials
+from sparsedp.optimise.watch import Watch
+from sparsedp.tree import leaves
 
 __all__ = ["minimise"]
 
-METHODS = {"lbfgs": Quasi, "gd": Descent, "adam": Adam}
+METHODS = {
+    "lbfgs": Quasi,
+    "gd": Descent,
+    "adam": Adam,
+    "newton_cg": NewtonCG,
+    "gauss_newton": GaussNewton,
+    "levenberg_marquardt": LevenbergMarquardt,
+    "half_inverse": HalfInverse,
+    "physical_gradient": PhysicalGradient,
+}
 
 
 def minimise(
-    loss, start, method="lbfgs", maxiter=100, tolerance=1e-8, callback=None, progress=False, gradient=None, **options
+    loss,
+    start,
+    method="lbfgs",
+    maxiter=100,
+    tolerance=1e-8,
+    callback=None,
+    progress=False,
+    gradient=None,
+    bounds=None,
+    project=None,
+    batches=None,
+    checkpoint=None,
+    **options,
 ):
     """Loss and start -> the best point found: any nesting of arrays in, the same nesting out.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x) -> real scalar``.
+        ``loss(x) -> real scalar``; with batches ``loss(x, batch)``. For gauss_newton, levenberg_marquardt and
+        half_inverse it returns residuals, an array, and half the sum of their squares is minimised. For
+        physical_gradient it is a function of the end state ``physics(x)``.
     start : array, number, or any nesting of them in tuples, lists and dicts
         Not modified. Leaves that are not floating stay as they are.
-    method : "lbfgs", "gd" or "adam"
+    method : str
+        "lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "levenberg_marquardt", "half_inverse" or
+        "physical_gradient".
     maxiter : int
         Most iterations; 0 evaluates the start and returns it.
     tolerance : float or callable
         Converged when the Euclidean norm of the gradient has fallen to `tolerance` times its value at the
-        start; nothing in the test is absolute. A callable is asked ``tolerance(record, first_record)``.
+        start; nothing in the test is absolute. A callable is asked ``tolerance(record, first_record)``; one
+        such as `certified` also chooses how far the solves of the loss go.
     callback : callable, optional
         ``callback(record, x)`` after every iteration; a true answer stops the run.
     progress : bool or str
         A progress bar on standard error, a string is its label; needs the extra `plot`.
     gradient : callable, optional
         ``gradient(x)``, with the structure of x. Default: reverse mode.
+    bounds : (lower, upper), optional
+        Each a number, None for none, or a tree like start. Points are moved onto the box.
+    project : callable, optional
+        ``project(x)``, a linear projection such as dp.projection(grid): the loss sees project(x), and so does the
+        result. Differentiable.
+    batches : sequence or callable, optional
+        The loss of iteration i is ``loss(x, batches[i % len(batches)])``, or ``loss(x, batches(i))``. For gd with a
+        rate, adam and half_inverse; the result is the last point, not the best one.
+    checkpoint : path, optional
+        A folder that keeps the last two states. A run that was killed goes on from the last one, to the same bits.
     **options
         lbfgs: memory=10, line_search=20. gd: rate=None (found by backtracking), momentum=0.0,
-        line_search=None or "backtracking". adam: rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8.
+        line_search=None or "backtracking". adam: rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8. newton_cg: inner=200.
+        gauss_newton: apart=False, dense=None. levenberg_marquardt: damping=1e-3, apart, dense.
+        half_inverse: rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto".
+        physical_gradient: physics, inverse, rate=1.0.
 
     Returns
     -------
@@ -52,7 +99,8 @@ def minimise(
     Raises
     ------
     ValueError
-        If the method is not known, or maxiter, tolerance or an option is out of range.
+        If the method is not known, or maxiter, tolerance, bounds or an option is out of range, or the checkpoint
+        folder holds another run.
     TypeError
         If the method has no such option.
     UnstableStepError, ConvergenceError, NonFiniteError
@@ -76,20 +124,62 @@ def minimise(
         raise ValueError(f"minimise needs maxiter >= 0, a whole number, got {maxiter!r}; the default is 100")
     if not callable(tolerance) and not (is_number(tolerance) and tolerance >= 0):
         raise ValueError(f"minimise needs a tolerance >= 0, got {tolerance!r}; the default is 1e-8")
-    packing = Packing(start)
-    trials = Trials(loss, gradient, packing)
+    if hasattr(tolerance, "inside"):  # it takes part in the evaluations
+        loss, gradient = tolerance.inside(loss, gradient)
+    packing, batches = Packing(start), Batches(batches)
+    if batches.varied and stepper.searches:
+        raise ValueError(f"{method} compares losses and cannot use batches; write method='adam', or give gd a rate")
+    if isinstance(stepper, PhysicalGradient):
+        loss, stepper = _after(stepper.rule, loss), Descent(rate=1.0)
+    if project is not None:
+        loss = _projected(loss, project)
+    box = Box.of(bounds, packing, start)
+    trials = Trials(loss, gradient, packing, box, batches, stepper.residuals)
+    settings = {"method": method, "options": repr(sorted(options.items())), "bounds": repr(bounds)}
+    journal = Journal(checkpoint, settings)
     watch = Watch(trials, packing, tolerance, callback, progress_bar(progress, int(maxiter)))
     try:
-        first = trials.first(packing.pack(start))
-        stuck = None
-        if not watch(first) and maxiter > 0:
-            run = stepper.run if isinstance(stepper, Quasi) else lambda *rest: _iterate(stepper, *rest)
-            stuck = run(first, trials, watch, int(maxiter))
+        stuck = _run(stepper, trials, watch, journal, box.inside(packing.pack(start)), int(maxiter))
     finally:
         watch.bar.close()
     message, converged = watch.reason(stuck)
-    best = trials.best
-    return Minimum(packing.unpack(best.vector), best.value, watch.history, method, message, converged, trials.count)
+    best, x = trials.best, packing.unpack(trials.best.vector)
+    x = x if project is None else _like(project(x), x)
+    return Minimum(x, best.value, watch.history, method, message, converged, trials.count, journal.told)
+
+
+def _run(stepper, trials, watch, journal, start, maxiter):
+    """Begin or resume, and advance until the watch stops it or it is stuck; return why it is stuck."""
+    first = trials.first(start)
+    state = stepper.begin(first)
+    resumed = journal.resume(state, trials, watch)
+    if resumed is not None:
+        state = resumed
+    elif watch(first):
+        return None
+    while watch.iteration < maxiter and not watch.stopped:
+        trials.batches.number = watch.iteration + 1  # a new point is seen by the next batch
+        try:
+            state = stepper.advance(state, trials)
+        except Stuck as reason:
+            return str(reason)
+        watch(state.trial)
+        journal.save(state, trials, watch)
+    return None
+
+
+def _after(rule, loss):
+    return lambda x, *rest: loss(rule(x), *rest)
+
+
+def _projected(loss, project):
+    return lambda x, *rest: loss(project(x), *rest)
+
+
+def _like(projected, x):
+    if len(leaves(projected)) != len(leaves(x)):
+        raise ShapeError("project must return a tree like start; write project=lambda x: ...")
+    return projected
 
 
 def _stepper(method, options):
@@ -100,73 +190,3 @@ def _stepper(method, options):
         if name not in known:
             raise TypeError(f"{method} has no option {name!r}; it has {', '.join(known)}")
     return METHODS[method](**options)
-
-
-def _iterate(stepper, first, trials, watch, maxiter):
-    """Advance a state until the watch stops it or it is stuck; return why it is stuck."""
-    state = stepper.begin(first)
-    while watch.iteration < maxiter:
-        try:
-            state = stepper.advance(state, trials)
-        except Stuck as reason:
-            return str(reason)
-        if watch(state.trial):
-            break
-    return None
-
-
-class Watch:
-    """Keeps the history and decides when to stop. Called with every accepted trial; true means stop."""
-
-    def __init__(self, trials, packing, tolerance, callback, bar):
-        self._trials, self._packing = trials, packing
-        self._tolerance, self._callback, self.bar = tolerance, callback, bar
-        self._clock = time.perf_counter()
-        self.history = []
-        self.stopped = ""
-
-    @property
-    def iteration(self):
-        """Number of the last recorded iteration."""
-        return len(self.history) - 1
-
-    def __call__(self, trial):
-        seconds = time.perf_counter() - self._clock
-        failed = self._trials.pop_failures()
-        record = Record(len(self.history), trial.value, norm(trial.slope), seconds, self._trials.count, failed)
-        self.history.append(record)
-        self.bar.show(record)
-        if self._met(record):
-            self.stopped = "converged"
-        elif self._callback is not None and record.iteration > 0:
-            if self._callback(record, self._packing.unpack(trial.vector)):
-                self.stopped = "callback"
-        return bool(self.stopped)
-
-    def _met(self, record):
-        first = self.history[0]
-        if record.gradient_norm == 0:
-            return True
-        if callable(self._tolerance):
-            return bool(self._tolerance(record, first))
-        return record.gradient_norm <= self._tolerance * first.gradient_norm
-
-    def reason(self, stuck):
-        """(message, converged) of a run that is over; `stuck` is why the method gave up, if it did."""
-        last, first = self.history[-1], self.history[0]
-        if self.stopped == "converged":
-            if last.gradient_norm == 0:
-                return "converged: the gradient is 0", True
-            return (
-                f"converged: the gradient is {last.gradient_norm / first.gradient_norm:.1e} of that at the start",
-                True,
-            )
-        if self.stopped:
-            return "stopped by the callback", False
-        if stuck == "rounding":
-            return "converged to rounding: the loss cannot fall further in floating point numbers", True
-        if stuck:
-            left = self._trials.pop_failures()
-            refused = f", {len(left)} points refused ({left[-1].error}: {left[-1].message})" if left else ""
-            return f"stopped: {stuck}{refused}; dp.check.gradient(loss, x) tells whether the gradient is right", False
-        return f"stopped after {last.iteration} iterations, as maxiter asks", False

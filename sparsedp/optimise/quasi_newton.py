@@ -1,23 +1,37 @@
-"""L-BFGS by SciPy, on a scaled flat problem, past trial points that the loss refuses."""
+"""L-BFGS as steps from one state to the next, past trial points that the loss refuses, inside bounds."""
+
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
 from sparsedp.fields import is_whole
-from sparsedp.optimise.trials import norm
+from sparsedp.optimise.trials import Stuck, Trial, norm
+from sparsedp.optimise.wolfe import line_search
 
-__all__ = ["Quasi"]
+__all__ = ["Quasi", "QuasiState"]
 
-RISE = 1.5  # a refused point looks as if the loss had risen by this multiple of the predicted fall
-RESTARTS = 20
+CURVED = 1e-12  # a step enters the memory when s.y is more than this share of |s| |y|
+
+
+class QuasiState(NamedTuple):
+    """State of L-BFGS: the point, and the last steps and changes of the gradient, oldest first.
+
+    The changes are kept as the gradient in units of `height`, the steps in units of `length` (powers of two, set
+    at the start), so that no product of two of them leaves the range of floating point numbers.
+    """
+
+    trial: Trial
+    steps: np.ndarray
+    changes: np.ndarray
+    length: float
+    height: float
 
 
 class Quasi:
-    """Limited-memory BFGS with a line search for the strong Wolfe conditions.
+    """Limited-memory BFGS with a line search for the weak Wolfe conditions.
 
-    SciPy's stopping tests are switched off: they are absolute. So is its first step, of length 1; the
-    problem is scaled by powers of two so that this step is |f| / |g| long, which would bring a linear loss
-    to 0, but not longer than x, and the scaled gradient is of size 1.
+    The first step is |f| / |g| long, which would bring a linear loss to 0, but not longer than x. Nothing is
+    absolute: a loss or an x times a power of two takes the same steps.
 
     Parameters
     ----------
@@ -28,8 +42,12 @@ class Quasi:
 
     Notes
     -----
-    Source: R. H. Byrd, P. Lu, J. Nocedal, C. Zhu, SIAM J. Sci. Comput. 16, 1995.
+    Source: D. C. Liu, J. Nocedal, On the limited memory BFGS method, Math. Program. 45, 1989. With bounds the
+    entries at which the gradient pushes against a bound are left out of the step: D. P. Bertsekas, SIAM J.
+    Control Optim. 20, 1982.
     """
+
+    residuals, searches = False, True
 
     def __init__(self, memory=10, line_search=20):
         if not (is_whole(memory, 1) and is_whole(line_search, 2)):
@@ -38,82 +56,74 @@ class Quasi:
             )
         self.memory, self.line_search = int(memory), int(line_search)
 
-    def run(self, first, trials, watch, maxiter):
-        """Iterate until `watch` stops it, or no lower point is found.
+    def begin(self, first):
+        """State at the start."""
+        length = _power_of_two(_first_length(first))
+        nothing = np.zeros((0, first.vector.size))
+        return QuasiState(first, nothing, nothing, length, _power_of_two(norm(first.slope)))
 
-        Returns
-        -------
-        "rounding", or words that say why no lower point was found; None when `watch` stopped it.
+    def advance(self, state, trials):
+        """One iteration; a line search that fails is tried once more without the memory.
+
+        Raises
+        ------
+        Stuck
+            When there is no lower point along the gradient either.
         """
-        search = _Search(first, trials, watch)
-        for _ in range(RESTARTS):
-            before = search.accepted
-            self._scipy(search, maxiter - watch.iteration)
-            if watch.stopped or watch.iteration >= maxiter:
-                return None
-            # A fresh memory helps after a failed line search, as long as it still brings progress.
-            if search.accepted is before or search.at_rounding():
+        for kept in (state, self._forgetful(state)):
+            trial = self._search(kept, trials)
+            if trial is not None:
+                return self._remember(kept, trial)
+            if not len(state.steps):
                 break
-        return "rounding" if search.at_rounding() else "the line search found no lower point"
+        raise Stuck(
+            "rounding" if _at_rounding(state, trials.downhill(state.trial)) else "the line search found no lower point"
+        )
 
-    def _scipy(self, search, maxiter):
-        options = {"maxiter": maxiter, "maxfun": 2**31 - 1, "maxcor": self.memory, "maxls": self.line_search}
-        start = search.accepted.vector / search.length
-        minimize(
-            search.evaluate, start, jac=True, method="L-BFGS-B", callback=search.iterate,
-            options={**options, "ftol": 0.0, "gtol": 0.0},
-        )  # fmt: skip
+    @staticmethod
+    def _forgetful(state):
+        return state._replace(steps=state.steps[:0], changes=state.changes[:0])
+
+    def _search(self, state, trials):
+        """A lower trial along the quasi-Newton direction, or None."""
+        here, box = state.trial, trials.box
+        slope = trials.downhill(here)
+        step = -box.free(here.vector, _product(state, slope))
+        if not np.dot(step, slope) < 0:
+            return None
+        return line_search(here, step, trials, self.line_search, box)
+
+    def _remember(self, state, trial):
+        step = (trial.vector - state.trial.vector) / state.length
+        change = trial.slope / state.height - state.trial.slope / state.height
+        state = state._replace(trial=trial)
+        if not np.dot(step, change) > CURVED * norm(step) * norm(change):
+            return state
+        steps = np.concatenate([state.steps, step[None]])[-self.memory :]
+        return state._replace(steps=steps, changes=np.concatenate([state.changes, change[None]])[-self.memory :])
 
 
-class _Search:
-    """The loss as SciPy sees it, and the point from which the present line search starts."""
+def _product(state, slope):
+    """Inverse Hessian of the memory times a gradient, by the two loops."""
+    g = slope / state.height
+    if not len(state.steps):
+        size = norm(g)
+        return (_first_length(state.trial) / size if size else 1.0) * g
+    weights = [1.0 / float(np.dot(s, y)) for s, y in zip(state.steps, state.changes)]
+    shares = []
+    for s, y, weight in reversed(list(zip(state.steps, state.changes, weights))):
+        shares.append(weight * float(np.dot(s, g)))
+        g = g - shares[-1] * y
+    last = state.changes[-1]
+    g = g / (weights[-1] * float(np.dot(last, last)))
+    for s, y, weight, share in zip(state.steps, state.changes, weights, reversed(shares)):
+        g = g + (share - weight * float(np.dot(y, g))) * s
+    return state.length * g
 
-    def __init__(self, first, trials, watch):
-        self.accepted = first
-        self.curvature = None
-        self._trials, self._watch = trials, watch
-        self._recent = []
-        self.length = _power_of_two(_first_length(first))
-        self._height = _power_of_two(self.length * norm(first.slope))
 
-    def evaluate(self, scaled):
-        """Scaled value and gradient; at a refused point those of a parabola that sends the search back."""
-        vector = self.length * scaled
-        trial = self.accepted if np.array_equal(vector, self.accepted.vector) else self._trials(vector)
-        value, slope = (trial.value, trial.slope) if not trial.refused else self._parabola(vector)
-        if not trial.refused:
-            self._recent.append((vector, trial))
-        return value / self._height, self.length * (slope / self._height)
-
-    def _parabola(self, vector):
-        """Through the accepted point with its slope, and RISE times the predicted fall higher here.
-
-        Its minimum lies at 1 / (2 RISE + 2) of the way, where an interpolating search goes next.
-        """
-        step = vector - self.accepted.vector
-        fall = abs(float(np.dot(self.accepted.slope, step))) or norm(self.accepted.slope) * norm(step)
-        length = float(np.dot(step, step)) or 1.0
-        return self.accepted.value + RISE * fall, (2 * RISE + 1) * fall / length * step
-
-    def iterate(self, scaled):
-        """SciPy accepted a point: record it, and stop when the watch says so."""
-        vector = self.length * scaled
-        known = (trial for point, trial in reversed(self._recent) if np.array_equal(point, vector))
-        trial = next(known, None) or self._trials(vector)
-        step, change = trial.vector - self.accepted.vector, trial.slope - self.accepted.slope
-        bend = float(np.dot(step, change))
-        self.curvature = bend / float(np.dot(step, step)) if bend > 0 else self.curvature
-        self.accepted, self._recent = trial, []
-        if self._watch(trial):
-            raise StopIteration
-
-    def at_rounding(self):
-        """Whether the fall that gradient and curvature still promise is lost in the rounding of the loss."""
-        if self.curvature is None:
-            return False
-        size = norm(self.accepted.slope)
-        promised = size * (size / (2 * self.curvature))  # in this order nothing overflows
-        return promised <= 100 * self.accepted.rounding
+def _at_rounding(state, slope):
+    """Whether the fall that the quasi-Newton step promises is lost in the rounding of the loss."""
+    return abs(float(np.dot(_product(state, slope), slope / 2))) <= 100 * state.trial.rounding
 
 
 def _first_length(first):

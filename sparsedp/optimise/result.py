@@ -41,6 +41,8 @@ class Minimum:
         Whether the tolerance was met, or the loss cannot fall further in floating point numbers.
     evaluations : int
         Evaluations of loss and gradient, refused ones included.
+    resumed : str
+        What was found in the checkpoint folder; empty without one.
     """
 
     x: Any
@@ -50,10 +52,12 @@ class Minimum:
     message: str
     converged: bool
     evaluations: int
+    resumed: str
 
-    def __init__(self, x, value, history, method, message, converged, evaluations):
+    def __init__(self, x, value, history, method, message, converged, evaluations, resumed=""):
         self.__dict__.update(x=x, value=value, history=tuple(history), method=method)
         self.__dict__.update(message=message, converged=converged, evaluations=evaluations)
+        self.__dict__.update(resumed=resumed)
 
     def __setattr__(self, name, value):
         raise AttributeError(f"the result of minimise is frozen; {name} cannot be set")
@@ -67,7 +71,7 @@ class Minimum:
         lines += [_line(record) for record in shown]
         if cut:
             lines.insert(SHOWN + 1, f"{'...':>6}")
-        return "\n".join([head, *lines, self.message])
+        return "\n".join([head, *lines, self.message, *([self.resumed] if self.resumed else [])])
 
     __repr__ = __str__
 

@@ -4,12 +4,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.derivative import value_and_grad
-from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError, UnstableStepError
+from sparsedp.derivative import pullback, value_and_grad
+from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
+from sparsedp.optimise.batches import Batches
+from sparsedp.optimise.box import Box
+from sparsedp.optimise.linearised import Linearised
+from sparsedp.tape import isbox
 
-__all__ = ["Failure", "Trial", "Trials", "norm"]
+__all__ = ["Failure", "Stuck", "Trial", "Trials", "norm"]
 
+OPEN, WHOLE = Box(), Batches()
 REFUSED = (UnstableStepError, ConvergenceError, NonFiniteError)
+
+
+class Stuck(Exception):
+    """No admissible point was found; the message says why."""
 
 
 class Failure(NamedTuple):
@@ -42,13 +51,20 @@ class Trials:
     gradient : callable or None
         None: reverse mode.
     packing : Packing
+    box : Box
+        The points that are allowed.
+    batches : Batches
+        What the loss is given after x; `batches.number` is moved by the loop.
+    residuals : bool
+        The loss returns residuals r, and what falls is |r|^2 / 2.
     """
 
     best: Trial
 
-    def __init__(self, loss, gradient, packing):
-        self._loss, self._gradient = loss, gradient
+    def __init__(self, loss, gradient, packing, box=OPEN, batches=WHOLE, residuals=False):
+        self._loss, self._gradient, self._residuals = loss, gradient, residuals
         self._packing = packing
+        self.box, self.batches = box, batches
         self.count = 0
         self.failures = []
 
@@ -64,28 +80,53 @@ class Trials:
         except REFUSED as error:
             self.failures.append(Failure(type(error).__name__, str(error)))
             return Trial(np.array(vector), np.inf, None)
-        if trial.value < self.best.value:
-            self.best = trial
+        if self.batches.varied or trial.value < self.best.value:
+            self.best = trial  # losses of two batches cannot be compared: the last point stands
         return trial
 
     def _evaluate(self, vector):
         self.count += 1
-        value, gradient = self._both(vector)
+        value, slope = self._squares(vector) if self._residuals else self._both(vector)
         if not np.isfinite(value):
             raise NonFiniteError(f"the loss is {value}; it must be finite at the start, and elsewhere it is avoided")
-        slope = self._packing.pack_gradient(gradient)
         rounded = self._packing.pack(self._packing.unpack(vector))  # single-precision leaves round
         return Trial(rounded, value, slope, self._packing.eps * abs(value))
 
+    def _squares(self, vector):
+        """Half the sum of squares of the residuals, and its gradient J^T r."""
+        here = Linearised(self._loss, self._packing, vector, self.batches.now())
+        return 0.5 * float(np.dot(here.flat, here.flat)), here.pull(here.flat)
+
     def _both(self, vector):
-        """Loss and gradient, each from a fresh tree."""
-        tree = self._packing.unpack(vector)
+        """Loss and flat gradient, each from a fresh tree."""
+        tree, batch = self._packing.unpack(vector), self.batches.now()
         if self._gradient is None:
-            return value_and_grad(self._loss)(tree)
-        value = self._loss(tree)
+            value, gradient = value_and_grad(self._loss)(tree, *batch)
+            return value, self._packing.pack_gradient(gradient)
+        value = self._loss(tree, *batch)
         if np.shape(value) != ():
             raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(value)}; sum it")
-        return float(value), self._gradient(self._packing.unpack(vector))
+        gradient = self._gradient(self._packing.unpack(vector), *batch)
+        return float(value), self._packing.pack_gradient(gradient)
+
+    def linearised(self, trial):
+        """The residuals at the last point and their Jacobian, on the batch that saw it."""
+        return Linearised(self._loss, self._packing, trial.vector, self.batches.now(back=1))
+
+    def curvature(self, trial):
+        """Function from a flat vector to the Hessian times it, at a point: one tape, one backward pass a product."""
+        if self._gradient is not None:
+            raise TypeError("newton_cg differentiates the loss twice and takes no gradient of yours; leave it out")
+        batch, packing = self.batches.now(back=1), self._packing
+        tree = packing.unpack(trial.vector)
+        slope, pull = pullback(lambda x: packing.join(value_and_grad(self._loss)(x, *batch)[1]), tree)
+        if isbox(slope) or slope.shape != trial.vector.shape:
+            raise DerivativeError("newton_cg takes real numbers, got complex ones; split them into two real arrays")
+        return lambda v: packing.pack_gradient(pull(np.asarray(v, dtype=slope.dtype)))
+
+    def downhill(self, trial):
+        """The part of the gradient that the bounds leave free."""
+        return self.box.free(trial.vector, trial.slope)
 
     def pop_failures(self):
         """The refused points since the last call."""

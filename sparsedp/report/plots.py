@@ -7,7 +7,7 @@ import numpy as np
 from sparsedp.errors import ShapeError
 from sparsedp.tape import plain
 
-__all__ = ["curves", "figure", "plot", "read_picture", "sample_file", "save"]
+__all__ = ["animate", "axes_or_current", "figure", "plot", "read_picture", "sample_file", "save"]
 
 ARROWS = 24  # arrows along an axis of a face field, at most
 
@@ -72,6 +72,67 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, colours="viridis
     if arrows is not None:
         _arrows(grid, arrows, ax)
     return ax
+
+
+def animate(grid, frames, path, title=None, limits=None, colours="viridis", rate=12):
+    """Frames of a field -> animated GIF.
+
+    Parameters
+    ----------
+    grid : Grid
+    frames : sequence of arrays
+        Fields that `plot` draws.
+    path : str or Path
+    title, limits, colours
+        As in `plot`; the limits hold for all frames.
+    rate : float
+        Frames a second.
+
+    Raises
+    ------
+    ValueError
+        If there is no frame.
+    ShapeError
+        If a frame is not a field on the grid.
+    ImportError
+        If matplotlib is not installed.
+
+    Examples
+    --------
+    >>> import io
+    >>> from sparsedp import Grid
+    >>> film = io.BytesIO()
+    >>> animate(Grid((2, 3)), [np.zeros((2, 3)), np.ones((2, 3))], film)
+    >>> film.getvalue()[:3]
+    b'GIF'
+    """
+    frames = [np.asarray(plain(frame)) for frame in frames]
+    if not frames:
+        raise ValueError("animate needs at least one frame, got none; run with keep='all'")
+    limits = limits or _range(np.concatenate([_drawn(grid, frame).ravel() for frame in frames]))
+    picture, images = figure(), []
+    _matplotlib("backends.backend_agg").FigureCanvasAgg(picture)
+    for frame in frames:
+        picture.clear()
+        plot(grid, frame, ax=picture.add_subplot(), title=title, limits=limits, colours=colours)
+        picture.canvas.draw()
+        images.append(_image(np.asarray(picture.canvas.buffer_rgba())))
+    first, *rest = images
+    first.save(path, format="GIF", save_all=True, append_images=rest, duration=round(1000 / rate), loop=0)
+
+
+def _drawn(grid, u):
+    """The numbers whose colours a map shows: of a face field its magnitude."""
+    if grid.dim > 1 and _kind(grid, u.shape, None) == "faces":
+        return np.sqrt(sum(part**2 for part in _at_centres(grid, u)))
+    return u
+
+
+def _image(pixels):
+    """Pixels -> picture in 256 colours. Pillow comes with matplotlib."""
+    from PIL import Image
+
+    return Image.fromarray(pixels[..., :3].copy()).quantize(256)
 
 
 def _kind(grid, shape, at):
@@ -155,40 +216,14 @@ def figure(width=5.5, height=4.4):
     return _matplotlib("figure").Figure(figsize=(width, height), layout="constrained")
 
 
+def axes_or_current(ax):
+    """The axes given, or the current ones of pyplot."""
+    return _matplotlib("pyplot").gca() if ax is None else ax
+
+
 def save(picture, stream):
     """Write a figure as PNG to an open binary stream."""
     picture.savefig(stream, format="png", dpi=150, bbox_inches="tight", pad_inches=0.15)
-
-
-def curves(lines, ax, x_label, y_label):
-    """Named curves -> one log-log picture; the best points reached at any time are marked.
-
-    Parameters
-    ----------
-    lines : dict
-        Name -> (x, y), two sequences of positive numbers.
-    ax : matplotlib Axes
-    x_label, y_label : str
-    """
-    best = _pareto([point for x, y in lines.values() for point in zip(x, y, strict=True)])
-    ax.plot(*zip(*best, strict=True), color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
-    for name, (x, y) in lines.items():
-        ax.plot(x, y, marker=".", markersize=4, linewidth=1, label=name)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.set_xlabel(x_label)
-    ax.set_ylabel(y_label)
-    ax.grid(visible=True, which="both", color="0.93")
-    ax.legend(frameon=False)
-
-
-def _pareto(points):
-    """Points that no other point beats in both coordinates, from left to right."""
-    kept: list = []
-    for x, y in sorted(points):
-        if not kept or y < kept[-1][1]:
-            kept.append((x, y))
-    return kept
 
 
 def sample_file(name):

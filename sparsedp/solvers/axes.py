@@ -1,9 +1,12 @@
-"""1-D factors diagonalised: by a sine, cosine or Fourier transform when uniform, by eigenvectors when not.
+"""1-D factors for separable solves: diagonalised, or eliminated for all modes of the other axes at once.
 
-A factor F of n cells is written F = S^-1 Q diag(eigenvalues) Q^-1 S with S diagonal and Q orthogonal
-(or the discrete Fourier transform). For a stretched grid S is the square root of the cell widths.
+Diagonalised by a sine, cosine or Fourier transform when uniform, by eigenvectors when not: a factor F of
+n cells is written F = S^-1 Q diag(eigenvalues) Q^-1 S with S diagonal and Q orthogonal (or the discrete
+Fourier transform). For a stretched grid S is the square root of the cell widths.
 Sources: Lynch, Rice, Thomas, Numer. Math. 6 (1964), direct solution by tensor products;
-Strang, SIAM Review 41 (1999), the discrete cosine transform.
+Strang, SIAM Review 41 (1999), the discrete cosine transform; Hockney, J. ACM 12 (1965), transforms along one
+axis and elimination along the other; Grassmann, Taksar, Heyman, Operations Research 33 (1985), pivots without
+subtractions.
 """
 
 from functools import cached_property
@@ -12,9 +15,12 @@ import numpy as np
 import scipy.fft as fft
 import scipy.linalg
 
-__all__ = ["Axis", "diagonalise"]
+from sparsedp import kernels
+
+__all__ = ["Axis", "Sweep", "diagonalise", "sweep"]
 
 ROUNDING = 16 * np.finfo(float).eps  # entries that should be equal may differ by this share
+TINY = 1e-40  # share of a link below which what is left of it in a filled row is dropped: it costs time only
 WIDEST = 1e4  # largest ratio of scalings that keeps the digits of the eigenvectors
 
 
@@ -39,14 +45,12 @@ class Axis:
         function = {"c": (fft.dct, fft.idct), "s": (fft.dst, fft.idst)}[self.kind[1]]
         return *function, int(self.kind[-1])
 
-    def forward(self, x, axis, transposed, workers):
-        """Field along `axis` -> coefficients. May overwrite x."""
-        if self.kind in ("identity", "fourier"):  # Fourier axes are transformed together, see separable.py
-            return x
+    def forward(self, x, axis, transposed, workers, overwrite):
+        """Field along `axis` -> coefficients. `overwrite`: the memory of x may be used."""
         if self.kind == "eigenvectors":
             return self._turn(x, axis, self._scale(transposed), self.vectors.T, None)
         there, _, number = self._transforms
-        return there(x, number, axis=axis, norm="ortho", overwrite_x=True, workers=workers)
+        return there(x, number, axis=axis, norm="ortho", overwrite_x=overwrite, workers=workers)
 
     def backward(self, y, axis, transposed, workers):
         """Coefficients along `axis` -> field. May overwrite y."""
@@ -171,3 +175,102 @@ def _exact_zero(factor, values):
 def _symmetric(matrix):
     difference = abs(matrix - matrix.T)
     return difference.nnz == 0 or difference.max() <= 1e-14 * abs(matrix).max()
+
+
+# ---------------------------------------------------------------- elimination along the first axis
+
+
+class Sweep:
+    """(T + mode) x = b for all modes at once, T a three-point factor along the first axis: elimination.
+
+    Rows are eliminated from the first to the last. On a periodic axis the last unknown is linked to the
+    first, so that the last column and the last row fill up. With off-diagonal entries of one sign and
+    rows that sum to the other, no pivot takes a subtraction: every digit of a small sum is kept. The
+    transpose has the same pivots.
+
+    Parameters
+    ----------
+    bands : Tridiagonal
+    excess : array, shape (n,)
+        What the rows sum to, times `sign`; >= 0.
+    modes : array, shape (m,)
+        Numbers on the diagonal, times `sign`; >= 0.
+    sign : 1.0 or -1.0
+        Sign of the diagonal.
+    """
+
+    def __init__(self, bands, excess, modes, sign):
+        n = bands.centre.size
+        self.lower, self.upper = bands.lower, bands.upper
+        lower, upper = np.abs(bands.lower), np.abs(bands.upper)
+        self.inverses = np.empty((n, modes.size))  # of the pivots; 0 where the system is singular
+        self.column = self.row = np.empty((0, modes.size))
+        if lower[0] == 0 and upper[-1] == 0:
+            rest = 0.0
+            for i in range(n):
+                rest = excess[i] + modes + (lower[i] * rest * self.inverses[i - 1] if i else 0.0)
+                _invert(upper[i] + rest, self.inverses[i])
+        else:
+            self.column, self.row = np.empty((2, n, modes.size))
+            self._fill(lower, upper, excess, modes)
+            if np.array_equal(self.column, self.row):
+                self.row = self.column
+        rows = np.arange(1, len(self.row) - 1)[:, None]  # of the last but one, the link is never dropped
+        self.ends = np.max(rows * ((self.column != 0) | (self.row != 0))[:-2], axis=0, initial=0)
+        self.inverses *= sign
+        for filled in {id(fill): fill for fill in (self.column, self.row)}.values():
+            filled *= -sign
+
+    def _fill(self, lower, upper, excess, modes):
+        """Pivots of a periodic axis, and the magnitudes of the filled last column and row."""
+        n = len(excess)
+        column, row = np.full((2, modes.size), [[lower[0]], [upper[-1]]])
+        rest, last = excess[0] + modes, excess[-1] + modes
+        for i in range(n - 1):
+            onwards = upper[i]
+            if i == n - 2:
+                column, row, onwards = column + upper[i], row + lower[-1], 0.0
+            inverse = _invert(onwards + column + rest, self.inverses[i])
+            self.column[i], self.row[i] = column, row
+            last = last + row * inverse * rest
+            row = _dropped(row * inverse * onwards, upper[-1])
+            column = _dropped(lower[i + 1] * inverse * column, lower[0])
+            rest = excess[i + 1] + modes + lower[i + 1] * inverse * rest
+        self.column[-1] = self.row[-1] = 0.0
+        _invert(last, self.inverses[-1])
+
+    def solve(self, x, transposed):
+        """x, shape (n, m), is overwritten with the solution."""
+        if transposed:
+            lower, upper = np.roll(self.upper, 1), np.roll(self.lower, -1)
+            kernels.sweep(x, lower, upper, self.inverses, self.row, self.column, self.ends)
+        else:
+            kernels.sweep(x, self.lower, self.upper, self.inverses, self.column, self.row, self.ends)
+
+
+def _invert(pivots, out):
+    out[...] = 0.0
+    return np.divide(1.0, pivots, out=out, where=pivots != 0)
+
+
+def _dropped(fill, link):
+    fill[fill < TINY * link] = 0.0
+    return fill
+
+
+def sweep(factor, modes):
+    """Square 1-D factor, numbers that are added to its diagonal -> Sweep, or None when it might lose digits.
+
+    Needed are three points a row, off-diagonal entries of one sign, and rows that sum to the other one.
+    """
+    bands = factor.tridiagonal
+    if bands is None or bands.centre.size < 3 or not np.any(bands.centre):
+        return None
+    sign = float(np.sign(bands.centre[np.argmax(np.abs(bands.centre))]))
+    links = np.abs(bands.lower) + np.abs(bands.upper)
+    excess = sign * bands.centre - links
+    excess[np.abs(excess) <= ROUNDING * links] = 0.0
+    against = np.concatenate([sign * bands.lower, sign * bands.upper])
+    if np.any(against > 0) or np.any(excess < 0) or np.any(sign * modes < 0):
+        return None
+    return Sweep(bands, excess, sign * modes, sign)

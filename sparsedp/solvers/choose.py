@@ -6,7 +6,7 @@ from time import perf_counter
 from sparsedp.errors import ConvergenceError, ShapeError
 from sparsedp.fields import is_number, is_whole
 from sparsedp.ledger import active as recordings
-from sparsedp.ledger import count
+from sparsedp.ledger import count, spent
 from sparsedp.operator import Operator
 from sparsedp.solvers.contract import Nothing, Solver
 from sparsedp.solvers.direct import direct_engine
@@ -123,8 +123,10 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
     name = name or f"inverse({op.name})"
     if recordings:
         count(name, "setup")
+        count(name, "hierarchy", int(engine.hierarchical))
+        spent(name, "setup", log.setup_seconds)
     recipe = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
-    return Inverse(Solver(system, engine, nullspace, log, name, recipe), reason)
+    return Inverse(Solver(system, engine, nullspace, log, name, recipe, reason), reason)
 
 
 def check_settings(method, rtol, maxiter, nullspace):

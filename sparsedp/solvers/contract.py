@@ -24,21 +24,26 @@ need not be exact: the contract refines with further calls on the residual. Attr
     method           word that the user writes, such as "direct"
     unit             what an iteration is called in messages: "iterations", "cycles"
     hierarchy        one line: levels, unknowns, entries
+    iterative        True: what it leaves depends on the tolerance
+    hierarchical     True: its set-up is a multigrid hierarchy
     overwrites       False: `b` is left as it is, so that the contract need not copy it
     refines          False: one call, no refinement and no error (fixed numbers of iterations)
-    unrolled         True: inv(b) is engine.unroll(b, start, transposed), differentiated as it runs
+    unrolled         True: inv(b) is engine.unroll(b, start, transposed, run), differentiated as it runs
 
 Its builder is a function (system, **options) -> engine; `system` is a System (system.py).
 """
+
+from functools import partial
 
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
 from sparsedp.fields import check_finite, place
 from sparsedp.ledger import active as recordings
-from sparsedp.ledger import count
+from sparsedp.ledger import count, observers, timed
 from sparsedp.solvers.record import Run, merged
-from sparsedp.solvers.scaling import in_range, largest, norm, shifted
+from sparsedp.solvers.scaling import in_range, largest, measured, norm, shifted
+from sparsedp.tape import plain
 
 __all__ = ["Engine", "Solver", "norm"]
 
@@ -53,6 +58,8 @@ class Engine:
     method = "engine"
     unit = "iterations"
     hierarchy = ""
+    iterative = False
+    hierarchical = False
     overwrites = True
     refines = True
     unrolled = False
@@ -77,10 +84,15 @@ class Solver:
     name : str
     recipe : (function, arguments)
         What makes the same inverse again.
+    reason : str
+        Why this method, in words.
     """
 
-    def __init__(self, system, engine, nullspace, log, name, recipe):
-        self.recipe = recipe
+    observed = True  # whether those who take part in solves are asked
+
+    def __init__(self, system, engine, nullspace, log, name, recipe, reason=""):
+        self.recipe, self.reason = recipe, reason
+        self.served = not recordings  # whether a solve was counted for this set-up
         self.system, self.engine = system, engine
         self.nullspace, self.log, self.name = nullspace, log, name
 
@@ -90,13 +102,43 @@ class Solver:
             return self._in_parts(b, transposed, checked, start)
         if self.system.complex:
             b = b.astype(complex)
-        if recordings:
-            count(self.name, "adjoint" if transposed else "solve")
+        return (self._counted if recordings else self.solved)(b, transposed, checked, start)
+
+    def _counted(self, b, transposed, checked, start):
+        """As `solved`, seen by the ledger and by those who take part in solves."""
+        if self.served:
+            count(self.name, "reused")
+        self.served = True
+        act = partial(observers[-1].linear, self) if observers and self.observed else self.solved
+        return timed(self.name, "adjoint" if transposed else "solve", act, b, transposed, checked, start)
+
+    def solved(self, b, transposed=False, checked=True, start=None):
+        """The solve itself, recorded in the log."""
         run = Run()
         try:
             return self._scaled(b, run, transposed, checked and not transposed, start)
         finally:
             self.log.note(run.info(), transposed)
+            if recordings:
+                count(self.name, "iterations", run.iterations)
+                count(self.name, "skipped", int(run.status == "exact_zero_rhs"))
+
+    def unroll(self, b, start, transposed):
+        """The engine's iterations on the tape. The record is that of the solve: its derivatives are no solves."""
+        run = Run()
+        try:
+            x = self.engine.unroll(b, start, transposed, run)
+        except ConvergenceError as error:
+            self.log.note(error.info, transposed)
+            raise
+        data, solution = (np.array(plain(value), dtype=float).reshape(-1) for value in (b, x))
+        solution = shifted(solution, self.system.exponent)
+        _, rest, length = self.system.residual(solution, data, transposed)
+        size = norm(data)
+        run.residual = rest / size if size else 0.0
+        run.backward_error = rest / (self.system.norm(transposed) * length + size or 1.0)
+        self.log.note(run.info(), transposed)
+        return x
 
     def _in_parts(self, b, transposed, checked, start):
         """A real operator acts on the real and on the imaginary part."""
@@ -109,7 +151,7 @@ class Solver:
         return parts[0] + 1j * parts[1]
 
     def _scaled(self, b, run, transposed, checked, start):
-        size, exponent = norm(b), 0
+        (size, total), exponent = self._measured(b), 0
         if not in_range(size):
             top = largest(b)
             if not np.isfinite(top):
@@ -121,12 +163,16 @@ class Solver:
                 return np.zeros_like(b)
             exponent = int(np.frexp(top)[1])
             b = shifted(b, -exponent)
-            size = norm(b)
+            size, total = self._measured(b)
         exponent -= self.system.exponent
         if start is not None:
             start = shifted(start, -exponent).astype(b.dtype)
-        x = self._compatible(b, size, run, transposed, checked, start)
+        x = self._compatible(b, (size, total), run, transposed, checked, start)
         return self._unscaled(x, exponent, run) if exponent else x
+
+    def _measured(self, b):
+        """Norm of the data, and their sum where a null space asks for it (else None)."""
+        return measured(b) if self.system.null_space.count else (norm(b), None)
 
     def _unscaled(self, x, exponent, run):
         x = shifted(x, exponent)
@@ -137,23 +183,21 @@ class Solver:
 
     # ------------------------------------------------------------ null space
 
-    def _compatible(self, b, raw, run, transposed, checked, start):
-        """Project, refuse what must be refused, solve. `raw` is the norm of b."""
-        space, size = self.system.null_space, raw
+    def _compatible(self, b, measures, run, transposed, checked, start):
+        """Project, refuse what must be refused, solve. `measures`: norm and sum of b."""
+        space, raw, (size, total) = self.system.null_space, measures[0], measures
         if self.system.active is not None:
             b, run.defect = self._on_unknowns(b, raw, run, checked)
-            size = norm(b)
+            size, total = self._measured(b)
         if space.count:
-            sums = space.sums(b, transposed)
+            sums = space.sums(b, transposed, total)
             defect, worst = space.defect(b, sums, size, self.system.rtol * raw, transposed)
             run.defect = max(run.defect, defect)
             if checked and self.nullspace == "raise" and defect > COMPATIBLE:
                 self._refuse_defect(run, defect, worst)
-            b = space.project(b, transposed, sums=sums)
-            before, size = size, norm(b)
+            before, (b, size) = size, space.projected(b, transposed, sums=sums)
             if size < 0.7 * before:  # most of it was taken out: what is left needs its own digits
-                b = space.project(b, transposed, into=b)
-                size = norm(b)
+                b, size = space.projected(b, transposed, into=b)
         if size <= 8 * EPS * raw and start is None:
             run.status = "converged_at_roundoff" if size else "exact_zero_rhs"
             return np.zeros_like(b)
@@ -196,13 +240,12 @@ class Solver:
             run.iterations += used
             trial = step if x is None else np.add(x, step, out=step)
             trial = system.null_space.project(trial, transposed, into=trial)
-            r_trial = system.residual(trial, b, transposed)
-            reached = norm(r_trial)
+            r_trial, reached, size = system.residual(trial, b, transposed)
             fell = reached <= 0.5 * residual
             if not np.isfinite(reached):
                 trouble = "nonfinite_output"
             elif reached <= residual or x is None:
-                x, r, residual, length = trial, r_trial, reached, norm(trial)
+                x, r, residual, length = trial, r_trial, reached, size
                 word = system.accepts(residual, goal, length, data, transposed)
             if trouble or not fell or not self.engine.refines or self._is_enough(word, residual, x, data, transposed):
                 break
@@ -219,8 +262,10 @@ class Solver:
         """(x, residual, its norm, norm of x) before the first call of the engine."""
         if start is None:
             return None, b, data, 0.0
-        r = self.system.null_space.project(self.system.residual(start, b, transposed), transposed)
-        return start, r, norm(r), norm(start)
+        r, size, length = self.system.residual(start, b, transposed)
+        if self.system.null_space.count:
+            r, size = self.system.null_space.projected(r, transposed)
+        return start, r, size, length
 
     def _correction(self, r, is_data, residual, goal, transposed):
         """One call of the engine, on a residual in the middle of the range of floats."""

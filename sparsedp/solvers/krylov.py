@@ -77,6 +77,7 @@ class Krylov(Engine):
     """
 
     method = "krylov"
+    iterative = True
     overwrites = False
     precondition: Any = None
 
@@ -152,7 +153,7 @@ class Krylov(Engine):
         apply = partial(system.product, transposed=transposed)
         return gmres(apply, b, precondition, goal, tested, self.maxiter, self.restart)
 
-    def unroll(self, b, start, transposed):
+    def unroll(self, b, start, transposed, run):
         """Conjugate gradients on the tape, in the inner product in which the operator is symmetric."""
         system = self.system
         op = system.given.T if transposed else system.given
@@ -161,10 +162,13 @@ class Krylov(Engine):
         x = anp.zeros(op.domain.shape) if start is None else start
         r = b - op(x) if start is not None else b * 1.0
         p, rr = r, anp.sum(weights * r * r)
-        goal = system.rtol * norm(np.ravel(np.asarray(plain(b), dtype=float)))
+        data = norm(np.ravel(np.asarray(plain(b), dtype=float)))
+        goal = system.rtol * data
         for number in range(self.maxiter + 1):
             residual = norm(np.ravel(np.asarray(plain(r), dtype=float)))
             if residual == 0 or number == self.iterations or (self.iterations is None and residual <= goal):
+                run.iterations = number
+                run.status = "max_iterations" if residual > goal else "converged" if data else "exact_zero_rhs"
                 return x
             q = op(p)
             step = rr / anp.sum(weights * p * q)

@@ -32,6 +32,7 @@ class Linearisation:
         solver = copy(self.inv.solver)
         solver.system = copy(solver.system)
         solver.system.rtol = max(forcing, solver.system.rtol)
+        solver.observed, self.inv.solver.served = False, True  # what it leaves, the next step takes away
         try:
             return solver.solve(-F, checked=False)
         except ConvergenceError as error:

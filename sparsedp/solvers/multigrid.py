@@ -15,6 +15,7 @@ from scipy.sparse import csr_array, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sparsedp.fields import is_number, is_whole
+from sparsedp.solvers.geometric import geometric_levels
 from sparsedp.solvers.krylov import Krylov
 
 __all__ = ["Multigrid", "multigrid_engine"]
@@ -25,7 +26,9 @@ COARSEST = 100  # unknowns that are solved densely
 MAXITER = 200
 
 
-def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), ("backward",)), levels=25):
+def multigrid_engine(
+    system, *, cycle="V", strength=0.25, sweeps=(("forward",), ("backward",)), levels=25, hierarchy="algebraic"
+):
     """System -> Multigrid: conjugate gradients (GMRES when not symmetric) around one multigrid cycle.
 
     Parameters
@@ -41,6 +44,9 @@ def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), 
         Gauss-Seidel sweeps before and after the coarse correction.
     levels : int
         Most levels.
+    hierarchy : "algebraic" or "geometric"
+        Levels from the entries (Ruge-Stueben), or from pairs of cells of the grid (geometric.py): a
+        fraction of the set-up, for coefficients that are smooth and the same along all axes.
 
     Returns
     -------
@@ -49,7 +55,8 @@ def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), 
     Raises
     ------
     ValueError
-        If the diagonal has both signs or a zero, there are no entries, or an option is out of range.
+        If the diagonal has both signs or a zero, there are no entries or, for a geometric hierarchy, no
+        cells of a grid, or an option is out of range.
 
     Notes
     -----
@@ -75,7 +82,15 @@ def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), 
             f"multigrid needs a diagonal of one sign; {system.given} has {ends.min():.1e} and {ends.max():.1e}; "
             "write method='direct'"
         )
-    return Multigrid(system, CYCLES[cycle], float(strength), tuple(map(tuple, sweeps)), int(levels))
+    if hierarchy not in ("algebraic", "geometric"):
+        raise ValueError(f"hierarchy must be 'algebraic' or 'geometric', got {hierarchy!r}")
+    if hierarchy == "geometric" and (system.op.domain.grid is None or system.op.domain.kind != "cells"):
+        raise ValueError(
+            f"a geometric hierarchy needs an operator on the cells of a grid, {system.given} is not; "
+            "write hierarchy='algebraic'"
+        )
+    grid = system.op.domain.grid if hierarchy == "geometric" else None
+    return Multigrid(system, CYCLES[cycle], float(strength), tuple(map(tuple, sweeps)), int(levels), grid)
 
 
 def _are_sweeps(given):
@@ -89,9 +104,10 @@ class Multigrid(Krylov):
     """The engine: a kept hierarchy, its cycle and the transposed cycle."""
 
     method = "multigrid"
+    hierarchical = True
     unit = "cycles"
 
-    def __init__(self, system, visits, strength, sweeps, levels):
+    def __init__(self, system, visits, strength, sweeps, levels, grid=None):
         mirrored = sweeps[0] == tuple(SWEEPS[sweep] for sweep in reversed(sweeps[1]))
         use_symmetric = system.symmetric and mirrored
         super().__init__(system, of_symmetric=use_symmetric, maxiter=MAXITER)
@@ -100,7 +116,11 @@ class Multigrid(Krylov):
         if use_symmetric:
             scale = np.broadcast_to(system.sign * system.weights, system.size)
             matrix = csr_array(matrix * scale[:, None])
-        built = _ruge_stueben(matrix if use_symmetric else matrix * system.sign, strength, levels)
+        matrix = matrix if use_symmetric else matrix * system.sign
+        if grid is None:
+            built = _ruge_stueben(matrix, strength, levels)
+        else:
+            built = [Level(*level) for level in geometric_levels(matrix, grid, levels, COARSEST)]
         self.forward = Hierarchy(built, visits, *sweeps)
         self._transposed: Any = None
         self.hierarchy = self.forward.words

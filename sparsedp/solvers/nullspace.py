@@ -11,6 +11,9 @@ import numpy as np
 from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 
+from sparsedp import kernels
+from sparsedp.solvers.scaling import measured, norm
+
 __all__ = ["NullSpace", "assembled", "find_null_space"]
 
 EPS = np.finfo(float).eps
@@ -34,24 +37,32 @@ class NullSpace:
         self.labels = labels
         self.right, self.left = right, left
         self.count = count
-        self._products = self._sums(right, left)
-        self._sides = (_thin(labels, right), _thin(labels, left))
+        self._products = self._dots(right, left) if count else np.zeros(0)
+        self._sides = (_thin(labels, right), _thin(labels, left)) if count else (right, left)
 
-    def _sums(self, left, values):
-        """Sum of left * values over each component."""
+    def _sums(self, left, values, total=None):
+        """Sum of left * values over each component. `total`: that of the values, if it is known."""
+        if self.labels is None and np.isscalar(left):
+            return np.array([left * (values.sum() if total is None else total)])
         if self.labels is None:
-            return np.array([left * values.sum() if np.isscalar(left) else np.einsum("i,i->", left, values)])
+            return np.array([np.einsum("i,i->", left, values)])
         if values.dtype.kind == "c" or self.left.dtype.kind == "c":  # bincount is real
             product = left * values
             return self._binned(product.real) + 1j * self._binned(product.imag)
         return self._binned(left * values)
 
+    def _dots(self, left, values, total=None):
+        """The same where `left` is 0 beside the components."""
+        if self.labels is None or self.count != 1:
+            return self._sums(left, values, total)
+        return np.array([np.einsum("i,i->", left, values)])
+
     def _binned(self, values):
         return np.bincount(self.labels + 1, values, self.count + 1)[1:]
 
-    def sums(self, b, transposed=False):
-        """l.b on each component."""
-        return self._sums(self._sides[not transposed], b)
+    def sums(self, b, transposed=False, total=None):
+        """l.b on each component; `total` is the sum of b, if it is known."""
+        return self._dots(self._sides[not transposed], b, total)
 
     def project(self, b, transposed=False, into=None, sums=None):
         """Take out, component by component, the part along the null space. The same map for b and x.
@@ -60,16 +71,29 @@ class NullSpace:
         """
         if not self.count:
             return b
+        return self.projected(b, transposed, into, sums)[0]
+
+    def projected(self, b, transposed=False, into=None, sums=None):
+        """What `project` gives, and its norm."""
         right = self._sides[transposed]
-        shares = (self.sums(b, transposed) if sums is None else sums) / self._products
-        part = right * (shares[0] if self.labels is None else np.append(shares, 0.0)[self.labels])
-        return np.subtract(b, part, out=into)
+        real = b.dtype == np.float64 and self.right.dtype == np.float64
+        if sums is None:
+            sums = self.sums(b, transposed, measured(b)[1] if real else None)
+        shares = sums / self._products
+        if self.labels is None and np.isscalar(right) and real:
+            into = np.empty_like(b) if into is None else into
+            return into, float(np.sqrt(kernels.lowered(b, right * shares[0], into)))
+        part = right * (shares[0] if self.count == 1 else np.append(shares, 0.0)[self.labels])
+        b = np.subtract(b, part, out=into)
+        return b, norm(b)
 
     def defect(self, b, sums, size, floor, transposed=False):
         """The largest |l.b| / (|l| |b|) over the components, and the number of that component.
 
         `size` is the norm of b, `floor` a size below which |b| on a component counts as noise.
         """
+        if self.labels is None and size > floor:
+            return float(abs(sums[0]) / (size * self._lone[not transposed])), 0
         lengths = np.sqrt(self._lengths[not transposed])
         sizes = np.array([size]) if self.labels is None else np.sqrt(self._sums(np.conj(b), b).real)
         sizes = np.maximum(sizes, floor)
@@ -79,7 +103,11 @@ class NullSpace:
 
     @cached_property
     def _lengths(self):
-        return tuple(self._sums(np.conj(side), side).real for side in (self.right, self.left))
+        return tuple(self._dots(np.conj(side), side).real for side in (self.right, self.left))
+
+    @cached_property
+    def _lone(self):
+        return tuple(float(np.sqrt(lengths[0])) for lengths in self._lengths)
 
     def cells(self, number):
         """Indices of the unknowns of one component."""

@@ -14,6 +14,8 @@ derivative of any order takes one linear solve with J or J^T, and derivatives of
 """
 
 from sparsedp.derivative import pullback
+from sparsedp.ledger import active as recordings
+from sparsedp.ledger import observers, tell
 from sparsedp.solvers.choose import check_settings
 from sparsedp.solvers.equation import Equation, Layout, push, vary
 from sparsedp.solvers.jacobian import Jacobians
@@ -137,6 +139,19 @@ class Root:
     # ------------------------------------------------------------ the root as a rule of the parameters
 
     def _newton(self, equation, guess, *leaves):
+        solved = observers[-1].root if recordings and observers else Root.solved
+        x = solved(self, equation, guess, leaves)
+        if recordings:
+            tell(self.name, "method", f"Newton's method, Jacobian {self._jacobians.way or 'not needed'}")
+        return x
+
+    def corrected(self, equation, x, leaves, share, kept=0.0):
+        """One more Newton step from x, to the residual `kept`; its linear solve to the relative residual `share`."""
+        F = equation.value(x, leaves) - kept
+        return x + self._jacobians.fresh(equation, x, leaves).step(F, share) if F.any() else x
+
+    def solved(self, equation, guess, leaves):
+        """Newton's method on flat arrays, recorded in the log."""
         run = Run()
         newton = Newton(equation, leaves, self._jacobians, self.rtol, self.maxiter, run)
         try:

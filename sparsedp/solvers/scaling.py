@@ -2,15 +2,37 @@
 
 import numpy as np
 
-__all__ = ["in_range", "largest", "norm", "shifted"]
+from sparsedp import kernels
+
+__all__ = ["in_range", "largest", "measured", "norm", "remainder", "shifted"]
 
 SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve computes leaves the range of floats
 
 
 def norm(x):
-    """2-norm of a flat array, without BLAS: its threads would stall compiled kernels."""
+    """2-norm of a flat array, without threads of BLAS: they would stall compiled kernels."""
     x = x.view(float) if x.dtype.kind == "c" else x
-    return float(np.sqrt(np.einsum("i,i->", x, x)))
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
+        return float(np.sqrt(kernels.squares(x)))
+
+
+def measured(x):
+    """2-norm and sum of a flat array, in one pass; of a complex one the sum is None."""
+    if x.dtype.kind == "c":
+        return norm(x), None
+    with np.errstate(over="ignore", invalid="ignore"):
+        total, squares = kernels.totals(x)
+    return float(np.sqrt(squares)), total
+
+
+def remainder(b, out, x):
+    """out = b - out, in place -> its norm and that of x. All flat."""
+    if out.dtype.kind == "c":
+        np.subtract(b, out, out=out)
+        return norm(out), norm(x)
+    with np.errstate(over="ignore", invalid="ignore"):
+        solution, rest = kernels.remainder(b, out, x)
+    return float(np.sqrt(rest)), float(np.sqrt(solution))
 
 
 def in_range(size):

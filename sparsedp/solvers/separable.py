@@ -3,7 +3,9 @@
     A = sum over axes of (1 x F_a x 1) + shift,    F_a = S_a^-1 Q_a diag(e_a) Q_a^-1 S_a
     f(A) = (product of S_a^-1 Q_a) diag f(sum e_a + shift) (product of Q_a^-1 S_a)
 
-so one diagonalisation gives the inverse (1 / e, 0 for the null space), powers and exponentials.
+so one diagonalisation gives the inverse (1 / e, 0 for the null space), powers and exponentials. The inverse
+needs no transform along the first axis where elimination along it is as accurate and takes less time:
+T + e for each sum e of the eigenvalues of the other axes, T the factor of the first (see `Sweep`).
 """
 
 from math import prod
@@ -12,12 +14,13 @@ import numpy as np
 import scipy.fft as fft
 
 from sparsedp import kernels
-from sparsedp.solvers.axes import Axis, diagonalise
+from sparsedp.solvers.axes import Axis, diagonalise, sweep
 from sparsedp.solvers.contract import Engine
 
 __all__ = ["Separable", "Spectrum", "separable_engine", "spectrum"]
 
-WORTH_THREADS = 65536  # unknowns below which a second thread costs more than it brings
+WORTH_THREADS = 131072  # unknowns below which a second thread costs more than it brings
+WIDE_COMPILED, WIDE_PLAIN = 16, 1024  # modes from which elimination along the first axis beats transforms
 ZERO = 4 * np.finfo(float).eps  # a sum of eigenvalues below this share of the largest one is 0
 
 
@@ -29,7 +32,7 @@ class Spectrum:
     shape : tuple
     axes : tuple of Axis
     eigenvalues : array
-        Sum over the axes, in the shape of the coefficients (the last Fourier axis is halved).
+        Sum over the axes, in the shape of the coefficients (the last Fourier axis is halved), or one line of it.
     """
 
     def __init__(self, shape, axes, shift):
@@ -37,6 +40,8 @@ class Spectrum:
         self.fourier = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier")
         total = np.full((1,) * len(shape), float(shift))
         for a, axis in enumerate(axes):
+            if a == 0 and len(axes) > 1 and not np.any(axis.eigenvalues):
+                continue  # one line of sums serves all
             values = axis.eigenvalues[: shape[a] // 2 + 1] if self.fourier[-1:] == (a,) else axis.eigenvalues
             total = total + values.reshape([-1 if b == a else 1 for b in range(len(shape))])
         largest = sum(np.max(np.abs(axis.eigenvalues)) for axis in axes) + abs(shift)
@@ -50,19 +55,29 @@ class Spectrum:
         return 1.0 if any(axis.kind == "eigenvectors" for axis in self.axes) else 0.25
 
     def apply(self, weights, x, transposed=False):
-        """f(A) x for the given values of f on the eigenvalues. x may be overwritten."""
-        x = x.reshape(self.shape)
+        """f(A) x for the given values of f on the eigenvalues, as a fresh array."""
+        y = self.forward(x, transposed)
+        y *= weights
+        return self.backward(y, transposed)
+
+    def forward(self, x, transposed):
+        """Flat field -> its coefficients, as a fresh array."""
+        x, fresh = x.reshape(self.shape), False
         for a, axis in enumerate(self.axes):
-            x = axis.forward(x, a, transposed, self.workers)
+            if axis.kind not in ("identity", "fourier"):  # Fourier axes are transformed together
+                x, fresh = axis.forward(x, a, transposed, self.workers, fresh), True
         if self.fourier:
-            x = fft.rfftn(x, axes=self.fourier, overwrite_x=True, workers=self.workers)
-        x *= weights
+            return fft.rfftn(x, axes=self.fourier, workers=self.workers)
+        return x if fresh else x.copy()
+
+    def backward(self, y, transposed):
+        """Coefficients -> flat field. May overwrite y."""
         if self.fourier:
             lengths = [self.shape[a] for a in self.fourier]
-            x = fft.irfftn(x, s=lengths, axes=self.fourier, overwrite_x=True, workers=self.workers)
+            y = fft.irfftn(y, s=lengths, axes=self.fourier, overwrite_x=True, workers=self.workers)
         for a in reversed(range(len(self.axes))):
-            x = self.axes[a].backward(x, a, transposed, self.workers)
-        return x.reshape(-1)
+            y = self.axes[a].backward(y, a, transposed, self.workers)
+        return y.reshape(-1)
 
     def inverse_weights(self):
         """1 / eigenvalues, and 0 for the null space."""
@@ -105,6 +120,7 @@ class Separable(Engine):
 
     method = "separable"
     unit = "refinements"
+    overwrites = False
 
     def __init__(self, found):
         self.spectrum = found
@@ -113,6 +129,39 @@ class Separable(Engine):
 
     def solve(self, b, goal, transposed):
         return self.spectrum.apply(self.weights, b, transposed), 0, ""
+
+
+class Swept(Engine):
+    """The engine: forward transforms along all axes but the first, elimination, backward transforms."""
+
+    method = "separable"
+    unit = "refinements"
+    overwrites = False
+
+    def __init__(self, found, elimination):
+        self.spectrum, self.elimination = found, elimination
+        self.hierarchy = f"elimination({found.shape[0]}) x {found.words.split(' x ', 1)[1]}"
+
+    def solve(self, b, goal, transposed):
+        y = self.spectrum.forward(b, transposed)
+        numbers = y.view(float) if y.dtype.kind == "c" else y
+        self.elimination.solve(numbers.reshape(len(y), -1), transposed)
+        return self.spectrum.backward(y, transposed), 0, ""
+
+
+def _swept(structure, found):
+    """The engine that spares the transforms along the first axis, or None when they are as good."""
+    first, modes = found.shape[0], found.eigenvalues[0].size
+    terms = [term for term in structure.blocks.get((0, 0), ()) if term.axes == (0,)]
+    if not terms or first < 3 or modes < (WIDE_COMPILED if kernels.compiled() else WIDE_PLAIN):
+        return None
+    rest = Spectrum(found.shape, (Axis("identity", np.zeros(first)), *found.axes[1:]), found.shift)
+    sums = rest.eigenvalues[0].reshape(-1)
+    if rest.fourier:
+        sums = np.repeat(sums, 2)  # real and imaginary parts
+    (term,) = terms
+    elimination = sweep(term.factors[0].scaled(term.scale), sums)
+    return None if elimination is None else Swept(rest, elimination)
 
 
 def separable_engine(system):
@@ -131,4 +180,4 @@ def separable_engine(system):
     found = spectrum(structure) if getattr(structure, "separable", False) and system.active is None else None
     if found is None:
         raise ValueError(f"separable needs a sum of 1-D factors that can be diagonalised, got {system.given}")
-    return Separable(found)
+    return _swept(structure, found) or Separable(found)

@@ -118,7 +118,7 @@ class Inverse(Operator):
         diff="unrolled" of krylov, the iterations themselves are differentiated, in b and in `start`.
         """
         if self.solver.engine.unrolled:
-            return self.solver.engine.unroll(b, start, self.structure.transposed)
+            return self.solver.unroll(b, start, self.structure.transposed)
         if start is None:
             return super().__call__(b)
         if np.shape(start) != self.codomain.shape:

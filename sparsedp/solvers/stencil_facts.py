@@ -5,7 +5,7 @@ from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sparsedp.solvers.nullspace import assembled
+from sparsedp.solvers.nullspace import NullSpace, assembled
 
 __all__ = ["components_of_stencil", "null_space_of_stencil"]
 
@@ -85,8 +85,10 @@ def null_space_of_stencil(stencil, labels, count, active):
     """
     size, volumes = stencil.grid.cells.size, stencil.grid.volumes.reshape(-1)
     held = stencil.extra.reshape(-1) > 0
+    if size and labels is None and held.any():
+        return NullSpace(None, np.zeros(size), np.zeros(size), 0)
     if labels is None:
-        singular = np.array([size > 0 and not held.any()])
+        singular = np.array([size > 0])
         chosen = np.full(size, singular[0])
     else:
         labels = labels if active is None else np.where(active, labels, count)

@@ -9,8 +9,9 @@ import numpy as np
 from sparsedp.kernels import multigrid_pack as pack
 from sparsedp.kernels import multigrid_setup, multigrid_setup3d
 from sparsedp.kernels.multigrid_cycle import AGAIN, DENSE, DOWN, SUM, UP
-from sparsedp.kernels.multigrid_pack import inside, packed, padded, repeat, width
-from sparsedp.solvers.stencil_coarsest import Natural, dense_inverse, merged, own_steps, steps
+from sparsedp.kernels.multigrid_diagonal import diagonal
+from sparsedp.kernels.multigrid_pack import packed, padded, repeat, width
+from sparsedp.solvers.stencil_coarsest import Natural, dense_inverse, merged, steps
 
 __all__ = ["Coarse", "Fine", "Levels", "Size", "half_shape"]
 
@@ -107,12 +108,12 @@ class Levels:
         while len(self.shapes) <= coarsenings:
             self.shapes.append(half_shape(self.shapes[-1]))
         self.table, self.parts = self._allocate(finest.periodic)
+        self.weak_share = 0.0  # largest share of cells that are held much weaker along one axis than another
         scale, root = self._scales(finest, False)
         self.size = self._size(self._deep(root), widths, unit)
         fine = self._finest(finest, scale)
-        level, self.weak_share = finest, 0.0
+        level = finest
         for number in range(len(self.shapes) - 1):
-            self._examine(level, number > 0)
             target = (fine.weights, fine.starts) if number == 0 else self._weights_of(number - 1)
             level, scale, root = self._next(level, scale, root, number, target)
         self.fine = fine
@@ -127,7 +128,7 @@ class Levels:
 
     def _deep(self, array):
         """Natural array -> 3-D."""
-        return array.reshape(array.shape[0], 1, array.shape[1]) if self.dim == 2 else array
+        return np.expand_dims(array, -2) if self.dim == 2 else array
 
     # ------------------------------------------------------------ sizes
 
@@ -210,7 +211,11 @@ class Levels:
     def _scales(self, level, nine):
         """One over the root of the diagonal, and the root; 0 where there is no unknown."""
         scale, root = padded(level.shape), padded(level.shape)
-        self.setup.scales(level.links, level.extra, scale, root, nine)
+        arrays = map(self._deep, (level.links, level.extra, scale, root))
+        links, *cells = arrays
+        weak = diagonal(links, np.array(steps(self.dim, nine)), *cells, WEAK, self.dim - 2)
+        if prod(level.shape) >= EXAMINED:
+            self.weak_share = max(self.weak_share, weak / prod(level.shape))
         return repeat(scale, level.shape, level.periodic), root
 
     def _finest(self, level, scale):
@@ -232,7 +237,7 @@ class Levels:
         weights = self.setup.weights(level.links, level.extra, scale, root, level.shape, level.periodic, number > 0)
         shape = half_shape(level.shape)
         links, extra = padded(shape, len(steps(self.dim, True))), padded(shape)
-        self.setup.galerkin(level.links, level.extra, weights, links, extra, level.periodic, number > 0)
+        self.setup.coarsen(level.links, level.extra, weights, links, extra, level.periodic, number > 0)
         free = level.free[(slice(None, None, 2),) * self.dim]
         coarse = merged(Natural(shape, level.periodic, links, extra, free))
         coarse_scale, coarse_root = self._scales(coarse, True)
@@ -240,18 +245,6 @@ class Levels:
         self._pack_weights(out, starts, weights, coarse_scale, root, level, number > 0)
         self._pack_links(coarse, coarse_scale, self.table[number])
         return coarse, coarse_scale, coarse_root
-
-    def _examine(self, level, nine):
-        """Keep the largest share of cells that are held much weaker along one axis than along another."""
-        if prod(level.shape) < EXAMINED:
-            return
-        own, held = inside(level.shape), np.zeros((self.dim, *level.shape))
-        for step, a in zip(own_steps(self.dim, nine), level.links):
-            there = a[own] + a[tuple(slice(1 - d, 1 - d + n) for d, n in zip(step, level.shape))]
-            for axis in np.flatnonzero(step):
-                held[axis] += there
-        weak = held.min(axis=0) < WEAK * held.max(axis=0)
-        self.weak_share = max(self.weak_share, np.count_nonzero(weak) / weak.size)
 
     def _pack_links(self, level, scale, row):
         first, size = row[14], 2 * row[3] * row[4]

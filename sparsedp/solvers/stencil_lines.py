@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.solvers.stencil import Stencil, cleaned
+from sparsedp.solvers.stencil import CLEAN, Stencil, cleaned
+from sparsedp.structure.base import Scaled
 from sparsedp.structure.kronecker import Kronecker
-from sparsedp.structure.lazy import Diagonal
+from sparsedp.structure.lazy import Chain, Diagonal
 
-__all__ = ["of_lines", "read_lines"]
+__all__ = ["Faces", "faces_of", "of_lines", "read_lines"]
 
 
 class Lines(NamedTuple):
@@ -51,8 +52,11 @@ def _of_axis(left, right, grid, axis):
         return None
     (d_below, d_above), (g_below, g_above), h = areas, slopes, grid.widths[axis]
     d_below, d_above = d_below * np.take(h, np.arange(faces) - 1, mode="wrap"), d_above * np.append(h, h)[:faces]
+    one, two = d_below * g_above, d_above * g_below
+    if not np.all(np.abs(one - two) <= CLEAN * np.abs(one)):  # not symmetric
+        return None
     linked = (g_below != 0) & (g_above != 0)
-    link = np.where(linked, -0.5 * (d_below * g_above + d_above * g_below), 0.0)
+    link = np.where(linked, -0.5 * (one + two), 0.0)
     size = np.abs(link)
     return Lines(link, cleaned(d_below * g_below - link, size), cleaned(d_above * g_above - link, size))
 
@@ -70,15 +74,13 @@ def _beside(factor, scale, n, faces, periodic):
     return below, above
 
 
-def of_lines(lines, k, grid):
-    """Lines of each axis and one value for each face -> Stencil of V D diag(k) G."""
+def of_lines(lines, k, grid, unit=1.0):
+    """Lines of each axis and one value for each face -> Stencil of `unit` V D diag(k) G."""
     links, extra = [], np.zeros(grid.shape)
     for axis, part in enumerate(grid.split(k)):
         line, faces = lines[axis], np.moveaxis(part, axis, 0)
-        area = np.take(np.moveaxis(grid.volumes, axis, 0), 0, 0) / grid.widths[axis][0]
-        if area.size and np.all(area == area.flat[0]):
-            area = area.flat[0]
-        links.append(np.moveaxis(_along(line.link, faces) * area, 0, axis))
+        area = unit * _area(grid, axis)
+        links.append(np.moveaxis(_along(line.link, faces, area), 0, axis))
         cells = np.moveaxis(extra, axis, 0)
         for values, shift in ((line.below, -1), (line.above, 0)):
             for f in np.flatnonzero(values):
@@ -86,10 +88,101 @@ def of_lines(lines, k, grid):
     return Stencil(grid, tuple(links), extra)
 
 
-def _along(line, faces):
-    """line[f] * faces[f, ...]."""
-    if line.size > 2 and np.all(line[1:-1] == line[1]):  # equal cells: one number, and the two ends
-        out = faces * line[1]
-        out[0], out[-1] = faces[0] * line[0], faces[-1] * line[-1]
+def _area(grid, axis):
+    """Areas of the faces across an axis: one number where they are equal."""
+    others = [h for other, h in enumerate(grid.widths) if other != axis]
+    if grid.cells.size and all(np.all(h == h[0]) for h in others):
+        return float(np.prod([h[0] for h in others]))
+    return others[0][:, None] * others[1] if len(others) > 1 else others[0]
+
+
+def _along(line, faces, area):
+    """line[f] * faces[f, ...] * area."""
+    if line.size > 2 and np.isscalar(area) and np.all(line[1:-1] == line[1]):  # equal cells: one number, and two ends
+        out = faces * (line[1] * area)
+        out[0], out[-1] = faces[0] * (line[0] * area), faces[-1] * (line[-1] * area)
         return out
-    return faces * line.reshape((-1,) + (1,) * (faces.ndim - 1))
+    return faces * (line.reshape((-1,) + (1,) * (faces.ndim - 1)) * area)
+
+
+class Faces:
+    """An operator shift + factor D diag(k) G whose coefficients are known, with k >= 0: it needs no probing.
+
+    Parameters
+    ----------
+    grid : Grid
+    lines : Lines of each axis
+    k : array
+        A field on the faces.
+    factor, shift : float
+    """
+
+    def __init__(self, grid, lines, k, factor=1.0, shift=0.0):
+        self.grid, self.lines, self.k, self.factor, self.shift = grid, lines, k, factor, shift
+        self.smallest, self.largest = float(k.min()), float(k.max())
+        self.sizes = [
+            float(np.max(np.abs(line.link)) + np.max(np.abs(line.below) + np.abs(line.above))) for line in lines
+        ]
+
+    @property
+    def usable(self):
+        """Whether it is what multigrid takes: links of the right sign, none below 0."""
+        signed = [self.factor * part for line in self.lines for part in line]
+        return 0 <= self.smallest <= self.largest < np.inf and all(np.all(v >= 0) for v in signed) and self.shift >= 0
+
+    @property
+    def connected(self):
+        """Whether every cell is linked to all of its neighbours."""
+        return self.smallest > 0 and self.grid.cells.size > 1 and all(map(np.all, self._between))
+
+    @property
+    def held(self):
+        """Whether something holds the level, where `connected`."""
+        return self.shift > 0 or any(np.any(line.below != 0) or np.any(line.above != 0) for line in self.lines)
+
+    @property
+    def _between(self):
+        """The links of each axis without those of walls."""
+        return [line.link if flag else line.link[1:-1] for line, flag in zip(self.lines, self.grid.periodic)]
+
+    def within(self, exponent):
+        """Whether |A|_inf is certainly between 2^-exponent and 2^exponent."""
+        least = [np.min(np.abs(part)) / np.max(h) for part, h in zip(self._between, self.grid.widths) if part.size]
+        low = abs(self.factor) * self.smallest * min(least, default=0.0)
+        most = max(size / np.min(h) for size, h in zip(self.sizes, self.grid.widths))
+        high = 8 * self.grid.dim * abs(self.factor) * self.largest * most + abs(self.shift)
+        return 2.0**-exponent < low and high < 2.0**exponent
+
+    def stencil(self):
+        """The stencil, near 1."""
+        areas = [np.max(_area(self.grid, axis), initial=0.0) for axis in range(self.grid.dim)]
+        most = self.largest * max(size * area for size, area in zip(self.sizes, areas))
+        shift = self.shift * np.max(areas) if self.shift else 0.0
+        scale = 2.0 ** -int(np.frexp(max(most, shift))[1])
+        links = of_lines(self.lines, self.k, self.grid, scale * self.factor)
+        if self.shift:
+            links = links._replace(extra=links.extra + scale * self.shift * self.grid.volumes)
+        return links._replace(scale=scale)
+
+
+def faces_of(structure, grid, factor=1.0):
+    """Structure -> Faces, or None where it is not of that kind."""
+    if isinstance(structure, Scaled):
+        found = faces_of(structure.inner, grid, factor * structure.factor)
+    elif isinstance(structure, Chain) and structure.members[0].shape == (grid.cells.size, grid.faces.size):
+        found = _faces(structure.members, grid, factor)
+    elif hasattr(structure, "assembly"):  # shift - D diag(k) G
+        D, G = structure.assembly.D.structure, structure.assembly.G.structure
+        D, G = (G.transpose(), D.transpose()) if structure.transposed else (D, G)
+        found = _faces((D, Diagonal(structure.k), G), grid, -factor, factor * structure.shift)
+    else:
+        return None
+    return found if found is not None and found.usable else None
+
+
+def _faces(members, grid, factor, shift=0.0):
+    read = read_lines(members[0], members[1:-1], members[-1], grid)
+    numbers = () if read is None else (factor, read[1], *(line.link for line in read[0]))
+    if not numbers or any(np.iscomplexobj(values) for values in numbers) or not read[1].size:
+        return None
+    return Faces(grid, read[0], read[1], factor, shift)

@@ -34,23 +34,18 @@ def stencil_of(system):
     Notes
     -----
     Known are sums of multiples of: D diag(...) G with any D, G between cells and faces that reach over one
-    face; Kronecker sums of three-point factors; diagonals; matrices. The result is compared with the
-    operator on a random field, so nothing is taken for granted.
+    face; Kronecker sums of three-point factors; diagonals; matrices. Where coefficients of faces are known the
+    stencil is written down from them; else the result is compared with the operator on a random field.
     """
-    grid = _grid(system)
-    stencil = _read(system.op.structure, grid, grid.volumes).checked()
+    if system.grid is None:
+        raise Unfit("it does not act on the cells of a grid")
+    if system.grid.dim == 1:
+        raise Unfit("the grid is 1-D")
+    if system.faces is not None:
+        return system.faces.stencil()
+    stencil = _read(system.op.structure, system.grid, system.grid.volumes).checked()
     _compare(stencil, system)
     return stencil
-
-
-def _grid(system):
-    grid = system.op.domain.grid or system.op.codomain.grid
-    kinds = {space.kind for space in (system.op.domain, system.op.codomain) if space.grid is not None}
-    if grid is None or kinds != {"cells"}:
-        raise Unfit("it does not act on the cells of a grid")
-    if grid.dim == 1:
-        raise Unfit("the grid is 1-D")
-    return facts.rescaled(grid)
 
 
 def _compare(stencil, system):

@@ -85,10 +85,17 @@ def _built(system, dtype):
     from sparsedp.solvers.stencil_facts import components_of_stencil, null_space_of_stencil
     from sparsedp.solvers.stencil_reading import stencil_of
 
-    stencil = stencil_of(system)
-    system.components = labels, count = components_of_stencil(stencil, system.active)
+    stencil, faces = stencil_of(system), system.faces
+    if faces is not None and faces.connected:
+        system.components = labels, count = None, 1
+    else:
+        system.components = labels, count = components_of_stencil(stencil, system.active)
     system.null_space = null_space_of_stencil(stencil, labels, count, system.active)
-    return Structured(stencil, system.null_space.right > 0, system.maxiter, dtype)
+    free = system.null_space.right > 0 if system.null_space.count else np.zeros(system.size, bool)
+    engine = Structured(stencil, free, system.maxiter, dtype)
+    if system.grid.cells.size and all(system.grid.uniform):
+        system.norms = engine.size.norm, engine.size.norm
+    return engine
 
 
 class Structured(Engine):
@@ -105,6 +112,7 @@ class Structured(Engine):
     """
 
     method = "structured"
+    iterative = hierarchical = True
     overwrites = False
 
     def __init__(self, stencil, free, maxiter=None, dtype=np.float32):
@@ -142,7 +150,10 @@ class Structured(Engine):
         with self.lock:
             run = _Run(self, b, goal, transposed)
             word, used = run.iterate()
-            return run.solution(), used, word
+            solution = run.solution()
+            for vector in self.vectors if word else ():  # the next solve multiplies them by 0
+                vector[:] = 0.0
+            return solution, used, word
 
 
 class _Run:
@@ -163,8 +174,7 @@ class _Run:
         self.gauge = engine.size.gauge[transposed]
         self.x, self.r, self.q = engine.wide_vectors
         self.z, self.p, self.old = engine.vectors
-        for vector in (self.x, self.p, self.old):
-            vector[:] = 0.0
+        self.x[:] = 0.0
         self.tail = engine.totals, engine.sums, teams
         self.field = engine.rings[0], engine.line, teams
         self.steps = 0.0, 0.0  # what is still to be added to x, of p and of old

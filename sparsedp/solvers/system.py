@@ -8,7 +8,9 @@ import scipy.sparse as sp
 from sparsedp.errors import NonFiniteError
 from sparsedp.operator import Operator
 from sparsedp.solvers import facts
+from sparsedp.solvers.mirrored import factor_symmetric, matrix_symmetric, pinned
 from sparsedp.solvers.nullspace import ROUNDING, find_null_space
+from sparsedp.solvers.scaling import remainder
 from sparsedp.space import Space
 from sparsedp.structure.explicit import Matrix
 from sparsedp.structure.kronecker import Kronecker
@@ -41,12 +43,13 @@ class System:
         self.size = op.domain.size
         self.rtol, self.maxiter = rtol, maxiter
         self.exponent = 0
-        exponent = int(np.frexp(self.norm(False))[1])
+        known = self.faces is not None and self.faces.within(FAR - 1)
+        exponent = 0 if known else int(np.frexp(self.norm(False))[1])
         if abs(exponent) > FAR:
             self.exponent = int(np.clip(exponent, -1000, 1000))
             self.op = op * 2.0**-self.exponent
             _check_kept(op, self.op)
-            for name in ("_magnitudes", "sums"):
+            for name in ("_magnitudes", "sums", "norms", "faces"):
                 self.__dict__.pop(name, None)
 
     # ------------------------------------------------------------ products
@@ -71,9 +74,24 @@ class System:
         return form, form.T
 
     def residual(self, x, b, transposed=False):
-        """b - A x for the unknowns, as a fresh array; b is 0 elsewhere."""
-        r = self.product(x, transposed)
-        return np.subtract(b, r, out=r)
+        """(b - A x for the unknowns, fresh; its norm; that of x). b is 0 elsewhere."""
+        return (r := self.product(x, transposed)), *remainder(b, r, x)
+
+    @cached_property
+    def grid(self):
+        """Grid of the cells that a square operator acts on, lengths divided by powers of two; or None."""
+        grid = self.op.domain.grid or self.op.codomain.grid
+        kinds = {space.kind for space in (self.op.domain, self.op.codomain) if space.grid is not None}
+        return facts.rescaled(grid) if grid is not None and kinds == {"cells"} else None
+
+    @cached_property
+    def faces(self):
+        """The coefficients of the faces, where the operator is made of them and no probing is needed; else None."""
+        if self.grid is None or self.grid.dim == 1:
+            return None
+        from sparsedp.solvers.stencil_lines import faces_of
+
+        return faces_of(self.op.structure, self.grid)
 
     @cached_property
     def complex(self):
@@ -99,7 +117,12 @@ class System:
 
     def norm(self, transposed=False):
         """|A|_inf (|A^T|_inf), or an upper bound of it."""
-        return float(np.max(self.sums[transposed], initial=0.0))
+        return self.norms[transposed]
+
+    @cached_property
+    def norms(self):
+        """|A|_inf and |A^T|_inf. An engine builder may set them."""
+        return tuple(float(np.max(sums, initial=0.0)) for sums in self.sums)
 
     # ------------------------------------------------------------ unknowns
 
@@ -110,6 +133,8 @@ class System:
         What no row reads (a column without entries: solid cells, coefficients that are 0) is not an
         unknown: it is 0 in every solution, and its equation is left out.
         """
+        if self.faces is not None and self.faces.connected:
+            return None
         read = self.sums[True] > 0
         return None if read.all() else read
 
@@ -121,6 +146,8 @@ class System:
     @cached_property
     def empty_row(self):
         """The first unknown whose row has no entries, or None."""
+        if self.faces is not None and self.faces.connected:
+            return None
         sums = self.sums[False] if self.active is None else self.magnitude(self.active.astype(float))
         empty = sums == 0 if self.active is None else (sums == 0) & self.active
         return int(np.argmax(empty)) if empty.any() else None
@@ -176,7 +203,7 @@ class System:
         grid = (self.op.domain if self.op.domain.grid is not None else self.op.codomain).grid
         for power in (0.0, 1.0, -1.0):
             widths = None if grid is None else grid.widths
-            if all(_factor_symmetric(term, widths, power) for term in self.op.structure.blocks.get((0, 0), ())):
+            if all(factor_symmetric(term, widths, power) for term in self.op.structure.blocks.get((0, 0), ())):
                 uniform = power == 0 or np.all(self.volumes == self.volumes[:1])
                 return 1.0 if uniform else self.volumes**power
         return None
@@ -184,7 +211,7 @@ class System:
     def _symmetric_with(self, weights):
         if isinstance(self.op.structure, Matrix) or "entries" in self.__dict__:
             scaled = self.matrix * (weights if np.isscalar(weights) else weights[:, None])
-            return _matrix_symmetric(sp.csr_array(scaled))
+            return matrix_symmetric(sp.csr_array(scaled))
         return self._symmetric_to_probes(weights)
 
     def _symmetric_to_probes(self, weights):
@@ -263,34 +290,6 @@ class System:
         """The residual that rounding leaves, row by row: well below the bound with |A|_inf on stretched grids."""
         rows = self.magnitude(np.abs(x), transposed)
         return np.finfo(float).eps * (float(np.sqrt(rows @ rows)) + data)
-
-
-def pinned(matrix, flags):
-    """Matrix -> copy whose flagged rows and columns are those of the identity, scaled to its entries."""
-    row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-    keep = ~(flags[row] | flags[matrix.indices])
-    size = matrix.diagonal()[~flags]
-    largest = size[np.argmax(np.abs(size))] if size.size and np.any(size) else 1.0
-    kept = sp.csr_array((matrix.data * keep, matrix.indices, matrix.indptr), shape=matrix.shape)
-    result = sp.csr_array(kept + sp.diags_array(np.where(flags, largest, 0.0), format="csr"))
-    result.eliminate_zeros()
-    return result
-
-
-def _factor_symmetric(term, widths, power):
-    for axis in term.axes:
-        factor = term.factors[axis].matrix
-        scale = np.ones(factor.shape[0]) if widths is None else widths[axis] ** power
-        if not _matrix_symmetric(sp.csr_array(factor * scale[:, None])):
-            return False
-    return True
-
-
-def _matrix_symmetric(matrix):
-    """Whether the entries equal their mirror images up to rounding."""
-    turned = matrix.T.tocsr()
-    excess = abs(matrix - turned) - ROUNDING * (abs(matrix) + abs(turned))
-    return excess.nnz == 0 or float(excess.max()) <= 0
 
 
 def _check_kept(op, scaled):

@@ -3,9 +3,10 @@
 import numpy as np
 from scipy.sparse._sparsetools import csr_matvec
 
+from sparsedp.ledger import active, count
 from sparsedp.structure.base import Structure, compact
 
-__all__ = ["Matrix"]
+__all__ = ["Matrix", "assembled"]
 
 
 class Matrix(Structure):
@@ -44,3 +45,10 @@ class Matrix(Structure):
 
     def scaled(self, factor):
         return Matrix(self.matrix * factor)
+
+
+def assembled(structure, name):
+    """Structure -> its entries as a Matrix, counted under the name of the operator."""
+    if active:
+        count(name, "assembled")
+    return Matrix(structure.explicit())

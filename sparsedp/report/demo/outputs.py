@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 
-from sparsedp.report import plots
+from sparsedp.report import charts, plots
 
 __all__ = ["PICTURES", "claim", "write_arrays", "write_pictures"]
 
@@ -118,7 +118,7 @@ def _convergence(trials):
             )
             for trial in trials
         }
-        plots.curves(lines, ax, "run time [s]", name)
+        charts.curves(lines, ax, "run time [s]", name)
     left.axhline(1.0, color="0.5", linestyle=":", linewidth=1)
     left.set_title("How well the readings are met (1: to the noise)")
     right.set_title("How well the ground is found (flat start: 1)")

@@ -1,0 +1,77 @@
+"""Operators of Poisson's equation that the benchmarks solve: -div k grad on boxes, and what makes it hard."""
+
+import numpy as np
+
+import sparsedp as dp
+
+__all__ = ["ANISOTROPIC", "JUMPS", "VARIABLE", "conductance", "wind"]
+
+
+def conductance(k, size=1.0, boundary=dp.dirichlet):
+    """Coefficient on the cells -> -div k grad, with the harmonic averages on the faces."""
+    grid = dp.Grid(k.shape, size=size)
+    faces = dp.diagonal(grid.faces, dp.harmonic_average(grid)(k))
+    return -dp.divergence(grid) @ faces @ dp.gradient(grid, boundary)
+
+
+def smooth(shape):
+    """k between 0.1 and 1.9, without jumps."""
+    return conductance(1 + 0.9 * np.prod([np.sin(9 * x) for x in dp.Grid(shape, size=1.0).centres()], axis=0))
+
+
+def masked(shape):
+    """k = 1 around nine solid balls without flux."""
+    grid = dp.Grid(shape, size=1.0)
+    x, y = grid.centres()[:2]
+    solid = (x % (1 / 3) - 1 / 6) ** 2 + (y % (1 / 3) - 1 / 6) ** 2 < 0.01
+    return -dp.laplacian(grid, dp.dirichlet, solid)
+
+
+def inclusions(shape):
+    """Twelve balls in which k is a million times larger."""
+    generator, places = np.random.default_rng(1), dp.Grid(shape, size=1.0).centres()
+    k = np.ones(shape)
+    for _ in range(12):
+        middle, radius = generator.random(len(shape)), generator.uniform(0.04, 0.1)
+        k[sum((x - c) ** 2 for x, c in zip(places, middle, strict=True)) < radius**2] = 1e6
+    return conductance(k)
+
+
+def layers(shape):
+    """One row in seven with k a million times smaller."""
+    return conductance(np.where(np.arange(shape[0])[:, None] % 7, 1.0, 1e-6) * np.ones(shape))
+
+
+def checkerboard(shape):
+    """Eight by eight fields, k = 1 and 1e6."""
+    x, y = dp.Grid(shape, size=1.0).centres()
+    return conductance(np.where((np.floor(8 * x) + np.floor(8 * y)) % 2, 1e6, 1.0))
+
+
+def random_decades(shape):
+    """k of every cell drawn from eight decades."""
+    return conductance(10.0 ** np.random.default_rng(0).uniform(-4, 4, shape))
+
+
+def anisotropic(shape):
+    """Along one axis k = 1, along the other 1e-6."""
+    grid = dp.Grid(shape, size=1.0)
+    weights = dp.diagonal(grid.faces, grid.join(1.0, 1e-6))
+    return -dp.divergence(grid) @ weights @ dp.gradient(grid, dp.dirichlet)
+
+
+def flat_cells(shape):
+    """Cells ten thousand times as long as high."""
+    return -dp.laplacian(dp.Grid(shape, size=(1.0, 1e-4)), dp.dirichlet)
+
+
+def wind(shape, strength=20.0):
+    """Upwind advection across the box, and diffusion: not symmetric."""
+    grid = dp.Grid(shape, size=1.0)
+    flow = strength * (dp.upwind(grid, 0, 1, dp.dirichlet) + 0.5 * dp.upwind(grid, 1, -1, dp.dirichlet))
+    return flow - dp.laplacian(grid, dp.dirichlet)
+
+
+VARIABLE = {"smooth k": smooth, "masks": masked}
+JUMPS = {"inclusions": inclusions, "layers": layers, "checkerboard": checkerboard, "random decades": random_decades}
+ANISOTROPIC = {"k ratio 1e-6": anisotropic, "cell aspect 1e4": flat_cells}

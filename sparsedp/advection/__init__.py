@@ -1,0 +1,1 @@
+"""Transport of a field by a velocity: one differentiable rule for each scheme."""

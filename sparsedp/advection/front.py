@@ -1,0 +1,248 @@
+"""transport: a field carried by a velocity for one time step. The schemes are laws in files of their own."""
+
+import numpy as np
+
+from sparsedp.advection.law import Law, Setting
+from sparsedp.advection.maccormack import MacCormack
+from sparsedp.advection.rule import rule_of
+from sparsedp.advection.semi_lagrangian import SemiLagrangian
+from sparsedp.advection.step import Step
+from sparsedp.advection.still import Still
+from sparsedp.advection.upwind import Upwind
+from sparsedp.advection.values import check_step, flat_numbers
+from sparsedp.advection.van_leer import VanLeer
+from sparsedp.conditions import dirichlet, neumann, resolve
+from sparsedp.errors import DerivativeError
+from sparsedp.grid import Grid
+from sparsedp.operator import Operator
+from sparsedp.operators.boundary import check_solid
+from sparsedp.structure.explicit import Matrix
+from sparsedp.tape import Rule, isbox
+
+__all__ = ["Transport", "transport"]
+
+LAWS = {"upwind": Upwind, "van_leer": VanLeer, "semi_lagrangian": SemiLagrangian, "maccormack": MacCormack}
+CHOICES = {
+    "velocity": ("faces", "cells"),
+    "of": ("cells", "faces"),
+    "form": (None, *dict.fromkeys(form for law in LAWS.values() for form in law.forms)),
+    "interpolation": ("linear", "cubic"),
+    "unstable": ("raise", "allow"),
+}
+
+
+def transport(
+    grid,
+    scheme="upwind",
+    boundary=neumann,
+    velocity="faces",
+    of="cells",
+    interpolation="linear",
+    form=None,
+    solid=None,
+    unstable="raise",
+):
+    """Grid -> one time step of transport, ``move(u, v, dt, inflow=0.0)``, differentiable in all four.
+
+    Parameters
+    ----------
+    grid : Grid
+    scheme : "upwind", "van_leer", "semi_lagrangian" or "maccormack"
+        upwind: donor cell, first order, linear in u, derivatives of every order; CFL number at most 1.
+        van_leer: limited slopes and two stages, second order where the field is smooth and has no extremum,
+        first derivatives; the sum of the CFL numbers at most 1/2.
+        semi_lagrangian: each point takes the value of the place its content comes from; any dt, linear in u,
+        keeps constants, does not conserve sums. maccormack: a step there and back, and half of what that
+        misses added, second order. Both on cells of equal width, first derivatives (in u alone any).
+    boundary : condition, or dict of conditions
+        Where the velocity points inwards: dirichlet brings in `inflow`, neumann the value of the
+        point at the wall. Outwards the field leaves in both cases. A closed wall is a velocity of 0 there.
+        semi_lagrangian, maccormack: these values stand one spacing beyond the last point and further out.
+    velocity : "faces" or "cells"
+        "faces": v is a flat face field. "cells": v has the shape (dim, *grid.shape), in 1-D also grid.shape.
+    of : "cells" or "faces"
+        What u is: a cell field, or a flat face field each component of which is carried. The velocity is
+        then interpolated to the control volumes of the faces (half cells at walls), linearly between
+        cells, as the mean inside a cell, and with the flow through both half cells along a side.
+    interpolation : "linear" or "cubic"
+        Of semi_lagrangian and maccormack. linear: order 1, no new extrema. cubic (Catmull-Rom): order 2 to 3
+        where the field is smooth, small new extrema.
+    form : str, optional
+        flux: du/dt = -div(v u), conserves the sum of u times volume. advective: du/dt = -v . grad u,
+        keeps constants. Default: flux for a velocity on faces, advective for one on cells.
+        semi_lagrangian: how a point looks back, "euler" (default) along its own velocity or "midpoint" along
+        the one half way. maccormack: "clamped" (default) to the least and greatest sample of the cell the
+        content comes from, "unclamped", "clamped midpoint", "unclamped midpoint".
+    solid : bool array, shape grid.shape, optional
+        Nothing passes through a face that touches a solid cell; what is in solid cells stays.
+        semi_lagrangian, maccormack: looked at from outside, a solid cell has the mean of its fluid neighbours.
+    unstable : "raise" or "allow"
+        What to do when a point would get a negative weight (CFL number above 1).
+
+    Returns
+    -------
+    Transport
+        ``move(u, v, dt, inflow=0.0)``: u [unit], v [length / time], dt [time], inflow [unit] a number or one
+        value for each place of ``move.walls`` (x-lower, x-upper, y-lower, ..., each component in turn).
+
+    Raises
+    ------
+    ValueError
+        If a word is not one of those above, or a condition is neither dirichlet nor neumann. On use: dt <= 0.
+    UnstableStepError
+        On use, if the step is larger than the scheme allows.
+    NonFiniteError, ShapeError, TypeError
+        On use, if u, v or inflow hold NaN or infinity, have another shape, or are no real numbers.
+    DerivativeError
+        If `solid` is traced.
+
+    Source
+    ------
+    R. Courant, E. Isaacson, M. Rees, Comm. Pure Appl. Math. 5 (1952) 243-255.
+    B. van Leer, J. Comput. Phys. 32 (1979) 101-136.
+    A. Staniforth, J. Cote, Monthly Weather Review 119 (1991) 2206-2223.
+    A. Selle, R. Fedkiw, B. Kim, Y. Liu, J. Rossignac, J. Sci. Comput. 35 (2008) 350-371.
+
+    Examples
+    --------
+    >>> move = transport(Grid(4, periodic=True))
+    >>> move(np.array([0.0, 1.0, 0.0, 0.0]), np.ones(4), 0.25)
+    array([0.  , 0.75, 0.25, 0.  ])
+    """
+    if not isinstance(grid, Grid):
+        raise TypeError(f"transport takes a Grid, got {type(grid).__name__}; write dp.Grid((64, 64), size=1.0)")
+    _check_word("scheme", scheme, tuple(LAWS))
+    given = {"velocity": velocity, "of": of, "form": form, "interpolation": interpolation, "unstable": unstable}
+    for name, word in given.items():
+        _check_word(name, word, CHOICES[name])
+    forms = LAWS[scheme].forms
+    if form is None:
+        form = "flux" if velocity == "faces" and "flux" in forms else forms[-1]
+    if form not in forms:
+        raise ValueError(f"transport {scheme} has no {form} form; write form={forms[0]!r}")
+    solid = None if solid is None else check_solid(grid, solid).copy()
+    sides = _sides(grid, boundary)
+    return Transport(Setting(grid, scheme, sides, velocity, of, interpolation, form, solid, unstable))
+
+
+def _check_word(name, word, known):
+    if not isinstance(word, (str, type(None))) or word not in known:
+        words = ", ".join(repr(w) for w in known if w is not None)
+        raise ValueError(f"transport takes {name} from {words}, got {word!r}; write one of them")
+
+
+def _sides(grid, boundary):
+    sides = resolve(grid, boundary)
+    for condition in [condition for pair in sides for condition in pair or ()]:
+        if condition not in (dirichlet, neumann):
+            raise ValueError(f"transport takes dirichlet (inflow values) or neumann (outflow), got {condition}")
+    return sides
+
+
+class Transport:
+    """One time step of transport, made by `transport`. Call it: ``move(u, v, dt, inflow=0.0)``. Frozen."""
+
+    setting: Setting
+    law: Law
+    _rule: Rule
+
+    def __init__(self, setting):
+        law = (LAWS[setting.scheme] if setting.grid.cells.size else Still)(setting)
+        self.__dict__.update(setting=setting, law=law, _rule=rule_of(law))
+
+    def __setattr__(self, name, value):
+        raise AttributeError(f"Transport is frozen; make a new one instead of setting {name}")
+
+    def __reduce__(self):
+        return Transport, (self.setting,)
+
+    def __call__(self, u, v, dt, inflow=0.0):
+        """The field after one step; differentiable in every argument; the result is fresh."""
+        return self._rule(u, v, dt, inflow)
+
+    @property
+    def space(self):
+        """Where the moved field lives."""
+        return self.setting.space
+
+    @property
+    def walls(self):
+        """Where inflow values live; ``move.walls.join(...)`` makes them from one array or number for each wall."""
+        return self.law.walls
+
+    def operator(self, v, dt):
+        """Velocity, time step -> the step as an explicit Operator on u, without what flows in.
+
+        Parameters
+        ----------
+        v : array
+            As for the call [length / time].
+        dt : float
+            [time]
+
+        Returns
+        -------
+        Operator
+
+        Raises
+        ------
+        ValueError
+            If the scheme is not linear in u, or dt <= 0.
+        DerivativeError
+            If v or dt are traced: an Operator is constant.
+
+        Examples
+        --------
+        >>> move = transport(Grid(3, periodic=True))
+        >>> move.operator(np.ones(3), 0.5).matrix.toarray()
+        array([[0.5, 0. , 0.5],
+               [0.5, 0.5, 0. ],
+               [0. , 0.5, 0.5]])
+        """
+        name, setting = f"transport {self.setting.scheme}", self.setting
+        if not self.law.linear:
+            raise ValueError(
+                f"{name} is not linear in u and has no matrix; write scheme='upwind', or call move(u, v, dt)"
+            )
+        if isbox(v) or isbox(dt):
+            raise DerivativeError(
+                f"{name}.operator needs constant v and dt, got traced ones; call move(u, v, dt) instead"
+            )
+        check_step(name, dt)
+        flat = flat_numbers(name, "v", v, *setting.velocity_shapes)
+        return Operator(Matrix(self.law.matrix(flat, float(dt))), self.space, self.space, name)
+
+    def step(self, dt, inflow=0.0):
+        """Time step, inflow -> ``step(u, v)``, the form that rollout takes, with plain forms that it runs faster.
+
+        Parameters
+        ----------
+        dt : float
+            [time]
+        inflow : float or array
+            As for the call [unit].
+
+        Returns
+        -------
+        Step
+
+        Raises
+        ------
+        DerivativeError
+            If dt or inflow are traced; write ``lambda u, p: move(u, p[0], p[1])`` for a derivative in them.
+
+        Examples
+        --------
+        >>> step = transport(Grid(3, periodic=True)).step(0.5)
+        >>> step(np.array([1.0, 0.0, 0.0]), np.ones(3))
+        array([0.5, 0.5, 0. ])
+        """
+        return Step(self, dt, inflow)
+
+    def __repr__(self):
+        setting = self.setting
+        conditions = {str(c) for pair in setting.sides for c in pair or ()}
+        words = [f"velocity on {setting.velocity}", f"{setting.form} form", *sorted(conditions)]
+        if setting.solid is not None:
+            words.append(f"{np.count_nonzero(setting.solid)} solid cells")
+        return f"<transport {setting.scheme}: {self.space}, {', '.join(words)}>"

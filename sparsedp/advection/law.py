@@ -1,0 +1,103 @@
+"""What a scheme must offer: plain functions of flat arrays, from which `front` makes one rule of the tape.
+
+Every array that a law gets is flat, contiguous, finite-or-not float64, and none of its business to check
+but for what it finds on the way: `u` of `space.size` numbers, `v` of the velocity as the user gave it,
+`dt` a float > 0, `inflow` of `walls.size` numbers. Arguments are numbered 0 to 3 in that order.
+"""
+
+from math import prod
+from typing import Any, NamedTuple
+
+from sparsedp.fields import place
+from sparsedp.space import Space
+
+__all__ = ["FIELD", "INFLOW", "STEP", "VELOCITY", "Law", "Setting", "component_shapes"]
+
+FIELD, VELOCITY, STEP, INFLOW = range(4)
+
+
+class Setting(NamedTuple):
+    """The checked arguments of `transport`."""
+
+    grid: Any
+    scheme: str
+    sides: tuple  # for each axis (lower, upper) conditions, or None where it is periodic
+    velocity: str
+    of: str
+    interpolation: str
+    form: str
+    solid: Any  # boolean array of the shape of the grid, or None
+    unstable: str
+
+    @property
+    def space(self):
+        """Where the moved field lives."""
+        return self.grid.cells if self.of == "cells" else self.grid.faces
+
+    @property
+    def velocity_shapes(self):
+        """The shapes that a velocity may have."""
+        shape = self.grid.shape
+        if self.velocity == "faces":
+            return (self.grid.faces.shape,)
+        return ((1, *shape), shape) if len(shape) == 1 else ((len(shape), *shape),)
+
+    def velocity_place(self, index):
+        """Number of an entry of the velocity -> its index as the user sees it."""
+        return place(index, self.velocity_shapes[-1])
+
+
+class Law:
+    """Base of the schemes. A subclass sets the flags and has these methods:
+
+    ``forward(u, v, dt, inflow, out=None)``
+        The moved field, into `out` when it is given.
+    ``pull(nums, g, u, v, dt, inflow, into=None)``
+        Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed.
+        `into` maps the number of an argument to an array: its cotangent is added there and returned.
+    ``push(tangents, u, v, dt, inflow)``
+        {number of an argument: tangent} -> tangent of the result.
+    ``matrix(v, dt)``
+        csr_array of the step in `u`, inflow 0; only where `linear`.
+
+    Attributes
+    ----------
+    setting : Setting
+    walls : Space
+        Where inflow values live: one part for each wall of each component, x-lower, x-upper, y-lower, ...
+    forms : tuple of str
+        The values of `form` that the scheme knows.
+    linear : bool
+        Whether the step is linear in (u, inflow).
+    twice : bool
+        Whether `pull` and `push` take traced values too, so that derivatives of every order follow.
+    """
+
+    forms: tuple[str, ...] = ("flux", "advective")
+    linear = False
+    twice = False
+    forward: Any
+    pull: Any
+    push: Any
+    matrix: Any
+
+    def __init__(self, setting):
+        self.setting = setting
+        self.name = f"transport {setting.scheme}"
+        self.walls = wall_space(setting)
+
+
+def component_shapes(setting):
+    """Shape of every component of the moved field."""
+    return (setting.grid.shape,) if setting.of == "cells" else setting.grid.faces.parts
+
+
+def wall_space(setting):
+    """Space of the inflow values: one number for each place of the field that touches a wall."""
+    parts = [
+        tuple(1 if a == axis else n for a, n in enumerate(shape))
+        for shape in component_shapes(setting)
+        for axis, sides in enumerate(setting.sides)
+        for _ in sides or ()
+    ]
+    return Space(sum(map(prod, parts)), "walls", setting.grid, parts)

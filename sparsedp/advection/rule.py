@@ -1,0 +1,70 @@
+"""A law -> one rule of the tape: cotangents of all requested arguments in one pass, tangents, second order."""
+
+import numpy as np
+
+from sparsedp.advection.law import FIELD, INFLOW
+from sparsedp.advection.values import prepare, raised, result_like, unflatten
+from sparsedp.errors import DerivativeError
+from sparsedp.tape import differentiable, isbox, linear, plain
+
+__all__ = ["rule_of"]
+
+
+def rule_of(law):
+    """Law -> Rule of (u, v, dt, inflow)."""
+    name = f"transport {law.setting.scheme}"
+
+    def forward(u, v, dt, inflow):
+        return result_like(u, law.forward(*prepare(law, u, v, dt, inflow)), law.setting.space.shape)
+
+    def vjp(nums, ans, *args):
+        def pull(g):
+            flat = prepare(law, *args)
+            g = raised(FIELD, law, g)
+            traced = isbox(g) or any(map(isbox, args))
+            found = _traced_pull(law, nums, g, flat) if traced else law.pull(nums, g, *flat)
+            return tuple(unflatten(args[num], back) for num, back in zip(nums, found, strict=True))
+
+        return pull
+
+    def jvp(nums, tangents, ans, *args):
+        flat = prepare(law, *args)
+        along = {num: raised(num, law, tangent) for num, tangent in zip(nums, tangents, strict=True)}
+        traced = any(map(isbox, (*args, *tangents)))
+        return unflatten(ans, _traced_push(law, along, flat) if traced else law.push(along, *flat))
+
+    return differentiable(name, forward, vjp, jvp)
+
+
+def _traced_pull(law, nums, g, flat):
+    if law.twice:
+        return law.pull(nums, g, *flat)
+    _check_linear(law, nums, flat)
+    flat = tuple(map(plain, flat))
+    return tuple(_turned(law, num, flat)[0](g) for num in nums)
+
+
+def _traced_push(law, along, flat):
+    if law.twice:
+        return law.push(along, *flat)
+    _check_linear(law, along, flat)
+    flat = tuple(map(plain, flat))
+    return sum(_turned(law, num, flat)[1](tangent) for num, tangent in along.items())
+
+
+def _turned(law, num, flat):
+    """The rules from g to the cotangent of u or inflow, and back: linear, and free of u and inflow."""
+
+    def pull(g):
+        return law.pull((num,), np.asarray(g), *flat)[0]
+
+    return linear(f"transport {law.setting.scheme}.T", pull, lambda tangent: law.push({num: tangent}, *flat))
+
+
+def _check_linear(law, nums, flat):
+    """A linear scheme has every derivative in u and inflow as long as v and dt are constant."""
+    if law.linear and set(nums) <= {FIELD, INFLOW} and not isbox(flat[1]) and not isbox(flat[2]):
+        return
+    raise DerivativeError(
+        f"transport {law.setting.scheme} has first derivatives only; for second ones write scheme='upwind'"
+    )

@@ -1,0 +1,36 @@
+"""Before a step is taken: are the numbers finite, and is the step small enough?"""
+
+import numpy as np
+
+from sparsedp.errors import UnstableStepError
+from sparsedp.fields import check_finite
+
+__all__ = ["check_numbers", "check_result", "check_weights"]
+
+ROUNDING = 8 * np.finfo(float).eps  # CFL exactly 1 leaves a weight of about -1e-16
+
+
+def check_numbers(setting, u, v, inflow):
+    """Refuse NaN and infinity: name the argument, the first index and the count."""
+    name = f"transport {setting.scheme}"
+    check_finite(name, u.reshape(setting.space.shape), "needs a finite field")
+    check_finite(name, v, "needs a finite velocity", setting.velocity_place)
+    check_finite(name, inflow, "needs finite inflow values")
+
+
+def check_weights(law, dt, rate, share=1.0):
+    """Refuse a step in which share - dt * rate, the weight that a point keeps, is negative somewhere."""
+    bad = ~(share - dt * rate >= -ROUNDING)
+    if law.setting.unstable == "raise" and np.any(bad):
+        worst = int(np.argmax(rate))
+        raise UnstableStepError(
+            f"transport {law.setting.scheme}: dt = {dt:g} is too large at {np.count_nonzero(bad)} of {rate.size} "
+            f"points, most at {law.matrices.place(worst)}; the largest stable dt is {share / rate[worst]:.6g}, "
+            "or write unstable='allow'"
+        )
+
+
+def check_result(setting, out):
+    """Refuse a result that overflows."""
+    needs = "cannot represent the result"
+    check_finite(f"transport {setting.scheme}", out.reshape(setting.space.shape), needs)

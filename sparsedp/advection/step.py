@@ -1,0 +1,61 @@
+"""A step of transport with a fixed dt, and its plain forms without the tape, for a time loop that owns its buffers."""
+
+import numpy as np
+
+from sparsedp.advection.law import FIELD, VELOCITY
+from sparsedp.advection.values import prepare, raised, result_like, unflatten
+from sparsedp.errors import DerivativeError
+from sparsedp.tape import isbox
+
+__all__ = ["Step"]
+
+
+class Step:
+    """``step(u, v)``: transport with fixed dt and inflow, made by ``Transport.step``."""
+
+    __slots__ = ("dt", "inflow", "transport")
+
+    def __init__(self, transport, dt, inflow):
+        if isbox(dt) or isbox(inflow):
+            raise DerivativeError(
+                "step needs constant dt and inflow, got traced ones; write lambda u, p: move(u, p[0], p[1]) instead"
+            )
+        self.transport, self.dt, self.inflow = transport, dt, inflow
+
+    def __call__(self, u, v):
+        return self.transport(u, v, self.dt, self.inflow)
+
+    def forward(self, u, v, out=None):
+        """The moved field, plain; the array `out` is used for it when it fits."""
+        law = self.transport.law
+        flat = law.forward(*prepare(law, u, v, self.dt, self.inflow), out=_target(out))
+        return result_like(u, flat, law.setting.space.shape)
+
+    def backward(self, u, v, g, into=None):
+        """Cotangents of u and v, plain; that of v is added to the array `into` when it is given."""
+        law, target = self.transport.law, _target(into)
+        flat = prepare(law, u, v, self.dt, self.inflow)
+        own = {} if target is None else {VELOCITY: target}
+        of_u, of_v = law.pull((FIELD, VELOCITY), raised(FIELD, law, g), *flat, into=own)
+        if into is None:
+            into = unflatten(v, of_v)
+        elif target is None:
+            into += unflatten(v, of_v)
+        return unflatten(u, of_u), into
+
+    def tangent(self, u, v, du, dv):
+        """Tangent of the moved field, plain."""
+        law = self.transport.law
+        flat = prepare(law, u, v, self.dt, self.inflow)
+        along = {FIELD: raised(FIELD, law, du), VELOCITY: raised(VELOCITY, law, dv)}
+        return unflatten(u, law.push(along, *flat))
+
+    def __repr__(self):
+        return f"<step of {self.transport!r}, dt = {self.dt:g}>"
+
+
+def _target(array):
+    """A flat view that may be written to, or None."""
+    if not isinstance(array, np.ndarray) or array.dtype != np.dtype(float):
+        return None
+    return array.reshape(-1) if array.flags.c_contiguous and array.flags.writeable else None

@@ -1,0 +1,31 @@
+"""Transport on a grid without cells: nothing moves."""
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.advection.law import FIELD, STEP, VELOCITY, Law
+from sparsedp.advection.stability import check_numbers
+
+__all__ = ["Still"]
+
+
+class Still(Law):
+    """The identity, whatever the scheme."""
+
+    linear = True
+    twice = True
+
+    def forward(self, u, v, dt, inflow, out=None):
+        check_numbers(self.setting, u, v, inflow)
+        return np.add(u, 0.0, out=out)
+
+    def pull(self, nums, g, u, v, dt, inflow, into=None):
+        nothing = {VELOCITY: np.zeros(np.shape(v)), STEP: 0.0}
+        found = {FIELD: g + 0.0, **nothing}
+        return tuple(found.get(num, np.zeros(np.shape(inflow))) for num in nums)
+
+    def push(self, tangents, u, v, dt, inflow):
+        return tangents.get(FIELD, np.zeros(np.shape(u))) + 0.0
+
+    def matrix(self, v, dt):
+        return sp.eye_array(self.setting.space.size, format="csr")

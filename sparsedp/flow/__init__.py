@@ -1,0 +1,1 @@
+"""Incompressible flow on faces: the projection, viscosity, and what carries momentum."""

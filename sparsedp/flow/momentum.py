@@ -1,0 +1,296 @@
+"""What acts on a velocity besides pressure: viscosity (face_laplacian, face_lift) and convection.
+
+Every component lives on its own faces. Along its own axis it is a field on nodes, and the wall faces
+hold the wall values; along the other axes it is a field between walls half a cell away, and what the
+fluid does there is a condition: no_slip and inflow are dirichlet, free_slip and outflow neumann.
+"""
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.conditions import dirichlet, neumann
+from sparsedp.flow.walls import CLOSED, flow_sides
+from sparsedp.operator import Operator
+from sparsedp.operators.boundary import check_solid, solid_faces
+from sparsedp.operators.stencils import along, differences, means, one_sided, slopes, wall_slopes
+from sparsedp.space import Space
+from sparsedp.structure.algebra import compose
+from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.factor import Factor
+from sparsedp.structure.kronecker import Kronecker
+from sparsedp.structure.lazy import Mask
+from sparsedp.tape import differentiable
+
+__all__ = ["convection", "face_laplacian", "face_lift"]
+
+
+def face_laplacian(grid, boundary="no_slip", solid=None, solid_boundary="no_slip"):
+    """Faces -> faces: the Laplacian of each component of a velocity, 0 on faces that are not free.
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary : str or dict
+        What the fluid does at the walls: "no_slip", "free_slip", "inflow", "outflow", for all bounded
+        sides or as {"x": (lower, upper), ...}. Moving walls enter through `face_lift`.
+    solid : bool array, shape `grid.shape`, optional
+        Obstacles.
+    solid_boundary : "no_slip" or "free_slip"
+        What the fluid does along the obstacles.
+
+    Returns
+    -------
+    Operator
+        in: faces [velocity]; out: faces [velocity / length^2]. Order 2 inside; values on walls and on
+        faces that touch an obstacle are taken as they are.
+
+    Raises
+    ------
+    ShapeError
+        If `solid` has another shape than the grid.
+    ValueError
+        If a word of `boundary` or `solid_boundary` is not known.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> L = face_laplacian(Grid((2, 2)), "no_slip")
+    >>> L(np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    array([ 0.,  0., -4., -4.,  0.,  0.,  0.,  0.,  0.,  0.,  0.,  0.])
+    """
+    sides = flow_sides(grid, boundary)
+    if solid_boundary not in CLOSED:
+        raise ValueError(f"solid_boundary needs no_slip or free_slip, got {solid_boundary!r}")
+    free = Mask(_free(grid, sides, solid))
+    if solid is None:
+        blocks = {
+            (c, c): sum((along(a, grid.dim, _second(grid, c, a, sides)) for a in range(grid.dim)), ())
+            for c in range(grid.dim)
+        }
+        structure = compose(free, Kronecker(grid.faces.parts, grid.faces.parts, blocks))
+    else:
+        flags = grid.faces.split(np.logical_or(*solid_faces(grid, check_solid(grid, solid))))
+        whole = sp.block_diag(
+            [_around(grid, c, sides, flags[c], _along_wall(solid_boundary)) for c in range(grid.dim)], format="csr"
+        )
+        structure = Matrix(free.explicit() @ whole)
+    return Operator(structure, grid.faces, grid.faces, "face_laplacian")
+
+
+def face_lift(grid, boundary="no_slip"):
+    """Wall velocities -> faces: what walls that move along themselves add, L(v) + B(values).
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary : str or dict
+        The same as for `face_laplacian`. Walls that are no_slip (and inflows) have a velocity along them.
+
+    Returns
+    -------
+    Operator
+        in: one flat array [velocity], wall after wall (x-lower, x-upper, y-lower, ...), for each the
+        components along it; ``op.domain.join(...)`` builds it from one number or array for each.
+        out: faces [velocity / length^2].
+
+    Raises
+    ------
+    ValueError
+        If a word of `boundary` is not known.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> B = face_lift(Grid((2, 2)))
+    >>> B(B.domain.join(0.0, 0.0, 0.0, 1.0))  # y-upper moves along x: a lid
+    array([0., 0., 0., 2., 0., 0., 0., 0., 0., 0., 0., 0.])
+    """
+    sides = flow_sides(grid, boundary)
+    parts: list[tuple[int, ...]] = []
+    blocks = {}
+    for a in range(grid.dim):
+        for side, word in enumerate(sides[a] or ()):
+            for c in range(grid.dim):
+                if c != a and _along_wall(word) is dirichlet:
+                    factor = differences(grid, a) @ wall_slopes(grid, a, side, dirichlet)
+                    blocks[c, len(parts)] = along(a, grid.dim, factor)
+                    parts.append(tuple(1 if b == a else n for b, n in enumerate(grid.face_shape(c))))
+    walls = Space(sum(int(np.prod(part)) for part in parts), "moving walls", grid, parts)
+    structure = compose(Mask(_free(grid, sides, None)), Kronecker(grid.faces.parts, parts, blocks))
+    return Operator(structure, walls, grid.faces, "face_lift")
+
+
+def convection(grid, boundary="no_slip", solid=None):
+    """Grid -> convect(v, w): the momentum that w carries, div(w v) on the faces, by central differences.
+
+    Each component of v and the velocity w that carries it are averaged to the sides of its control
+    volume. The flux form conserves momentum and, where w has no divergence, energy.
+
+        N(v, w) = C ((A v) (B w)),   N' = C ((A dv) (B w) + (A v) (B dw)),
+        cotangents of v and w: A^T ((B w) C^T g) and B^T ((A v) C^T g)
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary : str or dict
+        As in `face_laplacian`.
+    solid : bool array, shape `grid.shape`, optional
+
+    Returns
+    -------
+    Rule
+        ``convect(v, w)`` with two face fields [velocity] -> faces [velocity^2 / length], 0 on faces that
+        are not free; differentiable in both, to every order; one node on the tape. Order 2.
+
+    Raises
+    ------
+    ShapeError
+        If `solid` has another shape than the grid.
+    ValueError
+        If a word of `boundary` is not known.
+
+    Notes
+    -----
+    Source: Harlow and Welch, Physics of Fluids 8 (1965).
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> convect = convection(Grid(4, periodic=True))
+    >>> v = np.array([1.0, 2.0, 1.0, 0.0])
+    >>> convect(v, v)
+    array([ 2.,  0., -2.,  0.])
+    """
+    sides = flow_sides(grid, boundary)
+    flux = _flux_parts(grid)
+    carried, carrier, gain = {}, {}, {}
+    for number, (c, a) in enumerate((c, a) for c in range(grid.dim) for a in range(grid.dim)):
+        if a == c:
+            carried[number, c] = carrier[number, c] = along(c, grid.dim, _to_centres(grid, c))
+            gain[c, number] = along(c, grid.dim, _from_centres(grid, c))
+        else:
+            carried[number, c] = along(a, grid.dim, means(grid, a, _conditions(sides[a])))
+            carrier[number, a] = along(c, grid.dim, means(grid, c, _conditions(sides[c])))
+            gain[c, number] = along(a, grid.dim, differences(grid, a))
+    faces, sites = grid.faces, Space(sum(int(np.prod(part)) for part in flux), "fluxes", grid, flux)
+    free = Mask(_free(grid, sides, solid))
+    A = Operator(Kronecker(flux, faces.parts, carried), faces, sites, "carried")
+    B = Operator(Kronecker(flux, faces.parts, carrier), faces, sites, "carrier")
+    C = Operator(compose(free, Kronecker(faces.parts, flux, gain)), sites, faces, "gain")
+    return _bilinear("convection", A, B, C)
+
+
+def _bilinear(name, A, B, C):
+    """The rule of C((A v) (B w))."""
+
+    def vjp(nums, ans, v, w):
+        def pull(g):
+            g = C.T(g)
+            return tuple(B.T(A(v) * g) if num else A.T(B(w) * g) for num in nums)
+
+        return pull
+
+    def jvp(nums, tangents, ans, v, w):
+        return C(sum(A(v) * B(t) if num else A(t) * B(w) for num, t in zip(nums, tangents, strict=True)))
+
+    return differentiable(name, lambda v, w: C(A(v) * B(w)), vjp, jvp)
+
+
+# ------------------------------------------------------------ the factors
+
+
+def _along_wall(word):
+    return dirichlet if word in ("no_slip", "inflow") else neumann
+
+
+def _conditions(words):
+    return None if words is None else tuple(map(_along_wall, words))
+
+
+def _free(grid, sides, solid):
+    """Faces whose velocity is found: not on closed walls or inflows, and not at an obstacle."""
+    keep = [np.ones(part, dtype=bool) for part in grid.faces.parts]
+    for axis, words in enumerate(sides):
+        for side, word in zip((0, -1), words or (), strict=False):
+            np.moveaxis(keep[axis], axis, 0)[side] = word == "outflow"
+    flat = np.concatenate([part.ravel() for part in keep])
+    return flat if solid is None else flat & ~np.logical_or(*solid_faces(grid, check_solid(grid, solid)))
+
+
+def _second(grid, c, a, sides):
+    """Second differences of component c along axis a."""
+    if a == c:
+        n, m = grid.shape[a], grid.node_count(a)
+        cell, d = np.arange(n), 1 / grid.spacings(a)
+        low = (cell, cell, d[:n])  # what cell i gives to its lower face, and takes from its upper one
+        high = ((cell + 1) % max(m, 1), cell, -d[(cell + 1) % max(m, 1)])
+        return Factor.from_diagonals((m, n), low, high) @ differences(grid, a)
+    return differences(grid, a) @ slopes(grid, a, _conditions(sides[a]))
+
+
+def _around(grid, c, sides, closed, condition):
+    """The Laplacian of component c with the faces `closed` by obstacles, as a matrix."""
+    shape, total = grid.face_shape(c), 0
+    for a in range(grid.dim):
+        if a == c:  # a closed face holds the value of the obstacle itself
+            total = total + _matrix(_second(grid, c, a, sides), a, shape)
+            continue
+        lower, upper = _beside(closed, a, grid.periodic[a])
+        slope = _diagonal(~(lower | upper)) @ _matrix(slopes(grid, a, _conditions(sides[a])), a, shape)
+        slope = slope + _diagonal(lower & ~upper) @ _matrix(one_sided(grid, a, True, condition), a, shape)
+        slope = slope + _diagonal(upper & ~lower) @ _matrix(one_sided(grid, a, False, condition), a, shape)
+        corners = tuple(grid.node_count(b) if b == a else n for b, n in enumerate(shape))
+        total = total + _matrix(differences(grid, a), a, corners) @ slope
+    return total
+
+
+def _beside(flags, axis, periodic):
+    """Flags of cells along an axis -> flags of the neighbours below and above each node."""
+    if periodic:
+        return np.roll(flags, 1, axis).ravel(), flags.ravel()
+    pad = [(0, 0)] * flags.ndim
+    pad[axis] = (1, 0)
+    return np.pad(flags, pad).ravel(), np.pad(flags, [side[::-1] for side in pad]).ravel()
+
+
+def _matrix(factor, axis, shape):
+    out = tuple(factor.shape[0] if a == axis else n for a, n in enumerate(shape))
+    return Kronecker((out,), (shape,), {(0, 0): along(axis, len(shape), factor)}).explicit()
+
+
+def _diagonal(flags):
+    return sp.diags_array(flags.astype(float), format="csr")
+
+
+def _flux_parts(grid):
+    """Shapes of the fluxes of component c through the sides across axis a.
+
+    Along its own axis: the centres of the cells, and on a bounded axis the two walls, for the
+    half control volume of an open side.
+    """
+    parts = []
+    for c in range(grid.dim):
+        for a in range(grid.dim):
+            shape = list(grid.face_shape(c))
+            shape[a] = grid.shape[a] + 2 * (not grid.periodic[a]) if a == c else grid.node_count(a)
+            parts.append(tuple(shape))
+    return tuple(parts)
+
+
+def _to_centres(grid, c):
+    """Nodes -> cells: means; on a bounded axis the wall values stand before and after them."""
+    n, m = grid.shape[c], grid.node_count(c)
+    cell, half = np.arange(n), np.full(n, 0.5)
+    if grid.periodic[c]:
+        return Factor.from_diagonals((n, m), (cell, cell, half), (cell, (cell + 1) % max(n, 1), half))
+    ends = np.array([0, n + 1]), np.array([0, n]), np.ones(2)
+    return Factor.from_diagonals((n + 2, m), (cell + 1, cell, half), (cell + 1, cell + 1, half), ends)
+
+
+def _from_centres(grid, c):
+    """Fluxes at cells (and walls) -> nodes: (F[i] - F[i - 1]) / d[i]."""
+    n, m = grid.shape[c], grid.node_count(c)
+    node, d = np.arange(m), 1 / grid.spacings(c)
+    if grid.periodic[c]:
+        return Factor.from_diagonals((m, n), (node, node, d), (node, (node - 1) % max(n, 1), -d))
+    return Factor.from_diagonals((m, n + 2), (node, node + 1, d), (node, node, -d))

@@ -1,0 +1,107 @@
+"""What a projection is made of, set up once: closed faces, divergence, gradient, and the inverse of -D G."""
+
+from functools import cached_property
+
+import numpy as np
+
+from sparsedp.flow.passes import Passes
+from sparsedp.flow.walls import CLOSED, flow_sides, pressure_conditions
+from sparsedp.grid import Grid
+from sparsedp.operators.boundary import check_solid, solid_faces
+from sparsedp.operators.difference import divergence, gradient
+from sparsedp.solvers.choose import build
+from sparsedp.solvers.facts import magnitude
+from sparsedp.solvers.scaling import largest
+
+__all__ = ["Setup"]
+
+FEW = 1024  # cells below which transforms are tried even where `inverse` would factor
+
+
+class Setup:
+    """What a projection needs: the faces that are closed, D, G, and the inverse of A = -D G.
+
+    The grid is one of lengths near 1: P does not depend on the unit of length, while squares of
+    lengths may leave the range of floats.
+    """
+
+    def __init__(self, grid, solid, boundary, settings):
+        self.recipe = grid, solid, boundary, settings
+        self.grid, self.sides = grid, flow_sides(grid, boundary)
+        self.solid = None if solid is None else check_solid(grid, solid).copy()
+        self.exponent = int(np.frexp(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))[1])
+        near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
+        self.D = divergence(near)
+        self.G = gradient(near, pressure_conditions(self.sides), self.solid)
+        self.closed = np.flatnonzero(~self.open)
+        self.inverse = _inverse(-self.D @ self.G, *settings)
+        self.solver = self.inverse.solver
+        self._refuse_lost_inflow()
+        forward = self.D.structure, self.G.structure
+        self.firsts, self.seconds = zip(
+            forward,
+            forward if self.symmetric else (self.G.structure.transpose(), self.D.structure.transpose()),
+            strict=True,
+        )
+        fast = self.solver.engine.method == "separable" and self.grid.cells.size > 0
+        self.passes = self._make_passes() if fast else None
+        self.reach = tuple(largest(magnitude(first)(np.ones(grid.faces.size))) for first in self.firsts)
+
+    def _make_passes(self):
+        """The forward pair of passes, and the transposed one."""
+        free = []
+        for axis, words in enumerate(self.sides):
+            line = np.ones(self.grid.node_count(axis), dtype=bool)
+            if words:
+                line[[0, -1]] = [word not in CLOSED for word in words]
+            free.append(line)
+        forward = Passes(self.grid, self.D, self.G, free, False)
+        return forward, forward if self.symmetric else Passes(self.grid, self.D, self.G, free, True)
+
+    @cached_property
+    def open(self):
+        """Which faces are not closed."""
+        found = []
+        for axis, part in enumerate(self.grid.faces.parts):
+            keep = np.ones(part, dtype=bool)
+            for side, word in zip((0, -1), self.sides[axis] or (), strict=False):
+                np.moveaxis(keep, axis, 0)[side] = word not in CLOSED
+            found.append(keep.ravel())
+        flat = np.concatenate(found)
+        if self.solid is not None:
+            below, above = solid_faces(self.grid, self.solid)
+            flat &= ~(below | above)
+        return flat
+
+    @cached_property
+    def symmetric(self):
+        """Whether P is its own transpose."""
+        return all(self.grid.uniform) and all(word in CLOSED for pair in self.sides if pair for word in pair)
+
+    def _refuse_lost_inflow(self):
+        """What enters must be able to leave, in every region apart."""
+        labels = self.solver.system.null_space.labels if self.solver.system.size else None
+        closed = np.zeros(self.grid.shape, dtype=bool)
+        if self.solver.system.size and self.solver.system.null_space.count:
+            closed = np.ones(self.grid.shape, dtype=bool) if labels is None else (labels >= 0).reshape(self.grid.shape)
+        if self.solver.system.active is not None:  # a cell with no free face at all
+            closed |= ~self.solver.system.active.reshape(self.grid.shape)
+        if self.solid is not None:
+            closed &= ~self.solid
+        for axis, pair in enumerate(self.sides):
+            for side, word in zip((0, -1), pair or (), strict=False):
+                cells = np.moveaxis(closed, axis, 0)
+                if word == "inflow" and cells.size and cells[side].any():
+                    where = f"{('lower', 'upper')[side]} {self.grid.axes[axis]} side"
+                    raise ValueError(f"the inflow on the {where} enters a region without an outflow; open a side of it")
+
+
+def _inverse(op, method, rtol, maxiter, options):
+    """The inverse for the pressure. Transforms are preferred on small grids too: they skip the contract's passes."""
+    settings = rtol, maxiter, "project", options, "pressure solve"
+    if method == "auto" and op.domain.size < FEW and op.separable:
+        try:
+            return build(op, "separable", *settings)
+        except ValueError:  # an axis that cannot be diagonalised with all its digits
+            pass
+    return build(op, method, *settings)

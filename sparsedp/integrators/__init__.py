@@ -1,0 +1,1 @@
+"""Time steps: explicit, implicit, split and exponential integrators with exact derivatives."""

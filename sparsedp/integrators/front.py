@@ -1,0 +1,146 @@
+"""stepper(): a rate of change and a method -> a step for time loops."""
+
+from sparsedp.fields import is_number
+from sparsedp.integrators.adaptive import Adaptive
+from sparsedp.integrators.explicit import EXPLICIT, Explicit
+from sparsedp.integrators.fast import LinearStep
+from sparsedp.integrators.implicit_steps import IMPLICIT, Linear, Nonlinear
+from sparsedp.integrators.problem import posed, positive
+from sparsedp.integrators.split_steps import SPLIT, Exponential, Imex
+from sparsedp.integrators.stability import Limit
+from sparsedp.integrators.steps import Step
+from sparsedp.solvers.choose import check_settings
+
+__all__ = ["METHODS", "stepper"]
+
+METHODS = (*EXPLICIT, *IMPLICIT, *SPLIT)
+KEPT = {False: 2, True: 12}  # set-ups of linear steps, without and with error control
+
+
+def stepper(
+    method,
+    rate=None,
+    dt=None,
+    *,
+    linear=None,
+    source=None,
+    timed=None,
+    tolerance=None,
+    floor=None,
+    unstable="raise",
+    jacobian=None,
+    solver="auto",
+    rtol=1e-10,
+    maxiter=None,
+    **options,
+):
+    """Rate of change -> step(state, params): the state after a time dt, differentiable in everything.
+
+    Parameters
+    ----------
+    method : str
+        ======================= ===== ==============================================================
+        euler heun ssprk3 rk4   1 to 4 explicit: cheap where nothing is stiff
+        backward_euler          1     L-stable: any dt, what is stiff dies out
+        crank_nicolson          2     any dt, but what is stiff keeps its size and changes sign (it rings)
+        tr_bdf2                 2     L-stable, two stages with one factor
+        imex                    2     the operator `linear` implicit (L-stable), the rate explicit
+        etdrk4                  4     `linear` exact by transforms (separable only), the rate explicit
+        ======================= ===== ==============================================================
+    rate : callable or Operator
+        u' = ``rate(u, params)``, or ``rate(u, params, t)``: then the state is the pair (u, t). Written with
+        autograd.numpy, Operators and other rules; u an array or a tree of arrays. An Operator L means
+        u' = c L u, with the number c >= 0 as params (None: 1).
+    dt : float, traced number, or function of params
+        Length of a step [time], > 0. To differentiate in dt inside a loop write ``lambda params: params["dt"]``.
+    linear : Operator or (Operator, coefficient), optional
+        A term c L u beside the rate; `coefficient` is a number >= 0 or a function of params.
+    source : callable, optional
+        ``source(params)`` or ``source(params, t)``: a term that does not depend on u. A problem of operator
+        and source only is linear: one set-up for each c dt serves all stages, steps and adjoint solves.
+    timed : bool, optional
+        Whether rate or source takes the time; default: by its number of arguments.
+    tolerance : float, optional
+        Error control: dt is an interval, crossed in as many steps as keep the relative error of each below
+        this. Derivatives follow the steps that were taken; `step.taken` lists them.
+    floor : number or tree like u, optional
+        Errors are relative to |u| + floor. Default: the largest entry of each array.
+    unstable : "raise" or "allow"
+        Explicit steps of an Operator whose spectrum is known: refuse a dt beyond the stable limit, or take it.
+    jacobian : callable, optional
+        ``jacobian(u, params)`` (or with t): the derivative of the rate in u, for implicit steps of a
+        nonlinear rate. Default: found by colouring.
+    solver, rtol, maxiter, **options
+        `method`, tolerance and options of `inverse` (linear problems) or `implicit` (nonlinear ones).
+
+    Returns
+    -------
+    Step
+        ``step(state, params=None)``; with an input of `rollout`, ``step(state, params, input)``: the rate gets
+        the pair (params, input) as params. `step.info` holds the records of its solves.
+
+    Raises
+    ------
+    ValueError
+        If the method or a setting is unknown, dt <= 0, or a coefficient is negative.
+    TypeError
+        If rate, linear or source is not what it should be.
+    NonFiniteError
+        If dt, state or params holds NaN or infinity, or the new state would.
+    UnstableStepError
+        On use, if an explicit step is beyond the stable limit of the operator.
+    ConvergenceError
+        On use, if a solve fails.
+
+    Notes
+    -----
+    Formula: derivatives are those of the discrete step. A linear stage x of (1 - z L) x = b, z = c dt, has
+    b_bar = y, z_bar = y . L x with (1 - z L)^T y = g; a nonlinear one is a root, see `implicit`.
+    A coefficient of 0 leaves the state as it is, bit for bit, without set-up or solve.
+    With a tolerance, a finite difference also sees the lengths of the steps change: it agrees with the
+    gradient up to the size of the tolerance.
+    Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n).
+    Source: implicit_steps.py and explicit.py name the papers.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp import Grid, dirichlet, laplacian, value_and_grad
+    >>> step = stepper("backward_euler", laplacian(Grid(2), dirichlet), 0.25)  # eigenvalue -2 of (1, 1)
+    >>> value_and_grad(lambda nu: step(np.array([3.0, 3.0]), nu)[0])(2.0)
+    (1.5, -0.375)
+    """
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if unstable not in ("raise", "allow"):
+        raise ValueError(f"unstable must be 'raise' or 'allow', got {unstable!r}")
+    check_settings(solver, rtol, maxiter, "raise")
+    if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
+        raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
+    problem = posed(rate, linear, source, timed)
+    settings = dict(method=solver, rtol=rtol, nullspace="raise")
+    scheme = _scheme(method, problem, jacobian, settings, maxiter, options, KEPT[tolerance is not None])
+    limit = None
+    if tolerance is not None:
+        scheme = Adaptive(scheme, tolerance, floor, f"stepper({method})")
+    elif method in EXPLICIT and problem.op is not None and unstable == "raise":
+        limit = Limit(problem.op, EXPLICIT[method].reach, method)
+    dt = dt if callable(dt) else positive(dt, "dt")
+    bare = problem.whole and source is None and tolerance is None and isinstance(dt, float)
+    return (LinearStep if bare else Step)(method, problem, dt, scheme, limit)
+
+
+def _scheme(method, problem, jacobian, settings, maxiter, options, kept):
+    if method in EXPLICIT:
+        return Explicit(problem, method)
+    if method in SPLIT and problem.op is None:
+        raise TypeError(f"{method} needs the stiff linear term: write linear=L or linear=(L, coefficient)")
+    if method == "etdrk4":
+        return Exponential(problem)
+    linear = dict(settings, maxiter=maxiter, options=options)
+    if method == "imex":
+        return Imex(problem, linear, kept)
+    if problem.linear:
+        return Linear(problem, method, linear, kept)
+    newton = dict(settings, **options) if maxiter is None else dict(settings, maxiter=maxiter, **options)
+    return Nonlinear(problem, method, jacobian, newton)

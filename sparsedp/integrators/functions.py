@@ -1,0 +1,195 @@
+"""Functions of z L for a separable operator L: sums of phi_k(z L), differentiable in z.
+
+    phi_0(x) = exp(x),    phi_{k+1}(x) = (phi_k(x) - 1/k!) / x,    phi_k'(x) = phi_k(x) - k phi_{k+1}(x)
+
+so a sum f of them has a derivative of the same form, and with y = f(z L) b
+
+    dy = f(z L) db + L f'(z L) b dz,     b_bar = f(z L)^T g,     z_bar = g . L f'(z L) b.
+
+Near 0 the formula in the middle loses all digits: there the Taylor series of the highest one is summed and
+the others follow downwards, phi_k = x phi_{k+1} + 1/k!. Sources: Cox and Matthews, J. Comput. Phys. 176
+(2002); Kassam and Trefethen, SIAM J. Sci. Comput. 26 (2005), who name the trouble.
+"""
+
+from math import factorial
+from typing import NamedTuple
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.errors import NonFiniteError
+from sparsedp.solvers.separable import spectrum
+from sparsedp.solvers.spectral import SpectralFunction
+from sparsedp.tape import cast, differentiable, dtype_of, isbox
+
+__all__ = ["Function", "Functions", "phi"]
+
+NEAR, TERMS = 3.0, 36  # the series is summed up to |x| = 3, where its terms after the 36th are below rounding
+KEPT = 64  # tables of weights, for a few z
+
+
+def phi(k, x):
+    """[phi_0(x), ..., phi_k(x)] for real x, to a few units of the last digit.
+
+    Examples
+    --------
+    >>> [round(float(value), 6) for value in phi(2, np.array(-1e-9))]
+    [1.0, 1.0, 0.5]
+    """
+    near = np.abs(x) <= NEAR
+    small, large = np.where(near, x, 0.0), np.where(near, NEAR, x)
+    series = [sum_of_series(k, small)]
+    for j in reversed(range(k)):
+        series.insert(0, small * series[0] + 1 / factorial(j))
+    with np.errstate(over="ignore"):
+        upward = [np.exp(large)]
+    for j in range(k):
+        upward.append((upward[j] - 1 / factorial(j)) / large)
+    return [np.where(near, low, high) for low, high in zip(series, upward, strict=True)]
+
+
+def sum_of_series(k, x):
+    """phi_k(x) = sum over n of x^n / (n + k)!, for small x."""
+    total = np.zeros_like(x)
+    for n in reversed(range(TERMS)):
+        total = total * x + 1 / factorial(n + k)
+    return total
+
+
+class Function(NamedTuple):
+    """L^power f(z L) with f(x) = sum over k of weights[k] phi_k(scale x)."""
+
+    weights: tuple
+    scale: float = 1.0
+    power: int = 0
+
+    def derivative(self):
+        """The function of the same kind for d/dz."""
+        found = [*self.weights, 0.0]
+        for k, weight in enumerate(self.weights):
+            found[k + 1] -= k * weight
+        return Function(tuple(self.scale * weight for weight in found), self.scale, self.power + 1)
+
+    def values(self, z, eigenvalues):
+        """On the eigenvalues of L."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = phi(len(self.weights) - 1, self.scale * z * eigenvalues)
+            return eigenvalues**self.power * sum(a * value for a, value in zip(self.weights, found, strict=True) if a)
+
+
+class Functions:
+    """combine(functions, z, *fields): the sum of f_j(z L) b_j, by one transform for each field and one back.
+
+    Parameters
+    ----------
+    op : Operator
+        L, separable, or a power of a separable operator.
+    name : str
+        For messages and counts.
+
+    Raises
+    ------
+    ValueError
+        If L cannot be diagonalised by transforms.
+    """
+
+    def __init__(self, op, name):
+        self.op, self.name = op, name
+        self.found, self.eigenvalues = _diagonalised(op, name)
+        self._tables: dict = {}  # (function, z) -> weights; plain values only
+
+    def __call__(self, functions, z, *fields):
+        """The sum, differentiable in z and the fields."""
+        return self._rule(functions, False)(z, *fields)
+
+    def plain(self, functions, z, *fields, transposed=False):
+        """The same on plain values, or with the transpose of L."""
+        op, z = (self.op.T if transposed else self.op), float(z)
+        if z == 0:
+            return self._at_zero(functions, op, fields)
+        if any(np.iscomplexobj(field) for field in fields):
+            parts = [self.plain(functions, z, *map(part, fields), transposed=transposed) for part in (np.real, np.imag)]
+            return parts[0] + 1j * parts[1]
+        total = 0.0
+        for function, field in zip(functions, fields, strict=True):
+            wide = np.array(field, dtype=float)  # a copy: transforms overwrite
+            total = total + self.found.forward(wide, transposed) * self._table(function, z)
+        return self.found.backward(total, transposed).reshape(op.domain.shape)
+
+    def _spread(self, functions, z, g, transposed):
+        """[f(z L) g for each function], by one transform of g and one back for each."""
+        coefficients = self.found.forward(np.array(g, dtype=float), transposed)
+        shape = self.op.domain.shape
+        return [self.found.backward(coefficients * self._table(f, z), transposed).reshape(shape) for f in functions]
+
+    @staticmethod
+    def _at_zero(functions, op, fields):
+        """f(0) is a number: no transform, and for phi_0 the field itself, bit for bit."""
+        total = 0.0
+        for function, field in zip(functions, fields, strict=True):
+            for _ in range(function.power):
+                field = op.apply(field)
+            total = total + sum(a / factorial(k) for k, a in enumerate(function.weights)) * field
+        return total
+
+    def _table(self, function, z):
+        key = function, z
+        if key not in self._tables:
+            if len(self._tables) >= KEPT:
+                del self._tables[next(iter(self._tables))]  # the oldest
+            values = function.values(z, self.eigenvalues)
+            if not np.all(np.isfinite(values)):
+                raise NonFiniteError(
+                    f"{self.name}: exp({z:g} * {self.op.name}) is beyond 1.8e308; take a smaller dt or the other sign"
+                )
+            self._tables[key] = values
+        return self._tables[key]
+
+    def _rule(self, functions, transposed):
+        """The sum as a rule in (z, *fields)."""
+
+        def forward(z, *fields):
+            return self.plain(functions, z, *fields, transposed=transposed)
+
+        def slope(z, fields):
+            return self._rule(tuple(f.derivative() for f in functions), transposed)(z, *fields)
+
+        def vjp(nums, ans, z, *fields):
+            chosen = tuple(functions[num - 1] for num in nums if num)
+
+            def backs(g):
+                if len(chosen) > 1 and not (isbox(g) or isbox(z) or z == 0 or np.iscomplexobj(g)):
+                    return self._spread(chosen, float(z), g, not transposed)
+                return [self._rule((f,), not transposed)(z, g) for f in chosen]
+
+            def pull(g):
+                found = iter(backs(g))
+                return tuple(next(found) if num else _real(anp.sum(g * slope(z, fields)), z) for num in nums)
+
+            return pull
+
+        def jvp(nums, tangents, ans, z, *fields):
+            pairs = [(num, t) for num, t in zip(nums, tangents, strict=True) if num]
+            total = tangents[nums.index(0)] * slope(z, fields) if 0 in nums else 0.0
+            if pairs:
+                chosen = tuple(functions[num - 1] for num, _ in pairs)
+                total = total + self._rule(chosen, transposed)(z, *(t for _, t in pairs))
+            return total
+
+        return differentiable(f"{self.name}.phi.T" if transposed else f"{self.name}.phi", forward, vjp, jvp)
+
+
+def _diagonalised(op, name):
+    """(Spectrum, eigenvalues) of an operator that is separable, or a function of such a one."""
+    structure = op.structure
+    if isinstance(structure, SpectralFunction) and not structure.transposed:
+        return structure.found, structure.weights
+    found = spectrum(structure) if op.separable else None
+    if found is None:
+        raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}; try imex or tr_bdf2")
+    return found, found.eigenvalues
+
+
+def _real(cotangent, value):
+    """The cotangent of a real number from complex fields is the real part."""
+    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent

@@ -1,0 +1,134 @@
+"""What is integrated: u' = c L u + rate(u, params, t) + source(params, t), and the checks of its numbers."""
+
+import inspect
+
+import numpy as np
+
+from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.fields import is_number
+from sparsedp.integrators.combination import combine
+from sparsedp.operator import Operator
+from sparsedp.space import fits
+from sparsedp.tape import isbox, plain
+
+__all__ = ["Problem", "positive", "posed"]
+
+
+class Problem:
+    """The right-hand side of u' = c L u + rate + source, each part optional.
+
+    Parameters
+    ----------
+    rate : callable or None
+    op : Operator or None
+    coefficient : callable
+        ``coefficient(params)``: the number c.
+    source : callable or None
+    timed : bool
+        Whether the state is the pair (u, t).
+    whole : bool
+        Whether the params are the coefficient itself.
+
+    Attributes
+    ----------
+    linear : bool
+        Whether the right-hand side is c L u + source: a step is a linear solve.
+    """
+
+    def __init__(self, rate, op, coefficient, source, timed, whole=False):
+        self.rate, self.op, self.source, self.timed, self.whole = rate, op, source, timed, whole
+        self._coefficient = coefficient
+        self._calls = [(fun, _takes(fun, least)) for fun, least in ((rate, 3), (source, 2)) if fun is not None]
+        self.linear = op is not None and rate is None
+
+    def coefficient(self, params):
+        """The number c >= 0, traced or not."""
+        c = self._coefficient(params)
+        name = f"the coefficient of {self.op.name}"
+        value = _number(c, name)
+        if value < 0:
+            raise ValueError(f"{name} must be >= 0, got {value:g}; put the sign into the operator")
+        return c if isbox(c) else value
+
+    def rest(self, u, params, t):
+        """rate + source, or None when there is neither."""
+        total = None
+        for fun, with_time in self._calls:
+            args = (params, t) if with_time else (params,)
+            value = fun(*args) if fun is self.source else fun(u, *args)
+            total = value if total is None else combine(total, (1.0, value))
+        return total
+
+    def given(self, params, t):
+        """The source alone, or None."""
+        return self.rest(None, params, t) if self.source is not None else None
+
+    def __call__(self, u, params, t):
+        """The whole right-hand side."""
+        rest = self.rest(u, params, t)
+        if self.op is None:
+            return rest
+        c = self.coefficient(params)
+        grown = self.op(u) * c
+        return grown if rest is None else grown + rest
+
+
+def posed(rate, linear, source, timed):
+    """The arguments of `stepper` -> Problem."""
+    whole = isinstance(rate, Operator)
+    if whole and linear is not None:
+        raise TypeError("give the operator once: as rate, or as linear with the rest as rate")
+    op, coefficient = _linear(rate if whole else linear, whole)
+    rate = None if whole else rate
+    for name, fun in (("rate", rate), ("source", source)):
+        if fun is not None and not callable(fun):
+            raise TypeError(f"{name} must be a function or, for rate, an Operator, got {type(fun).__name__}")
+    if rate is None and op is None:
+        raise TypeError("stepper needs a rate, a function rate(u, params) or an Operator, or the option linear")
+    if timed is None:
+        timed = any(fun is not None and _takes(fun, least) for fun, least in ((rate, 3), (source, 2)))
+    return Problem(rate, op, coefficient, source, timed, whole)
+
+
+def _linear(given, whole):
+    """(Operator or None, function params -> coefficient)."""
+    if given is None:
+        return None, None
+    op, coefficient = given if isinstance(given, tuple) and len(given) == 2 else (given, 1.0)
+    if not isinstance(op, Operator):
+        raise TypeError(f"linear takes an Operator or a pair (Operator, coefficient), got {type(op).__name__}")
+    if not fits(op.domain, op.codomain):
+        raise ShapeError(
+            f"stepper needs an operator from a space to itself, {op.name} maps {op.domain} to {op.codomain}"
+        )
+    if whole:
+        return op, lambda params: 1.0 if params is None else params
+    return op, coefficient if callable(coefficient) else lambda params: coefficient
+
+
+def _takes(fun, least):
+    """Whether a function takes this many arguments: then the last one is the time."""
+    try:
+        found = inspect.signature(fun).parameters.values()
+    except (TypeError, ValueError):
+        return False
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in kinds and p.default is p.empty for p in found) >= least
+
+
+def positive(value, name):
+    """A number > 0, traced or not; plain ones as float, so that a float32 state stays one."""
+    number = _number(value, name)
+    if number <= 0:
+        raise ValueError(f"{name} must be > 0, got {number:g}")
+    return value if isbox(value) else number
+
+
+def _number(value, name):
+    value = plain(value)
+    if not is_number(value):
+        given = f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
+        raise TypeError(f"{name} must be one real number, got {given}")
+    if not np.isfinite(value):
+        raise NonFiniteError(f"{name} must be finite, got {value}")
+    return float(value)

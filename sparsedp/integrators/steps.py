@@ -1,0 +1,111 @@
+"""Step: what `stepper` returns, a function of state and params for time loops."""
+
+import numpy as np
+
+from sparsedp.errors import NonFiniteError
+from sparsedp.fields import check_finite
+from sparsedp.integrators.combination import like
+from sparsedp.integrators.problem import positive
+from sparsedp.tape import is_variable, plain
+from sparsedp.tree import leaves
+
+__all__ = ["Step"]
+
+
+class Step:
+    """step(state, params): the state after a time dt. Made by `stepper`.
+
+    Parameters
+    ----------
+    method : str
+    problem : Problem
+    dt : number, traced number, or function of params
+    scheme : callable
+        ``scheme(u, params, t, h)``: the state after a step h.
+    limit : Limit or None
+        Of explicit steps.
+
+    Attributes
+    ----------
+    order : int
+        Of accuracy in time.
+    info : SolveLog or None
+        Records of the last solves and set-up.
+    taken : list of float
+        With error control: the accepted lengths of the last interval, as shares of it.
+    """
+
+    def __init__(self, method, problem, dt, scheme, limit):
+        self.method, self.problem, self.dt, self.scheme, self.limit = method, problem, dt, scheme, limit
+        self.name = f"stepper({method})"
+
+    @property
+    def order(self):
+        return self.scheme.order
+
+    @property
+    def info(self):
+        return getattr(self.scheme, "info", None)
+
+    @property
+    def taken(self):
+        return getattr(self.scheme, "taken", [1.0])
+
+    def __call__(self, state, params=None, *inputs):
+        """One step.
+
+        Parameters
+        ----------
+        state : array or tree u, or the pair (u, t) where the rate takes a time
+        params : tree
+        *inputs : tree, optional
+            Of this step; the rate then gets the pair (params, input) as its params.
+
+        Returns
+        -------
+        state, like the one given
+        """
+        params = (params, *inputs) if inputs else params
+        u, t = self._parts(state)
+        h = positive(self.dt(params), "dt") if callable(self.dt) else self.dt
+        if self.limit is not None:
+            self.limit.check(h, self.problem.coefficient(params))
+        new = self.checked(like(self.scheme(u, params, t, h), u), state, params, h)
+        return (new, t + h) if self.problem.timed else new
+
+    def checked(self, new, state, params, h):
+        """The new state, refused when it is not finite."""
+        if not all(map(_finite, leaves(new))):
+            self._refuse(state, params, h)
+        return new
+
+    def _parts(self, state):
+        if not self.problem.timed:
+            return state, None
+        if not (isinstance(state, (tuple, list)) and len(state) == 2):
+            given = type(state).__name__
+            raise TypeError(f"the rate of {self.name} takes a time, so its state is the pair (u, t), got {given}")
+        return state
+
+    def _refuse(self, state, params, h):
+        """Say where NaN or infinity came from."""
+        for what, tree in (("state", state), ("params", params)):
+            found = leaves(tree)
+            for number, leaf in enumerate(found):
+                if is_variable(leaf):
+                    place = f"part {number + 1} of the {what}" if len(found) > 1 else f"the {what}"
+                    check_finite(f"{place} of {self.name}", np.asarray(plain(leaf)))
+        raise NonFiniteError(
+            f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
+            "take smaller steps or an implicit method"
+        )
+
+    def __repr__(self):
+        length = "given by the params" if callable(self.dt) else f"{float(plain(self.dt)):g}"
+        return f"<{self.name}: order {self.order}, dt {length}>"
+
+
+def _finite(leaf):
+    """Whether all numbers are finite; their sum tells in one pass, unless it overflows."""
+    value = plain(leaf)
+    return not is_variable(value) or bool(np.isfinite(np.sum(value)) or np.all(np.isfinite(value)))

@@ -1,0 +1,166 @@
+r"""Convolution layers in 1-D and 2-D: one fused rule, derivatives of every order by hand.
+
+With the padded field P x the layer is  y[o, i] = sum_{c, d} w[o, c, d] (P x)[c, i + d] + b[o],  a bilinear map of x
+and w. With the trilinear form T(x, w, g) = sum g . y its derivatives are two more bilinear maps,
+
+    back(g, w):  sum_o of g against the filters turned round, then P^T: the cotangent of x;
+    weigh(x, g): correlation of P x with g: the cotangent of w;
+
+and the derivatives of each of the three are the other two.
+"""
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.errors import ShapeError
+from sparsedp.kernels.correlation import correlate, fold, pad, weigh
+from sparsedp.tape import Rule, differentiable, plain
+
+__all__ = ["convolution"]
+
+PADDINGS = ("periodic", "zero", "replicate")
+
+
+def convolution(p, x, padding="periodic"):
+    """Weights and fields on cells -> fields on the same cells, each a sum of filtered inputs plus a bias.
+
+    Parameters
+    ----------
+    p : dict
+        weight : (outputs, inputs, width) in 1-D, (outputs, inputs, width_x, width_y) in 2-D, odd widths;
+        bias : (outputs,).
+        Both may have one more leading axis, one copy for each sample of x.
+    x : (samples, inputs, n) or (samples, inputs, nx, ny) array
+    padding : "periodic", "zero" or "replicate"
+        What lies beyond the field.
+
+    Returns
+    -------
+    (samples, outputs, n) or (samples, outputs, nx, ny) array
+
+    Raises
+    ------
+    ValueError
+        If the padding is not known or a width is even.
+    ShapeError
+        If the shapes do not fit.
+
+    Examples
+    --------
+    >>> p = {"weight": np.array([[[-0.5, 0.0, 0.5]]]), "bias": np.zeros(1)}
+    >>> convolution(p, np.array([[[0.0, 1.0, 4.0, 9.0]]]), "replicate")
+    array([[[0.5, 2. , 4. , 2.5]]])
+    """
+    weight, bias = p["weight"], p["bias"]
+    _check(np.shape(plain(weight)), np.shape(plain(bias)), np.shape(plain(x)), padding)
+    return _convolution(x, weight, bias, padding)
+
+
+def _check(weight, bias, x, padding):
+    if padding not in PADDINGS:
+        raise ValueError(f"padding must be periodic, zero or replicate, got {padding!r}")
+    dim = len(x) - 2
+    if dim not in (1, 2) or len(weight) not in (dim + 2, dim + 3):
+        raise ShapeError(
+            f"convolution takes x (samples, inputs, n) or (samples, inputs, nx, ny) and a weight (outputs, inputs, "
+            f"widths), got {x} and {weight}"
+        )
+    widths, copies = weight[-dim:], weight[: len(weight) - dim - 2]
+    if any(width % 2 == 0 for width in widths):
+        raise ValueError(f"convolution needs odd widths, so that the output lies on the same cells, got {widths}")
+    if weight[-dim - 1] != x[1] or bias != (*copies, weight[-dim - 2]) or copies not in ((), x[:1]):
+        raise ShapeError(f"convolution got x {x}, weight {weight} and bias {bias}; inputs, outputs or samples differ")
+
+
+def _forward(x, weight, bias, padding):
+    dim = np.ndim(x) - 2
+    y = correlate(pad(x, weight.shape[-dim:], padding), weight)
+    y += bias.reshape(bias.shape + (1,) * dim)
+    return y
+
+
+def _vjp(nums, y, x, weight, bias, padding):
+    def pull(g):
+        made = (
+            lambda: _back(g, weight, padding),
+            lambda: _weigh(x, g, weight.shape, padding),
+            lambda: _total(g, anp.ndim(bias)),
+        )
+        return tuple(made[num]() for num in nums)
+
+    return pull
+
+
+def _total(g, rank):
+    """Cotangent of the bias: the sum over cells, and over samples unless each has its own."""
+    g = anp.sum(g, axis=tuple(range(2, anp.ndim(g))))
+    return g if rank == 2 else anp.sum(g, axis=0)
+
+
+def _jvp(nums, tangents, y, x, weight, bias, padding):
+    given = dict(zip(nums, tangents, strict=True))
+    total = 0.0
+    if 0 in given:
+        total = total + _linear(given[0], weight, padding)
+    if 1 in given:
+        total = total + _linear(x, given[1], padding)
+    if 2 in given:
+        dim = anp.ndim(x) - 2
+        spread = anp.reshape(given[2], anp.shape(given[2]) + (1,) * dim)
+        total = total + spread * anp.ones(anp.shape(y))
+    return total
+
+
+_convolution = differentiable("convolution", _forward, _vjp, _jvp)
+
+
+def _two(name, forward, first, second):
+    """A bilinear rule of (a, b, *static); first(g, a, b, *static) and second are the cotangents of a and b."""
+
+    def vjp(nums, ans, a, b, *static):
+        return lambda g: tuple((first, second)[num](g, a, b, *static) for num in nums)
+
+    def jvp(nums, tangents, ans, a, b, *static):
+        given = dict(zip(nums, tangents, strict=True))
+        parts = [rule(given[0], b, *static)] if 0 in given else []
+        parts += [rule(a, given[1], *static)] if 1 in given else []
+        return sum(parts[1:], parts[0])
+
+    rule = differentiable(name, forward, vjp, jvp)
+    return rule
+
+
+def _plain_linear(x, weight, padding):
+    return correlate(pad(x, weight.shape[2 - np.ndim(x) :], padding), weight)
+
+
+def _plain_back(g, weight, padding):
+    dim = np.ndim(g) - 2
+    turned = np.swapaxes(np.flip(weight, tuple(range(-dim, 0))), -dim - 1, -dim - 2)
+    widths = weight.shape[-dim:]
+    return fold(correlate(pad(g, [2 * width - 1 for width in widths], "zero"), turned), widths, padding)
+
+
+def _plain_weigh(x, g, shape, padding):
+    dim = np.ndim(g) - 2
+    return weigh(pad(x, shape[-dim:], padding), g, shape)
+
+
+_linear: Rule = _two(
+    "convolution, linear part",
+    _plain_linear,
+    lambda g, x, weight, padding: _back(g, weight, padding),
+    lambda g, x, weight, padding: _weigh(x, g, anp.shape(weight), padding),
+)
+_back: Rule = _two(
+    "convolution, back",
+    _plain_back,
+    lambda h, g, weight, padding: _linear(h, weight, padding),
+    lambda h, g, weight, padding: _weigh(h, g, anp.shape(weight), padding),
+)
+_weigh: Rule = _two(
+    "convolution, weights",
+    _plain_weigh,
+    lambda v, x, g, shape, padding: _back(g, v, padding),
+    lambda v, x, g, shape, padding: _linear(x, v, padding),
+)

@@ -1,0 +1,183 @@
+"""Dense layers, activations and residual blocks."""
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.errors import ShapeError
+from sparsedp.network.filters import convolution
+from sparsedp.tape import differentiable, plain
+
+__all__ = ["dense", "relu", "residual_block", "softplus", "tanh"]
+
+
+def dense(p, x):
+    """Weights and vectors -> x @ weight + bias.
+
+    Parameters
+    ----------
+    p : dict
+        weight : (inputs, outputs); bias : (outputs,). Both may have one more leading axis, one copy for each sample.
+    x : (samples, inputs) array
+
+    Returns
+    -------
+    (samples, outputs) array
+
+    Raises
+    ------
+    ShapeError
+        If the shapes do not fit.
+
+    Examples
+    --------
+    >>> dense({"weight": np.array([[1.0, 2.0]]), "bias": np.zeros(2)}, np.array([[3.0]]))
+    array([[3., 6.]])
+    """
+    weight, bias = p["weight"], p["bias"]
+    w, b, given = (np.shape(plain(value)) for value in (weight, bias, x))
+    copies = w[:-2]
+    if len(given) != 2 or w[-2:-1] != given[1:] or b != (*copies, *w[-1:]) or copies not in ((), given[:1]):
+        raise ShapeError(
+            f"dense takes x (samples, inputs), a weight (inputs, outputs) and a bias (outputs,), "
+            f"got {given}, {w} and {b}"
+        )
+    return _dense(x, weight, bias)
+
+
+def _forward(x, weight, bias):
+    return (x @ weight if weight.ndim == 2 else (x[:, None] @ weight)[:, 0]) + bias
+
+
+def _product(x, weight):
+    return x @ weight if anp.ndim(weight) == 2 else (x[:, None] @ weight)[:, 0]
+
+
+def _vjp(nums, y, x, weight, bias):
+    """Cotangents g w^T, x^T g and the sum of g; with a weight for each sample, sample by sample."""
+    apart = anp.ndim(weight) == 3
+
+    def pull(g):
+        made = (
+            lambda: _product(g, anp.swapaxes(weight, -1, -2)),
+            lambda: x[:, :, None] * g[:, None, :] if apart else x.T @ g,
+            lambda: g if apart else anp.sum(g, axis=0),
+        )
+        return tuple(made[num]() for num in nums)
+
+    return pull
+
+
+def _jvp(nums, tangents, y, x, weight, bias):
+    parts = {0: lambda t: _product(t, weight), 1: lambda t: _product(x, t), 2: lambda t: t + anp.zeros(anp.shape(y))}
+    found = [parts[num](t) for num, t in zip(nums, tangents, strict=True)]
+    return sum(found[1:], found[0])
+
+
+_dense = differentiable("dense", _forward, _vjp, _jvp)
+
+
+def _activation(name, forward, slope):
+    """A function of each number from its value and slope(x, y), y the value."""
+
+    def vjp(nums, y, x):
+        return lambda g: (g * slope(x, y),)
+
+    def jvp(nums, tangents, y, x):
+        return tangents[0] * slope(x, y)
+
+    return differentiable(name, forward, vjp, jvp)
+
+
+_TANH = _activation("tanh", np.tanh, lambda x, y: 1.0 - y * y)
+_RELU = _activation("relu", lambda x: np.maximum(x, 0.0), lambda x, y: 0.5 * (1.0 + anp.sign(plain(x))))
+_SOFTPLUS = _activation(
+    "softplus", lambda x: np.logaddexp(x, 0.0), lambda x, y: 0.5 * (1.0 + _TANH(0.5 * x))
+)  # fmt: skip
+
+
+def tanh(x):
+    """Hyperbolic tangent of each number.
+
+    Parameters
+    ----------
+    x : array
+
+    Returns
+    -------
+    array like x
+
+    Examples
+    --------
+    >>> float(tanh(np.array(0.0)))
+    0.0
+    """
+    return _TANH(x)
+
+
+def relu(x):
+    """max(x, 0) of each number; the derivative at 0 is 1/2, the mean of both sides.
+
+    Parameters
+    ----------
+    x : array
+
+    Returns
+    -------
+    array like x
+
+    Examples
+    --------
+    >>> relu(np.array([-1.0, 2.0]))
+    array([0., 2.])
+    """
+    return _RELU(x)
+
+
+def softplus(x):
+    """log(1 + exp(x)) of each number, without overflow.
+
+    Parameters
+    ----------
+    x : array
+
+    Returns
+    -------
+    array like x
+
+    Examples
+    --------
+    >>> softplus(np.array([0.0, 1000.0]))
+    array([6.93147181e-01, 1.00000000e+03])
+    """
+    return _SOFTPLUS(x)
+
+
+def residual_block(p, x, activation=tanh, padding="periodic"):
+    """Two convolutions beside the identity: x + second(activation(first(x))).
+
+    Parameters
+    ----------
+    p : dict
+        first, second : weights of convolutions; see residual_weights.
+    x : (samples, channels, *cells) array
+    activation : callable
+    padding : str
+        As for convolution.
+
+    Returns
+    -------
+    array like x
+
+    Raises
+    ------
+    ShapeError, ValueError
+        As convolution.
+
+    Examples
+    --------
+    >>> from sparsedp.network.weights import residual_weights
+    >>> x = np.ones((1, 2, 8))
+    >>> np.array_equal(residual_block(residual_weights(np.random.default_rng(0), 2, 3, gain=0.0), x), x)
+    True
+    """
+    return x + convolution(p["second"], activation(convolution(p["first"], x, padding)), padding)

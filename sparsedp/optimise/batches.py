@@ -1,0 +1,42 @@
+"""What the loss is given after x: nothing, or the batch of the present iteration."""
+
+from collections.abc import Sequence
+
+__all__ = ["Batches"]
+
+
+class Batches:
+    """Batches by number of iteration, so that a run that is resumed sees the same ones.
+
+    Parameters
+    ----------
+    given : None, sequence or callable
+        A sequence is used in turn and again from its start; a callable is asked for the batch of an iteration.
+
+    Raises
+    ------
+    TypeError
+        If it is neither; ValueError if the sequence is empty.
+    """
+
+    def __init__(self, given=None):
+        if given is not None and not callable(given) and not isinstance(given, Sequence):
+            raise TypeError(
+                f"batches must be a list or a function of the iteration, got {type(given).__name__}; "
+                "write list(batches)"
+            )
+        if given is not None and not callable(given) and not len(given):
+            raise ValueError("batches is empty; leave it out, and the loss is called with x alone")
+        self._given, self.number = given, 0
+
+    @property
+    def varied(self):
+        """Whether two iterations may see two losses."""
+        return self._given is not None
+
+    def now(self, back=0):
+        """The arguments of the loss after x in this iteration, or so many iterations earlier."""
+        if self._given is None:
+            return ()
+        number = self.number - back
+        return (self._given(number) if callable(self._given) else self._given[number % len(self._given)],)

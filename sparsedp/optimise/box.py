@@ -1,0 +1,71 @@
+"""Bounds on the unknowns, as flat vectors."""
+
+import numpy as np
+
+from sparsedp.fields import is_number
+from sparsedp.tree import leaves
+
+__all__ = ["Box"]
+
+ULPS = 4 * float(np.finfo(float).eps)
+
+
+class Box:
+    """Lower and upper bounds of a flat vector; without any it is open and changes nothing.
+
+    Parameters
+    ----------
+    lower, upper : (n,) array or None
+    """
+
+    def __init__(self, lower=None, upper=None):
+        self.lower, self.upper = lower, upper
+        self.open = lower is None and upper is None
+
+    @classmethod
+    def of(cls, bounds, packing, start):
+        """What a user writes as bounds -> Box. `start` is the tree that `packing` packs.
+
+        Raises
+        ------
+        ValueError
+            If bounds is not a pair, has another structure than start, is NaN, or a lower bound is above an upper.
+        """
+        if bounds is None:
+            return cls()
+        if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
+            raise ValueError(f"bounds must be a pair (lower, upper), got {bounds!r}; write (0.0, None) for x >= 0")
+        lower, upper = (_side(side, packing, start, value) for side, value in zip(bounds, (-np.inf, np.inf)))
+        if np.any(np.isnan(lower) | np.isnan(upper)) or np.any(lower > upper):
+            raise ValueError("bounds must be numbers with lower <= upper; write None for a side without a bound")
+        return cls(lower, upper)
+
+    def inside(self, vector):
+        """The nearest point of the box."""
+        return vector if self.open else np.clip(vector, self.lower, self.upper)
+
+    def free_mask(self, vector, slope):
+        """Which entries can go downhill: not those at which the gradient pushes against a bound. None: all."""
+        if self.open:
+            return None
+        near = ULPS * np.abs(vector)  # a step that ends on a bound may miss it by rounding
+        return ~(((vector - near <= self.lower) & (slope > 0)) | ((vector + near >= self.upper) & (slope < 0)))
+
+    def free(self, vector, slope):
+        """A gradient with 0 where it pushes against a bound."""
+        return slope if self.open else np.where(self.free_mask(vector, slope), slope, 0.0)
+
+
+def _side(side, packing, start, without):
+    if side is None:
+        return np.full(packing.size, without)
+    if not isinstance(side, (tuple, list, dict)) and is_number(side):
+        return np.full(packing.size, float(side))
+    given, wanted = leaves(side), leaves(start)
+    if len(given) != len(wanted):
+        raise ValueError(
+            f"a bound must be a number or have the structure of start, got {len(given)} leaves where start has "
+            f"{len(wanted)}; write one number, or a tree like start"
+        )
+    full = [np.full(np.shape(x), without if b is None else b) for x, b in zip(wanted, given, strict=True)]
+    return packing.pack_leaves(full)

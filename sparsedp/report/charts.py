@@ -1,0 +1,81 @@
+"""Charts of checks and measurements."""
+
+from sparsedp.report.plots import axes_or_current
+
+__all__ = ["curves", "v_curve"]
+
+
+def curves(lines, ax, x_label, y_label):
+    """Named curves -> one log-log picture; the best points reached at any time are marked.
+
+    Parameters
+    ----------
+    lines : dict
+        Name -> (x, y), two sequences of positive numbers.
+    ax : matplotlib Axes
+    x_label, y_label : str
+    """
+    best = _pareto([point for x, y in lines.values() for point in zip(x, y, strict=True)])
+    ax.plot(*zip(*best, strict=True), color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
+    for name, (x, y) in lines.items():
+        ax.plot(x, y, marker=".", markersize=4, linewidth=1, label=name)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel(x_label)
+    ax.set_ylabel(y_label)
+    ax.grid(visible=True, which="both", color="0.93")
+    ax.legend(frameon=False)
+
+
+def v_curve(audit, ax=None):
+    """Audit of a gradient -> picture of |difference - gradient| over the step, one curve for each direction.
+
+    A right gradient gives a V: the error of the differences falls with the step until rounding lifts it. A
+    wrong one gives a plateau.
+
+    Parameters
+    ----------
+    audit : Audit
+        From `check.gradient`.
+    ax : matplotlib Axes, optional
+        Default: the current axes of pyplot.
+
+    Returns
+    -------
+    matplotlib Axes
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp import check
+    >>> from sparsedp.report.plots import figure
+    >>> result = check.gradient(lambda u: np.sum(u**3), np.array([1.0, 2.0]), gradient=lambda u: 3 * u**2)
+    >>> v_curve(result, figure().add_subplot()).get_xlabel()
+    'step'
+    """
+    ax = axes_or_current(ax)
+    for name in dict.fromkeys(row["direction"] for row in audit.rows):
+        rows = [row for row in audit.rows if row["direction"] == name and not row["note"] and row["gap"]]
+        ax.plot([row["step"] for row in rows], [abs(row["gap"]) for row in rows], marker=".", linewidth=1, label=name)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel("step")
+    ax.set_ylabel("|difference - gradient| / |derivative|")
+    ax.set_title(f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}")
+    ax.grid(visible=True, which="major", color="0.93")
+    ax.legend(frameon=False, fontsize="small")
+    return ax
+
+
+def _pareto(points):
+    """Points that no other point beats in both coordinates, from left to right."""
+    kept: list = []
+    for x, y in sorted(points):
+        if not kept or y < kept[-1][1]:
+            kept.append((x, y))
+    return kept

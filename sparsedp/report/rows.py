@@ -1,0 +1,181 @@
+"""Rows of error against run time: as a table, a CSV file that can be continued, and a picture."""
+
+import csv
+import io
+import math
+from pathlib import Path
+
+from sparsedp.check.findings import table
+
+__all__ = ["COLUMNS", "Rows", "kept_rows", "write_row"]
+
+COLUMNS = (
+    "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
+    "seconds_forward", "seconds_backward", "peak_bytes", "solves_forward", "solves_adjoint", "iterations", "status",
+    "seed", "versions", "settings", "reference_error", "seconds_forward_median", "seconds_forward_max",
+    "seconds_backward_median", "seconds_backward_max",
+)  # fmt: skip
+TEXTS = ("scene", "method", "status", "seed", "versions", "settings")
+SHOWN = (
+    "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup", "seconds_forward",
+    "seconds_backward", "peak_bytes", "solves_forward", "solves_adjoint", "iterations", "status",
+)  # fmt: skip
+
+
+class Rows:
+    """Error against run time. Made by `workprec`.
+
+    Attributes
+    ----------
+    scene : str
+    rows : list of dict
+        Keys are COLUMNS; NaN where a figure does not exist.
+    left_out : list of str
+        Runs that were not made, with the reason.
+    """
+
+    def __init__(self, scene, rows, left_out):
+        self.scene, self.rows, self.left_out = scene, rows, left_out
+
+    def seconds(self, row, error="gradient_error"):
+        """The run time that belongs to an error: of the value, or of value and gradient."""
+        return row["seconds_forward"] + (row["seconds_backward"] if error == "gradient_error" else 0.0)
+
+    def pareto(self, error="gradient_error"):
+        """Rows that no other row beats in both time and error, the fastest first."""
+        usable = [row for row in self.rows if row["status"] == "ok" and self._known(row, error)]
+        kept: list = []
+        for row in sorted(usable, key=lambda row: (self.seconds(row, error), row[error])):
+            if not kept or row[error] < kept[-1][error]:
+                kept.append(row)
+        return kept
+
+    def _known(self, row, error):
+        return math.isfinite(row[error]) and math.isfinite(self.seconds(row, error))
+
+    def best(self, error, which="gradient_error"):
+        """The fastest row whose error is at most `error`, or None."""
+        return next((row for row in self.pareto(which) if row[which] <= error), None)
+
+    def markdown(self):
+        """The table in Markdown, with what was left out; a star marks the Pareto set of the gradient."""
+        stars = [id(row) for row in [*self.pareto(), *self.pareto("forward_error")]]
+        used = [name for name in SHOWN if any(not _empty(row[name]) for row in self.rows)]
+        lines = [f"| {' | '.join(used)} | best |", f"|{'---|' * (len(used) + 1)}"]
+        for row in self.rows:
+            cells = [_text(row[name]) for name in used]
+            lines.append(f"| {' | '.join(cells)} | {'*' if id(row) in stars else ''} |")
+        errors = [row["reference_error"] for row in self.rows if not _empty(row["reference_error"])]
+        stated = [f"\nError of the reference: {max(errors):.1e}."] if errors else []
+        left = [f"- left out: {sentence}" for sentence in self.left_out]
+        return "\n".join([f"### {self.scene}", "", *lines, *stated, *([""] if left else []), *left]) + "\n"
+
+    def csv(self):
+        """All columns as CSV."""
+        stream = io.StringIO()
+        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows)
+        return stream.getvalue()
+
+    def plot(self, ax=None, error="gradient_error"):
+        """Log-log picture: run time across, error up, one curve for each method, the Pareto set marked.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+        error : "gradient_error" or "forward_error"
+
+        Returns
+        -------
+        matplotlib Axes
+        """
+        from sparsedp.report import charts, plots
+
+        lines: dict = {}
+        for row in self.rows:
+            if row["status"] == "ok" and self._known(row, error) and row[error] > 0:
+                lines.setdefault(row["method"], []).append((self.seconds(row, error), row[error]))
+        ax = plots.figure().add_subplot() if ax is None else ax
+        curves = {name: tuple(zip(*sorted(points), strict=True)) for name, points in lines.items()}
+        if curves:
+            charts.curves(curves, ax, "run time [s]", error.replace("_", " "))
+        ax.set_title(self.scene)
+        return ax
+
+    def save(self, folder):
+        """Write scene.md, scene.csv and, where matplotlib is installed, scene.png into a folder -> list of paths."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = [folder / f"{self.scene}.{kind}" for kind in ("md", "csv")]
+        for path, text in zip(paths, (self.markdown(), self.csv()), strict=True):
+            path.write_text(text, encoding="utf-8")
+        try:
+            from sparsedp.report import plots
+
+            gradient = any(not _empty(row["gradient_error"]) for row in self.rows)
+            ax = self.plot(plots.figure().add_subplot(), "gradient_error" if gradient else "forward_error")
+            with (folder / f"{self.scene}.png").open("wb") as stream:
+                plots.save(ax.figure, stream)
+        except ImportError:
+            return paths
+        return [*paths, folder / f"{self.scene}.png"]
+
+    def __str__(self):
+        used = [name for name in SHOWN if any(not _empty(row[name]) for row in self.rows)]
+        lines = [[_text(row[name]) for name in used] for row in self.rows]
+        left = [f"  left out: {sentence}" for sentence in self.left_out]
+        return "\n".join([f"{self.scene}: error against run time", table(lines, tuple(used)), *left])
+
+    __repr__ = __str__
+
+
+def _empty(value):
+    return isinstance(value, float) and math.isnan(value)
+
+
+def _text(value):
+    if isinstance(value, str):
+        return value
+    return "" if _empty(value) else f"{value:.2g}" if isinstance(value, float) else str(value)
+
+
+# ------------------------------------------------------------ a file that can be continued
+
+
+def write_row(file, row):
+    """Add a finished row to a CSV file."""
+    path = Path(file)
+    fresh = not path.exists() or not path.stat().st_size
+    torn = not fresh and not path.read_bytes().endswith(b"\n")  # a run was cut off while it wrote
+    with path.open("a", encoding="utf-8", newline="") as stream:
+        stream.write("\n" * torn)
+        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+        if fresh:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def kept_rows(file, versions):
+    """CSV file -> (finished rows of these versions by key, what is left out)."""
+    path = Path(file)
+    if not path.exists() or not path.stat().st_size:
+        return {}, []
+    with path.open(encoding="utf-8", newline="") as stream:
+        reader = csv.DictReader(stream)
+        if tuple(reader.fieldnames or ()) != COLUMNS:
+            raise ValueError(f"{path.name} is no table of workprec; give another file name")
+        rows = [row for row in reader if row["versions"] and row["seconds_backward_max"] is not None]
+    same = [_typed(row) for row in rows if row["versions"] == versions]
+    other = len(rows) - len(same)
+    left = [f"{other} rows of {path.name} from other versions: run again"] if other else []
+    return {tuple(row[name] for name in ("scene", "method", "settings", "seed")): row for row in same}, left
+
+
+def _typed(row):
+    return {name: text if name in TEXTS else _number(text) for name, text in row.items()}
+
+
+def _number(text):
+    value = float(text or "nan")
+    return int(value) if value.is_integer() and "." not in text and "e" not in text else value

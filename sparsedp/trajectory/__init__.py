@@ -1,0 +1,1 @@
+"""Many steps as one node on the tape, under a memory budget."""

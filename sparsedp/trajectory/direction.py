@@ -1,0 +1,66 @@
+"""Directional derivatives of functions between trees: forward, or by two reverse passes where a part has no JVP."""
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.errors import DerivativeError
+from sparsedp.tape import backward, dtype_of, fit, forward_root, is_variable, plain, reverse_root, split_box, trace
+from sparsedp.trajectory.ends import pull_ends
+from sparsedp.tree import flatten
+
+__all__ = ["push", "zero_like"]
+
+
+def push(fun, tree, tangents):
+    """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants)."""
+    try:
+        return _forward(fun, tree, tangents)
+    except (NotImplementedError, DerivativeError):
+        if any(dtype_of(t).kind == "c" for t in tangents if t is not None):
+            raise
+        return _twice_reverse(fun, tree, tangents)
+
+
+def _forward(fun, tree, tangents):
+    roots = [None if tangent is None else forward_root(tangent) for tangent in tangents]
+    result, number = trace(fun, tree, roots)
+    found, rebuild = flatten(result)
+    parts = [split_box(leaf, number) for leaf in found]
+    slopes = [_tangent(value, None if node is None else node.g) for value, node in parts]
+    return rebuild(value for value, _ in parts), rebuild(slopes)
+
+
+def _twice_reverse(fun, tree, tangents):
+    """The pullback z -> J^T z is linear, so the gradient in z of <J^T z, tangent> is J tangent."""
+    roots = [None if tangent is None else reverse_root() for tangent in tangents]
+    result, number = trace(fun, tree, roots)
+    found, rebuild = flatten(result)
+    parts = [split_box(leaf, number) for leaf in found]
+    used = [place for place, (_, node) in enumerate(parts) if node is not None]
+    moving = [(root, tangent) for root, tangent in zip(roots, tangents, strict=True) if root is not None]
+
+    def paired(z):
+        backs = pull_ends([parts[place][1] for place in used], z, [root for root, _ in moving])
+        products = [anp.sum(back * t) for back, (_, t) in zip(backs, moving, strict=True) if back is not None]
+        return sum(products[1:], products[0]) if products else 0.0
+
+    starts = [reverse_root() for _ in used]
+    total, inner = trace(paired, [zero_like(parts[place][0]) for place in used], starts)
+    _, end = split_box(total, inner)
+    slopes = {} if end is None else backward(end, 1.0)
+    known = dict(zip(used, starts, strict=True))
+    values = [value for value, _ in parts]
+    return rebuild(values), rebuild(
+        _tangent(value, slopes.get(known[place]) if place in known else None) for place, value in enumerate(values)
+    )
+
+
+def _tangent(value, slope):
+    if not is_variable(value):
+        return None
+    return zero_like(value) if slope is None else fit("the step", value, slope, slope)
+
+
+def zero_like(value):
+    """A plain zero of the shape and dtype of a value, traced or not."""
+    return np.zeros(np.shape(plain(value)), dtype_of(value))[()]

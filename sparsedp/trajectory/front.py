@@ -1,0 +1,156 @@
+"""rollout(): a time loop whose gradient costs one node on the tape."""
+
+import numpy as np
+
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.fields import is_whole
+from sparsedp.tape import dtype_of, is_variable, isbox, plain
+from sparsedp.trajectory.keep import All, Each, Last
+from sparsedp.trajectory.layout import Layout, dense
+from sparsedp.trajectory.rules import rollout_rule
+from sparsedp.trajectory.run import Run
+from sparsedp.trajectory.schedule import slots_within
+from sparsedp.tree import leaves
+
+__all__ = ["rollout"]
+
+
+def rollout(
+    step, state, params, n, inputs=None, memory=None, keep="last", truncate=None, *, progress=False, record=None
+):
+    """Step and first state -> the state after n steps, differentiable as one node on the tape.
+
+    Parameters
+    ----------
+    step : callable
+        ``step(state, params)``, or ``step(state, params, input)`` with inputs: the next state, of the same
+        form. It uses only its arguments and constants, and changes none of them.
+    state : array, number, or any nesting of them in tuples, lists and dicts
+        Not modified. Leaves that are not floating (int, None, str) are handed along without a derivative.
+    params : the same, or None
+    n : int
+        Number of steps.
+    inputs : the same, optional
+        What changes from step to step: step i gets entry i of the first axis of every array.
+    memory : None, number of bytes, or text such as "200 MB"
+        What the rollout may take. None keeps every state. Else as many are kept as fit beside params, inputs
+        and their gradients, and the others are run again from those, as rarely as possible. Not counted:
+        what one step needs by itself, and all states that `keep` hands out.
+    keep : "last", "all" or callable
+        What is handed out: the last state; all n + 1, each array with a new first axis; or the tuple of what
+        ``keep(index, state)`` returned for index = 0 ... n, any trees.
+    truncate : int, optional
+        Truncated back-propagation: state i counts as a constant for the steps after it wherever n - i is a
+        multiple of `truncate`, 0 < i < n. The value is the same, derivatives of all orders are cut there.
+    progress : bool or str
+        Progress bars on standard error, a string is their label; needs the extra `plot`.
+    record : callable, optional
+        ``record(one)`` after every run over the steps, forward and backward: steps, states kept, steps run
+        again, growth of the cotangent. For example ``record=runs.append``.
+
+    Returns
+    -------
+    tree
+        Fresh arrays, with the dtypes of `state`.
+
+    Raises
+    ------
+    ValueError
+        If n, memory, keep or truncate is out of range; if the step changes one of its arguments.
+    ShapeError
+        If a state has another form, shape or dtype than the first, or inputs have not n entries.
+    NonFiniteError
+        If state, params or inputs hold NaN or infinity, or a step makes some, or the way back does.
+    DerivativeError
+        If the step or `keep` uses a traced value that is not an argument; if a derivative is asked of a state
+        without floating numbers; if a step that is run again gives another result.
+    ImportError
+        If a progress bar is wanted and tqdm is not installed.
+
+    Warns
+    -----
+    GrowthWarning
+        If the cotangent of the state grew by more than 1e8: a chaotic run. The gradient is exact; nothing is cut.
+
+    Notes
+    -----
+    Cost: n steps forward; backward n steps on a tape of their own, plus those run again:
+    with s states kept and at most r runs over each step, n <= (s + r)! / (s! r!) steps go back. The gradient
+    has the same bits for every `memory`. A step that carries plain forms of its own (protocol.py) needs no tape.
+
+    Source
+    ------
+    A. Griewank, A. Walther, ACM Trans. Math. Softw. 26 (2000) 19-45 (binomial checkpoints).
+
+    Examples
+    --------
+    >>> from sparsedp import value_and_grad
+    >>> decay = lambda u, rate: u - 0.5 * rate * u
+    >>> rollout(decay, 16.0, 1.0, 3)
+    2.0
+    >>> value_and_grad(lambda rate: rollout(decay, 16.0, rate, 3))(1.0)
+    (2.0, -6.0)
+    >>> rollout(decay, 16.0, 1.0, 3, keep="all")
+    array([16.,  8.,  4.,  2.])
+    """
+    n = _number_of_steps(n)
+    forms = Layout(state, "state"), Layout(params, "params"), None if inputs is None else Layout(inputs, "inputs")
+    _check_inputs(inputs, n)
+    args = _variables(state, forms[0]) + _variables(params, forms[1])
+    args += [] if inputs is None else _variables(inputs, forms[2])
+    beside = 2 * sum(form.nbytes for form in forms[1:] if form is not None)  # a copy and a gradient
+    slots = None if memory is None else slots_within(memory, forms[0].nbytes, n, beside)
+    if truncate is not None and not is_whole(truncate, 1):
+        raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
+    run = Run(step, *forms, n, _kind(keep, forms[0]), slots, truncate, any(map(isbox, args)), progress, record)
+    _check_values(run, args)
+    outputs = rollout_rule(run, *args)
+    count = len(plain(outputs)) if isinstance(plain(outputs), tuple) else None
+    return run.keep.tree([outputs] if count is None else [outputs[k] for k in range(count)], run.outcome)
+
+
+def _number_of_steps(n):
+    if isbox(n):
+        raise DerivativeError("rollout needs n as a plain whole number, got a traced value; it has no derivative")
+    if isinstance(n, bool) or not is_whole(n, 0):
+        raise ValueError(f"rollout needs n >= 0, a whole number of steps, got {n!r}")
+    return int(n)
+
+
+def _variables(tree, layout):
+    found = leaves(tree)
+    return [found[place] if isbox(found[place]) else dense(found[place]) for place in layout.places]
+
+
+def _check_inputs(inputs, n):
+    for leaf in leaves(inputs):
+        if is_variable(leaf) or isinstance(leaf, np.ndarray):
+            shape = np.shape(plain(leaf))
+            if shape[:1] != (n,):
+                raise ShapeError(f"inputs need a first axis of n = {n} entries, got an array of shape {shape}")
+
+
+def _kind(keep, layout):
+    if callable(keep):
+        return Each(layout, keep)
+    if keep not in ("last", "all"):
+        raise ValueError(f'keep must be "last", "all" or a function of (index, state), got {keep!r}')
+    return All(layout) if keep == "all" else Last(layout)
+
+
+def _check_values(run, args):
+    layouts = run.state, run.params, run.inputs
+    for layout, values in zip(layouts, run.split(args), strict=True):
+        if layout is not None:
+            layout.check_finite([plain(value) for value in values], "rollout")
+            for name, value in zip(layout.names, values, strict=True):
+                if dtype_of(value).kind not in "fc":
+                    raise DerivativeError(
+                        f"{name} of rollout is traced but holds {dtype_of(value)}; derivatives need floating numbers"
+                    )
+    if run.store and not run.state.places:
+        kinds = ", ".join(sorted({str(dtype_of(leaf)) for leaf in run.state.statics if leaf is not None}))
+        raise DerivativeError(
+            f"a gradient through rollout needs a state of floating numbers, got {kinds or 'nothing'}; "
+            "write state.astype(float)"
+        )

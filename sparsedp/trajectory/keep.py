@@ -1,0 +1,213 @@
+"""What a rollout hands out: the last state, all states, or what a function makes of each.
+
+Each kind collects arrays going forward (`collector`), builds the user's tree from them (`tree`), and going
+backward says which cotangent enters at which state (`source`).
+"""
+
+import numpy as np
+
+from sparsedp.errors import DerivativeError
+from sparsedp.tape import dtype_of, is_variable, isbox, reverse_root, split_box, trace
+from sparsedp.trajectory.ends import pull_ends
+from sparsedp.trajectory.layout import frozen, owned
+from sparsedp.tree import flatten
+
+__all__ = ["All", "Each", "Last"]
+
+
+class Last:
+    """The last state.
+
+    Parameters
+    ----------
+    layout : Layout
+    shown : slice
+        Which of the variables are handed out.
+    """
+
+    along = False  # cotangents enter at the end only
+    recycles = True  # nobody sees the states on the way: their arrays may be used again
+
+    def __init__(self, layout, shown=slice(None)):
+        self.layout, self.shown = layout, shown
+
+    def collector(self, n):
+        """Start collecting."""
+        return _LastCollector(self)
+
+    def tree(self, outputs, statics):
+        """Outputs of the rule -> what the user gets."""
+        pairs = zip(outputs, self.layout.floats, strict=True)
+        return self.layout.build([float(v) if bare and not isbox(v) else v for v, bare in pairs], statics)
+
+    def source(self, n, g):
+        """Cotangents of the outputs -> function (index, variables, statics) -> cotangents of a state, or None."""
+        entering = [None] * len(self.layout.places)
+        entering[self.shown] = g
+        return lambda i, values, statics: entering if i == n else None
+
+
+class _LastCollector:
+    shared = False  # whether the states seen are parts of the result
+
+    def __init__(self, keep):
+        self._keep = keep
+
+    def room(self, i):
+        """Where state i may be computed: nowhere in particular."""
+        return None
+
+    def see(self, i, values, statics):
+        self._values, self._statics = values, statics
+        return values
+
+    def finish(self, stored):
+        return tuple(owned(value) for value in self._values[self._keep.shown]), self._statics
+
+
+class All:
+    """All n + 1 states, stacked along a new first axis."""
+
+    along, recycles = True, False
+
+    def __init__(self, layout, shown=slice(None)):
+        self.layout, self.shown = layout, shown
+
+    def collector(self, n):
+        """Start collecting."""
+        return _AllCollector(self, n)
+
+    def tree(self, outputs, statics):
+        """Outputs of the rule -> what the user gets."""
+        return self.layout.build(outputs, [_stacked(line) for line in zip(*statics, strict=True)])
+
+    def source(self, n, g):
+        """Cotangents of the outputs -> function (index, variables, statics) -> cotangents of a state."""
+        count, shown = len(self.layout.places), self.shown
+
+        def at(i, values, statics):
+            entering = [None] * count
+            entering[shown] = [block[i] for block in g]
+            return entering
+
+        return at
+
+
+class _AllCollector:
+    def __init__(self, keep, n):
+        self._shown = keep.shown
+        pairs = list(zip(keep.layout.shapes, keep.layout.dtypes, strict=True))[keep.shown]
+        self._blocks = [np.empty((n + 1, *shape), dtype) for shape, dtype in pairs]
+        self._statics: list = []
+        self._whole = self.shared = len(pairs) == len(keep.layout.shapes)
+
+    def room(self, i):
+        """Where state i may be computed: in its place."""
+        self._room = [block[i] for block in self._blocks] if self._whole else None
+        return self._room
+
+    def see(self, i, values, statics):
+        self._statics.append(statics)
+        room = self._room if i else self.room(i)
+        for block, value in zip(self._blocks, values[self._shown], strict=True):
+            if room is None or not any(value is row for row in room):
+                block[i] = value
+        if not room:
+            return values
+        return [row if type(row) is np.ndarray else value for row, value in zip(room, values, strict=True)]
+
+    def finish(self, stored):
+        if stored:  # the way back uses these very arrays
+            for block in self._blocks:
+                block.flags.writeable = False
+        return tuple(self._blocks), self._statics
+
+
+def _stacked(line):
+    """A leaf that is no variable, along the trajectory: numbers are stacked, the rest is taken once."""
+    return np.stack(line) if isinstance(line[0], (bool, int, np.ndarray, np.generic)) else line[0]
+
+
+class Each:
+    """What function(index, state) makes of each state; floating results of one shape are kept in one stack."""
+
+    along, recycles = True, False
+
+    def __init__(self, layout, function):
+        self.layout, self.function = layout, function
+        self._groups: dict = {}
+
+    def collector(self, n):
+        """Start collecting."""
+        return _EachCollector(self)
+
+    def tree(self, outputs, statics):
+        """Outputs of the rule -> the tuple of what the function returned."""
+        return tuple(
+            rebuild([outputs[place[0]][place[1]] if place else leaf for leaf, place in zip(found, places, strict=True)])
+            for rebuild, found, places in statics
+        )
+
+    def source(self, n, g):
+        """Cotangents of the stacks -> function (index, variables, statics) -> cotangents of a state."""
+        counters = [len(stack) for stack in g]
+
+        def at(i, values, statics):
+            return self._pull(i, values, statics, g, counters)
+
+        return at
+
+    def _pull(self, i, values, statics, g, counters):
+        roots = [reverse_root() for _ in values]
+        state = self.layout.build(values, statics)
+        result, number = trace(lambda tree: self.function(i, tree), state, self.layout.spread(roots))
+        nodes, slopes = [], []
+        for leaf in reversed([leaf for leaf in flatten(result)[0] if is_variable(leaf)]):
+            value, node = split_box(leaf, number)
+            group = self._groups[_sort(value)]
+            counters[group] -= 1
+            if node is not None:
+                nodes.append(node)
+                slopes.append(g[group][counters[group]])
+        return pull_ends(nodes, slopes, roots)
+
+
+def _sort(value):
+    return np.shape(value), dtype_of(value).char
+
+
+class _EachCollector:
+    shared = False
+
+    def __init__(self, keep):
+        self._keep = keep
+        self._stacks: dict = {}
+        self._trees: list = []
+
+    def room(self, i):
+        """Where state i may be computed: nowhere in particular."""
+        return None
+
+    def see(self, i, values, statics):
+        layout = self._keep.layout
+        found, rebuild = flatten(self._keep.function(i, layout.build([frozen(v) for v in values], statics)))
+        places = [self._store(leaf) if is_variable(leaf) else None for leaf in found]
+        found = [None if place else leaf for leaf, place in zip(found, places, strict=True)]
+        self._trees.append((flatten(rebuild(found))[1], found, places))
+        return values
+
+    def _store(self, leaf):
+        if isbox(leaf):
+            raise DerivativeError(
+                "keep uses a traced value that is not part of the state, and its derivative would be lost; "
+                "return what it needs of the state, and combine the two outside of rollout"
+            )
+        numbers = {key: number for number, key in enumerate(self._stacks)}
+        key = _sort(leaf)
+        stack = self._stacks.setdefault(key, [])
+        stack.append(owned(leaf))
+        return numbers.get(key, len(numbers)), len(stack) - 1
+
+    def finish(self, stored):
+        self._keep._groups = {key: number for number, key in enumerate(self._stacks)}
+        return tuple(np.stack(stack) for stack in self._stacks.values()), self._trees

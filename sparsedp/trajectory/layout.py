@@ -1,0 +1,211 @@
+"""Where the numbers of a state lie in its tree, and whether another tree has the same form."""
+
+import numpy as np
+
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.fields import check_finite
+from sparsedp.tape import dtype_of, is_variable, isbox, plain
+from sparsedp.tree import flatten
+
+__all__ = ["Layout", "dense", "frozen", "owned", "still", "surely_finite"]
+
+
+class Layout:
+    """The form of a tree: which leaves are variables (floating numbers and arrays) and which stay as they are.
+
+    Parameters
+    ----------
+    tree : any nesting of arrays, tuples, lists and dicts
+    root : str
+        What messages call it.
+
+    Attributes
+    ----------
+    places : list of int
+        Numbers of the variable leaves.
+    statics : tuple
+        All leaves, None in place of the variables.
+    labels, names : lists of str
+        Of all leaves and of the variables, as one would write them: ``state["ink"][0]``.
+    bare : bool
+        The tree is one variable leaf and nothing else.
+    shapes, dtypes, floats : list
+        Of the variable leaves.
+    """
+
+    def __init__(self, tree, root):
+        found, rebuild = flatten(tree)
+        self.root = root
+        self.places = [place for place, leaf in enumerate(found) if is_variable(leaf)]
+        self.statics = tuple(None if is_variable(leaf) else leaf for leaf in found)
+        # Rebuilt without the variables: what is kept must not hold a trace or a large array.
+        self._template = rebuild(self.statics)
+        self._rebuild = flatten(self._template)[1]
+        self.bare = not isinstance(tree, (tuple, list, dict)) and bool(self.places)
+        self.labels = _labels(tree, root)
+        self.names = [self.labels[place] for place in self.places]
+        variables = [plain(found[place]) for place in self.places]
+        self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
+        self.shapes = [np.shape(leaf) for leaf in variables]
+        self.dtypes = [dtype_of(leaf) for leaf in variables]
+
+    @property
+    def nbytes(self):
+        """Bytes of the variables."""
+        return sum(int(np.prod(s, dtype=int)) * d.itemsize for s, d in zip(self.shapes, self.dtypes, strict=True))
+
+    def build(self, variables, statics=None):
+        """Variables and the other leaves -> the tree."""
+        if self.bare:
+            return variables[0]
+        found = list(self.statics if statics is None else statics)
+        for place, value in zip(self.places, variables, strict=True):
+            found[place] = value
+        return self._rebuild(found)
+
+    def spread(self, values):
+        """One value for each variable -> one for each leaf, None for the others."""
+        if self.bare:
+            return list(values)
+        found = [None] * len(self.statics)
+        for place, value in zip(self.places, values, strict=True):
+            found[place] = value
+        return found
+
+    def take(self, tree, when):
+        """A tree of the same form -> its variables and its other leaves.
+
+        Raises
+        ------
+        ShapeError
+            If the form differs; `when` says who made the tree.
+        """
+        if self.bare:
+            if isinstance(tree, (tuple, list, dict)):
+                raise ShapeError(_changed(self.root, "one array", _kind(tree), when))
+            return [tree], (None,)
+        found: list = []
+        self._collect(self._template, tree, self.root, when, found)
+        variables = [found[place] for place in self.places]
+        for place in self.places:
+            found[place] = None
+        if any(map(is_variable, found)):
+            place = next(place for place, leaf in enumerate(found) if is_variable(leaf))
+            raise ShapeError(
+                f"{self.root} must keep its form: {when} made a floating value of {self.statics[place]!r}; "
+                "start with a floating value, for example state.astype(float)"
+            )
+        return variables, tuple(found)
+
+    def _collect(self, wanted, tree, name, when, found):
+        if isinstance(wanted, dict):
+            if not isinstance(tree, dict) or tree.keys() != wanted.keys():
+                raise ShapeError(_changed(name, _kind(wanted), _kind(tree), when))
+            for key, branch in wanted.items():
+                self._collect(branch, tree[key], f"{name}[{key!r}]", when, found)
+        elif isinstance(wanted, (tuple, list)):
+            if not isinstance(tree, (tuple, list)) or len(tree) != len(wanted):
+                raise ShapeError(_changed(name, _kind(wanted), _kind(tree), when))
+            for number, branch in enumerate(wanted):
+                self._collect(branch, tree[number], f"{name}[{number}]", when, found)
+        elif isinstance(tree, (tuple, list, dict)):
+            raise ShapeError(_changed(name, "one leaf", _kind(tree), when))
+        else:
+            found.append(tree)
+
+    def is_one(self, value):
+        """Whether a result is the one array that the form asks for, contiguous: the common case, told fast."""
+        return (
+            type(value) is np.ndarray
+            and value.shape == self.shapes[0]
+            and value.dtype == self.dtypes[0]
+            and value.flags.c_contiguous
+        )
+
+    def check(self, values, when):
+        """Values of the variables after a step -> the same, contiguous; refuse another shape or dtype."""
+        return [
+            value
+            if type(value) is np.ndarray and value.shape == shape and value.dtype == dtype and value.flags.c_contiguous
+            else self._settled(number, value, when)
+            for number, (value, shape, dtype) in enumerate(zip(values, self.shapes, self.dtypes, strict=True))
+        ]
+
+    def _settled(self, number, value, when):
+        name, shape, dtype = self.names[number], self.shapes[number], self.dtypes[number]
+        if isbox(value):
+            raise DerivativeError(
+                f"{when} uses a traced value that is not one of its arguments, and its derivative would be lost; "
+                "pass it in params"
+            )
+        if not isinstance(value, (np.ndarray, np.generic, float, complex)):
+            raise ShapeError(_changed(name, "one array", _kind(value), when))
+        if np.shape(value) != shape:
+            raise ShapeError(_changed(name, f"shape {shape}", f"shape {np.shape(value)}", when))
+        if dtype_of(value) != dtype:
+            raise ShapeError(_changed(name, f"dtype {dtype}", f"dtype {dtype_of(value)}", when))
+        return dense(value)
+
+    def check_finite(self, values, owner):
+        """Refuse NaN and infinity in plain variables: leaf, first index, count."""
+        for name, value in zip(self.names, values, strict=True):
+            if not surely_finite(value):
+                check_finite(f"{name} of {owner}", value)
+
+    def is_finite(self, values):
+        """Whether all variables are finite."""
+        return all(surely_finite(value) or bool(np.all(np.isfinite(value))) for value in values)
+
+
+def surely_finite(value):
+    """One pass without a temporary array; False also when a finite sum is too large."""
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(np.sum(value)))
+
+
+def dense(value):
+    """Array or number -> contiguous array, or a NumPy scalar when it has no axes."""
+    value = np.ascontiguousarray(value) if np.ndim(value) else np.asarray(value)[()]
+    return value
+
+
+def owned(value):
+    """Array or number -> a contiguous copy of its own."""
+    return np.array(value, order="C", subok=False) if np.ndim(value) else np.asarray(value)[()]
+
+
+def frozen(value):
+    """Array -> a view nobody can write through; numbers as they are."""
+    if type(value) is not np.ndarray:
+        return value
+    view = value.view()
+    view.flags.writeable = False
+    return view
+
+
+def still(statics):
+    """Leaves that are no variables -> the same, arrays among them as copies nobody can write into."""
+    if any(type(leaf) is np.ndarray for leaf in statics):
+        return tuple(frozen(leaf.copy()) if type(leaf) is np.ndarray else leaf for leaf in statics)
+    return statics
+
+
+def _labels(tree, name):
+    """Names of all leaves, from left to right."""
+    if isinstance(tree, dict):
+        return [label for key, branch in tree.items() for label in _labels(branch, f"{name}[{key!r}]")]
+    if isinstance(tree, (tuple, list)):
+        return [label for number, branch in enumerate(tree) for label in _labels(branch, f"{name}[{number}]")]
+    return [name]
+
+
+def _kind(tree):
+    if isinstance(tree, dict):
+        return f"a dict of {', '.join(map(str, tree)) or 'nothing'}"
+    if isinstance(tree, (tuple, list)):
+        return f"a {type(tree).__name__} of length {len(tree)}"
+    return "one array" if isinstance(tree, (np.ndarray, np.generic, float)) or isbox(tree) else type(tree).__name__
+
+
+def _changed(name, wanted, given, when):
+    return f"{name} must keep its form: {when} made {given} of {wanted}; return a state like the first one"

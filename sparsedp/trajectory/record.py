@@ -1,0 +1,108 @@
+"""What is known of a rollout afterwards: how often steps were run, and how the cotangent grew on its way back.
+
+A cotangent that grows by exp(rate) a step is that of a chaotic run: the gradient is exact for these very steps, but
+a change of the start by rounding changes it by about amplification * 1e-16. Nothing is clipped. Beyond LIMIT the
+gradient says little about the physics, and a GrowthWarning says so.
+"""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+
+from sparsedp.errors import GrowthWarning
+
+__all__ = ["Growth", "Record"]
+
+LIMIT = 1e8  # half of the digits are gone
+SAMPLES = 32  # measurements of the cotangent in a long run
+APART = 16  # least number of steps between two of them: they cost a pass over the cotangent
+
+
+class Record(NamedTuple):
+    """One run over all steps, as `rollout` hands it to `record`.
+
+    Attributes
+    ----------
+    direction : str
+        "forward" or "backward".
+    steps : int
+    kept : int
+        States kept for the way back.
+    recomputed : int
+        Steps run again on the way back.
+    norms : tuple of (int, float)
+        Index of a state and the largest entry of its cotangent, from the last state to the first.
+    growth : float
+        Rate a step: the norm behaves like exp(growth * number of steps back); NaN when it was not measured.
+    amplification : float
+        Largest norm over the first one.
+    """
+
+    direction: str
+    steps: int
+    kept: int
+    recomputed: int
+    norms: tuple = ()
+    growth: float = float("nan")
+    amplification: float = float("nan")
+
+    @property
+    def factor(self):
+        """Plain steps over steps, the first run included: 1 when nothing was run again."""
+        return 1 + self.recomputed / max(self.steps, 1)
+
+    @property
+    def flagged(self):
+        """Whether the cotangent grew beyond what makes a gradient useful."""
+        return self.amplification > LIMIT
+
+
+class Growth:
+    """Measures the cotangent of the state now and then on the way back."""
+
+    def __init__(self, n, truncate):
+        self._n, self.every, self._truncate = n, max(n // SAMPLES, APART), truncate
+        self.norms: list = []
+
+    def see(self, i, g):
+        """The cotangent of state i, before anything enters there; asked where i is a multiple of `every`."""
+        if g is None:
+            return
+        norm = max((_largest(leaf) for leaf in g if leaf is not None), default=0.0)
+        self.norms.append((i, norm))
+
+    def _pieces(self):
+        """Pairs of neighbouring measurements with no cut between them: (steps, growth of the logarithm)."""
+        known = [(i, np.log(norm)) for i, norm in self.norms if 0 < norm < np.inf]
+        for (i, first), (j, second) in zip(known, known[1:], strict=False):
+            if self._truncate is None or (self._n - i) // self._truncate == (self._n - j - 1) // self._truncate:
+                yield i - j, second - first
+
+    def record(self, kept, recomputed):
+        """The record of the way back; warns when the cotangent grew too much."""
+        pieces = list(self._pieces())
+        steps = sum(length for length, _ in pieces)
+        rate = float(sum(rise for _, rise in pieces) / steps) if steps else float("nan")
+        first = next((norm for _, norm in self.norms if norm > 0), 0.0)
+        grown = max((norm / first for _, norm in self.norms), default=float("nan")) if first > 0 else float("nan")
+        found = Record("backward", self._n, kept, recomputed, tuple(self.norms), rate, float(grown))
+        if found.flagged:
+            warnings.warn(
+                GrowthWarning(
+                    f"the cotangent grew by {grown:.0e} over {self._n} steps of rollout, {rate:.2g} a step in the "
+                    "logarithm; the gradient is exact and of little use, take fewer steps or truncate"
+                ),
+                stacklevel=2,
+            )
+        return found
+
+
+def _largest(g):
+    """Largest entry, without a temporary array; NaN and infinity come through."""
+    if not np.size(g):
+        return 0.0
+    if np.iscomplexobj(g):
+        return float(np.max(np.abs(g)))
+    low, high = float(np.min(g)), float(np.max(g))
+    return max(high, -low) if low == low else low

@@ -1,0 +1,277 @@
+"""A rollout as a value: the step, the form of its arguments, how far, and what is kept."""
+
+import numpy as np
+
+from sparsedp.errors import DerivativeError, NonFiniteError
+from sparsedp.fields import place
+from sparsedp.ledger import active, count
+from sparsedp.trajectory.layout import still, surely_finite
+from sparsedp.trajectory.progress import shown_steps
+from sparsedp.trajectory.protocol import engine_of
+from sparsedp.trajectory.record import Growth, Record
+from sparsedp.trajectory.schedule import stride
+
+__all__ = ["Run"]
+
+
+class Run:
+    """What is fixed in a rollout; the variables are passed in.
+
+    Parameters
+    ----------
+    step : callable
+    state, params : Layout
+    inputs : Layout or None
+    n : int
+    keep : Last, All or Each
+    slots : int or None
+        How many states may be kept for the way back; None: all.
+    truncate : int or None
+    store : bool
+        Whether a way back will follow the first run.
+    progress : bool or str
+    record : callable or None
+    """
+
+    def __init__(
+        self,
+        step,
+        state,
+        params,
+        inputs,
+        n,
+        keep,
+        slots=None,
+        truncate=None,
+        store=False,
+        progress=False,
+        record=None,
+    ):
+        self.step, self.state, self.params, self.inputs = step, state, params, inputs
+        self.n, self.keep, self.slots, self.truncate, self.store = n, keep, slots, truncate, store
+        self.progress, self.record = progress, record
+        self.place_of: dict = {}  # in a dual run: number of an argument of the run -> its number here
+        self.silenced: tuple = ()  # variables that are zero for the step after a cut: tangents
+        self.outcome = None  # what the user's tree holds beside the variables
+        self.given: list = []  # the arguments of the last run whose states were kept
+        self._kept: list | None = None
+        self._final: tuple = ()
+
+    # ------------------------------------------------------------ arguments
+
+    def split(self, args):
+        """Variables of all arguments -> those of state, params and inputs."""
+        first = len(self.state.places)
+        second = first + len(self.params.places)
+        return list(args[:first]), list(args[first:second]), list(args[second:])
+
+    def input_at(self, i, x):
+        """The inputs of step i, in a list; empty when there are none."""
+        if self.inputs is None:
+            return []
+        statics = [leaf[i] if isinstance(leaf, np.ndarray) else leaf for leaf in self.inputs.statics]
+        return [self.inputs.build([_at(block, i) for block in x], statics)]
+
+    # ------------------------------------------------------------ forward
+
+    def forward(self, args):
+        """Run all steps; return the arrays to hand out."""
+        engine = engine_of(self, args)
+        collector = self.keep.collector(self.n)
+        with engine.guarded():
+            state, statics, kept = self._advance(engine, collector, args)
+        engine.check_params()
+        self._check_end(args, state)
+        if self.store:
+            self.given = list(args)
+            self._kept, self._final = kept, (state if collector.shared else engine.store(state), statics)
+        if active:
+            count("rollout.step", "forward", self.n)
+            count("rollout", "bytes", len(kept) * self.state.nbytes if self.store else 0)
+        if self.record is not None:
+            self.record(Record("forward", self.n, len(kept), 0))
+        outputs, self.outcome = collector.finish(self.store)
+        return outputs
+
+    def _advance(self, engine, collector, args):
+        """(last state, its statics, kept states) after all steps."""
+        state, statics = self.split(args)[0], still(self.state.statics)
+        state = collector.see(0, state, statics)
+        kept: list = []
+        stop = 0 if self.store else -1
+        for i in shown_steps(self.progress, range(self.n), "forward"):
+            stored = i == stop or (stop >= 0 and i == self.n - 1)
+            if stored:
+                kept.append((i, state if collector.shared or i == 0 else engine.store(state), statics))
+                stop = self._next(i, len(kept)) if i == stop else stop
+            before = state
+            state, statics = engine.forward(i, state, statics, collector.room(i + 1))
+            state = collector.see(i + 1, state, statics)
+            if not stored and i:
+                engine.release(before)
+        return state, statics, kept
+
+    def _next(self, i, used):
+        """Index of the state to be kept after state i."""
+        if self.slots is None:
+            return i + 1
+        return i + stride(self.n - i, self.slots - used + 1) if self.n - i > 1 else self.n
+
+    def _check_end(self, args, state):
+        """Refuse a last state that is not finite: NaN stays, so one look tells, and a second run finds the step."""
+        if self.state.is_finite(state):
+            return
+        engine = engine_of(self, args)
+        state, statics = self.split(args)[0], still(self.state.statics)
+        for i in range(self.n):
+            state, statics = engine.forward(i, state, statics)
+            for name, value in zip(self.state.names, state, strict=True):
+                finite = np.isfinite(value)
+                if not np.all(finite):
+                    many = finite.size - np.count_nonzero(finite)
+                    where = place(int(np.argmin(finite)), finite.shape) if finite.ndim else 0
+                    raise NonFiniteError(
+                        f"step {i} of rollout made {many} values of {name} NaN or infinite, the first at {where}; "
+                        "take a smaller time step"
+                    )
+
+    # ------------------------------------------------------------ backward
+
+    def compare(self, values):
+        """Refuse a last step that gives another state than it gave going forward."""
+        for name, value, known in zip(self.state.names, values, self._final[0], strict=True):
+            if not np.array_equal(value, known):
+                raise DerivativeError(
+                    f"the step gives another {name} when it is run again; it must depend on its arguments only"
+                )
+
+    def backward(self, args, wanted, g):
+        """Cotangents of the outputs -> those of the arguments in `wanted`, in that order."""
+        if self._kept is None:
+            self.store = True
+            self.forward(args)
+        engine = engine_of(self, args, frozenset(wanted))
+        with engine.guarded():
+            state = Way(self, engine, any(number < len(self.state.places) for number in wanted)).back(g)
+        found = [*(state or [None] * len(self.state.places)), *engine.gradients()]
+        for number in wanted:
+            self._check_gradient(number, found[number], g)
+        return tuple(_or_zeros(found[number], args[number]) for number in wanted)
+
+    def _check_gradient(self, number, slope, g):
+        """Refuse a gradient that is not finite, unless the cotangents given were not."""
+        if slope is None or surely_finite(slope) or np.all(np.isfinite(slope)):
+            return
+        if all(np.all(np.isfinite(leaf)) for leaf in g):
+            name = [*self.state.names, *self.params.names, *(self.inputs.names if self.inputs else ())][number]
+            raise NonFiniteError(
+                f"the way back through {self.n} steps of rollout makes the gradient in {name} NaN or infinite; "
+                "take fewer steps, or cut it with truncate"
+            )
+
+    def is_cut(self, i):
+        """Whether truncation makes state i a constant for the steps after it."""
+        return self.truncate is not None and 0 < i < self.n and (self.n - i) % self.truncate == 0
+
+    def take_kept(self):
+        """The kept states. Under a budget they are handed over: freed as they are used, run again if asked again."""
+        kept = self._kept
+        if self.slots is not None:
+            self._kept = None
+        return kept, self._final
+
+
+class Way:
+    """One way back over all steps.
+
+    Parameters
+    ----------
+    run : Run
+    engine : Taped or Protocol
+    want_state : bool
+        Whether the first state wants a cotangent.
+    """
+
+    def __init__(self, run, engine, want_state):
+        self.run, self.engine, self.want_state = run, engine, want_state
+        self.stack, self.final = run.take_kept()
+        self.recomputed = 0
+
+    def back(self, g):
+        """Cotangents of the outputs -> cotangents of the first state; the rest is added up in the engine."""
+        run = self.run
+        growth, many = Growth(run.n, run.truncate), len(self.stack)
+        source = run.keep.source(run.n, g)
+        total = source(run.n, *self.final)
+        growth.see(run.n, total)
+        for i in shown_steps(run.progress, range(run.n - 1, -1, -1), "backward"):
+            if total is None and not run.keep.along:
+                break  # cut by truncation
+            total = self._step(i, total, source, growth)
+        if active:
+            count("rollout.step", "vjp", run.n)
+            count("rollout.step", "recomputed", self.recomputed)
+        known = growth.record(many, self.recomputed)
+        if run.record is not None:
+            run.record(known)
+        return total
+
+    def _step(self, i, total, source, growth):
+        run = self.run
+        values, statics = self._state_at(i)
+        wants = not run.is_cut(i) if i else self.want_state
+        if total is not None:
+            total = self.engine.backward(i, values, statics, total, wants)
+            if i % growth.every == 0:
+                growth.see(i, total)
+        if run.keep.along and (i > 0 or self.want_state):
+            total = _sum(total, source(i, values, statics))
+        if run.slots is not None and i:
+            self.engine.release(values)
+        return total
+
+    def _state_at(self, i):
+        """State i, from the nearest kept state; states on the way are kept by the binomial rule."""
+        run, stack = self.run, self.stack
+        if run.slots is None:
+            return stack[i][1:]
+        start, values, statics = stack[-1]
+        while start < i:
+            free = run.slots - len(stack) + 1
+            stop = start + (stride(i + 1 - start, free) if free > 1 else i - start)
+            values, statics = self._again(start, stop, values, statics)
+            start = stop
+            if start < i:
+                values = self.engine.store(values)
+                stack.append((start, values, statics))
+        if stack[-1][0] == i:
+            stack.pop()
+        return values, statics
+
+    def _again(self, start, stop, values, statics):
+        """Run from a kept state on."""
+        self.recomputed += stop - start
+        for k in range(start, stop):
+            before = values
+            values, statics = self.engine.forward(k, values, statics)
+            if k > start:
+                self.engine.release(before)
+        return values, statics
+
+
+def _at(block, i):
+    row = block[i]
+    if type(row) is np.ndarray:
+        row.flags.writeable = False
+    return row
+
+
+def _sum(total, entering):
+    """Two lists of cotangents, or None, added leaf by leaf."""
+    if total is None or entering is None:
+        return entering if total is None else total
+    return [b if a is None else a if b is None else a + b for a, b in zip(total, entering, strict=True)]
+
+
+def _or_zeros(g, value):
+    return np.zeros_like(value) if g is None else g

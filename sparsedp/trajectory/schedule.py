@@ -1,0 +1,132 @@
+"""Which states to keep: binomial checkpointing, optimal for a known number of steps.
+
+With s kept states (the first one included) and at most r runs over any step,
+
+    beta(s, r) = (s + r)! / (s! r!)
+
+steps can be reversed. For n steps with beta(s, r-1) < n <= beta(s, r) the least number of plain steps is
+
+    t(n, s) = r n - beta(s + 1, r - 1),
+
+the first run over n - 1 steps included. It is reached by any rule that puts the next kept state m steps
+further on, where both parts stay in the range of their own r: beta(s, r-2) <= m <= beta(s, r-1) and
+beta(s-1, r-1) <= n - m <= beta(s-1, r).
+"""
+
+import re
+from typing import NamedTuple
+
+from sparsedp.fields import is_number
+
+__all__ = ["Plan", "advances", "plan", "recomputed", "slots_within", "stride"]
+
+UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+WORKING = 6  # states at work beside the kept ones: the present, the next, the last, a cotangent of two, the result
+OWN = 5  # states left to what a step needs by itself, where there is room for that
+
+
+def beta(s, r):
+    """Number of steps that s kept states and r runs can reverse; 0 where r or s is negative."""
+    if s < 0 or r < 0:
+        return 0
+    total = 1
+    for k in range(1, min(s, r) + 1):
+        total = total * (max(s, r) + k) // k
+    return total
+
+
+def repetitions(n, s):
+    """The least r with beta(s, r) >= n."""
+    if s == 1:
+        return n - 1
+    r, reach = 0, 1
+    while reach < n:
+        r += 1
+        reach = reach * (s + r) // r
+    return r
+
+
+def advances(n, s):
+    """Least number of plain steps that reversing n steps takes with s kept states, the first run included."""
+    if n <= 1:
+        return 0
+    r = repetitions(n, s)
+    return r * n - beta(s + 1, r - 1)
+
+
+def recomputed(n, s):
+    """Least number of steps that are run again."""
+    return advances(n, s) - max(n - 1, 0)
+
+
+def stride(n, s):
+    """How many steps further on the next state is kept, when n > 1 steps lie ahead and s states may be kept."""
+    if s == 1:
+        return n - 1  # nothing is kept: on to the last state
+    r = repetitions(n, s)
+    return min(beta(s, r - 1), n - beta(s - 1, r - 1))
+
+
+def slots_within(memory, state_bytes, n, beside=0):
+    """Memory and bytes of a state -> how many states may be kept beside those at work, at most n.
+
+    `beside`: bytes of what is there once, params and inputs and their gradients.
+
+    Raises
+    ------
+    ValueError
+        If not even the first state fits, or memory is no positive number of bytes.
+    """
+    allowed, size = _bytes(memory), max(state_bytes, 1)
+    slots = (allowed - beside) // size - WORKING
+    if slots < 1:
+        raise ValueError(
+            f"rollout cannot work within memory={memory!r}: {WORKING + 1} states of {size} bytes and {beside} bytes "
+            f"for params and inputs are needed; write memory={(WORKING + 1) * size + beside}"
+        )
+    slots -= min(OWN, slots // 16)
+    return min(slots, max(n, 1))
+
+
+def _bytes(memory):
+    """Bytes, or a text such as "200 MB" -> bytes."""
+    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*([A-Za-z]+)\s*", memory) if isinstance(memory, str) else None
+    if found and found[2].upper() in UNITS:
+        return int(float(found[1]) * UNITS[found[2].upper()])
+    if not is_number(memory) or not 0 < memory < float("inf"):
+        raise ValueError(f'rollout needs memory as bytes > 0 or a text, got {memory!r}; write for example "200 MB"')
+    return int(memory)
+
+
+class Plan(NamedTuple):
+    """What a budget means for a run, before it is made.
+
+    Attributes
+    ----------
+    steps : int
+    kept : int
+        States kept for the way back.
+    recomputed : int
+        Steps run again; the least number that is possible with so many states.
+    """
+
+    steps: int
+    kept: int
+    recomputed: int
+
+    @property
+    def factor(self):
+        """Plain steps over steps, the first run included."""
+        return 1 + self.recomputed / max(self.steps, 1)
+
+
+def plan(n, memory, state_bytes, beside=0):
+    """Steps, memory and bytes of a state, and of what is there once -> Plan.
+
+    Examples
+    --------
+    >>> plan(10_000, "100 MB", 256 * 256 * 8)
+    Plan(steps=10000, kept=179, recomputed=9820)
+    """
+    slots = max(n, 1) if memory is None else slots_within(memory, state_bytes, n, beside)
+    return Plan(n, slots, recomputed(n, slots))

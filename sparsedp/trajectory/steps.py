@@ -1,0 +1,177 @@
+"""One step, forward on plain values and backward on a tape of its own."""
+
+from contextlib import contextmanager
+
+import numpy as np
+
+from sparsedp.tape import fit, reverse_root, split_box, trace
+from sparsedp.trajectory.direction import zero_like
+from sparsedp.trajectory.ends import pull_ends
+from sparsedp.trajectory.layout import frozen, owned, still
+from sparsedp.tree import flatten, leaves
+
+__all__ = ["Taped"]
+
+
+class Taped:
+    """A step that is a plain function: run as it is going forward, put on a tape of its own going backward.
+
+    Parameters
+    ----------
+    run : Run
+    args : tuple of plain arrays
+        Variables of state, params and inputs.
+    wanted : set of int
+        Which of them want a cotangent.
+    """
+
+    def __init__(self, run, args, wanted=()):
+        self.run = run
+        _, self.p, self.x = run.split(args)
+        self.params = run.params.build([frozen(value) for value in self.p], still(run.params.statics))
+        self._given = leaves(self.params)
+        self._last: tuple = ()
+        first, second = len(run.state.places), len(run.state.places) + len(self.p)
+        self._p = [place for place in range(len(self.p)) if first + place in wanted]
+        self._x = [place for place in range(len(self.x)) if second + place in wanted]
+        self.gp: list = [None] * len(self.p)
+        self.gx: list = [np.zeros_like(x) if place in self._x else None for place, x in enumerate(self.x)]
+        self._roots = {want: self._plan_roots(want) for want in (True, False)}
+
+    # ------------------------------------------------------------ forward
+
+    def forward(self, i, values, statics, room=None):
+        """Variables and statics of state i -> those of state i + 1. `room` is for steps that can use it."""
+        run = self.run
+        values = self._silenced(i, values)
+        self._last = i, values, statics
+        if run.state.bare:
+            result = run.step(frozen(values[0]), self.params, *run.input_at(i, self.x))
+            if run.state.is_one(result):
+                return [result], statics
+        else:
+            state = run.state.build([frozen(value) for value in values], statics)
+            result = run.step(state, self.params, *run.input_at(i, self.x))
+        values, statics = run.state.take(result, "the step")
+        return run.state.check(values, "the step"), still(statics)
+
+    def _silenced(self, i, values):
+        """A dual run has no tangents where the derivative is cut."""
+        if not self.run.silenced or not self.run.is_cut(i):
+            return values
+        return [zero_like(value) if number in self.run.silenced else value for number, value in enumerate(values)]
+
+    @contextmanager
+    def guarded(self):
+        """Turn NumPy's refusal to write into an argument into an error that names it."""
+        try:
+            yield
+        except (ValueError, TypeError) as error:
+            if "read-only" not in str(error) and "readonly" not in str(error):
+                raise
+            raise ValueError(
+                f"{self._culprit()} in place; write u = u + du instead of u += du, or work on a copy"
+            ) from error
+
+    def _culprit(self):
+        """Which array the step writes into: the one that stops it when all others may be written."""
+        if not self._last:
+            return "keep changes the state"
+        i, values, statics = self._last
+        run = self.run
+        parts = [run.state.build(values, statics), self.params, *run.input_at(i, self.x)]
+        found, rebuild = flatten(parts)
+        layouts = [run.state, run.params, run.inputs][: len(parts)]
+        for number, name in enumerate(label for layout in layouts for label in layout.labels):
+            if isinstance(found[number], np.ndarray):
+                copies = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in found]
+                copies[number].flags.writeable = False
+                try:
+                    run.step(*rebuild(copies))
+                except (ValueError, TypeError):
+                    return f"the step changes {name}"
+        return "keep changes the state"
+
+    def check_params(self):
+        """Refuse a step that puts other things into the dicts and lists of params."""
+        found = leaves(self.params)
+        if len(found) != len(self._given) or any(a is not b for a, b in zip(found, self._given, strict=True)):
+            raise ValueError("the step changes the entries of params; make what changes a part of the state")
+
+    def store(self, values):
+        """A copy that nobody else can write into."""
+        return [owned(value) for value in values]
+
+    def release(self, values):
+        """The state is not needed any more."""
+
+    # ------------------------------------------------------------ backward
+
+    def backward(self, i, values, statics, g, want_state):
+        """Cotangents of state i + 1 -> those of state i; those of params and inputs are added up."""
+        run = self.run
+        values = self._silenced(i, values)
+        self._last = i, values, statics
+        roots, spread = self._roots[want_state]
+        parts = [run.state.build([frozen(value) for value in values], statics), self.params]
+        parts += run.input_at(i, self.x)
+        result, number = trace(lambda parts: run.step(*parts), parts, spread)
+        ends = run.state.take(result, "the step")[0]
+        pairs = [split_box(end, number) for end in ends]
+        if i == run.n - 1:
+            run.compare(run.state.check([value for value, _ in pairs], "the step"))
+        nodes, slopes = [], []
+        for (_, node), slope in zip(pairs, g, strict=True):
+            if node is not None and slope is not None:
+                nodes.append(node)
+                slopes.append(slope)
+        return self._sorted(i, values, pull_ends(nodes, slopes, roots), want_state)
+
+    def _plan_roots(self, want_state):
+        """The roots in use, and the roots in the order of all leaves. They hold nothing: every step uses them again."""
+        run = self.run
+        state = [reverse_root() if want_state else None for _ in run.state.places]
+        p, x = [reverse_root() for _ in self._p], [reverse_root() for _ in self._x]
+        spread = run.state.spread(state) + run.params.spread(_at(self._p, p, len(self.p)))
+        if run.inputs is not None:
+            spread += run.inputs.spread(_at(self._x, x, len(self.x)))
+        return [*(state if want_state else ()), *p, *x], spread
+
+    def _sorted(self, i, values, backs, want_state):
+        split = len(values) if want_state else 0
+        for place, back in zip(self._p, backs[split:], strict=False):
+            if back is not None:
+                self._add(place, back)
+        for place, back in zip(self._x, backs[split + len(self._p) :], strict=True):
+            if back is not None:
+                self.gx[place][i] = back
+        if not want_state:
+            return None
+        return [back if back is None else _fitted(back, value) for back, value in zip(backs, values, strict=False)]
+
+    def _add(self, place, back):
+        back, total = _fitted(back, self.p[place]), self.gp[place]
+        if total is None:
+            self.gp[place] = owned(back)
+        elif type(total) is np.ndarray:
+            np.add(total, back, out=total)
+        else:
+            self.gp[place] = total + back
+
+    def gradients(self):
+        """What has been added up for params and inputs."""
+        return [*self.gp, *self.gx]
+
+
+def _at(places, values, count):
+    spread = [None] * count
+    for place, value in zip(places, values, strict=True):
+        spread[place] = value
+    return spread
+
+
+def _fitted(back, value):
+    """A cotangent in the dtype of its value."""
+    if type(back) is type(value) and back.dtype == value.dtype and back.shape == value.shape:
+        return back
+    return fit("the step", value, back, back)

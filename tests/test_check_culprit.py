@@ -1,0 +1,212 @@
+"""Who is at fault: the audit names the call whose own derivative is wrong; and what it knows about ripples."""
+
+import json
+import subprocess
+import sys
+from collections import Counter
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from autograd.test_util import check_grads
+from planted import call, rule, scene
+
+import sparsedp as dp
+
+AUDIT = dp.check.gradient
+GRID = dp.Grid((5, 4), spacing=0.7)
+X = np.linspace(1.0, 2.0, 20).reshape(5, 4)
+
+
+def named(seeds, error, **options):
+    """How often the verdict is right, and the culprit the planted one (none without an error)."""
+    found = Counter()
+    for seed in seeds:
+        loss, x, planted = scene(seed, error, **options)
+        result = AUDIT(loss, x)
+        found[result.verdict, result.culprit == (planted if error else None)] += 1
+    return found
+
+
+@pytest.mark.parametrize("error", [1e-3, 1e-4])
+def test_the_culprit_of_random_scenes(error):
+    assert named(range(4), error) == {("disagrees", True): 4}
+
+
+def test_right_scenes_have_none():
+    assert named(range(8, 13), 0.0) == {("agrees", True): 5}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [1e-3, 1e-4])
+def test_the_culprit_of_200_random_scenes(error):
+    assert named(range(200), error)["disagrees", True] >= 198
+
+
+@pytest.mark.slow
+def test_200_right_scenes():
+    found = named(range(200), 0.0)
+    assert found["agrees", True] >= 190 and not any(verdict == "disagrees" for verdict, _ in found)
+
+
+@pytest.mark.parametrize("kind", ["rule", "operator", "inverse", "elliptic", "matrix", "function", "operator given"])
+def test_every_kind_of_call(kind, rng):
+    act, name = call(kind, "guilty", GRID, rng, 1e-3, False)
+    result = AUDIT(lambda u: anp.sum(anp.sin(act(u)) ** 2 * X), X)
+    assert result.verdict == "disagrees" and result.culprit == name
+    assert f"culprit: {name}, its" in str(result) and result.to_dict()["culprit"] == name
+
+
+def test_what_is_wrong_is_said(rng):
+    act = call("inverse", "diffusion", GRID, rng, 1e-3, False)[0]
+    assert "which it inverts" in str(AUDIT(lambda u: anp.sum(act(u) ** 2), X))
+    act = rule("law", rng, 1e-3, jvp=True)
+    result = AUDIT(lambda u: anp.sum(act(u) ** 2), X)
+    assert result.culprit == "law" and "its JVP differs from its VJP by" in str(result)
+    bent = dp.from_functions(lambda u: u + 1e-3 * u**2, lambda g: g, GRID.cells, GRID.cells, name="bent")
+    assert AUDIT(lambda u: anp.sum(bent(u) ** 2), X).culprit == "bent"
+    blind = dp.from_functions(lambda u: 2 * u, lambda g: g[::-1] + g, GRID.cells, GRID.cells, name="blind")
+    assert "its transpose is off by" in str(AUDIT(lambda u: anp.sum(blind(u) ** 3), X))
+
+
+def test_a_fault_inside_a_root_or_a_loop(rng):
+    """A rule that runs other rules is named only when none of those is at fault."""
+    cube = dp.differentiable("cube", lambda u: u**3, lambda nums, ans, u: lambda g: (3.003 * u**2 * g,))
+    root = dp.implicit(lambda u, p: u + cube(u) - p)
+    found = AUDIT(lambda p: anp.sum(root(p, p) ** 2), X[0])
+    assert found.verdict == "disagrees" and found.culprit == "cube"
+
+    def steps(u):
+        for _ in range(3):
+            u = cube(u) + u
+        return u
+
+    def vjp(nums, ans, u):
+        return lambda g: (dp.value_and_grad(lambda v: anp.sum(g * steps(v)))(u)[1],)
+
+    loop = dp.differentiable("loop", steps, vjp)
+    assert AUDIT(lambda u: anp.sum(loop(u) ** 2), 0.1 * X).culprit == "cube"
+
+
+def test_a_value_beside_the_tape_has_no_culprit():
+    frozen = lambda u: anp.sum(u * np.sin(getattr(u, "_value", u)))
+    found = AUDIT(frozen, X)
+    assert found.verdict == "disagrees" and found.culprit is None
+    assert "a value may bypass the tape" in str(found)
+    assert AUDIT(lambda u: np.sum(u**2), X, gradient=lambda u: u).culprit is None
+
+
+def test_a_gradient_that_was_given():
+    assert AUDIT(lambda u: np.sum(u**3), X, gradient=lambda u: 3 * u**2)
+    assert AUDIT(lambda u: np.sum(u**3), X, gradient=3 * X**2)
+    assert AUDIT(lambda u: np.sum(u**3), X, gradient=lambda u: 3.003 * u**2).verdict == "disagrees"
+
+
+# ---- what others get wrong -----------------------------------------------------------------------------------------
+
+
+def rule_of(name, forward, slope):
+    return dp.differentiable(name, forward, lambda nums, ans, u: lambda g: (g * slope(u),))
+
+
+def test_four_functions_that_check_grads_gets_wrong(rng):
+    small = rule_of("small", lambda u: 1e-9 * u**2, lambda u: 3 * 2e-9 * u)  # three times too large
+    offset = rule_of("offset", lambda u: 1e-7 * np.sin(u), lambda u: 1e-7 * np.cos(u) + 1e-7)
+    for wrong in (small, offset):
+        check_grads(lambda u, f=wrong: anp.sum(f(u)), modes=["rev"], order=1)(X)  # passes
+        found = AUDIT(lambda u, f=wrong: anp.sum(f(u)), X)
+        assert found.verdict == "disagrees" and found.culprit == wrong.name
+
+    def lost(p):  # a parameter that a checkpoint captured: 6 where 12 is right
+        kept = getattr(p, "_value", p)
+        step = rule_of("checkpoint", lambda u: u * kept, lambda u: kept)
+        return anp.sum(step(step(p)) + 0.0 * p)
+
+    assert AUDIT(lost, np.array([2.0])).verdict == "disagrees"
+
+    def random(u):
+        return anp.sum(u**2) + 1e-7 * rng.standard_normal()
+
+    found = AUDIT(random, X)
+    assert found.verdict == "inconclusive" and "not deterministic" in found.reason
+
+
+@pytest.mark.parametrize("frequency", [1e6, 1e7, 1e8])
+def test_a_ripple_is_inconclusive(frequency):
+    """The right gradient of a loss with a ripple differs from what coarse steps see."""
+    x = np.linspace(1.0, 2.0, 20)
+    found = AUDIT(lambda u: anp.sum(u**2) + anp.sum(anp.sin(frequency * u)) / frequency, x)
+    assert found.verdict == "inconclusive" and "a ripple" in found.reason
+    smooth = AUDIT(lambda u: np.sum(u**2), x, gradient=lambda u: 2.2 * u)
+    assert smooth.verdict == "disagrees"
+
+
+# ---- the result as data, in pytest, as a picture --------------------------------------------------------------------
+
+
+def test_complex_step():
+    assert "complex step: agrees to" in str(AUDIT(lambda u: anp.sum(anp.sin(u) * u**2), X))
+    assert "complex step" not in str(AUDIT(lambda u: anp.sum(anp.abs(u) ** 2), X))
+
+
+def test_in_pytest(tmp_path):
+    """A failing assertion shows the table and the culprit."""
+    test = tmp_path / "test_it.py"
+    test.write_text(
+        "import numpy as np, autograd.numpy as anp, sparsedp as dp\n"
+        "law = dp.differentiable('law', lambda u: u**2, lambda nums, ans, u: lambda g: (2.01 * u * g,))\n"
+        "def test_gradient():\n    assert dp.check.gradient(lambda u: anp.sum(law(u)), np.ones(3) + np.arange(3.0))\n"
+    )
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(test)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 1
+    assert "culprit: law, its VJP is off by" in run.stdout and "<gradient disagrees: along" in run.stdout
+
+
+def test_to_dict_and_picture():
+    result = AUDIT(lambda u: anp.sum(anp.sin(u)), X)
+    data = json.loads(json.dumps(result.to_dict()))
+    assert data["verdict"] == "agrees" and data["culprit"] is None and len(data["rows"]) >= 30
+    pytest.importorskip("matplotlib")
+    from sparsedp.report.plots import figure
+
+    ax = figure().add_subplot()
+    assert dp.v_curve(result, ax) is ax
+    assert len(ax.lines) == len(result.lines) and ax.get_xscale() == ax.get_yscale() == "log"
+    assert "agrees" in ax.get_title()
+
+
+def test_loose_solves_are_inconclusive():
+    solve = dp.inverse(-dp.laplacian(dp.Grid((16, 16)), dp.dirichlet), "krylov", rtol=1e-3)
+    b = np.sin(np.arange(256.0)).reshape(16, 16)
+    found = AUDIT(lambda u: anp.sum(solve(u) ** 3), b)
+    assert found.verdict == "inconclusive" and "tighten" in found.reason
+    assert (
+        AUDIT(lambda u: anp.sum(solve(-u) * u) * 0.0 + anp.sum(u**2), b, gradient=lambda u: 3 * u).verdict
+        == "disagrees"
+    )
+    law = rule_of("law", lambda u: u**3, lambda u: 4 * u**2)
+    assert AUDIT(lambda u: anp.sum(law(solve(u))), b).culprit == "law"
+
+
+def test_a_fault_inside_rollout_transport_and_steps():
+    grid = dp.Grid((6, 5), size=1.0)
+    L, move = dp.laplacian(grid, dp.dirichlet), dp.transport(grid, "upwind")
+    ink, wind = np.cos(np.arange(30.0)).reshape(6, 5), 0.1 * np.sin(np.arange(float(grid.faces.size)))
+    cube = dp.differentiable(
+        "cube", lambda u: u**3, lambda nums, ans, u: lambda g: (3.003 * u**2 * g,), lambda n, t, ans, u: 3 * u**2 * t[0]
+    )
+    bent = dp.from_functions(L.apply, lambda g: 1.001 * L.T.apply(g), grid.cells, grid.cells, "bent")
+    step = dp.stepper("rk4", lambda u, p: p * bent(u), 1e-3)
+    scenes = (
+        (lambda v: anp.sum(dp.rollout(lambda u, w: move(cube(u), w, 0.02) + 0.1 * u, ink, v, 3) ** 2), wind, "cube"),
+        (lambda p: anp.sum(dp.rollout(step, ink, p, 3) ** 2), 0.05, "bent"),
+    )
+    for loss, x, name in scenes:
+        found = AUDIT(loss, x, directions=2)
+        assert found.verdict == "disagrees" and found.culprit == name
+    assert AUDIT(lambda v: anp.sum(dp.rollout(lambda u, w: move(u, w, 0.02), ink, v, 3) ** 2), wind, directions=1)

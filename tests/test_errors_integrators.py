@@ -1,0 +1,150 @@
+"""Every message of stepper, printed once."""
+
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+SHAPE, TYPE, VALUE = dp.errors.ShapeError, TypeError, ValueError
+FINITE, UNSTABLE = dp.errors.NonFiniteError, dp.errors.UnstableStepError
+L = dp.laplacian(dp.Grid(4), dp.dirichlet)
+U = np.ones(4)
+
+
+def decay(u, p):
+    return -p * u
+
+
+TABLE = [
+    (
+        lambda: dp.stepper("rk5", decay, 0.1),
+        VALUE,
+        "method must be one of euler, heun, ssprk3, rk4, backward_euler, crank_nicolson, tr_bdf2, imex, "
+        "etdrk4, got 'rk5'",
+    ),
+    (lambda: dp.stepper("euler", L, 0.1, unstable="warn"), VALUE, "unstable must be 'raise' or 'allow', got 'warn'"),
+    (
+        lambda: dp.stepper("euler", decay, 0.1, tolerance=0),
+        VALUE,
+        "tolerance must be between 0 and 1 or None, got 0; write for example 1e-6",
+    ),
+    (
+        lambda: dp.stepper("imex", decay, 0.1),
+        TYPE,
+        "imex needs the stiff linear term: write linear=L or linear=(L, coefficient)",
+    ),
+    (
+        lambda: dp.stepper("etdrk4", dp.from_matrix(np.triu(np.ones((2, 2))), name="A"), 0.1),
+        VALUE,
+        "stepper(etdrk4) needs a separable operator that can be diagonalised, got "
+        "<A: space(2) -> space(2), explicit>; try imex or tr_bdf2",
+    ),
+    (
+        lambda: dp.stepper("etdrk4", -1.0 * L, 1e6)(U),
+        FINITE,
+        "stepper(etdrk4): exp(1e+06 * -laplacian) is beyond 1.8e308; take a smaller dt or the other sign",
+    ),
+    (
+        lambda: dp.stepper("euler", L, 0.1, linear=L),
+        TYPE,
+        "give the operator once: as rate, or as linear with the rest as rate",
+    ),
+    (
+        lambda: dp.stepper("euler", 3.0, 0.1),
+        TYPE,
+        "rate must be a function or, for rate, an Operator, got float",
+    ),
+    (
+        lambda: dp.stepper("euler", None, 0.1),
+        TYPE,
+        "stepper needs a rate, a function rate(u, params) or an Operator, or the option linear",
+    ),
+    (
+        lambda: dp.stepper("euler", decay, 0.1, linear=3.0),
+        TYPE,
+        "linear takes an Operator or a pair (Operator, coefficient), got float",
+    ),
+    (
+        lambda: dp.stepper("euler", dp.gradient(dp.Grid(4)), 0.1),
+        SHAPE,
+        "stepper needs an operator from a space to itself, gradient maps cells(4) to faces(4)",
+    ),
+    (lambda: dp.stepper("euler", decay, 0.0), VALUE, "dt must be > 0, got 0"),
+    (lambda: dp.stepper("euler", decay, -1.0), VALUE, "dt must be > 0, got -1"),
+    (lambda: dp.stepper("euler", decay, np.nan), FINITE, "dt must be finite, got nan"),
+    (lambda: dp.stepper("euler", decay), TYPE, "dt must be one real number, got None"),
+    (lambda: dp.stepper("euler", decay, U), TYPE, "dt must be one real number, got an array of shape (4,)"),
+    (lambda: dp.stepper("euler", decay, lambda p: -p)(U, 1.0), VALUE, "dt must be > 0, got -1"),
+    (
+        lambda: dp.stepper("backward_euler", L, 0.1)(U, -1.0),
+        VALUE,
+        "the coefficient of laplacian must be >= 0, got -1; put the sign into the operator",
+    ),
+    (
+        lambda: dp.stepper("backward_euler", L, 0.1)(U, np.nan),
+        FINITE,
+        "the coefficient of laplacian must be finite, got nan",
+    ),
+    (
+        lambda: dp.stepper("euler", L, 0.6)(U, 1.0),
+        UNSTABLE,
+        "euler is unstable for laplacian with dt = 0.6: the largest stable dt is 0.5; take smaller steps or an "
+        "implicit method, or write unstable='allow'",
+    ),
+    (
+        lambda: dp.stepper("euler", lambda u, p, t: u, 0.6)(U),
+        TYPE,
+        "the rate of stepper(euler) takes a time, so its state is the pair (u, t), got ndarray",
+    ),
+    (
+        lambda: dp.stepper("euler", decay, 0.6)(np.array([1, np.nan, 1]), 1.0),
+        FINITE,
+        "the state of stepper(euler) must be finite, got 1 that are NaN or infinite, the first at 1",
+    ),
+    (
+        lambda: dp.stepper("euler", lambda u, p: p[0] * u, 0.6)(U, (np.inf, 1.0)),
+        FINITE,
+        "part 1 of the params of stepper(euler) must be finite, got inf; write a finite number",
+    ),
+    (
+        lambda: dp.stepper("euler", lambda u, p: p * u, 1.0)(U * 1e300, 1e300),
+        FINITE,
+        "stepper(euler) got NaN or infinity from a finite state with dt = 1; take smaller steps or an implicit method",
+    ),
+    (
+        lambda: dp.stepper("euler", lambda u, p: u[:1], 0.6)(U),
+        SHAPE,
+        "a rate must have the shape of the state, (4,), got (1,)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("call", "error", "message"), TABLE, ids=[row[2][:50] for row in TABLE])
+def test_message(call, error, message):
+    with np.errstate(over="ignore"), pytest.raises(error) as caught:
+        call()
+    assert str(caught.value) == message
+
+
+def test_unstable_steps_are_taken_when_allowed():
+    step = dp.stepper("euler", L, 0.75, unstable="allow")
+    mode = np.array([1.0, -1.0, 1.0, -1.0])  # eigenvalue -4
+    assert step(mode, 1.0) == pytest.approx(-2 * mode)
+
+
+def test_the_limit_itself_is_stable():
+    for op in (L, L.explicit(), dp.from_matrix(L.explicit().matrix)):
+        assert np.all(np.abs(dp.stepper("euler", op, 0.5)(U, 1.0)) <= 1)
+        with pytest.raises(UNSTABLE, match="the largest stable dt is"):
+            dp.stepper("rk4", op, 0.7)(U, 1.0)
+
+
+def test_no_step_meets_the_tolerance():
+    """The solution 1 / (1 - t) ends at t = 1."""
+    step = dp.stepper("rk4", lambda u, p: u**2, 2.0, tolerance=1e-3)
+    message = (
+        r"stepper\(rk4\) found no step that meets the tolerance 0.001 at 0.5 of its interval after \d+ steps; take a "
+        "larger tolerance or a method for stiff problems"
+    )
+    with pytest.raises(dp.errors.ConvergenceError, match=message):
+        step(np.ones(1))

@@ -1,0 +1,125 @@
+"""What the optimisers refuse: each message, whole."""
+
+import re
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
+
+
+def run(loss=lambda x: anp.sum(x**2), start=(0.5, 0.5), method="lbfgs", **options):
+    return lambda: dp.minimise(loss, np.array(start), method, **options)
+
+
+def direction(outputs=lambda u: u, x=(1.0, 1.0), g=None, **options):
+    return lambda: dp.update_direction(outputs, np.array(x), g, **options)
+
+
+def back(inverse):
+    """The way back through a simulator with this inverse."""
+    rule = dp.physical_gradient(lambda x: x, inverse)
+    return lambda: dp.value_and_grad(lambda x: anp.sum(rule(x)))(np.ones(3))
+
+
+WRONG = [
+    (
+        run(batches=[1]), ValueError,
+        "lbfgs compares losses and cannot use batches; write "
+        "method='adam', or give gd a rate",
+    ),
+    (run(method="gd", batches=[1]), ValueError, "gd compares losses and cannot use batches; write method='adam'"),
+    (
+        run(method="adam", batches=3), TypeError,
+        "batches must be a list or a function of the iteration, got int; write list(batches)",
+    ),
+    (run(method="adam", batches=[]), ValueError, "batches is empty; leave it out, and the loss is called with x alone"),
+    (run(bounds=3), ValueError, "bounds must be a pair (lower, upper), got 3; write (0.0, None) for x >= 0"),
+    (
+        run(bounds=(2.0, 1.0)), ValueError,
+        "bounds must be numbers with lower <= upper; write None for "
+        "a side without a bound",
+    ),
+    (
+        run(bounds=(np.nan, 1.0)), ValueError,
+        "bounds must be numbers with lower <= upper; write None for "
+        "a side without",
+    ),
+    (
+        run(bounds=((np.zeros(2), 1.0), None)), ValueError,
+        "a bound must be a number or have the structure of start, "
+        "got 2 leaves where start has 1; write one number, or a "
+        "tree like start",
+    ),
+    (
+        run(project=lambda x: (x, x), loss=lambda x: anp.sum(x[0] ** 2)), ShapeError,
+        "project must return a tree like start; write project=lambda x: ...",
+    ),
+    (
+        run(method="newton_cg", inner=0), ValueError,
+        "newton_cg needs inner >= 1, a whole number, got 0; the "
+        "default is 200",
+    ),
+    (
+        run(method="newton_cg", gradient=lambda x: x), TypeError,
+        "newton_cg differentiates the loss twice and takes no gradient of yours; leave it out",
+    ),
+    (
+        run(lambda z: anp.sum(anp.abs(z - 1j) ** 2), (0.5j,), "newton_cg"), DerivativeError,
+        "newton_cg takes real numbers, got complex ones; split them into two real arrays",
+    ),
+    (
+        run(method="levenberg_marquardt", damping=0), ValueError,
+        "levenberg_marquardt needs a positive damping, got 0; the default is 1e-3",
+    ),
+    (run(method="half_inverse", rate=0), ValueError, "half_inverse needs a positive rate, got 0; the default is 1"),
+    (
+        run(method="physical_gradient"), TypeError,
+        "physical_gradient needs physics and inverse; write minimise(loss_of_y, x, 'physical_gradient', physics=f, "
+        "inverse=f_inverse)",
+    ),
+    (
+        run(method="gauss_newton"), DerivativeError,
+        "the outputs are one number; return the residuals as an array, do not sum them",
+    ),
+    (direction(power=2), ValueError, "power must be from 0 to 1, got 2; 0.75 gives half-inverse gradients"),
+    (direction(damping=-1), ValueError, "damping must be finite and >= 0, got -1; the default is 0"),
+    (direction(truncation=1), ValueError, "truncation must be from 0 to below 1, got 1; the default is 1e-10"),
+    (direction(method="svd"), ValueError, "method must be auto, dense or krylov, got 'svd'"),
+    (direction(rank=0), ValueError, "rank must be a whole number >= 1, got 0; leave it out for no limit"),
+    (
+        direction(x=(1j, 1.0)), DerivativeError,
+        "this method takes real numbers, got complex ones; split them into two real arrays",
+    ),
+    (
+        direction(g=np.ones(3)), ShapeError,
+        "the cotangent must have the shape (2,) of the outputs, got (3,)",
+    ),
+    (direction(lambda u: u * np.nan), NonFiniteError, "an output must be finite, got 2 that are NaN or infinite"),
+    (
+        direction(g=np.array([1, np.nan])), NonFiniteError,
+        "the cotangent must be finite, got 1 that are NaN or "
+        "infinite",
+    ),
+    (
+        direction(lambda u: anp.ones((6, 2)) @ anp.reshape(u, (-1, 2))[0], apart=True, method="dense"), ShapeError,
+        "with apart=True every leaf of x gets a leading axis of 6 copies, one for each sample, and the outputs do not "
+        "follow them; let the function broadcast over it",
+    ),
+    (
+        lambda: dp.physical_gradient(lambda x: x, lambda y, x: y, rate=0), ValueError,
+        "physical_gradient needs a positive rate, got 0; the default is 1",
+    ),
+    (
+        back(lambda y, x: y[:1]), ShapeError,
+        "the inverse of physical gradient must return an x of shape (3,), got (1,)",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("call, error, message", WRONG)
+def test_refusals(call, error, message):
+    with pytest.raises(error, match="^" + re.escape(message)):
+        call()

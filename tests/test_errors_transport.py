@@ -1,0 +1,142 @@
+"""Every message of transport: what was given, what is needed, what to write instead."""
+
+import re
+
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.derivative import value_and_grad
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
+
+GRID = dp.Grid((3, 2))
+U, V = np.ones((3, 2)), np.zeros(17)
+
+
+def bad(array, index, value=np.nan):
+    array = np.array(array, dtype=float)
+    array[index] = value
+    return array
+
+
+def through_walls():
+    """Much too fast at one face, which leaves a cell of a 1-D grid."""
+    return dp.transport(dp.Grid(4, spacing=0.5))(np.ones(4), np.array([0, 0, 2.0, 0, 0]), 0.5)
+
+
+def traced_solid(x):
+    return dp.transport(GRID, solid=x)(U, V, 0.1)
+
+
+def frozen():
+    dp.transport(GRID).law = None
+
+
+def call(u=U, v=V, dt=0.1, inflow=0.0, **options):
+    return lambda: dp.transport(GRID, **options)(u, v, dt, inflow)
+
+
+CASES = [
+    (lambda: dp.transport(7), TypeError, "transport takes a Grid, got int; write dp.Grid((64, 64), size=1.0)"),
+    (
+        lambda: dp.transport(GRID, of="nodes"),
+        ValueError,
+        "transport takes of from 'cells', 'faces', got 'nodes'; write one of them",
+    ),
+    (
+        lambda: dp.transport(GRID, boundary=dp.robin(1, 1)),
+        ValueError,
+        "transport takes dirichlet (inflow values) or neumann (outflow), got robin(1, 1)",
+    ),
+    (frozen, AttributeError, "Transport is frozen; make a new one instead of setting law"),
+    (
+        call(dt=0.0),
+        ValueError,
+        "transport upwind needs dt > 0, got 0; to go back in time turn the velocity round",
+    ),
+    (
+        call(dt="soon"),
+        TypeError,
+        "transport upwind needs one real number as dt, got 'soon'; write for example dt=0.01",
+    ),
+    (call(dt=np.nan), NonFiniteError, "transport upwind needs a finite dt, got nan; write a finite number"),
+    (call(u=U[0]), ShapeError, "transport upwind takes u of shape (3, 2), got an array of shape (2,)"),
+    (call(v=U), ShapeError, "transport upwind takes v of shape (17,), got an array of shape (3, 2)"),
+    (call(inflow=np.ones(3)), ShapeError, "transport upwind takes inflow of shape (10,), got an array of shape (3,)"),
+    (
+        call(u=1j * U),
+        TypeError,
+        "transport upwind takes real numbers as u, got dtype complex128; write u.real or u.astype(float)",
+    ),
+    (
+        call(u=np.ma.masked_array(U)),
+        TypeError,
+        "transport upwind takes plain arrays, got a masked array as u; fill it first",
+    ),
+    (
+        call(u=bad(U, (1, 1))),
+        NonFiniteError,
+        "transport upwind needs a finite field, got 1 that are NaN or infinite, the first at (1, 1)",
+    ),
+    (
+        call(v=bad(V, slice(5, 7), np.inf)),
+        NonFiniteError,
+        "transport upwind needs a finite velocity, got 2 that are NaN or infinite, the first at 5",
+    ),
+    (
+        call(inflow=bad(np.zeros(10), 3), boundary=dp.dirichlet),
+        NonFiniteError,
+        "transport upwind needs finite inflow values, got 1 that are NaN or infinite, the first at 3",
+    ),
+    (
+        through_walls,
+        UnstableStepError,
+        "transport upwind: dt = 0.5 is too large at 1 of 4 points, most at 1; "
+        "the largest stable dt is 0.25, or write unstable='allow'",
+    ),
+    (
+        lambda: dp.transport(GRID)(1.7e308 * U, GRID.join(np.array([[0], [0.4], [-0.4], [0]]), 0.0), 1.0),
+        NonFiniteError,
+        "transport upwind cannot represent the result, got 2 that are NaN or infinite, the first at (1, 0)",
+    ),
+    (
+        lambda: value_and_grad(lambda x: traced_solid(x).sum())(U),
+        DerivativeError,
+        "solid needs a constant boolean array, got a traced one; take it from plain numbers",
+    ),
+    (
+        lambda: value_and_grad(lambda x: dp.transport(GRID).operator(x, 0.1)(U).sum())(V),
+        DerivativeError,
+        "transport upwind.operator needs constant v and dt, got traced ones; call move(u, v, dt) instead",
+    ),
+    (
+        lambda: value_and_grad(lambda x: dp.transport(GRID).step(x)(U, V).sum())(0.1),
+        DerivativeError,
+        "step needs constant dt and inflow, got traced ones; write lambda u, p: move(u, p[0], p[1]) instead",
+    ),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case[2][:60])
+def test_message(case):
+    act, kind, message = case
+    with pytest.raises(kind, match=f"^{re.escape(message)}$"):
+        act()
+
+
+def test_messages_of_other_schemes(monkeypatch):
+    """What a scheme says that is not linear, has no second derivatives and only one form."""
+    law = type(dp.transport(GRID).law)
+    monkeypatch.setattr(law, "linear", False)
+    monkeypatch.setattr(law, "twice", False)
+    monkeypatch.setattr(law, "forms", ("advective",))
+    with pytest.raises(ValueError, match="transport upwind has no flux form; write form='advective'"):
+        dp.transport(GRID, form="flux")
+    move = dp.transport(GRID)
+    message = "transport upwind is not linear in u and has no matrix; write scheme='upwind', or call move(u, v, dt)"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        move.operator(V, 0.1)
+    message = "transport upwind has first derivatives only; for second ones write scheme='upwind'"
+    slope = value_and_grad(lambda u: (move(u, V, 0.1) ** 2).sum())
+    with pytest.raises(DerivativeError, match=message):
+        value_and_grad(lambda u: (slope(u)[1] ** 2).sum())(U)

@@ -1,0 +1,41 @@
+"""What explain says of time loops: bytes kept, steps run again, solves that a zero step skips."""
+
+import autograd.numpy as anp
+import numpy as np
+
+import sparsedp as dp
+
+GRID = dp.Grid((12, 10), size=(1.0, 1.0))
+L = dp.laplacian(GRID, dp.dirichlet)
+U = np.sin(np.arange(120.0)).reshape(GRID.shape)
+
+
+def test_a_time_loop():
+    """Every state kept: nothing runs twice. Under a budget: fewer bytes, more steps, and both are said."""
+    move, wind = dp.transport(GRID, "upwind"), 0.1 * np.sin(np.arange(float(GRID.faces.size)))
+
+    def loss(memory):
+        return lambda v: anp.sum(dp.rollout(lambda u, w: move(u, w, 0.01), U, v, 20, memory=memory) ** 2)
+
+    free, tight = dp.explain(loss(None), wind), dp.explain(loss(8 * U.nbytes + 2 * wind.nbytes), wind)
+    assert free.counts["rollout.step", "forward"] == free.counts["rollout.step", "vjp"] == 20
+    assert free.recomputation == 1.0 and free.tape_bytes >= 20 * U.nbytes
+    assert tight.recomputation == 1 + tight.counts["rollout.step", "recomputed"] / 20 > 1.0
+    assert tight.tape_bytes < free.tape_bytes - 10 * U.nbytes
+    assert tight.value == free.value
+
+
+def test_implicit_steps_take_one_adjoint_solve_each():
+    step = dp.stepper("backward_euler", lambda u, nu: nu * L(u), 0.01)
+    plan = dp.explain(lambda nu: anp.sum(dp.rollout(step, U, nu, 3) ** 2), 0.1)
+    assert plan.counts["rollout.step", "forward"] == plan.totals["adjoint solves"] == 3
+
+
+def test_without_diffusion_no_diffusion_solve():
+    """nu = 0: the identity; nothing set up, nothing solved, and it is said."""
+    from sparsedp.integrators.resolvent import Resolvent
+
+    spread = Resolvent(L, "diffusion", dict(method="auto", rtol=1e-10, maxiter=None, nullspace="raise", options={}))
+    plan = dp.explain(lambda u: anp.sum(spread(0.0, u) ** 2), U)
+    assert plan.totals["set-ups built"] == plan.totals["forward solves"] == plan.totals["adjoint solves"] == 0
+    assert any("no solve and no set-up" in sentence for sentence in plan.left_out)

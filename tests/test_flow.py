@@ -1,0 +1,220 @@
+"""Viscosity, moving walls, convection and the flow step: identities, orders, derivatives, and what is left out."""
+
+from itertools import product
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.derivative import pushforward, value_and_grad
+from sparsedp.ledger import recording
+
+FINITE = dp.errors.NonFiniteError
+
+
+def field(grid, seed=0):
+    return np.random.default_rng(seed).standard_normal(grid.faces.size)
+
+
+def grids(shape):
+    rng = np.random.default_rng(3)
+    for periodic in product((False, True), repeat=len(shape)):
+        yield dp.Grid(shape, spacing=0.3, periodic=periodic)
+        yield dp.Grid(shape, spacing=[rng.uniform(0.5, 2.0, n) for n in shape], periodic=periodic)
+
+
+# ---------------------------------------------------------------- viscosity
+
+
+@pytest.mark.parametrize("shape", [(6, 5), (4, 3, 5), (7,)])
+@pytest.mark.parametrize("word", ["no_slip", "free_slip"])
+def test_viscosity_is_symmetric_and_takes_energy(shape, word):
+    """With W the volumes of the faces and K those inside, W K L K is symmetric and not positive."""
+    for grid in grids(shape):
+        K = dp.interior(grid)
+        matrix = (K @ dp.face_laplacian(grid, word) @ K).explicit().matrix.toarray() * grid.faces.volumes[:, None]
+        np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
+        assert np.linalg.eigvalsh(matrix).max() <= 1e-12
+
+
+def test_laplacian_of_a_solenoidal_field_is_minus_curl_curl():
+    grid = dp.Grid((8, 9), size=(1.0, 2.0), periodic=True)
+    psi = np.random.default_rng(1).standard_normal(grid.nodes.shape)
+    v = dp.curl(grid)(psi)
+    vorticity = -dp.curl(grid).T(v)
+    np.testing.assert_allclose(dp.face_laplacian(grid)(v), dp.curl(grid)(vorticity), atol=1e-9)
+
+
+@pytest.mark.parametrize("word", ["no_slip", "free_slip"])
+def test_obstacles_by_hand(word):
+    """One solid cell in the middle of 5 x 5 unit cells; the x-face just above it."""
+    grid = dp.Grid((5, 5))
+    solid = np.zeros(grid.shape, bool)
+    solid[2, 2] = True
+    L = dp.face_laplacian(grid, "no_slip", solid, word)
+    v = dp.interior(grid, solid)(field(grid))
+    u, bent = grid.split(v)[0], grid.split(L(v))[0]
+    below = -u[2, 3] if word == "no_slip" else u[2, 3]  # the mirror image in the upper side of the obstacle
+    wanted = u[1, 3] + u[3, 3] + u[2, 4] + below - 4 * u[2, 3]
+    assert bent[2, 3] == pytest.approx(wanted, rel=1e-13)
+    assert bent[2, 2] == bent[3, 2] == 0.0
+    far = dp.face_laplacian(grid)(v)
+    assert bent[1, 1] == pytest.approx(grid.split(far)[0][1, 1], rel=1e-13)
+
+
+@pytest.mark.parametrize("stretched", [False, True])
+def test_moving_wall_drags_the_fluid_along(stretched):
+    """Couette flow between a wall at rest and a moving one is linear, exactly."""
+    widths = np.linspace(1, 2, 6) if stretched else np.ones(6)
+    grid = dp.Grid((3, 6), spacing=(1.0, widths), periodic=(True, False))
+    L, B = dp.face_laplacian(grid), dp.face_lift(grid)
+    y = grid.face_centres(0)[1]
+    v = grid.join(2.0 * y / grid.size[1], 0.0)
+    np.testing.assert_allclose(L(v) + B(B.domain.join(0.0, 2.0)), 0, atol=1e-13)
+
+
+def test_channel_is_of_second_order():
+    """Poiseuille flow between walls: nu u'' = -1."""
+    errors = []
+    for n in (8, 16, 32):
+        grid = dp.Grid((2, n), size=(1.0, 1.0), periodic=(True, False))
+        solve = dp.inverse(
+            dp.mask(grid.faces, ~dp.interior(grid)(np.ones(grid.faces.size)).astype(bool)) - dp.face_laplacian(grid)
+        )
+        u, y = grid.split(solve(grid.join(1.0, 0.0)))[0], grid.face_centres(0)[1]
+        errors.append(np.max(np.abs(u - 0.5 * y * (1 - y))))
+    assert 1.9 <= np.log2(errors[0] / errors[1]) <= 2.2 and 1.9 <= np.log2(errors[1] / errors[2]) <= 2.2
+
+
+# ---------------------------------------------------------------- convection
+
+
+def slices(u, w, h):
+    """div(w u) on a periodic 2-D grid by slices: the twin, x-component and y-component."""
+    back = lambda a, axis: anp.roll(a, 1, axis)
+    ahead = lambda a, axis: anp.roll(a, -1, axis)
+    (ux, uy), (wx, wy) = u, w
+    xx = 0.25 * (ux + ahead(ux, 0)) * (wx + ahead(wx, 0))
+    yy = 0.25 * (uy + ahead(uy, 1)) * (wy + ahead(wy, 1))
+    xy = 0.25 * (ux + back(ux, 1)) * (wy + back(wy, 0))
+    yx = 0.25 * (uy + back(uy, 0)) * (wx + back(wx, 1))
+    return (xx - back(xx, 0) + ahead(xy, 1) - xy) / h, (yy - back(yy, 1) + ahead(yx, 0) - yx) / h
+
+
+def test_convection_and_its_derivatives_against_slices():
+    grid = dp.Grid((6, 5), spacing=0.3, periodic=True)
+    convect = dp.convection(grid)
+    twin = lambda v, w: grid.join(*slices(grid.split(v), grid.split(w), 0.3))
+    v, w, g = (field(grid, seed) for seed in range(3))
+    np.testing.assert_allclose(convect(v, w), twin(v, w), atol=1e-13)
+    for f in (
+        lambda rule: lambda v: anp.sum(g * rule(v, v)),
+        lambda rule: lambda v: anp.sum(rule(v, w) ** 2 * rule(w, v)),
+    ):
+        (value, slope), (other, wanted) = value_and_grad(f(convect))(v), value_and_grad(f(twin))(v)
+        assert value == pytest.approx(other, rel=1e-12)
+        np.testing.assert_allclose(slope, wanted, atol=1e-10 * np.max(np.abs(wanted)))
+        second = lambda rule: value_and_grad(lambda v: anp.sum(w * value_and_grad(f(rule))(v)[1]))(v)[1]
+        np.testing.assert_allclose(second(convect), second(twin), atol=1e-9 * np.max(np.abs(wanted)))
+    tangent = pushforward(lambda v: convect(v, v), v, w)[1]
+    np.testing.assert_allclose(tangent, convect(v, w) + convect(w, v), atol=1e-13)
+
+
+@pytest.mark.parametrize("shape", [(6, 5), (4, 3, 5), (7,)])
+def test_convection_conserves(shape):
+    """Momentum on periodic grids, and energy wherever nothing enters, when the carrier has no divergence."""
+    for grid in grids(shape):
+        w, v = dp.projection(grid)(field(grid)), dp.interior(grid)(field(grid, 1))
+        convect, W = dp.convection(grid), grid.faces.volumes
+        rate = convect(v, w)
+        if all(grid.periodic):
+            for part in grid.split(W * rate):
+                assert abs(np.sum(part)) <= 1e-12 * np.sum(np.abs(rate))
+        if all(grid.uniform):
+            assert abs(np.sum(W * v * rate)) <= 1e-10 * np.sum(W * np.abs(v * rate)) + 1e-14
+
+
+def test_check_gradient_agrees_on_a_channel():
+    grid = dp.Grid((8, 6), size=(2.0, 1.0))
+    sides = {"x": ("inflow", "outflow")}
+    solid = np.zeros(grid.shape, bool)
+    solid[3, 2:4] = True
+    step = dp.flow_step(grid, 0.01, 0.1, boundary=sides, solid=solid)
+
+    def loss(v):
+        return anp.sum(dp.rollout(step, step.start(v), None, 3)["v"] ** 2)
+
+    assert dp.check.gradient(loss, field(grid)).verdict == "agrees"
+
+
+# ---------------------------------------------------------------- the step
+
+
+def vortex(grid):
+    """A divergence-free velocity that is 0 on all walls, with its slope along them."""
+    x, y = np.meshgrid(*(grid.coordinates(a, "nodes") for a in (0, 1)), indexing="ij")
+    return dp.curl(grid)(np.sin(np.pi * x) ** 2 * np.sin(np.pi * y) ** 2 * (1 + x))
+
+
+@pytest.mark.parametrize("implicit", [False, True])
+def test_order_two_in_time(implicit):
+    """Velocity of a vortex between four walls, incremental pressure: order 1.8 or more; its gradient in nu too."""
+    grid = dp.Grid((10, 10), size=1.0)
+    start, end = vortex(grid), 0.16
+
+    def run(steps):
+        step = dp.flow_step(grid, end / steps, 0.05, implicit=implicit)
+        loss = lambda v: anp.sum(dp.rollout(step, step.start(v), None, steps)["v"] ** 2)
+        v = dp.rollout(step, step.start(start), None, steps)["v"]
+        return v, value_and_grad(loss)(start)[1]
+
+    exact, slope = run(256)
+    errors = [[np.linalg.norm(a - b) for a, b in zip(run(steps), (exact, slope))] for steps in (16, 32)]
+    orders = np.log2(np.divide(*errors))
+    assert np.all(orders >= 1.8) and np.all(orders <= 2.6), (orders, errors)
+
+
+def test_implicit_viscosity_is_stable_at_any_step():
+    grid = dp.Grid((16, 16), size=1.0)
+    step = dp.flow_step(grid, 1.0, 100.0, implicit=True, convective=False)
+    state = dp.rollout(step, step.start(vortex(grid)), None, 20)
+    assert np.max(np.abs(state["v"])) < np.max(np.abs(vortex(grid)))
+
+
+def test_what_a_scene_does_not_need_is_not_built():
+    grid = dp.Grid((8, 8), periodic=True)
+    plain = dp.flow_step(grid, 0.1)
+    assert plain.laplacian is None and plain.relax is None and plain.walls is None
+    assert repr(plain).endswith("pressure, convection>")
+    state = plain.start(field(grid))
+    with recording() as calls:
+        plain(state, None)
+    assert not any("laplacian" in name for name, _ in calls)
+    assert sum(many for (_, kind), many in calls.items() if kind == "solve") == 1
+
+
+def test_free_stream_passes_an_open_channel():
+    """A uniform wind between gliding walls stays as it is."""
+    grid = dp.Grid((10, 6))
+    sides = {"x": ("inflow", "outflow"), "y": "free_slip"}
+    step = dp.flow_step(grid, 0.2, 0.1, boundary=sides)
+    state = dp.rollout(step, step.start(grid.join(1.0, 0.0)), None, 10)
+    np.testing.assert_allclose(state["v"], grid.join(1.0, 0.0), atol=1e-12)
+
+
+def test_what_is_refused():
+    grid = dp.Grid((4, 4))
+    with pytest.raises(ValueError, match="flow_step needs dt > 0, got 0; write a number"):
+        dp.flow_step(grid, 0)
+    with pytest.raises(ValueError, match="flow_step needs viscosity >= 0, got -1.0; write a number"):
+        dp.flow_step(grid, 0.1, -1.0)
+    with pytest.raises(FINITE, match="flow_step needs a finite dt, got nan; write a number"):
+        dp.flow_step(grid, np.nan)
+    with pytest.raises(ValueError, match="solid_boundary needs no_slip or free_slip, got 'outflow'"):
+        dp.face_laplacian(grid, solid=np.zeros(grid.shape, bool), solid_boundary="outflow")
+    with pytest.raises(ValueError, match="animate needs at least one frame, got none; run with keep='all'"):
+        dp.animate(grid, [], "film.gif")
+    step = dp.flow_step(grid, 0.1)
+    with pytest.raises(FINITE, match="the velocity in projection must be finite"):
+        step.start(np.full(grid.faces.size, np.nan))

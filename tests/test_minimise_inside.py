@@ -1,0 +1,90 @@
+"""newton_cg, bounds and projections of minimise."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import sparsedp as dp
+from sparsedp.errors import UnstableStepError
+
+
+def valley(x):
+    return anp.sum(100 * (x[1:] - x[:-1] ** 2) ** 2 + (1 - x[:-1]) ** 2)
+
+
+@pytest.mark.parametrize("start", [[-1.2, 1.0], [0.5, 1.0] * 4, [0.0] * 6])
+def test_newton(start):
+    best = dp.minimise(valley, np.array(start), "newton_cg", maxiter=200)
+    assert best.converged and np.allclose(best.x, 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [2.0**-600, 1e-9, 1e9, 2.0**600])
+def test_newton_does_not_see_the_size_of_the_loss(scale):
+    plain, scaled = (
+        dp.minimise(lambda x, s=s: s * valley(x), np.array([-1.2, 1.0]), "newton_cg", maxiter=8) for s in (1.0, scale)
+    )
+    assert np.allclose(plain.x, scaled.x, rtol=1e-6)
+
+
+def test_newton_on_a_quadratic_and_past_a_wall(rng):
+    matrix = rng.standard_normal((8, 8))
+    matrix = matrix @ matrix.T + np.eye(8)
+    best = dp.minimise(lambda x: 0.5 * anp.sum(x * (matrix @ x)) - anp.sum(x), np.zeros(8), "newton_cg", tolerance=1e-9)
+    assert np.allclose(best.x, np.linalg.solve(matrix, np.ones(8))) and len(best.history) < 12
+
+    def walled(x):
+        if abs(dp.tape.plain(x)[0]) > 1.05:
+            raise UnstableStepError("beyond")
+        return valley(x)
+
+    assert np.allclose(dp.minimise(walled, np.zeros(2), "newton_cg").x, 1, atol=1e-5)
+
+
+def test_newton_leaves_a_saddle():
+    best = dp.minimise(lambda x: (x[0] ** 2 - 1) ** 2 + x[1] ** 2, np.array([1e-3, 1.0]), "newton_cg")
+    assert abs(best.x[0]) == pytest.approx(1) and best.value < 1e-10
+
+
+# ---- bounds --------------------------------------------------------------------------------------------------------
+
+METHODS = ["lbfgs", "gd", "newton_cg"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_bounds_against_scipy(rng, method):
+    matrix = rng.standard_normal((10, 10))
+    matrix = matrix @ matrix.T + 2 * np.eye(10)
+    data = 3 * rng.standard_normal(10)
+    loss = lambda x: 0.5 * anp.sum(x * (matrix @ x)) - anp.sum(data * x)
+    best = dp.minimise(loss, np.full(10, 0.1), method, bounds=(0.0, 0.3), maxiter=3000, tolerance=1e-9)
+    known = minimize(loss, np.full(10, 0.1), jac=lambda x: matrix @ x - data, bounds=[(0, 0.3)] * 10, tol=1e-14)
+    assert np.all(best.x >= 0) and np.all(best.x <= 0.3)
+    assert np.allclose(best.x, known.x, atol=1e-5)
+
+
+def test_bounds_as_trees_and_on_one_side():
+    start = {"a": np.zeros(2), "b": 5.0, "n": 3}
+    best = dp.minimise(
+        lambda x: anp.sum((x["a"] - 2.0) ** 2) + (x["b"] - 1.0) ** 2, start,
+        bounds=({"a": None, "b": 4.0, "n": None}, {"a": np.array([1.0, 9.0]), "b": None, "n": None}),
+    )  # fmt: skip
+    assert np.allclose(best.x["a"], [1, 2]) and best.x["b"] == 4.0 and best.x["n"] == 3 and best.converged
+    assert np.allclose(dp.minimise(lambda x: anp.sum(x**2), np.ones(3), "adam", bounds=(0.5, None), rate=0.1).x, 0.5)
+    assert np.allclose(dp.minimise(lambda x: x - 2.0, np.zeros(3), "levenberg_marquardt", bounds=(None, 1.0)).x, 1.0)
+
+
+def test_a_start_outside_is_moved_inside():
+    best = dp.minimise(lambda x: anp.sum(x**2), np.full(3, -7.0), bounds=(1.0, 2.0), maxiter=0)
+    assert np.array_equal(best.x, np.ones(3))
+
+
+# ---- projections ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "newton_cg"])
+def test_a_projection_is_kept(method):
+    mean_free = lambda x: x - anp.mean(x)
+    target = np.array([1.0, 2.0, 6.0])
+    best = dp.minimise(lambda x: anp.sum((x - target) ** 2), np.ones(3), method, project=mean_free)
+    assert np.allclose(best.x, target - 3) and abs(np.sum(best.x)) < 1e-12

@@ -1,0 +1,122 @@
+"""rollout: values and derivatives against the loop written out, at every memory budget."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.derivative import pullback, pushforward
+from sparsedp.trajectory.schedule import advances, stride
+from sparsedp.tree import flatten, leaves
+
+N = 9
+START = {"u": np.array([0.3, -1.2, 0.8, 0.1, 2.0]), "v": np.array([1.0, 0.2, -0.4, 0.9, -0.7]), "turn": 0, "name": "a"}
+PARAMS = {"k": np.linspace(0.5, 1.5, 5), "c": 0.7, "grid": None}
+FORCE = np.sin(np.arange(5.0 * N)).reshape(N, 5)
+MEMORY = [1376, 1456, 1536, 1700, "2 kB", 1e6]
+
+
+def step(state, params, force=0.0):
+    u, v = state["u"], state["v"]
+    moved = v - 0.1 * u * anp.roll(u, 1) * params["c"] + 0.1 * force
+    return {"v": moved, "u": u + 0.1 * anp.sin(params["k"] * v), "turn": state["turn"] + 1, "name": "a"}
+
+
+def unrolled(state, params, n, inputs=None):
+    """The loop, every step on the tape."""
+    states = [state]
+    for i in range(n):
+        states.append(step(states[-1], params) if inputs is None else step(states[-1], params, inputs[i]))
+    return states
+
+
+def measure(state):
+    return anp.sum(state["u"] ** 2 * anp.array([1.0, 2.0, 3.0, 4.0, 5.0])) + anp.sum(anp.cos(state["v"]))
+
+
+def by_loop(x):
+    return measure(unrolled(x[0], x[1], N, x[2])[-1])
+
+
+def by_rollout(x, **options):
+    return measure(dp.rollout(step, x[0], x[1], N, inputs=x[2], **options))
+
+
+def gap(one, other):
+    pairs = [
+        (a, b) for a, b in zip(leaves(one), leaves(other), strict=True) if not isinstance(a, (int, str, type(None)))
+    ]
+    return max(float(np.max(np.abs(np.asarray(a) - np.asarray(b)))) for a, b in pairs)
+
+
+@pytest.mark.parametrize("inputs", [None, FORCE])
+def test_value_and_gradient(inputs):
+    x = (START, PARAMS, inputs)
+    wanted, found = dp.value_and_grad(by_loop)(x), dp.value_and_grad(by_rollout)(x)
+    assert wanted[0] == found[0]
+    assert gap(wanted[1], found[1]) < 1e-14
+    assert dp.check.gradient(by_rollout, x)
+
+
+@pytest.mark.parametrize("memory", MEMORY)
+def test_the_budget_does_not_change_a_bit(memory):
+    x = (START, PARAMS, FORCE)
+    value, slope = dp.value_and_grad(by_rollout)(x)
+    again, same = dp.value_and_grad(lambda x: by_rollout(x, memory=memory))(x)
+    assert again == value and gap(slope, same) == 0.0
+
+
+def test_all_states():
+    states = dp.rollout(step, START, PARAMS, N, keep="all")
+    wanted = unrolled(START, PARAMS, N)
+    for name in ("u", "v", "turn"):
+        assert np.array_equal(states[name], np.stack([state[name] for state in wanted]))
+    assert states["name"] == "a"
+
+
+def hessian_product(loss, x, along, reverse):
+    def slope(x):
+        return dp.value_and_grad(loss)(x)[1]
+
+    if not reverse:
+        return pushforward(slope, x, along)[1]
+
+    def paired(x):
+        pairs = zip(leaves(slope(x)), leaves(along), strict=True)
+        return sum(anp.sum(g * t) for g, t in pairs if g is not None)
+
+    return dp.value_and_grad(paired)(x)[1]
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("memory", [None, 1400])
+def test_second_order(reverse, memory, rng):
+    x = (START, PARAMS, FORCE)
+    found, rebuild = flatten(x)
+    along = rebuild([rng.normal(size=np.shape(a))[()] if isinstance(a, (float, np.ndarray)) else a for a in found])
+    wanted = hessian_product(by_loop, x, along, True)
+    assert gap(wanted, hessian_product(lambda x: by_rollout(x, memory=memory), x, along, reverse)) < 1e-12
+
+
+def test_a_pullback_may_be_used_again():
+    for memory in (None, 1400):
+        _, pull = pullback(lambda x: by_rollout(x, memory=memory), (START, PARAMS, FORCE))
+        assert gap(pull(1.0), pull(1.0)) == 0.0
+
+
+def test_binomial_schedule_is_optimal():
+    def best(n, s, known):
+        if n <= 1 or s == 1:
+            return n * (n - 1) // 2
+        if (n, s) not in known:
+            known[n, s] = min(m + best(n - m, s - 1, known) + best(m, s, known) for m in range(1, n))
+        return known[n, s]
+
+    def ours(n, s):
+        if n <= 1 or s == 1:
+            return n * (n - 1) // 2
+        m = stride(n, s)
+        return m + ours(n - m, s - 1) + ours(m, s)
+
+    known: dict = {}
+    assert all(best(n, s, known) == advances(n, s) == ours(n, s) for n in range(60) for s in range(1, 8))

@@ -1,0 +1,240 @@
+"""rollout under a budget: bits, counts and bytes; steps with plain forms of their own."""
+
+import tracemalloc
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.ledger import recording
+from sparsedp.trajectory.schedule import advances, plan, recomputed, stride
+
+
+class Shift:
+    """A donor-cell step with plain forms: u_i + c_i (u_(i-1) - u_i), periodic."""
+
+    def __init__(self, wrong=None):
+        self.wrong = wrong
+
+    def __call__(self, u, c):
+        return u + c * (anp.roll(u, 1, 0) - u)
+
+    def forward(self, u, c, out=None):
+        out = np.empty_like(u) if out is None else out
+        np.subtract(u[:-1], u[1:], out=out[1:])
+        np.subtract(u[-1:], u[:1], out=out[:1])
+        out *= c
+        out += u
+        return out
+
+    def backward(self, u, c, g, into=None):
+        into = np.zeros_like(c) if into is None else into
+        moved = g * c
+        back = g - moved
+        back[:-1] += moved[1:]
+        back[-1] += moved[0]
+        into[1:] += g[1:] * (u[:-1] - u[1:])
+        into[0] += g[0] * (u[-1] - u[0])
+        return (g if self.wrong == "identity" else back), into
+
+
+class Plain:
+    """The same without plain forms."""
+
+    def __call__(self, u, c):
+        return Shift()(u, c)
+
+
+class Tree:
+    """The same on trees, with a leaf that is no variable, and a float among the parameters."""
+
+    def __call__(self, s, p):
+        return {"u": Shift()(s["u"], p["c"]) * p["scale"], "v": s["v"], "n": s["n"]}
+
+    def forward(self, s, p, out=None):
+        u = Shift().forward(s["u"], p["c"], None if out is None else out["u"])
+        u *= p["scale"]
+        v = s["v"].copy() if out is None else out["v"]
+        v[:] = s["v"]
+        return {"n": s["n"], "v": v, "u": u}
+
+    def backward(self, s, p, g, into=None):
+        moved = Shift().forward(s["u"], p["c"])
+        back, _ = Shift().backward(s["u"], p["c"], g["u"] * p["scale"], into["c"])
+        into["scale"] += np.sum(moved * g["u"])
+        return {"u": back, "v": g["v"], "n": None}, into
+
+
+N, CELLS = 40, 12
+U0, C0 = np.sin(np.arange(CELLS)), 0.4 + 0.2 * np.cos(np.arange(CELLS))
+WEIGHTS = np.cos(np.arange(CELLS * (N + 1.0))).reshape(N + 1, CELLS)
+BUDGETS = [CELLS * 8 * k for k in (9, 10, 11, 13, 19, 48)]
+
+
+def loss(step, x, keep="last", n=N, **options):
+    out = dp.rollout(step, *x, n, keep=keep, **options)
+    if keep == "last":
+        return anp.sum(WEIGHTS[0] * out**2)
+    return anp.sum(WEIGHTS * out**2) if keep == "all" else sum(out)
+
+
+@pytest.mark.parametrize("keep", ["last", "all", lambda i, u: anp.sum(WEIGHTS[i] * u**3)], ids=["last", "all", "each"])
+@pytest.mark.parametrize("memory", [None, *BUDGETS])
+def test_plain_forms_give_the_gradient_of_the_tape(keep, memory):
+    x = (U0, C0)
+    value, slope = dp.value_and_grad(lambda x: loss(Shift(), x, keep, memory=memory))(x)
+    same, exact = dp.value_and_grad(lambda x: loss(Plain(), x, keep))(x)
+    assert abs(value - same) < 1e-13
+    assert max(np.max(np.abs(a - b)) for a, b in zip(slope, exact)) < 1e-13
+    _, again = dp.value_and_grad(lambda x: loss(Shift(), x, keep))(x)
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(slope, again))
+
+
+def test_plain_forms_on_trees():
+    state, params = {"u": U0, "v": C0, "n": 3}, {"scale": 0.99, "c": C0, "word": "x"}
+
+    def total(step, memory=None):
+        def of(x):
+            end = dp.rollout(step, *x, N, memory=memory)
+            return anp.sum(WEIGHTS[0] * end["u"] ** 2) + anp.sum(end["v"] * C0)
+
+        return dp.value_and_grad(of)((state, params))
+
+    value, (s, p) = total(Tree())
+    same, (t, q) = total(Tree().__call__)
+    assert abs(value - same) < 1e-13 and abs(p["scale"] - q["scale"]) < 1e-12 and p["word"] is None
+    assert np.max(np.abs(s["u"] - t["u"])) < 1e-13 and np.max(np.abs(p["c"] - q["c"])) < 1e-13
+    assert np.array_equal(s["v"], C0)
+    for memory in (2 * b for b in BUDGETS):
+        _, (a, b) = total(Tree(), memory)
+        assert a["u"].tobytes() == s["u"].tobytes() and b["c"].tobytes() == p["c"].tobytes()
+
+
+def test_second_order_of_plain_forms():
+    x, d = (U0, C0), (np.cos(U0), U0)
+
+    def product(step, **options):
+        slope = lambda x: dp.value_and_grad(lambda x: loss(step, x, n=6, **options))(x)[1]
+        return dp.value_and_grad(lambda x: sum(anp.sum(a * b) for a, b in zip(slope(x), d)))(x)[1]
+
+    wanted = product(Plain())
+    for found in (product(Shift()), product(Shift(), memory=BUDGETS[1])):
+        assert max(np.max(np.abs(a - b)) for a, b in zip(found, wanted)) < 1e-13
+
+
+def test_a_wrong_plain_form_is_caught_by_the_check():
+    assert dp.check.gradient(lambda x: loss(Shift(), x), (U0, C0)).verdict == "agrees"
+    assert dp.check.gradient(lambda x: loss(Shift("identity"), x), (U0, C0)).verdict == "disagrees"
+
+
+def test_an_input_is_never_overwritten():
+    u, c = U0.copy(), C0.copy()
+    end = dp.rollout(Shift(), u, c, 5)
+    assert np.array_equal(u, U0) and np.array_equal(c, C0)
+    kept = end.copy()
+    dp.rollout(Shift(), u, c, 9)
+    assert np.array_equal(end, kept)
+
+
+# ---------------------------------------------------------------- the schedule
+
+
+def test_binomial_schedule_is_optimal():
+    known: dict = {}
+
+    def best(n, s):
+        if n <= 1 or s == 1:
+            return n * (n - 1) // 2
+        if (n, s) not in known:
+            known[n, s] = min(m + best(n - m, s - 1) + best(m, s) for m in range(1, n))
+        return known[n, s]
+
+    def ours(n, s):
+        if n <= 1 or s == 1:
+            return n * (n - 1) // 2
+        m = stride(n, s)
+        return m + ours(n - m, s - 1) + ours(m, s)
+
+    assert all(best(n, s) == advances(n, s) == ours(n, s) for n in range(60) for s in range(1, 8))
+
+
+@pytest.mark.parametrize("step", [Shift(), Plain()], ids=["plain forms", "tape"])
+@pytest.mark.parametrize("slots", [1, 2, 3, 5, 11, 60])
+@pytest.mark.parametrize("n", [1, 2, 7, N])
+def test_steps_are_run_again_as_rarely_as_possible(step, slots, n):
+    runs: list = []
+    memory = CELLS * 8 * (slots + 8)
+    with recording() as calls:
+        dp.value_and_grad(lambda x: loss(step, x, n=n, memory=memory, record=runs.append))((U0, C0))
+    told = plan(n, memory, CELLS * 8, 2 * CELLS * 8)
+    assert runs[-1].recomputed == told.recomputed == recomputed(n, told.kept) == calls["rollout.step", "recomputed"]
+    assert runs[-1].factor == told.factor == pytest.approx((advances(n, told.kept) + 1) / n)
+    assert calls["rollout.step", "forward"] == calls["rollout.step", "vjp"] == n
+    assert calls["rollout", "forward"] == calls["rollout", "vjp"] == 1
+
+
+def test_many_steps_without_recursion():
+    """10^5 steps of 16^2 cells, 24 states kept."""
+    u, c = np.random.default_rng(0).random((16, 16)), np.full((16, 16), 0.3)
+    told = plan(100_000, 33 * 2048, 2048, 2 * 2048)
+    assert told.kept == 24 and told.factor < 5
+    runs: list = []
+    step, n = Shift(), 20_000  # the test itself is shorter; the benchmark runs all
+    slope = dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, c, n, memory=33 * 2048, record=runs.append)))(u)[1]
+    assert np.max(np.abs(slope - 1)) < 1e-9 and runs[-1].steps == n
+
+
+# ---------------------------------------------------------------- bytes
+
+
+def peak(call):
+    tracemalloc.start()
+    try:
+        call()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("step", [Shift(), Plain()], ids=["plain forms", "tape"])
+@pytest.mark.parametrize("keep", ["last", "all"])
+def test_peak_is_the_trajectory(step, keep):
+    u, n = np.random.default_rng(0).random(20_000), 100
+    c = np.full(u.shape, 0.5)
+    weights = np.ones(()) if keep == "last" else np.ones((n + 1, 1))
+
+    def gradient():
+        return dp.value_and_grad(lambda x: anp.sum(weights * dp.rollout(step, *x, n, keep=keep)))((u, c))
+
+    gradient()
+    used = peak(gradient) / (n * u.nbytes)
+    # The loss of all states has a cotangent of the size of the trajectory, and a product on the tape.
+    assert used < (1.2 if keep == "last" else 3.3)
+
+
+@pytest.mark.parametrize("step", [Shift(), Plain()], ids=["plain forms", "tape"])
+@pytest.mark.parametrize("states", [9, 12, 24])
+def test_peak_under_a_budget(step, states):
+    u, n = np.random.default_rng(0).random(20_000), 60
+    c = np.full(u.shape, 0.5)
+    gradient = lambda: dp.value_and_grad(lambda x: anp.sum(dp.rollout(step, *x, n, memory=states * u.nbytes)))((u, c))
+    gradient()
+    # params, their gradient, the result, a cotangent; and what the step needs
+    beside = 7 if isinstance(step, Shift) else 9
+    assert peak(gradient) < (states + beside) * u.nbytes + 200_000
+    plain = peak(lambda: dp.rollout(step, u, c, n, memory=states * u.nbytes))
+    assert plain < 7.2 * u.nbytes  # nothing is kept without a gradient
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", ["1 GB", "100 MB"])
+def test_ten_thousand_steps_at_256(memory):
+    u, c = np.random.default_rng(0).random((256, 256)), np.full((256, 256), 0.4)
+
+    def gradient(n, memory):
+        return dp.value_and_grad(lambda x: anp.sum(dp.rollout(Shift(), *x, n, memory=memory) ** 2))((u, c))
+
+    assert peak(lambda: gradient(10_000, memory)) < (1.0 if memory == "1 GB" else 0.1) * 1e9
+    short, full = gradient(1000, memory), gradient(1000, None)
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(short[1], full[1]))

@@ -1,0 +1,105 @@
+"""The fused loops of transport: compiled against NumPy, and bits that do not depend on the number of threads."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp import kernels
+from sparsedp.kernels import streams_plain
+from sparsedp.kernels.streams import TILE
+
+NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
+SHAPES = [(1,), (3,), (2 * TILE + 5,), (1, 9), (9, 1), (3, TILE + 20), (11, 13), (4, 5, 6), (2, 1, 19)]
+FORMS = list(product(("faces", "cells"), ("flux", "advective")))
+
+
+def scenes():
+    rng = np.random.default_rng(0)
+    for turn, (scheme, shape, (velocity, form)) in enumerate(product(("upwind", "van_leer"), SHAPES, FORMS)):
+        widths = [rng.uniform(0.5, 1.5, n) for n in shape] if turn % 2 else 0.5
+        grid = dp.Grid(shape, spacing=widths, periodic=tuple(rng.random(len(shape)) < 0.5))
+        solid = rng.random(shape) < 0.2 if turn % 3 == 0 else None
+        of = "faces" if turn % 5 == 0 else "cells"
+        move = dp.transport(grid, scheme, dp.dirichlet, velocity, of, form=form, solid=solid)
+        v = np.where(
+            rng.random(move.setting.velocity_shapes[0]) < 0.1, 0.0, rng.normal(size=move.setting.velocity_shapes[0])
+        )
+        yield move, rng.normal(size=move.space.shape), v, rng.normal(size=move.walls.shape)
+
+
+def results(move, u, v, q):
+    """Step and all cotangents, through the plain forms."""
+    law, args = move.law, (u.ravel(), v.ravel(), 0.01, q)
+    new = law.forward(*args)
+    g = np.cos(np.arange(new.size))
+    tasks = ((0, 1, 2, 3), (0,), (1, 2), (2,), (3,))
+    return [new, *(np.ravel(x) for nums in tasks for x in law.pull(nums, g, *args))]
+
+
+@NUMBA
+def test_compiled_is_numpy(monkeypatch):
+    for scene in scenes():
+        compiled = results(*scene)
+        with monkeypatch.context() as patch:
+            patch.setattr(kernels, "compiled", lambda: False)
+            plain = results(*scene)
+        for one, other in zip(compiled, plain):
+            np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)
+
+
+@NUMBA
+def test_bits_do_not_depend_on_threads(monkeypatch):
+    from sparsedp.kernels import native
+
+    monkeypatch.setattr(native, "SERIAL", 0)
+    for scene in scenes():
+        found = []
+        for threads in (1, 2):
+            monkeypatch.setattr(kernels, "threads", lambda: threads)
+            found.append([x.tobytes() for x in results(*scene)])
+        assert found[0] == found[1]
+
+
+@NUMBA
+def test_numpy_takes_over_where_nothing_can_be_compiled(monkeypatch):
+    from sparsedp.kernels import native, streams_native
+
+    def refuse(*args, **options):
+        raise TypeError("no such target")
+
+    move, u, v, q = next(scenes())
+    streams_native._loops.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(native, "_kept", refuse)
+        with pytest.warns(RuntimeWarning, match="The compiled kernels do not work here .no such target"):
+            new = move(u, v, 0.01, q)
+    streams_native._loops.cache_clear()
+    np.testing.assert_array_equal(new, move(u, v, 0.01, q))
+
+
+def test_parts_that_are_asked_alone_are_the_same():
+    for move, u, v, q in scenes():
+        _, *all_four, field, velocity, dt, dt_alone, inflow = results(move, u, v, q)
+        np.testing.assert_array_equal(field, all_four[0])
+        np.testing.assert_array_equal(velocity, all_four[1])
+        np.testing.assert_allclose([dt, dt_alone], [all_four[2]] * 2, rtol=1e-12, atol=1e-13)
+        np.testing.assert_array_equal(inflow, all_four[3])
+
+
+def test_lines_that_are_short_everywhere():
+    """A grid whose last axis has few cells is gathered instead of cut into segments."""
+    grid = dp.Grid((3000, 2), size=1.0)
+    move, rng = dp.transport(grid), np.random.default_rng(1)
+    u, v = rng.random(grid.shape), rng.normal(size=grid.faces.size)
+    np.testing.assert_allclose(move(u, v, 1e-5), move.operator(v, 1e-5)(u), rtol=1e-13)
+
+
+def test_numbers_of_the_numpy_twin():
+    x = streams_plain.Numbers(np.array([-1.0, 0.0, 2.0, np.nan, np.inf]))
+    y = streams_plain.Numbers(np.array([-1.0, 0.0, 2.0]))
+    np.testing.assert_array_equal(x.step().value, [0.0, 0.5, 1.0, 0.0, 1.0])
+    np.testing.assert_array_equal(x.short_of(0.0).value, [1.0, 0.0, 0.0, 1.0, 0.0])
+    np.testing.assert_array_equal(x.infinite().value, [0.0, 0.0, 0.0, 1.0, 1.0])
+    np.testing.assert_array_equal((y / 2.0 + y * y - y * 0.5).value, [1.0, 0.0, 4.0])

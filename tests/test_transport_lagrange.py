@@ -1,0 +1,151 @@
+"""Semi-Lagrangian and MacCormack transport against their twins: values, all derivatives, both kinds of kernels."""
+
+import numpy as np
+import pytest
+from looking_back import moved
+
+import sparsedp as dp
+from sparsedp import kernels
+from sparsedp.derivative import pullback, pushforward
+from sparsedp.errors import DerivativeError
+from sparsedp.kernels import sampling, sampling_plain
+
+NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
+SCHEMES = [
+    ("semi_lagrangian", "euler"),
+    ("semi_lagrangian", "midpoint"),
+    ("maccormack", "clamped"),
+    ("maccormack", "unclamped midpoint"),
+]
+GRIDS = [((7,), (True,)), ((6, 5), (False, True)), ((3, 4, 5), (False, True, False))]
+PLACES = [("cells", "faces"), ("faces", "faces"), ("cells", "cells"), ("faces", "cells")]
+
+
+@pytest.fixture
+def without_numba(monkeypatch):
+    monkeypatch.setattr(sampling, "_loop", lambda name, like=(): getattr(sampling_plain, name))
+
+
+def setting(shape, periodic, scheme, form, interpolation, of="cells", velocity="faces", solid=None, **options):
+    """A transport and a point (u, v, dt, inflow) that is off all kinks."""
+    grid = dp.Grid(shape, spacing=(0.3, 0.4, 0.5)[: len(shape)], periodic=periodic)
+    move = dp.transport(
+        grid, scheme, velocity=velocity, of=of, interpolation=interpolation, form=form, solid=solid, **options
+    )
+    rng = np.random.default_rng(5)
+    v = 0.7 * rng.standard_normal(grid.faces.shape if velocity == "faces" else (grid.dim, *shape))
+    return move, (rng.standard_normal(move.space.shape), v, 0.31, 0.4)
+
+
+def every_case(test):
+    test = pytest.mark.parametrize("boundary", [dp.neumann, dp.dirichlet], ids=repr)(test)
+    test = pytest.mark.parametrize(("of", "velocity"), PLACES)(test)
+    test = pytest.mark.parametrize("interpolation", ["linear", "cubic"])(test)
+    test = pytest.mark.parametrize(("scheme", "form"), SCHEMES)(test)
+    return pytest.mark.parametrize(("shape", "periodic"), GRIDS)(test)
+
+
+@every_case
+def test_twin(without_numba, shape, periodic, scheme, form, interpolation, of, velocity, boundary):
+    """Value and cotangents of field, velocity, step and inflow; the tangent against them."""
+    move, point = setting(shape, periodic, scheme, form, interpolation, of, velocity, boundary=boundary)
+    value, pull = pullback(lambda x: move(*x), point)
+    wanted, wanted_pull = pullback(lambda x: moved(move, *x), point)
+    assert value == pytest.approx(wanted, rel=1e-12, abs=1e-12)
+    g = np.random.default_rng(6).standard_normal(value.shape)
+    back = pull(g)
+    for mine, twin in zip(back, wanted_pull(g)):
+        assert mine == pytest.approx(twin, rel=1e-11, abs=1e-11)
+    rng = np.random.default_rng(7)
+    along = tuple(rng.standard_normal(np.shape(x)) if np.ndim(x) else 0.3 for x in point)
+    _, tangent = pushforward(lambda x: move(*x), point, along)
+    forward, backward = np.sum(g * tangent), sum(np.sum(a * b) for a, b in zip(back, along))
+    assert abs(forward - backward) <= 1e-12 * (1 + abs(forward))
+
+
+@NUMBA
+@pytest.mark.parametrize(("shape", "interpolation"), [((7,), "linear"), ((6, 5), "cubic"), ((3, 4, 5), "linear")])
+@pytest.mark.parametrize(("scheme", "form"), SCHEMES)
+def test_compiled_against_numpy(monkeypatch, shape, interpolation, scheme, form):
+    periodic = (True, False, False)[: len(shape)]
+    for boundary in (dp.neumann, dp.dirichlet):
+        move, point = setting(shape, periodic, scheme, form, interpolation, "faces", boundary=boundary)
+        along = tuple(0.3 * np.cos(np.arange(np.size(x))).reshape(np.shape(x)) if np.ndim(x) else 0.3 for x in point)
+        results = []
+        for loop in (sampling._loop, lambda name, like=(): getattr(sampling_plain, name)):
+            monkeypatch.setattr(sampling, "_loop", loop)
+            value, pull = pullback(lambda x: move(*x), point)
+            results.append((value, *pull(np.cos(value)), pushforward(lambda x: move(*x), point, along)[1]))
+            monkeypatch.undo()
+        for one, other in zip(*results):
+            assert one == pytest.approx(other, rel=1e-13, abs=1e-13)
+
+
+@pytest.mark.parametrize(("scheme", "form"), SCHEMES)
+@pytest.mark.parametrize("of", ["cells", "faces"])
+def test_gradient_is_that_of_the_value(scheme, form, of):
+    move, (u, v, dt, _) = setting((6, 5), (False, True), scheme, form, "linear", of, boundary=dp.dirichlet)
+    inflow = np.cos(3.0 * np.arange(move.walls.size))  # equal ones would be a kink of the clamp
+    loss = lambda x: (move(x["u"], x["v"], x["dt"], x["inflow"]) ** 3).sum()
+    result = dp.check.gradient(loss, {"u": u, "v": v, "dt": dt, "inflow": inflow})
+    assert result.verdict == "agrees", str(result)
+
+
+# ---------------------------------------------------------------- solids
+
+
+@pytest.mark.parametrize(("scheme", "form"), SCHEMES)
+@pytest.mark.parametrize("of", ["cells", "faces"])
+def test_solid(without_numba, scheme, form, of):
+    """What is in a solid stays, and cells around it do not see it; the derivative knows."""
+    solid = np.zeros((6, 5), bool)
+    solid[2:5, 1:4] = True
+    move, point = setting((6, 5), (False, True), scheme, form, "linear", of, solid=solid)
+    u, v, dt, _ = point
+    new = move(u, v, dt)
+    if of == "cells":
+        assert np.array_equal(new[solid], u[solid])
+        assert np.array_equal(move(np.where(solid, 99.0, u), v, dt)[~solid], new[~solid])
+    assert move(np.full_like(u, 3.0), v, dt) == pytest.approx(np.full(u.shape, 3.0), rel=1e-14)
+    result = dp.check.gradient(lambda x: (move(x[0], x[1], dt) ** 3).sum(), (u, v))
+    assert result.verdict == "agrees", str(result)
+
+
+def test_nothing_but_solid(without_numba):
+    move, (u, v, dt, _) = setting((3, 2), False, "maccormack", "clamped", "linear", solid=np.ones((3, 2), bool))
+    assert np.array_equal(move(u, v, dt), u)
+
+
+# ---------------------------------------------------------------- the matrix
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+@pytest.mark.parametrize("of", ["cells", "faces"])
+def test_matrix(without_numba, of, interpolation):
+    solid = np.zeros((6, 5), bool)
+    solid[3, 1:3] = True
+    move, (u, v, dt, _) = setting(
+        (6, 5), (True, False), "semi_lagrangian", "euler", interpolation, of, solid=solid, boundary=dp.dirichlet
+    )
+    op = move.operator(v, dt)
+    assert op(u) == pytest.approx(move(u, v, dt), rel=1e-13, abs=1e-13)
+    g = np.cos(u)
+    assert op.T(g) == pytest.approx(pullback(lambda u: move(u, v, dt), u)[1](g), rel=1e-13, abs=1e-13)
+
+
+def test_no_matrix():
+    move, (_, v, dt, _) = setting((6, 5), True, "maccormack", "clamped", "linear")
+    with pytest.raises(ValueError, match="transport maccormack is not linear in u and has no matrix"):
+        move.operator(v, dt)
+
+
+def test_second_derivatives(without_numba):
+    """In the field of the linear scheme, any; else a typed error."""
+    move, (u, v, dt, _) = setting((6, 5), True, "semi_lagrangian", "euler", "linear")
+    slope = lambda u: dp.value_and_grad(lambda w: (move(w, v, dt) ** 3).sum())(u)[1]
+    along = np.sin(np.arange(u.size)).reshape(u.shape)
+    _, bend = dp.value_and_grad(lambda u: (slope(u) * along).sum())(u)
+    assert bend == pytest.approx((slope(u + 1e-6 * along) - slope(u - 1e-6 * along)) / 2e-6, rel=1e-6, abs=1e-6)
+    curved = lambda v: dp.value_and_grad(lambda w: (move(u, w, dt) ** 2).sum())(v)[1]
+    with pytest.raises(DerivativeError, match="transport semi_lagrangian has first derivatives only"):
+        dp.value_and_grad(lambda v: curved(v).sum())(v)

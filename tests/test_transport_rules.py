@@ -1,0 +1,206 @@
+"""Derivatives of transport: Taylor rates, second order, what is not asked, repeated bits, plain forms of the step."""
+
+from itertools import product
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.advection.upwind import Upwind
+from sparsedp.derivative import pushforward, value_and_grad
+from sparsedp.errors import DerivativeError
+from sparsedp.ledger import recording
+
+RNG = np.random.default_rng(0)
+GRIDS = {
+    "1-D": dp.Grid(12, spacing=RNG.uniform(0.5, 1.5, 12)),
+    "2-D": dp.Grid((5, 4), size=3.0, periodic=(False, True)),
+    "3-D": dp.Grid((3, 2, 4), size=2.0, periodic=(True, False, False)),
+}
+FORMS = list(product(("faces", "cells"), ("flux", "advective")))
+
+
+def scene(scheme, grid, velocity, form, of="cells", **options):
+    """A move, its arguments and a loss of all four."""
+    rng = np.random.default_rng(1)
+    move = dp.transport(grid, scheme, dp.dirichlet, velocity, of, form=form, **options)
+    shape = move.setting.velocity_shapes[0]
+    # Means of cells of both signs could be close to 0, where there is a kink.
+    signs = (
+        rng.choice([-1, 1], shape)
+        if velocity == "faces"
+        else (-1.0) ** np.arange(len(shape) - 1).reshape(-1, *[1] * (len(shape) - 1))
+    )
+    args = {
+        "u": rng.normal(size=move.space.shape),
+        "v": rng.uniform(0.2, 1, shape) * signs,
+        "dt": 0.02,
+        "inflow": rng.normal(size=move.walls.shape),
+    }
+    weights = rng.uniform(0.5, 1.5, move.space.shape)
+
+    def loss(p):
+        u = move(p["u"], p["v"], p["dt"], p["inflow"])
+        return anp.sum(weights * move(u, p["v"], p["dt"], p["inflow"]) ** 2)
+
+    return move, args, loss
+
+
+@pytest.mark.parametrize("name", GRIDS)
+@pytest.mark.parametrize("velocity, form", FORMS)
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
+def test_taylor(scheme, velocity, form, name):
+    _, args, loss = scene(scheme, GRIDS[name], velocity, form)
+    result = dp.check.gradient(loss, args)
+    assert result.verdict == "agrees", str(result)
+
+
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
+@pytest.mark.parametrize("number", ["u", "v", "dt", "inflow"])
+def test_taylor_in_each_argument(scheme, number):
+    _, args, loss = scene(scheme, GRIDS["2-D"], "faces", "flux", of="faces")
+    result = dp.check.gradient(lambda x: loss({**args, number: x}), args[number])
+    assert result.verdict == "agrees", str(result)
+
+
+def moved(args, along, h):
+    return {name: args[name] + h * along[name] for name in args}
+
+
+def rates(values, steps):
+    return np.diff(np.log(np.abs(values))) / np.diff(np.log(steps))
+
+
+@pytest.mark.parametrize("name", GRIDS)
+@pytest.mark.parametrize("velocity, form", FORMS)
+def test_hessian_of_upwind(velocity, form, name):
+    """Remainder of order 3 with it, 2 without; every mode of second order agrees."""
+    _, args, loss = scene("upwind", GRIDS[name], velocity, form)
+    rng = np.random.default_rng(2)
+    along = {key: rng.normal(size=np.shape(x))[()] * (0.1 if key != "dt" else 0.01) for key, x in args.items()}
+    dot = lambda a, b: sum(anp.sum(a[key] * b[key]) for key in a)
+    gradient = lambda p: value_and_grad(loss)(p)[1]
+    value, g = value_and_grad(loss)(args)
+    forward_over_reverse = pushforward(gradient, args, along)[1]
+    reverse_over_reverse = value_and_grad(lambda p: dot(gradient(p), along))(args)[1]
+    reverse_over_forward = value_and_grad(lambda p: pushforward(loss, p, along)[1])(args)[1]
+    for key in args:
+        scale = np.max(np.abs(forward_over_reverse[key]), initial=1.0)
+        for other in (reverse_over_reverse, reverse_over_forward):
+            np.testing.assert_allclose(other[key], forward_over_reverse[key], rtol=0, atol=1e-12 * scale)
+    steps = np.array([0.2, 0.1, 0.05])
+    curved = dot(forward_over_reverse, along)
+    rest = [loss(moved(args, along, h)) - value - h * dot(g, along) for h in steps]
+    assert np.all(rates(rest, steps) >= 1.9)
+    assert np.all(rates([r - h * h / 2 * curved for r, h in zip(rest, steps)], steps) >= 2.9)
+
+
+def test_second_order_of_van_leer_is_refused():
+    move, args, loss = scene("van_leer", GRIDS["1-D"], "faces", "flux")
+    slope = lambda u: anp.sum(value_and_grad(lambda u: loss({**args, "u": u}))(u)[1] ** 2)
+    with pytest.raises(DerivativeError, match="transport van_leer has first derivatives only; for second ones write"):
+        value_and_grad(slope)(args["u"])
+    with pytest.raises(DerivativeError, match="transport van_leer has first derivatives only; for second ones write"):
+        pushforward(lambda u: value_and_grad(lambda u: loss({**args, "u": u}))(u)[1], args["u"], args["u"])
+
+
+def test_operator_is_the_step_and_refused_where_there_is_none():
+    for grid, (velocity, form), of in product(GRIDS.values(), FORMS, ("cells", "faces")):
+        move, args, _ = scene("upwind", grid, velocity, form, of)
+        op = move.operator(args["v"], args["dt"])
+        assert op.form == "explicit" and op.matrix.indices.dtype == np.int32
+        np.testing.assert_allclose(op(args["u"]), move(args["u"], args["v"], args["dt"]), rtol=0, atol=1e-14)
+    move, args, _ = scene("van_leer", grid, velocity, form)
+    with pytest.raises(ValueError, match="transport van_leer is not linear in u and has no matrix; write scheme="):
+        move.operator(args["v"], 0.1)
+
+
+# ---- what is computed -----------------------------------------------------------------------------------------------
+
+
+def test_only_what_is_asked_is_computed(monkeypatch):
+    move, args, loss = scene("upwind", GRIDS["2-D"], "faces", "flux")
+    asked = []
+    pull = Upwind.pull
+    spy = lambda self, nums, *rest, **more: asked.append(nums) or pull(self, nums, *rest, **more)
+    monkeypatch.setattr(Upwind, "pull", spy)
+    for name, number in (("u", (0,)), ("v", (1,)), ("dt", (2,)), ("inflow", (3,))):
+        asked.clear()
+        value_and_grad(lambda x: squares(move, {**args, name: x}))(args[name])
+        assert asked == [number]
+    asked.clear()
+    value_and_grad(loss)(args)
+    assert [set(nums) for nums in asked] == [{0, 1, 2, 3}] * 2
+
+
+def squares(move, args):
+    return anp.sum(move(args["u"], args["v"], args["dt"], args["inflow"]) ** 2)
+
+
+def test_each_step_is_one_rule():
+    move, args, loss = scene("upwind", GRIDS["2-D"], "faces", "flux")
+    with recording() as counts:
+        value_and_grad(loss)(args)
+    assert counts["transport upwind", "forward"] == 2 and counts["transport upwind", "vjp"] == 2
+
+
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
+def test_the_same_bits_twice(scheme):
+    _, args, loss = scene(scheme, GRIDS["3-D"], "faces", "flux")
+    first, second = (value_and_grad(loss)(args)[1] for _ in range(2))
+    for name in args:
+        np.testing.assert_array_equal(first[name], second[name])
+
+
+def test_inflow_as_one_number_gets_the_sum():
+    move, args, _ = scene("upwind", GRIDS["2-D"], "faces", "flux")
+    f = lambda q: anp.sum(move(args["u"], args["v"], args["dt"], q) ** 2)
+    each = value_and_grad(f)(np.full(move.walls.size, 0.7))
+    whole = value_and_grad(f)(0.7)
+    assert whole == pytest.approx((each[0], np.sum(each[1])), rel=1e-13)
+
+
+@pytest.mark.parametrize("velocity", ["faces", "cells"])
+@pytest.mark.parametrize("kink", ["rest", "some"])
+def test_kinks_get_the_mean_of_both_sides(velocity, kink):
+    """At v = 0 the derivative is that of the central difference."""
+    grid = dp.Grid((5, 4), size=1.0)
+    move, rng = dp.transport(grid, boundary=dp.dirichlet, velocity=velocity), np.random.default_rng(3)
+    u, shape, q = rng.normal(size=grid.shape), move.setting.velocity_shapes[0], rng.normal(size=18)
+    v = np.zeros(shape) if kink == "rest" else np.where(rng.random(shape) < 0.5, 0.0, rng.normal(size=shape))
+    g = rng.normal(size=grid.shape)
+    loss = lambda v: anp.sum(g * move(u, v, 0.01, q))
+    slope, h = value_and_grad(loss)(v)[1], 2.0**-20
+    for index in np.ndindex(shape):
+        unit = np.zeros(shape)
+        unit[index] = h
+        assert slope[index] == pytest.approx((loss(v + unit) - loss(v - unit)) / (2 * h), abs=1e-8)
+
+
+# ---- the plain forms of the step ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
+@pytest.mark.parametrize("velocity, form", FORMS)
+@pytest.mark.parametrize("of", ["cells", "faces"])
+def test_plain_forms_of_the_step(scheme, velocity, form, of):
+    move, args, _ = scene(scheme, GRIDS["2-D"], velocity, form, of)
+    u, v, g = args["u"], args["v"], np.random.default_rng(4).normal(size=move.space.shape)
+    step = move.step(args["dt"], args["inflow"])
+    assert repr(step) == f"<step of {move!r}, dt = 0.02>"
+    out, wanted = np.full_like(u, np.nan), move(u, v, args["dt"], args["inflow"])
+    assert np.shares_memory(step.forward(u, v, out), out)
+    np.testing.assert_array_equal(out, wanted)
+    np.testing.assert_array_equal(step(u, v), wanted)
+    of_u, of_v = value_and_grad(lambda p: anp.sum(g * step(*p)))((u, v))[1]
+    into = np.ones_like(v)
+    found = step.backward(u, v, g, into)
+    assert found[1] is into
+    np.testing.assert_array_equal(found[0], of_u)
+    np.testing.assert_allclose(into, 1 + of_v, rtol=1e-14)
+    np.testing.assert_allclose(step.backward(u, v, g)[1], of_v, rtol=1e-14, atol=1e-16)
+    narrow = step.backward(u, v, g, np.zeros(v.shape, np.float32))[1]
+    np.testing.assert_allclose(narrow, of_v, rtol=1e-6, atol=1e-6)
+    tangent = step.tangent(u, v, u, v)
+    np.testing.assert_array_equal(tangent, pushforward(lambda p: step(*p), (u, v), (u, v))[1])

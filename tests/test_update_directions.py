@@ -1,0 +1,178 @@
+"""Gradient, half-inverse, Gauss-Newton: one family of directions, and the methods of minimise built on it."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.tape import linear
+
+SHAPES = [(12, 30), (30, 12), (9, 9), (1, 5), (5, 1)]
+
+
+def jacobian(rng, shape, decades=3):
+    """A matrix with singular values over so many decades."""
+    u, _, v = np.linalg.svd(rng.standard_normal(shape), full_matrices=False)
+    return u * np.logspace(0, -decades, min(shape)) @ v
+
+
+def reference(matrix, g, power, damping=0.0, truncation=1e-10):
+    u, s, v = np.linalg.svd(matrix, full_matrices=False)
+    kept = s > truncation * s[0]
+    weights = np.where(kept, s * (s**2 + damping) ** -power, 0.0)
+    return v.T @ (weights * (u.T @ g))
+
+
+def gap(a, b):
+    return np.linalg.norm(a - b) / np.linalg.norm(b)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("power", [0, 0.5, 0.75, 1])
+@pytest.mark.parametrize("method", ["dense", "krylov"])
+def test_the_family_against_the_svd(rng, shape, power, method):
+    matrix = jacobian(rng, shape)
+    x = rng.standard_normal(shape[1])
+    for damping in (0.0, 1e-3):
+        found = dp.update_direction(lambda u: matrix @ u, x, power=power, damping=damping, method=method)
+        assert gap(found.step, reference(matrix, matrix @ x, power, damping)) < 1e-10
+    if power:
+        assert gap(found.spectrum[0], 1.0) < 1e-10 or shape == (1, 5) or method == "krylov"
+
+
+def test_power_zero_is_the_gradient_to_the_last_digits(rng):
+    matrix, x = jacobian(rng, (7, 11)), rng.standard_normal(11)
+    _, slope = dp.value_and_grad(lambda u: 0.5 * anp.sum((matrix @ u) ** 2))(x)
+    assert gap(dp.update_direction(lambda u: matrix @ u, x, power=0).step, slope) < 1e-13
+
+
+@pytest.mark.parametrize("method", ["dense", "krylov"])
+def test_truncation(rng, method):
+    matrix = jacobian(rng, (8, 20), decades=7)
+    x = rng.standard_normal(20)
+    found = dp.update_direction(lambda u: matrix @ u, x, power=1, truncation=3e-5, method=method)
+    assert found.kept == 5 if method == "dense" else found.kept <= 5
+    expected = reference(matrix, matrix @ x, 1, truncation=3e-5)
+    assert gap(found.step, expected) < 1e-6
+    gram = dp.update_direction(lambda u: matrix @ u, x, power=1, truncation=3e-5)
+    assert gram.method == "gram" and f"{gram.kept} kept" in str(gram)
+
+
+def test_a_rank_deficient_jacobian(rng):
+    matrix = jacobian(rng, (4, 10))[[0, 1, 1, 2, 3, 3]]
+    x = rng.standard_normal(10)
+    for method in ("dense", "krylov"):
+        found = dp.update_direction(lambda u: matrix @ u, x, power=1, method=method)
+        assert np.allclose(matrix @ found.step, matrix @ x, rtol=1e-9)
+
+
+def test_nothing_to_do():
+    for method in ("dense", "krylov"):
+        assert np.array_equal(dp.update_direction(lambda u: 0.0 * u, np.ones(3), method=method).step, np.zeros(3))
+        assert np.array_equal(dp.update_direction(lambda u: u[:0], np.ones(3), method=method).step, np.zeros(3))
+    assert "J is 0" in str(dp.update_direction(lambda u: u[:0], np.ones(3), method="krylov"))
+
+
+def test_trees_and_samples_apart(rng):
+    inputs = rng.standard_normal((6, 3))
+
+    def layer(x, u=inputs):  # broadcasts over copies of the weights, one for each sample
+        return anp.tanh(anp.sum(x["w"] * u[:, :, None], axis=-2) + x["b"])
+
+    x = {"w": rng.standard_normal((3, 2)), "b": np.zeros(2), "name": "layer"}
+    plain, apart = (dp.update_direction(layer, x, method="dense", apart=flag) for flag in (False, True))
+    assert plain.step["name"] == "layer" and plain.step["w"].shape == (3, 2)
+    assert gap(plain.step["w"], apart.step["w"]) < 1e-11 and gap(plain.step["b"], apart.step["b"]) < 1e-11
+
+
+def test_memory_of_the_bidiagonalisation(rng):
+    """No matrix of m x n numbers: products with an operator of 10^10 entries."""
+    size = 100_000
+    weights = 1.0 / (1 + np.arange(size) % 7)
+    rule = linear("weights", lambda u: weights * u, lambda g: weights * g)[0]
+    x = rng.standard_normal(size)
+    found = dp.update_direction(rule, x, power=0.75)
+    assert found.method == "krylov" and len(found.spectrum) <= 16  # seven different numbers, and rounding
+    assert gap(found.step, np.sqrt(weights) * x) < 1e-8
+
+
+# ---- the methods of minimise ---------------------------------------------------------------------------------------
+
+
+def valley(x):
+    """Residuals of Rosenbrock's function."""
+    return anp.concatenate([10 * (x[1:] - x[:-1] ** 2), 1 - x[:-1]])
+
+
+SQUARES = [
+    ("gauss_newton", {}),
+    ("gauss_newton", {"dense": False}),
+    ("levenberg_marquardt", {}),
+    ("levenberg_marquardt", {"dense": False, "damping": 1e-2}),
+]
+
+
+@pytest.mark.parametrize("method, options", SQUARES)
+def test_least_squares(method, options):
+    best = dp.minimise(valley, np.array([-1.2, 1.0] * 3), method, maxiter=60, **options)
+    assert best.converged and np.allclose(best.x, 1, atol=1e-6)
+    assert best.value == pytest.approx(0.5 * np.sum(valley(best.x) ** 2))
+
+
+@pytest.mark.parametrize("method, options", SQUARES)
+def test_a_linear_problem_takes_one_step_and_none_at_rounding(rng, method, options):
+    matrix, data = rng.standard_normal((9, 4)), rng.standard_normal(9)
+    best = dp.minimise(lambda x: matrix @ x - data, np.zeros(4), method, tolerance=0, maxiter=40, **options)
+    assert np.allclose(best.x, np.linalg.lstsq(matrix, data, rcond=None)[0], atol=1e-6)
+    assert best.converged
+
+
+def test_a_singular_jacobian_takes_the_shortest_step():
+    best = dp.minimise(lambda x: anp.array([1.0, 1.0]) * (x[0] + x[1] - 2.0), np.zeros(2), "gauss_newton")
+    assert np.allclose(best.x, 1.0)
+
+
+def test_the_two_variables_of_the_literature():
+    """y = (x0, x1^2), L = |y|^2 from (3, 3). Source: Holl, Koltun, Thuerey, 2022; figures of case C1."""
+    start, y = np.array([3.0, 3.0]), lambda x: anp.stack([x[0], x[1] ** 2])
+    square = lambda v: anp.sum(v**2)
+    fixed = {"maxiter": 10, "tolerance": 0}
+    descent = dp.minimise(lambda x: square(y(x)), start, "gd", rate=0.01, **fixed)
+    assert np.allclose(descent.x, (2.4512184, 0.96171147), rtol=1e-6)
+    options = {"physics": y, "inverse": lambda v, x: np.stack([v[0], np.sqrt(v[1])])}
+    slow = dp.minimise(square, start, "physical_gradient", rate=0.15, **options, **fixed)
+    assert np.allclose(slow.x, (0.08474258, 0.50421), rtol=1e-6)
+    assert np.array_equal(dp.minimise(square, start, "physical_gradient", rate=0.5, **options, maxiter=1).x, [0, 0])
+
+
+def test_half_inverse_equalises_the_directions():
+    scales = np.array([1.0, 1e-4])
+    best = dp.minimise(lambda x: scales * (x - 1.0), np.zeros(2), "half_inverse", maxiter=60, tolerance=0)
+    descent = dp.minimise(lambda x: anp.sum((scales * (x - 1.0)) ** 2), np.zeros(2), "gd", maxiter=60)
+    assert abs(best.x[1] - 1) < 0.6 < 0.99 < abs(descent.x[1] - 1)
+
+
+def test_batches():
+    data = [np.full(3, value) for value in (1.0, 2.0, 3.0)]
+    for batches in (data, lambda i: data[i % 3]):
+        best = dp.minimise(lambda x, b: x - b, np.zeros(3), "half_inverse", maxiter=30, batches=batches, rate=0.5)
+        assert np.all(best.x > 1.5) and np.all(best.x < 3) and best.value == best.history[-1].value
+    seen = []
+
+    def loss(x, batch):
+        seen.append(batch)
+        return anp.sum((x - batch) ** 2)
+
+    dp.minimise(loss, np.zeros(1), "adam", maxiter=4, batches=[0, 1, 2], tolerance=0)
+    assert seen == [0, 1, 2, 0, 1]
+
+
+def test_a_minimum_that_is_not_a_solution():
+    best = dp.minimise(lambda x: anp.abs(x) + 1.0, np.full(2, 0.5), "gauss_newton")
+    assert not best.converged and "no lower point along the Gauss-Newton step" in best.message
+
+
+def test_the_inverse_simulator():
+    double = dp.physical_gradient(lambda x: 2.0 * x, lambda y, x: 0.5 * y, name="double")
+    _, update = dp.value_and_grad(lambda x: 0.5 * anp.sum((double(x) - 8.0) ** 2))(np.ones((5, 2)))
+    assert np.array_equal(1.0 - update, np.full((5, 2), 4.0))
