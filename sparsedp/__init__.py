@@ -36,6 +36,7 @@ _WINDOW = {
     "report.charts": "v_curve",
     "report.plots": "animate plot",
     "report.certificate": "certify",
+    "report.extremes": "stress",
     "report.precision": "workprec",
     "report.tolerances": "certified",
     "report.plan": "explain",

@@ -41,6 +41,7 @@ from .optimise.loop import minimise as minimise
 from .optimise.physical import physical_gradient as physical_gradient
 from .report.certificate import certify as certify
 from .report.charts import v_curve as v_curve
+from .report.extremes import stress as stress
 from .report.plan import explain as explain
 from .report.plots import animate as animate
 from .report.plots import plot as plot

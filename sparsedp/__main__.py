@@ -1,14 +1,19 @@
-"""The command line: ``python -m sparsedp demo``."""
+"""The command line: ``python -m sparsedp demo``, ``check FILE.py:loss`` and ``report FILE.py --out DIR``.
+
+Exit codes of check and report: 0 agrees, 1 disagrees, 3 inconclusive, 2 the input was refused.
+"""
 
 import argparse
 import sys
 from pathlib import Path
 
 REFUSED = 2  # exit code of a bad input, the same as argparse's
+CODES = {"agrees": 0, "disagrees": 1, "inconclusive": 3}
+SCENE = "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"
 
 
 def main(arguments=None):
-    """Command line -> exit code: 0 done, 1 the demo failed, 2 the input was refused."""
+    """Command line -> exit code: 0 done or agrees, 1 failed or disagrees, 2 the input was refused, 3 inconclusive."""
     options = _parser().parse_args(arguments)
     return options.run(options)
 
@@ -39,7 +44,55 @@ def _parser():
     demo.add_argument("--out", type=Path, default=Path("sparsedp-demo"), metavar="DIR", help="where the results go")
     demo.add_argument("--force", action="store_true", help="overwrite results of an earlier run")
     demo.set_defaults(run=run_demo)
+    check = rooms.add_parser(
+        "check",
+        help="audit the gradient of a loss in a file",
+        description="Audit a gradient. Exit code: 0 agrees, 1 disagrees, 3 inconclusive, 2 refused.",
+    )
+    check.add_argument("scene", metavar="SCENE", help=SCENE)
+    check.set_defaults(run=run_check)
+    report = rooms.add_parser(
+        "report",
+        help="audit, plan, certificate, error against run time and stress of a loss in a file, in one folder",
+        description="All instruments on one scene. Exit code: 0 agrees, 1 disagrees or a case FAILED, "
+        "3 inconclusive, 2 refused. In the file, workprec_options and stress_options may hold dicts of arguments.",
+    )
+    report.add_argument("scene", metavar="SCENE", help=SCENE)
+    report.add_argument("--out", type=Path, default=Path("sparsedp-report"), metavar="DIR", help="where the results go")
+    report.add_argument("--force", action="store_true", help="overwrite an earlier report")
+    report.set_defaults(run=run_report)
     return parser
+
+
+def run_check(options):
+    """Options of the command `check` -> exit code."""
+    from sparsedp.check.audit import gradient
+    from sparsedp.report.source import load
+
+    try:
+        source = load(options.scene)
+    except ValueError as error:
+        return refuse(error)
+    try:
+        audit = gradient(source.loss, source.x)
+    except Exception as error:  # the loss is the user's: it may raise anything
+        return refuse(f"{options.scene} cannot be audited: {type(error).__name__}: {error}")
+    print(audit)
+    return CODES[audit.verdict]
+
+
+def run_report(options):
+    """Options of the command `report` -> exit code."""
+    from sparsedp.report.folder import write_report
+    from sparsedp.report.source import load
+
+    try:
+        source = load(options.scene)
+        verdict, lines = write_report(source, options.out, options.force)
+    except ValueError as error:
+        return refuse(error)
+    print(*lines, f"{verdict}; see {options.out / 'report.md'}", sep="\n")
+    return CODES[verdict]
 
 
 def run_demo(options):

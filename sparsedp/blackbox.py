@@ -44,6 +44,8 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
 
     Raises
     ------
+    TypeError
+        If f is no function.
     ValueError
         If `derivative` is not known.
     ShapeError
@@ -67,6 +69,8 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     >>> value_and_grad(lambda x: anp.sum(shift(x)))(np.array([1.0, 2.0, 3.0]))
     (14.0, array([2., 4., 6.]))
     """
+    if not callable(f):
+        raise TypeError(f"adopt takes a function of one array, got {type(f).__name__}; write dp.adopt(lambda x: ...)")
     if derivative not in ("auto", "complex", "difference"):
         raise ValueError(f"derivative must be auto, complex or difference, got {derivative!r}")
     return Adopted(f, sparsity, derivative, name or getattr(f, "__name__", "simulator"))

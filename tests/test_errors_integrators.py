@@ -81,7 +81,7 @@ TABLE = [
         "the coefficient of laplacian must be >= 0, got -1; put the sign into the operator",
     ),
     (
-        lambda: dp.stepper("backward_euler", L, 0.1)(U, np.nan),
+        lambda: dp.stepper("backward_euler", None, 0.1, linear=(L, np.nan))(U),
         FINITE,
         "the coefficient of laplacian must be finite, got nan",
     ),
@@ -95,6 +95,16 @@ TABLE = [
         lambda: dp.stepper("euler", lambda u, p, t: u, 0.6)(U),
         TYPE,
         "the rate of stepper(euler) takes a time, so its state is the pair (u, t), got ndarray",
+    ),
+    (
+        lambda: dp.stepper("euler", lambda u, p: 1j * u, 0.6)(U),
+        TYPE,
+        "a rate of complex numbers needs a complex state, got float64; write u.astype(complex)",
+    ),
+    (
+        lambda: dp.stepper("euler", lambda u, p: u.__imul__(2.0), 0.6)(U),
+        VALUE,
+        "the rate changes the state in place; write u = u + du instead of u += du, or work on a copy",
     ),
     (
         lambda: dp.stepper("euler", decay, 0.6)(np.array([1, np.nan, 1]), 1.0),

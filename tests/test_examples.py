@@ -29,6 +29,9 @@ SMALL = {
     "obstacle.py": "10",
     "shape.py": "12",
     "velocity_recovery.py": "64",
+    "update_directions.py": "10",
+    "half_inverse.py": "1",
+    "inverse_heat.py": "6",
 }  # cells, the end time, or gradients; the others run with 16
 
 
@@ -200,6 +203,15 @@ def test_error_against_time():
     assert poisson.count("1e-10") >= 12 and "fastest" not in poisson
 
 
+def test_stiff_and_extreme():
+    """Three scenes pass; the long explicit step and the null space left in are found."""
+    rows = dict(re.findall(r"^(\S.*?) +stress: .* (\d+) FAILED$", run("stiff_and_extreme.py"), re.MULTILINE))
+    assert [int(rows[name]) for name in ("implicit diffusion", "pressure in a closed box", "ink in a wind")] == [0] * 3
+    assert int(rows["explicit, number 0.6"]) >= 1 and int(rows["null space left in"]) >= 1
+    assert "is a null space left in?" in run("stiff_and_extreme.py")
+    assert "changes its sign from step to step" in run("stiff_and_extreme.py")
+
+
 def test_velocity_recovery():
     """Case A1: 9.30 from rest stalls; from a constant velocity loss <= 1e-6, error <= 0.1 where the marker passes."""
     rows = re.findall(
@@ -208,3 +220,40 @@ def test_velocity_recovery():
     table = {(start.split()[0], method): tuple(map(float, figures)) for start, method, *figures in rows}
     assert table["rest", "lbfgs"][0] == 9.30 and all(table["rest", method][1] <= 2.5 for method in ("gd", "lbfgs"))
     assert table["constant", "lbfgs"][1] <= 1e-6 and table["constant", "lbfgs"][2] <= 0.1
+
+
+def test_update_directions():
+    """Case C1: first steps and ends of three directions as published; rate 1 is exact after one step."""
+    printed = run("update_directions.py")
+    found = re.findall(r"(1\.\d+)  \((\S+), (\S+)\) +\S+ +\d+  (1\S+)  \((\S+), (\S+)\)$", printed, re.MULTILINE)
+    assert len(found) == 3
+    for row in found:
+        assert [float(a) for a in row[:3]] == pytest.approx([float(a) for a in row[3:]], rel=1e-6)
+    assert re.search(r"rate 1 .*\(0\.00000000, 0\.00000000\)", printed)
+
+
+def test_half_inverse():
+    """Case C2: the loss after one epoch as published, far below Adam's; Levenberg-Marquardt <= 3e-8 on what it sees."""
+    row = r"^(\S.*?\S)  +(\d+) +(\S+) +(\S+) +(\S+)"
+    printed = run("half_inverse.py")
+    found = {name: (float(a), float(b)) for name, _, _, a, b in re.findall(row, printed, re.MULTILINE)}
+    assert 5.4e-5 / 2 <= found["half-inverse"][0] <= 2 * 5.4e-5 and found["half-inverse"][1] <= 2 * 5.4e-5
+    assert found["Adam, equal time"][0] > 2 * found["half-inverse"][0] > 20 * found["Levenberg-Marquardt"][0]
+    assert float(re.search(r"it sees: (\S+)", printed)[1]) <= 3e-8
+
+
+def test_adopt_a_simulator():
+    """At most 20 runs for a Jacobian on both grids, the entries of the stencil, and an audit that agrees."""
+    printed = run("adopt_a_simulator.py")
+    found = re.findall(r"^ +(\d+) +(\d+) +(\d+) +\S+ +(\d+) +\S+ +\1$", printed, re.MULTILINE)
+    assert len(found) == 2
+    for unknowns, entries, _, runs in (map(int, row) for row in found):
+        assert entries == 6 * unknowns and runs <= 20
+    assert "agrees" in printed
+
+
+def test_inverse_heat():
+    """Case C3: one physical gradient beats 1000 gradients; with few jumps and no network below the published 50.4."""
+    found = re.findall(r"^(\S.*?) +\d+ +(\S+) +\S+  (\d+)", run("inverse_heat.py"), re.MULTILINE)
+    errors = [float(error) for _, error, _ in found]
+    assert len(errors) == 3 and errors[0] > 1.2 * errors[1] and errors[2] <= 50.4

@@ -228,3 +228,24 @@ def test_unrolled_solves_leave_a_record(rng):
     with pytest.raises(dp.errors.ConvergenceError, match="unrolled krylov on "):
         short(b)
     assert short.info.forward.status == "max_iterations"
+
+
+@pytest.mark.parametrize("method", ["krylov", "multigrid"])
+@pytest.mark.parametrize("exponent", [-30, -150, 150])
+def test_a_small_right_hand_side_gives_the_same_bits(method, exponent):
+    """The tolerance is relative, whatever the size of the data."""
+    grid = dp.Grid((12, 11), size=1.0)
+    b = np.cos(np.arange(132.0)).reshape(12, 11)
+    solve = dp.inverse(-dp.laplacian(grid, dp.dirichlet), method, rtol=1e-8)
+    for act in (solve, solve.T):
+        assert np.array_equal(act(b * 2.0**exponent), act(b) * 2.0**exponent)
+
+
+def test_a_coefficient_may_be_reused_before_the_pullback():
+    grid = dp.Grid((6, 5), size=1.0)
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
+    k, b = 1.0 + np.arange(float(grid.faces.size)) / 9, np.cos(np.arange(30.0)).reshape(6, 5)
+    wanted = pullback(lambda b: solve(k, b), b)[1](b)
+    pull = pullback(lambda b: solve(k, b), b)[1]
+    k *= 5.0
+    assert np.array_equal(pull(b), wanted)

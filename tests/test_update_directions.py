@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp.optimise.triangle import thin
 from sparsedp.tape import linear
 
 SHAPES = [(12, 30), (30, 12), (9, 9), (1, 5), (5, 1)]
@@ -38,6 +39,19 @@ def test_the_family_against_the_svd(rng, shape, power, method):
         assert gap(found.step, reference(matrix, matrix @ x, power, damping)) < 1e-10
     if power:
         assert gap(found.spectrum[0], 1.0) < 1e-10 or shape == (1, 5) or method == "krylov"
+
+
+@pytest.mark.parametrize("decades, shape", [(0, (7, 7)), (4, (6, 40)), (6, (6, 40)), (9, (6, 40)), (13, (1, 3))])
+def test_the_thin_factor(rng, decades, shape):
+    """Two passes of Cholesky while they hold, Householder beyond: as exact either way."""
+    matrix = jacobian(rng, shape, decades)
+    factor = thin(matrix)
+    assert (factor.inner is None) == (decades == 9)
+    q = np.transpose([factor.along(unit) for unit in np.eye(len(matrix))])
+    assert np.allclose(q.T @ q, np.eye(len(matrix)), atol=1e-13)
+    assert np.linalg.norm(factor.triangle @ q.T - matrix) <= 1e-14 * np.linalg.norm(matrix)
+    assert np.allclose(factor.across(q @ factor.triangle[0]), factor.triangle[0])
+    assert thin(np.zeros(shape)).inner is None
 
 
 def test_power_zero_is_the_gradient_to_the_last_digits(rng):

@@ -117,11 +117,12 @@ class SemiLagrangian(Law):
         """Add cotangents to `into` (u, outside; or None) and return those of the velocities of the looks, if wanted."""
         field, aside = (NOTHING, NOTHING) if into is None else into
         speeds = np.zeros((self.setting.grid.dim, g.size)) if wanted else None
-        u, target = (u, field) if self.fill is None else (self.fill[0] @ u, np.zeros_like(field))
+        filled = self.fill is not None and into is not None
+        u, target = u if self.fill is None else self.fill[0] @ u, np.zeros_like(field) if filled else field
         axes = (NOTHING,) * 3 if speeds is None else three(speeds)
         w, scale = looks[0]
         sampling.retreat(self.points[number], u, outside, w, scale, g, target, aside, axes)
-        if target is not field:
+        if filled:
             field += self.fill[1] @ target
         return (speeds,)
 

@@ -5,7 +5,7 @@ import numpy as np
 from sparsedp.advection.law import FIELD, VELOCITY
 from sparsedp.advection.values import prepare, raised, result_like, unflatten
 from sparsedp.errors import DerivativeError
-from sparsedp.tape import isbox
+from sparsedp.tape import dtype_of, isbox
 
 __all__ = ["Step"]
 
@@ -38,20 +38,26 @@ class Step:
         own = {} if target is None else {VELOCITY: target}
         of_u, of_v = law.pull((FIELD, VELOCITY), raised(FIELD, law, g), *flat, into=own)
         if into is None:
-            into = unflatten(v, of_v)
+            into = _rounded(v, unflatten(v, of_v))
         elif target is None:
             into += unflatten(v, of_v)
-        return unflatten(u, of_u), into
+        return _rounded(u, unflatten(u, of_u)), into
 
     def tangent(self, u, v, du, dv):
         """Tangent of the moved field, plain."""
         law = self.transport.law
         flat = prepare(law, u, v, self.dt, self.inflow)
         along = {FIELD: raised(FIELD, law, du), VELOCITY: raised(VELOCITY, law, dv)}
-        return unflatten(u, law.push(along, *flat))
+        return _rounded(u, unflatten(u, law.push(along, *flat)))
 
     def __repr__(self):
         return f"<step of {self.transport!r}, dt = {self.dt:g}>"
+
+
+def _rounded(value, found):
+    """In the dtype of a value in single precision."""
+    kind = dtype_of(value)
+    return found.astype(kind.newbyteorder("=")) if kind.char == "f" else found
 
 
 def _target(array):

@@ -6,7 +6,7 @@ from sparsedp.errors import ShapeError
 from sparsedp.tape import cast, dtype_of, is_variable, plain
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["combine", "like", "untraced"]
+__all__ = ["combine", "frozen", "like", "untraced"]
 
 
 def combine(u, *pairs):
@@ -54,7 +54,25 @@ def like(new, u):
 
 def _rounded(leaf, old):
     kind = dtype_of(old)
-    return leaf if not is_variable(old) or dtype_of(leaf) == kind else cast(leaf, kind)
+    if not is_variable(old) or dtype_of(leaf) == kind:
+        return leaf
+    if dtype_of(leaf).kind == "c" != kind.kind:
+        raise TypeError(f"a rate of complex numbers needs a complex state, got {kind}; write u.astype(complex)")
+    return cast(leaf, kind)
+
+
+def frozen(tree):
+    """The same tree with arrays that nobody can write into: a rate must not change the state."""
+    found, rebuild = flatten(tree)
+    return rebuild(map(_view, found))
+
+
+def _view(leaf):
+    if type(leaf) is not np.ndarray or not leaf.flags.writeable:
+        return leaf
+    view = leaf.view()
+    view.flags.writeable = False
+    return view
 
 
 def untraced(tree):

@@ -24,6 +24,8 @@ __all__ = ["LinearStep"]
 class LinearStep(Step):
     """A Step of an Operator alone: plain forward and backward, without a tape."""
 
+    sparing = True
+
     def forward(self, state, params, out=None):
         """The state after a step, of plain values; `out` is written into where that saves time."""
         if self.method not in EXPLICIT or not isinstance(state, np.ndarray) or state.dtype != np.float64:
@@ -50,17 +52,20 @@ class LinearStep(Step):
             kept = self._room = [np.empty(shape) for _ in range(count)]
         return kept[:count]
 
-    def backward(self, state, params, g, into=None, new=None):
+    def backward(self, state, params, g, into=None, new=None, wanted=True):
         """Cotangents (of state, of params) of a step; plain.
 
         `into`: the cotangent of params is added to it. `new`: the result of the step where it is still known;
-        it saves the solve that finds it again.
+        it saves the solve that finds it again. `wanted`: whether params want a cotangent.
         """
-        z = self.dt * self.problem.coefficient(params)
-        wanted = is_variable(params)
+        inner = D * self.dt if self.method in ("tr_bdf2", "imex") else self.dt
+        z = inner * self.problem.coefficient(params)  # to the last bit that of the way forward: one set-up
+        wanted = wanted and is_variable(params)
+        if wanted and new is None and self.method == "crank_nicolson":
+            new = self(state, params)  # the slope is made of it, with the same bits
         back, slope = PULLS[self.method](self.scheme, z, state, g, new, wanted)
-        back = back if back.dtype == g.dtype else back.astype(g.dtype)
-        return back, _added(into, self.dt * slope) if wanted else None
+        back = back if back.dtype == state.dtype else back.astype(state.dtype)
+        return back, _added(params, into, self.dt * np.real(slope)) if wanted else None
 
     def tangent(self, state, params, dstate, dparams):
         """Tangent of a step along (dstate, dparams); plain."""
@@ -69,9 +74,9 @@ class LinearStep(Step):
         return pushforward(lambda both: self(*both), (state, params), (dstate, dparams))[1]
 
 
-def _added(into, slope):
+def _added(params, into, slope):
     if into is None:
-        return float(slope)
+        return np.asarray(params).dtype.type(slope)
     if isinstance(into, np.ndarray):
         into += slope
         return into
@@ -119,19 +124,19 @@ def crank_nicolson(scheme, z, u, g, new, wanted):
 
 
 def two_solves(share, double):
-    """Of v = u + share (y - u) and y = x (or 2 x - u) with x = S u, then S v."""
+    """z is that of a stage, D dt c. Of v = u + share (y - u) and y = x (or 2 x - u) with x = S u, then S v."""
     factor = 2.0 if double else 1.0
 
     def pull(scheme, z, u, g, new, wanted):
         solve, L = scheme.resolvent.plain, scheme.problem.op
-        q = solve(D * z, g, transposed=True)
-        p = solve(D * z, factor * share * q, transposed=True)
+        q = solve(z, g, transposed=True)
+        p = solve(z, factor * share * q, transposed=True)
         back = (1 - factor * share) * q + p
         if not wanted:
             return back, 0.0
-        x = solve(D * z, u)
+        x = solve(z, u)
         if new is None:
-            new = solve(D * z, u + share * (factor * x - factor * u))
+            new = solve(z, u + share * (factor * x - factor * u))
         return back, D * (np.sum(q * L.apply(new)) + np.sum(p * L.apply(x)))
 
     return pull

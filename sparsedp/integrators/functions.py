@@ -17,7 +17,7 @@ from typing import NamedTuple
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import NonFiniteError
+from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.solvers.separable import spectrum
 from sparsedp.solvers.spectral import SpectralFunction
 from sparsedp.tape import cast, differentiable, dtype_of, isbox
@@ -105,6 +105,9 @@ class Functions:
     def plain(self, functions, z, *fields, transposed=False):
         """The same on plain values, or with the transpose of L."""
         op, z = (self.op.T if transposed else self.op), float(z)
+        for field in fields:
+            if np.shape(field) != op.domain.shape:
+                raise ShapeError(f"{self.name} takes a field on {op.domain}, got an array of shape {np.shape(field)}")
         if z == 0:
             return self._at_zero(functions, op, fields)
         if any(np.iscomplexobj(field) for field in fields):

@@ -6,7 +6,7 @@ import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import is_number
-from sparsedp.integrators.combination import combine
+from sparsedp.integrators.combination import combine, frozen
 from sparsedp.operator import Operator
 from sparsedp.space import fits
 from sparsedp.tape import isbox, plain
@@ -55,7 +55,7 @@ class Problem:
         total = None
         for fun, with_time in self._calls:
             args = (params, t) if with_time else (params,)
-            value = fun(*args) if fun is self.source else fun(u, *args)
+            value = fun(*args) if fun is self.source else _unchanged(fun, u, args)
             total = value if total is None else combine(total, (1.0, value))
         return total
 
@@ -122,6 +122,18 @@ def positive(value, name):
     if number <= 0:
         raise ValueError(f"{name} must be > 0, got {number:g}")
     return value if isbox(value) else number
+
+
+def _unchanged(rate, u, args):
+    """The rate, which must not write into the state."""
+    try:
+        return rate(frozen(u), *args)
+    except ValueError as error:
+        if "read-only" not in str(error):
+            raise
+        raise ValueError(
+            "the rate changes the state in place; write u = u + du instead of u += du, or work on a copy"
+        ) from error
 
 
 def _number(value, name):

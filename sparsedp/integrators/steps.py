@@ -70,7 +70,12 @@ class Step:
         h = positive(self.dt(params), "dt") if callable(self.dt) else self.dt
         if self.limit is not None:
             self.limit.check(h, self.problem.coefficient(params))
-        new = self.checked(like(self.scheme(u, params, t, h), u), state, params, h)
+        try:
+            new = like(self.scheme(u, params, t, h), u)
+        except NonFiniteError:  # a solver on the way may have met it: name the argument
+            self._blame(state, params)
+            raise
+        new = self.checked(new, state, params, h)
         return (new, t + h) if self.problem.timed else new
 
     def checked(self, new, state, params, h):
@@ -89,16 +94,20 @@ class Step:
 
     def _refuse(self, state, params, h):
         """Say where NaN or infinity came from."""
+        self._blame(state, params)
+        raise NonFiniteError(
+            f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
+            "take smaller steps or an implicit method"
+        )
+
+    def _blame(self, state, params):
+        """Refuse arguments that are not finite."""
         for what, tree in (("state", state), ("params", params)):
             found = leaves(tree)
             for number, leaf in enumerate(found):
                 if is_variable(leaf):
                     place = f"part {number + 1} of the {what}" if len(found) > 1 else f"the {what}"
                     check_finite(f"{place} of {self.name}", np.asarray(plain(leaf)))
-        raise NonFiniteError(
-            f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
-            "take smaller steps or an implicit method"
-        )
 
     def __repr__(self):
         length = "given by the params" if callable(self.dt) else f"{float(plain(self.dt)):g}"

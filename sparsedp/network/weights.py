@@ -140,7 +140,7 @@ def load(path):
     (1.5, None)
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:  # a damaged file is closed too
             words = json.loads(bytes(stored["arr_0"]).decode())
             tree = _tree(words["tree"], stored) if words.get("format") == FORMAT else None
     except (AttributeError, BadZipFile, EOFError, KeyError, TypeError, ValueError):

@@ -13,13 +13,15 @@ import scipy.linalg
 from sparsedp.fields import is_number
 from sparsedp.optimise.flat import Packing
 from sparsedp.optimise.linearised import Linearised
+from sparsedp.optimise.triangle import thin
 
 __all__ = ["Direction", "Family", "update_direction"]
 
 DENSE = 3e7  # entries of a Jacobian (240 MB) above which it is not formed
 SETTLED = 1e-9  # relative change of the direction at which the bidiagonalisation stops
 EXHAUSTED = 1e-13  # relative size below which a new basis vector is rounding
-LOOK = 4  # steps of the bidiagonalisation between two looks at the direction
+LOOK = 4  # fewest steps of the bidiagonalisation between two looks at the direction, which cost an SVD each
+BLOCK = 32  # rows of a basis that are stored together
 
 
 class Direction(NamedTuple):
@@ -54,8 +56,8 @@ class Family:
     truncation : float
         Singular values below this share of the largest are left out.
     method : "auto", "dense" or "krylov"
-        dense: J is formed; thin QR of J or J^T, SVD of the small triangle (the Gram matrix, which squares the
-        spectrum, serves when truncation > 1e-7). krylov: Golub-Kahan bidiagonalisation with full
+        dense: J is formed; thin QR of J or J^T by products of matrices, SVD of the small triangle (the Gram matrix,
+        which squares the spectrum, serves when truncation > 1e-7). krylov: Golub-Kahan bidiagonalisation with full
         reorthogonalisation from products with J and J^T alone; memory rank (m + n).
     rank : int or None
         Most steps of the bidiagonalisation; None: until the direction has settled.
@@ -92,13 +94,13 @@ class Family:
         if self.truncation > 1e-7 and len(jacobian) <= jacobian.shape[1]:
             return self._gram(jacobian, g)
         wide = len(jacobian) <= jacobian.shape[1]
-        q, r = scipy.linalg.qr(jacobian.T if wide else jacobian, mode="economic", check_finite=False)
-        left, s, right = scipy.linalg.svd(r, full_matrices=False, check_finite=False)
-        if wide:  # J = r^T q^T = right^T s (q left)^T
-            weights, kept = self._weights(s, right @ g)
-            return Direction(q @ (left @ weights), s, kept, "dense")
-        weights, kept = self._weights(s, left.T @ (q.T @ g))
-        return Direction(right.T @ weights, s, kept, "dense")
+        factor = thin(jacobian if wide else jacobian.T)
+        left, s, right = scipy.linalg.svd(factor.triangle, full_matrices=False, check_finite=False)
+        if wide:  # J = T Q = left s right Q
+            weights, kept = self._weights(s, left.T @ g)
+            return Direction(factor.along(right.T @ weights), s, kept, "dense")
+        weights, kept = self._weights(s, right @ factor.across(g))  # J^T = T Q
+        return Direction(left @ weights, s, kept, "dense")
 
     def _gram(self, jacobian, g):
         squares, u = scipy.linalg.eigh(jacobian @ jacobian.T, check_finite=False)
@@ -130,7 +132,7 @@ class Family:
             return Direction(pull(0.0 * g), np.zeros(0), 0, "krylov")
         before = None
         while True:
-            more = basis.grow(min(LOOK, rank - basis.steps))
+            more = basis.grow(min(max(LOOK, basis.steps // 8), rank - basis.steps))
             weights, s, kept = self._small(basis, size)
             if not more or basis.steps >= rank or _settled(weights, before):
                 return Direction(basis.combine(weights), s, kept, "krylov")
@@ -150,26 +152,38 @@ def _settled(weights, before):
 
 
 class _Rows:
-    """Orthonormal rows in one array that grows by doubling."""
+    """Orthonormal rows, in blocks: no copy is made when one more comes."""
 
     def __init__(self, size):
-        self._store, self.count = np.empty((8, size)), 0
+        self._size, self._blocks, self.count = size, [], 0
+        self.last = np.empty(0)
 
     def append(self, row):
-        if self.count == len(self._store):
-            self._store = np.concatenate([self._store, np.empty_like(self._store)])
-        self._store[self.count] = row
+        if self.count == BLOCK * len(self._blocks):
+            self._blocks.append(np.empty((BLOCK, self._size)))
+        self.last = self._blocks[-1][self.count % BLOCK]
+        self.last[:] = row
         self.count += 1
 
-    @property
-    def rows(self):
-        return self._store[: self.count]
+    def _parts(self):
+        return [block[: self.count - BLOCK * i] for i, block in enumerate(self._blocks)]
 
     def apart(self, vector):
         """The part of a vector orthogonal to the rows; twice, so that rounding does not bring them back."""
         for _ in range(2):
-            vector = vector - (self.rows @ vector) @ self.rows
+            shares = [rows @ vector for rows in self._parts()]
+            vector = vector - self._sum(shares)
         return vector
+
+    def combine(self, weights):
+        """weights @ rows."""
+        return self._sum([weights[BLOCK * i : BLOCK * (i + 1)] for i in range(len(self._blocks))])
+
+    def _sum(self, shares):
+        total = np.zeros(self._size)
+        for share, rows in zip(shares, self._parts(), strict=True):
+            total += share @ rows
+        return total
 
 
 class _Bidiagonal:
@@ -203,7 +217,7 @@ class _Bidiagonal:
     def grow(self, steps):
         """Up to so many steps; false when there is no further one."""
         for _ in range(steps):
-            u = self._left.apart(self._push(self._right.rows[-1]))
+            u = self._left.apart(self._push(self._right.last))
             size = float(np.linalg.norm(u))
             if not size > EXHAUSTED * self._largest:
                 return False
@@ -219,7 +233,7 @@ class _Bidiagonal:
 
     def combine(self, weights):
         """Q times weights."""
-        return weights @ self._right.rows
+        return self._right.combine(weights)
 
 
 def update_direction(outputs, x, g=None, **options):

@@ -3,7 +3,7 @@
 The loss is half the sum of squares of residuals r(x); J is their Jacobian.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -13,10 +13,12 @@ from sparsedp.fields import is_number
 from sparsedp.optimise.directions import DENSE, Family
 from sparsedp.optimise.first_order import HALVINGS, admissible
 from sparsedp.optimise.trials import Stuck, Trial, norm
+from sparsedp.optimise.triangle import thin
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 
 ENOUGH = 1e-4
+EXACT = 1e-9  # damping relative to |J|^2 above which the Gram matrix, with rounding 1e-16, gives 6 digits of the step
 FORCING = 1e-10  # relative accuracy of the inner least-squares solution
 
 
@@ -33,13 +35,15 @@ class _Normal:
     """Solves min |J d + r|^2 + damping |d|^2 at one point, for several dampings."""
 
     def __init__(self, linearised, apart, dense):
-        self._linearised, self._factor = linearised, None
+        self._linearised = linearised
+        self._jacobian: Any = None
+        self._gram: Any = None
+        self._factor: Any = None
         rows, columns = linearised.shape
         if dense is None:
             dense = rows * columns <= DENSE and min(rows, columns) <= 4000
         if dense:
-            jacobian = linearised.rows(apart)
-            self._factor = _triangle(jacobian, linearised.flat)
+            self._jacobian = jacobian = linearised.rows(apart)
             self.largest = float(np.max(np.einsum("ij,ij->j", jacobian, jacobian), initial=0.0))
         else:
             slope = linearised.pull(linearised.flat)
@@ -47,32 +51,50 @@ class _Normal:
             self.largest = norm(linearised.push(slope / size)) ** 2 if size > 0 else 0.0
 
     def step(self, damping):
-        if self._factor is not None:
-            return -_solve(self._factor, damping)
+        if self._jacobian is None:
+            return -self._iterated(damping)
+        if damping > EXACT * np.linalg.norm(self._jacobian) ** 2:
+            return -self._damped(damping)
+        if self._factor is None:
+            self._factor = _triangle(self._jacobian, self._linearised.flat)
+        return -_solve(self._factor, damping)
+
+    def _damped(self, damping):
+        """By Cholesky of J J^T + damping or J^T J + damping, whichever is small."""
+        jacobian, r = self._jacobian, self._linearised.flat
+        wide = len(jacobian) < jacobian.shape[1]
+        if self._gram is None:
+            self._gram = jacobian @ jacobian.T if wide else jacobian.T @ jacobian
+        matrix = self._gram + damping * np.eye(len(self._gram))
+        factor = scipy.linalg.cho_factor(matrix, overwrite_a=True, check_finite=False)
+        if wide:
+            return scipy.linalg.cho_solve(factor, r, check_finite=False) @ jacobian
+        return scipy.linalg.cho_solve(factor, r @ jacobian, check_finite=False)
+
+    def _iterated(self, damping):
         rows, columns = self._linearised.shape
         product = LinearOperator(
             (rows, columns), matvec=self._linearised.push, rmatvec=self._linearised.pull, dtype=float
         )
-        found = lsmr(product, self._linearised.flat, damp=np.sqrt(damping), atol=FORCING, btol=FORCING, conlim=1e14)
-        return -found[0]
+        return lsmr(product, self._linearised.flat, damp=np.sqrt(damping), atol=FORCING, btol=FORCING, conlim=1e14)[0]
 
 
 def _triangle(jacobian, r):
-    """SVD of the small triangle of J = Q R, so that every damping costs one product with it."""
+    """J = Q^T T^T or T Q and the SVD of the small T, so that every damping costs one product."""
     wide = len(jacobian) < jacobian.shape[1]
-    q, small = scipy.linalg.qr(jacobian.T if wide else jacobian, mode="economic", check_finite=False)
-    left, s, right = scipy.linalg.svd(small, full_matrices=False, check_finite=False)
+    factor = thin(jacobian if wide else jacobian.T)
+    left, s, right = scipy.linalg.svd(factor.triangle, full_matrices=False, check_finite=False)
     if wide:
-        return q @ left, s, right @ r
-    return right.T, s, left.T @ (q.T @ r)
+        return (lambda shares: factor.along(right.T @ shares)), s, left.T @ r, max(jacobian.shape)
+    return (lambda shares: left @ shares), s, right @ factor.across(r), max(jacobian.shape)
 
 
 def _solve(factor, damping):
-    basis, s, parts = factor
-    floor = np.finfo(float).eps * max(basis.shape) * (s[0] if len(s) else 0.0)
+    combine, s, parts, size = factor
+    floor = np.finfo(float).eps * size * (s[0] if len(s) else 0.0)
     kept = s > floor
     shares = np.divide(s, s * s + damping, out=np.zeros_like(s), where=kept)
-    return basis @ (shares * parts)
+    return combine(shares * parts)
 
 
 class GaussNewton:

@@ -1,8 +1,10 @@
 """Charts of checks and measurements."""
 
+import numpy as np
+
 from sparsedp.report.plots import axes_or_current
 
-__all__ = ["curves", "v_curve"]
+__all__ = ["curves", "stability", "v_curve"]
 
 
 def curves(lines, ax, x_label, y_label):
@@ -79,3 +81,30 @@ def _pareto(points):
         if not kept or y < kept[-1][1]:
             kept.append((x, y))
     return kept
+
+
+def stability(found, ax):
+    """Stability map -> picture: growth factor over viscosity (across) and time step (up); refused steps are grey.
+
+    Parameters
+    ----------
+    found : StabilityMap
+    ax : matplotlib Axes
+
+    Returns
+    -------
+    matplotlib Axes
+    """
+    ax.set_facecolor("0.75")
+    values = np.ma.masked_invalid(np.clip(found.factors, 0.0, 2.0))
+    image = ax.pcolormesh(
+        found.viscosities, found.time_steps, values, vmin=0, vmax=2, cmap="coolwarm", shading="nearest"
+    )
+    ax.figure.colorbar(image, ax=ax, label="growth factor of a step (2 and more: red)")
+    ax.plot(found.here[1], found.here[0], marker="*", color="black", markersize=12)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel(found.names[1])
+    ax.set_ylabel(found.names[0])
+    ax.set_title("stable: blue; grows: red; refused: grey")
+    return ax

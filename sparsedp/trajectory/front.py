@@ -4,6 +4,7 @@ import numpy as np
 
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import is_whole
+from sparsedp.ledger import loops
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.trajectory.keep import All, Each, Last
 from sparsedp.trajectory.layout import Layout, dense
@@ -104,6 +105,8 @@ def rollout(
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
     run = Run(step, *forms, n, _kind(keep, forms[0]), slots, truncate, any(map(isbox, args)), progress, record)
     _check_values(run, args)
+    for told in loops:
+        told(step, state, params, inputs, n)
     outputs = rollout_rule(run, *args)
     count = len(plain(outputs)) if isinstance(plain(outputs), tuple) else None
     return run.keep.tree([outputs] if count is None else [outputs[k] for k in range(count)], run.outcome)

@@ -92,7 +92,7 @@ class Layout:
         if any(map(is_variable, found)):
             place = next(place for place, leaf in enumerate(found) if is_variable(leaf))
             raise ShapeError(
-                f"{self.root} must keep its form: {when} made a floating value of {self.statics[place]!r}; "
+                f"{self.root} must keep its form: {when} made a floating value of {_brief(self.statics[place])}; "
                 "start with a floating value, for example state.astype(float)"
             )
         return variables, tuple(found)
@@ -155,6 +155,10 @@ class Layout:
     def is_finite(self, values):
         """Whether all variables are finite."""
         return all(surely_finite(value) or bool(np.all(np.isfinite(value))) for value in values)
+
+
+def _brief(value):
+    return f"an array of dtype {value.dtype}" if isinstance(value, np.ndarray) else repr(value)
 
 
 def surely_finite(value):

@@ -7,7 +7,8 @@ A step may have, beside its call,
                                                          `into`: a tree like params; the gradient is added to its
                                                          arrays in place, and it is returned as g_params
 
-both on plain trees. Transport and the explicit steppers do.
+both on plain trees. Transport and the linear steppers do. Where `step.sparing` is true, backward also takes
+`new`, the result of the step when it is still known, or None, and `wanted`, whether params want a cotangent.
 """
 
 import numpy as np
@@ -31,6 +32,7 @@ class Protocol(Taped):
         self._pool: list = []
         self._arrays = bool(run.state.shapes) and all(run.state.shapes)
         self._recycles = run.keep.recycles
+        self._sparing = run.state.bare and getattr(run.step, "sparing", False)
         self._into = run.params.build([np.zeros(np.shape(v), v.dtype) for v in self.p]) if self._p else None
 
     def forward(self, i, values, statics, room=None):
@@ -62,7 +64,8 @@ class Protocol(Taped):
         """Cotangents of state i + 1 -> those of state i; those of params are added up."""
         layout, step = self.run.state, self.run.step
         if layout.bare:
-            back, self._into = step.backward(values[0], self.params, g[0], self._into)
+            more = {"new": self.known and self.known[0], "wanted": bool(self._p)} if self._sparing else {}
+            back, self._into = step.backward(values[0], self.params, g[0], self._into, **more)
             if not want_state:
                 return None
             return [back] if layout.is_one(back) else layout.check([back], "the backward form of the step")

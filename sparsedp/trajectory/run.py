@@ -221,6 +221,7 @@ class Way:
         values, statics = self._state_at(i)
         wants = not run.is_cut(i) if i else self.want_state
         if total is not None:
+            self.engine.known = self._known(i + 1)
             total = self.engine.backward(i, values, statics, total, wants)
             if i % growth.every == 0:
                 growth.see(i, total)
@@ -229,6 +230,12 @@ class Way:
         if run.slots is not None and i:
             self.engine.release(values)
         return total
+
+    def _known(self, i):
+        """Variables of state i where every state is kept."""
+        if self.run.slots is not None:
+            return None
+        return self.stack[i][1] if i < len(self.stack) else self.final[0]
 
     def _state_at(self, i):
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""

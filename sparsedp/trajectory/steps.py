@@ -25,6 +25,8 @@ class Taped:
         Which of them want a cotangent.
     """
 
+    known = None  # going back: variables of the state after this step, where every state is kept
+
     def __init__(self, run, args, wanted=()):
         self.run = run
         _, self.p, self.x = run.split(args)

@@ -1,0 +1,169 @@
+"""All instruments on one scene, in one folder: Markdown, CSV and pictures, and a page that says what they say."""
+
+import csv
+import os
+
+from sparsedp.check.audit import gradient
+from sparsedp.errors import SparsedpError
+from sparsedp.report.certificate import certify
+from sparsedp.report.extremes import stress
+from sparsedp.report.plan import explain
+from sparsedp.report.precision import workprec
+
+__all__ = ["write_report"]
+
+PAGE = "report.md"
+TROUBLE = (SparsedpError, ValueError, TypeError, RuntimeError, ArithmeticError, LookupError)
+GOAL = 0.01  # the error that the page recommends a method for
+
+
+def write_report(source, folder, force=False):
+    """Scene and folder -> (verdict, sentences): "agrees", "disagrees" or "inconclusive", and what stands on the page.
+
+    Parameters
+    ----------
+    source : Source
+    folder : pathlib.Path
+    force : bool
+        Whether a report that is there may be replaced.
+
+    Raises
+    ------
+    ValueError
+        If there is a report already, or the folder cannot be written.
+    """
+    _claim(folder, force)
+    audit = _attempt(lambda: gradient(source.loss, source.x))
+    trial = _attempt(lambda: stress(source.loss, source.x, **source.stress))
+    plan = _attempt(lambda: explain(source.loss, source.x))
+    certificate = _attempt(lambda: certify(source.loss, source.x))
+    found = _attempt(lambda: workprec(**source.workprec)) if source.workprec else None
+    sections = [_audit(audit, folder), _stress(trial, folder), _plan(plan, folder), _certificate(certificate, folder)]
+    sections.append(_workprec(found, folder))
+    verdict = _verdict(audit, trial)
+    lines = [sentence for sentences in sections for sentence in sentences]
+    page = "\n".join([f"# {source.name}: {verdict}", "", *(f"- {line}" for line in lines), "", *_details(folder)])
+    (folder / PAGE).write_text(page, encoding="utf-8")
+    return verdict, lines
+
+
+def _claim(folder, force):
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{folder} cannot be made a folder: {error.strerror}; name another with --out") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{folder} cannot be written to; name another with --out")
+    if (folder / PAGE).exists() and not force:
+        raise ValueError(f"{folder / PAGE} is there already; name another folder with --out, or write --force")
+
+
+def _attempt(make):
+    """What an instrument gives, or the error in words: one that fails does not take the others with it."""
+    try:
+        return make()
+    except TROUBLE as error:
+        return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _verdict(audit, trial):
+    """Wrong beats open: a gradient that disagrees or a case that FAILED, then anything that was not decided."""
+    if not isinstance(audit, str) and audit.verdict == "disagrees":
+        return "disagrees"
+    if not isinstance(trial, str) and not trial:
+        return "disagrees"
+    return "inconclusive" if isinstance(audit, str) or isinstance(trial, str) else audit.verdict
+
+
+def _audit(audit, folder):
+    if isinstance(audit, str):
+        return [f"gradient: not audited, {audit}"]
+    _text(folder / "audit.md", "Audit of the gradient", str(audit))
+    _table(folder / "audit.csv", list(audit.rows))
+    _picture(folder / "audit.png", lambda ax: _drawn(audit, ax))
+    proved = f", {audit.digits} digits" if audit.digits is not None else ""
+    words = [f"gradient: {audit.verdict}{proved}{': ' if audit.reason else ''}{audit.reason}"]
+    return words + ([f"at fault: {audit.culprit}"] if audit.culprit else [])
+
+
+def _drawn(audit, ax):
+    from sparsedp.report.charts import v_curve
+
+    return v_curve(audit, ax)
+
+
+def _stress(trial, folder):
+    if isinstance(trial, str):
+        return [f"stress: not run, {trial}"]
+    (folder / "stress.md").write_text(f"# Stiff and extreme cases\n\n{trial.markdown()}", encoding="utf-8")
+    (folder / "stress.csv").write_text(trial.csv(), encoding="utf-8")
+    if trial.map is not None:
+        _picture(folder / "stress.png", trial.plot)
+    failed = [f"FAILED: {row['parameter']} {row['case']}: {row['note']}".replace(":  ", ": ") for row in trial.failures]
+    return [trial.summary, *failed, *(f"stress left out {sentence}" for sentence in trial.left_out)]
+
+
+def _plan(plan, folder):
+    if isinstance(plan, str):
+        return [f"plan: not made, {plan}"]
+    _text(folder / "plan.md", "What was computed, and what was left out", str(plan))
+    _table(folder / "plan.csv", plan.rows)
+    sums = ", ".join(f"{many} {word}" for word, many in plan.totals.items() if many)
+    return [f"one gradient: {sums or 'nothing was called'}", *(f"left out: {sentence}" for sentence in plan.left_out)]
+
+
+def _certificate(found, folder):
+    if isinstance(found, str):
+        return [f"certificate: not made, {found}"]
+    _text(folder / "certificate.md", "Error that solves leave", str(found))
+    _table(folder / "certificate.csv", found.solves)
+    return [f"error of the gradient from its solves: about {found.gradient_error:.1e}; {found.advice}"]
+
+
+def _workprec(found, folder):
+    if found is None:
+        return [
+            "error against run time: left out; the file gives no workprec_options (problem, methods, over, reference)"
+        ]
+    if isinstance(found, str):
+        return [f"error against run time: not measured, {found}"]
+    found.save(folder)
+    errors = "gradient_error" if found.pareto() else "forward_error"
+    best = found.best(GOAL, errors)
+    what = errors.replace("_", " ")
+    left = [f"error against run time left out {sentence}" for sentence in found.left_out]
+    if best is None:
+        return [f"error against run time: no method reaches a {what} of {GOAL:g}, see {found.scene}.md", *left]
+    named = f"{best['method']}, {found.seconds(best, errors):.1e} s, settings {best['settings']}"
+    return [f"fastest at a {what} of {100 * GOAL:g} %: {named}", *left]
+
+
+def _details(folder):
+    names = sorted(
+        path.name for path in folder.iterdir() if path.suffix in (".md", ".csv", ".png") and path.name != PAGE
+    )
+    pictures = [f"![{name}]({name})" for name in names if name.endswith(".png")]
+    return ["Details: " + ", ".join(f"[{name}]({name})" for name in names), "", *pictures, ""]
+
+
+def _text(path, title, text):
+    path.write_text(f"# {title}\n\n```text\n{text}\n```\n", encoding="utf-8")
+
+
+def _table(path, rows):
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]) if rows else ["nothing"], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _picture(path, draw):
+    """A picture, where matplotlib is installed."""
+    try:
+        from sparsedp.report import plots
+
+        ax = draw(plots.figure().add_subplot())
+        with path.open("wb") as stream:
+            plots.save(ax.figure, stream)
+    except ImportError:
+        return

@@ -1,0 +1,157 @@
+"""`python -m sparsedp check` and `report`: verdicts, exit codes, the folder, and refusals in one sentence."""
+
+import csv
+import os
+import subprocess
+import sys
+
+import pytest
+from sources import ROOT
+
+from sparsedp.__main__ import main
+
+SCENE = """
+import sys
+
+import autograd.numpy as np
+
+import sparsedp as dp
+
+print("arguments:", sys.argv[1:])
+grid = dp.Grid((8, 8), size=1.0)
+solve = dp.inverse(-dp.laplacian(grid, dp.dirichlet), "krylov", rtol=1e-8)
+x, _ = grid.centres()
+start = np.sin(3 * x)
+cube = dp.differentiable("cube", lambda u: u**3, lambda nums, ans, u: lambda g: (3.003 * u**2 * g,))
+
+
+def loss(b):
+    return np.sum(solve(b) ** 2)
+
+
+def wrong(b):
+    return np.sum(cube(solve(b)))
+
+
+def kinked(b):
+    return np.sum(np.abs(b - start[4, 4]))
+
+
+def broken(b):
+    raise LookupError("no such well")
+
+
+def point_load(method, cells):
+    box = dp.Grid((cells, cells), size=1.0)
+    deflection, centre = dp.inverse(-dp.laplacian(box, dp.dirichlet), method), dp.sample(box, [[0.5, 0.5]])
+    return lambda s: centre(deflection(s * np.ones(box.shape)))[0], 1.0
+
+
+stress_options = {"ranges": (-2.0, 2.0), "only": ["as given", "not finite"]}
+workprec_options = dict(
+    problem=point_load, methods={"direct": {"method": "direct"}}, over={"cells": [8, 16]},
+    reference=(0.07367135328151, 0.07367135328151), repeats=1,
+)
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "poisson.py"
+    path.write_text(SCENE, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("name, code, word", [("loss", 0, "agrees"), ("wrong", 1, "disagrees"),
+                                              ("kinked", 3, "inconclusive")])  # fmt: skip
+def test_check(scene, capsys, name, code, word):
+    assert main(["check", f"{scene}:{name}"]) == code
+    printed = capsys.readouterr()
+    assert f"verdict: {word}" in printed.out
+    assert "arguments: []" in printed.err  # what the file prints stays out of the table
+
+
+def test_check_at_another_point(scene, capsys):
+    assert main(["check", f"{scene}:loss:x"]) == 0
+    assert main(["check", str(scene)]) == 0
+
+
+def test_the_report(scene, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["report", str(scene), "--out", str(out)]) == 0
+    page = (out / "report.md").read_text(encoding="utf-8")
+    assert page.startswith("# poisson: agrees")
+    assert "fastest at a gradient error of 1 %: direct" in page
+    assert "left out: multigrid hierarchy" in page and "stress left out 10^4 steps" in page
+    assert "may stop at" in page
+    names = {path.name for path in out.iterdir()}
+    assert names >= {f"{name}.{kind}" for name in ("audit", "plan", "certificate", "stress", "point_load")
+                     for kind in ("md", "csv")}  # fmt: skip
+    for path in out.glob("*.csv"):
+        with path.open(encoding="utf-8", newline="") as stream:
+            assert list(csv.DictReader(stream)), path
+    assert main(["report", str(scene), "--out", str(out)]) == 2
+    assert "is there already; name another folder with --out, or write --force" in capsys.readouterr().err
+    assert main(["report", f"{scene}:wrong", "--out", str(out), "--force"]) == 1
+    page = (out / "report.md").read_text(encoding="utf-8")
+    assert page.startswith("# poisson-wrong: disagrees") and "at fault: cube" in page
+
+
+def test_pictures(scene, tmp_path):
+    pytest.importorskip("matplotlib")
+    main(["report", str(scene), "--out", str(tmp_path)])
+    assert {path.name for path in tmp_path.glob("*.png")} == {"audit.png", "point_load.png"}
+
+
+def test_a_report_of_a_loss_that_does_not_run(scene, tmp_path, capsys):
+    assert main(["report", f"{scene}:broken", "--out", str(tmp_path / "out")]) == 3
+    assert "gradient: not audited, LookupError: no such well" in capsys.readouterr().out
+
+
+def test_as_a_command(scene):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "sparsedp", "check", "poisson.py:kinked"]
+    done = subprocess.run(command, cwd=scene.parent, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 3 and "verdict: inconclusive" in done.stdout
+
+
+REFUSALS = [
+    ("poisson", "'poisson' names no scene; write FILE.py:loss, or FILE.py:loss:start"),
+    ("none.py", "there is no file none.py; name one that is there"),
+    ("poisson.py:nothing", "poisson.py has no function 'nothing'; write poisson.py:NAME of the function to examine"),
+    ("poisson.py:start", "poisson.py has no function 'start'; write poisson.py:NAME of the function to examine"),
+    ("poisson.py:loss:y", "poisson.py has no 'y', the point; write poisson.py:loss:NAME"),
+    ("bare.py", "bare.py has no 'start or x', the point; write bare.py:loss:NAME"),
+    ("ends.py", "ends.py does not run: line 2: ZeroDivisionError: division by zero"),
+    ("typo.py", "typo.py does not run: line 1: SyntaxError: "),
+    ("options.py", "stress_options in options.py must be a dict of arguments, got int"),
+    ("poisson.py:broken", "poisson.py:broken cannot be audited: LookupError: no such well"),
+    ("poisson.py:grid", "poisson.py has no function 'grid'; write poisson.py:NAME of the function to examine"),
+]
+
+
+@pytest.mark.parametrize("target, sentence", REFUSALS)
+def test_refusals(scene, monkeypatch, capsys, target, sentence):
+    monkeypatch.chdir(scene.parent)
+    for name, text in {
+        "bare.py": "loss = abs",
+        "ends.py": "y = 0\n1 / y",
+        "typo.py": "a b",
+        "options.py": "loss, x, stress_options = abs, 1.0, 3",
+    }.items():
+        (scene.parent / name).write_text(text, encoding="utf-8")
+    assert main(["check", target]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be(scene, tmp_path, capsys):
+    assert main(["report", str(scene), "--out", str(scene)]) == 2
+    assert "cannot be made a folder: File exists; name another with --out" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_is_closed(scene, tmp_path, capsys):
+    closed = tmp_path / "closed"
+    closed.mkdir(mode=0o500)
+    assert main(["report", str(scene), "--out", str(closed)]) == 2
+    assert "closed cannot be written to; name another with --out" in capsys.readouterr().err

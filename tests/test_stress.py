@@ -1,0 +1,184 @@
+"""stress: planted instabilities are found, sound scenes pass, every case that is left out has a reason."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+GRID = dp.Grid(24, size=1.0)
+L = dp.laplacian(GRID, dp.dirichlet)
+START = np.sin(3 * GRID.centres()[0])
+
+
+def explicit(p):
+    """Diffusion by an Euler step that is written by hand."""
+    return anp.sum(dp.rollout(lambda u, p: u + p["dt"] * p["nu"] * L(u), START, p, 40) ** 2)
+
+
+def by_hand(p):
+    u = START
+    for _ in range(30):
+        u = u + p["dt"] * L(u)
+    return anp.sum(u**2)
+
+
+def implicit(p):
+    solve = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
+    u = p["start"]
+    for _ in range(3):
+        u = solve(p["nu"] * p["dt"], u, 1.0)
+    return anp.sum(u**2)
+
+
+def notes(result, group):
+    return [(row["case"], row["outcome"], row["note"]) for row in result.rows if row["group"] == group]
+
+
+def number(d, nu=1.0):
+    """Parameters with diffusion number d."""
+    return {"dt": d / 24**2 / nu, "nu": nu}
+
+
+def test_a_stable_step_passes():
+    result = dp.stress(explicit, number(0.4))
+    assert result and result.counts["FAILED"] == 0 and not result.failures
+    assert ("growth in one step", "passed", "") in notes(result, "as given")
+
+
+@pytest.mark.parametrize("d", [0.52, 0.6, 3.0])
+def test_a_diffusion_number_above_a_half_is_found(d):
+    result = dp.stress(explicit, number(d), only=["as given"])
+    assert not result
+    (row,) = result.failures
+    assert row["case"] == "growth in one step" and row["figure"] == pytest.approx(4 * d - 1, abs=0.05 * d)
+
+
+def test_a_legal_range_that_is_too_wide_is_found():
+    result = dp.stress(explicit, number(0.4), ranges={"nu": (0.1, 10.0)}, only=["legal range"])
+    assert not result and all(row["figure"] > 1.01 for row in result.failures)
+
+
+def test_a_loop_without_rollout():
+    x = {"dt": 0.6 / 24**2}
+    assert any("give step=" in sentence for sentence in dp.stress(by_hand, x, only=["as given"]).left_out)
+    found = dp.stress(by_hand, x, step=lambda p: (lambda u: u + p["dt"] * L(u), START), only=["as given"])
+    assert found.failures[0]["case"] == "growth in one step"
+
+
+def test_physics_that_grows_passes():
+    grow = lambda p: anp.sum(dp.rollout(lambda u, p: u + p["dt"] * 2.0 * u, START, p, 10))
+    row = dp.stress(grow, {"dt": 0.1}, only=["as given"]).rows[-1]
+    assert (row["outcome"], row["note"]) == ("passed", "grows as the physics does")
+    assert row["figure"] == pytest.approx(1.2)
+
+
+def test_growth_without_a_time_step_is_no_verdict():
+    grow = lambda u: anp.sum(dp.rollout(lambda u, _: 1.2 * u, u, None, 10))
+    assert dp.stress(grow, START, only=["as given"]).rows[-1]["outcome"] == "degraded"
+
+
+# ---- null space ----------------------------------------------------------------------------------------------------
+
+
+def singular():
+    """A Neumann problem on cells of different size: (operator, right-hand side without a mean)."""
+    grid = dp.Grid(24, spacing=1 + 0.5 * np.sin(np.arange(24.0)))
+    volumes = grid.volumes
+    return -dp.divergence(grid) @ dp.gradient(grid), START - np.sum(volumes * START) / np.sum(volumes)
+
+
+def test_a_missing_null_space_projection_is_found():
+    op, b = singular()
+    inverse = np.linalg.inv(op.explicit().matrix.toarray())  # rounding makes it regular
+    bad = dp.from_functions(lambda u: inverse @ u, lambda u: inverse.T @ u, op.domain, op.codomain)
+    result = dp.stress(lambda b: anp.sum(bad(b) ** 2), b)
+    assert not result
+    assert any("is a null space left in?" in row["note"] for row in result.failures)
+    assert any("rounding is amplified" in row["note"] for row in result.failures)
+
+
+@pytest.mark.parametrize("nullspace", ["raise", "project"])
+def test_a_projected_null_space_passes(nullspace):
+    op, b = singular()
+    solve = dp.inverse(op, nullspace=nullspace)
+    result = dp.stress(lambda b: anp.sum(solve(b) ** 2), b)
+    assert result
+    words = {case: word for case, word, _ in notes(result, "constant added")}
+    assert words["plus 1 of itself"] == ("refused correctly" if nullspace == "raise" else "passed")
+    assert all(word == "refused correctly" for _, word, _ in notes(result, "not finite"))
+
+
+# ---- other faults ----------------------------------------------------------------------------------------------------
+
+
+def test_a_wrong_gradient_and_a_swallowed_nan_fail():
+    off = dp.differentiable("off", lambda u: u**3, lambda nums, ans, u: lambda g: (3.3 * u**2 * g,))
+    assert (
+        dp.stress(lambda u: anp.sum(off(u)), START).failures[0]["note"] == "the differences settle on another gradient"
+    )
+    swallow = lambda u: anp.sum(anp.where(anp.isfinite(u), u, 0.0) ** 2)
+    failed = dp.stress(swallow, START, only=["not finite"]).failures
+    assert {row["case"] for row in failed} >= {"one nan"} and "swallowed" in failed[0]["note"]
+
+
+def test_a_state_and_a_modified_input_fail():
+    calls = []
+
+    def forgetful(u):
+        calls.append(1)
+        return anp.sum(u**2) * len(calls)
+
+    assert [row["case"] for row in dp.stress(forgetful, START).failures][0] == "two runs"
+
+    def greedy(u):
+        if isinstance(u, np.ndarray) and u.flags.writeable:
+            u *= 1.0 + 1e-9
+        return anp.sum(u**2)
+
+    assert dp.stress(lambda u: greedy(getattr(u, "_value", u)) + anp.sum(u), START).failures
+
+
+def test_implicit_diffusion_passes_and_has_a_map():
+    result = dp.stress(implicit, {"start": START, "dt": 1e-3, "nu": 0.1})
+    assert result, str(result)
+    assert result.map is None  # no rollout
+
+
+# ---- the value ------------------------------------------------------------------------------------------------------
+
+
+def test_what_it_is_as_data_and_text():
+    result = dp.stress(explicit, number(0.4), ranges={"nu": (0.5, 1.0)})
+    data = result.to_dict()
+    assert data["counts"] == result.counts and len(data["rows"]) == len(result.rows)
+    assert sum(result.counts.values()) == len(result.rows)
+    assert len(result.csv().splitlines()) == len(result.rows) + 1
+    assert "| group |" in result.markdown() and "left out" in result.markdown()
+    assert str(result).endswith(result.summary) and "growth factor of a step" in str(result)
+    assert np.shape(data["map"]["factors"]) == (9, 9)
+
+
+def test_the_map_knows_the_limit_of_euler():
+    found = dp.stress(explicit, number(0.4), only=["time step and viscosity"]).map
+    d = found.time_steps[:, None] * found.viscosities * 24**2
+    assert np.all(found.factors[d < 0.49] <= 1.001) and np.all(found.factors[d > 0.55] > 1.1)
+
+
+def test_the_picture():
+    plots = pytest.importorskip("matplotlib") and __import__("sparsedp.report.plots", fromlist=["figure"])
+    result = dp.stress(explicit, number(0.4), only=["time step and viscosity"])
+    assert result.plot(plots.figure().add_subplot()).get_ylabel() == "dt"
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="stress knows the parameters dt, nu, got 'k'; write one of them"):
+        dp.stress(explicit, number(0.4), ranges={"k": (0, 1)})
+    with pytest.raises(ValueError, match=r"stress needs ranges of two finite numbers, low < high, got \(1, 0\) for nu"):
+        dp.stress(explicit, number(0.4), ranges={"nu": (1, 0)})
+    with pytest.raises(ValueError, match="stress has no cases 'all'; write some of as given, scaling"):
+        dp.stress(explicit, number(0.4), only=["all"])
+    with pytest.raises(
+        ValueError, match="this scene has no stability map; it needs a rollout, a time step and a viscosity by name"
+    ):
+        dp.stress(by_hand, {"dt": 1e-4}, only=["as given"]).plot()
