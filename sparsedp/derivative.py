@@ -20,7 +20,10 @@ from sparsedp.tape import (
 )
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["pullback", "pushforward", "value_and_grad"]
+__all__ = ["NO_JVP", "pullback", "pushforward", "value_and_grad"]
+
+# What `pushforward` raises where one of our rules, or of autograd's, has none.
+NO_JVP = (DerivativeError, NotImplementedError)
 
 
 def pullback(fun, x):

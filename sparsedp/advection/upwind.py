@@ -5,15 +5,11 @@ of the numbers and of the step in the same pass.
 Source: R. Courant, E. Isaacson, M. Rees, Comm. Pure Appl. Math. 5 (1952) 243-255.
 """
 
-from functools import cached_property
-from math import isfinite
-
 import numpy as np
 
-from sparsedp.advection.bilinear import Bilinear
-from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
-from sparsedp.advection.loops import Loops
-from sparsedp.advection.stability import check_numbers, check_result, check_weights
+from sparsedp.advection.eulerian import Eulerian
+from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY
+from sparsedp.advection.stability import check_numbers, check_weights
 from sparsedp.kernels.formulas import BOTH, BOTH_ADDED, FORWARD
 from sparsedp.kernels.formulas import FIELD as OF_FIELD
 from sparsedp.kernels.formulas import VELOCITY as OF_VELOCITY
@@ -24,47 +20,23 @@ __all__ = ["Upwind"]
 ADDED = BOTH_ADDED - BOTH
 
 
-class Upwind(Law):
+class Upwind(Eulerian):
     """See the head of the file."""
 
     linear = True
     twice = True
 
-    def __init__(self, setting):
-        super().__init__(setting)
-        self.bilinear = Bilinear(setting, self.walls)
-
-    @property
-    def matrices(self):
-        return self.bilinear.matrices
-
-    @cached_property
-    def _loops(self):
-        return Loops(self.matrices)
-
-    def _needed(self, v):
-        """The velocity where the scheme needs it."""
-        between = self.bilinear.between
-        return v if between is None else between[0] @ v
-
     def forward(self, u, v, dt, inflow, out=None):
         out = np.empty(u.size) if out is None else out
         sums = self._loops.run(FORWARD, dt, {"u": u, "inflow": inflow, "w": self._needed(v), "out": out})
-        # What is not used is not met by the loop: inflow values at closed walls, velocities inside solids.
-        unseen = inflow.sum() if inflow.size else 0.0
-        if self.setting.solid is not None:
-            unseen += v.sum()
-        if sums[0] or not isfinite(unseen):
-            check_numbers(self.setting, u, v, inflow)
-            check_weights(self, dt, self.bilinear.rate(v))
-            check_result(self.setting, out)
+        self._check(sums[0], u, v, dt, inflow, out)
         return out
 
     def pull(self, nums, g, u, v, dt, inflow, into=None):
         if any(map(isbox, (g, u, v, dt, inflow))):
             return self.bilinear.pull(nums, g, u, v, dt, inflow)
-        between, kept, found = self.bilinear.between, (into or {}).get(VELOCITY), {}
-        added = between is None and kept is not None
+        kept, found = (into or {}).get(VELOCITY), {}
+        added = self.bilinear.between is None and kept is not None
         of_field, of_velocity = FIELD in nums or INFLOW in nums, VELOCITY in nums
         task = (BOTH if of_field else OF_VELOCITY) + (ADDED if added else 0) if of_velocity else OF_FIELD
         arrays = {"u": u, "inflow": inflow, "w": self._needed(v), "g": g, "ginflow": np.empty(inflow.size)}
@@ -77,10 +49,7 @@ class Upwind(Law):
             self._loops.return_inflow(arrays["out"], arrays["ginflow"])
             found[FIELD], found[INFLOW] = arrays["out"], arrays["ginflow"]
         if of_velocity:
-            found[VELOCITY] = arrays["gw"] if between is None else between[1] @ arrays["gw"]
-            if kept is not None and not added:
-                kept += found[VELOCITY]
-                found[VELOCITY] = kept
+            found[VELOCITY] = self._of_velocity(arrays["gw"], kept, added)
         found[STEP] = sums[0] / dt
         return tuple(found[num] for num in nums)
 

@@ -18,42 +18,25 @@ Source: B. van Leer, J. Comput. Phys. 32 (1979) 101-136; stretched grids: A. Mig
 """
 
 from functools import cached_property
-from math import isfinite
 
 import numpy as np
 
-from sparsedp.advection.bilinear import Bilinear
-from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
-from sparsedp.advection.loops import Loops
+from sparsedp.advection.eulerian import Eulerian
+from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY
 from sparsedp.advection.reconstruction import Reconstruction
-from sparsedp.advection.stability import check_numbers, check_result, check_weights
 from sparsedp.kernels.limited import FIRST, JUMPS, PULL, PULL_ADDED, SECOND, SLOPES
 
 __all__ = ["VanLeer"]
 
 
-class VanLeer(Law):
+class VanLeer(Eulerian):
     """See the head of the file."""
 
-    def __init__(self, setting):
-        super().__init__(setting)
-        self.bilinear = Bilinear(setting, self.walls)
-
-    @property
-    def matrices(self):
-        return self.bilinear.matrices
+    limited = True
 
     @cached_property
     def _faces(self):
         return Reconstruction(self.setting, self.walls)
-
-    @cached_property
-    def _loops(self):
-        return Loops(self.matrices, limited=True)
-
-    def _needed(self, v):
-        between = self.bilinear.between
-        return v if between is None else between[0] @ v
 
     def _arrays(self, u, v, inflow):
         return {"u": u, "w": self._needed(v), "inflow": inflow, "slope": np.empty(self._slopes)}
@@ -74,20 +57,14 @@ class VanLeer(Law):
         arrays.update(u=first, u0=u, out=np.empty(u.size) if out is None else out)
         self._loops.run(SLOPES, dt, arrays)
         wrong += self._loops.run(SECOND, dt, arrays)[0]
-        unseen = inflow.sum() if inflow.size else 0.0
-        if self.setting.solid is not None:
-            unseen += v.sum()
-        if wrong or not isfinite(unseen):
-            check_numbers(self.setting, u, v, inflow)
-            check_weights(self, dt, self.bilinear.rate(v), share=0.5)
-            check_result(self.setting, arrays["out"])
+        self._check(wrong, u, v, dt, inflow, arrays["out"], share=0.5)
         return arrays["out"]
 
     def pull(self, nums, g, u, v, dt, inflow, into=None):
-        between, kept, half = self.bilinear.between, (into or {}).get(VELOCITY), 0.5 * g
+        kept, half = (into or {}).get(VELOCITY), 0.5 * g
         arrays = self._arrays(u, v, inflow)
         first, _ = self._first(arrays, dt)
-        added = between is None and kept is not None
+        added = self.bilinear.between is None and kept is not None
         arrays["gw"] = kept if added else np.empty(arrays["w"].size)
         arrays.update(u=first, g=half, a=np.empty(self._slopes), b=np.empty(self._slopes))
         self._loops.run(SLOPES, dt, arrays)
@@ -97,10 +74,7 @@ class VanLeer(Law):
         of_u, more, by_first = self._pull_stage(PULL_ADDED, dt, arrays)
         found = {FIELD: of_u + half, INFLOW: of_inflow + more, STEP: (by_first + by_second) / dt}
         if VELOCITY in nums:
-            found[VELOCITY] = arrays["gw"] if between is None else between[1] @ arrays["gw"]
-            if kept is not None and not added:
-                kept += found[VELOCITY]
-                found[VELOCITY] = kept
+            found[VELOCITY] = self._of_velocity(arrays["gw"], kept, added)
         return tuple(found[num] for num in nums)
 
     def _pull_stage(self, task, dt, arrays):

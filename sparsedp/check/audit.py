@@ -12,8 +12,7 @@ from sparsedp.check.point import Point
 from sparsedp.check.probes import generator
 from sparsedp.check.sweep import Line, Trials, default_steps, dot
 from sparsedp.check.verdict import Audit, decide
-from sparsedp.derivative import pushforward, value_and_grad
-from sparsedp.errors import DerivativeError
+from sparsedp.derivative import NO_JVP, pushforward, value_and_grad
 
 __all__ = ["gradient"]
 
@@ -163,7 +162,7 @@ def _forward_mode(loss, point, lines, judged):
         try:
             with np.errstate(all="ignore"):
                 _, slope = pushforward(loss, point.tree(), point.tree(tangent))
-        except (DerivativeError, NotImplementedError):
+        except NO_JVP:
             return [("", "forward mode: not available, a rule has no JVP")]
         wanted = dot(line.gradient, tangent)
         if found.jitter > ROUNDING or line.solved:

@@ -7,7 +7,6 @@ kernel is compiled for a dtype at its first use and kept on disk where that is p
 import functools
 import os
 import threading
-import warnings
 
 import numpy as np
 from numba import cfunc, njit, prange, types
@@ -18,6 +17,7 @@ from sparsedp.kernels.layout import CHUNK
 from sparsedp.kernels.lines import line_worker
 from sparsedp.kernels.pointers import address, call
 from sparsedp.kernels.sums import sum_worker, sweep_worker
+from sparsedp.kernels.unable import warn_unable
 
 __all__ = ["along_axis", "kronecker_sum", "measure", "sweep"]
 
@@ -129,7 +129,7 @@ def _kernel(name, letter):
         loops = _kept(functools.partial(cfunc, types.void(*numbers)), worker(np.dtype(letter).type, _stamp()))
         run = _kept(functools.partial(njit, [signature]), team(_stamp()), nogil=True, parallel=True)
     except Exception as error:  # whatever LLVM or numba object to on this machine
-        return _unable(error)
+        return warn_unable(error, 5)
     return functools.partial(run, loops.address), loops
 
 
@@ -139,11 +139,7 @@ def _measures():
     try:
         return (_kept(functools.partial(njit, [measures.SIGNATURE]), measures.run, nogil=True, parallel=True),)
     except Exception as error:
-        return _unable(error)
-
-
-def _unable(error):
-    warnings.warn(f"The compiled kernels do not work here ({error}); NumPy is used instead.", RuntimeWarning, 5)
+        return warn_unable(error, 5)
 
 
 # ---------------------------------------------------------------- threads

@@ -1,9 +1,9 @@
 """The passes of the projection on plain arrays: compiled where numba is installed, NumPy elsewhere."""
 
 import functools
-import warnings
 
 from sparsedp.kernels import compiled
+from sparsedp.kernels.unable import warn_unable
 
 __all__ = ["net_flow", "push"]
 
@@ -17,8 +17,7 @@ def _staggered():
 
             return staggered
         except Exception as error:  # whatever LLVM or numba object to on this machine
-            text = f"The compiled kernels do not work here ({error}); NumPy is used instead."
-            warnings.warn(text, RuntimeWarning, stacklevel=4)
+            warn_unable(error, 5)
     from sparsedp.kernels import staggered_plain
 
     return staggered_plain

@@ -10,13 +10,13 @@ for an axis that is not there). The arrays are not checked; NaN does no harm.
 """
 
 import functools
-import warnings
 from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sparsedp.kernels import compiled, sampling_plain
+from sparsedp.kernels.unable import warn_unable
 
 __all__ = ["Points", "advance", "extend", "extrema", "fold", "gather", "layers", "mean_of_equal", "scatter", "slopes"]
 __all__ += ["finite", "retreat", "spread_to_equal"]
@@ -56,7 +56,7 @@ def _loop(name, like=()):
 
             return sampling_native.kernel(name, like)
         except Exception as error:  # whatever LLVM or numba object to on this machine
-            warnings.warn(f"The compiled kernels do not work here ({error}); NumPy is used instead.", RuntimeWarning, 3)
+            warn_unable(error, 4)
     return getattr(sampling_plain, name)
 
 

@@ -2,13 +2,13 @@
 
 import functools
 import os
-import warnings
 
 import numpy as np
 from numba import cfunc, njit, prange, types
 
 from sparsedp.kernels import emit, formulas, limited, native, streams_plain
 from sparsedp.kernels.pointers import address, call
+from sparsedp.kernels.unable import warn_unable
 
 __all__ = ["run"]
 
@@ -54,7 +54,7 @@ def _loops(number):
     try:
         return native._kept(functools.partial(cfunc, signature), _worker(number, _stamp())), _run()
     except Exception as error:  # whatever LLVM or numba object to on this machine
-        warnings.warn(f"The compiled kernels do not work here ({error}); NumPy is used instead.", RuntimeWarning, 4)
+        warn_unable(error, 5)
         return None
 
 

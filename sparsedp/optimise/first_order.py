@@ -71,19 +71,31 @@ class Descent:
 
     def _search(self, state, step, trials):
         """Halve the step until the loss falls; a full step that does is tried at twice the length next time."""
-        refused = False
-        for halvings in range(HALVINGS):
-            share = 0.5**halvings
-            point = trials.box.inside(state.trial.vector + share * step)
-            fall = float(np.dot(state.trial.vector - point, state.trial.slope))
-            trial = trials(point)
-            refused |= trial.refused
-            if not trial.refused and _lower(trial, state.trial, ENOUGH * fall):
-                return DescentState(trial, share * step, state.rate * (share if halvings else 2.0), 1.0)
-            if fall <= state.trial.rounding:
-                break
-        hopeless = not refused and fall <= 100 * share * state.trial.rounding
-        raise Stuck("rounding" if hopeless else "no lower point along the gradient")
+        trial, share = backtracked(state.trial, step, trials, "the gradient")
+        return DescentState(trial, share * step, state.rate * (share if share < 1 else 2.0), 1.0)
+
+
+def backtracked(here, step, trials, along):
+    """The first trial along a step, halved again and again, that is lower by enough, and the share of the step.
+
+    Raises
+    ------
+    Stuck
+        When there is none; `along` names the step.
+    """
+    refused = False
+    for halvings in range(HALVINGS):
+        share = 0.5**halvings
+        point = trials.box.inside(here.vector + share * step)
+        fall = float(np.dot(here.vector - point, here.slope))
+        trial = trials(point)
+        refused |= trial.refused
+        if not trial.refused and _lower(trial, here, ENOUGH * fall):
+            return trial, share
+        if fall <= here.rounding:
+            break
+    hopeless = not refused and fall <= 100 * share * here.rounding
+    raise Stuck("rounding" if hopeless else f"no lower point along {along}")
 
 
 def admissible(point, step, share, trials):

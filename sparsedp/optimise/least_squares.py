@@ -11,13 +11,12 @@ from scipy.sparse.linalg import LinearOperator, lsmr
 
 from sparsedp.fields import is_number
 from sparsedp.optimise.directions import DENSE, Family
-from sparsedp.optimise.first_order import HALVINGS, admissible
+from sparsedp.optimise.first_order import HALVINGS, admissible, backtracked
 from sparsedp.optimise.trials import Stuck, Trial, norm
 from sparsedp.optimise.triangle import thin
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 
-ENOUGH = 1e-4
 EXACT = 1e-9  # damping relative to |J|^2 above which the Gram matrix, with rounding 1e-16, gives 6 digits of the step
 FORCING = 1e-10  # relative accuracy of the inner least-squares solution
 
@@ -120,17 +119,8 @@ class GaussNewton:
     def advance(self, state, trials):
         """One iteration. Raises Stuck when no lower point is found."""
         step = _Normal(trials.linearised(state.trial), self.apart, self.dense).step(0.0)
-        fall, refused = -float(np.dot(step, state.trial.slope)), False
-        for halvings in range(HALVINGS):
-            share = 0.5**halvings
-            trial = trials(trials.box.inside(state.trial.vector + share * step))
-            refused |= trial.refused
-            if not trial.refused and trial.value < state.trial.value - ENOUGH * share * fall:
-                return state._replace(trial=trial)
-            if share * fall <= state.trial.rounding:
-                break
-        hopeless = not refused and fall <= 100 * state.trial.rounding
-        raise Stuck("rounding" if hopeless else "no lower point along the Gauss-Newton step")
+        trial, _ = backtracked(state.trial, step, trials, "the Gauss-Newton step")
+        return state._replace(trial=trial)
 
 
 class LevenbergMarquardt:

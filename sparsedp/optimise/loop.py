@@ -130,9 +130,9 @@ def minimise(
     if batches.varied and stepper.searches:
         raise ValueError(f"{method} compares losses and cannot use batches; write method='adam', or give gd a rate")
     if isinstance(stepper, PhysicalGradient):
-        loss, stepper = _after(stepper.rule, loss), Descent(rate=1.0)
+        loss, stepper = _composed(loss, stepper.rule), Descent(rate=1.0)
     if project is not None:
-        loss = _projected(loss, project)
+        loss = _composed(loss, project)
     box = Box.of(bounds, packing, start)
     trials = Trials(loss, gradient, packing, box, batches, stepper.residuals)
     settings = {"method": method, "options": repr(sorted(options.items())), "bounds": repr(bounds)}
@@ -168,12 +168,8 @@ def _run(stepper, trials, watch, journal, start, maxiter):
     return None
 
 
-def _after(rule, loss):
-    return lambda x, *rest: loss(rule(x), *rest)
-
-
-def _projected(loss, project):
-    return lambda x, *rest: loss(project(x), *rest)
+def _composed(loss, inner):
+    return lambda x, *rest: loss(inner(x), *rest)
 
 
 def _like(projected, x):

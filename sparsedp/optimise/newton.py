@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import is_whole
-from sparsedp.optimise.trials import Stuck, Trial, norm
+from sparsedp.optimise.trials import Stuck, Trial, norm, power_of_two
 
 __all__ = ["NewtonCG", "NewtonState"]
 
@@ -77,7 +77,7 @@ class _Model:
     """The quadratic model of the loss at one point, in units in which its gradient has size 1."""
 
     def __init__(self, here, trials, limit, forcing):
-        self._height = 2.0 ** np.frexp(norm(here.slope))[1]
+        self._height = power_of_two(norm(here.slope))
         self._free = trials.box.free_mask(here.vector, here.slope)
         self._product, self._limit, self._forcing = trials.curvature(here), limit, forcing
         self._slope = self._masked(here.slope / self._height)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import is_whole
-from sparsedp.optimise.trials import Stuck, Trial, norm
+from sparsedp.optimise.trials import Stuck, Trial, norm, power_of_two
 from sparsedp.optimise.wolfe import line_search
 
 __all__ = ["Quasi", "QuasiState"]
@@ -58,9 +58,9 @@ class Quasi:
 
     def begin(self, first):
         """State at the start."""
-        length = _power_of_two(_first_length(first))
+        length = power_of_two(_first_length(first))
         nothing = np.zeros((0, first.vector.size))
-        return QuasiState(first, nothing, nothing, length, _power_of_two(norm(first.slope)))
+        return QuasiState(first, nothing, nothing, length, power_of_two(norm(first.slope)))
 
     def advance(self, state, trials):
         """One iteration; a line search that fails is tried once more without the memory.
@@ -131,8 +131,3 @@ def _first_length(first):
     slope, size = norm(first.slope), norm(first.vector)
     known = [length for length in (abs(first.value) / slope if slope else 0.0, size) if 0 < length < np.inf]
     return min(known, default=1.0)
-
-
-def _power_of_two(value):
-    """The power of two next above, so that dividing by it changes no digits."""
-    return 2.0 ** float(np.clip(np.frexp(value)[1], -900, 900)) if value > 0 else 1.0

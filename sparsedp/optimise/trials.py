@@ -1,6 +1,6 @@
 """Evaluations of a loss and its gradient: counted, refused ones kept apart, the best one remembered."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from sparsedp.optimise.box import Box
 from sparsedp.optimise.linearised import Linearised
 from sparsedp.tape import isbox
 
-__all__ = ["Failure", "Stuck", "Trial", "Trials", "norm"]
+__all__ = ["Failure", "Stuck", "Trial", "Trials", "norm", "power_of_two"]
 
 OPEN, WHOLE = Box(), Batches()
 REFUSED = (UnstableStepError, ConvergenceError, NonFiniteError)
@@ -67,6 +67,7 @@ class Trials:
         self.box, self.batches = box, batches
         self.count = 0
         self.failures = []
+        self._last: Any = None  # what was linearised last: it, its point, the number of its batch
 
     def first(self, vector):
         """The trial at the start; what the loss raises there is not caught."""
@@ -95,6 +96,7 @@ class Trials:
     def _squares(self, vector):
         """Half the sum of squares of the residuals, and its gradient J^T r."""
         here = Linearised(self._loss, self._packing, vector, self.batches.now())
+        self._last = here, np.array(vector), self.batches.number
         return 0.5 * float(np.dot(here.flat, here.flat)), here.pull(here.flat)
 
     def _both(self, vector):
@@ -110,7 +112,11 @@ class Trials:
         return float(value), self._packing.pack_gradient(gradient)
 
     def linearised(self, trial):
-        """The residuals at the last point and their Jacobian, on the batch that saw it."""
+        """The residuals at a point and their Jacobian, on the batch that saw it: kept, when it was the last one."""
+        if self._last is not None:
+            here, vector, number = self._last
+            if number == self.batches.number - 1 and np.array_equal(vector, trial.vector):
+                return here
         return Linearised(self._loss, self._packing, trial.vector, self.batches.now(back=1))
 
     def curvature(self, trial):
@@ -138,3 +144,8 @@ def norm(vector):
     """Euclidean norm without overflow or underflow."""
     largest = float(np.max(np.abs(vector), initial=0.0))
     return largest * float(np.linalg.norm(vector / largest)) if 0 < largest < np.inf else largest
+
+
+def power_of_two(value):
+    """The power of two next above, so that dividing by it changes no digits."""
+    return 2.0 ** float(np.clip(np.frexp(value)[1], -900, 900)) if value > 0 else 1.0

@@ -12,8 +12,8 @@ import numpy as np
 
 from sparsedp.check.point import root_sum_squares
 from sparsedp.check.probes import generator
-from sparsedp.derivative import pushforward
-from sparsedp.errors import DerivativeError, SparsedpError
+from sparsedp.derivative import NO_JVP, pushforward
+from sparsedp.errors import SparsedpError
 from sparsedp.ledger import loops
 from sparsedp.tape import is_variable
 from sparsedp.tree import flatten
@@ -121,7 +121,7 @@ def _pushed(advance, state, v):
     try:
         after, moved = pushforward(advance, state, _with(state, v))
         return after, [m for a, m in zip(flatten(after)[0], flatten(moved)[0], strict=True) if is_variable(a)]
-    except (DerivativeError, NotImplementedError):  # a rule without a JVP
+    except NO_JVP:  # a rule without a JVP
         here = _floating(state)
         t = SMALL * (root_sum_squares([np.asarray(leaf) for leaf in here]) or 1.0)
         after = advance(state)

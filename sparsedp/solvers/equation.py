@@ -3,7 +3,7 @@
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import pullback, pushforward
+from sparsedp.derivative import NO_JVP, pullback, pushforward
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.tape import dtype_of, is_variable, isbox, linear, plain
 from sparsedp.tree import flatten, leaves
@@ -174,7 +174,7 @@ def push(fun, x, tangent):
     """
     try:
         return pushforward(fun, x, tangent)[1]
-    except (NotImplementedError, DerivativeError):
+    except NO_JVP:
         value, pull = pullback(fun, x)
     directions = leaves(tangent)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.derivative import pushforward
+from sparsedp.derivative import NO_JVP, pushforward
 from sparsedp.errors import ConvergenceError, DerivativeError, ShapeError
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count
@@ -246,6 +246,6 @@ def _is_valid(equation, x, leaves):
 def _has_jvp(equation, x, leaves):
     try:
         pushforward(lambda y: equation(y, *leaves), x, np.ones_like(x))
-    except (NotImplementedError, DerivativeError):
+    except NO_JVP:
         return False
     return True

@@ -3,7 +3,7 @@
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import DerivativeError
+from sparsedp.derivative import NO_JVP
 from sparsedp.tape import backward, dtype_of, fit, forward_root, is_variable, plain, reverse_root, split_box, trace
 from sparsedp.trajectory.ends import pull_ends
 from sparsedp.tree import flatten
@@ -15,7 +15,7 @@ def push(fun, tree, tangents):
     """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants)."""
     try:
         return _forward(fun, tree, tangents)
-    except (NotImplementedError, DerivativeError):
+    except NO_JVP:
         if any(dtype_of(t).kind == "c" for t in tangents if t is not None):
             raise
         return _twice_reverse(fun, tree, tangents)
