@@ -2,13 +2,14 @@
 
 Sections: cost, orders. Run ``python -m benchmarks.parametric [cost|orders] [--quick]`` in the root of
 the repository. `cost`: a new coefficient each time; the set-up is what the first solve with it takes
-longer than the second; limit: value and gradient <= 2.1 forward solves and one set-up. `orders`: with t
-the step, the remainder of the loss without derivatives falls like t, with the gradient like t^2 (limit
-1.95), with the Hessian like t^3 (2.9).
+longer than the second; limit: value and gradient <= 2.1 forward solves and one set-up. Times are the
+smallest of a few, of the processor and on one thread, which other programs hardly disturb. `orders`:
+with t the step, the remainder of the loss without derivatives falls like t, with the gradient like t^2
+(limit 1.95), with the Hessian like t^3 (2.9).
 """
 
 import argparse
-from time import perf_counter
+from time import process_time
 
 import autograd.numpy as anp
 import numpy as np
@@ -49,13 +50,14 @@ def root(n):
 
 
 def timed(task):
-    start = perf_counter()
+    start = process_time()
     found = task()
-    return perf_counter() - start, found
+    return process_time() - start, found
 
 
 def cost(quick):
     """Value and gradient in k beside the forward solve."""
+    dp.set_threads(1)
     shapes = ((64, 64), (16, 16, 16)) if quick else ((256, 256), (512, 512), (64, 64, 64))
     print("\nelliptic_solver, a new k each time; limit: (value + gradient - set-up) / forward <= 2.1")
     print(
@@ -67,11 +69,12 @@ def cost(quick):
             if method == "direct" and len(shape) == 3 and shape[0] > 32:
                 continue
             solve, (k, b, shift) = elliptic(shape, method)
-            _cost_row("x".join(map(str, shape)), method, solve, k, b, shift, turns=5 if len(shape) == 2 else 2)
+            _cost_row("x".join(map(str, shape)), method, solve, k, b, shift, turns=6)
     print("matrix_solver (direct) and implicit: the same")
     for n in (32,) if quick else (64, 128):
         solve, (data, b) = entries(n)
         _cost_row(f"{n}x{n} entries", "auto", solve, data, b)
+    dp.set_threads()
 
 
 def _cost_row(cells, method, solve, k, *rest, turns=5):

@@ -11,11 +11,12 @@ import os
 import subprocess
 import sys
 from functools import partial
+from itertools import product
 
 import numpy as np
 
 import sparsedp as dp
-from benchmarks.scenes import ANISOTROPIC, JUMPS, VARIABLE, wind
+from benchmarks.scenes import ANISOTROPIC, JUMPS, VARIABLE, WINDS
 from benchmarks.solves import HEAD, Ours, PyAMG, row
 from sparsedp import kernels
 from sparsedp.ledger import recording
@@ -104,10 +105,10 @@ def adjoint(quick):
     """Not symmetric: the adjoint within 20 % of the forward iterations, without a second set-up."""
     table("advection and diffusion; limit: adjoint iterations 1.2 x forward")
     for n in (60,) if quick else (60, 100, 200, 400):
-        for strength in (20.0, 500.0):
-            op = wind((n, n), strength)
+        for (name, make), strength in product(WINDS.items(), (20.0, 500.0, 1e5)):
+            op = make((n, n), strength)
             with recording() as calls:
-                row(f"wind {strength:g}, {n}", op, ours("multigrid"))
+                row(f"{name} {strength:g}, {n}", op, ours("multigrid"))
             print(f"set-ups: {sum(number for (_, what), number in calls.items() if what == 'setup')}")
 
 

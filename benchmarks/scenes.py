@@ -4,7 +4,7 @@ import numpy as np
 
 import sparsedp as dp
 
-__all__ = ["ANISOTROPIC", "JUMPS", "VARIABLE", "conductance", "wind"]
+__all__ = ["ANISOTROPIC", "JUMPS", "VARIABLE", "WINDS", "conductance", "vortex", "wind"]
 
 
 def conductance(k, size=1.0, boundary=dp.dirichlet):
@@ -22,9 +22,7 @@ def smooth(shape):
 def masked(shape):
     """k = 1 around nine solid balls without flux."""
     grid = dp.Grid(shape, size=1.0)
-    x, y = grid.centres()[:2]
-    solid = (x % (1 / 3) - 1 / 6) ** 2 + (y % (1 / 3) - 1 / 6) ** 2 < 0.01
-    return -dp.laplacian(grid, dp.dirichlet, solid)
+    return -dp.laplacian(grid, dp.dirichlet, solid(grid))
 
 
 def inclusions(shape):
@@ -65,13 +63,56 @@ def flat_cells(shape):
     return -dp.laplacian(dp.Grid(shape, size=(1.0, 1e-4)), dp.dirichlet)
 
 
+def solid(grid):
+    """Nine balls, in units of the lengths of the box."""
+    x, y = (c / (c.flat[0] + c.flat[-1]) for c in grid.centres()[:2])
+    return (x % (1 / 3) - 1 / 6) ** 2 + (y % (1 / 3) - 1 / 6) ** 2 < 0.01
+
+
+def anisotropic_masked(shape):
+    """As `anisotropic`, around nine solid balls: no transform takes it."""
+    grid = dp.Grid(shape, size=1.0)
+    weights = dp.diagonal(grid.faces, grid.join(1.0, 1e-6))
+    return -dp.divergence(grid) @ weights @ dp.gradient(grid, dp.dirichlet, solid(grid))
+
+
+def flat_cells_masked(shape):
+    """As `flat_cells`, around nine solid balls."""
+    grid = dp.Grid(shape, size=(1.0, 1e-4))
+    return -dp.laplacian(grid, dp.dirichlet, solid(grid))
+
+
+def clustered_masked(shape):
+    """Cells from 1 to 1e5 high, around nine solid balls."""
+    heights = np.geomspace(1e-5, 1.0, shape[1])
+    grid = dp.Grid(shape, spacing=(1.0 / shape[0], heights / heights.sum()))
+    return -dp.laplacian(grid, dp.dirichlet, solid(grid))
+
+
 def wind(shape, strength=20.0):
     """Upwind advection across the box, and diffusion: not symmetric."""
     grid = dp.Grid(shape, size=1.0)
-    flow = strength * (dp.upwind(grid, 0, 1, dp.dirichlet) + 0.5 * dp.upwind(grid, 1, -1, dp.dirichlet))
+    flow = strength * (dp.upwind(grid, 0, 1, dp.dirichlet) - 0.5 * dp.upwind(grid, 1, -1, dp.dirichlet))
     return flow - dp.laplacian(grid, dp.dirichlet)
 
 
+def vortex(shape, strength=20.0):
+    """Upwind advection around the middle of the box, with closed stream lines, and diffusion: not symmetric."""
+    grid = dp.Grid(shape, size=1.0)
+    x, y = np.meshgrid(*(np.linspace(0.0, 1.0, n + 1) for n in shape), indexing="ij")
+    v = strength * dp.curl(grid)((np.sin(np.pi * x) * np.sin(np.pi * y)) ** 2)
+    dt = 0.1 / (strength * max(shape))
+    rate = (dp.identity(grid.cells) - dp.transport(grid, "upwind").operator(v, dt)) * (1 / dt)
+    return rate - dp.laplacian(grid, dp.dirichlet)
+
+
+WINDS = {"wind": wind, "vortex": vortex}
 VARIABLE = {"smooth k": smooth, "masks": masked}
 JUMPS = {"inclusions": inclusions, "layers": layers, "checkerboard": checkerboard, "random decades": random_decades}
-ANISOTROPIC = {"k ratio 1e-6": anisotropic, "cell aspect 1e4": flat_cells}
+ANISOTROPIC = {
+    "k ratio 1e-6": anisotropic,
+    "cell aspect 1e4": flat_cells,
+    "k ratio, masks": anisotropic_masked,
+    "cell aspect, masks": flat_cells_masked,
+    "clustered, masks": clustered_masked,
+}

@@ -1,6 +1,12 @@
-"""The shop window of sparsedp: every public name, imported when it is first used.
+"""Physics that can be differentiated, on grids: operators, solvers, time steps, optimisers, checks of gradients.
 
-``import sparsedp as dp`` loads nothing else, so a scene pays only for what it names.
+    import autograd.numpy as np  # NumPy that the library can look through
+    import sparsedp as dp
+
+``dir(dp)`` lists the public names, ``help(dp.transport)`` explains one: shapes, units, errors, an example. README.md
+shows how they work together, examples/ what they are for.
+
+Every name is imported when it is first used: ``import sparsedp`` loads nothing else.
 A new public name is one word in ``_WINDOW`` and one in ``__init__.pyi``, the copy that type checkers read.
 """
 
@@ -33,7 +39,7 @@ _WINDOW = {
     "optimise.loop": "minimise",
     "optimise.physical": "physical_gradient",
     "kernels": "set_threads",
-    "report.charts": "v_curve",
+    "report.charts": "convergence v_curve",
     "report.plots": "animate plot",
     "report.certificate": "certify",
     "report.extremes": "stress",
@@ -42,7 +48,7 @@ _WINDOW = {
     "report.plan": "explain",
     "blackbox": "adopt",
 }
-_ROOMS = ("check", "errors", "network")
+_ROOMS = ("check", "errors", "network", "report")
 _HOME = {name: module for module, names in _WINDOW.items() for name in names.split()}
 
 __all__ = sorted([*_HOME, *_ROOMS])

@@ -1,6 +1,7 @@
 from . import check as check
 from . import errors as errors
 from . import network as network
+from . import report as report
 from .advection.front import transport as transport
 from .blackbox import adopt as adopt
 from .conditions import dirichlet as dirichlet
@@ -40,6 +41,7 @@ from .optimise.directions import update_direction as update_direction
 from .optimise.loop import minimise as minimise
 from .optimise.physical import physical_gradient as physical_gradient
 from .report.certificate import certify as certify
+from .report.charts import convergence as convergence
 from .report.charts import v_curve as v_curve
 from .report.extremes import stress as stress
 from .report.plan import explain as explain

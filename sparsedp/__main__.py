@@ -5,10 +5,12 @@ Exit codes of check and report: 0 agrees, 1 disagrees, 3 inconclusive, 2 the inp
 
 import argparse
 import sys
+from contextlib import redirect_stdout
 from pathlib import Path
 
 REFUSED = 2  # exit code of a bad input, the same as argparse's
 CODES = {"agrees": 0, "disagrees": 1, "inconclusive": 3}
+OUT = "where the results go (default: %(default)s)"
 SCENE = "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"
 
 
@@ -41,7 +43,7 @@ def _parser():
     )
     demo.add_argument("--input", type=Path, metavar="FILE", help="a 2-D field as .npy, .npz or .png (default: terrain)")
     demo.add_argument("--size", type=int, default=64, metavar="N", help="cells along the longest side (default: 64)")
-    demo.add_argument("--out", type=Path, default=Path("sparsedp-demo"), metavar="DIR", help="where the results go")
+    demo.add_argument("--out", type=Path, default=Path("sparsedp-demo"), metavar="DIR", help=OUT)
     demo.add_argument("--force", action="store_true", help="overwrite results of an earlier run")
     demo.set_defaults(run=run_demo)
     check = rooms.add_parser(
@@ -58,7 +60,7 @@ def _parser():
         "3 inconclusive, 2 refused. In the file, workprec_options and stress_options may hold dicts of arguments.",
     )
     report.add_argument("scene", metavar="SCENE", help=SCENE)
-    report.add_argument("--out", type=Path, default=Path("sparsedp-report"), metavar="DIR", help="where the results go")
+    report.add_argument("--out", type=Path, default=Path("sparsedp-report"), metavar="DIR", help=OUT)
     report.add_argument("--force", action="store_true", help="overwrite an earlier report")
     report.set_defaults(run=run_report)
     return parser
@@ -74,7 +76,8 @@ def run_check(options):
     except ValueError as error:
         return refuse(error)
     try:
-        audit = gradient(source.loss, source.x)
+        with redirect_stdout(sys.stderr):  # what the loss prints is no part of the table
+            audit = gradient(source.loss, source.x)
     except Exception as error:  # the loss is the user's: it may raise anything
         return refuse(f"{options.scene} cannot be audited: {type(error).__name__}: {error}")
     print(audit)

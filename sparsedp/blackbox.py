@@ -1,5 +1,6 @@
 """A simulator without derivatives becomes differentiable: sparse Jacobians by coloured differences."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -9,15 +10,17 @@ from sparsedp.fields import check_finite
 from sparsedp.ledger import active, count
 from sparsedp.solvers.colouring import Coloured
 from sparsedp.solvers.kept import Kept
+from sparsedp.solvers.probing import REFUSED, changes, points_near, typical
 from sparsedp.solvers.sparsity import dense_pattern, find_pattern, pattern_of
+from sparsedp.solvers.translates import translated_pattern
 from sparsedp.tape import Rule, differentiable, plain
 
 __all__ = ["Adopted", "adopt"]
 
-POINTS = 3  # points at which the pattern is probed
 COMPLEX = 1e-30  # step of the complex step: no difference is taken, so nothing cancels
 CENTRAL = np.finfo(float).eps ** (1 / 3)  # step of central differences, relative to x
 AGREES = {"complex step": 1e-6, "central differences": 1e-4}
+ROWS = {"complex step": (1e-9, 0.0), "central differences": (1e-5, 1e-9)}  # of a row, and of the largest: what may miss
 
 
 def adopt(f, sparsity=None, derivative="auto", name=None):
@@ -28,8 +31,10 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     f : callable
         ``f(x) -> y``, real arrays of any shapes; it must give the same y for the same x.
     sparsity : sparse matrix or array, optional
-        (y.size, x.size), not 0 where y_i may depend on x_j. Default: found by changing random parts of x at 3 points.
-        An entry that is not 0 on a share s of all points is missed with probability (1 - s)^3.
+        (y.size, x.size), not 0 where y_i may depend on x_j. Default: what three cells touch, moved over the grid, if at
+        3 points each row of the Jacobian agrees with a derivative along a random direction; else found by changing
+        random parts of x at 3 points. An entry that is not 0 on a share s of all points is missed with probability
+        (1 - s)^3; from a stencil also one below 1e-9 (differences: 1e-5) of its row.
     derivative : "auto", "complex" or "difference"
         complex: f(x + i h v), to rounding, for code that is analytic and takes complex numbers. difference: central
         differences, about ten digits. auto: complex where it is found to agree with differences.
@@ -131,8 +136,6 @@ class Adopted:
 
         return vjp
 
-    # ------------------------------------------------------------ runs
-
     def _run(self, x):
         """One run on plain values."""
         self.runs += 1
@@ -148,8 +151,6 @@ class Adopted:
 
     def _back(self, g, x):
         return (self.jacobian(x).T @ np.ravel(g)).reshape(np.shape(x))
-
-    # ------------------------------------------------------------ the Jacobian
 
     def jacobian(self, x):
         """dy/dx at a point, csr_array; kept for the last two points.
@@ -188,47 +189,44 @@ class Adopted:
     def _pattern(self, x, y):
         rows, columns = y.size, x.size
         if self._sparsity is not None:
-            row, column = np.nonzero(self._dense_or_sparse())
-            pattern = pattern_of(row, column, self._sparsity.shape)
+            given = self._sparsity.tocsr() if hasattr(self._sparsity, "tocsr") else np.asarray(self._sparsity)
+            row, column = np.nonzero(given)
+            pattern = pattern_of(row, column, given.shape)
             if pattern.shape != (rows, columns):
                 raise ShapeError(f"the sparsity of {self.name} must have shape {(rows, columns)}, got {pattern.shape}")
             return Coloured(pattern, self._grid(x, y), by_rows=False)
         if not np.array_equal(self._run(x), y, equal_nan=True):
             raise DerivativeError(f"{self.name} gives two results for one argument; fix its random state first")
-        products = [product for product in map(self._changes, self._near(x)) if product is not None]
+        near, grid = points_near(self._run, x), self._grid(x, y)
+        products = [changes(self._run, point) for point in near]
+        guess = None if grid is None else translated_pattern(products, grid)
+        if guess is not None and self._holds(Coloured(guess, grid, by_rows=False), x, near):
+            return self._coloured
         found = find_pattern(products, rows, columns)
         return Coloured(dense_pattern(rows, columns) if found is None else found, self._grid(x, y), by_rows=False)
-
-    def _dense_or_sparse(self):
-        given = self._sparsity
-        return given.tocsr() if hasattr(given, "tocsr") else np.asarray(given)
 
     @staticmethod
     def _grid(x, y):
         return x.shape if x.shape == y.shape else None
 
-    @staticmethod
-    def _near(x):
-        rng = np.random.default_rng(0)
-        size = np.sqrt(np.mean(x**2)) or 1.0
-        near, far = 0.1 * x, 0.05 * size
-        parts = (near * rng.uniform(-1, 1, x.shape) + far * rng.standard_normal(x.shape) for _ in range(POINTS))
-        return [x + part for part in parts]
-
-    def _changes(self, x):
-        """v -> how the result changes when x does, at one point; None where f refuses the point."""
-        size = 0.1 * (np.sqrt(np.mean(x**2)) or 1.0)
-        try:
-            before = self._run(x)
-        except (ValueError, ArithmeticError, RuntimeError):
-            return None
-        if not np.all(np.isfinite(before)):
-            return None
-        return lambda v: np.ravel(self._run(x + size * v.reshape(x.shape)) - before)
+    def _holds(self, coloured, x, near):
+        """Whether Jacobians on a guessed pattern give every row of a derivative along a random direction."""
+        self._coloured, rng = coloured, np.random.default_rng(4)
+        way = self._choose(x)
+        share, floor = ROWS[way]
+        for point in near:
+            v = self._steps(point) * rng.standard_normal(point.shape)
+            try:
+                matrix, known = self._by_colours(point, way), self._product(point, way)(v)
+            except REFUSED:  # not finite so close to an allowed point
+                return False
+            size = abs(matrix) @ np.abs(v).reshape(-1)
+            if not np.all(np.abs(matrix @ v.reshape(-1) - known) <= share * size + floor * np.max(size)):
+                return False
+        return True
 
     def _steps(self, x):
-        typical = np.sqrt(np.mean(x**2)) or 1.0
-        return CENTRAL * np.maximum(np.abs(x), typical)
+        return CENTRAL * np.maximum(np.abs(x), typical(x))
 
     def _product(self, x, way):
         if way == "complex step":
@@ -256,7 +254,10 @@ class Adopted:
         v = self._steps(x) * np.random.default_rng(1).uniform(0.5, 1.5, x.shape)
         difference = self._product(x, "central differences")(v)
         try:
-            with np.errstate(all="ignore"):
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter(
+                    "error", np.exceptions.ComplexWarning
+                )  # what is cast to real has lost the derivative
                 step = self._product(x, "complex step")(v)
         except Exception:
             return False

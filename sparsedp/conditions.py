@@ -96,7 +96,7 @@ def resolve(grid, boundary):
     ValueError
         If a periodic axis or an axis the grid does not have is named.
     TypeError
-        If an entry is not a condition.
+        If an entry is not a condition, or the grid not a grid.
 
     Examples
     --------
@@ -104,6 +104,8 @@ def resolve(grid, boundary):
     >>> resolve(Grid((2, 2), periodic=(True, False)), {"y": (dirichlet, neumann)})
     (None, (dirichlet, neumann))
     """
+    if not hasattr(grid, "periodic"):
+        raise TypeError(f"an operator needs a grid first, got {grid!r}; write dp.Grid((8, 6), size=1.0)")
     named = boundary if isinstance(boundary, dict) else dict.fromkeys(AXES, boundary)
     if isinstance(boundary, dict):
         _check_names(grid, boundary)

@@ -5,7 +5,8 @@ from numbers import Number
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
+from sparsedp.fields import check_function
 from sparsedp.tape import (
     backward,
     dtype_of,
@@ -62,7 +63,7 @@ def pullback(fun, x):
         raise DerivativeError(
             f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write x.astype(float)"
         )
-    result, number = trace(fun, x, roots)
+    result, number = _traced(fun, x, roots)
     if not _is_array(result):
         raise DerivativeError(
             f"the function must return one array or number, got {type(result).__name__}; sum or join it"
@@ -79,6 +80,20 @@ def pullback(fun, x):
         )
 
     return value, pull
+
+
+def _traced(fun, x, roots):
+    """trace, with a word of advice where NumPy, math or Python refuse a traced value."""
+    try:
+        return trace(fun, x, roots)
+    except (TypeError, ValueError, AttributeError) as error:
+        said = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
+        if isinstance(error, SparsedpError) or not any("ArrayBox" in words for words in said):
+            raise
+        raise DerivativeError(
+            f"a traced value was refused ({error}); write the function with autograd.numpy, without float(), item() "
+            "and u[i] = ..., or take foreign code in by dp.adopt or dp.differentiable"
+        ) from error
 
 
 def _apart(gradients):
@@ -128,7 +143,7 @@ def pushforward(fun, x, tangent):
         forward_root(direction) if is_variable(leaf) else None
         for leaf, direction in zip(found, directions, strict=True)
     ]
-    result, number = trace(fun, x, roots)
+    result, number = _traced(fun, x, roots)
     ends, rebuild = flatten(result)
     pairs = [split_box(end, number) for end in ends]
     values = rebuild(value for value, node in pairs)
@@ -186,6 +201,8 @@ def value_and_grad(loss):
 
     Raises
     ------
+    TypeError
+        If `loss` is not a function.
     ShapeError
         If the loss is not a scalar.
     DerivativeError
@@ -196,6 +213,7 @@ def value_and_grad(loss):
     >>> value_and_grad(lambda x: x["a"] ** 2 * x["n"])({"a": 3.0, "n": 2})
     (18.0, {'a': 12.0, 'n': None})
     """
+    check_function("value_and_grad", loss, "lambda x: np.sum(x**2)")
 
     def evaluate(x, *rest):
         value, pull = pullback(lambda tree: loss(tree, *rest), x)

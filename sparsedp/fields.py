@@ -1,20 +1,33 @@
 """What may be given: the checks of fields, of numbers and of reused result arrays."""
 
+from math import isfinite
+
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
 
-__all__ = ["check_finite", "check_out", "field_array", "is_number", "is_whole", "place"]
+__all__ = [
+    "check_finite",
+    "check_function",
+    "check_out",
+    "check_plain",
+    "field_array",
+    "is_number",
+    "is_whole",
+    "place",
+    "surely_finite",
+]
+
+FLOAT = np.dtype(float)
 
 
 def field_array(op, u):
     """Argument of an operator -> contiguous native array of float32, float64 or a complex kind."""
     if type(u) is not np.ndarray:
-        if isinstance(u, np.ma.MaskedArray):
-            raise TypeError(f"{op.name} takes plain arrays, got a masked array; fill it first")
-        u = np.asarray(u)
+        check_plain(op.name, u)
+        u = _array(op, u)
     if u.shape != op.domain.shape:
-        raise ShapeError(f"{op.name} takes a field on {op.domain}, got an array of shape {u.shape}")
+        raise ShapeError(f"{op.name} takes a field on {op.domain.told}, got an array of shape {u.shape}")
     if u.dtype.char not in "dfDF":
         if u.dtype.kind not in "biu":
             raise TypeError(f"{op.name} takes float or complex numbers, got dtype {u.dtype}; write u.astype(float)")
@@ -22,6 +35,20 @@ def field_array(op, u):
     if not u.flags.c_contiguous or not u.dtype.isnative:
         u = np.ascontiguousarray(u, dtype=u.dtype.newbyteorder("="))
     return u
+
+
+def _array(op, u):
+    try:
+        return np.asarray(u)
+    except ValueError:  # a list of arrays of different shapes
+        parts = "grid.join(*parts)" if op.domain.kind == "faces" else "op.domain.join(*parts)"
+        raise ShapeError(f"{op.name} takes one array on {op.domain.told}, got {len(u)} parts; write {parts}") from None
+
+
+def check_plain(name, *values):
+    """Refuse masked arrays: NumPy would drop the mask without a word."""
+    if any(isinstance(value, np.ma.MaskedArray) for value in values):
+        raise TypeError(f"{name} takes plain arrays, got a masked array; fill it first")
 
 
 def check_out(op, out, u, dtype):
@@ -52,10 +79,26 @@ def check_finite(name, values, needs="must be finite", where=None):
     raise NonFiniteError(f"{name} {needs}, got {many} that are NaN or infinite, the first at {first}")
 
 
+def surely_finite(value):
+    """One pass without a temporary array; False also when a finite sum is too large."""
+    if type(value) is np.ndarray and value.size < 4096 and value.dtype == FLOAT and value.flags.c_contiguous:
+        flat = value.reshape(-1)
+        if isfinite(np.vdot(flat, flat)):  # one cheap call; a square may overflow where the value does not
+            return True
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(np.sum(value)))
+
+
 def place(index, shape):
     """Number of an entry in C order -> its index: a number in 1-D, else a tuple."""
     found = tuple(map(int, np.unravel_index(index, shape)))
     return found[0] if len(found) == 1 else found
+
+
+def check_function(name, thing, example):
+    """Refuse what cannot be called."""
+    if not callable(thing):
+        raise TypeError(f"{name} takes a function, got {type(thing).__name__}; write {example}")
 
 
 def is_number(value):

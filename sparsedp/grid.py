@@ -10,7 +10,7 @@
 * Lengths carry whatever unit the user chose; every docstring says [length].
 """
 
-from functools import cached_property
+from functools import cached_property, reduce
 from math import prod
 
 import numpy as np
@@ -18,7 +18,7 @@ import numpy as np
 from sparsedp.space import Space
 from sparsedp.spacing import AXES, cell_widths, finite_number, flag, lengths, per_axis
 
-__all__ = ["Grid"]
+__all__ = ["Grid", "check_grid"]
 
 
 class Grid:
@@ -256,7 +256,7 @@ class Grid:
 
     def axis(self, axis):
         """Check an axis number or name ("x") and return the number."""
-        number = AXES.index(axis) if axis in AXES else axis
+        number = AXES.index(axis) if isinstance(axis, str) and axis in AXES else axis
         if isinstance(number, (int, np.integer)) and 0 <= number < self.dim:
             return int(number)
         raise ValueError(
@@ -289,7 +289,10 @@ class Grid:
 
 
 def _outer(lines):
-    volumes = np.ones(())
-    for line in lines:
-        volumes = np.multiply.outer(volumes, line)
-    return volumes
+    return reduce(np.multiply.outer, lines, np.ones(()))
+
+
+def check_grid(name, grid):
+    """Refuse what is no Grid."""
+    if not isinstance(grid, Grid):
+        raise TypeError(f"{name} takes a Grid, got {type(grid).__name__}; write dp.Grid((64, 64), size=1.0)")

@@ -10,12 +10,21 @@ from contextlib import contextmanager
 from time import perf_counter
 from typing import Any
 
-__all__ = ["Calls", "active", "count", "loops", "observers", "recording", "spent", "tell", "timed"]
+__all__ = ["Calls", "active", "count", "loops", "observers", "recording", "spent", "tally", "tell", "timed"]
 
 active: list["Calls"] = []  # the open `recording()` blocks
 observers: list[Any] = []  # who takes part in every solve, the last one first; asked inside recordings only
 loops: list[Any] = []  # who is told of every time loop before it runs: called with (step, state, params, inputs, n)
 _inner: list[float] = []  # for each timed call that is under way, the seconds of the calls inside it
+
+
+class Tally:
+    """Solves since the program began, forward and adjoint: counted always, for one addition a solve."""
+
+    solves = 0
+
+
+tally = Tally()
 
 
 class Calls(Counter):

@@ -177,6 +177,8 @@ class Operator:
         return Operator(self._acting, Space(self.domain.size), Space(self.codomain.size), self.name, self.form)
 
     def __add__(self, other):
+        if isinstance(other, Number):
+            raise TypeError(f"a number cannot be added to {self.name}; write {self.name} + c * dp.identity(space)")
         if not isinstance(other, Operator):
             return NotImplemented
         if not (fits(self.domain, other.domain) and fits(self.codomain, other.codomain)):
@@ -194,13 +196,15 @@ class Operator:
     def __mul__(self, factor):
         if isbox(factor):
             raise DerivativeError(f"a traced number cannot scale an operator; write nu * {self.name}(u)")
+        if isinstance(factor, Operator):
+            raise TypeError(f"{self.name} * {factor.name} is not defined; write A @ B to compose operators")
         if not (isinstance(factor, Number) or (isinstance(factor, np.ndarray) and factor.shape == ())):
             return NotImplemented
         number = complex(factor)  # type: ignore[arg-type]
         if not np.isfinite(number):
             raise NonFiniteError(f"{self.name} can be scaled by a finite number only, got {factor}")
         label = "-" if number == -1 else f"{factor:g} * "
-        structure = self.structure.scaled(number if _is_complex(factor) else number.real)
+        structure = self.structure.scaled(number if np.iscomplexobj(factor) else number.real)  # type: ignore[arg-type]
         return Operator(structure, self.domain, self.codomain, f"{label}{_bracket(self.name)}")
 
     __rmul__ = __mul__
@@ -210,7 +214,7 @@ class Operator:
             return NotImplemented
         if not isbox(number) and not (number != 0 and np.isfinite(number)):
             raise NonFiniteError(f"{self.name} can be divided by a finite number other than 0 only, got {number}")
-        if isbox(number) or _is_complex(number):
+        if isbox(number) or np.iscomplexobj(number):
             return self * (1.0 / number)
         share, exponent = np.frexp(float(number))  # 1 / 1e308 has lost digits, 2^-1024 has not
         structure = self.structure.scaled(1.0 / float(share)).scaled(2.0 ** -int(exponent))
@@ -290,10 +294,6 @@ def _chosen_form(structure):
         return "matrix-free"
     limit = EXPLICIT_BELOW_COMPILED if kernels.compiled() else EXPLICIT_BELOW_PLAIN
     return "explicit" if max(structure.shape) <= limit else "matrix-free"
-
-
-def _is_complex(number):
-    return np.asarray(number).dtype.kind == "c"
 
 
 def _bracket(name):

@@ -99,7 +99,7 @@ class Space:
             If `v` has another shape.
         """
         if np.shape(v) != self.shape:
-            raise ShapeError(f"split takes a field on {self}, got an array of shape {np.shape(v)}")
+            raise ShapeError(f"split takes a field on {self.told}, got an array of shape {np.shape(v)}")
         if isbox(v):
             return tuple(_part(self, axis)(v) for axis in range(len(self.parts)))
         flat = np.asarray(v).reshape(-1)
@@ -112,6 +112,7 @@ class Space:
         Parameters
         ----------
         *parts : arrays that can be broadcast to the shapes in `self.parts`
+            Or that differ from them by axes of length 1 only, as the values along one wall.
 
         Returns
         -------
@@ -145,6 +146,12 @@ class Space:
 
     __repr__ = __str__
 
+    @property
+    def told(self):
+        """Its name for messages, with the shape of a field where the name does not show it: faces are flat."""
+        shape = self.shape if self.grid is None else self.grid.shape
+        return str(self) if shape == self.shape else f"{self} of shape {self.shape}"
+
 
 def fits(one, other):
     """Whether two spaces hold the same fields: equal, or of one size when one has no grid."""
@@ -154,6 +161,8 @@ def fits(one, other):
 
 
 def _broadcast(space, part, shape):
+    if [n for n in np.shape(part) if n != 1] == [n for n in shape if n != 1]:
+        return anp.reshape(part, shape)
     try:
         np.broadcast_shapes(np.shape(part), shape)
         # autograd cannot broadcast_to into more dimensions; a product with ones can.

@@ -1,8 +1,7 @@
 """The tape: rules with hand-written derivatives, and the traces that run through them.
 
-This is the only file that talks to autograd's extension interface. A `Rule` is an ordinary
-object. All rules go through one primitive (`_call`), all Operators through a second, lighter one
-(`apply_operator`). A primitive for each rule would stay in autograd's tables for ever.
+Only this file talks to autograd's extension interface. All rules go through one primitive (`_call`), all Operators
+through a lighter one (`apply_operator`): a primitive for each rule would stay in autograd's tables for ever.
 
 Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A x is A^T g.
 """
@@ -14,15 +13,17 @@ import autograd.numpy as anp
 import numpy as np
 from autograd.core import JVPNode, VJPNode, add_outgrads
 from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
-from autograd.tracer import getval, isbox, new_box, toposort, trace_stack
+from autograd.tracer import getval, isbox, new_box, notrace_primitives, toposort, trace_stack
 
+from sparsedp.cotangents import added
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, tell, timed
 from sparsedp.tree import flatten, leaves
 
 __all__ = [
     "ReverseNode", "Rule", "apply_operator", "backward", "called", "cast", "differentiable", "dtype_of", "fit",
-    "forward_root", "is_variable", "isbox", "linear", "plain", "reverse_root", "split_box", "trace", "witnesses",
+    "forward_root", "is_variable", "isbox", "linear", "plain", "reverse_root", "split_box", "trace", "untraced",
+    "witnesses",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
@@ -43,20 +44,18 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     jvp : callable, optional
         ``jvp(nums, tangents, ans, *args) -> tangent of ans``.
     keywords : tuple of str
-        Names of trailing arguments of `forward` that a caller may pass by keyword. They are moved
-        into their positions before tracing, because the tracer does not see keywords.
+        Trailing arguments of `forward` that a caller may pass by keyword; they are traced like the others.
 
     Returns
     -------
     Rule
-        Call it like `forward`. `vjp` and `jvp` must use `ans`, `args` and `g` only through other
-        rules, Operators or autograd.numpy: then derivatives of every order follow.
+        Call it like `forward`. `vjp` and `jvp` use `ans`, `args` and `g` only through other rules, Operators or
+        autograd.numpy: then derivatives of every order follow.
 
     Raises
     ------
     DerivativeError
-        When a rule is called with a traced value in a place that cannot be differentiated, has no
-        derivative, or returns a cotangent of the wrong number, shape or dtype.
+        When a traced value comes where there is no derivative, or a cotangent has a wrong number, shape or dtype.
 
     Examples
     --------
@@ -156,6 +155,11 @@ def _checked(name, values, cotangents, g):
 
 def fit(name, value, cotangent, g):
     """Check a derivative of `value` that was computed from `g`, and give it the dtype of `value`."""
+    if type(cotangent) is type(value) is np.ndarray and (cotangent.shape, cotangent.dtype) == (
+        value.shape,
+        value.dtype,
+    ):
+        return cotangent
     cotangent = np.asarray(cotangent) if isinstance(cotangent, list) else cotangent
     shape, wanted = np.shape(plain(cotangent)), np.shape(plain(value))
     if shape != wanted:
@@ -186,15 +190,7 @@ def cast(g, dtype):
 
 
 def linear(name, forward, transpose):
-    """Linear function + its transpose -> the two rules, each the derivative of the other.
-
-    Parameters
-    ----------
-    name : str
-    forward : callable
-        ``forward(x)``, linear, on plain arrays.
-    transpose : callable
-        ``transpose(g)``, with sum(g * forward(x)) == sum(transpose(g) * x).
+    """Name, linear ``forward(x)``, its ``transpose(g)`` on plain arrays -> two rules, each the other's derivative.
 
     Examples
     --------
@@ -221,9 +217,8 @@ def apply_operator(op, u):
 
 def _operator_vjp(argnums, ans, args, kwargs):
     op, u = args
-    dtype = u.dtype
 
-    def pull(g):
+    def pull(g, dtype=u.dtype):
         act = partial(apply_operator, op.T) if isbox(g) else op.T.apply
         back = timed(op.name, "vjp", act, g) if active else act(g)
         return (back if back.dtype == dtype else cast(back, dtype),)
@@ -255,9 +250,8 @@ def trace(fun, tree, roots):
     top = trace_stack.top
     try:
         with trace_stack.new_trace() as number:
-            boxed = [
-                leaf if root is None else new_box(leaf, number, root) for leaf, root in zip(found, roots, strict=True)
-            ]
+            pairs = zip(found, roots, strict=True)
+            boxed = [leaf if root is None else new_box(leaf, number, root) for leaf, root in pairs]
             result = fun(rebuild(boxed))
     finally:
         trace_stack.top = top  # autograd forgets this when `fun` raises
@@ -266,9 +260,7 @@ def trace(fun, tree, roots):
 
 def split_box(value, number):
     """The value below the box of this trace, and its node (None when it does not depend on x)."""
-    if isbox(value) and value._trace == number:
-        return value._value, value._node
-    return value, None
+    return (value._value, value._node) if isbox(value) and value._trace == number else (value, None)
 
 
 def backward(end, g):
@@ -279,11 +271,12 @@ def backward(end, g):
         if not node.parents:
             found[node] = g
         for parent, back in zip(node.parents, node.vjp(g), strict=True):
-            cotangents[parent] = add_outgrads(cotangents.get(parent), back)
+            known = cotangents.get(parent)
+            cotangents[parent] = added(known, back) or add_outgrads(known, back)
     return found
 
 
-ReverseNode = VJPNode
+ReverseNode, untraced = VJPNode, notrace_primitives  # untraced: by kind of node, functions that leave the tape
 witnesses: list[type[VJPNode]] = []  # kinds of nodes that see what they stand for; the last one is used
 
 

@@ -62,13 +62,16 @@ def down(part, axis, wraps):
     return 0.5 * (_cut(part, axis, 0, n) + _cut(part, axis, 1, n + 1))
 
 
-def up(part, axis, wraps):
-    """Mean of neighbours along an axis: cells -> faces, at a wall the only cell."""
-    if wraps:
-        return 0.5 * (part + anp.roll(part, 1, axis))
+def up(part, axis, wraps, widths):
+    """Linear interpolation along an axis: cells -> faces, at a wall the only cell."""
     n = part.shape[axis]
-    first, last = _cut(part, axis, 0, 1), _cut(part, axis, n - 1, n)
-    return 0.5 * (anp.concatenate([first, part], axis) + anp.concatenate([part, last], axis))
+    line = [-1 if a == axis else 1 for a in range(part.ndim)]
+    before = np.roll(widths, 1) if wraps else np.append(widths[:1], widths)
+    after = widths if wraps else np.append(widths, widths[-1:])
+    before, after = before.reshape(line), after.reshape(line)
+    lower = anp.roll(part, 1, axis) if wraps else anp.concatenate([_cut(part, axis, 0, 1), part], axis)
+    upper = part if wraps else anp.concatenate([part, _cut(part, axis, n - 1, n)], axis)
+    return (after * lower + before * upper) / (before + after)
 
 
 def _cut(part, axis, start, stop):
@@ -91,7 +94,7 @@ def speeds(move, v):
                 line.append(part)
                 continue
             part = down(part, axis, grid.periodic[axis]) if setting.velocity == "faces" else part
-            line.append(up(part, own, grid.periodic[own]))
+            line.append(up(part, own, grid.periodic[own], grid.widths[own]))
         found.append(line)
     return found
 
@@ -102,23 +105,67 @@ def moved(move, u, v, dt, inflow):
     grid = setting.grid
     parts = [u] if setting.of == "cells" else grid.split(u)
     letters = ["wrap" if pair is None else "edge" if repr(pair[0]) == "neumann" else "in" for pair in setting.sides]
-    step = [dt / widths[0] for widths in grid.widths]
-    results = [_component(move, part, w, step, letters, inflow) for part, w in zip(parts, speeds(move, v))]
+    results = [
+        _component(move, part, w, _lines(grid, setting.of == "faces" and own), dt, letters, inflow)
+        for own, (part, w) in enumerate(zip(parts, speeds(move, v)))
+    ]
     return results[0] if setting.of == "cells" else grid.join(*results)
 
 
-def _component(move, u, w, step, sides, inflow):
+def _lines(grid, own):
+    """For each axis what lies at the points -3 ... n + 2, the end cells repeated. own: the axis of faces, or False."""
+    found = []
+    for axis, (h, wraps) in enumerate(zip(grid.widths, grid.periodic)):
+        wide = np.pad(h, 4, mode="wrap" if wraps else "edge")
+        nodes = np.cumsum(wide) - wide - np.sum(wide[:4])
+        on_faces = own is not False and axis == own
+        line = nodes[1:] if on_faces else (nodes + 0.5 * wide)[1:-1]
+        found.append(line[:-1] if on_faces and wraps else line)
+    return found
+
+
+def number(line, x, cubic, period):
+    """Where among the points a place lies: the inverse of the curve through them, by bisection and a Newton step."""
+    n = line.size - 6
+    turns = np.floor((getval(x) - line[3]) / period) if period else 0.0
+    x = x - turns * period if period else x
+    numbers = np.arange(-3.0, n + 3)
+    if not cubic:
+        i = np.clip(np.searchsorted(line, getval(x), "right") - 1, 0, line.size - 2)
+        return numbers[i] + (x - line[i]) / (line[i + 1] - line[i]) + turns * n
+
+    def curve(q):
+        i = np.clip(np.floor(q).astype(int) + 3, 1, line.size - 3)
+        t = q - numbers[i]
+        a, b, c, d = (line[i + k] for k in (-1, 0, 1, 2))
+        steep = (c - a) / 2, (2 * a - 5 * b + 4 * c - d) / 2, (3 * b - a - 3 * c + d) / 2
+        return b + t * (steep[0] + t * (steep[1] + t * steep[2])), steep[0] + t * (2 * steep[1] + 3 * t * steep[2])
+
+    low, high = np.full(np.shape(x), -2.0), np.full(np.shape(x), n + 1.0)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        above = curve(middle)[0] > getval(x)
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    value, slope = curve(low)
+    return low + (x - value) / slope + turns * n
+
+
+def _component(move, u, w, lines, dt, sides, inflow):
     setting = move.setting
     cubic, midpoint = setting.interpolation == "cubic", setting.form.endswith("midpoint")
-    own = np.meshgrid(*(np.arange(n) for n in u.shape), indexing="ij")
+    at = np.meshgrid(*(line[3 : 3 + n] for line, n in zip(lines, u.shape)), indexing="ij")
+    periods = [np.sum(h) if side == "wrap" else None for h, side in zip(setting.grid.widths, sides)]
+
+    def back(speed, step, curved):
+        return [number(line, x - step * s, curved, p) for line, x, s, p in zip(lines, at, speed, periods)]
 
     def places(sign):
         used = w
         if midpoint:
-            half = [i - 0.5 * sign * s * x for i, s, x in zip(own, step, w)]
+            half = back(w, 0.5 * sign * dt, False)
             closed = ["wrap" if side == "wrap" else "edge" for side in sides]
             used = [look(x, half, closed, 0.0) for x in w]
-        return [i - sign * s * x for i, s, x in zip(own, step, used)]
+        return back(used, sign * dt, cubic)
 
     there = places(1.0)
     f = look(u, there, sides, inflow, cubic)

@@ -99,3 +99,48 @@ def test_outputs_of_another_shape_and_a_full_jacobian(rng):
     x = rng.standard_normal(30)
     assert np.allclose(f.jacobian(x).toarray(), matrix * np.cos(x), rtol=1e-12)
     assert f(x.astype(np.float32)).shape == (3,)
+
+
+def walls(x):
+    """Diffusion and upwind differences in a box: bounded, and entries that come and go with the sign of x."""
+    v = np.pad(x, 1, mode="edge")
+    spread = v[2:, 1:-1] + v[:-2, 1:-1] + v[1:-1, 2:] + v[1:-1, :-2] - 4 * x
+    return x + 0.1 * spread - 0.1 * np.where(x > 0, x * (x - v[:-2, 1:-1]), x * (v[2:, 1:-1] - x))
+
+
+def far(x):
+    """The reaction, with one cell that sees another far away."""
+    y = reaction(x)
+    y[0, 3, 3] += 1e-3 * x[1, 40, 50]
+    return y
+
+
+@pytest.mark.parametrize(
+    "f, shape, most",
+    [(reaction, (2, 64, 64), 100), (real_only, (2, 64, 64), 130), (walls, (64, 63), 100), (far, (2, 64, 64), 700)],
+)
+def test_a_stencil_is_found_from_a_few_cells(rng, f, shape, most):
+    """And where the field is not the same everywhere the whole pattern is searched for."""
+    x, step = rng.standard_normal(shape), dp.adopt(f)
+    jacobian = step.jacobian(x)
+    assert step.runs <= most
+    v = 1e-6 * rng.standard_normal(shape)
+    change = (f(x + v) - f(x - v)).reshape(-1) / 2
+    assert np.linalg.norm(jacobian @ v.reshape(-1) - change) <= 1e-7 * np.linalg.norm(change)
+    if f is far:
+        row, column = (np.ravel_multi_index(place, shape) for place in ((0, 3, 3), (1, 40, 50)))
+        assert jacobian[row, column] == pytest.approx(1e-3) and step.runs > 200
+    if f is walls:
+        assert jacobian.nnz == 5 * 64 * 63 - 2 * (64 + 63)  # nothing reaches round a wall
+
+
+@pytest.mark.parametrize("limit", [1.0001, 1.15, 1.2, 1.25, 1.4])
+@pytest.mark.parametrize("answer", ["raises", "is not finite"])
+def test_code_that_refuses_what_is_near(limit, answer):
+    def picky(x):
+        if np.max(np.abs(x)) > limit and answer == "raises":
+            raise ValueError("too large")
+        return np.where(np.max(np.abs(x)) > limit, np.nan, x * np.roll(x, 1))
+
+    jacobian = dp.adopt(picky).jacobian(np.full(300, 1.0))
+    assert jacobian.nnz == 600 and np.allclose(jacobian.sum(axis=1), 2.0)

@@ -83,3 +83,76 @@ def test_text_and_data():
     for words in ("one application:", "us explicit", "M-matrix yes, of -A", "spectral radius", "stable step", "bytes"):
         assert words in str(card)
     assert json.loads(json.dumps(card.to_dict()))["null space"] == 1
+
+
+# ---- integration by parts, order -----------------------------------------------------------------------------------
+
+STRETCHED = dp.Grid((9, 8), spacing=[np.linspace(1.0, 2.0, 9), 0.3])
+SOLID = np.zeros((9, 8), bool)
+SOLID[3:5, 3:5] = True
+BY_PARTS = {
+    "gradient": (dp.gradient(GRID), "with the divergence", 2, "u_x; u_y"),
+    "at a wall of value": (dp.gradient(STRETCHED, dp.dirichlet), "with the divergence", 1, "u_x; u_y"),
+    "around a solid": (dp.gradient(GRID, solid=SOLID), "with the divergence", 2, "u_x; u_y"),
+    "divergence": (dp.divergence(GRID), "with the gradient", 2, "u1_x + u2_y"),
+    "laplacian": (dp.laplacian(STRETCHED), "self-adjoint", 1, "u_xx + u_yy"),
+    "upwind": (3 * dp.upwind(GRID, "x"), "not self-adjoint", 1, "3 u_x"),
+    "average": (dp.average(GRID), "not with the divergence", 2, "u; u"),
+    "curl": (dp.curl(GRID), "not known: no rule for nodes -> faces", 2, "u_y; -u_x"),
+    "identity": (dp.identity(GRID.cells), "self-adjoint", "exact on polynomials", "u"),
+    "mixed": (
+        dp.identity(GRID.cells) - 2 * dp.laplacian(GRID),
+        "self-adjoint",
+        "not known: it mixes u with -2 u_xx",
+        "",
+    ),
+    "inverse": (dp.inverse(-dp.laplacian(GRID, dp.dirichlet)), "self-adjoint", "not known: a row is no stencil", ""),
+    "matrix": (dp.from_matrix(np.eye(5)), "not known: it is between", "not known: it is no operator", ""),
+    "few cells": (dp.laplacian(dp.Grid(4)), "self-adjoint", "not known: it needs 5 cells", ""),
+    "complex": (1j * dp.laplacian(GRID), "not known", "not known: it is complex", ""),
+    "zero": (0 * dp.laplacian(GRID), "self-adjoint", "not known: its rows in the middle are 0", ""),
+    "one way": (
+        dp.from_functions(lambda u: 2 * u, None, GRID.cells, GRID.cells),
+        "self-adjoint",
+        "not known: it has no transpose",
+        "",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BY_PARTS)
+def test_integration_by_parts_and_order(name):
+    """Adjoint to what, which derivative, and how exactly; or why that is not known."""
+    op, rule, order, terms = BY_PARTS[name]
+    card = CARD(op, seeds=1)
+    assert card.facts["integration by parts"].startswith(rule), card
+    if isinstance(order, int):
+        assert card.facts["order"] == order and card.facts["acts as"] == terms
+        assert f"order: {order}" in str(card) and "integration by parts: " in str(card)
+    else:
+        assert card.facts["order"].startswith(order) and card.facts.get("acts as", "") == terms
+
+
+def test_a_sign_and_a_factor_show():
+    grid = dp.Grid((9, 8), spacing=0.5)
+    G = dp.gradient(grid)
+    bent = dp.from_functions(lambda u: 1.001 * G.apply(u), lambda v: 1.001 * G.T.apply(v), G.domain, G.codomain, "bent")
+    facts = CARD(bent, seeds=1).facts
+    assert facts["integration by parts"].startswith("not with") and facts["acts as"] == "1.001 u_x; 1.001 u_y"
+    turned = CARD(-dp.divergence(grid), seeds=1).facts
+    assert turned["integration by parts"].startswith("not with") and turned["acts as"] == "-u1_x - u2_y"
+
+
+def test_the_order_that_refinement_shows():
+    """The order from one row is the slope of the error over grids."""
+
+    def error(build):
+        def at(n):
+            op = build(dp.Grid(n, size=1.0))
+            (x,), inside = op.domain.grid.centres(), slice(3, -3)
+            return np.max(np.abs(op(np.sin(3 * x)) - 3 * np.cos(3 * x))[inside])
+
+        return at
+
+    wind = lambda grid: dp.upwind(grid, "x")
+    assert dp.check.order(error(wind), expected=CARD(wind(dp.Grid(16)), seeds=1).facts["order"])

@@ -1,5 +1,7 @@
 """Every message of the foundation, printed once. A message says what was given and what to write instead."""
 
+import math
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -79,7 +81,11 @@ TABLE = [
         VALUE,
         "Grid(2 x 2 cells, size 2 x 2) has axes 0 to 1, got 2; write a number or a name of x, y",
     ),
-    (lambda: LINE.split(np.ones(3)), SHAPE, "split takes a field on faces(3), got an array of shape (3,)"),
+    (
+        lambda: LINE.split(np.ones(3)),
+        SHAPE,
+        "split takes a field on faces(3) of shape (4,), got an array of shape (3,)",
+    ),
     (lambda: BOX.join(np.ones(3)), SHAPE, "join on faces(2, 2) takes 2 components, got 1"),
     (
         lambda: BOX.join(np.ones(7), 1.0),
@@ -236,6 +242,28 @@ TABLE = [
         "odd maps cells(2, 2) to cells(2, 2), but its matrix has shape (3, 3)",
     ),
 ]
+
+
+def filled(u):
+    v = np.zeros(3)
+    v[0] = u[0]
+    return anp.sum(v)
+
+
+REFUSE = (
+    "a traced value was refused ({}); write the function with autograd.numpy, without float(), item() and "
+    "u[i] = ..., or take foreign code in by dp.adopt or dp.differentiable"
+)
+
+
+@pytest.mark.parametrize("loss", [lambda u: float(anp.sum(u)), lambda u: math.sin(u[0]), lambda u: u[0].item(), filled])
+def test_a_loss_that_leaves_the_tape(loss):
+    for run in (dp.value_and_grad(loss), lambda x: dp.check.gradient(loss, x), lambda x: dp.minimise(loss, x)):
+        with pytest.raises(DERIVATIVE) as caught:
+            run(np.ones(3))
+        said = str(caught.value)
+        assert said == REFUSE.format(caught.value.__cause__) and isinstance(caught.value, TypeError)
+    assert dp.check.gradient(lambda u: float(np.sum(u**2)), np.ones(3), gradient=lambda u: 2 * u)
 
 
 @pytest.mark.parametrize(("call", "error", "message"), TABLE, ids=[row[2][:50] for row in TABLE])

@@ -76,6 +76,31 @@ def test_check_at_another_point(scene, capsys):
     assert main(["check", str(scene)]) == 0
 
 
+STRANGERS = {
+    "without a guard": ("grid = dp.Grid(9, size=1.0)\nstart = np.ones(9)\nL = dp.laplacian(grid, dp.dirichlet)\n"
+                        "loss = lambda u: np.sum(L(u) ** 2)\nprint(dp.minimise(loss, start, maxiter=2))",
+                        "", 0, "agrees"),
+    "a tuple as the point": ("start = (np.ones(3), 2.0)\nloss = lambda p: np.sum(p[0] ** 3) * p[1]", "", 0, "agrees"),
+    "two arguments": ("x = (np.ones(3), 2.0)\ndef energy(u, k):\n    return k * np.sum(u**3)", ":energy", 0, "agrees"),
+    "one that prints": ("x = np.ones(3)\ndef loss(u):\n    print('here')\n    return np.sum(u**3)", "", 0, "agrees"),
+    "a constant": ("x = np.ones(3)\nloss = lambda u: 0 * np.sum(u)", "", 3, "constant to rounding"),
+    "no function": ("x = np.ones(3)", "", 2, ""),
+    "no Python": ("def loss(x)\n    return x", "", 2, ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", STRANGERS)
+def test_files_as_strangers_write_them(tmp_path, monkeypatch, capsys, kind):
+    """What the file or the loss prints goes to stderr; a refusal is one line."""
+    text, name, code, word = STRANGERS[kind]
+    (tmp_path / "scene.py").write_text("import autograd.numpy as np\nimport sparsedp as dp\n" + text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", f"scene.py{name}"]) == code
+    printed = capsys.readouterr()
+    assert word in printed.out and "here" not in printed.out and "Minimum" not in printed.out
+    assert code != 2 or (printed.out == "" and len(printed.err.splitlines()) == 1)
+
+
 def test_the_report(scene, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["report", str(scene), "--out", str(out)]) == 0
@@ -84,6 +109,11 @@ def test_the_report(scene, tmp_path, capsys):
     assert "fastest at a gradient error of 1 %: direct" in page
     assert "left out: multigrid hierarchy" in page and "stress left out 10^4 steps" in page
     assert "may stop at" in page
+    assert "| 1 % | direct | cells=16, method=direct |" in page  # which method at 1 % error
+    answers = page.index("## Which method for which error?"), page.index("## What was left out, and why")
+    assert answers[0] < page.index("fastest at") < answers[1] < page.index("left out: multigrid hierarchy")
+    table = (out / "point_load.md").read_text(encoding="utf-8")
+    assert "| method | cells | unknowns |" in table and "| * |" in table  # the settings that tell rows apart
     names = {path.name for path in out.iterdir()}
     assert names >= {f"{name}.{kind}" for name in ("audit", "plan", "certificate", "stress", "point_load")
                      for kind in ("md", "csv")}  # fmt: skip

@@ -18,13 +18,13 @@ def bad(array, index, value=np.nan):
     return array
 
 
-STRETCHED = dp.Grid(2, spacing=[np.array([1.0, 2.0])])
+STRETCHED = dp.Grid(3, spacing=[np.array([1.0, 1.0, 12.0])])
 CASES = [
     (
-        lambda: dp.transport(STRETCHED, "maccormack"),
+        lambda: dp.transport(STRETCHED, "maccormack", interpolation="cubic"),
         ValueError,
-        "transport maccormack needs cells of equal width along each axis, got "
-        "Grid(2 cells, size 3, stretched in x); write scheme='upwind' or 'van_leer'",
+        "transport maccormack with cubic interpolation needs points whose distances change by at most "
+        "a factor of 5 from one to the next, got 6.5; write interpolation='linear'",
     ),
     (
         lambda: dp.transport(GRID, "semi_lagrangian", form="flux"),

@@ -228,7 +228,7 @@ TABLE = [
         "the step changes the entries of params; make what changes a part of the state",
     ),
     (
-        slope(Forgetful()),
+        slope(Forgetful(), memory=7 * 24 + 2 * 8),  # under a budget steps are run again
         NONE,
         "the step gives another state when it is run again; it must depend on its arguments only",
     ),

@@ -32,7 +32,12 @@ SMALL = {
     "update_directions.py": "10",
     "half_inverse.py": "1",
     "inverse_heat.py": "6",
+    "control.py": "2",
+    "conductivity_design.py": "200",
+    "residual_or_physics.py": "10",
+    "solver_in_the_loop.py": "48",
 }  # cells, the end time, or gradients; the others run with 16
+LINES = {"solver_in_the_loop.py": 125}  # two solvers, a network and a study; the others stay below 60
 
 
 @cache
@@ -54,7 +59,7 @@ def test_it_runs(name):
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_short_and_on_both_pages(name):
     text = (ROOT / "examples" / name).read_text(encoding="utf-8")
-    assert len(text.splitlines()) < 60
+    assert len(text.splitlines()) < LINES.get(name, 60)
     assert text.startswith('"""') and f"python examples/{name}" in text.splitlines()[0]
     assert f"`{name}`" in (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
     assert f"`examples/{name}`" in (ROOT / "README.md").read_text(encoding="utf-8")
@@ -191,15 +196,17 @@ def test_certified():
 
 
 def test_error_against_time():
-    """First order behind second order behind exponential, at equal steps; every solver of Poisson to 1.3 % and less."""
+    """A front: first order behind second, the exponential as exact in a quarter of the steps; solvers of Poisson."""
     burgers, poisson, _ = run("error_against_time.py").split("fastest at an error of 1 %:")
-    rows = re.findall(r"^ +(euler|heun|exponential) +2 +(\d+) +(\S+) +(\S+)", burgers, re.MULTILINE)
-    error = {(name, int(steps)): float(gradient) for name, steps, _, gradient in rows}
-    counts = sorted({steps for _, steps in error})
-    for steps in counts:
-        assert error["exponential", steps] < error["heun", steps] < 0.2 * error["euler", steps]
-    assert 1.7 <= error["euler", counts[0]] / error["euler", counts[1]] <= 2.5
-    assert 3.4 <= error["heun", counts[0]] / error["heun", counts[1]] <= 5.0
+    rows = re.findall(r"^ +(order 1|order 2|exponential) +(\d+) +\d+ +(\d+) +(\S+) +(\S+)", burgers, re.MULTILINE)
+    steps = {(name, int(cells)): int(many) for name, cells, many, _, _ in rows}
+    values, slopes = ({(row[0], int(row[1])): float(row[place]) for row in rows} for place in (3, 4))
+    for name in ("order 2", "exponential"):  # twice as many cells, a quarter of the error
+        assert 3.4 <= values[name, 128] / values[name, 256] <= 5 and slopes[name, 128] / slopes[name, 256] > 3
+        assert values[name, 256] < 0.1 * values["order 1", 256] and slopes[name, 256] < 0.1 * slopes["order 1", 256]
+    assert 1.7 <= values["order 1", 64] / values["order 1", 128] <= 3.5
+    assert steps["exponential", 256] < 0.3 * steps["order 2", 256]
+    assert values["exponential", 256] < 1.5 * values["order 2", 256]
     assert poisson.count("1e-10") >= 12 and "fastest" not in poisson
 
 
@@ -233,13 +240,14 @@ def test_update_directions():
 
 
 def test_half_inverse():
-    """Case C2: the loss after one epoch as published, far below Adam's; Levenberg-Marquardt <= 3e-8 on what it sees."""
+    """Case C2: the loss after one epoch as published, far below Adam's; Levenberg-Marquardt <= 3e-8 on all samples."""
     row = r"^(\S.*?\S)  +(\d+) +(\S+) +(\S+) +(\S+)"
     printed = run("half_inverse.py")
     found = {name: (float(a), float(b)) for name, _, _, a, b in re.findall(row, printed, re.MULTILINE)}
     assert 5.4e-5 / 2 <= found["half-inverse"][0] <= 2 * 5.4e-5 and found["half-inverse"][1] <= 2 * 5.4e-5
-    assert found["Adam, equal time"][0] > 2 * found["half-inverse"][0] > 20 * found["Levenberg-Marquardt"][0]
-    assert float(re.search(r"it sees: (\S+)", printed)[1]) <= 3e-8
+    assert found["Adam, equal time"][0] > 2 * found["half-inverse"][0]
+    assert max(found["Levenberg-Marquardt"]) <= 3e-8
+    assert float(re.search(r"it sees: (\S+)", printed)[1]) <= found["Levenberg-Marquardt"][0]
 
 
 def test_adopt_a_simulator():
@@ -257,3 +265,20 @@ def test_inverse_heat():
     found = re.findall(r"^(\S.*?) +\d+ +(\S+) +\S+  (\d+)", run("inverse_heat.py"), re.MULTILINE)
     errors = [float(error) for _, error, _ in found]
     assert len(errors) == 3 and errors[0] > 1.2 * errors[1] and errors[2] <= 50.4
+
+
+def test_control():
+    """Case C5 in two scenes: a weaker force than the one that made the end, which is met; far beyond cross-entropy."""
+    found = re.findall(r"^(adjoint|cross).* +(\d+) +\S+ +\S+ +(\S+) +(\S+) +(\S+)$", run("control.py"), re.MULTILINE)
+    (gradients, force, worst, miss), (runs, _, _, other) = (tuple(map(float, row[1:])) for row in found[-2:])
+    assert force <= worst <= 1.0 and miss <= 1e-4
+    assert runs <= 3 * gradients and other > 100 * miss
+
+
+def test_solver_in_the_loop():
+    """Case C4 after 48 gradients: the network helps, through 4 steps more than through 1, and loses no mass."""
+    found = re.findall(r"^(\S.*?)(?:  +[\d.]+){3} +(\S+) +(\S+) +(\S+)$", run("solver_in_the_loop.py"), re.MULTILINE)
+    table = {label: tuple(map(float, figures)) for label, *figures in found}
+    assert len(table) == 6 and table["1, then 4, then 8 steps"][1] > 1.1
+    assert table["4 steps"][0] < 0.85 * table["1 step"][0]
+    assert all(lost < 1e-13 for _, _, lost in table.values())

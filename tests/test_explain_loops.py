@@ -4,6 +4,7 @@ import autograd.numpy as anp
 import numpy as np
 
 import sparsedp as dp
+from sparsedp.tape import untraced
 
 GRID = dp.Grid((12, 10), size=(1.0, 1.0))
 L = dp.laplacian(GRID, dp.dirichlet)
@@ -39,3 +40,31 @@ def test_without_diffusion_no_diffusion_solve():
     plan = dp.explain(lambda u: anp.sum(spread(0.0, u) ** 2), U)
     assert plan.totals["set-ups built"] == plan.totals["forward solves"] == plan.totals["adjoint solves"] == 0
     assert any("no solve and no set-up" in sentence for sentence in plan.left_out)
+
+
+def test_comparisons_and_shapes_in_a_loss():
+    kinds = list(untraced)
+    plan = dp.explain(lambda u: anp.sum(anp.where(L(u) > 0, L(u), 0.0) ** 2) / anp.size(u), U)
+    assert plan.counts["laplacian", "forward"] == 2 and plan.counts["laplacian", "vjp"] == 1
+    assert list(untraced) == kinds  # none stays behind
+
+
+def test_each_scene_leaves_out_what_it_does_not_need():
+    """By the public steps alone: what is not needed is not built, not solved, not taped, and a line says so."""
+    n, move = 4, dp.transport(GRID, "upwind")
+    wind = 0.1 * np.sin(np.arange(float(GRID.faces.size)))
+    carried = dp.explain(lambda v: anp.sum(dp.rollout(lambda u, w: move(u, w, 0.01), U, v, n) ** 2), wind)
+    for word in ("hierarchies built", "set-ups built", "matrices assembled", "forward solves", "adjoint solves"):
+        assert carried.totals[word] == 0, word  # no projection: no pressure
+    assert any(sentence.startswith("solves: none") for sentence in carried.left_out)
+
+    step = dp.stepper("backward_euler", L, 0.01)
+    spread = lambda start, k: dp.explain(lambda u: anp.sum(dp.rollout(step, u, k, n) ** 2), start)
+    plan = spread(U, 0.5)  # a fixed operator: one set-up, 2 n solves
+    assert plan.totals["set-ups built"] == 1 and plan.totals["hierarchies built"] == 0
+    assert plan.totals["forward solves"] + plan.totals["adjoint solves"] == 2 * n
+    still = spread(U, 0.0)  # nu = 0: no diffusion
+    assert still.totals["set-ups built"] == still.totals["forward solves"] == still.totals["adjoint solves"] == 0
+    assert np.array_equal(dp.rollout(step, U, 0.0, n), U)
+    only = dp.explain(lambda u: anp.sum(dp.rollout(step, u, 0.5, n) ** 2), U, gradient=False)
+    assert only.totals["forward solves"] == n and only.totals["adjoint solves"] == only.tape_nodes == 0

@@ -1,5 +1,6 @@
 """Viscosity, moving walls, convection and the flow step: identities, orders, derivatives, and what is left out."""
 
+import re
 from itertools import product
 
 import autograd.numpy as anp
@@ -25,6 +26,14 @@ def grids(shape):
 
 
 # ---------------------------------------------------------------- viscosity
+
+
+def test_explicit_viscosity_at_its_limit_does_not_grow():
+    grid = dp.Grid((16, 16), size=1.0)
+    v = np.random.default_rng(0).standard_normal(grid.faces.size)
+    step = dp.flow_step(grid, 0.125 / 256, 1.0, convective=False)
+    first = dp.rollout(step, step.start(v), None, 20)["v"]
+    assert np.max(np.abs(dp.rollout(step, step.start(v), None, 300)["v"])) < np.max(np.abs(first))
 
 
 @pytest.mark.parametrize("shape", [(6, 5), (4, 3, 5), (7,)])
@@ -203,18 +212,79 @@ def test_free_stream_passes_an_open_channel():
     np.testing.assert_allclose(state["v"], grid.join(1.0, 0.0), atol=1e-12)
 
 
+def test_viscosity_as_a_parameter():
+    """The same bits as with the number, and the energy J of Taylor-Green vortices has dJ/dnu = -4 T J."""
+    grid = dp.Grid((32, 32), size=2 * np.pi, periodic=True)
+    (x, y), (s, t) = grid.face_centres(0), grid.face_centres(1)
+    v = grid.join(np.sin(x) * np.cos(y), -np.cos(s) * np.sin(t))
+    step = dp.flow_step(grid, 0.04, lambda nu: nu)
+
+    def energy(nu):
+        return 0.5 * anp.sum(dp.rollout(step, step.start(v, nu), nu, 25)["v"] ** 2)
+
+    value, slope = dp.value_and_grad(energy)(0.1)
+    plain = dp.flow_step(grid, 0.04, 0.1)
+    assert value == 0.5 * np.sum(dp.rollout(plain, plain.start(v), None, 25)["v"] ** 2)
+    assert slope == pytest.approx(-4 * value, rel=0.01)
+    assert dp.check.gradient(energy, 0.1).verdict == "agrees"
+
+
 def test_what_is_refused():
     grid = dp.Grid((4, 4))
     with pytest.raises(ValueError, match="flow_step needs dt > 0, got 0; write a number"):
         dp.flow_step(grid, 0)
     with pytest.raises(ValueError, match="flow_step needs viscosity >= 0, got -1.0; write a number"):
         dp.flow_step(grid, 0.1, -1.0)
+    rest = np.zeros(grid.faces.size)
+    with pytest.raises(
+        ValueError, match="implicit viscosity of flow_step is a number, got a function; write implicit=False"
+    ):
+        dp.flow_step(grid, 0.1, lambda nu: nu, implicit=True)
+    with pytest.raises(
+        dp.errors.DerivativeError,
+        match="flow_step needs a constant viscosity, got a traced one; a derivative in the viscosity takes "
+        "viscosity=lambda params: ...",
+    ):
+        dp.value_and_grad(lambda nu: anp.sum(dp.flow_step(grid, 0.1, nu).start(rest)["v"]))(0.1)
+    with pytest.raises(ValueError, match="the viscosity in flow_step must be a finite number >= 0, got -1.0"):
+        dp.flow_step(grid, 0.1, lambda nu: nu).start(rest, -1.0)
+    with pytest.raises(
+        dp.errors.ShapeError, match="flow_step takes a dict of v, p and a as its state; make it with step.start"
+    ):
+        dp.flow_step(grid, 0.1)({"v": rest})
     with pytest.raises(FINITE, match="flow_step needs a finite dt, got nan; write a number"):
         dp.flow_step(grid, np.nan)
+    with pytest.raises(
+        dp.errors.UnstableStepError,
+        match=re.escape(
+            "flow_step is unstable for viscosity = 1 with dt = 0.001: the largest stable dt is 0.000488281; take "
+            "smaller steps or write implicit=True"
+        ),
+    ):
+        dp.flow_step(dp.Grid((16, 16), size=1.0), 0.001, 1.0)
+    step = dp.flow_step(grid, 0.1, lambda nu: nu)
+    with pytest.raises(dp.errors.UnstableStepError, match="flow_step is unstable for viscosity = 100"):
+        step.start(np.zeros(grid.faces.size), 100.0)
     with pytest.raises(ValueError, match="solid_boundary needs no_slip or free_slip, got 'outflow'"):
         dp.face_laplacian(grid, solid=np.zeros(grid.shape, bool), solid_boundary="outflow")
     with pytest.raises(ValueError, match="animate needs at least one frame, got none; run with keep='all'"):
         dp.animate(grid, [], "film.gif")
     step = dp.flow_step(grid, 0.1)
+    with pytest.raises(dp.errors.ShapeError, match="flow_step takes a dict of v, p and a as its state"):
+        step(np.zeros(grid.faces.size))
     with pytest.raises(FINITE, match="the velocity in projection must be finite"):
         step.start(np.full(grid.faces.size, np.nan))
+
+
+@pytest.mark.parametrize("convective", [False, True])
+def test_a_short_step_drags_alike_with_explicit_and_implicit_viscosity(convective):
+    """Moving walls drag the field at both ends of an implicit step: a short one ends where the explicit one does."""
+    grid, dt, nu = dp.Grid((6, 5), size=1.0), 1e-6, 0.3
+    lid = dp.face_lift(grid)
+    walls = lid(lid.domain.join(0.0, -0.5, 0.0, 1.0))
+    shorts = [
+        dp.flow_step(grid, dt, nu, implicit=implicit, convective=convective, walls=walls) for implicit in (True, False)
+    ]
+    implicit, explicit = (step(step.start(0.0 * walls)) for step in shorts)
+    assert np.linalg.norm(explicit["v"]) > 0.1 * dt * nu * np.linalg.norm(walls)
+    np.testing.assert_allclose(implicit["v"], explicit["v"], rtol=0, atol=1e-4 * np.max(np.abs(explicit["v"])))

@@ -3,7 +3,7 @@
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+from scipy.optimize import least_squares, lsq_linear, minimize
 
 import sparsedp as dp
 from sparsedp.errors import UnstableStepError
@@ -63,6 +63,28 @@ def test_bounds_against_scipy(rng, method):
     assert np.allclose(best.x, known.x, atol=1e-5)
 
 
+@pytest.mark.parametrize("method", ["levenberg_marquardt", "gauss_newton"])
+@pytest.mark.parametrize("options", [{}, {"dense": False}])
+def test_bounded_least_squares_against_scipy(rng, method, options):
+    """A step that counts on an unknown at its bound is no descent for the others; it must not pass for converged."""
+    matrix, data = rng.standard_normal((12, 8)), 3 * rng.standard_normal(12)
+    best = dp.minimise(lambda x: matrix @ x - data, np.zeros(8), method, bounds=(-0.3, 0.4), **options)
+    known = lsq_linear(matrix, data, bounds=(-0.3, 0.4), tol=1e-14)
+    assert best.converged and np.allclose(best.x, known.x, atol=1e-7)
+    bent = lambda x: anp.concatenate([10 * (x[1:] - x[:-1] ** 2), 1 - x[:-1]])
+    start = np.array([-0.5, 0.3, -0.5, 0.4])
+    best = dp.minimise(bent, start, method, bounds=(-1.0, 0.5), **options)
+    known = least_squares(bent, start, bounds=(-1.0, 0.5), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert best.converged and best.value == pytest.approx(known.cost, rel=1e-9)
+
+
+def test_half_inverse_leaves_what_presses_against_a_bound():
+    draw = np.random.default_rng(1)
+    matrix, data = draw.standard_normal((12, 8)), 3 * draw.standard_normal(12)
+    best = dp.minimise(lambda x: matrix @ x - data, np.zeros(8), "half_inverse", bounds=(-0.3, 0.4))
+    assert best.converged and np.allclose(best.x, lsq_linear(matrix, data, bounds=(-0.3, 0.4), tol=1e-14).x, atol=1e-6)
+
+
 def test_bounds_as_trees_and_on_one_side():
     start = {"a": np.zeros(2), "b": 5.0, "n": 3}
     best = dp.minimise(
@@ -88,3 +110,32 @@ def test_a_projection_is_kept(method):
     target = np.array([1.0, 2.0, 6.0])
     best = dp.minimise(lambda x: anp.sum((x - target) ** 2), np.ones(3), method, project=mean_free)
     assert np.allclose(best.x, target - 3) and abs(np.sum(best.x)) < 1e-12
+
+
+def test_history_counts_forward_and_adjoint_solves(tmp_path):
+    solve, target = dp.inverse(-dp.laplacian(dp.Grid((6, 5)), dp.dirichlet)), np.arange(30.0).reshape(6, 5)
+
+    def run(maxiter, **options):
+        return dp.minimise(lambda b: anp.sum((solve(b) - target) ** 2), 0 * target, maxiter=maxiter, **options)
+
+    best = run(6)
+    assert [record.solves for record in best.history] == [2 * record.evaluations for record in best.history]
+    assert dp.minimise(lambda x: anp.sum(x**2), np.ones(2)).history[-1].solves == 0
+    run(3, checkpoint=tmp_path)
+    again = run(6, checkpoint=tmp_path)
+    assert again.resumed.startswith("resumed") and again.history[-1].solves == best.history[-1].solves
+
+
+def test_convergence_is_drawn():
+    pytest.importorskip("matplotlib")
+    from sparsedp.report.plots import figure
+
+    best = dp.minimise(lambda x: anp.sum((x - 1.0) ** 2) - 2.0, np.zeros(2), "gd", rate=0.25, maxiter=4)
+    ax = dp.report.convergence(best, figure().add_subplot(), against="evaluations")
+    assert [line.get_label() for line in ax.lines] == ["loss - least loss", "gradient norm"]
+    assert list(ax.lines[1].get_ydata()) == [record.gradient_norm for record in best.history]
+    assert ax.get_yscale() == "log" and ax.get_xlabel() == "evaluations"
+    with pytest.raises(
+        ValueError, match="convergence is drawn against iteration, seconds, evaluations or solves, got 'time'"
+    ):
+        dp.convergence(best, against="time")

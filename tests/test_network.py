@@ -171,6 +171,8 @@ def test_refusals(rng):
         ValueError, match=r"convolution needs odd widths, so that the output lies on the same cells, got \(2,\)"
     ):
         nn.convolution({**p, "weight": p["weight"][..., :2]}, x)
+    with pytest.raises(ValueError, match=r"convolution needs odd widths, .* got \(4, 4\)"):
+        nn.convolution_weights(np.random.default_rng(0), 1, 2, (4, 4))
     with pytest.raises(
         dp.errors.ShapeError,
         match=r"convolution got x \(3, 1, 6\), weight \(4, 2, 3\) and bias \(4,\); inputs, outputs or samples differ",

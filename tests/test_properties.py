@@ -1,6 +1,7 @@
 """Properties that hold for any field: symmetry, homogeneity, layout. hypothesis picks the cases."""
 
 import numpy as np
+import pytest
 from catalogue import CATALOGUE
 from hypothesis import given
 from hypothesis import strategies as st
@@ -101,3 +102,21 @@ def test_axes_mean_what_they_say(data):
         y_too, x_too = other.split(builder(other, dp.dirichlet)(u.T))
         np.testing.assert_array_equal(x, x_too.T)
         np.testing.assert_array_equal(y, y_too.T)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("a, b", [(1.0, 0.0), (0.0, 1.0), (0.7, 1.3)])
+def test_lift_knows_the_cell_at_its_own_wall(a, b, side):
+    """A linear field with its wall values: one slope on all faces, though both ends have cells of other widths."""
+    grid = dp.Grid((4, 2), spacing=(np.array([0.5, 1.0, 2.0, 3.0]), np.array([1.5, 0.25])))
+    for axis in range(2):
+        condition = [dp.neumann, dp.neumann]
+        condition[side] = dp.robin(a, b)
+        boundary = {"xy"[axis]: tuple(condition)}
+        lift, wall = dp.lift(grid, boundary), (0.0, grid.size[axis])[side]
+        values = [np.zeros(part) for part in lift.domain.parts]
+        values[2 * axis + side] += a * (2.0 * wall + 1.0) + b * (2.0 if side else -2.0)
+        u = 2.0 * grid.centres()[axis] + 1.0
+        slopes = dp.gradient(grid, boundary)(u) + lift(np.concatenate([part.ravel() for part in values]))
+        found = np.moveaxis(grid.split(slopes)[axis], axis, 0)
+        assert np.allclose(found[1:] if side else found[:-1], 2.0, rtol=1e-13)

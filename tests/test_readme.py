@@ -110,6 +110,13 @@ def test_first_scene_is_short():
     assert len([line for line in first.text.splitlines() if line.strip()]) <= 20
 
 
+def test_both_tables_of_examples_have_one_order():
+    pages = [page(), (ROOT / "examples" / "README.md").read_text(encoding="utf-8")]
+    rows = [re.findall(r"^\| (\d+) \| `(?:examples/)?(\w+\.py)`", text, flags=re.MULTILINE) for text in pages]
+    assert rows[0] == rows[1] and [int(number) for number, _ in rows[0]] == list(range(1, len(rows[0]) + 1))
+    assert {name for _, name in rows[0]} == {path.name for path in (ROOT / "examples").glob("*.py")}
+
+
 def test_comparison_of_printed_text():
     assert same("loss  1.0 -> 2e-3", "loss 1.0000001 ->  0.002", rel_tol=1e-6, abs_tol=0.0)
     assert not same("loss 1.0", "loss 1.1", rel_tol=1e-6, abs_tol=0.0)

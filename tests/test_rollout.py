@@ -1,5 +1,7 @@
 """rollout: values and derivatives against the loop written out, at every memory budget."""
 
+import re
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -120,3 +122,46 @@ def test_binomial_schedule_is_optimal():
 
     known: dict = {}
     assert all(best(n, s, known) == advances(n, s) == ours(n, s) for n in range(60) for s in range(1, 8))
+
+
+def test_steps_run_once_where_their_tapes_fit():
+    """Small tapes and large budgets: no step and no solve runs again, and no bit of the gradient changes."""
+    grid = dp.Grid((6, 5), size=1.0)
+    solve = dp.inverse(dp.identity(grid.cells) - 0.01 * dp.laplacian(grid))
+    u, calls = np.cos(np.arange(30.0)).reshape(grid.shape), []
+
+    def step(u, k):
+        calls.append(1)
+        return solve(k * anp.floor(1.0 + u**2) * anp.sin(u))
+
+    def slopes(memory=None):
+        calls.clear()
+        found = dp.value_and_grad(lambda x: anp.sum(dp.rollout(step, *x, 8, memory=memory) ** 2))((u, 0.9))
+        return len(calls), found[1][0].tobytes(), found[1][1]
+
+    many, *wanted = slopes()
+    assert many == 8
+    for memory, least, most in (("1 MB", 8, 8), (240 * 200, 9, 15), (240 * 20, 16, 16), (240 * 9, 17, 99)):
+        many, *found = slopes(memory)
+        assert found == wanted and least <= many <= most
+
+
+def test_masked_arrays_are_refused():
+    u, end = np.arange(3.0), "; fill it first, and hand the mask along as an array of its own"
+    masked = np.ma.masked_array(u, u > 1)
+    for message, call in {
+        "rollout takes plain arrays, got a masked array as state['b'][1]": lambda: (same, {"b": (u, masked)}, None),
+        "rollout takes plain arrays, got a masked array as params": lambda: (same, u, masked.astype(int)),
+        "the step made a masked array of state": lambda: (lambda u, p: np.ma.masked_array(u, u > 1), u, None),
+        "the step made a masked array of state[0]": lambda: (lambda s, p: [np.ma.masked_array(s[0])], [u], None),
+    }.items():
+        with pytest.raises(TypeError, match=re.escape(message + end)):
+            dp.rollout(*call(), 2)
+    with pytest.raises(
+        TypeError, match="keep returned a masked array; fill it first, and hand the mask along as an array of its own"
+    ):
+        dp.rollout(same, u, None, 2, keep=lambda i, u: np.ma.masked_array(u))
+
+
+def same(u, p):
+    return u

@@ -238,3 +238,18 @@ def test_ten_thousand_steps_at_256(memory):
     assert peak(lambda: gradient(10_000, memory)) < (1.0 if memory == "1 GB" else 0.1) * 1e9
     short, full = gradient(1000, memory), gradient(1000, None)
     assert all(a.tobytes() == b.tobytes() for a, b in zip(short[1], full[1]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", [None, "1 MB"])
+@pytest.mark.parametrize("kind", ["plain forms", "tape"])
+def test_a_hundred_thousand_steps(kind, memory):
+    """16^2 cells, no recursion trouble; the wind turns once, mass stays, and the gradient of the mass says so."""
+    grid, n = dp.Grid((16, 16), size=1.0, periodic=True), 100_000
+    move, x = dp.transport(grid, velocity="cells"), grid.centres()[0]
+    step = move.step(1e-3) if kind == "plain forms" else lambda u, v: move(u, v, 1e-3)
+    u, v, runs = 1.0 + np.sin(2 * np.pi * x), np.stack([np.ones(x.shape), 0.3 * np.ones(x.shape)]), []
+    loss = lambda p: anp.sum(dp.rollout(step, *p, n, memory=memory, record=runs.append))
+    value, slopes = dp.value_and_grad(loss)((u, v))
+    assert value == pytest.approx(256.0, rel=1e-10) and np.max(np.abs(slopes[0] - 1.0)) < 1e-10
+    assert runs[-1].steps == n and np.all(np.isfinite(slopes[1]))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp import kernels
 from sparsedp.solvers.geometric import geometric_levels
 
 
@@ -51,6 +52,28 @@ def test_interpolation_keeps_constants_and_lines():
         assert P @ np.ones(P.shape[1]) == pytest.approx(1.0) and abs(P.T - R).nnz == 0
         assert P.indices.dtype == np.int32
     assert len(levels) >= 4 and levels[-1][1] is None
+
+
+def test_auto_takes_pairs_of_cells_in_3d_without_numba(monkeypatch, rng):
+    """For coefficients and cells that are even; not for jumps, flat cells or obstacles, nor in 2-D."""
+    monkeypatch.setattr(kernels, "compiled", lambda: False)
+    cube = dp.Grid((26, 25, 24), size=1.0)
+    k = 1 + 0.5 * np.prod([np.sin(5 * x) for x in cube.centres()], axis=0)
+
+    def chosen(grid, k, **options):
+        faces = dp.diagonal(grid.faces, dp.harmonic_average(grid)(k))
+        return dp.inverse(-dp.divergence(grid) @ faces @ dp.gradient(grid, dp.dirichlet, **options))
+
+    even = chosen(cube, k)
+    assert "levels from pairs of cells" in even.reason and "15600 > 2028 > 294" in even.info.hierarchy
+    b = rng.standard_normal(cube.shape)
+    even(b), even.T(b)
+    assert max(even.info.forward.iterations, even.info.adjoint.iterations) <= 14
+    solid = np.zeros(cube.shape, bool)
+    solid[9:12, 9:12, 9:12] = True
+    flat = dp.Grid(cube.shape, size=(1.0, 1.0, 0.1))
+    for other in (chosen(cube, np.where(solid, 1e3, k)), chosen(flat, k), chosen(cube, k, solid=solid)):
+        assert other.method == "multigrid" and "pairs of cells" not in other.reason
 
 
 def test_refusals():

@@ -21,7 +21,7 @@ SWEEPS = {
 
 def wind(n, strength=20.0):
     grid = dp.Grid((n, n), size=1.0)
-    flow = strength * (dp.upwind(grid, 0, 1, dp.dirichlet) + 0.5 * dp.upwind(grid, 1, -1, dp.dirichlet))
+    flow = strength * (dp.upwind(grid, 0, 1, dp.dirichlet) - 0.5 * dp.upwind(grid, 1, -1, dp.dirichlet))
     return flow - dp.laplacian(grid, dp.dirichlet)
 
 

@@ -272,3 +272,18 @@ def test_nothing_to_solve(method):
     empty = dp.inverse(neumann(dp.Grid((0, 3))), method)
     assert empty(np.zeros((0, 3))).shape == (0, 3) and empty.T(np.zeros((0, 3))).shape == (0, 3)
     assert "no unknowns" in str(empty)
+
+
+@pytest.mark.parametrize("share, stretched", [(0.45, False), (0.6, False), (0.6, True)])
+def test_multigrid_leaves_rounding_residues_alone(share, stretched):
+    """Regions that shrink to one unknown on a coarse level have a row of rounding there, and no equation."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        spacing = (rng.uniform(0.5, 2.0, 30), rng.uniform(0.5, 2.0, 26)) if stretched else None
+        grid = dp.Grid((30, 26), spacing=spacing)
+        solid = rng.random(grid.shape) < share
+        laplacian = dp.laplacian(grid, solid=solid)
+        inv = dp.inverse(-laplacian, "multigrid", nullspace="project")
+        wanted = -laplacian(rng.standard_normal(grid.shape))
+        assert np.linalg.norm(-laplacian(inv(wanted)) - wanted) <= 1e-9 * np.linalg.norm(wanted)
+        assert inv.T(wanted).any() and inv.info.adjoint.iterations <= 12

@@ -122,6 +122,27 @@ def test_a_wrong_gradient_and_a_swallowed_nan_fail():
     assert {row["case"] for row in failed} >= {"one nan"} and "swallowed" in failed[0]["note"]
 
 
+def test_a_refusal_names_the_field_or_the_place():
+    """NaN in a scene of the library is refused with its place; "something is wrong" is no help."""
+    solve = dp.inverse(-L)
+    sound = dp.stress(lambda b: anp.sum(solve(b) ** 2), START, only=["not finite"])
+    assert sound and all("the first at" in row["note"] for row in sound.rows)
+
+    def mute(sentence):
+        def loss(u):
+            if not np.all(np.isfinite(getattr(u, "_value", u))):
+                raise ValueError(sentence)
+            return anp.sum(u**2)
+
+        return loss
+
+    for sentence, word in (("something is wrong", "degraded"), ("x must be finite", "refused correctly")):
+        rows = dp.stress(mute(sentence), START, only=["not finite"]).rows
+        assert {row["outcome"] for row in rows} == {word}, sentence
+    rows = dp.stress(mute("something is wrong"), START, only=["not finite"]).rows
+    assert "refused without a name or a place: ValueError: something is wrong" in rows[0]["note"]
+
+
 def test_a_state_and_a_modified_input_fail():
     calls = []
 

@@ -100,6 +100,24 @@ def test_inclusions_with_jumps_of_a_million(shape, rng):
     assert inv.info.forward.iterations <= 30 and inv.info.forward.backward_error <= 1e-12
 
 
+@pytest.mark.parametrize("jump, precision", [(1e4, "single"), (1e6, "double"), (1e10, "double")])
+def test_the_precision_of_the_cycle_follows_the_jumps(jump, precision, rng):
+    """Twelve balls: in single precision 1e6 takes twice as many iterations, and 1e10 ends far off."""
+    grid = dp.Grid((256, 256), size=1.0)
+    k, places = np.ones(grid.shape), np.random.default_rng(1)
+    for _ in range(12):
+        middle, radius = places.random(2), places.uniform(0.04, 0.1)
+        k[sum((x - c) ** 2 for x, c in zip(grid.centres(), middle, strict=True)) < radius**2] = jump
+    op, b = conductance(grid, k), rng.standard_normal(grid.shape)
+    inv = dp.inverse(op)
+    inv(b), inv.T(b)
+    assert inv.method == "structured" and ("double precision" in str(inv)) is (precision == "double")
+    for record in (inv.info.forward, inv.info.adjoint):
+        assert record.iterations <= 12 and record.backward_error <= 1e-15
+    as_asked = dp.inverse(op, "structured", precision=precision)
+    assert np.array_equal(as_asked(b), inv(b))
+
+
 def test_a_bad_scene_is_solved_or_refused_but_not_wrong(rng):
     grid = dp.Grid((96, 96), size=1.0)
     op = conductance(grid, 10 ** (8 * rng.random(grid.shape)))
@@ -199,7 +217,7 @@ def test_the_whole_message_of_a_refusal():
 
 
 def test_an_unknown_precision():
-    with pytest.raises(ValueError, match="^precision must be 'single' or 'double', got 'half'$"):
+    with pytest.raises(ValueError, match="^precision must be 'auto', 'single' or 'double', got 'half'$"):
         dp.inverse(PLUS, "structured", precision="half")
 
 
@@ -232,3 +250,18 @@ def test_anisotropy_is_refused_honestly_and_left_to_others(rng):
         dp.inverse(op, "structured")(b)
     assert caught.value.info.residual > 1e-10 and caught.value.info.status in ("stagnated", "max_iterations")
     assert dp.inverse(op).method == "direct"
+
+
+@pytest.mark.parametrize("dim, shape, share", [(2, (64, 64), 0.5), (2, (33, 40), 0.5), (3, (9, 8, 7), 0.5)])
+def test_many_regions_between_random_obstacles(dim, shape, share):
+    """Coarse cells without a fine cell of their own, and fine ones without weights: seeds that once failed."""
+    for seed in {(64, 64): (7, 37, 43), (33, 40): (0, 4, 18, 44), (9, 8, 7): (3,)}[shape]:
+        rng = np.random.default_rng(seed)
+        periodic = (seed % 3 == 0, False) if dim == 2 else (seed % 3 == 0, False, seed % 4 == 0)
+        spacing = None if dim == 2 else tuple(rng.uniform(0.5, 2, n) for n in shape)
+        grid = dp.Grid(shape, size=1.0 if dim == 2 else None, spacing=spacing, periodic=periodic)
+        solid = rng.random(shape) < share
+        sides = {"y": (dp.neumann if seed % 5 else dp.dirichlet, dp.neumann)}
+        op = -dp.laplacian(grid, sides, solid=solid)
+        inv, b = dp.inverse(op, "structured", nullspace="project"), op(rng.standard_normal(shape))
+        assert np.linalg.norm(op(inv(b)) - b) <= 1e-9 * np.linalg.norm(b) and inv.info.forward.iterations <= 110

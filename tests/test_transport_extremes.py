@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.derivative import value_and_grad
+from sparsedp.derivative import pushforward, value_and_grad
 from sparsedp.errors import NonFiniteError, UnstableStepError
 
 SCHEMES = pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
@@ -86,6 +86,20 @@ def test_scaling_keeps_the_bits(scheme, power):
         large = value_and_grad(lambda p: scale * anp.sum(move(*p, 0.01, q)))((u, v))[1]
         for one, other in zip(plain, large):
             np.testing.assert_array_equal(other, scale * one)
+
+
+@SCHEMES
+@pytest.mark.parametrize("velocity", ["faces", "cells"])
+def test_a_derivative_beyond_the_floats_is_an_error(scheme, velocity):
+    """Field and cotangent of 2^900: their product, the gradient in the velocity, is refused, not infinity."""
+    move, u, v, q = scene(scheme, velocity=velocity)
+    u, scale = 2.0**900 * u, 2.0**900
+    through = lambda x, dt=0.01: scale * anp.sum(move(u, x, dt, q) * u / scale)
+    for loss, x, name in ((through, v, "v"), (lambda dt: through(v, dt), 0.01, "dt")):
+        with np.errstate(all="ignore"), pytest.raises(NonFiniteError, match=f"cannot represent the gradient in {name}"):
+            value_and_grad(loss)(x)
+    with np.errstate(all="ignore"), pytest.raises(NonFiniteError, match="cannot represent the tangent, got"):
+        pushforward(lambda x: move(u, x, 0.01, q), v, scale * v)
 
 
 def disguises(x):

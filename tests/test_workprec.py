@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 
 import autograd.numpy as anp
 import numpy as np
@@ -199,6 +200,8 @@ def test_words_pictures_and_refusals(tmp_path):
     text = found.markdown()
     assert text.startswith("### poisson") and "| * |" in text and "- left out: krylov with" in text
     assert "left out: krylov" in str(found) and repr(found) == str(found)
+    assert "| method | cells | unknowns |" in text and "| direct | 16 |" in text  # what tells two rows apart is shown
+    assert re.search(r"^ *method +cells +unknowns", str(found), re.MULTILINE)
     paths = [path.name for path in found.save(tmp_path / "out")]
     assert paths[:2] == ["poisson.md", "poisson.csv"]
     pytest.importorskip("matplotlib")
@@ -212,6 +215,8 @@ def test_words_pictures_and_refusals(tmp_path):
         table(repeats=0)
     with pytest.raises(ValueError, match="workprec needs at least one method; write {'name': {settings}}"):
         dp.workprec(poisson, {})
+    with pytest.raises(ValueError, match="workprec needs at least one method"):
+        dp.workprec(poisson, ["direct"])
     with pytest.raises(
         TypeError, match=r"a problem gives \(loss, x\) or \(loss, x, facts\), got float; write return loss, x"
     ):

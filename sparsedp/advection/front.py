@@ -53,7 +53,7 @@ def transport(
         first derivatives; the sum of the CFL numbers at most 1/2.
         semi_lagrangian: each point takes the value of the place its content comes from; any dt, linear in u,
         keeps constants, does not conserve sums. maccormack: a step there and back, and half of what that
-        misses added, second order. Both on cells of equal width, first derivatives (in u alone any).
+        misses added, second order. Both on cells of any width, first derivatives (in u alone any).
     boundary : condition, or dict of conditions
         Where the velocity points inwards: dirichlet brings in `inflow`, neumann the value of the
         point at the wall. Outwards the field leaves in both cases. A closed wall is a velocity of 0 there.
@@ -66,7 +66,7 @@ def transport(
         cells, as the mean inside a cell, and with the flow through both half cells along a side.
     interpolation : "linear" or "cubic"
         Of semi_lagrangian and maccormack. linear: order 1, no new extrema. cubic (Catmull-Rom): order 2 to 3
-        where the field is smooth, small new extrema.
+        where the field is smooth, small new extrema; widths of cells may change by a factor of 5 from one to the next.
     form : str, optional
         flux: du/dt = -div(v u), conserves the sum of u times volume. advective: du/dt = -v . grad u,
         keeps constants. Default: flux for a velocity on faces, advective for one on cells.

@@ -3,8 +3,9 @@
 import numpy as np
 
 from sparsedp.advection.law import FIELD, INFLOW
-from sparsedp.advection.values import prepare, raised, result_like, unflatten
+from sparsedp.advection.values import LETTERS, prepare, raised, result_like, unflatten
 from sparsedp.errors import DerivativeError
+from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import differentiable, isbox, linear, plain
 
 __all__ = ["rule_of"]
@@ -23,6 +24,8 @@ def rule_of(law):
             g = raised(FIELD, law, g)
             traced = isbox(g) or any(map(isbox, args))
             found = _traced_pull(law, nums, g, flat) if traced else law.pull(nums, g, *flat)
+            for num, back in zip(nums, found, strict=True):
+                _check_slope(law, "the gradient in " + LETTERS.get(num, "dt"), back, (g,))
             return tuple(unflatten(args[num], back) for num, back in zip(nums, found, strict=True))
 
         return pull
@@ -31,9 +34,19 @@ def rule_of(law):
         flat = prepare(law, *args)
         along = {num: raised(num, law, tangent) for num, tangent in zip(nums, tangents, strict=True)}
         traced = any(map(isbox, (*args, *tangents)))
-        return unflatten(ans, _traced_push(law, along, flat) if traced else law.push(along, *flat))
+        found = _traced_push(law, along, flat) if traced else law.push(along, *flat)
+        _check_slope(law, "the tangent", found, tangents)
+        return unflatten(ans, found)
 
     return differentiable(name, forward, vjp, jvp)
+
+
+def _check_slope(law, what, slope, given):
+    """Refuse a derivative that overflows; NaN and infinity that were handed in are no fault of the step."""
+    slope = plain(slope)
+    if surely_finite(slope) or not all(np.all(np.isfinite(plain(value))) for value in given):
+        return
+    check_finite(f"transport {law.setting.scheme}", np.asarray(slope), f"cannot represent {what}")
 
 
 def _traced_pull(law, nums, g, flat):

@@ -22,7 +22,8 @@ import scipy.sparse as sp
 from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
 from sparsedp.advection.look_matrix import block
 from sparsedp.advection.places import filling, points_of
-from sparsedp.advection.wind import Euler, Midpoint, three, wind_of
+from sparsedp.advection.ruler import ruler_of, three
+from sparsedp.advection.wind import Euler, Midpoint, wind_of
 from sparsedp.fields import check_finite
 from sparsedp.kernels import sampling
 from sparsedp.operators.boundary import solid_faces
@@ -42,11 +43,6 @@ class SemiLagrangian(Law):
     def __init__(self, setting):
         super().__init__(setting)
         grid = setting.grid
-        if not all(grid.uniform):
-            raise ValueError(
-                f"transport {setting.scheme} needs cells of equal width along each axis, got {grid}; "
-                "write scheme='upwind' or 'van_leer'"
-            )
         self.empty = not setting.space.size
         if self.empty:
             return
@@ -57,9 +53,11 @@ class SemiLagrangian(Law):
         self.wind = wind_of(setting)
         absent, n = 3 - grid.dim, setting.space.size
         # One component that looks back along its own velocity: two calls of the kernels do all the work.
+        self.stretched = not all(grid.uniform)
         self.direct = len(self.spans) == 1 and not self.bent and self.ways == (1,) and self.solids[0] is None
+        self.direct = self.direct and not self.stretched
+        self.ruler = ruler_of(setting, setting.interpolation)
         self.rows = (slice(n),) * absent + tuple(slice(a * n, (a + 1) * n) for a in range(grid.dim))
-        self.rates = (0.0,) * (3 - grid.dim) + tuple(1.0 / float(widths[0]) for widths in grid.widths)
 
     @cached_property
     def solids(self):
@@ -102,10 +100,7 @@ class SemiLagrangian(Law):
 
     def steepness(self, number, samples, look, g):
         """g times the derivative of `value` in the velocity of the look."""
-        found = np.zeros((self.setting.grid.dim, g.size))
-        w, scale = look
-        sampling.slopes(self.points[number], samples, w, scale, g, three(found))
-        return found
+        return self.ruler.steepness(self.points[number], samples, look, g)
 
     def carry(self, number, u, outside, looks, out):
         """The moved component -> out; whether all that it came from is finite."""
@@ -116,6 +111,11 @@ class SemiLagrangian(Law):
     def carry_back(self, number, g, u, outside, looks, into, wanted):
         """Add cotangents to `into` (u, outside; or None) and return those of the velocities of the looks, if wanted."""
         field, aside = (NOTHING, NOTHING) if into is None else into
+        if wanted and self.stretched:
+            speeds = self.steepness(number, self.samples(number, u, outside), looks[0], g)
+            if into is not None:
+                self.carry_back(number, g, u, outside, looks, into, False)
+            return (speeds,)
         speeds = np.zeros((self.setting.grid.dim, g.size)) if wanted else None
         filled = self.fill is not None and into is not None
         u, target = u if self.fill is None else self.fill[0] @ u, np.zeros_like(field) if filled else field
@@ -146,14 +146,10 @@ class SemiLagrangian(Law):
             start += size
         return found
 
-    def _scale(self, dt, way=1):
-        step = dt * way
-        return self.rates[0] * step, self.rates[1] * step, self.rates[2] * step
-
     def _looks(self, number, w, dt):
-        """For each look what the kernels take: velocities and their scale."""
-        scales = [self._scale(dt, way) for way in self.ways]
-        return [(three(self.trace.used(number, w, scale)), scale) for scale in scales]
+        """For each look the velocities that are used, and where they lead."""
+        steps = [dt * way for way in self.ways]
+        return [self.ruler.look(number, self.trace.used(number, w, step), step) for step in steps]
 
     def _refuse(self, u, v, inflow):
         """Name the first number that is not finite; what only overflows on the way is let through."""
@@ -168,10 +164,10 @@ class SemiLagrangian(Law):
             return out
         if self.direct:
             w = v if self.wind is None else self.wind.apply(v)
-            if not sampling.advance(self.points[0], u, inflow, self._axes(w), self._scale(dt), out):
+            if not sampling.advance(self.points[0], u, inflow, self._axes(w), self.ruler.scale(dt), out):
                 self._refuse(u, v, inflow)
             return out
-        if self.bent and not sampling.finite(v):  # a place half way may hide what is not finite
+        if (self.bent or self.stretched) and not sampling.finite(v):  # a place may hide what is not finite
             self._refuse(u, v, inflow)
         good = True
         for number, (span, w) in enumerate(zip(self.spans, self._speeds(v), strict=True)):
@@ -210,7 +206,7 @@ class SemiLagrangian(Law):
             speeds = into[VELOCITY] if self.wind is None and VELOCITY in into else np.zeros(w.size)
         axes = self._axes(speeds)
         sampling.retreat(
-            self.points[0], u, inflow, self._axes(w), self._scale(dt), g, found[FIELD], found[INFLOW], axes
+            self.points[0], u, inflow, self._axes(w), self.ruler.scale(dt), g, found[FIELD], found[INFLOW], axes
         )
         if VELOCITY in nums:
             back = speeds if self.wind is None else self.wind.T.apply(speeds)
@@ -244,9 +240,9 @@ class SemiLagrangian(Law):
         """Cotangents of the velocities of the looks -> that of w, and dt times that of dt when it is wanted."""
         total, rate = None, 0.0
         for look, change in zip(looks, steep, strict=True):
-            back, extra = self.trace.pull(number, w, look[1], change)
+            back, extra = self.trace.pull(number, w, look.step, change)
             total = back if total is None else total + back
-            rate += extra + float(np.sum(change * _there(look, w))) if step else 0.0
+            rate += extra + float(np.sum(change * look.speeds)) if step else 0.0
         return total, rate
 
     def push(self, tangents, u, v, dt, inflow):
@@ -272,9 +268,9 @@ class SemiLagrangian(Law):
             return None
         found = []
         for look in looks:
-            total = np.zeros_like(w) if dw is None else self.trace.push(number, w, look[1], dw)
+            total = np.zeros_like(w) if dw is None else self.trace.push(number, w, look.step, dw)
             if ddt is not None:
-                total = total + (_there(look, w) + self.trace.faster(number, w, look[1])) * (ddt / dt)
+                total = total + (look.speeds + self.trace.faster(number, w, look.step)) * (ddt / dt)
             found.append(total)
         return found
 
@@ -284,11 +280,6 @@ class SemiLagrangian(Law):
             return sp.csr_array((0, 0))
         blocks = [block(self, number, self._looks(number, w, dt)[0]) for number, w in enumerate(self._speeds(v))]
         return sp.csr_array(sp.block_diag(blocks, format="csr"))
-
-
-def _there(look, w):
-    """The velocities of a look, for the axes that are there."""
-    return np.stack(look[0][3 - len(w) :])
 
 
 def _ones(u):

@@ -8,9 +8,10 @@ from sparsedp.errors import ShapeError
 from sparsedp.fields import check_finite, is_number
 from sparsedp.tape import cast, dtype_of, isbox, plain
 
-__all__ = ["check_step", "flat_numbers", "prepare", "raised", "result_like", "unflatten"]
+__all__ = ["LETTERS", "check_step", "flat_numbers", "prepare", "raised", "result_like", "unflatten"]
 
 FLOAT = np.dtype(float)
+NONE = np.empty(0)
 LETTERS = {FIELD: "u", VELOCITY: "v", INFLOW: "inflow"}
 
 
@@ -58,6 +59,8 @@ def flat_numbers(name, letter, value, *shapes):
 
 
 def _inflow(name, inflow, walls):
+    if not walls.size and np.shape(inflow) == () and not isbox(inflow) and np.isfinite(inflow):
+        return NONE
     if type(inflow) is float and -np.inf < inflow < np.inf:
         return np.full(walls.size, inflow)
     if np.shape(inflow) == ():

@@ -1,7 +1,7 @@
 """The velocity at the points of a field, and the places it comes from.
 
-Interpolation to the points is the mean of the two neighbours along each axis in which they differ;
-at a wall the only cell. For the x-faces that is the mean of the four y-faces around.
+Interpolation to the points is linear along each axis in which they differ; at a wall the only cell. For the
+x-faces of cells of equal width that is the mean of the four y-faces around.
 
 A point looks back along the velocity: with s = dt / spacing, from its own index i to
 
@@ -19,13 +19,15 @@ import numpy as np
 
 from sparsedp.advection.law import component_shapes
 from sparsedp.advection.places import points_of
+from sparsedp.advection.ruler import ruler_of
+from sparsedp.conditions import neumann
 from sparsedp.kernels import sampling
 from sparsedp.operator import Operator
-from sparsedp.operators.stencils import cell_beside, pick
+from sparsedp.operators.stencils import means, pick
 from sparsedp.space import Space
 from sparsedp.structure.kronecker import Kronecker, Term
 
-__all__ = ["Euler", "Midpoint", "three", "wind_of"]
+__all__ = ["Euler", "Midpoint", "wind_of"]
 
 NOTHING = np.empty(0)
 
@@ -54,14 +56,10 @@ def _factors(setting, component, axis):
     if component == axis and setting.velocity == "faces":
         return tuple(factors)
     if setting.velocity == "faces":
-        factors[axis] = _mean(pick, grid, axis)
+        factors[axis] = pick(grid, axis, False).scaled(0.5) + pick(grid, axis, True).scaled(0.5)
     if component is not None:
-        factors[component] = _mean(cell_beside, grid, component)
+        factors[component] = means(grid, component, None if grid.periodic[component] else (neumann, neumann))
     return tuple(factors)
-
-
-def _mean(stencil, grid, axis):
-    return stencil(grid, axis, False).scaled(0.5) + stencil(grid, axis, True).scaled(0.5)
 
 
 class Euler:
@@ -70,19 +68,19 @@ class Euler:
     def __init__(self, setting):
         pass
 
-    def used(self, number, w, scale):
+    def used(self, number, w, step):
         """Velocities with which component `number` looks back."""
         return w
 
-    def pull(self, number, w, scale, g):
+    def pull(self, number, w, step, g):
         """Cotangent of what `used` gave -> cotangent of w, and what the step alone adds to w . g_w / dt."""
         return g, 0.0
 
-    def push(self, number, w, scale, dw):
+    def push(self, number, w, step, dw):
         """Tangents of w -> tangents of what `used` gives, without that of the step."""
         return dw
 
-    def faster(self, number, w, scale):
+    def faster(self, number, w, step):
         """Change of what `used` gives when the step grows by itself, or 0."""
         return 0.0
 
@@ -92,46 +90,40 @@ class Midpoint:
 
     def __init__(self, setting):
         self.points = points_of(setting, "linear", closed=True)
+        self.ruler = ruler_of(setting, "linear")
 
     def _samples(self, number, w):
         return [sampling.extend(self.points[number], part, NOTHING) for part in w]
 
-    def used(self, number, w, scale):
-        points, half = self.points[number], _half(scale)
-        return np.stack(
-            [sampling.gather(points, s, three(w), half, np.empty(w.shape[1])) for s in self._samples(number, w)]
-        )
+    def _half_way(self, number, w, step):
+        return self.ruler.look(number, w, 0.5 * step)
 
-    def pull(self, number, w, scale, g):
-        points, half = self.points[number], _half(scale)
+    def _carried(self, number, w, half):
+        samples, (places, scale) = self._samples(number, w), half
+        return np.stack([sampling.gather(self.points[number], s, places, scale, np.empty_like(w[0])) for s in samples])
+
+    def used(self, number, w, step):
+        return self._carried(number, w, self._half_way(number, w, step))
+
+    def pull(self, number, w, step, g):
+        points, half = self.points[number], self._half_way(number, w, step)
         direct, bent = np.zeros_like(w), np.zeros_like(w)
         for axis, samples in enumerate(self._samples(number, w)):
-            sampling.fold(points, sampling.scatter(points, g[axis], three(w), half), direct[axis], NOTHING)
-            sampling.slopes(points, samples, three(w), half, g[axis], three(bent))
+            sampling.fold(points, sampling.scatter(points, g[axis], *half), direct[axis], NOTHING)
+            bent += self.ruler.steepness(points, samples, half, g[axis])
         return direct + bent, float(np.sum(bent * w))
 
-    def push(self, number, w, scale, dw):
-        points, half = self.points[number], _half(scale)
-        carried = [sampling.gather(points, s, three(w), half, np.empty(w.shape[1])) for s in self._samples(number, dw)]
-        return np.stack(carried) + self._bent(number, w, scale, dw)
+    def push(self, number, w, step, dw):
+        half = self._half_way(number, w, step)
+        return self._carried(number, dw, half) + self._bent(number, w, half, dw)
 
-    def faster(self, number, w, scale):
-        return self._bent(number, w, scale, w)
+    def faster(self, number, w, step):
+        return self._bent(number, w, self._half_way(number, w, step), w)
 
-    def _bent(self, number, w, scale, dw):
+    def _bent(self, number, w, half, dw):
         """Change of the velocities half way when the place half way moves by -(s / 2) dw."""
-        points, half, found = self.points[number], _half(scale), np.empty_like(w)
+        found = np.empty_like(w)
         for axis, samples in enumerate(self._samples(number, w)):
-            steep = np.zeros_like(w)
-            sampling.slopes(points, samples, three(w), half, np.ones(w.shape[1]), three(steep))
+            steep = self.ruler.steepness(self.points[number], samples, half, np.ones(w.shape[1]))
             found[axis] = np.sum(steep * dw, axis=0)
         return found
-
-
-def three(w):
-    """One array for each of three axes; those that are not there get the first one, and nothing comes of it."""
-    return (w[0],) * (3 - len(w)) + tuple(w)
-
-
-def _half(scale):
-    return tuple(0.5 * s for s in scale)

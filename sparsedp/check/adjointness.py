@@ -4,6 +4,7 @@ import numpy as np
 
 from sparsedp.check.findings import Findings, attempted, skipped
 from sparsedp.check.probes import DTYPES, field, generator, representable, size_of, unit
+from sparsedp.operators.given import check_operator
 
 __all__ = ["transpose", "transpose_rows"]
 
@@ -41,6 +42,7 @@ def transpose(op, seeds=5, rng=None):
     >>> transpose(from_functions(np.cumsum, np.cumsum, 5, 5)).verdict
     'disagrees'
     """
+    check_operator("check.transpose", op)
     rng = generator(rng)
     title = f"transpose of {op.name}, {op.domain} -> {op.codomain}"
     return Findings(title, transpose_rows(op.tangent, size_of(op.tangent, rng), seeds, rng), LIMIT)

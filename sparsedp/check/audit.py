@@ -1,26 +1,26 @@
 """The audit of a gradient: differences over many step sizes, Taylor rates, determinism, forward against reverse."""
 
 import math
-import warnings
+from contextlib import suppress
 
 import numpy as np
 
 from sparsedp.check.culprit import culprit_of
 from sparsedp.check.extension import measured
-from sparsedp.check.plateau import ROUNDING
+from sparsedp.check.modes import complex_step, forward_mode, hessian
+from sparsedp.check.noise import noise_of
 from sparsedp.check.point import Point
 from sparsedp.check.probes import generator
-from sparsedp.check.sweep import Line, Trials, default_steps, dot
+from sparsedp.check.ripple import hidden
+from sparsedp.check.sweep import REFUSALS, Line, Trials, default_steps, dot
 from sparsedp.check.verdict import Audit, decide
-from sparsedp.derivative import NO_JVP, pushforward, value_and_grad
+from sparsedp.derivative import value_and_grad
+from sparsedp.fields import check_function, is_whole
 
 __all__ = ["gradient"]
 
 FEWEST_STEPS = 8
-TINY_STEP = 2.0**-100  # of a complex step, in units of x: its square is lost beside x
-APART = 1e-10  # forward and reverse mode differ by rounding
-SOLVED = 1e-6  # by more, when there are solves inside: each mode ends at its own residual
-FORGIVEN = 1e3  # tolerances of the solves inside; beyond, no solve is to blame
+BESIDE = 7  # seed of the place where a kinked loss is looked at again
 LOOSE = 1e-8  # a tolerance of solves above this may explain any gap that no call is to blame for
 UNDERFLOW = 1e-303  # differences of a loss that changes by less are not normal numbers
 
@@ -31,7 +31,7 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None):
     Parameters
     ----------
     loss : callable
-        ``loss(x) -> real scalar``. Any function: of this library, of autograd, or foreign.
+        ``loss(x) -> real scalar``. Any function: of this library, of autograd, or foreign (then give `gradient`).
     x : array, number, or any nesting of them in tuples, lists and dicts
         At least one floating leaf, real or complex, float32 or float64. Never modified.
     gradient : callable or tree, optional
@@ -56,7 +56,7 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None):
     Raises
     ------
     ValueError
-        If `steps` are fewer than eight, or not positive.
+        If `steps` are fewer than eight, or not positive, or `directions` is no whole number >= 0.
     DerivativeError
         If x has no floating leaf, or the gradient does not have the structure of x.
     NonFiniteError
@@ -74,6 +74,15 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None):
     or in the kernel of a Laplacian: no order 1).
     Forward against reverse mode: 1e-10, and 1e-6 behind a solve or in noise.
 
+    Noise is measured by a table of differences of neighbouring values. Where it is more than rounding, agreement
+    needs six digits; with fewer the verdict is inconclusive and says how many there are. A ripple (a part of the loss
+    that is small, with a derivative that is not) is inconclusive too: where fine steps see another derivative than
+    coarse ones, or the gradient itself varies within steps that the noise hides. A ripple below the rounding of the
+    loss that the gradient does not know either leaves no trace: no difference can see it.
+
+    The Hessian product along the first direction is judged by the third Taylor remainder, of order 2.9 or more:
+    `.hessian` and a note say how. It does not touch the verdict, which is about the gradient.
+
     Everything is relative: a loss times 1e-200 or 1e200 is judged the same. A loss that refuses a trial
     point (unstable step, no convergence, not finite, a ValueError) makes that step unusable. At a kink
     central differences prove nothing, and the verdict is inconclusive.
@@ -87,18 +96,31 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None):
     >>> gradient(lambda u: np.sum(u**3), x, gradient=lambda u: 3.003 * u**2).verdict
     'disagrees'
     """
+    check_function("check.gradient", loss, "lambda x: np.sum(x**2)")
+    return _audit(loss, x, gradient, steps, directions, rng, beside=False)
+
+
+def _audit(loss, x, gradient, steps, directions, rng, beside):
     point, trials = Point(x), Trials(loss)
-    chosen = default_steps(point.eps) if steps is None else _checked(steps)
+    chosen = _checked(steps, directions) or default_steps(point.eps)
     base = trials.value(point.tree())
-    leaves, doubts = _own_gradient(loss, point, trials, base, gradient)
-    lines, judged = [], []
+    evaluate = (lambda tree: value_and_grad(loss)(tree)[1]) if gradient is None else gradient
+    leaves, doubts = _own_gradient(point, trials, base, evaluate)
+    lines, judged, bend = [], [], None
     if math.isfinite(base) and all(np.all(np.isfinite(g)) for g in leaves):
-        for name, direction in point.directions(leaves, directions, generator(rng)):
-            lines.append(Line(name, direction, point, leaves, trials, base))
-            judged.append(measured(lines[-1], chosen, point, trials, extend=steps is None))
+        lines = _lines(point, leaves, directions, generator(rng), trials, base)
+        judged = [measured(line, chosen, point, trials, extend=steps is None) for line in lines]
+        if callable(evaluate):
+            judged = [_once_more(*pair, evaluate, trials, point) for pair in zip(lines, judged, strict=True)]
+        if any(one.word == "outside" for one in judged) and callable(evaluate) and not beside:
+            judged = _beside(loss, point, gradient, directions, judged)
         if gradient is None:
-            doubts += _forward_mode(loss, point, lines[:directions], judged)
-        doubts += _complex_step(loss, point, lines[:directions], base)
+            doubts += forward_mode(loss, point, lines[:directions], judged)
+        doubts += complex_step(loss, point, lines[:directions], base)
+        if gradient is None and directions and judged[0].word in ("agrees", "vanishes"):
+            bend = hessian(loss, point, lines[0], judged[0], trials, extend=steps is None)
+            judged[0] = judged[0]._replace(bend=bend.value, rate3=bend.rate)
+            doubts.append(("", bend.note))
         if _bits(trials.value(point.tree())) != _bits(base):
             doubts.append(("inconclusive", "the loss gives another value after the audit: it keeps a state"))
     verdict, reason = decide(judged, doubts)
@@ -110,7 +132,44 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None):
         if culprit is None and trials.tolerance > LOOSE:
             verdict = "inconclusive"
             reason += f"; no call is at fault, but solves stop at rtol {trials.tolerance:g}: tighten them"
-    return Audit(verdict, reason, judged, lines, base, trials.count, point.size, notes, culprit)
+    word = bend.word if bend else None
+    return Audit(verdict, reason, judged, lines, base, trials.count, point.size, notes, culprit, word)
+
+
+def _lines(point, leaves, directions, rng, trials, base):
+    """One line for each direction. The noise of the loss is that along the first and the last of them."""
+    ways = point.directions(leaves, directions, rng)
+    lines = [Line(name, direction, point, leaves, trials, base) for name, direction in ways]
+    noise = noise_of([*lines[:1], *lines[1:][-1:]], point, trials, base)
+    for place, line in enumerate(lines):
+        line.noise, line.close = noise, place == 0
+    return lines
+
+
+def _once_more(line, found, evaluate, trials, point):
+    """A gap that a ripple of the gradient may explain is none that differences prove."""
+
+    def slope_at(tree):
+        try:
+            return dot(point.leaves_of(evaluate(tree)), line.direction)
+        except REFUSALS:
+            return line.slope
+
+    with np.errstate(all="ignore"):
+        return hidden(line, found, slope_at, trials.eps, point)
+
+
+def _beside(loss, point, gradient, directions, judged):
+    """At several kinks at once a derivative may lie outside the one-sided ones and follow a convention all the same.
+
+    What is wrong beside the kinks as well is wrong.
+    """
+    moved = point.moved(next(point.directions(point.values, 1, generator(BESIDE)))[1], 2.0**-6)
+    with suppress(*REFUSALS):
+        if _audit(loss, point.tree(moved), gradient, None, directions, None, beside=True).verdict != "disagrees":
+            note = "several kinks; beside them nothing speaks against the gradient"
+            return [one._replace(word="kink", note=note) if one.word == "outside" else one for one in judged]
+    return judged
 
 
 def _culprit(loss, point):
@@ -121,23 +180,26 @@ def _culprit(loss, point):
     return fault.name, f"culprit: {fault.name}, {fault.reason}"
 
 
-def _checked(steps):
+def _checked(steps, directions):
+    if not is_whole(directions, 0):
+        raise ValueError(f"a sweep needs directions >= 0, a whole number, got {directions!r}; the default is 3")
+    if steps is None:
+        return None
     steps = tuple(float(step) for step in steps)
     if len(set(steps)) < FEWEST_STEPS or not all(0 < step < math.inf for step in steps):
         raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {steps}")
     return steps
 
 
-def _own_gradient(loss, point, trials, base, given):
+def _own_gradient(point, trials, base, evaluate):
     """Leaves of the gradient, and the doubts that come before any difference."""
     doubts = []
     if not math.isfinite(base):
         doubts.append(("inconclusive", f"the loss is {base} at x"))
     elif _bits(trials.value(point.tree())) != _bits(base):
         doubts.append(("inconclusive", "two evaluations of the loss differ: it is not deterministic"))
-    if given is not None and not callable(given):
-        return point.leaves_of(given), doubts
-    evaluate = (lambda x: value_and_grad(loss)(x)[1]) if given is None else given
+    if not callable(evaluate):
+        return point.leaves_of(evaluate), doubts
     with np.errstate(all="ignore"):
         first, second = (point.leaves_of(evaluate(point.tree())) for _ in range(2))
     if any(a.tobytes() != b.tobytes() for a, b in zip(first, second, strict=True)):
@@ -149,56 +211,6 @@ def _own_gradient(loss, point, trials, base, given):
         if not np.all(np.isfinite(g)):
             doubts.append(("disagrees", f"the gradient of {name} holds NaN or infinity"))
     return first, doubts
-
-
-def _forward_mode(loss, point, lines, judged):
-    """Forward mode against reverse mode along the random directions, where every rule has a JVP.
-
-    They may differ by APART of the derivative, by SOLVED where the ledger shows a solve or the loss is noisy.
-    """
-    worst, text, allowed = 0.0, "", max(APART, 300 * point.eps)
-    for line, found in zip(lines, judged, strict=False):
-        tangent = [d.astype(x.dtype) for d, x in zip(line.direction, point.values, strict=True)]
-        try:
-            with np.errstate(all="ignore"):
-                _, slope = pushforward(loss, point.tree(), point.tree(tangent))
-        except NO_JVP:
-            return [("", "forward mode: not available, a rule has no JVP")]
-        wanted = dot(line.gradient, tangent)
-        if found.jitter > ROUNDING or line.solved:
-            allowed = max(allowed, SOLVED)
-        scale = max(found.scale, abs(wanted), line.typical)
-        gap = 0.0 if slope == wanted else abs(float(slope) - wanted) / scale
-        if not gap <= worst:
-            worst, text = gap, f"{float(slope):.9g} beside {wanted:.9g} along {line.name}"
-    loosest = max((line.tolerance for line in lines), default=0.0)
-    if not worst <= allowed and worst <= FORGIVEN * loosest:
-        reason = f"forward and reverse mode differ by {worst:.0e}, which solves to rtol {loosest:g} may leave"
-        return [("open", f"{reason}; tighten them")]
-    if not worst <= allowed:
-        return [("disagrees", f"forward and reverse mode differ: {text}; the JVP or the VJP of a rule is wrong")]
-    return [("", f"forward mode: agrees with reverse mode to {worst:.0e}")]
-
-
-def _complex_step(loss, point, lines, base):
-    """Im f(x + i t d) / t beside g . d: exact to rounding where the code is analytic, and else only a note.
-
-    Source: W. Squire and G. Trapp, SIAM Review 40, 1998.
-    """
-    worst = 0.0
-    for line in lines if not any(x.dtype.kind == "c" for x in point.values) else ():
-        moved = [x + 1j * TINY_STEP * d for x, d in zip(point.values, line.direction, strict=True)]
-        try:
-            with np.errstate(all="ignore"), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # a discarded imaginary part shows in the figure
-                value = complex(loss(point.tree(moved, exact=False)))
-        except Exception:  # a loss of real numbers may refuse complex ones in any way
-            return []
-        scale = max(abs(line.slope), line.typical)
-        if value.imag == 0 or not abs(value.real - base) <= 1e-9 * abs(base) or not scale:
-            return []
-        worst = max(worst, abs(value.imag / TINY_STEP - line.slope) / scale)
-    return [("", f"complex step: agrees to {worst:.0e}")] if lines and worst <= APART else []
 
 
 def _bits(value):

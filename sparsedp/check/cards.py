@@ -8,16 +8,19 @@ from sparsedp.check.adjointness import transpose_rows
 from sparsedp.check.arguments import argument_rows, scaling_rows
 from sparsedp.check.calculus import derivative_rows
 from sparsedp.check.findings import Findings, Row
+from sparsedp.check.locality import integration_by_parts, order_inside
 from sparsedp.check.probes import generator, listable, size_of
 from sparsedp.check.traits import bytes_of, costs, signs, spectrum_of
 from sparsedp.check.twins import twin_rows
 from sparsedp.operator import Operator
+from sparsedp.operators.given import check_operator
 from sparsedp.space import fits
 from sparsedp.structure.explicit import Matrix
 
 __all__ = ["Card", "operator"]
 
 SHOWN = ("row sums", "symmetric", "definite", "M-matrix", "null space", "spectral radius", "stable step")
+LINES = "integration by parts", "order", "acts as"
 
 
 def operator(op, seeds=3, rng=None):
@@ -43,7 +46,9 @@ def operator(op, seeds=3, rng=None):
     Rows: linearity, transpose (scaled dot test in four dtypes), twin (explicit against matrix-free,
     forward, transposed and entry by entry), JVP, VJP, second order, wrong shapes refused, dtypes, memory
     layouts, fresh results, same bits twice, the same digits for a
-    field times 2^+-900. Figures are in units of rounding; an inverse is judged by
+    field times 2^+-900. Beside them stand facts without a verdict (`Card.facts`): cost and bytes, row sums, spectrum,
+    the largest stable step, what the operator is adjoint to, the derivative that it stands for and its order.
+    Figures are in units of rounding; an inverse is judged by
     the tolerance of its solve, without its check of primal data.
 
     Examples
@@ -57,6 +62,7 @@ def operator(op, seeds=3, rng=None):
     >>> "transpose, float64" in operator(wrong).failed
     True
     """
+    check_operator("check.operator", op)
     with np.errstate(all="ignore"):  # what overflows shows in the figures
         return _card(op, op.tangent, seeds, generator(rng))
 
@@ -83,7 +89,9 @@ class Card(Findings):
         sqrt(|A|_1 |A|_inf), from below when the entries are not known.
     facts : dict
         What the operator is: domain, codomain, form, dtype, nnz, bytes, size; seconds of one application
-        in each form; row sums, symmetry, M-matrix; of a square one spectral radius, definiteness, null space
+        in each form; row sums, symmetry, M-matrix; integration by parts in the volumes of its grid, the derivative
+        that a row inside stands for and its order, or why they are not known; of a square one
+        spectral radius, definiteness, null space
         and the largest stable step of u' = A u by explicit Euler. Found when they are asked for; what cannot
         be found at a fair price is left out.
     """
@@ -113,6 +121,8 @@ class Card(Findings):
         with np.errstate(all="ignore"):
             found |= {} if hasattr(op, "solver") else {"bytes": bytes_of(op)}  # factors and hierarchies are not ours
             found |= {"seconds": costs(op.tangent, generator(None)), **signs(op)}
+            found |= {"integration by parts": integration_by_parts(op.tangent, generator(None))}
+            found |= order_inside(op.tangent)
             square = fits(op.domain, op.codomain) and op.dtype.kind != "c"
             return found | (spectrum_of(op, found.get("symmetric", False)) if square and not self.failed else {})
 
@@ -132,6 +142,7 @@ class Card(Findings):
             lines.append(f"  one application: {times}")
         known = [f"{name} {_word(facts[name])}" for name in SHOWN if name in facts]
         lines += [f"  {', '.join(known)}"] if known else []
+        lines += [f"  {name}: {facts[name]}" for name in LINES if name in facts]
         return "\n".join([*lines, rows])
 
     __repr__ = __str__

@@ -16,7 +16,7 @@ import numpy as np
 
 from sparsedp.check.remainders import taylor
 
-__all__ = ["ROUNDING", "Judgement", "judge"]
+__all__ = ["NOISY", "ROUNDING", "Gaps", "Judgement", "judge"]
 
 RESOLVED = 1e-3  # an error bar above this share of the derivative proves nothing
 AGREED = 1e-8  # a gap below this share is agreement, whatever the bar
@@ -35,7 +35,9 @@ class Judgement(NamedTuple):
     """The verdict along one direction, in a word.
 
     agrees, disagrees; vanishes: both derivatives are 0 to rounding; kink: the one-sided derivatives differ;
+    outside: they differ, and the gradient is beyond both;
     rough: a Taylor remainder has the wrong order; noise, few: nothing is proved, by noise or for want of usable steps;
+    masked: gap and bar are small, but noise that is no rounding leaves too few digits;
     constant: the loss does not change, as the gradient says; ripple: coarse and fine steps see two derivatives.
     """
 
@@ -52,6 +54,8 @@ class Judgement(NamedTuple):
     digits: float
     jitter: float  # noise of the loss, in units of its rounding
     note: str
+    bend: float = np.nan  # d . H d, where a Hessian product was looked at
+    rate3: float = np.nan  # order of f(x + t d) - f - t g . d - t^2/2 d . H d; infinite when it is noise
 
     @property
     def resolution(self):
@@ -70,14 +74,15 @@ class Gaps:
         ).T
         ahead_of, behind_of = plus - line.base, minus - line.base
         self.first = np.hypot(ahead_of, behind_of) / np.sqrt(2)
-        self.second = np.hypot(ahead_of - ahead, behind_of - behind) / np.sqrt(2)
+        self.rests = ahead_of - ahead, behind_of - behind  # without the gradient, on both sides
+        self.second = np.hypot(*self.rests) / np.sqrt(2)
         # The gap of the one-sided differences, with the part that comes from unequal displacements taken out.
         self.kinks = (plus + minus - 2 * line.base - (ahead + behind)) / self.t
         sizes = np.maximum(np.maximum(np.abs(plus), np.abs(minus)), abs(line.base))
         # What the finest levels vary by, as a share of the loss. Rounding does that, or a solver inside.
         fine = slice(-FINEST, None)
         share = np.abs(np.diff(self.m[fine])) * self.t[fine][1:] / np.maximum(sizes[fine][1:], TINY)
-        self.jitter = float(np.max(share, initial=0.0)) / eps
+        self.jitter = max(float(np.max(share, initial=0.0)) / eps, 2 * line.noise)
         self.noise = max(2.0, self.jitter) * eps * sizes
         least = NOISY if line.solved else AGREED
         self.agreed = max(float(np.clip(PER_NOISE * eps * self.jitter, least, NOISY)), 300 * spread)
@@ -130,9 +135,9 @@ def judge(line, eps, spread):
     gap, bar, index, jump = _plateau(gaps, line)
     bar += gaps.floor
     scale = max(abs(line.slope), abs(line.slope + gap), line.typical)
-    word, note = _word(gaps, line, (gap, bar, scale), jump)
+    word, note = _word(gaps, line, (gap, bar, scale), jump, eps)
     sharp = bar + abs(gap) <= VANISHED * scale
-    orders = taylor(gaps, line.slope, gap if word in ("agrees", "vanishes") else 0.0, index, sharp)
+    orders = taylor(gaps, line.slope, gap if word in ("agrees", "masked", "vanishes") else 0.0, index, sharp)
     if word == "agrees" or (word == "vanishes" and orders.word == "rough"):
         word, note = orders.word or word, orders.note
     reference = gaps.curvature if word == "vanishes" else scale
@@ -160,7 +165,7 @@ def _plateau(gaps, line):
     return best
 
 
-def _word(gaps, line, measured, jump):
+def _word(gaps, line, measured, jump, eps):
     """The verdict, before the Taylor rates have a say."""
     gap, bar, scale = measured
     size, (split, uncertain) = abs(gap), jump
@@ -168,7 +173,7 @@ def _word(gaps, line, measured, jump):
         # Between the two one-sided derivatives every value is a matter of convention.
         outside = size - split / 2
         if outside > FAR * (bar + uncertain) and outside > RESOLVED * scale:
-            return "disagrees", f"outside the one-sided derivatives by {outside / scale:.1e}"
+            return "outside", f"outside the one-sided derivatives by {outside / scale:.1e}"
         return "kink", f"a kink: the one-sided derivatives differ by {split / max(scale, split):.1e}"
     far = FAR if gaps.jitter < ROUNDING else 3 * FAR
     if size > far * bar and size > gaps.agreed * max(scale, 1e-4 * gaps.curvature):
@@ -180,6 +185,9 @@ def _word(gaps, line, measured, jump):
         return "noise", "the loss is noisy or chaotic: differences see no derivative at all"
     if bar <= RESOLVED * scale:
         if size <= max(min(NEAR * bar, RESOLVED * scale - bar), gaps.agreed * scale):
+            if gaps.jitter > ROUNDING and bar > NOISY * scale:
+                noise = f"noise of {eps * gaps.jitter:.0e} of the loss"
+                return "masked", f"{noise} leaves {max(-np.log10(bar / scale), 0):.0f} digits, 6 are needed"
             return "agrees", ""
         return "noise", f"off by {size / scale:.1e}, {size / bar:.1f} error bars: not enough to tell"
     if size <= NEAR * bar and scale + bar <= max(VANISHED, gaps.agreed) * gaps.curvature:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from sparsedp.check.findings import table
+from sparsedp.fields import check_function
 
 __all__ = ["Refinement", "order"]
 
@@ -41,6 +42,7 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
     >>> result.verdict, round(result.order, 2)
     ('agrees', 2.0)
     """
+    check_function("check.order", error_at, "lambda n: error on n cells")
     sizes = tuple(int(n) for n in sizes)
     if len(sizes) < 3 or any(a >= b for a, b in zip(sizes, sizes[1:])) or sizes[0] < 1:
         raise ValueError(f"order needs at least three increasing sizes, got {sizes}")

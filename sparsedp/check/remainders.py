@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["FIRST", "SECOND", "Taylor", "taylor"]
+__all__ = ["CLEAR", "FEWEST", "FIRST", "SECOND", "Taylor", "rates", "taylor"]
 
 FIRST = 0.05  # order 1 is 1 to within this
 SECOND = 1.95  # the least order with the gradient
@@ -49,7 +49,7 @@ def taylor(gaps, slope, gap, index, sharp):
     rates2 = _second(gaps, gap, near)
     seen = near & (gaps.first >= CLEAR * gaps.noise)
     climbs = np.abs(slope) * gaps.t >= LINEAR * np.abs(gaps.kinks * gaps.t) / 2
-    rates1 = _rates(gaps.t, gaps.first, seen & climbs)
+    rates1 = rates(gaps.t, gaps.first, seen & climbs)
     still = sharp and not np.any(seen) and bool(np.all(np.abs(slope) * gaps.t < CLEAR * gaps.noise))
     flat = rates1.used < FEWEST and (still or bool(np.any(seen & ~climbs)))
     rate1 = max(rates1.orders, key=lambda rate: abs(rate - 1), default=np.nan)
@@ -62,8 +62,8 @@ def _second(gaps, gap, near):
     whole = gaps.second >= CLEAR * (gaps.noise + gaps.t * abs(gap))
     found = []
     for place in (near, np.ones_like(near)):
-        found.append(_rates(gaps.t, gaps.second, place & whole))
-        found.append(_rates(gaps.t, even, place & (even >= CLEAR * gaps.noise)))
+        found.append(rates(gaps.t, gaps.second, place & whole))
+        found.append(rates(gaps.t, even, place & (even >= CLEAR * gaps.noise)))
     return next((rates for rates in found if rates.used >= FEWEST), max(found, key=lambda rates: rates.used))
 
 
@@ -84,7 +84,7 @@ class _Rates(NamedTuple):
     orders: list
 
 
-def _rates(t, remainder, usable):
+def rates(t, remainder, usable):
     """Orders of the finest usable levels; the two levels of a pair are at least a factor APART."""
     levels = np.flatnonzero(usable)[-MOST:]
     orders = []

@@ -101,6 +101,13 @@ class Line:
     trials : Trials
     base : float
         The loss at the point.
+
+    Attributes
+    ----------
+    noise : float
+        Noise of the loss in units of its rounding, where a table of differences has shown it; else 0.
+    close : bool
+        Whether steps far below the plateau are looked at as well, where there is noise.
     """
 
     def __init__(self, name, direction, point, gradient, trials, base):
@@ -111,6 +118,12 @@ class Line:
         self.slope = dot(gradient, direction)
         self.typical = root_sum_squares([g * d for g, d in zip(gradient, direction, strict=True)])
         self.levels = []
+        self.noise = 0.0  # of the loss, in units of its rounding, as a table of differences shows it
+        self.close = False  # whether steps far below the plateau are looked at as well, where there is noise
+
+    def expected(self, displacement):
+        """What the gradient says that the loss changes by."""
+        return dot(self.gradient, displacement)
 
     def sweep(self, steps):
         """Evaluate the loss at x + t d and x - t d for every t of `steps`."""
@@ -120,7 +133,7 @@ class Line:
         ends = [self._point.moved(self.direction, sign * step) for sign in (1, -1)]
         there, back = map(self._point.away, ends)
         length = root_sum_squares([a - b for a, b in zip(there, back, strict=True)]) / (2 * step)
-        ahead, behind = dot(self.gradient, there), dot(self.gradient, back)
+        ahead, behind = self.expected(there), self.expected(back)
         if not abs(length / self._length - 1) < 0.1:
             return Level(step, np.nan, np.nan, ahead, behind, "the step is lost in the rounding of x")
         plus, note = self._trials.attempt(self._point.tree(ends[0]))

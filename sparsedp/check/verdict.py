@@ -24,7 +24,7 @@ def decide(judged, doubts):
     rippled = next((one for one in judged if one.word == "ripple"), None)
     if rippled:
         return "inconclusive", f"along {rippled.direction}: {rippled.note}"
-    wrong = [one for one in judged if one.word == "disagrees"]
+    wrong = [one for one in judged if one.word in ("disagrees", "outside")]
     if wrong:
         worst = max(wrong, key=lambda one: abs(one.gap) / one.scale if one.scale else math.inf)
         return "disagrees", f"along {worst.direction}: {worst.note}"
@@ -35,7 +35,7 @@ def decide(judged, doubts):
     for one in judged:
         if one.word in ("kink", "rough"):
             return "inconclusive", f"along {one.direction}: {one.note}"
-        if one.word in ("noise", "few") and not _negligible(one, largest):
+        if one.word in ("noise", "masked", "few") and not _negligible(one, largest):
             return "inconclusive", f"along {one.direction}: {one.note}"
     if not any(one.word in ("agrees", "vanishes") for one in judged):
         return "inconclusive", "the loss is constant to rounding"
@@ -66,8 +66,11 @@ class Audit:
         Name of the first operator, rule or function of autograd on the tape whose own VJP or JVP is at
         fault, when the verdict is "disagrees"; a note says what is wrong with it. None when each is right:
         then a value bypasses the tape, or the gradient was given.
+    hessian : "agrees", "disagrees", "inconclusive" or None
+        What the third Taylor remainder says of a Hessian product along the first direction; it does not touch the
+        verdict on the gradient. None where there is no product: no second derivatives, or a gradient that was given.
     lines : tuple of Judgement
-        One for each direction: word, difference, slope, gap, bar, scale, step, rates, digits, note.
+        One for each direction: word, difference, slope, gap, bar, scale, step, rates, digits, note, bend.
     value : float
         The loss at x.
     evaluations : int
@@ -78,6 +81,7 @@ class Audit:
     reason: str
     digits: int | None
     culprit: str | None
+    hessian: str | None
     lines: tuple[Judgement, ...]
     value: float
     evaluations: int
@@ -85,11 +89,18 @@ class Audit:
     notes: tuple[str, ...]
     _sweeps: tuple[Line, ...]
 
-    def __init__(self, verdict, reason, judged, lines, value, evaluations, size, notes=(), culprit=None):
+    def __init__(self, verdict, reason, judged, lines, value, evaluations, size, notes=(), culprit=None, hessian=None):
         proved = [one.digits for one in judged if one.word in ("agrees", "vanishes")]
         digits = int(min(proved)) if verdict == "agrees" else None
-        self.__dict__.update(verdict=verdict, reason=reason, digits=digits, culprit=culprit, lines=tuple(judged))
-        self.__dict__.update(value=value, evaluations=evaluations, size=size, notes=tuple(notes), _sweeps=tuple(lines))
+        self.__dict__.update(verdict=verdict, reason=reason, digits=digits, culprit=culprit, hessian=hessian)
+        self.__dict__.update(
+            lines=tuple(judged),
+            value=value,
+            evaluations=evaluations,
+            size=size,
+            notes=tuple(notes),
+            _sweeps=tuple(lines),
+        )
 
     def __setattr__(self, name, value):
         raise AttributeError(f"an audit is frozen; {name} cannot be set")
@@ -123,7 +134,7 @@ class Audit:
 
     def to_dict(self):
         """The audit as plain numbers, strings and lists."""
-        names = ("verdict", "reason", "digits", "culprit", "value", "evaluations", "size")
+        names = ("verdict", "reason", "digits", "culprit", "hessian", "value", "evaluations", "size")
         return {
             **{name: getattr(self, name) for name in names},
             "notes": list(self.notes),
@@ -164,10 +175,10 @@ class Audit:
         """One line for each direction."""
         lines = [
             (one.direction, f"{one.slope:.9g}", f"{one.difference:.9g}", f"{_share(abs(one.gap), one.scale):.0e}",
-             f"{one.resolution:.0e}", _order(one.rate1), _order(one.rate2), one.word, one.note)
+             f"{one.resolution:.0e}", _order(one.rate1), _order(one.rate2), _order(one.rate3), one.word, one.note)
             for one in self.lines
         ]  # fmt: skip
-        head = ("direction", "g . d", "differences", "gap", "bar", "order 1", "order 2", "", "")
+        head = ("direction", "g . d", "differences", "gap", "bar", "order 1", "order 2", "order 3", "", "")
         return table(lines, head)
 
 

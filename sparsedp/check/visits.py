@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.tape import ReverseNode, called, isbox, witnesses
+from sparsedp.tape import ReverseNode, called, isbox, untraced, witnesses
 
 __all__ = ["Visit", "bytes_held", "witnessed"]
 
@@ -78,6 +78,7 @@ def witnessed(nodes=None):
         """A node that reports itself."""
 
         vjp: Any
+        asks_again = nodes is None  # calls inside a loop are looked for on its way back
 
         def __init__(self, value, fun, args, options, nums, parents):
             super().__init__(value, fun, args, options, nums, parents)
@@ -97,11 +98,13 @@ def witnessed(nodes=None):
 
             self.vjp = watched
 
+    untraced[Witness] = untraced[ReverseNode]  # comparisons, shapes, rounding: plain values for this kind too
     witnesses.append(Witness)
     try:
         yield found
     finally:
         witnesses.remove(Witness)
+        del untraced[Witness]
 
 
 def bytes_held(nodes):

@@ -17,8 +17,9 @@ import numpy as np
 
 from sparsedp.fields import check_finite, place
 from sparsedp.flow.setup import Setup
+from sparsedp.grid import check_grid
 from sparsedp.ledger import active as recordings
-from sparsedp.ledger import count
+from sparsedp.ledger import count, tally
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import mask
 from sparsedp.solvers.choose import check_settings
@@ -41,7 +42,8 @@ def projection(grid, solid=None, boundary="no_slip", method="auto", rtol=1e-10, 
         Obstacles. Faces that touch one get 0.
     boundary : str or dict
         "no_slip", "free_slip" (both closed here), "inflow" (keeps the value that is given) or "outflow"
-        (pressure 0), for all bounded sides or as {"x": (lower, upper), ...}; see `flow_sides`.
+        (pressure 0), for all bounded sides or as {"x": (lower, upper), ...}; axes that are not named are
+        no_slip. An inflow is the value that the faces of that side already have.
     method, rtol, maxiter, **options
         Of the pressure solve, as in `inverse`.
 
@@ -76,6 +78,7 @@ def projection(grid, solid=None, boundary="no_slip", method="auto", rtol=1e-10, 
     >>> P(np.array([1.0, 2.0, 3.0, 4.0, 0.0, 0.0, 0.0, 0.0]))
     array([2., 3., 2., 3., 0., 0., 0., 0.])
     """
+    check_grid("projection", grid)
     check_settings(method, rtol, maxiter, "project")
     settings = (method, rtol, maxiter, options)
     return Projection(Setup(grid, solid, boundary, settings))
@@ -148,6 +151,7 @@ class Projected(Structure):
             return False
         run.status = "converged" if residual <= goal else "converged_at_roundoff"
         run.residual = residual / size if size else 0.0
+        tally.solves += 1
         if recordings:
             count(setup.solver.name, "adjoint" if turned else "solve")
         setup.solver.log.note(run.info(), turned)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.errors import NonFiniteError
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import is_number
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
@@ -20,8 +20,12 @@ from sparsedp.flow.walls import flow_sides, pressure_conditions
 from sparsedp.operators.boundary import identity, mask
 from sparsedp.operators.difference import gradient
 from sparsedp.solvers.choose import inverse
+from sparsedp.solvers.facts import magnitude
+from sparsedp.tape import isbox, plain
 
 __all__ = ["FlowStep", "flow_step"]
+
+ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
 
 
 def flow_step(
@@ -43,8 +47,8 @@ def flow_step(
     grid : Grid
     dt : float
         Time step > 0 [time].
-    viscosity : float
-        >= 0 [length^2 / time]. 0 builds no Laplacian.
+    viscosity : float or callable
+        >= 0 [length^2 / time]. 0 builds no Laplacian. ``viscosity(params)`` has a derivative; explicit only.
     force : callable, optional
         ``force(v, params)`` -> faces [velocity / time]; whatever is differentiable goes here.
     boundary, solid, solid_boundary
@@ -59,19 +63,26 @@ def flow_step(
     Returns
     -------
     FlowStep
-        ``step.start(v)`` makes the first state, a dict of the velocity "v" [velocity], the pressure "p"
-        [velocity^2] and the acceleration before "a"; ``step(state, params)`` the next one. For `rollout`.
+        ``step.start(v, params=None)`` makes the first state, a dict of the velocity "v" [velocity], the pressure "p"
+        [velocity^2] and the acceleration before "a"; ``step(state, params)`` the next one. For `rollout`. The params
+        are those of the force.
 
     Raises
     ------
     ValueError
         If dt or the viscosity is out of range, or a word of `boundary` is not known.
+    ShapeError
+        On use, if the state is not one that ``step.start`` makes.
+    DerivativeError
+        If dt or the viscosity is traced.
     NonFiniteError
         If dt or the viscosity is NaN or infinite; on use, if the velocity is.
+    UnstableStepError
+        If dt is beyond what explicit viscosity allows.
 
     Notes
     -----
-    A step of explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth).
+    A step of explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth); a longer one is refused.
     Cost: one pressure solve, and one solve for implicit viscosity.
     Source: van Kan, SIAM J. Sci. Stat. Comput. 7 (1986).
 
@@ -84,6 +95,15 @@ def flow_step(
     True
     """
     for name, number, least in (("dt", dt, "> 0"), ("viscosity", viscosity, ">= 0")):
+        if isbox(number):
+            raise DerivativeError(
+                f"flow_step needs a constant {name}, got a traced one; a derivative in the viscosity takes "
+                "viscosity=lambda params: ..."
+            )
+        if name == "viscosity" and callable(number):
+            if implicit:
+                raise ValueError("implicit viscosity of flow_step is a number, got a function; write implicit=False")
+            continue
         if not is_number(number) or number < 0 or (name == "dt" and number == 0):
             raise ValueError(f"flow_step needs {name} {least}, got {number!r}; write a number")
         if not np.isfinite(number):
@@ -102,11 +122,27 @@ class FlowStep:
         self.slope = gradient(grid, pressure_conditions(flow_sides(grid, boundary)), solid)
         self.kept = mask(grid.faces, self.project.structure.setup.open)
         self.convect: Any = convection(grid, boundary, solid) if convective else None
-        self.laplacian: Any = face_laplacian(grid, boundary, solid, solid_boundary) if viscosity else None
+        self.laplacian: Any = None
+        if viscosity:
+            self.laplacian = face_laplacian(grid, boundary, solid, solid_boundary)
         self.walls = walls if viscosity else None
         self.relax: Any = None
         if implicit and viscosity:
             self.relax = inverse(identity(grid.faces) - (0.5 * dt * viscosity) * self.laplacian)
+        elif viscosity:  # no eigenvalue is beyond the largest sum of a row
+            rows = magnitude(self.laplacian.structure)(np.ones(grid.faces.size))
+            self._steepest = float(np.max(rows, initial=0.0))
+            if not callable(viscosity):
+                self._check(viscosity)
+
+    def _check(self, viscosity):
+        """Adams-Bashforth is stable for dt nu |lambda| <= 1."""
+        rate = viscosity * self._steepest
+        if self.dt * rate > 1 + ROUNDING:
+            raise UnstableStepError(
+                f"flow_step is unstable for viscosity = {viscosity:.6g} with dt = {self.dt:.6g}: the largest "
+                f"stable dt is {1 / rate:.6g}; take smaller steps or write implicit=True"
+            )
 
     def start(self, v, params=None):
         """Velocity -> the first state: made incompressible, the pressure still unknown."""
@@ -121,13 +157,24 @@ class FlowStep:
         if self.convect is not None:
             a = a - self.convect(v, v)
         if self.laplacian is not None and self.relax is None:
-            a = a + self.viscosity * self._bend(v)
+            a = a + self._viscosity(params) * self._bend(v)
         return a
+
+    def _viscosity(self, params):
+        if not callable(self.viscosity):
+            return self.viscosity
+        found = self.viscosity(params)
+        if not is_number(plain(found)) or not 0 <= plain(found) < np.inf:
+            raise ValueError(f"the viscosity in flow_step must be a finite number >= 0, got {plain(found)}")
+        self._check(float(plain(found)))
+        return found
 
     def _bend(self, v):
         return self.laplacian(v) if self.walls is None else self.laplacian(v) + self.walls
 
     def __call__(self, state, params=None):
+        if not isinstance(state, dict) or state.keys() != {"v", "p", "a"}:
+            raise ShapeError("flow_step takes a dict of v, p and a as its state; make it with step.start")
         v, p, dt = state["v"], state["p"], self.dt
         a = self.acceleration(v, params)
         ahead = v + dt * (1.5 * a - 0.5 * state["a"] - self.slope(p))

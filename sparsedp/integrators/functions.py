@@ -107,7 +107,9 @@ class Functions:
         op, z = (self.op.T if transposed else self.op), float(z)
         for field in fields:
             if np.shape(field) != op.domain.shape:
-                raise ShapeError(f"{self.name} takes a field on {op.domain}, got an array of shape {np.shape(field)}")
+                raise ShapeError(
+                    f"{self.name} takes a field on {op.domain.told}, got an array of shape {np.shape(field)}"
+                )
         if z == 0:
             return self._at_zero(functions, op, fields)
         if any(np.iscomplexobj(field) for field in fields):

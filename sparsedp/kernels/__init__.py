@@ -25,6 +25,7 @@ __all__ = [
     "squares",
     "sweep",
     "threads",
+    "through_faces",
     "totals",
 ]
 
@@ -200,6 +201,26 @@ def sweep(x, lower, upper, inverses, column, row, ends):
         _native().sweep(x, lower, upper, inverses, column, row, ends, threads())
     else:
         plain.sweep(x, lower, upper, inverses, column, row, ends)
+
+
+def through_faces(u, k, lines, out, closed):
+    """Field, three components on faces, their lines -> out = L diag(k) R u in one pass -> whether it works here.
+
+    Needs `compiled`. See `sparsedp.structure.through` for the lines.
+
+    Parameters
+    ----------
+    u, out : float64 arrays, shape (n0, n1, n2)
+        C-contiguous, without overlap.
+    k : three float64 arrays
+        One for each axis; empty where the axis has one cell.
+    lines : four float64 arrays for each axis, shape (n_a + 1,), in a row
+    closed : bool
+        Whether faces with k = 0 carry 0, whatever the cells hold.
+    """
+    from sparsedp.kernels import conductance
+
+    return conductance.through_faces(u, k, lines, out, np.empty((threads(), u.shape[2] + 1)), closed, threads())
 
 
 def squares(x):

@@ -7,7 +7,7 @@ index (1, j + lead, 1); in 2-D there is one j and lead is 0.
 
 import numpy as np
 
-from sparsedp.kernels.multigrid_rows import PAD, ends, inner, rows
+from sparsedp.kernels.multigrid_rows import LANES, PAD, ends, inner, rows
 
 __all__ = [
     "inside",
@@ -45,9 +45,10 @@ def repeat(array, shape, periodic):
     return array
 
 
-def width(count):
-    """Length of a packed row of `count` cells: the padding, then an even number of vectors."""
-    return PAD + -(-count // 16) * 16
+def width(count, split=True):
+    """Length of a packed row of `count` cells: the padding, then vectors; an even number in natural order."""
+    whole = LANES if split else 2 * LANES
+    return PAD + -(-count // whole) * whole
 
 
 def packed(*shape, dtype=float):
@@ -77,6 +78,13 @@ def pack_fine_links(before, after, a, scale, step, shape, periodic, lead):
 
 
 @inner
+def _thrice(out, a, b, c):
+    """Every second product of three lines."""
+    for k in range(out.size):
+        out[k] = a[2 * k] * b[2 * k] * c[2 * k]
+
+
+@inner
 def pack_coarse_links(out, a, scale, step, shape, periodic, lead):
     """Links a from a cell to the cell `step` in front -> c, rows split by column parity."""
     half = (shape[2] + 1) // 2
@@ -85,9 +93,9 @@ def pack_coarse_links(out, a, scale, step, shape, periodic, lead):
         for j in range(shape[1]):
             row, l, m = 1 + i * shape[1] + j, i + 1, j + lead
             for p in range(2):
-                for k in range((shape[2] + 1 - p) // 2):
-                    c = p + 1 + 2 * k
-                    out[row, p, PAD + k] = a[l, m, c] * scale[l, m, c] * scale[l + d0, m + d1, c + d2]
+                last = PAD + (shape[2] + 1 - p) // 2
+                there = scale[l + d0, m + d1, p + 1 + d2 :]
+                _thrice(out[row, p, PAD:last], a[l, m, p + 1 :], scale[l, m, p + 1 :], there)
                 ends(rows(out)[0] + (2 * row + p) * rows(out)[1], half, out.dtype.type(0.0), periodic[2])
 
 

@@ -16,6 +16,7 @@ from numba.extending import intrinsic
 from sparsedp.kernels.pointers import address, get, pointer, prefetch, put
 
 __all__ = [
+    "LANES",
     "PAD",
     "advance",
     "blend",
@@ -26,6 +27,7 @@ __all__ = [
     "ends",
     "inner",
     "merge",
+    "mix",
     "narrow",
     "plus",
     "rest",
@@ -144,8 +146,8 @@ def weigh_onto(row, places, factors):
 
 @_operation
 def narrow(row, places, factors):
-    """(out, a): out = a, from d to T."""
-    row.store(row.load(places[1], "d", "T"), places[0], "T")
+    """(out, a), (factor,): out = factor a, from d to T."""
+    row.store(row.builder.fmul(row.splat(factors[0], "d"), row.load(places[1], "d", "d")), places[0], "T")
 
 
 @_operation
@@ -193,12 +195,21 @@ def advance(row, places, factors):
 
 @_operation
 def sum_up(row, places, factors):
-    """(z, r, total): z += r in T, total += z r in d; r is d."""
+    """(z, r, p, total), (own, factor): z = own p + factor (z + r) in T, total += z r in d; r is d."""
     r, z = row.load(places[1], "d", "d"), row.load(places[0], "T", "T")
     z = row.builder.fadd(z, row.cast(r, row.kinds["T"]) if row.kinds["T"] != _DOUBLE else r)
+    kept = row.builder.fmul(row.splat(factors[0], "T"), row.load(places[2], "T", "T"))
+    z = row.times(row.splat(factors[1], "T"), z, kept)
     row.store(z, places[0], "T")
     wide = row.cast(z, _DOUBLE) if row.kinds["T"] != _DOUBLE else z
-    row.store(row.times(wide, r, row.load(places[2], "d", "d")), places[2], "d")
+    row.store(row.times(wide, r, row.load(places[3], "d", "d")), places[3], "d")
+
+
+@_operation
+def mix(row, places, factors):
+    """(out, a), (own, factor): out = own out + factor a, in T."""
+    kept = row.builder.fmul(row.splat(factors[0], "T"), row.load(places[0], "T", "T"))
+    row.store(row.times(row.splat(factors[1], "T"), row.load(places[1], "T", "T"), kept), places[0], "T")
 
 
 @_operation

@@ -63,41 +63,45 @@ def update(r, q, gauge, alpha, shape, periodic, half, totals, sums, teams):
 
 
 @inner
-def _restrict(team, n, links, r, coarse, weights, starts, shape, periodic, half, rings, lines, teams):
+def _restrict(team, n, links, r, coarse, weights, starts, over, shape, periodic, half, rings, lines, teams):
     grid = shape, periodic, half
-    first = _share(n, team, teams), rows(links), rows(r), rows(coarse), rows(weights), address(starts)
+    first = _share(n, team, teams), rows(links), rows(r), rows(coarse), rows(weights), address(starts), over
     multigrid.restrict(*first, grid, links.dtype.type(0.0), links.itemsize, rings[team], rows(lines[team]))
 
 
 @_team
-def restrict(links, r, coarse, weights, starts, shape, periodic, half, rings, lines, teams):
+def restrict(links, r, coarse, weights, starts, over, shape, periodic, half, rings, lines, teams):
     """See `multigrid.restrict`."""
     n = (shape[0] + 1) // 2
     if teams == 1:
-        _restrict(n * 0, n, links, r, coarse, weights, starts, shape, periodic, half, rings, lines, teams)
+        _restrict(n * 0, n, links, r, coarse, weights, starts, over, shape, periodic, half, rings, lines, teams)
     else:
         for member in prange(teams):
             team = types.int64(member)
-            _restrict(team, n, links, r, coarse, weights, starts, shape, periodic, half, rings, lines, teams)
+            _restrict(team, n, links, r, coarse, weights, starts, over, shape, periodic, half, rings, lines, teams)
 
 
 @inner
-def _correct(team, n, links, r, z, coarse, weights, starts, shape, periodic, half, rings, totals, sums, teams):
+def _correct(team, n, links, r, z, coarse, weights, starts, over, shape, periodic, half, rings, totals, sums, teams):
     grid = shape, periodic, half
-    first = _share(n, team, teams), rows(links), rows(r), rows(z), rows(coarse), rows(weights), address(starts)
+    first = _share(n, team, teams), rows(links), rows(r), rows(z), rows(coarse), rows(weights), address(starts), over
     multigrid.correct(*first, grid, links.dtype.type(0.0), links.itemsize, rings[team], totals[team], sums)
 
 
 @_team
-def correct(links, r, z, coarse, weights, starts, shape, periodic, half, rings, totals, sums, teams):
+def correct(links, r, z, coarse, weights, starts, over, shape, periodic, half, rings, totals, sums, teams):
     """See `multigrid.correct`."""
     n = sums.shape[0]
     if teams == 1:
-        _correct(n * 0, n, links, r, z, coarse, weights, starts, shape, periodic, half, rings, totals, sums, teams)
+        _correct(
+            n * 0, n, links, r, z, coarse, weights, starts, over, shape, periodic, half, rings, totals, sums, teams
+        )
     else:
         for member in prange(teams):
             team = types.int64(member)
-            _correct(team, n, links, r, z, coarse, weights, starts, shape, periodic, half, rings, totals, sums, teams)
+            _correct(
+                team, n, links, r, z, coarse, weights, starts, over, shape, periodic, half, rings, totals, sums, teams
+            )
 
 
 @inner

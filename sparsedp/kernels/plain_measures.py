@@ -27,4 +27,5 @@ def measure(mode, b, x, number, out):
 
 
 def _square(x):
-    return sum(part.dot(part) for part in (x[start : start + SMALL] for start in range(0, x.size, SMALL)))
+    with np.errstate(over="ignore"):  # as the compiled twin: the caller sees inf, or did not ask for the sum
+        return sum(part.dot(part) for part in (x[start : start + SMALL] for start in range(0, x.size, SMALL)))

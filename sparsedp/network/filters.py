@@ -16,7 +16,7 @@ from sparsedp.errors import ShapeError
 from sparsedp.kernels.correlation import correlate, fold, pad, weigh
 from sparsedp.tape import Rule, differentiable, plain
 
-__all__ = ["convolution"]
+__all__ = ["check_widths", "convolution"]
 
 PADDINGS = ("periodic", "zero", "replicate")
 
@@ -51,9 +51,26 @@ def convolution(p, x, padding="periodic"):
     >>> convolution(p, np.array([[[0.0, 1.0, 4.0, 9.0]]]), "replicate")
     array([[[0.5, 2. , 4. , 2.5]]])
     """
-    weight, bias = p["weight"], p["bias"]
+    weight, bias = weight_and_bias(p, "convolution")
     _check(np.shape(plain(weight)), np.shape(plain(bias)), np.shape(plain(x)), padding)
     return _convolution(x, weight, bias, padding)
+
+
+def weight_and_bias(p, layer):
+    """The two arrays of one layer."""
+    try:
+        return p["weight"], p["bias"]
+    except (KeyError, TypeError, IndexError):
+        found = ", ".join(map(str, p)) if isinstance(p, dict) else type(p).__name__
+        raise TypeError(
+            f"{layer} takes the dict of one layer, with weight and bias, got {found}; write p['name'] of that layer"
+        ) from None
+
+
+def check_widths(widths):
+    """Refuse filters without a middle."""
+    if any(width % 2 == 0 for width in widths):
+        raise ValueError(f"convolution needs odd widths, so that the output lies on the same cells, got {widths}")
 
 
 def _check(weight, bias, x, padding):
@@ -66,8 +83,7 @@ def _check(weight, bias, x, padding):
             f"widths), got {x} and {weight}"
         )
     widths, copies = weight[-dim:], weight[: len(weight) - dim - 2]
-    if any(width % 2 == 0 for width in widths):
-        raise ValueError(f"convolution needs odd widths, so that the output lies on the same cells, got {widths}")
+    check_widths(widths)
     if weight[-dim - 1] != x[1] or bias != (*copies, weight[-dim - 2]) or copies not in ((), x[:1]):
         raise ShapeError(f"convolution got x {x}, weight {weight} and bias {bias}; inputs, outputs or samples differ")
 

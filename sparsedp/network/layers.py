@@ -4,7 +4,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.network.filters import convolution
+from sparsedp.network.filters import convolution, weight_and_bias
 from sparsedp.tape import differentiable, plain
 
 __all__ = ["dense", "relu", "residual_block", "softplus", "tanh"]
@@ -33,7 +33,7 @@ def dense(p, x):
     >>> dense({"weight": np.array([[1.0, 2.0]]), "bias": np.zeros(2)}, np.array([[3.0]]))
     array([[3., 6.]])
     """
-    weight, bias = p["weight"], p["bias"]
+    weight, bias = weight_and_bias(p, "dense")
     w, b, given = (np.shape(plain(value)) for value in (weight, bias, x))
     copies = w[:-2]
     if len(given) != 2 or w[-2:-1] != given[1:] or b != (*copies, *w[-1:]) or copies not in ((), given[:1]):

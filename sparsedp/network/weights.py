@@ -5,6 +5,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from sparsedp.network.filters import check_widths
+
 __all__ = ["convolution_weights", "dense_weights", "load", "residual_weights", "save"]
 
 FORMAT = "sparsedp network 1"
@@ -31,7 +33,7 @@ def dense_weights(rng, inputs, outputs, gain=1.0):
     >>> p["weight"].shape, p["bias"].shape
     ((3, 2), (2,))
     """
-    weight = rng.standard_normal((inputs, outputs)) * (gain / np.sqrt(max(inputs, 1)))
+    weight = _normal(rng, (inputs, outputs)) * (gain / np.sqrt(max(inputs, 1)))
     return {"weight": weight, "bias": np.zeros(outputs)}
 
 
@@ -58,9 +60,16 @@ def convolution_weights(rng, inputs, outputs, widths, gain=1.0):
     (8, 1, 5, 5)
     """
     widths = (widths,) if np.ndim(widths) == 0 else tuple(widths)
+    check_widths(widths)
     fan = max(inputs * int(np.prod(widths)), 1)
-    weight = rng.standard_normal((outputs, inputs, *widths)) * (gain / np.sqrt(fan))
+    weight = _normal(rng, (outputs, inputs, *widths)) * (gain / np.sqrt(fan))
     return {"weight": weight, "bias": np.zeros(outputs)}
+
+
+def _normal(rng, shape):
+    if not hasattr(rng, "standard_normal"):
+        raise TypeError(f"weights are drawn from a numpy Generator, got {rng!r}; write np.random.default_rng(0)")
+    return rng.standard_normal(shape)
 
 
 def residual_weights(rng, channels, widths, gain=1.0):

@@ -5,6 +5,7 @@ import numpy as np
 from sparsedp.conditions import resolve
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite
+from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, wall_slopes
 from sparsedp.space import Space
@@ -29,12 +30,18 @@ def lift(grid, boundary):
     -------
     Operator
         in: one flat array of wall values, x-lower, x-upper, y-lower, ... (periodic axes have none);
-        ``op.domain.join(...)`` builds it from one array or number for each wall. out: faces [unit / length].
+        ``op.domain.join(...)`` builds it from one array (in 2-D: the values along the wall) or number for each wall.
+        out: faces [unit / length].
 
     Raises
     ------
     ValueError
         If `boundary` names a periodic axis.
+
+    Notes
+    -----
+    With walls of values v the equation -D (G u + B v) = b is solved by ``solve(b + D(B(v)))``,
+    solve = inverse(-D @ G); with a coefficient, by ``solve(k, b + D(k * B(v)))``.
 
     Examples
     --------
@@ -104,6 +111,7 @@ def interior(grid, solid=None):
     >>> interior(Grid(3))(np.ones(4))
     array([0., 1., 1., 0.])
     """
+    check_grid("interior", grid)
     keep = [np.ones(part, dtype=bool) for part in grid.faces.parts]
     for axis, inner in enumerate(keep):
         if not grid.periodic[axis]:

@@ -1,6 +1,7 @@
 """Differences on the staggered grid: gradient, divergence, laplacian, curl, upwind."""
 
 from sparsedp.conditions import check_condition, neumann, resolve
+from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.stencils import along, differences, one_sided, pick, slopes
@@ -95,6 +96,7 @@ def divergence(grid):
     >>> divergence(Grid(3))(np.array([0.0, 1.0, 3.0, 3.0]))
     array([1., 2., 0.])
     """
+    check_grid("divergence", grid)
     blocks = {(0, a): along(a, grid.dim, differences(grid, a)) for a in range(grid.dim)}
     return Operator(Kronecker(grid.cells.parts, grid.faces.parts, blocks), grid.faces, grid.cells, "divergence")
 
@@ -132,6 +134,7 @@ def laplacian(grid, boundary=neumann, solid=None, solid_boundary=neumann):
     >>> laplacian(Grid(3))(np.array([1.0, 2.0, 4.0]))
     array([ 1.,  1., -2.])
     """
+    check_grid("laplacian", grid)
     product = divergence(grid) @ gradient(grid, boundary, solid, solid_boundary)
     return Operator(product.structure, grid.cells, grid.cells, "laplacian")
 
@@ -162,6 +165,7 @@ def curl(grid):
     >>> curl(grid)(np.array([[0.0, 1.0], [0.0, 0.0]]))
     array([1., 0., 0., 1.])
     """
+    check_grid("curl", grid)
     if grid.dim == 1:
         raise ValueError(f"curl needs a 2-D or 3-D grid, got {grid}; a 1-D slope is gradient(grid)")
     if grid.dim == 2:
@@ -204,6 +208,7 @@ def upwind(grid, axis=0, direction=1, boundary=neumann):
     >>> upwind(Grid(3, periodic=True))(np.array([1.0, 2.0, 4.0]))
     array([-3.,  1.,  2.])
     """
+    check_grid("upwind", grid)
     axis = grid.axis(axis)
     if direction not in (1, -1):
         raise ValueError(f"upwind needs direction 1 or -1, got {direction!r}")

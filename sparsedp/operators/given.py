@@ -4,13 +4,19 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite
+from sparsedp.fields import check_finite, check_plain
 from sparsedp.operator import Operator
 from sparsedp.space import Space
 from sparsedp.structure.explicit import Matrix
 from sparsedp.structure.lazy import Functions
 
-__all__ = ["from_functions", "from_linear_operator", "from_matrix"]
+__all__ = ["check_operator", "from_functions", "from_linear_operator", "from_matrix"]
+
+
+def check_operator(name, op):
+    """Refuse what is no Operator."""
+    if not isinstance(op, Operator):
+        raise TypeError(f"{name} takes an Operator, got {type(op).__name__}; write dp.from_matrix(...) first")
 
 
 def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
@@ -30,6 +36,8 @@ def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
 
     Raises
     ------
+    TypeError
+        If the matrix does not hold numbers, or is a masked array.
     ShapeError
         If the matrix is not 2-D or does not fit the spaces.
     NonFiniteError
@@ -43,7 +51,8 @@ def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
     >>> rows.T(np.array([1.0, 0.0]))
     array([1., 2.])
     """
-    entries = matrix if sp.issparse(matrix) else np.asarray(matrix)
+    check_plain(name, matrix)
+    entries = matrix if sp.issparse(matrix) else _rows(name, matrix)
     if entries.ndim != 2:
         raise ShapeError(
             f"{name} needs a 2-D matrix, got an array of shape {entries.shape}; write matrix[None] for a row"
@@ -59,6 +68,13 @@ def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
         lambda n: (int(np.searchsorted(rows, n, side="right")) - 1, int(columns[n])),
     )
     return Operator(structure, _space(domain, structure.shape[1]), _space(codomain, structure.shape[0]), name)
+
+
+def _rows(name, matrix):
+    try:
+        return np.asarray(matrix)
+    except ValueError:
+        raise ShapeError(f"{name} needs rows of one length, got a list of different ones; fill them with 0") from None
 
 
 def from_linear_operator(linop, domain=None, codomain=None, name="operator"):
@@ -78,6 +94,8 @@ def from_linear_operator(linop, domain=None, codomain=None, name="operator"):
 
     Raises
     ------
+    TypeError
+        If `linop` has no shape or no matvec.
     ShapeError
         If the operator does not fit the spaces.
     DerivativeError
@@ -90,6 +108,9 @@ def from_linear_operator(linop, domain=None, codomain=None, name="operator"):
     >>> op.T(np.array([1.0, 0.0]))
     array([1., 2.])
     """
+    if not (hasattr(linop, "shape") and hasattr(linop, "matvec")):
+        instead = "from_matrix" if hasattr(linop, "shape") else "from_functions"
+        raise TypeError(f"from_linear_operator takes a LinearOperator, got {type(linop).__name__}; write dp.{instead}")
     rows, columns = linop.shape
 
     def forward(x):

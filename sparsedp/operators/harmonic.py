@@ -13,6 +13,7 @@ import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_finite
+from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, cell_beside
 from sparsedp.structure.kronecker import Kronecker
@@ -50,6 +51,7 @@ def harmonic_average(grid):
     >>> harmonic_average(Grid(2))(np.array([1.0, 3.0]))
     array([1. , 1.5, 3. ])
     """
+    check_grid("harmonic_average", grid)
     below, above = (_beside(grid, upper) for upper in (False, True))
     widths = grid.join(*(_full_widths(grid, axis, upper=False) for axis in range(grid.dim)))
     others = grid.join(*(_full_widths(grid, axis, upper=True) for axis in range(grid.dim)))

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from sparsedp.conditions import neumann, resolve
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_finite, is_whole
-from sparsedp.grid import Grid
+from sparsedp.grid import Grid, check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.interpolation import linear_weights
 from sparsedp.operators.stencils import along, means, single
@@ -74,6 +74,7 @@ def sample(grid, points):
     >>> sample(Grid(3), [0.5, 1.25])(np.array([1.0, 2.0, 4.0]))
     array([1.  , 1.75])
     """
+    check_grid("sample", grid)
     given = real_numbers(points, "points", "points=[[0.5, 1.0]]").astype(float)
     points = given
     if points.ndim == 1 and grid.dim == 1:
@@ -122,6 +123,7 @@ def restrict(grid, factor):
     >>> restrict(Grid(4), 2)(np.array([1.0, 3.0, 5.0, 9.0]))
     array([2., 7.])
     """
+    check_grid("restrict", grid)
     coarse, factors = _coarse(grid, factor)
     lines = []
     for h, size in zip(grid.widths, factors, strict=True):
@@ -163,6 +165,7 @@ def prolong(grid, factor, interpolation="constant"):
     >>> prolong(Grid(4), 2, "linear")(np.array([1.0, 3.0]))
     array([0.5, 1.5, 2.5, 3.5])
     """
+    check_grid("prolong", grid)
     if interpolation not in ("constant", "linear"):
         raise ValueError(f"prolong needs interpolation 'constant' or 'linear', got {interpolation!r}")
     coarse, factors = _coarse(grid, factor)
@@ -211,6 +214,7 @@ def embed(grid, axis):
     >>> embed(Grid((1, 1)), "x")(np.array([[1.0], [2.0]]))
     array([1., 2., 0., 0.])
     """
+    check_grid("embed", grid)
     axis = grid.axis(axis)
     component = Space(grid.face_shape(axis), f"{grid.axes[axis]}-faces", grid)
     blocks = {(axis, 0): along(axis, grid.dim, None)}
@@ -240,5 +244,6 @@ def part(grid, axis):
     >>> part(Grid((1, 1)), "y")(np.array([1.0, 2.0, 3.0, 4.0]))
     array([[3., 4.]])
     """
+    check_grid("part", grid)
     turned = embed(grid, axis)
     return Operator(turned.structure.transpose(), turned.codomain, turned.domain, "part")

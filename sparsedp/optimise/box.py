@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sparsedp.errors import ShapeError
 from sparsedp.fields import is_number
 from sparsedp.tree import leaves
 
@@ -30,6 +31,8 @@ class Box:
         ------
         ValueError
             If bounds is not a pair, has another structure than start, is NaN, or a lower bound is above an upper.
+        ShapeError
+            If a bound has another shape than its array.
         """
         if bounds is None:
             return cls()
@@ -67,5 +70,11 @@ def _side(side, packing, start, without):
             f"a bound must be a number or have the structure of start, got {len(given)} leaves where start has "
             f"{len(wanted)}; write one number, or a tree like start"
         )
-    full = [np.full(np.shape(x), without if b is None else b) for x, b in zip(wanted, given, strict=True)]
-    return packing.pack_leaves(full)
+    return packing.pack_leaves([_full(np.shape(x), without if b is None else b) for x, b in zip(wanted, given)])
+
+
+def _full(shape, bound):
+    try:
+        return np.full(shape, bound)
+    except ValueError:
+        raise ShapeError(f"a bound of shape {np.shape(bound)} does not fit start, of shape {shape}") from None

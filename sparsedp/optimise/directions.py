@@ -10,16 +10,17 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from sparsedp.fields import is_number
+from sparsedp.fields import check_function, is_number
 from sparsedp.optimise.flat import Packing
 from sparsedp.optimise.linearised import Linearised
-from sparsedp.optimise.triangle import thin
+from sparsedp.optimise.singular_values import singular
 
 __all__ = ["Direction", "Family", "update_direction"]
 
 DENSE = 3e7  # entries of a Jacobian (240 MB) above which it is not formed
 SETTLED = 1e-9  # relative change of the direction at which the bidiagonalisation stops
 EXHAUSTED = 1e-13  # relative size below which a new basis vector is rounding
+CANCELLED = 0.1  # a vector of which less is left after Gram and Schmidt's pass gets a second one
 LOOK = 4  # fewest steps of the bidiagonalisation between two looks at the direction, which cost an SVD each
 BLOCK = 32  # rows of a basis that are stored together
 
@@ -56,9 +57,9 @@ class Family:
     truncation : float
         Singular values below this share of the largest are left out.
     method : "auto", "dense" or "krylov"
-        dense: J is formed; thin QR of J or J^T by products of matrices, SVD of the small triangle (the Gram matrix,
-        which squares the spectrum, serves when truncation > 1e-7). krylov: Golub-Kahan bidiagonalisation with full
-        reorthogonalisation from products with J and J^T alone; memory rank (m + n).
+        dense: J is formed, and its singular values come group by group from Gram matrices, as exact as from an SVD
+        (when truncation > 1e-7 all at once). krylov: Golub-Kahan bidiagonalisation with full reorthogonalisation from
+        products with J and J^T alone; memory rank (m + n).
     rank : int or None
         Most steps of the bidiagonalisation; None: until the direction has settled.
     apart : bool
@@ -94,13 +95,13 @@ class Family:
         if self.truncation > 1e-7 and len(jacobian) <= jacobian.shape[1]:
             return self._gram(jacobian, g)
         wide = len(jacobian) <= jacobian.shape[1]
-        factor = thin(jacobian if wide else jacobian.T)
-        left, s, right = scipy.linalg.svd(factor.triangle, full_matrices=False, check_finite=False)
-        if wide:  # J = T Q = left s right Q
-            weights, kept = self._weights(s, left.T @ g)
-            return Direction(factor.along(right.T @ weights), s, kept, "dense")
-        weights, kept = self._weights(s, right @ factor.across(g))  # J^T = T Q
-        return Direction(left @ weights, s, kept, "dense")
+        if wide:
+            found = singular(jacobian)
+            weights, kept = self._weights(found.s, found.left.T @ g)
+            return Direction(found.along(weights), found.s, kept, "dense")
+        found = singular(jacobian.T)
+        weights, kept = self._weights(found.s, found.across(g))
+        return Direction(found.left @ weights, found.s, kept, "dense")
 
     def _gram(self, jacobian, g):
         squares, u = scipy.linalg.eigh(jacobian @ jacobian.T, check_finite=False)
@@ -169,11 +170,12 @@ class _Rows:
         return [block[: self.count - BLOCK * i] for i, block in enumerate(self._blocks)]
 
     def apart(self, vector):
-        """The part of a vector orthogonal to the rows; twice, so that rounding does not bring them back."""
-        for _ in range(2):
-            shares = [rows @ vector for rows in self._parts()]
-            vector = vector - self._sum(shares)
-        return vector
+        """The part of a vector orthogonal to the rows; twice where little is left, so that rounding stays out."""
+        before = float(np.linalg.norm(vector))
+        vector = vector - self._sum([rows @ vector for rows in self._parts()])
+        if np.linalg.norm(vector) > CANCELLED * before:
+            return vector
+        return vector - self._sum([rows @ vector for rows in self._parts()])
 
     def combine(self, weights):
         """weights @ rows."""
@@ -248,7 +250,8 @@ def update_direction(outputs, x, g=None, **options):
         The cotangent, dL/dy. Default: the outputs themselves, the gradient of half their sum of squares.
     **options
         power=0.75 (0: gradient, 3/4: half-inverse, 1: Gauss-Newton), damping=0.0, truncation=1e-10,
-        method="auto" | "dense" | "krylov", rank=None, apart=False.
+        method="auto" | "dense" | "krylov", rank=None, apart=False. truncation: singular values below this share
+        of the largest are left out; rank: at most so many are kept; apart: as in `minimise`.
 
     Returns
     -------
@@ -275,6 +278,7 @@ def update_direction(outputs, x, g=None, **options):
     >>> direction.spectrum
     array([4., 1.])
     """
+    check_function("update_direction", outputs, "lambda x: A @ x - b")
     family, packing = Family(**options), Packing(x)
     linearised = Linearised(outputs, packing, packing.pack(x))
     cotangent = linearised.flat if g is None else linearised.like(g)

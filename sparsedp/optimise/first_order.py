@@ -92,9 +92,9 @@ def backtracked(here, step, trials, along):
         refused |= trial.refused
         if not trial.refused and _lower(trial, here, ENOUGH * fall):
             return trial, share
-        if fall <= here.rounding:
+        if abs(fall) <= here.rounding:  # below 0 where bounds turn a long step uphill: a shorter one may do
             break
-    hopeless = not refused and fall <= 100 * share * here.rounding
+    hopeless = not refused and abs(fall) <= 100 * share * here.rounding
     raise Stuck("rounding" if hopeless else f"no lower point along {along}")
 
 

@@ -98,16 +98,20 @@ class Packing:
         return anp.concatenate([anp.reshape(leaves[place], (-1,)) for place in self._places])
 
     def copies(self, tree, count):
-        """Every floating leaf with a new leading axis of so many copies of itself."""
+        """Every floating leaf with a new leading axis of so many copies of itself; read-only, they share memory."""
         leaves = list(flatten(tree)[0])
         for place in self._places:
-            leaves[place] = np.repeat(np.asarray(leaves[place])[None], count, axis=0)
+            leaf = np.asarray(leaves[place])
+            leaves[place] = np.broadcast_to(leaf, (count, *leaf.shape))
         return self._rebuild(leaves)
 
-    def pack_copies(self, tree, count):
-        """Tree as `copies` gives it -> one packed row for each copy."""
-        leaves = flatten(tree)[0]
-        return np.concatenate([np.asarray(leaves[place]).reshape(count, -1) for place in self._places], axis=1)
+    def pack_copies(self, tree, out):
+        """Tree as `copies` gives it -> one packed row of `out` for each copy."""
+        leaves, start = flatten(tree)[0], 0
+        for place in self._places:
+            rows = np.asarray(leaves[place]).reshape(len(out), -1)
+            out[:, start : start + rows.shape[1]] = rows
+            start += rows.shape[1]
 
 
 def _parts(values):

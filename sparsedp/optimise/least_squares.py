@@ -12,8 +12,8 @@ from scipy.sparse.linalg import LinearOperator, lsmr
 from sparsedp.fields import is_number
 from sparsedp.optimise.directions import DENSE, Family
 from sparsedp.optimise.first_order import HALVINGS, admissible, backtracked
+from sparsedp.optimise.singular_values import singular
 from sparsedp.optimise.trials import Stuck, Trial, norm
-from sparsedp.optimise.triangle import thin
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 
@@ -55,8 +55,13 @@ class _Normal:
         if damping > EXACT * np.linalg.norm(self._jacobian) ** 2:
             return -self._damped(damping)
         if self._factor is None:
-            self._factor = _triangle(self._jacobian, self._linearised.flat)
+            self._factor = _decomposed(self._jacobian, self._linearised.flat)
         return -_solve(self._factor, damping)
+
+    def fall(self, d):
+        """How far the linearised problem falls along d, which a bound may have cut short."""
+        change = self._linearised.push(d)
+        return -float(np.dot(change, self._linearised.flat) + 0.5 * np.dot(change, change))
 
     def _damped(self, damping):
         """By Cholesky of J J^T + damping or J^T J + damping, whichever is small."""
@@ -64,8 +69,9 @@ class _Normal:
         wide = len(jacobian) < jacobian.shape[1]
         if self._gram is None:
             self._gram = jacobian @ jacobian.T if wide else jacobian.T @ jacobian
-        matrix = self._gram + damping * np.eye(len(self._gram))
-        factor = scipy.linalg.cho_factor(matrix, overwrite_a=True, check_finite=False)
+        matrix = self._gram.copy()
+        np.einsum("ii->i", matrix)[:] += damping
+        factor = scipy.linalg.cho_factor(matrix.T, overwrite_a=True, check_finite=False)
         if wide:
             return scipy.linalg.cho_solve(factor, r, check_finite=False) @ jacobian
         return scipy.linalg.cho_solve(factor, r @ jacobian, check_finite=False)
@@ -78,14 +84,13 @@ class _Normal:
         return lsmr(product, self._linearised.flat, damp=np.sqrt(damping), atol=FORCING, btol=FORCING, conlim=1e14)[0]
 
 
-def _triangle(jacobian, r):
-    """J = Q^T T^T or T Q and the SVD of the small T, so that every damping costs one product."""
-    wide = len(jacobian) < jacobian.shape[1]
-    factor = thin(jacobian if wide else jacobian.T)
-    left, s, right = scipy.linalg.svd(factor.triangle, full_matrices=False, check_finite=False)
-    if wide:
-        return (lambda shares: factor.along(right.T @ shares)), s, left.T @ r, max(jacobian.shape)
-    return (lambda shares: left @ shares), s, right @ factor.across(r), max(jacobian.shape)
+def _decomposed(jacobian, r):
+    """What every damping shares: how to combine directions, singular values, the parts of r along them."""
+    if len(jacobian) < jacobian.shape[1]:
+        found = singular(jacobian)
+        return found.along, found.s, found.left.T @ r, max(jacobian.shape)
+    found = singular(jacobian.T)
+    return (lambda shares: found.left @ shares), found.s, found.across(r), max(jacobian.shape)
 
 
 def _solve(factor, damping):
@@ -160,7 +165,8 @@ class LevenbergMarquardt:
             trial = trials(trials.box.inside(here.vector + step))
             predicted = 0.5 * float(np.dot(step, damping * step - here.slope))
             if not trial.refused and trial.value < here.value:
-                gain = (here.value - trial.value) / predicted if predicted > 0 else 0.0
+                fall = predicted if trials.box.open else normal.fall(trial.vector - here.vector)
+                gain = (here.value - trial.value) / fall if fall > 0 else 0.0
                 return SquaresState(trial, damping * max(1 / 3, 1 - (2 * gain - 1) ** 3))
             if predicted <= here.rounding:
                 break

@@ -6,7 +6,7 @@ from sparsedp.derivative import pullback, pushforward
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite
 
-__all__ = ["Linearised"]
+__all__ = ["Linearised", "Restricted"]
 
 NOT_APART = (
     "with apart=True every leaf of x gets a leading axis of {} copies, one for each sample, and the outputs do not "
@@ -89,7 +89,7 @@ class Linearised:
         weight = np.zeros((samples, width))
         for column in range(width):
             weight[:, column] = 1.0
-            jacobian[:, column] = self._packing.pack_copies(pull(weight.reshape(value.shape)), samples)
+            self._packing.pack_copies(pull(weight.reshape(value.shape)), jacobian[:, column])
             weight[:, column] = 0.0
         jacobian = jacobian.reshape(self.shape)
         # A function that looks at one copy alone gives outputs of the right shape and wrong rows.
@@ -98,3 +98,31 @@ class Linearised:
         if not np.linalg.norm(found - known) <= 1e-6 * np.linalg.norm(known):
             raise ShapeError(NOT_APART.format(samples))
         return jacobian
+
+
+class Restricted:
+    """A linearisation in which some unknowns stand still: their columns of J are 0.
+
+    A step that counts on unknowns which a bound then holds back is no descent for the others.
+
+    Parameters
+    ----------
+    whole : Linearised
+    free : (n,) bool array
+    """
+
+    def __init__(self, whole, free):
+        self._whole, self._free = whole, free
+        self.flat, self.shape = whole.flat, whole.shape
+
+    def pull(self, w):
+        """(m,) -> J^T w, (n,)."""
+        return np.where(self._free, self._whole.pull(w), 0.0)
+
+    def push(self, v):
+        """(n,) -> J v, (m,)."""
+        return self._whole.push(np.where(self._free, v, 0.0))
+
+    def rows(self, apart=False):
+        """J, m x n."""
+        return np.where(self._free, self._whole.rows(apart), 0.0)

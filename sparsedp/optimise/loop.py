@@ -3,7 +3,7 @@
 import inspect
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import is_number, is_whole
+from sparsedp.fields import check_function, is_number, is_whole
 from sparsedp.optimise.batches import Batches
 from sparsedp.optimise.box import Box
 from sparsedp.optimise.first_order import Adam, Descent
@@ -74,7 +74,8 @@ def minimise(
     gradient : callable, optional
         ``gradient(x)``, with the structure of x. Default: reverse mode.
     bounds : (lower, upper), optional
-        Each a number, None for none, or a tree like start. Points are moved onto the box.
+        Each a number, None for none, or a tree like start. Points are moved onto the box. half_inverse compares
+        no losses and may settle elsewhere on the box than the others.
     project : callable, optional
         ``project(x)``, a linear projection such as dp.projection(grid): the loss sees project(x), and so does the
         result. Differentiable.
@@ -82,13 +83,16 @@ def minimise(
         The loss of iteration i is ``loss(x, batches[i % len(batches)])``, or ``loss(x, batches(i))``. For gd with a
         rate, adam and half_inverse; the result is the last point, not the best one.
     checkpoint : path, optional
-        A folder that keeps the last two states. A run that was killed goes on from the last one, to the same bits.
+        A folder that keeps the last two states. The same call goes on from the last one, to the same bits, when the
+        run was killed, stopped by its callback or by maxiter; a new problem needs a new folder.
     **options
         lbfgs: memory=10, line_search=20. gd: rate=None (found by backtracking), momentum=0.0,
         line_search=None or "backtracking". adam: rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8. newton_cg: inner=200.
         gauss_newton: apart=False, dense=None. levenberg_marquardt: damping=1e-3, apart, dense.
         half_inverse: rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto".
-        physical_gradient: physics, inverse, rate=1.0.
+        physical_gradient: physics, inverse, rate=1.0. apart=True: residuals along axis 0 are samples, and the loss
+        takes every leaf of x with a leading axis of copies, one for each (a few products give the whole Jacobian).
+        dense: whether the Jacobian is formed; None: when it is small. truncation, rank: see `update_direction`.
 
     Returns
     -------
@@ -119,6 +123,9 @@ def minimise(
     >>> best.converged
     True
     """
+    check_function("minimise", loss, "lambda x: np.sum(x**2)")
+    if callback is not None:
+        check_function("callback of minimise", callback, "lambda record, x: False")
     stepper = _stepper(method, options)
     if not is_whole(maxiter, 0):
         raise ValueError(f"minimise needs maxiter >= 0, a whole number, got {maxiter!r}; the default is 100")

@@ -12,8 +12,8 @@ SHOWN = 6  # lines of the history at each end
 class Record(NamedTuple):
     """One iteration; number 0 is the start.
 
-    `seconds` and `evaluations` count from the start of the run; `failed` lists the trial points that the
-    loss refused in this iteration, as (error, message).
+    `seconds`, `evaluations` and `solves` (forward and adjoint, of every inverse) count from the start of the
+    run; `failed` lists the trial points that the loss refused in this iteration, as (error, message).
     """
 
     iteration: int
@@ -22,6 +22,7 @@ class Record(NamedTuple):
     seconds: float
     evaluations: int
     failed: tuple[Failure, ...] = ()
+    solves: int = 0
 
 
 class Minimum:
@@ -65,7 +66,7 @@ class Minimum:
     def __str__(self):
         last = self.history[-1]
         head = f"{self.method}: loss {self.value:.6g} after {last.iteration} iterations, {self.evaluations} evaluations"
-        lines = [f"{'n':>6}  {'loss':>13}  {'gradient':>9}  {'seconds':>8}  evaluations"]
+        lines = [f"{'n':>6}  {'loss':>13}  {'gradient':>9}  {'seconds':>8}  evaluations  solves"]
         cut = len(self.history) > 2 * SHOWN + 1
         shown = self.history[:SHOWN] + self.history[-SHOWN:] if cut else self.history
         lines += [_line(record) for record in shown]
@@ -80,4 +81,4 @@ def _line(record):
     text = f"{record.iteration:6d}  {record.value:13.6e}  {record.gradient_norm:9.2e}  {record.seconds:8.2f}"
     words = sorted({failure.error for failure in record.failed})
     refused = f"  {len(record.failed)} refused: {', '.join(words)}" if record.failed else ""
-    return f"{text}  {record.evaluations:11d}{refused}"
+    return f"{text}  {record.evaluations:11d}  {record.solves:6d}{refused}"

@@ -57,7 +57,7 @@ class Journal:
         now = time.perf_counter()
         if self._checkpoint is None or (SHARE * (now - self._last) < self._cost and not watch.stopped):
             return
-        table = np.array([record[:5] for record in watch.history], dtype=float)
+        table = np.array([(*record[:5], record.solves) for record in watch.history], dtype=float)
         failed = {str(record.iteration): record.failed for record in watch.history if record.failed}
         words = {"evaluations": trials.count, "stopped": watch.stopped, "failed": failed}
         self._checkpoint.save(watch.iteration, ((state, trials.best), table), words)
@@ -67,13 +67,13 @@ class Journal:
 
 def _restored(template, found):
     """Leaves from the file -> ((state, best trial), history), numbers as the kinds that the template has."""
-    originals, rebuild = flatten(((template, template.trial), np.empty((0, 5))))
+    originals, rebuild = flatten(((template, template.trial), np.empty((0, 6))))
     pairs = zip(originals, found, strict=True)
     return rebuild(leaf if isinstance(like, np.ndarray) else type(like)(leaf) for like, leaf in pairs)
 
 
 def _records(table, failed):
     for row in table:
-        iteration, value, size, seconds, evaluations = row
+        iteration, value, size, seconds, evaluations, solves = row
         failures = tuple(Failure(*words) for words in failed.get(str(int(iteration)), ()))
-        yield Record(int(iteration), float(value), float(size), float(seconds), int(evaluations), failures)
+        yield Record(int(iteration), float(value), float(size), float(seconds), int(evaluations), failures, int(solves))

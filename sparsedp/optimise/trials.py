@@ -8,7 +8,7 @@ from sparsedp.derivative import pullback, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.optimise.batches import Batches
 from sparsedp.optimise.box import Box
-from sparsedp.optimise.linearised import Linearised
+from sparsedp.optimise.linearised import Linearised, Restricted
 from sparsedp.tape import isbox
 
 __all__ = ["Failure", "Stuck", "Trial", "Trials", "norm", "power_of_two"]
@@ -112,7 +112,13 @@ class Trials:
         return float(value), self._packing.pack_gradient(gradient)
 
     def linearised(self, trial):
-        """The residuals at a point and their Jacobian, on the batch that saw it: kept, when it was the last one."""
+        """The residuals at a point and their Jacobian in what the bounds leave free, on the batch that saw it."""
+        free = self.box.free_mask(trial.vector, trial.slope)
+        here = self._linearised(trial)
+        return here if free is None else Restricted(here, free)
+
+    def _linearised(self, trial):
+        """Kept, when it was the last one."""
         if self._last is not None:
             here, vector, number = self._last
             if number == self.batches.number - 1 and np.array_equal(vector, trial.vector):

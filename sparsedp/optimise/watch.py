@@ -2,6 +2,7 @@
 
 import time
 
+from sparsedp.ledger import tally
 from sparsedp.optimise.result import Record
 from sparsedp.optimise.trials import norm
 
@@ -15,14 +16,17 @@ class Watch:
         self._trials, self._packing = trials, packing
         self._tolerance, self._callback, self.bar = tolerance, callback, bar
         self._clock = time.perf_counter()
-        self._before = 0.0
+        self._before, self._solves = 0.0, -tally.solves
         self.history = []
         self.stopped = ""
 
     def resume(self, history, stopped):
-        """Go on from a history that was kept."""
-        self.history, self.stopped = list(history), stopped
+        """Go on from a history that was kept. A callback stops one run, and a tolerance that is met, this one."""
+        self.history = list(history)
         self._before = self.history[-1].seconds
+        self._solves = self.history[-1].solves - tally.solves
+        if stopped == "converged" and (callable(self._tolerance) or self._met(self.history[-1])):
+            self.stopped = stopped
 
     @property
     def iteration(self):
@@ -32,9 +36,8 @@ class Watch:
     def __call__(self, trial):
         seconds = self._before + time.perf_counter() - self._clock
         failed = self._trials.pop_failures()
-        record = Record(
-            len(self.history), trial.value, norm(self._trials.downhill(trial)), seconds, self._trials.count, failed
-        )
+        size, solves = norm(self._trials.downhill(trial)), self._solves + tally.solves
+        record = Record(len(self.history), trial.value, size, seconds, self._trials.count, failed, solves)
         self.history.append(record)
         self.bar.show(record)
         if self._met(record):

@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp.report.plots import axes_or_current
 
-__all__ = ["curves", "stability", "v_curve"]
+__all__ = ["convergence", "curves", "stability", "v_curve"]
 
 
 def curves(lines, ax, x_label, y_label):
@@ -27,6 +27,58 @@ def curves(lines, ax, x_label, y_label):
     ax.set_ylabel(y_label)
     ax.grid(visible=True, which="both", color="0.93")
     ax.legend(frameon=False)
+
+
+def convergence(best, ax=None, against="iteration"):
+    """Result of `minimise` -> picture of the loss and the gradient norm over iterations, seconds or solves.
+
+    Parameters
+    ----------
+    best : Minimum
+        From `minimise`.
+    ax : matplotlib Axes, optional
+        Default: the current axes of pyplot.
+    against : "iteration", "seconds", "evaluations" or "solves"
+        What runs across.
+
+    Returns
+    -------
+    matplotlib Axes
+        Logarithmic upwards; a loss that is not positive everywhere is drawn as its distance from the least one.
+
+    Raises
+    ------
+    ValueError
+        If `against` is another word.
+    ImportError
+        If matplotlib is not installed.
+
+    Examples
+    --------
+    >>> import autograd.numpy as anp
+    >>> import numpy as np
+    >>> from sparsedp import minimise
+    >>> from sparsedp.report.plots import figure
+    >>> best = minimise(lambda x: anp.sum((x - 1.0) ** 4), np.zeros(2), maxiter=5)
+    >>> convergence(best, figure().add_subplot()).get_xlabel()
+    'iteration'
+    """
+    if against not in ("iteration", "seconds", "evaluations", "solves"):
+        raise ValueError(f"convergence is drawn against iteration, seconds, evaluations or solves, got {against!r}")
+    ax = axes_or_current(ax)
+    across = [getattr(record, against) for record in best.history]
+    values = np.array([record.value for record in best.history])
+    label = "loss" if np.all(values > 0) else "loss - least loss"
+    values = values if np.all(values > 0) else values - values.min()
+    for name, heights in ((label, values), ("gradient norm", [record.gradient_norm for record in best.history])):
+        # A height of 0 has no logarithm and leaves a gap.
+        ax.plot(across, np.where(np.asarray(heights) > 0, heights, np.nan), marker=".", linewidth=1, label=name)
+    ax.set_yscale("log")
+    ax.set_xlabel(against)
+    ax.set_title(f"{best.method}: {best.message.split(':')[0]}")
+    ax.grid(visible=True, which="major", color="0.93")
+    ax.legend(frameon=False)
+    return ax
 
 
 def v_curve(audit, ax=None):

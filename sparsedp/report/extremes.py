@@ -6,6 +6,7 @@ import math
 from collections import Counter
 
 from sparsedp.check.findings import table
+from sparsedp.fields import check_function
 from sparsedp.report.hardships import GROUPS, cases
 from sparsedp.report.maps import stability_map
 from sparsedp.report.scene import Scene
@@ -47,7 +48,8 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     time_step, viscosity : str, optional
         Names of these parameters. Default: those called dt, time_step, tau; nu, viscosity, diffusivity, kappa, mu.
     only : sequence of str, optional
-        Groups of cases to run. Default: all that apply.
+        Groups of cases to run: "as given", "scaling", "legal range", "zeros and signs", "jumps", "constant added",
+        "not finite", "kinds of arrays", "time step and viscosity". Default: all that apply.
 
     Returns
     -------
@@ -83,6 +85,7 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     >>> stress(heat, {"dt": 0.6}, only=["as given"]).failures[0]["note"]
     'grows and changes its sign from step to step: the step is too large'
     """
+    check_function("stress", loss, "lambda x: np.sum(x**2)")
     known = [make.__name__.strip("_").replace("_", " ") for make in GROUPS]
     for group in only or ():
         if group not in known:

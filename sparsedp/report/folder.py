@@ -1,7 +1,9 @@
 """All instruments on one scene, in one folder: Markdown, CSV and pictures, and a page that says what they say."""
 
+import contextlib
 import csv
 import os
+import sys
 
 from sparsedp.check.audit import gradient
 from sparsedp.errors import SparsedpError
@@ -9,12 +11,20 @@ from sparsedp.report.certificate import certify
 from sparsedp.report.extremes import stress
 from sparsedp.report.plan import explain
 from sparsedp.report.precision import workprec
+from sparsedp.report.rows import Rows, settings_of
 
 __all__ = ["write_report"]
 
 PAGE = "report.md"
 TROUBLE = (SparsedpError, ValueError, TypeError, RuntimeError, ArithmeticError, LookupError)
-GOAL = 0.01  # the error that the page recommends a method for
+GOAL = 0.01  # the error that the page recommends a method for, in a sentence
+GOALS = 0.1, GOAL, 1e-3, 1e-4, 1e-6  # and in a table
+LEFT = "left out"  # in every sentence about it
+MEANING = {
+    "agrees": "The gradient is what differences of the loss say, and no stiff or extreme case failed.",
+    "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
+    "inconclusive": "Nothing is proved: the reason stands below. This is no pass.",
+}
 
 
 def write_report(source, folder, force=False):
@@ -33,18 +43,49 @@ def write_report(source, folder, force=False):
         If there is a report already, or the folder cannot be written.
     """
     _claim(folder, force)
-    audit = _attempt(lambda: gradient(source.loss, source.x))
-    trial = _attempt(lambda: stress(source.loss, source.x, **source.stress))
-    plan = _attempt(lambda: explain(source.loss, source.x))
-    certificate = _attempt(lambda: certify(source.loss, source.x))
-    found = _attempt(lambda: workprec(**source.workprec)) if source.workprec else None
-    sections = [_audit(audit, folder), _stress(trial, folder), _plan(plan, folder), _certificate(certificate, folder)]
-    sections.append(_workprec(found, folder))
+    with contextlib.redirect_stdout(sys.stderr):  # what the loss prints is no part of the report
+        audit = _attempt(lambda: gradient(source.loss, source.x))
+        trial = _attempt(lambda: stress(source.loss, source.x, **source.stress))
+        plan = _attempt(lambda: explain(source.loss, source.x))
+        certificate = _attempt(lambda: certify(source.loss, source.x))
+        found = _attempt(lambda: workprec(**source.workprec)) if source.workprec else None
+    chapters = {
+        "Is the gradient right?": _audit(audit, folder),
+        "Which method for which error?": _workprec(found, folder),
+        "How exact is the gradient, and how exact need the solves be?": _certificate(certificate, folder),
+        "What one gradient computes": _plan(plan, folder),
+        "Stiff and extreme cases": _stress(trial, folder),
+    }
     verdict = _verdict(audit, trial)
-    lines = [sentence for sentences in sections for sentence in sentences]
-    page = "\n".join([f"# {source.name}: {verdict}", "", *(f"- {line}" for line in lines), "", *_details(folder)])
+    lines = [sentence for sentences in chapters.values() for sentence in sentences]
+    page = "\n".join(
+        [f"# {source.name}: {verdict}", "", MEANING[verdict], *_chapters(chapters, found), *_details(folder)]
+    )
     (folder / PAGE).write_text(page, encoding="utf-8")
     return verdict, lines
+
+
+def _chapters(chapters, found):
+    """The page: one chapter for each question, and what was left out, from all of them, at the end."""
+    left = [sentence for sentences in chapters.values() for sentence in sentences if LEFT in sentence]
+    for title, sentences in chapters.items():
+        yield from ("", f"## {title}", "", *(f"- {one}" for one in sentences if one not in left))
+        if sentences is chapters["Which method for which error?"] and isinstance(found, Rows):
+            yield from ("", *_goals(found))
+    yield from ("", "## What was left out, and why", "", *(f"- {one}" for one in left), "")
+
+
+def _goals(found):
+    """The fastest method for each error, as a Markdown table."""
+    errors = "gradient_error" if found.pareto() else "forward_error"
+    what = errors.replace("_", " ")
+    yield from (f"| {what} at most | fastest method | its settings | its {what} | seconds |", "|---|---|---|---|---|")
+    for goal in GOALS:
+        row = found.best(goal, errors)
+        cells = ["none here", "", "", ""] if row is None else [
+            row["method"], settings_of(row), f"{100 * row[errors]:.2g} %", f"{found.seconds(row, errors):.1e}"
+        ]  # fmt: skip
+        yield f"| {100 * goal:g} % | {' | '.join(cells)} |"
 
 
 def _claim(folder, force):
@@ -134,7 +175,7 @@ def _workprec(found, folder):
     left = [f"error against run time left out {sentence}" for sentence in found.left_out]
     if best is None:
         return [f"error against run time: no method reaches a {what} of {GOAL:g}, see {found.scene}.md", *left]
-    named = f"{best['method']}, {found.seconds(best, errors):.1e} s, settings {best['settings']}"
+    named = f"{best['method']} ({settings_of(best)}), {found.seconds(best, errors):.1e} s"
     return [f"fastest at a {what} of {100 * GOAL:g} %: {named}", *left]
 
 
@@ -143,7 +184,14 @@ def _details(folder):
         path.name for path in folder.iterdir() if path.suffix in (".md", ".csv", ".png") and path.name != PAGE
     )
     pictures = [f"![{name}]({name})" for name in names if name.endswith(".png")]
-    return ["Details: " + ", ".join(f"[{name}]({name})" for name in names), "", *pictures, ""]
+    return [
+        "## Details",
+        "",
+        "Tables and numbers: " + ", ".join(f"[{name}]({name})" for name in names),
+        "",
+        *pictures,
+        "",
+    ]
 
 
 def _text(path, title, text):

@@ -210,8 +210,8 @@ def _not_finite(scene):
             if np.ndim(leaf):
                 spoilt = np.array(leaf)
                 spoilt[place] = bad
-            yield name, f"one {bad}", partial(must_refuse, scene.loss,
-                                              scene.at({name: spoilt if np.ndim(leaf) else bad}), nan=True)  # fmt: skip
+            worse = scene.at({name: spoilt if np.ndim(leaf) else bad})
+            yield name, f"one {bad}", partial(must_refuse, scene.loss, worse, spoilt=name)
 
 
 def _kinds_of_arrays(scene):

@@ -8,6 +8,7 @@ from typing import Any
 from sparsedp.check.findings import table
 from sparsedp.check.visits import bytes_held, witnessed
 from sparsedp.derivative import value_and_grad
+from sparsedp.fields import check_function
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
 from sparsedp.report.omissions import omitted
@@ -73,6 +74,7 @@ def explain(loss, x, gradient=True):
     >>> plan.counts["laplacian", "forward"], plan.counts["laplacian", "vjp"], plan.tape_bytes
     (1, 1, 64)
     """
+    check_function("explain", loss, "lambda x: np.sum(x**2)")
     clock = perf_counter()
     marks: dict[str, Any] = {"before": set(sys.modules), "nodes": 0, "bytes": 0}
     nodes: list = []

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from sparsedp.errors import ShapeError
+from sparsedp.grid import check_grid
 from sparsedp.tape import plain
 
 __all__ = ["animate", "axes_or_current", "figure", "plot", "read_picture", "sample_file", "save"]
@@ -51,6 +52,7 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, colours="viridis
     >>> picture.get_xlabel(), picture.get_ylabel(), picture.get_title()
     ('x', 'y', 'flat')
     """
+    check_grid("plot", grid)
     u = np.asarray(plain(u))
     if np.iscomplexobj(u):
         raise TypeError(f"plot draws real fields, got dtype {u.dtype}; plot its real part or its absolute value")

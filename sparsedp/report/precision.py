@@ -7,7 +7,7 @@ import platform
 import numpy as np
 
 from sparsedp.check.point import root_sum_squares
-from sparsedp.fields import is_whole
+from sparsedp.fields import check_function, is_whole
 from sparsedp.report.measurement import FAILURES, failure_word, measured_row, task_of
 from sparsedp.report.rows import COLUMNS, Rows, kept_rows, write_row
 from sparsedp.tree import leaves
@@ -77,9 +77,10 @@ def workprec(
     >>> [f"{row['gradient_error']:.4f}" for row in table.rows]
     ['0.0313', '0.0078', '0.0020']
     """
+    check_function("workprec", problem, "lambda cells: (loss, x)")
     if not is_whole(repeats, 1):
         raise ValueError(f"workprec needs repeats >= 1, a whole number, got {repeats!r}; the default is 3")
-    if not methods:
+    if not methods or not isinstance(methods, dict):
         raise ValueError("workprec needs at least one method; write {'name': {settings}}")
     scene, compare = scene or getattr(problem, "__name__", "scene"), compare or _distance
     known, left_out = kept_rows(file, _versions()) if file else ({}, [])

@@ -2,12 +2,13 @@
 
 import csv
 import io
+import json
 import math
 from pathlib import Path
 
 from sparsedp.check.findings import table
 
-__all__ = ["COLUMNS", "Rows", "kept_rows", "write_row"]
+__all__ = ["COLUMNS", "Rows", "kept_rows", "settings_of", "write_row"]
 
 COLUMNS = (
     "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
@@ -60,15 +61,30 @@ class Rows:
     def markdown(self):
         """The table in Markdown, with what was left out; a star marks the Pareto set of the gradient."""
         stars = [id(row) for row in [*self.pareto(), *self.pareto("forward_error")]]
-        used = [name for name in SHOWN if any(not _empty(row[name]) for row in self.rows)]
+        used, cells_of = self._shown()
         lines = [f"| {' | '.join(used)} | best |", f"|{'---|' * (len(used) + 1)}"]
-        for row in self.rows:
-            cells = [_text(row[name]) for name in used]
+        for row, cells in zip(self.rows, cells_of, strict=True):
             lines.append(f"| {' | '.join(cells)} | {'*' if id(row) in stars else ''} |")
+        lines += ["", "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."]
         errors = [row["reference_error"] for row in self.rows if not _empty(row["reference_error"])]
         stated = [f"\nError of the reference: {max(errors):.1e}."] if errors else []
         left = [f"- left out: {sentence}" for sentence in self.left_out]
         return "\n".join([f"### {self.scene}", "", *lines, *stated, *([""] if left else []), *left]) + "\n"
+
+    def _shown(self):
+        """Names of the columns for readers, settings that tell the rows of a method apart among them; their texts."""
+        settings = [json.loads(row["settings"]) for row in self.rows]
+        seen: dict = {}
+        for row, own in zip(self.rows, settings, strict=True):
+            for name, value in own.items():
+                seen.setdefault((name, row["method"]), set()).add(str(value))
+        told = dict.fromkeys(name for (name, _), values in seen.items() if len(values) > 1 and name not in SHOWN)
+        used = [name for name in SHOWN if any(not _empty(row[name]) for row in self.rows)]
+        lines = [
+            [row["method"], *(str(own.get(name, "")) for name in told), *(_text(row[name]) for name in used[1:])]
+            for row, own in zip(self.rows, settings, strict=True)
+        ]
+        return (*used[:1], *told, *used[1:]), lines
 
     def csv(self):
         """All columns as CSV."""
@@ -122,12 +138,16 @@ class Rows:
         return [*paths, folder / f"{self.scene}.png"]
 
     def __str__(self):
-        used = [name for name in SHOWN if any(not _empty(row[name]) for row in self.rows)]
-        lines = [[_text(row[name]) for name in used] for row in self.rows]
+        used, lines = self._shown()
         left = [f"  left out: {sentence}" for sentence in self.left_out]
-        return "\n".join([f"{self.scene}: error against run time", table(lines, tuple(used)), *left])
+        return "\n".join([f"{self.scene}: error against run time", table(lines, used), *left])
 
     __repr__ = __str__
+
+
+def settings_of(row):
+    """The settings of a row in words."""
+    return ", ".join(f"{name}={value}" for name, value in json.loads(row["settings"]).items()) or "no settings"
 
 
 def _empty(value):

@@ -1,6 +1,7 @@
 """A scene in a file, named on the command line: FILE.py, FILE.py:loss or FILE.py:loss:start."""
 
 import contextlib
+import inspect
 import re
 import runpy
 import sys
@@ -29,9 +30,9 @@ def load(target):
     Parameters
     ----------
     target : str
-        ``FILE.py[:loss[:start]]``. Without a name the loss is called `loss`, and the point `start` or `x`. Two
-        dicts in the file are handed on: `workprec_options` (problem, methods, ...) and `stress_options`
-        (ranges, step, ...).
+        ``FILE.py[:loss[:start]]``. Without a name the loss is called `loss`, and the point `start` or `x`; a point
+        that is a tuple fills a loss of several arguments. Two dicts in the file are handed on: `workprec_options`
+        (problem, methods, ...) and `stress_options` (ranges, step, ...).
 
     Raises
     ------
@@ -53,7 +54,20 @@ def load(target):
     for key, given in zip(("workprec_options", "stress_options"), options, strict=True):
         if not isinstance(given, dict):
             raise ValueError(f"{key} in {file} must be a dict of arguments, got {type(given).__name__}")
-    return Source(name, found[loss], found[names[0]], *options)
+    return Source(name, _of_one(found[loss], found[names[0]]), found[names[0]], *options)
+
+
+def _of_one(loss, x):
+    """The loss as a function of one point: a point that is a tuple fills a loss of several arguments."""
+    if not isinstance(x, tuple) or hasattr(x, "_fields"):
+        return loss
+    try:
+        inspect.signature(loss).bind(None)
+    except TypeError:
+        return lambda point: loss(*point)
+    except ValueError:  # a function of C without a signature
+        return loss
+    return loss
 
 
 def _run(file):

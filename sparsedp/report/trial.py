@@ -1,6 +1,7 @@
 """One run of a scene at an extreme point, and the word for what came out of it."""
 
 import math
+import re
 import warnings
 from typing import Any, NamedTuple
 
@@ -128,14 +129,24 @@ def _value(loss, x):
             return math.nan
 
 
-def must_refuse(loss, x, nan=False):
-    """(word, figure, note): the run must end with a typed error. nan: a field of x holds NaN or infinity."""
+def must_refuse(loss, x, spoilt=None):
+    """(word, figure, note): the run must end with a typed error.
+
+    spoilt: name of the parameter that holds NaN or infinity. Then the error has to say which number it is, or where
+    the first one stands (a loss may have moved it on the way), or to name the parameter.
+    """
     out = run(loss, x)
+    if out.error is not None and out.typed and spoilt is not None and not _located(out.words, spoilt):
+        return DEGRADED, math.nan, f"refused without a name or a place: {out.words}"
     if out.error is not None:
         return (REFUSED if out.typed else DEGRADED), math.nan, out.words
-    if nan and out.finite:
+    if spoilt is not None and out.finite:
         return FAILED, out.value, "swallowed: the value and the gradient are finite"
     return DEGRADED, math.nan, f"taken without an error; value {out.value:g}"
+
+
+def _located(words, name):
+    return re.search(rf"the first at|got -?(nan|inf)\b|\b{re.escape(name)}\b", words) is not None
 
 
 def same(loss, x, base, tolerance=0.0):

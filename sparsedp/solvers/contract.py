@@ -40,7 +40,7 @@ import numpy as np
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
 from sparsedp.fields import check_finite, place
 from sparsedp.ledger import active as recordings
-from sparsedp.ledger import count, observers, timed
+from sparsedp.ledger import count, observers, tally, timed
 from sparsedp.solvers.record import Run, merged
 from sparsedp.solvers.scaling import in_range, largest, measured, norm, shifted
 from sparsedp.tape import plain
@@ -115,6 +115,7 @@ class Solver:
     def solved(self, b, transposed=False, checked=True, start=None):
         """The solve itself, recorded in the log."""
         run = Run()
+        tally.solves += 1
         try:
             return self._scaled(b, run, transposed, checked and not transposed, start)
         finally:

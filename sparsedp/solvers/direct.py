@@ -82,8 +82,8 @@ class Direct(Engine):
             )
         if not growth < MOST_GROWTH:
             raise ConvergenceError(
-                f"{system.given} is singular and its null space is neither constant nor that of the volumes; "
-                "add a shift, or remove the rows that depend on others",
+                f"{system.given} is singular and its null space is neither constant nor that of the volumes, or its "
+                "condition number is beyond 1e14; add a shift, or remove the rows that depend on others",
                 info=failure("setup_failed"),
             )
 

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.fields import check_plain
 from sparsedp.operators.given import from_matrix
 from sparsedp.solvers.choose import build, check_settings
 from sparsedp.solvers.kept import Kept
@@ -139,6 +140,7 @@ class MatrixSolver:
         -------
         array, a field on the domain
         """
+        check_plain(self.name, data, b)
         values = np.asarray(plain(data))
         if values.shape != self.rows.shape:
             raise ShapeError(f"data takes one value for each of {self.rows.size} entries, got shape {values.shape}")

@@ -5,6 +5,7 @@ import numpy as np
 
 from sparsedp.derivative import NO_JVP, pullback, pushforward
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
+from sparsedp.fields import check_plain
 from sparsedp.tape import dtype_of, is_variable, isbox, linear, plain
 from sparsedp.tree import flatten, leaves
 
@@ -60,6 +61,7 @@ class Layout:
 
 
 def _check_unknown(leaf, name):
+    check_plain(name, leaf)
     kind = np.asarray(leaf).dtype.kind
     if kind == "c":
         raise TypeError(f"{name} solves for real unknowns; give real and imaginary part as two fields")

@@ -6,7 +6,6 @@ restriction P^T, pre-smoothing t_n^T ... t_1^T and post-smoothing s_m^T ... s_1^
 forward Gauss-Seidel sweep on A is a backward sweep on A^T.
 """
 
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +23,7 @@ CYCLES = {"V": 1, "W": 2}
 SWEEPS = {"forward": "backward", "backward": "forward"}  # each with its mirror image
 COARSEST = 100  # unknowns that are solved densely
 MAXITER = 200
+RESIDUE = 1e-13  # share of the entries that were added up, below which a row of a coarse level is rounding
 
 
 def multigrid_engine(
@@ -211,9 +211,25 @@ def _ruge_stueben(matrix, strength, levels):
         )
     finally:
         np.random.set_state(state)  # noqa: NPY002
-    return [Level(csr_array(one.A), csr_array(one.P), csr_array(one.R)) for one, _ in pairwise(built.levels)] + [
-        Level(csr_array(built.levels[-1].A), None, None)
-    ]
+    return _without_residues([*built.levels])
+
+
+def _without_residues(built):
+    """PyAMG's levels -> Levels, with rows of rounding residues made empty.
+
+    A region that nothing holds ends, levels down, in one unknown whose row is 0 but for rounding: a sweep or the
+    coarsest solve would divide by it. Empty rows are left out by both.
+    """
+    reference, levels = abs(built[0].A) @ np.ones(built[0].A.shape[0]), []
+    for number, level in enumerate(built):
+        A, last = csr_array(level.A), number == len(built) - 1
+        residue = abs(A) @ np.ones(A.shape[0]) <= RESIDUE * reference
+        if residue.any():
+            A = csr_array(A.multiply(~residue[:, None]).multiply(~residue))
+            A.eliminate_zeros()
+        levels.append(Level(A, None if last else csr_array(level.P), None if last else csr_array(level.R)))
+        reference = reference if last else abs(level.R) @ reference
+    return levels
 
 
 class CoarseSolve:

@@ -19,7 +19,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_finite
+from sparsedp.fields import check_finite, check_plain
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
 from sparsedp.solvers.assembly import Assembly
@@ -55,7 +55,7 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     Raises
     ------
     TypeError
-        If D or G is not an Operator.
+        If D or G is not an Operator, and on use, if k or b is a masked array.
     ShapeError
         If D and G do not fit, and on use, if k or b has another shape.
     ValueError
@@ -127,6 +127,7 @@ class EllipticSolver:
         -------
         array, a field on the cells, of the dtype of b
         """
+        check_plain("elliptic_solver", k, b)
         k = self._coefficient(k)
         _check_shift(plain(shift))
         return self._rule(False, True)(k, b if isbox(b) else np.asarray(b), shift)
@@ -134,9 +135,13 @@ class EllipticSolver:
     def _coefficient(self, k):
         values, space = np.asarray(plain(k)), self.D.domain
         if values.shape not in ((), space.shape):
-            raise ShapeError(f"k takes a number or a field on {space}, got an array of shape {values.shape}")
+            advice = "; write harmonic_average(grid)(k)" if values.shape == self.D.codomain.shape else ""
+            raise ShapeError(
+                f"k takes a number or a field on {space.told}, got an array of shape {values.shape}{advice}"
+            )
         if values.dtype.kind not in "biuf":
-            raise ValueError(f"k must hold real numbers, got dtype {values.dtype}; write k.real")
+            instead = "k.real" if values.dtype.kind == "c" else "np.asarray(k, float)"
+            raise ValueError(f"k must hold real numbers, got dtype {values.dtype}; write {instead}")
         check_finite("k", values)
         if np.any(values < 0):
             raise ValueError(f"k must be >= 0, got {values.min():g} at {np.argmin(values)}")

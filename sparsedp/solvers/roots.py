@@ -62,6 +62,8 @@ def implicit(
 
     Raises
     ------
+    TypeError
+        If `residual` or `jacobian` is not a function, and on use, if the guess does not hold numbers.
     ValueError
         If a setting is out of range.
     ConvergenceError
@@ -92,6 +94,9 @@ def implicit(
     >>> value_and_grad(lambda p: root(1.0, p))(9.0)[1]
     0.16666666666666666
     """
+    if not (callable(residual) and (jacobian is None or callable(jacobian))):
+        given = [("residual", residual), ("jacobian", jacobian)][callable(residual)]
+        raise TypeError(f"implicit takes a function as {given[0]}, got {type(given[1]).__name__}; write lambda x: ...")
     check_settings(method, rtol, maxiter, nullspace)
     if maxiter is None:
         raise ValueError("maxiter must be a whole number >= 1, got None")

@@ -3,6 +3,7 @@
 import numpy as np
 
 from sparsedp.errors import NonFiniteError
+from sparsedp.fields import is_number
 from sparsedp.operator import Operator
 from sparsedp.solvers.separable import spectrum
 from sparsedp.structure.base import Structure
@@ -53,6 +54,8 @@ def exponential(op, time=1.0):
     ------
     ValueError
         If the operator is not separable or cannot be diagonalised.
+    TypeError
+        If `time` is not one real number.
     NonFiniteError
         If `time` is not finite, or the exponential leaves the range of floats.
 
@@ -68,6 +71,8 @@ def exponential(op, time=1.0):
     [2. 2.]
     """
     found = _spectrum(op, "exponential")
+    if not is_number(time):
+        raise TypeError(f"exponential needs one real number as time, got {time!r}; write for example 0.1")
     if not np.isfinite(time):
         raise NonFiniteError(f"exponential needs a finite time, got {time}")
     with np.errstate(over="ignore"):
@@ -96,6 +101,8 @@ def power(op, exponent):
     ------
     ValueError
         If the operator is not separable, or a fractional power of a negative eigenvalue is asked for.
+    TypeError
+        If `exponent` is not one real number.
     NonFiniteError
         If `exponent` is not finite, or the power leaves the range of floats.
 
@@ -107,6 +114,8 @@ def power(op, exponent):
     [-1. -1.  2.]
     """
     found = _spectrum(op, "power")
+    if not is_number(exponent):
+        raise TypeError(f"power needs one real number as exponent, got {exponent!r}; write for example 0.5")
     if not np.isfinite(exponent):
         raise NonFiniteError(f"power needs a finite exponent, got {exponent}")
     values = found.eigenvalues

@@ -9,6 +9,7 @@ from sparsedp.kernels.multigrid_pack import inside, padded, repeat
 
 __all__ = ["Natural", "dense_inverse", "merged", "own_steps", "steps"]
 
+ACCURATE, RANK = 1e-3, 1e-14  # residual of an inverse that will do; eigenvalues below, of a diagonal of 1, are 0
 FINE_STEPS = {2: [(0, 0, 1), (1, 0, 0)], 3: [(0, 0, 1), (1, 0, 0), (0, 1, 0)]}
 ROWS_AHEAD = {2: [(1, 0)], 3: [(0, 1), (1, -1), (1, 0), (1, 1)]}
 
@@ -75,9 +76,22 @@ def dense_inverse(level, scale):
     nothing = np.zeros_like(matrix)
     for label in np.unique(labels[free]):
         vector = np.where(labels == label, np.sqrt(np.maximum(diagonal, 0.0)), 0.0)
-        if np.count_nonzero(vector) > 1:
+        if np.count_nonzero(vector) > 1 and np.all(free[vector > 0.0]):
             nothing += np.outer(vector, vector) / (vector @ vector)
-    return np.linalg.inv(matrix + nothing) - nothing
+    return _inverse(matrix + nothing) - nothing
+
+
+def _inverse(matrix):
+    """Inverse of a symmetric matrix; cells whose weights depend on each other give modes of 0, which are left out."""
+    try:
+        found = np.linalg.inv(matrix)
+        if np.max(np.abs(matrix @ found - np.eye(len(matrix))), initial=0.0) < ACCURATE:
+            return found
+    except np.linalg.LinAlgError:
+        pass
+    values, vectors = np.linalg.eigh(matrix)
+    kept = np.abs(values) > RANK
+    return (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
 
 
 def _dense(level):

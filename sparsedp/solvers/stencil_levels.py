@@ -11,11 +11,13 @@ from sparsedp.kernels import multigrid_setup, multigrid_setup3d
 from sparsedp.kernels.multigrid_cycle import AGAIN, DENSE, DOWN, SUM, UP
 from sparsedp.kernels.multigrid_diagonal import diagonal
 from sparsedp.kernels.multigrid_pack import packed, padded, repeat, width
-from sparsedp.solvers.stencil_coarsest import Natural, dense_inverse, merged, steps
+from sparsedp.solvers.stencil_coarsest import Natural, dense_inverse, merged, own_steps, steps
+from sparsedp.solvers.stencil_free import free_below, without_negative
 
 __all__ = ["Coarse", "Fine", "Levels", "Size", "half_shape"]
 
-TWICE = 1  # a second visit to a sixteenth of the cells (2-D) takes a fifth of the iterations off
+TWICE = 1  # in 2-D a second visit to a sixteenth of the cells takes a fifth of the iterations off
+STRETCH = {2: 1.0, 3: 1.08}  # of the correction of the finest level: in 3-D it does what a second visit would
 COARSEST = 100  # cells that are solved by a dense matrix
 WEAK = 0.1  # a cell is weak along an axis that holds it with less than this share of another one
 EXAMINED = 1000  # cells of the smallest level that is examined
@@ -31,12 +33,12 @@ def deep(shape):
     return (shape[0], 1, shape[1]) if len(shape) == 2 else tuple(shape)
 
 
-def schedule(count):
-    """What the cycle does, on which coarse level: a V-cycle with two visits to the levels from TWICE on."""
+def schedule(count, dim):
+    """What the cycle does, on which coarse level: a V-cycle; in 2-D with two visits to the levels from TWICE on."""
     done = [(DENSE, count - 1)]
     for k in range(count - 2, -1, -1):
         done = [(DOWN, k), *done, (UP, k)]
-        if k == TWICE:
+        if k == TWICE and dim == 2:
             done = [*done, (AGAIN, k), *done, (SUM, k)]
     return np.array(done)
 
@@ -119,7 +121,7 @@ class Levels:
         self.fine = fine
         dense = dense_inverse(level, scale)
         rest = dict(around=len(steps(self.dim, True)) // 3, matrix=dense, vector=np.zeros(len(dense)))
-        self.coarse = Coarse(schedule(len(self.shapes) - 1), self.table, **rest, **self.parts)
+        self.coarse = Coarse(schedule(len(self.shapes) - 1, self.dim), self.table, **rest, **self.parts)
         first, last = (" x ".join(map(str, shape)) for shape in (self.shapes[0], self.shapes[-1]))
         self.words = f"{len(self.shapes)} levels, {first} to {last}"
 
@@ -152,7 +154,7 @@ class Levels:
         vectors = weights = starts = natural = 0
         for row, shape in zip(table, self.shapes[1:]):
             n0, n1, n2 = deep(shape)
-            rows, w, wide = 1 + n0 * n1, width((n2 + 1) // 2), width(n2)
+            rows, w, wide = 1 + n0 * n1, width((n2 + 1) // 2), width(n2, split=False)
             own = np.zeros(rows, np.int64)
             count = self._starts(own, shape, True)
             row[:11] = n0, n1, n2, rows, w, vectors, weights, starts, natural, wide, count
@@ -238,7 +240,8 @@ class Levels:
         shape = half_shape(level.shape)
         links, extra = padded(shape, len(steps(self.dim, True))), padded(shape)
         self.setup.coarsen(level.links, level.extra, weights, links, extra, level.periodic, number > 0)
-        free = level.free[(slice(None, None, 2),) * self.dim]
+        free = free_below(level, weights, root, number == 0)
+        without_negative(links, extra, free, own_steps(self.dim, True))
         coarse = merged(Natural(shape, level.periodic, links, extra, free))
         coarse_scale, coarse_root = self._scales(coarse, True)
         out, starts = target
@@ -256,6 +259,7 @@ class Levels:
     def _pack_weights(self, target, starts, weights, coarse, root, level, nine):
         shape, flags = deep(level.shape), self._flags(level.periodic)
         coarse, root = self._deep(coarse), self._deep(root)
+        coarse = coarse if nine or STRETCH[self.dim] == 1.0 else coarse * STRETCH[self.dim] ** 0.5  # there and back
         groups = list(product((0, 1), (0,) if self.dim == 2 else (0, 1)))
         for group in groups:
             final = group == groups[-1]

@@ -12,6 +12,7 @@ from sparsedp.solvers.stencil import CLEAN, Stencil, cleaned
 from sparsedp.structure.base import Scaled
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Chain, Diagonal
+from sparsedp.structure.through import beside
 
 __all__ = ["Faces", "faces_of", "of_lines", "read_lines"]
 
@@ -46,8 +47,8 @@ def _of_axis(left, right, grid, axis):
     if len(terms) != 1 or len(slopes) != 1 or terms[0].axes != (axis,) or slopes[0].axes != (axis,):
         return None
     n, faces = grid.shape[axis], grid.node_count(axis)
-    areas = _beside(terms[0].factors[axis].T, terms[0].scale, n, faces, grid.periodic[axis])
-    slopes = _beside(slopes[0].factors[axis], slopes[0].scale, n, faces, grid.periodic[axis])
+    areas = beside(terms[0].factors[axis].T, terms[0].scale, n, faces, grid.periodic[axis])
+    slopes = beside(slopes[0].factors[axis], slopes[0].scale, n, faces, grid.periodic[axis])
     if areas is None or slopes is None:
         return None
     (d_below, d_above), (g_below, g_above), h = areas, slopes, grid.widths[axis]
@@ -59,19 +60,6 @@ def _of_axis(left, right, grid, axis):
     link = np.where(linked, -0.5 * (one + two), 0.0)
     size = np.abs(link)
     return Lines(link, cleaned(d_below * g_below - link, size), cleaned(d_above * g_above - link, size))
-
-
-def _beside(factor, scale, n, faces, periodic):
-    """A factor from cells to faces -> its entries for the cell below and the cell above each face, or None."""
-    m = factor.matrix
-    row = np.repeat(np.arange(faces), np.diff(m.indptr))
-    below, above = np.zeros(faces), np.zeros(faces)
-    is_above = m.indices == row
-    is_below = (m.indices == row - 1) | (periodic & (row == 0) & (m.indices == n - 1))
-    if not np.all(is_above ^ is_below):  # further cells; or one periodic cell, on both sides of its face
-        return None
-    above[row[is_above]], below[row[is_below]] = scale * m.data[is_above], scale * m.data[is_below]
-    return below, above
 
 
 def of_lines(lines, k, grid, unit=1.0):

@@ -16,24 +16,32 @@ from sparsedp.solvers.contract import Engine, norm
 
 __all__ = ["Structured", "structured_engine", "structured_if_suited"]
 
+PRECISIONS = {"auto": None, "single": np.float32, "double": np.float64}  # words -> types of the cycle
+
 CHUNK = 16384  # cells for which one sum is kept
 SERIAL = 100_000  # cells below which a team of threads is not worth it
 MAXITER = 200
+OVER = 1.2  # of a sweep on the finest level; 1 takes up to one iteration more
 SLOW = 0.3  # a step that leaves more than this share of the residual may have met rounding
 WEAK_SHARE = 0.1  # of cells: beyond it a cycle with point smoothing takes more than about 30 iterations
 SURE = 1 - 1e-6  # sizes are measured with weights in single precision
 PATIENCE = 20  # steps without a smaller residual before giving up
 ROUNDING = 4 * np.finfo(float).eps
+# Ratio of the coefficients times cells along the longest axis, up to which a cycle in single precision does:
+# a strong cluster of that width is held by so small a share of its links. Beyond, single precision takes 14 to
+# 100 iterations where double takes 9 (a million times stronger balls, 512^2), and fails from ratios of 1e8 on.
+SINGLE_UP_TO = 2e7
 
 
-def structured_engine(system, *, precision="single"):
+def structured_engine(system, *, precision="auto"):
     """System -> Structured: compiled multigrid for a symmetric 5- or 7-point operator on a 2-D or 3-D grid.
 
     Parameters
     ----------
     system : System
-    precision : "single" or "double"
-        In which the multigrid cycle computes; the solution is double in any case.
+    precision : "auto", "single" or "double"
+        In which the multigrid cycle computes; the solution is double in any case. "auto" takes single unless
+        coefficients jump too far for it.
 
     Returns
     -------
@@ -50,12 +58,12 @@ def structured_engine(system, *, precision="single"):
     """
     from sparsedp.solvers.stencil import Unfit
 
-    if precision not in ("single", "double"):
-        raise ValueError(f"precision must be 'single' or 'double', got {precision!r}")
+    if precision not in tuple(PRECISIONS):
+        raise ValueError(f"precision must be 'auto', 'single' or 'double', got {precision!r}")
     if not kernels.compiled():
         raise ValueError("structured needs numba, which is not installed; write method='multigrid'")
     try:
-        return _built(system, np.float32 if precision == "single" else np.float64)
+        return _built(system, PRECISIONS[precision])
     except Unfit as reason:
         message = f"structured does not take {system.given}: {reason}; write method='multigrid'"
         raise ValueError(message) from None
@@ -71,7 +79,7 @@ def structured_if_suited(system):
     if not kernels.compiled():
         return None, "structured multigrid needs numba, which is not installed"
     try:
-        engine = _built(system, np.float32)
+        engine = _built(system)
     except Unfit as reason:
         return None, f"structured multigrid does not take it: {reason}"
     if engine.weak_share > WEAK_SHARE:
@@ -80,8 +88,8 @@ def structured_if_suited(system):
     return engine, ""
 
 
-def _built(system, dtype):
-    """The engine; raises Unfit."""
+def _built(system, dtype=None):
+    """The engine; raises Unfit. The type of its cycle, where it is not given, is found from the coefficients."""
     from sparsedp.solvers.stencil_facts import components_of_stencil, null_space_of_stencil
     from sparsedp.solvers.stencil_reading import stencil_of
 
@@ -92,10 +100,20 @@ def _built(system, dtype):
         system.components = labels, count = components_of_stencil(stencil, system.active)
     system.null_space = null_space_of_stencil(stencil, labels, count, system.active)
     free = system.null_space.right > 0 if system.null_space.count else np.zeros(system.size, bool)
-    engine = Structured(stencil, free, system.maxiter, dtype)
+    engine = Structured(stencil, free, system.maxiter, dtype or _precision(stencil, faces))
     if system.grid.cells.size and all(system.grid.uniform):
         system.norms = engine.size.norm, engine.size.norm
     return engine
+
+
+def _precision(stencil, faces):
+    """The type that resolves how weakly the cells with the largest coefficients may be held together."""
+    limit = SINGLE_UP_TO / max(1, *stencil.grid.shape)
+    if faces is not None and faces.largest <= limit * faces.smallest:
+        return np.float32
+    linked = [np.where(c > 0, c, np.inf).min(initial=np.inf) for c in stencil.inner]
+    small = all(c.max(initial=0.0) <= limit * least for c, least in zip(stencil.inner, linked))
+    return np.float32 if small else np.float64
 
 
 class Structured(Engine):
@@ -125,6 +143,7 @@ class Structured(Engine):
         spread = Spread(stencil.grid)
         levels = Levels(spread.natural(stencil, free), spread.widths(), spread.coarsenings, dtype, abs(stencil.scale))
         self.fine, self.coarse, self.hierarchy = levels.fine, levels.coarse, levels.words
+        self.hierarchy += ", cycle in double precision" if dtype == np.float64 else ""
         self.found, self.volumes, self.ones = spread.found, spread.widths(), spread.widths(of_grid=False)
         self.shape = stencil.grid.shape if spread.dim == 3 else (stencil.grid.shape[0], 1, stencil.grid.shape[1])
         self.size, self.weak_share = levels.size, levels.weak_share
@@ -139,9 +158,10 @@ class Structured(Engine):
         self.wide_vectors = [packed(*rows) for _ in range(3)]
         self.vectors = [packed(*rows, dtype=dtype) for _ in range(3)]
         self.sums = np.zeros((max(1, min(shape[0], prod(shape) // CHUNK)), 2))
-        self.totals, self.line = packed(teams, 2, wide), packed(teams, width(shape[2]))
+        self.totals, self.line = packed(teams, 2, wide), packed(teams, width(shape[2], split=False))
         self.rings = packed(teams, 2, 3, shape[1], wide), packed(teams, 2, 3, shape[1], wide, dtype=dtype)
-        self.lines = packed(teams, 2 * ((shape[1] + 1) // 2), wide, dtype=dtype)
+        natural = width((shape[2] + 1) // 2, split=False)
+        self.lines = packed(teams, 2 * ((shape[1] + 1) // 2) + 1, natural, dtype=dtype)
         first = self.coarse.levels[0]
         self.first = self.coarse.b[: 2 * first[3] * first[4]].reshape(first[3], 2, first[4])
         self.natural = self.coarse.natural[: first[3] * first[9]].reshape(first[3], first[9])
@@ -211,7 +231,7 @@ class _Run:
         """z = M r -> r . z."""
         engine, fine = self.engine, self.engine.fine
         light = *self.grid, engine.rings[1]
-        transfer = fine.weights, fine.starts
+        transfer = fine.weights, fine.starts, OVER
         engine.passes.restrict(fine.light, self.r, engine.first, *transfer, *light, engine.lines, engine.teams)
         engine.cycle(*engine.coarse, engine.lines, engine.teams)
         engine.passes.correct(fine.light, self.r, self.z, engine.natural, *transfer, *light, *self.tail)

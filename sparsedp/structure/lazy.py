@@ -1,14 +1,18 @@
 """Lazy structures: diagonals, products, sums and functions. Nothing is multiplied out before it is needed."""
 
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp import kernels
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.structure.base import Structure, compact, result_dtype
+from sparsedp.structure.through import through_faces
 
 __all__ = ["Chain", "Diagonal", "Functions", "Mask", "Sum"]
+
+FEW = 16384  # cells for which passes one after the other are quick
 
 
 class Diagonal(Structure):
@@ -60,6 +64,9 @@ class Chain(Structure):
         self.has_entries = all(member.has_entries for member in members)
 
     def apply(self, x, out):
+        if x.dtype == float == self.dtype and x.size >= FEW and kernels.compiled():
+            if self._fused is not None and self._fused.apply(x, out):
+                return
         single = x.dtype.char in "fF"
         x = x.astype(np.result_type(x.dtype, np.float64)) if single else x
         for member in self.members[:0:-1]:
@@ -68,6 +75,13 @@ class Chain(Structure):
             np.copyto(out, self.members[0].product(x), casting="same_kind")
         else:
             self.members[0].apply(x, out)
+
+    @cached_property
+    def _fused(self):
+        """All members in one pass, where they are differences through faces; else None."""
+        middle = self.members[1:-1]
+        diagonals = all(isinstance(member, Diagonal) for member in middle)
+        return through_faces(self.members[0], middle, self.members[-1]) if diagonals else None
 
     def transpose(self):
         return Chain([member.transpose() for member in reversed(self.members)])

@@ -74,7 +74,8 @@ class DualStep:
     @staticmethod
     def joined(layout, places):
         """An example of the pair, without memory of its own."""
-        examples = [np.broadcast_to(d.type(0), s)[()] for s, d in zip(layout.shapes, layout.dtypes, strict=True)]
+        kinds = zip(layout.shapes, layout.dtypes, layout.floats, strict=True)
+        examples = [0.0 if bare else np.broadcast_to(dtype.type(0), shape)[()] for shape, dtype, bare in kinds]
         return layout.build(examples), tuple(examples[place] for place in places)
 
     def __call__(self, *pairs):

@@ -3,14 +3,15 @@
 import numpy as np
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import is_whole
+from sparsedp.fields import check_function, is_whole
 from sparsedp.ledger import loops
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.trajectory.keep import All, Each, Last
 from sparsedp.trajectory.layout import Layout, dense
 from sparsedp.trajectory.rules import rollout_rule
 from sparsedp.trajectory.run import Run
-from sparsedp.trajectory.schedule import slots_within
+from sparsedp.trajectory.schedule import room_within, slots_within
+from sparsedp.trajectory.tapes import Tapes
 from sparsedp.tree import leaves
 
 __all__ = ["rollout"]
@@ -35,7 +36,8 @@ def rollout(
         What changes from step to step: step i gets entry i of the first axis of every array.
     memory : None, number of bytes, or text such as "200 MB"
         What the rollout may take. None keeps every state. Else as many are kept as fit beside params, inputs
-        and their gradients, and the others are run again from those, as rarely as possible. Not counted:
+        and their gradients, and the others are run again from those, as rarely as possible. Where all fit, what
+        is left goes to the tapes of the steps (4 MB with None): such a step runs once, not twice. Not counted:
         what one step needs by itself, and all states that `keep` hands out.
     keep : "last", "all" or callable
         What is handed out: the last state; all n + 1, each array with a new first axis; or the tuple of what
@@ -75,7 +77,7 @@ def rollout(
 
     Notes
     -----
-    Cost: n steps forward; backward n steps on a tape of their own, plus those run again:
+    Cost: n steps forward; backward n steps on a tape of their own, unless it is kept, plus those run again:
     with s states kept and at most r runs over each step, n <= (s + r)! / (s! r!) steps go back. The gradient
     has the same bits for every `memory`. A step that carries plain forms of its own (protocol.py) needs no tape.
 
@@ -94,6 +96,7 @@ def rollout(
     >>> rollout(decay, 16.0, 1.0, 3, keep="all")
     array([16.,  8.,  4.,  2.])
     """
+    check_function("rollout", step, "lambda state, params: ...")
     n = _number_of_steps(n)
     forms = Layout(state, "state"), Layout(params, "params"), None if inputs is None else Layout(inputs, "inputs")
     _check_inputs(inputs, n)
@@ -105,6 +108,9 @@ def rollout(
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
     run = Run(step, *forms, n, _kind(keep, forms[0]), slots, truncate, any(map(isbox, args)), progress, record)
     _check_values(run, args)
+    if run.store and (slots is None or slots >= n):
+        room = None if memory is None else room_within(memory, forms[0].nbytes, n, beside)
+        run.tapes = Tapes(room, frozenset(k for k, arg in enumerate(args) if isbox(arg)), slots is not None)
     for told in loops:
         told(step, state, params, inputs, n)
     outputs = rollout_rule(run, *args)

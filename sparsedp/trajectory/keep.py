@@ -9,7 +9,7 @@ import numpy as np
 from sparsedp.errors import DerivativeError
 from sparsedp.tape import dtype_of, is_variable, isbox, reverse_root, split_box, trace
 from sparsedp.trajectory.ends import pull_ends
-from sparsedp.trajectory.layout import frozen, owned
+from sparsedp.trajectory.layout import frozen, owned, refuse_mask
 from sparsedp.tree import flatten
 
 __all__ = ["All", "Each", "Last"]
@@ -191,6 +191,8 @@ class _EachCollector:
     def see(self, i, values, statics):
         layout = self._keep.layout
         found, rebuild = flatten(self._keep.function(i, layout.build([frozen(v) for v in values], statics)))
+        for leaf in found:
+            refuse_mask("keep returned a masked array", leaf)
         places = [self._store(leaf) if is_variable(leaf) else None for leaf in found]
         found = [None if place else leaf for leaf, place in zip(found, places, strict=True)]
         self._trees.append((flatten(rebuild(found))[1], found, places))

@@ -3,11 +3,11 @@
 import numpy as np
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite
+from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten
 
-__all__ = ["Layout", "dense", "frozen", "owned", "still", "surely_finite"]
+__all__ = ["Layout", "dense", "frozen", "owned", "refuse_mask", "still"]
 
 
 class Layout:
@@ -31,10 +31,18 @@ class Layout:
         The tree is one variable leaf and nothing else.
     shapes, dtypes, floats : list
         Of the variable leaves.
+    rounds : bool
+        Whether a step may widen float32 to float64, and is rounded: beside numbers of Python, which are
+        traced as float64, autograd widens what NumPy does not.
     """
+
+    rounds = False
 
     def __init__(self, tree, root):
         found, rebuild = flatten(tree)
+        self.labels = _labels(tree, root)
+        for label, leaf in zip(self.labels, found, strict=True):
+            refuse_mask(f"rollout takes plain arrays, got a masked array as {label}", leaf)
         self.root = root
         self.places = [place for place, leaf in enumerate(found) if is_variable(leaf)]
         self.statics = tuple(None if is_variable(leaf) else leaf for leaf in found)
@@ -42,7 +50,6 @@ class Layout:
         self._template = rebuild(self.statics)
         self._rebuild = flatten(self._template)[1]
         self.bare = not isinstance(tree, (tuple, list, dict)) and bool(self.places)
-        self.labels = _labels(tree, root)
         self.names = [self.labels[place] for place in self.places]
         variables = [plain(found[place]) for place in self.places]
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
@@ -83,6 +90,7 @@ class Layout:
         if self.bare:
             if isinstance(tree, (tuple, list, dict)):
                 raise ShapeError(_changed(self.root, "one array", _kind(tree), when))
+            refuse_mask(f"{when} made a masked array of {self.root}", tree)
             return [tree], (None,)
         found: list = []
         self._collect(self._template, tree, self.root, when, found)
@@ -111,6 +119,7 @@ class Layout:
         elif isinstance(tree, (tuple, list, dict)):
             raise ShapeError(_changed(name, "one leaf", _kind(tree), when))
         else:
+            refuse_mask(f"{when} made a masked array of {name}", tree)
             found.append(tree)
 
     def is_one(self, value):
@@ -142,6 +151,8 @@ class Layout:
             raise ShapeError(_changed(name, "one array", _kind(value), when))
         if np.shape(value) != shape:
             raise ShapeError(_changed(name, f"shape {shape}", f"shape {np.shape(value)}", when))
+        if self.rounds and dtype_of(value) == np.result_type(dtype, np.float64):
+            value = np.asarray(value, dtype)
         if dtype_of(value) != dtype:
             raise ShapeError(_changed(name, f"dtype {dtype}", f"dtype {dtype_of(value)}", when))
         return dense(value)
@@ -161,12 +172,6 @@ def _brief(value):
     return f"an array of dtype {value.dtype}" if isinstance(value, np.ndarray) else repr(value)
 
 
-def surely_finite(value):
-    """One pass without a temporary array; False also when a finite sum is too large."""
-    with np.errstate(all="ignore"):
-        return bool(np.isfinite(np.sum(value)))
-
-
 def dense(value):
     """Array or number -> contiguous array, or a NumPy scalar when it has no axes."""
     value = np.ascontiguousarray(value) if np.ndim(value) else np.asarray(value)[()]
@@ -176,6 +181,12 @@ def dense(value):
 def owned(value):
     """Array or number -> a contiguous copy of its own."""
     return np.array(value, order="C", subok=False) if np.ndim(value) else np.asarray(value)[()]
+
+
+def refuse_mask(what, leaf):
+    """The mask of an array would be lost on the way."""
+    if isinstance(leaf, np.ma.MaskedArray):
+        raise TypeError(f"{what}; fill it first, and hand the mask along as an array of its own")
 
 
 def frozen(value):

@@ -18,10 +18,10 @@ from sparsedp.trajectory.steps import Taped
 __all__ = ["Protocol", "engine_of"]
 
 
-def engine_of(run, args, wanted=()):
+def engine_of(run, args, wanted=(), recording=False):
     """What runs the steps of a run: the step's own plain forms where it has both, else the tape."""
     plain = run.inputs is None and all(callable(getattr(run.step, name, None)) for name in ("forward", "backward"))
-    return (Protocol if plain else Taped)(run, args, wanted)
+    return Protocol(run, args, wanted) if plain else Taped(run, args, wanted, recording)
 
 
 class Protocol(Taped):

@@ -1,15 +1,18 @@
 """A rollout as a value: the step, the form of its arguments, how far, and what is kept."""
 
+from contextlib import nullcontext
+
 import numpy as np
 
 from sparsedp.errors import DerivativeError, NonFiniteError
-from sparsedp.fields import place
+from sparsedp.fields import place, surely_finite
 from sparsedp.ledger import active, count
-from sparsedp.trajectory.layout import still, surely_finite
+from sparsedp.trajectory.layout import still
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.protocol import engine_of
 from sparsedp.trajectory.record import Growth, Record
 from sparsedp.trajectory.schedule import stride
+from sparsedp.trajectory.tapes import Tapes
 
 __all__ = ["Run"]
 
@@ -48,8 +51,10 @@ class Run:
         record=None,
     ):
         self.step, self.state, self.params, self.inputs = step, state, params, inputs
+        state.rounds = any(any(form.floats) for form in (state, params, inputs) if form is not None)
         self.n, self.keep, self.slots, self.truncate, self.store = n, keep, slots, truncate, store
         self.progress, self.record = progress, record
+        self.tapes: Tapes | None = None  # of single steps, kept from the way forward
         self.place_of: dict = {}  # in a dual run: number of an argument of the run -> its number here
         self.silenced: tuple = ()  # variables that are zero for the step after a cut: tangents
         self.outcome = None  # what the user's tree holds beside the variables
@@ -76,9 +81,10 @@ class Run:
 
     def forward(self, args):
         """Run all steps; return the arrays to hand out."""
-        engine = engine_of(self, args)
+        tapes = self.tapes if self.store else None
+        engine = engine_of(self, args, tapes.wanted if tapes else (), tapes is not None)
         collector = self.keep.collector(self.n)
-        with engine.guarded():
+        with engine.guarded(), tapes.fresh() if tapes else nullcontext():
             state, statics, kept = self._advance(engine, collector, args)
         engine.check_params()
         self._check_end(args, state)
@@ -152,7 +158,7 @@ class Run:
             self.forward(args)
         engine = engine_of(self, args, frozenset(wanted))
         with engine.guarded():
-            state = Way(self, engine, any(number < len(self.state.places) for number in wanted)).back(g)
+            state = Way(self, engine, self.wants(0, wanted)).back(g)
         found = [*(state or [None] * len(self.state.places)), *engine.gradients()]
         for number in wanted:
             self._check_gradient(number, found[number], g)
@@ -168,6 +174,10 @@ class Run:
                 f"the way back through {self.n} steps of rollout makes the gradient in {name} NaN or infinite; "
                 "take fewer steps, or cut it with truncate"
             )
+
+    def wants(self, i, wanted):
+        """Whether step i hands a cotangent on to its state, when the arguments in `wanted` want theirs."""
+        return not self.is_cut(i) if i else any(number < len(self.state.places) for number in wanted)
 
     def is_cut(self, i):
         """Whether truncation makes state i a constant for the steps after it."""

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from sparsedp.fields import is_number
 
-__all__ = ["Plan", "advances", "plan", "recomputed", "slots_within", "stride"]
+__all__ = ["Plan", "advances", "plan", "recomputed", "room_within", "slots_within", "stride"]
 
 UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
 WORKING = 6  # states at work beside the kept ones: the present, the next, the last, a cotangent of two, the result
@@ -86,6 +86,11 @@ def slots_within(memory, state_bytes, n, beside=0):
         )
     slots -= min(OWN, slots // 16)
     return min(slots, max(n, 1))
+
+
+def room_within(memory, state_bytes, n, beside=0):
+    """Bytes left for other things where all n states and those at work are kept; less than 0 when there are none."""
+    return _bytes(memory) - beside - (n + WORKING + OWN) * state_bytes
 
 
 def _bytes(memory):

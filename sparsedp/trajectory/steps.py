@@ -26,19 +26,22 @@ class Taped:
     """
 
     known = None  # going back: variables of the state after this step, where every state is kept
+    keeps = True  # whether tapes of the way forward are of use on the way back
 
-    def __init__(self, run, args, wanted=()):
-        self.run = run
+    def __init__(self, run, args, wanted=(), recording=False):
+        self.run, self.recording = run, recording
         _, self.p, self.x = run.split(args)
         self.params = run.params.build([frozen(value) for value in self.p], still(run.params.statics))
         self._given = leaves(self.params)
         self._last: tuple = ()
+        self.wanted = frozenset(wanted)
         first, second = len(run.state.places), len(run.state.places) + len(self.p)
         self._p = [place for place in range(len(self.p)) if first + place in wanted]
         self._x = [place for place in range(len(self.x)) if second + place in wanted]
         self.gp: list = [None] * len(self.p)
         self.gx: list = [np.zeros_like(x) if place in self._x else None for place, x in enumerate(self.x)]
-        self._roots = {want: self._plan_roots(want) for want in (True, False)}
+        flags = [(want, weighed) for want in (True, False) for weighed in {recording, False}] if wanted else []
+        self._roots = {flag: self._plan_roots(*flag) for flag in flags}
 
     # ------------------------------------------------------------ forward
 
@@ -47,6 +50,8 @@ class Taped:
         run = self.run
         values = self._silenced(i, values)
         self._last = i, values, statics
+        if self.recording and run.tapes.fit:
+            return self._recorded(i, values, statics)
         if run.state.bare:
             result = run.step(frozen(values[0]), self.params, *run.input_at(i, self.x))
             if run.state.is_one(result):
@@ -114,26 +119,42 @@ class Taped:
         run = self.run
         values = self._silenced(i, values)
         self._last = i, values, statics
-        roots, spread = self._roots[want_state]
-        parts = [run.state.build([frozen(value) for value in values], statics), self.params]
-        parts += run.input_at(i, self.x)
-        result, number = trace(lambda parts: run.step(*parts), parts, spread)
-        ends = run.state.take(result, "the step")[0]
-        pairs = [split_box(end, number) for end in ends]
-        if i == run.n - 1:
-            run.compare(run.state.check([value for value, _ in pairs], "the step"))
+        ends = run.tapes and run.tapes.take(i, self.wanted)
+        if not ends:
+            pairs, roots, _ = self._taped(i, values, statics, want_state)
+            if i == run.n - 1:
+                run.compare(run.state.check([value for value, _ in pairs], "the step"))
+            ends = [node for _, node in pairs], roots
         nodes, slopes = [], []
-        for (_, node), slope in zip(pairs, g, strict=True):
+        for node, slope in zip(ends[0], g, strict=True):
             if node is not None and slope is not None:
                 nodes.append(node)
                 slopes.append(slope)
-        return self._sorted(i, values, pull_ends(nodes, slopes, roots), want_state)
+        return self._sorted(i, values, pull_ends(nodes, slopes, ends[1]), want_state)
 
-    def _plan_roots(self, want_state):
+    def _taped(self, i, values, statics, want_state, weighed=False):
+        """A step on a tape of its own: (value, node) of each variable, the roots, the other leaves."""
+        run = self.run
+        roots, spread = self._roots[want_state, weighed]
+        parts = [run.state.build([frozen(value) for value in values], statics), self.params]
+        parts += run.input_at(i, self.x)
+        result, number = trace(lambda parts: run.step(*parts), parts, spread)
+        ends, others = run.state.take(result, "the step")
+        return [split_box(end, number) for end in ends], roots, others
+
+    def _recorded(self, i, values, statics):
+        """The same as `forward`, on a tape that is kept for the way back."""
+        run, before = self.run, self.run.tapes.bytes
+        pairs, roots, statics = self._taped(i, values, statics, run.wants(i, self.wanted), run.tapes.weighs(i))
+        run.tapes.keep(i, ([node for _, node in pairs], roots), before)
+        return run.state.check([value for value, _ in pairs], "the step"), still(statics)
+
+    def _plan_roots(self, want_state, weighed):
         """The roots in use, and the roots in the order of all leaves. They hold nothing: every step uses them again."""
         run = self.run
-        state = [reverse_root() if want_state else None for _ in run.state.places]
-        p, x = [reverse_root() for _ in self._p], [reverse_root() for _ in self._x]
+        root = run.tapes.root if weighed else reverse_root
+        state = [root() if want_state else None for _ in run.state.places]
+        p, x = [root() for _ in self._p], [root() for _ in self._x]
         spread = run.state.spread(state) + run.params.spread(_at(self._p, p, len(self.p)))
         if run.inputs is not None:
             spread += run.inputs.spread(_at(self._x, x, len(self.x)))

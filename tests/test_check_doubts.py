@@ -1,0 +1,133 @@
+"""What an audit must not decide: kinks, noise and ripples; and the orders of a Hessian product."""
+
+import json
+from collections import Counter
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from doubtful import kinked, noisy
+
+import sparsedp as dp
+
+AUDIT = dp.check.gradient
+X = np.linspace(1.0, 2.0, 20)
+
+
+def verdicts(make, seeds):
+    with np.errstate(all="ignore"):
+        return Counter(AUDIT(*make(seed)).verdict for seed in seeds)
+
+
+@pytest.mark.parametrize("make", [kinked, noisy])
+def test_at_a_kink_or_in_noise_nothing_agrees(make):
+    assert not verdicts(make, range(4, 6))["agrees"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [kinked, noisy])
+def test_100_scenes_at_a_kink_or_in_noise(make):
+    """A norm at 0 has a gradient of NaN, which is wrong; nothing else is."""
+    found = verdicts(make, range(100))
+    assert not found["agrees"] and found["inconclusive"] >= (87 if make is kinked else 99), found
+
+
+def test_noise_is_said_in_digits():
+    staircase = AUDIT(lambda u: float(np.float32(np.sum(u**2))), X, gradient=lambda u: 2 * u)
+    assert staircase.verdict == "inconclusive" and "of the loss leaves" in staircase.reason
+    assert AUDIT(lambda u: float(np.float32(np.sum(u**2))), X, gradient=lambda u: 2.02 * u).verdict == "disagrees"
+
+
+def test_stairs_that_the_steps_of_the_sweep_cannot_see():
+    """Powers of two meet a loss in single precision at one place of its stairs; the table of differences does not."""
+    loss, x = noisy(6)
+    assert AUDIT(loss, x).verdict == "inconclusive"
+    slope = lambda u: float(np.float32(8.0 + u)) - 8.0
+    assert AUDIT(slope, 1 / 3, gradient=1.001).verdict != "agrees"
+
+
+def test_several_kinks_at_once_follow_a_convention():
+    weights = np.random.default_rng(3).standard_normal(20)
+    clipped = lambda u: anp.sum(weights * anp.clip(u - X, -9.0, 0.0)) + 3 * anp.sum(u)
+    assert AUDIT(clipped, X).verdict == "inconclusive"  # 0 at the kink lies outside some one-sided derivatives
+    wrong = lambda u: 3 + weights * (u < X) + 0.1
+    assert AUDIT(clipped, X, gradient=wrong).verdict == "disagrees"
+
+
+# ---- ripples --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size, frequency", [(1e-12, 1e9), (1e-14, 1e11), (1e-10, 1e9), (1e-11, 1e11)])
+def test_a_ripple_decides_nothing(size, frequency):
+    """The loss moves by its ripple no more than by rounding (or by little more), its derivative by far more."""
+    x = X[:3]
+    slope = lambda u: size * frequency * np.cos(frequency * u)
+    loss = lambda u: anp.sum(u**2) + size * anp.sum(anp.sin(frequency * u))
+    taped = AUDIT(loss, x)
+    assert taped.verdict == "inconclusive" and "a ripple" in taped.reason
+    assert AUDIT(loss, x, gradient=lambda u: 2 * u + slope(u)).verdict == "inconclusive"
+    blind = AUDIT(loss, x, gradient=lambda u: 2 * u)  # what the whole climbs by is not the derivative
+    assert blind.verdict == "inconclusive" or size * frequency < 1e-2
+
+
+def test_a_wrong_gradient_is_no_ripple():
+    for error in (1e-7, 1e-5, 1e-3):
+        assert AUDIT(lambda u: np.sum(np.exp(u)), X, gradient=lambda u: (1 + error) * np.exp(u)).verdict == "disagrees"
+
+
+# ---- the size of a gradient, Hessian products -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1e200])
+def test_any_size_is_judged_the_same(scale):
+    """A right gradient, one three times too large, one off by 1e-7, a kink: with a Hessian product of that size."""
+    smooth = lambda u: scale * anp.sum(anp.sin(u) * u**2)
+    assert AUDIT(smooth, X).to_dict()["hessian"] == "agrees"
+    slope = lambda u: scale * (np.cos(u) * u**2 + 2 * u * np.sin(u))
+    assert AUDIT(smooth, X, gradient=lambda u: 3 * slope(u)).verdict == "disagrees"
+    assert AUDIT(smooth, X, gradient=lambda u: (1 + 1e-7) * slope(u)).verdict == "disagrees"
+    assert AUDIT(lambda u: scale * anp.sum(anp.abs(u - X)), X).verdict == "inconclusive"
+
+
+def test_order_three_with_a_hessian_product():
+    found = AUDIT(lambda u: anp.sum(anp.sin(u) * u**2), X)
+    line = found.lines[0]
+    assert found.hessian == "agrees" and line.rate3 == pytest.approx(3, abs=0.1) and "order 3" in str(found)
+    data = json.loads(json.dumps(found.to_dict()))
+    assert data["hessian"] == "agrees" and data["lines"][0]["rate3"] == line.rate3
+    square = AUDIT(lambda u: anp.sum(u**2), X)
+    assert square.hessian == "agrees" and np.isinf(square.lines[0].rate3)
+    solve = dp.inverse(-dp.laplacian(dp.Grid((5, 4)), dp.dirichlet))
+    assert AUDIT(lambda b: anp.sum(solve(anp.exp(b)) ** 2), X.reshape(5, 4)).lines[0].rate3 >= 2.9
+
+
+def test_a_wrong_hessian_leaves_the_verdict_on_the_gradient():
+    kept = dp.differentiable(
+        "kept", lambda u: u**3, lambda nums, ans, u: lambda g: (3 * np.asarray(plain(u)) ** 2 * g,)
+    )
+    found = AUDIT(lambda u: anp.sum(kept(u) * u), X)
+    assert found and found.hessian == "disagrees" and "Hessian product: disagrees" in str(found)
+    assert found.lines[0].rate3 == pytest.approx(2, abs=0.05)
+
+
+def plain(u):
+    return getattr(u, "_value", u)
+
+
+def test_hessians_that_are_not_known():
+    bent = AUDIT(lambda u: anp.sum(u**2) + anp.sum(anp.abs(u - X) ** 2.5), X)
+    assert bent and bent.hessian == "inconclusive" and "not three times differentiable" in str(bent)
+    assert AUDIT(lambda u: np.sum(u**2), X, gradient=2 * X).hessian is None
+    assert "x is complex" in str(AUDIT(lambda z: anp.sum(anp.abs(z) ** 2), X + 1j))
+
+    def once(nums, ans, u):
+        def pull(g):
+            if isinstance(u, np.ndarray):
+                return (3 * u**2 * g,)
+            raise TypeError("no second derivative")
+
+        return pull
+
+    cube = dp.differentiable("cube", lambda u: u**3, once)
+    found = AUDIT(lambda u: anp.sum(cube(u)), X)
+    assert found and found.hessian is None and "Hessian product: not available (TypeError)" in str(found)

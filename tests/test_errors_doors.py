@@ -1,0 +1,164 @@
+"""What is no grid, no operator, no function, or no plain array is named at the door."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+GRID = dp.Grid((4, 3))
+U, V = np.ones((4, 3)), np.ones(GRID.faces.size)
+MASKED = np.ma.masked_array(U, mask=np.eye(4, 3, dtype=bool))
+SHAPE, TYPE, VALUE = dp.errors.ShapeError, TypeError, ValueError
+LAP = -dp.laplacian(GRID, dp.dirichlet)
+SOLVE = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
+BUILDERS = {
+    "divergence": dp.divergence,
+    "laplacian": dp.laplacian,
+    "curl": dp.curl,
+    "upwind": dp.upwind,
+    "interior": dp.interior,
+    "sample": lambda grid: dp.sample(grid, [[0.5, 0.5]]),
+    "restrict": lambda grid: dp.restrict(grid, 2),
+    "prolong": lambda grid: dp.prolong(grid, 2),
+    "embed": lambda grid: dp.embed(grid, "x"),
+    "part": lambda grid: dp.part(grid, "x"),
+    "harmonic_average": dp.harmonic_average,
+    "projection": dp.projection,
+    "transport": dp.transport,
+}
+
+
+@pytest.mark.parametrize("given", [None, (4, 3), 7, U, GRID.cells], ids=lambda given: type(given).__name__)
+@pytest.mark.parametrize("name", BUILDERS)
+def test_what_is_no_grid(name, given):
+    message = f"{name} takes a Grid, got {type(given).__name__}; write dp.Grid((64, 64), size=1.0)"
+    with pytest.raises(TypeError) as caught:
+        BUILDERS[name](given)
+    assert str(caught.value) == message
+
+
+TABLE = [
+    (lambda: dp.curl("grid"), TYPE, "curl takes a Grid, got str; write dp.Grid((64, 64), size=1.0)"),
+    (
+        lambda: dp.from_matrix([[1, 2], [3]]),
+        SHAPE,
+        "matrix needs rows of one length, got a list of different ones; fill them with 0",
+    ),
+    (lambda: dp.from_matrix(MASKED), TYPE, "matrix takes plain arrays, got a masked array; fill it first"),
+    (
+        lambda: dp.from_linear_operator(np.eye(3)),
+        TYPE,
+        "from_linear_operator takes a LinearOperator, got ndarray; write dp.from_matrix",
+    ),
+    (
+        lambda: dp.from_linear_operator(lambda x: x),
+        TYPE,
+        "from_linear_operator takes a LinearOperator, got function; write dp.from_functions",
+    ),
+    (lambda: SOLVE(1.0, MASKED), TYPE, "elliptic_solver takes plain arrays, got a masked array; fill it first"),
+    (
+        lambda: SOLVE(np.ma.masked_array(V), U),
+        TYPE,
+        "elliptic_solver takes plain arrays, got a masked array; fill it first",
+    ),
+    (lambda: SOLVE(None, U), VALUE, "k must hold real numbers, got dtype object; write np.asarray(k, float)"),
+    (lambda: SOLVE("1", U), VALUE, "k must hold real numbers, got dtype <U1; write np.asarray(k, float)"),
+    (lambda: SOLVE(1j, U), VALUE, "k must hold real numbers, got dtype complex128; write k.real"),
+    (
+        lambda: dp.matrix_solver(np.eye(4))(np.ones(4), MASKED[:, 0]),
+        TYPE,
+        "matrix_solver takes plain arrays, got a masked array; fill it first",
+    ),
+    (lambda: dp.implicit(None), TYPE, "implicit takes a function as residual, got NoneType; write lambda x: ..."),
+    (
+        lambda: dp.implicit(lambda x: x, LAP.matrix),
+        TYPE,
+        "implicit takes a function as jacobian, got csr_array; write lambda x: ...",
+    ),
+    (
+        lambda: dp.implicit(lambda x: x)(MASKED),
+        TYPE,
+        "implicit(<lambda>) takes plain arrays, got a masked array; fill it first",
+    ),
+    (
+        lambda: dp.value_and_grad(3.0),
+        TYPE,
+        "value_and_grad takes a function, got float; write lambda x: np.sum(x**2)",
+    ),
+    (
+        lambda: dp.exponential(LAP, "a"),
+        TYPE,
+        "exponential needs one real number as time, got 'a'; write for example 0.1",
+    ),
+    (
+        lambda: dp.power(LAP, [1, 2]),
+        TYPE,
+        "power needs one real number as exponent, got [1, 2]; write for example 0.5",
+    ),
+    (
+        lambda: dp.rollout(None, U, None, 3),
+        TYPE,
+        "rollout takes a function, got NoneType; write lambda state, params: ...",
+    ),
+    (lambda: dp.minimise(None, U), TYPE, "minimise takes a function, got NoneType; write lambda x: np.sum(x**2)"),
+    (
+        lambda: dp.minimise(np.sum, U, callback=1),
+        TYPE,
+        "callback of minimise takes a function, got int; write lambda record, x: False",
+    ),
+    (lambda: dp.explain(1.0, U), TYPE, "explain takes a function, got float; write lambda x: np.sum(x**2)"),
+    (lambda: dp.stress(1.0, U), TYPE, "stress takes a function, got float; write lambda x: np.sum(x**2)"),
+    (lambda: dp.workprec(1.0, {}), TYPE, "workprec takes a function, got float; write lambda cells: (loss, x)"),
+    (
+        lambda: dp.update_direction(LAP.matrix, U),
+        TYPE,
+        "update_direction takes a function, got csr_array; write lambda x: A @ x - b",
+    ),
+    (
+        lambda: dp.check.gradient(1.0, U),
+        TYPE,
+        "check.gradient takes a function, got float; write lambda x: np.sum(x**2)",
+    ),
+    (lambda: dp.check.order(2), TYPE, "check.order takes a function, got int; write lambda n: error on n cells"),
+    (
+        lambda: dp.check.transpose(np.eye(3)),
+        TYPE,
+        "check.transpose takes an Operator, got ndarray; write dp.from_matrix(...) first",
+    ),
+    (
+        lambda: dp.check.operator(None),
+        TYPE,
+        "check.operator takes an Operator, got NoneType; write dp.from_matrix(...) first",
+    ),
+    (
+        lambda: dp.plot(None, U),
+        TYPE,
+        "plot takes a Grid, got NoneType; write dp.Grid((64, 64), size=1.0)",
+    ),
+    (
+        lambda: dp.inverse(np.eye(3)),
+        TYPE,
+        "inverse takes an Operator, got ndarray; write dp.from_matrix(...) first",
+    ),
+]
+
+
+@pytest.mark.parametrize(("call", "error", "message"), TABLE, ids=[row[2][:60] for row in TABLE])
+def test_message(call, error, message):
+    with pytest.raises(error) as caught:
+        call()
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.complex64, np.complex128, int, bool])
+def test_what_solves_take(kind):
+    """Single and complex numbers keep their kind; whole numbers and flags become float64; lists are arrays."""
+    b = U.astype(kind)
+    wanted = np.dtype(kind) if np.dtype(kind).kind in "fc" else np.dtype(float)
+    for solve in (dp.inverse(LAP), dp.inverse(LAP).T, lambda b: SOLVE(1.0, b)):
+        x = solve(b)
+        assert x.dtype == wanted and solve(b.tolist()).shape == (4, 3)
+        assert LAP(x) == pytest.approx(b.astype(wanted), abs=1e-5)
+    value, slope = dp.value_and_grad(lambda k: anp.sum(anp.real(SOLVE(k, b))))(V)
+    assert slope.dtype == float and np.all(slope <= 1e-12) and value > 0

@@ -1,0 +1,38 @@
+"""What the pages of the learning examples promise: case B12, learned first guesses, and case A8 by a network."""
+
+import re
+
+from test_examples import run
+
+
+def rows(text, pattern):
+    return [(found[1].strip(), *map(float, found.groups()[1:])) for found in re.finditer(pattern, text, re.MULTILINE)]
+
+
+def test_conductivity_design():
+    """Case B12: ratio 0.75 +- 0.005 at n = 200, both contents as known, and the exact conductivity."""
+    printed = run("conductivity_design.py")
+    rod, plate = rows(printed, r"^(.*\S) +(\d\.\d+) +(\d\.\d+) +(\d\.\d+) +(\d+) +\S+ +(\S+) to (\S+)$")
+    assert abs(rod[3] - 0.75) <= 0.005 and abs(rod[1] - 1 / 3) <= 1e-4 and abs(rod[2] - 1 / 4) <= 1e-4
+    assert rod[4] <= 30 and abs(rod[5] - 0.5) <= 1e-2 and abs(rod[6] - 0.5) <= 1e-2
+    assert float(re.search(r"off by (\S+)", printed)[1]) <= 1e-2
+    assert plate[3] < 0.5
+
+
+def test_warm_start_learned():
+    """Every learned guess is far better after k iterations, and none does what multigrid does from zero."""
+    printed = run("warm_start_learned.py")
+    zero, *learned = rows(printed, r"^(\S.*?) +\d+\.\d +(\S+e\S+) +(\S+e\S+) +(\S+) +(\S+)$")
+    assert zero[0] == "zero" and len(learned) == 3
+    for _, residual, error, plain, cycles in learned:
+        assert residual < zero[1] / 5 and error < zero[2] / 5
+        assert zero[4] <= cycles + 0.5 and zero[4] <= 5 < plain < zero[3]
+
+
+def test_residual_or_physics():
+    """Case A8: the adjoint finds the start, a network with the adjoint keeps the physics; residuals break it."""
+    found = rows(run("residual_or_physics.py"), r"^(\w.*?) +\d+ +\d+\.\d +\d+\.\d +(\S+) +(\S+) +(\S+) +(\S+)$")
+    assert len(found) == 4
+    by_equation, by_scheme, network, start = found
+    assert start[3] <= 0.03 and start[4] == network[4] == 0.0
+    assert min(by_equation[4], by_scheme[4]) > 0 and min(by_equation[3], by_scheme[3]) > start[3]
