@@ -22,6 +22,8 @@ CENTRAL = np.finfo(float).eps ** (1 / 3)  # step of central differences, relativ
 AGREES = {"complex step": 1e-6, "central differences": 1e-4}
 ROWS = {"complex step": (1e-9, 0.0), "central differences": (1e-5, 1e-9)}  # of a row, and of the largest: what may miss
 
+TIMES = 2, 5, 11  # steps at which what a row lacks is looked at again
+
 
 def adopt(f, sparsity=None, derivative="auto", name=None):
     """Any NumPy function of an array -> the same function, differentiable.
@@ -215,13 +217,17 @@ class Adopted:
         way = self._choose(x)
         share, floor = ROWS[way]
         for point in near:
-            v = self._steps(point) * rng.standard_normal(point.shape)
+            v, product = self._steps(point) * rng.standard_normal(point.shape), self._product(point, way)
             try:
-                matrix, known = self._by_colours(point, way), self._product(point, way)(v)
+                matrix = self._by_colours(point, way)
+                lacks = product(v) - matrix @ v.reshape(-1)
+                size = share * (abs(matrix) @ np.abs(v).reshape(-1))
+                small = ~(np.abs(lacks) <= size)
+                if not np.all(np.abs(lacks) <= size + floor / share * np.max(size)):
+                    return False
+                if np.any(small) and np.any(small & _grows(lacks, v, product, matrix)):
+                    return False
             except REFUSED:  # not finite so close to an allowed point
-                return False
-            size = abs(matrix) @ np.abs(v).reshape(-1)
-            if not np.all(np.abs(matrix @ v.reshape(-1) - known) <= share * size + floor * np.max(size)):
                 return False
         return True
 
@@ -255,9 +261,8 @@ class Adopted:
         difference = self._product(x, "central differences")(v)
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():
-                warnings.simplefilter(
-                    "error", np.exceptions.ComplexWarning
-                )  # what is cast to real has lost the derivative
+                # What is cast to real has lost the derivative.
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)
                 step = self._product(x, "complex step")(v)
         except Exception:
             return False
@@ -275,6 +280,15 @@ class Adopted:
                 "direction; its sparsity lacks entries, or it has a kink at x: give sparsity, or "
                 "derivative='difference'"
             )
+
+
+def _grows(lacks, v, product, matrix):
+    """Which rows lack something in proportion to the step: entries, however small. What rounding makes does not grow.
+
+    A row may be far smaller than the largest, as one of other units is.
+    """
+    gaps = [product(times * v) - times * (matrix @ v.reshape(-1)) - times * lacks for times in TIMES]
+    return np.all([np.abs(gap) <= 0.1 * np.abs(lacks) for gap in gaps], axis=0) & (lacks != 0)
 
 
 def _gap(found, known):

@@ -104,7 +104,7 @@ def resolve(grid, boundary):
     >>> resolve(Grid((2, 2), periodic=(True, False)), {"y": (dirichlet, neumann)})
     (None, (dirichlet, neumann))
     """
-    if not hasattr(grid, "periodic"):
+    if not hasattr(grid, "periodic"):  # Grid itself stands on a higher floor
         raise TypeError(f"an operator needs a grid first, got {grid!r}; write dp.Grid((8, 6), size=1.0)")
     named = boundary if isinstance(boundary, dict) else dict.fromkeys(AXES, boundary)
     if isinstance(boundary, dict):

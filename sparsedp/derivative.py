@@ -21,7 +21,7 @@ from sparsedp.tape import (
 )
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["NO_JVP", "pullback", "pushforward", "value_and_grad"]
+__all__ = ["NO_JVP", "pullback", "pushforward", "traced", "value_and_grad"]
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
 NO_JVP = (DerivativeError, NotImplementedError)
@@ -63,7 +63,7 @@ def pullback(fun, x):
         raise DerivativeError(
             f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write x.astype(float)"
         )
-    result, number = _traced(fun, x, roots)
+    result, number = traced(fun, x, roots)
     if not _is_array(result):
         raise DerivativeError(
             f"the function must return one array or number, got {type(result).__name__}; sum or join it"
@@ -82,8 +82,8 @@ def pullback(fun, x):
     return value, pull
 
 
-def _traced(fun, x, roots):
-    """trace, with a word of advice where NumPy, math or Python refuse a traced value."""
+def traced(fun, x, roots):
+    """`tape.trace`, with a word of advice where NumPy, math or Python refuse a traced value."""
     try:
         return trace(fun, x, roots)
     except (TypeError, ValueError, AttributeError) as error:
@@ -143,7 +143,7 @@ def pushforward(fun, x, tangent):
         forward_root(direction) if is_variable(leaf) else None
         for leaf, direction in zip(found, directions, strict=True)
     ]
-    result, number = _traced(fun, x, roots)
+    result, number = traced(fun, x, roots)
     ends, rebuild = flatten(result)
     pairs = [split_box(end, number) for end in ends]
     values = rebuild(value for value, node in pairs)

@@ -15,8 +15,9 @@ from math import prod
 
 import numpy as np
 
+from sparsedp.errors import ShapeError
 from sparsedp.space import Space
-from sparsedp.spacing import AXES, cell_widths, finite_number, flag, lengths, per_axis
+from sparsedp.spacing import AXES, cell_widths, finite_number, flag, lengths, node_axes, per_axis
 
 __all__ = ["Grid", "check_grid"]
 
@@ -138,9 +139,9 @@ class Grid:
 
     def control_volumes(self, kind, axis):
         """Volumes that belong to one component of a space; they sum to the volume of the box."""
-        on_nodes = {"cells": (), "nodes": range(self.dim), "faces": (axis,)}.get(kind)
-        if on_nodes is None:  # edges sit on nodes across their own axis
-            on_nodes = tuple(a for a in range(self.dim) if a != axis)
+        on_nodes = node_axes(kind, axis, self.dim)
+        if on_nodes is None:
+            raise ShapeError(f"values on {kind} have no volumes; take those of grid.cells, faces, nodes or edges")
         lengths = [self.spacings(a) if a in on_nodes else self.widths[a] for a in range(self.dim)]
         return _outer(lengths)
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp.errors import ShapeError
 
-__all__ = ["AXES", "cell_widths", "finite_number", "flag", "lengths", "per_axis", "real_numbers"]
+__all__ = ["AXES", "cell_widths", "finite_number", "flag", "lengths", "node_axes", "per_axis", "real_numbers"]
 
 AXES = ("x", "y", "z")
 
@@ -16,6 +16,17 @@ def lengths(shape):
     if not (whole and 1 <= len(shape) <= 3):
         raise ShapeError(f"a grid needs one to three whole lengths >= 0, got shape {shape}; write Grid((8, 6))")
     return tuple(int(n) for n in shape)
+
+
+def node_axes(kind, component, dim):
+    """Axes along which values sit on nodes, not on centres; None for kinds of spaces that have no places, as walls.
+
+    kind: cells, nodes, faces, edges, or one component of faces, such as x-faces; component: its number.
+    """
+    if kind in [f"{axis}-faces" for axis in AXES[:dim]]:
+        return (AXES.index(kind[0]),)
+    across = tuple(axis for axis in range(dim) if axis != component)
+    return {"cells": (), "nodes": tuple(range(dim)), "faces": (component,), "edges": across}.get(kind)
 
 
 def per_axis(value, shape, name):

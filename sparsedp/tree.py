@@ -1,10 +1,14 @@
-"""Nested containers of arrays: taken apart into leaves, and put together again.
+"""Nested containers of arrays: taken apart into leaves, put together again, and measured.
 
 A tree is any nesting of tuples (named ones too), lists and dicts. Everything else is a leaf.
 Dict entries keep their order.
 """
 
-__all__ = ["flatten", "leaves"]
+from math import hypot, isfinite
+
+import numpy as np
+
+__all__ = ["flatten", "leaves", "norm"]
 
 
 def flatten(tree):
@@ -57,6 +61,31 @@ def leaves(tree):
     found: list = []
     _collect(tree, found)
     return found
+
+
+def norm(tree):
+    """Tree -> Euclidean norm over the numbers of all leaves, without overflow or underflow.
+
+    Parameters
+    ----------
+    tree : any nesting of tuple, list and dict
+        Of arrays and numbers, real or complex; None counts for nothing.
+
+    Returns
+    -------
+    float
+        Infinite or NaN where a leaf is.
+
+    Examples
+    --------
+    >>> norm([3e200, None, np.array([0.0, 4e200])]) == 5e200
+    True
+    """
+    arrays = [np.asarray(leaf) for leaf in leaves(tree) if leaf is not None]
+    largest = max((float(np.max(np.abs(a), initial=0.0)) for a in arrays), default=0.0)
+    if largest == 0 or not isfinite(largest):
+        return largest
+    return largest * hypot(*(float(np.linalg.norm(a / largest)) for a in arrays))
 
 
 def _collect(tree, found):

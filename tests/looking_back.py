@@ -4,7 +4,10 @@ from itertools import product
 
 import autograd.numpy as anp
 import numpy as np
+import pytest
 from autograd.tracer import getval
+
+from sparsedp.derivative import pullback, pushforward
 
 
 def look(u, places, sides, inflow, cubic=False):
@@ -179,3 +182,19 @@ def _component(move, u, w, lines, dt, sides, inflow):
         low = value if low is None else anp.minimum(low, value)
         high = value if high is None else anp.maximum(high, value)
     return anp.minimum(anp.maximum(new, low), high)
+
+
+def against_twin(move, point, share):
+    """Assert that value and cotangents of a transport are those of its twin, and that its tangent fits them."""
+    value, pull = pullback(lambda x: move(*x), point)
+    wanted, wanted_pull = pullback(lambda x: moved(move, *x), point)
+    assert value == pytest.approx(wanted, rel=share, abs=share)
+    g = np.random.default_rng(6).standard_normal(value.shape)
+    back = pull(g)
+    for mine, twin in zip(back, wanted_pull(g)):
+        assert mine == pytest.approx(twin, rel=10 * share, abs=10 * share)
+    rng = np.random.default_rng(7)
+    along = tuple(rng.standard_normal(np.shape(x)) if np.ndim(x) else 0.3 for x in point)
+    tangent = pushforward(lambda x: move(*x), point, along)[1]
+    forward, backward = np.sum(g * tangent), sum(np.sum(a * b) for a, b in zip(back, along))
+    assert abs(forward - backward) <= 1e-12 * (1 + abs(forward))

@@ -134,6 +134,20 @@ def test_a_stencil_is_found_from_a_few_cells(rng, f, shape, most):
         assert jacobian.nnz == 5 * 64 * 63 - 2 * (64 + 63)  # nothing reaches round a wall
 
 
+@pytest.mark.parametrize("size", [1e-6, 1e-10, 1e-30, 1e-100])
+def test_small_rows_keep_what_no_stencil_has(rng, size):
+    """A row of other units is not lost in the rounding of the largest, where differences are taken."""
+    sizes, x = np.ones(300), rng.standard_normal(300)
+    sizes[[37, 101]] = size
+
+    def f(x):
+        x = np.asarray(x).real
+        return sizes * (np.roll(x, 1) - 2 * x + 0.1 * x**2 + np.where(sizes < 1, np.sum(x), 0.0))
+
+    small = dp.adopt(f, derivative="difference").jacobian(x).toarray()[[37, 101]]
+    assert np.all(small != 0) and np.max(np.abs(small[0, 200:] / size - 1)) < 1e-6
+
+
 @pytest.mark.parametrize("limit", [1.0001, 1.15, 1.2, 1.25, 1.4])
 @pytest.mark.parametrize("answer", ["raises", "is not finite"])
 def test_code_that_refuses_what_is_near(limit, answer):

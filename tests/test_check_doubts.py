@@ -70,6 +70,14 @@ def test_a_ripple_decides_nothing(size, frequency):
     assert blind.verdict == "inconclusive" or size * frequency < 1e-2
 
 
+def test_a_constant_far_above_the_rest_makes_no_ripple():
+    """Steps of 1e11 see no curvature at all, and are no measure of the usual one."""
+    x, off = np.random.default_rng(0).uniform(0.5, 1.0, 7), lambda factor: lambda u: factor * np.cos(u)
+    loss = lambda u: 1e8 + anp.sum(anp.sin(u))
+    assert AUDIT(loss, x, gradient=off(1.01)).verdict == "disagrees"
+    assert AUDIT(loss, x, gradient=off(1.0)).verdict == "agrees"
+
+
 def test_a_wrong_gradient_is_no_ripple():
     for error in (1e-7, 1e-5, 1e-3):
         assert AUDIT(lambda u: np.sum(np.exp(u)), X, gradient=lambda u: (1 + error) * np.exp(u)).verdict == "disagrees"

@@ -45,6 +45,11 @@ TABLE = [
         SHAPE,
         "matrix needs rows of one length, got a list of different ones; fill them with 0",
     ),
+    (
+        lambda: dp.lift(GRID, dp.dirichlet).domain.volumes,
+        SHAPE,
+        "values on walls have no volumes; take those of grid.cells, faces, nodes or edges",
+    ),
     (lambda: dp.from_matrix(MASKED), TYPE, "matrix takes plain arrays, got a masked array; fill it first"),
     (
         lambda: dp.from_linear_operator(np.eye(3)),

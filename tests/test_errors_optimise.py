@@ -43,6 +43,11 @@ WRONG = [
         "a side without a bound",
     ),
     (
+        run(bounds=(np.inf, None)), ValueError,
+        "bounds must be numbers with lower <= upper; write None for "
+        "a side without a bound",
+    ),
+    (
         run(bounds=(np.nan, 1.0)), ValueError,
         "bounds must be numbers with lower <= upper; write None for "
         "a side without",

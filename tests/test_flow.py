@@ -229,6 +229,14 @@ def test_viscosity_as_a_parameter():
     assert dp.check.gradient(energy, 0.1).verdict == "agrees"
 
 
+@pytest.mark.parametrize("shape", [(7,), (3, 1), (1, 5, 1)])
+def test_nothing_flows_in_a_closed_line_of_cells(shape):
+    """Not even rounding, which an audit of the operator would take for a wrong transpose."""
+    P = dp.projection(dp.Grid(shape))
+    assert not np.any(P(np.arange(1.0, P.domain.size + 1.0))) and not dp.check.operator(P).failed
+    assert np.any(dp.projection(dp.Grid(7), boundary={"x": ("inflow", "outflow")})(np.ones(8)))
+
+
 def test_what_is_refused():
     grid = dp.Grid((4, 4))
     with pytest.raises(ValueError, match="flow_step needs dt > 0, got 0; write a number"):

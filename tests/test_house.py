@@ -25,6 +25,7 @@ FLOORS = [
     ("derivative", 2),
     ("space", 2),
     ("conditions", 2),
+    ("direction", 3),
     ("grid", 3),
     ("structure", 3),
     ("operator", 4),

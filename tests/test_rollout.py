@@ -146,6 +146,33 @@ def test_steps_run_once_where_their_tapes_fit():
         assert found == wanted and least <= many <= most
 
 
+@pytest.mark.parametrize("memory", [None, "1 MB", 240 * 40])
+@pytest.mark.parametrize("period", [0, 2, 4, 11])
+def test_steps_may_write_into_arrays_of_their_own(memory, period):
+    """A tape that is kept must not see what a later step, or another rollout, writes there."""
+    start, own, order, n = np.linspace(0.5, 1.0, 30), np.empty(30), np.empty(30, int), 12
+    forcing = np.cos(np.arange(n) % (period or n))
+
+    def reused(u, p, x):
+        np.multiply(x, np.linspace(0.0, 1.0, 30), out=own)
+        order[:] = np.roll(np.arange(30), int(9 * x))
+        return anp.sin(u * own) * p + 0.1 * u[order] + 0.1 * anp.reshape(u, (1, 30))[(0, order)]
+
+    def fresh(u, p, x):
+        moved = u[np.roll(np.arange(30), int(9 * x))]
+        return anp.sin(u * (x * np.linspace(0.0, 1.0, 30))) * p + 0.1 * moved + 0.1 * moved
+
+    def slopes(step):
+        def loss(x):
+            first = dp.rollout(step, *x, n, inputs=forcing, memory=memory)
+            return anp.sum(first * dp.rollout(step, *x, 3, inputs=forcing[3:6], memory=memory))
+
+        return dp.value_and_grad(loss)((start, 0.9))[1]
+
+    for found, wanted in zip(slopes(reused), slopes(fresh), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-13)
+
+
 def test_masked_arrays_are_refused():
     u, end = np.arange(3.0), "; fill it first, and hand the mask along as an array of its own"
     masked = np.ma.masked_array(u, u > 1)

@@ -7,6 +7,8 @@ import pytest
 
 import sparsedp as dp
 from sparsedp import kernels
+from sparsedp.solvers.assembly import Assembly
+from sparsedp.solvers.parametric import Elliptic
 from sparsedp.structure import lazy
 
 pytestmark = pytest.mark.skipif(not kernels.compiled(), reason="the fused pass needs numba")
@@ -17,6 +19,7 @@ SHAPES = [(2, 2), (7, 5), (16, 17), (2, 3, 2), (5, 4, 6), (8, 2, 5)]
 @pytest.fixture(autouse=True)
 def at_every_size(monkeypatch):
     monkeypatch.setattr(lazy, "FEW", 0)
+    monkeypatch.setattr(lazy, "SHORT", 0)
 
 
 def chain(grid, k, boundary=dp.dirichlet):
@@ -74,3 +77,14 @@ def test_the_same_bits_with_one_thread_and_two(rng):
         dp.set_threads(threads)
         found.append(op(u))
     assert np.array_equal(*found)
+
+
+def test_a_parametric_operator_acts_in_one_pass(rng):
+    """shift - D diag(k) G, as `elliptic_solver` applies it, forward and transposed."""
+    grid = dp.Grid((6, 5), spacing=[rng.uniform(0.5, 2, n) for n in (6, 5)])
+    assembly = Assembly(dp.divergence(grid), dp.gradient(grid, dp.robin(1, 2)))
+    op = Elliptic(assembly, rng.uniform(0.1, 9, grid.faces.size), 0.7)
+    for structure in (op, op.transpose()):
+        assert structure._product._fused is not None
+        x, matrix = rng.standard_normal(grid.cells.size), structure.explicit()
+        assert np.max(np.abs(structure.product(x) - matrix @ x)) <= 2e-15 * np.max(abs(matrix) @ np.abs(x))

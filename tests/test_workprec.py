@@ -33,6 +33,16 @@ def table(**options):
     return dp.workprec(poisson, METHODS, {"cells": [8, 16]}, **{"reference": EXACT, "repeats": 2, **options})
 
 
+def test_names_that_tables_and_files_cannot_hold(tmp_path):
+    methods = {"a|b": METHODS["direct"], 3: METHODS["krylov"]}
+    options = {"reference": EXACT, "repeats": 1, "scene": "walls/x", "file": tmp_path / "rows.csv"}
+    found = dp.workprec(poisson, methods, {"cells": [8]}, **options)
+    assert "| a\\|b |" in found.markdown() and "| 3 |" in found.markdown()
+    assert [path.name for path in found.save(tmp_path)[:2]] == ["walls-x.md", "walls-x.csv"]
+    again = dp.workprec(poisson, methods, {"cells": [8]}, **options)
+    assert [row["method"] for row in again.rows] == ["a|b", "3"] and again.markdown() == found.markdown()
+
+
 def test_rows():
     found = table(seed=7)
     assert COLUMNS[:17] == tuple(FIRST.split())

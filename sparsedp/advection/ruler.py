@@ -65,9 +65,7 @@ class Uniform:
 
     def steepness(self, points, samples, look, g):
         """g times the derivative of what is found, in the velocities of the look."""
-        found = np.zeros_like(look.speeds)
-        sampling.slopes(points, samples, look[0], look[1], g, three(found))
-        return found
+        return _slopes(points, samples, look.speeds, look[1], g)
 
 
 class Stretched:
@@ -95,15 +93,17 @@ class Stretched:
         (above, below), arrays = look.sides, np.stack(look[0][3 - len(look.speeds) :])
         kinks = above != below
         if not kinks.any():
-            return above * self._slopes(points, samples, arrays, g)
+            return above * _slopes(points, samples, arrays, look[1], g)
         nudge = np.where(kinks, 16 * np.finfo(float).eps * (max(points.shape) + LAYERS), 0.0)
-        upper, lower = (self._slopes(points, samples, arrays + sign * nudge, g) for sign in (-1, 1))
+        upper, lower = (_slopes(points, samples, arrays + sign * nudge, look[1], g) for sign in (-1, 1))
         return 0.5 * (above * upper + below * lower)
 
-    def _slopes(self, points, samples, arrays, g):
-        found = np.zeros_like(arrays)
-        sampling.slopes(points, samples, three(arrays), (1.0,) * 3, g, three(found))
-        return found
+
+def _slopes(points, samples, arrays, scale, g):
+    """g times the slope of the samples along each axis, where arrays (axis, point) and their scale lead to."""
+    found = np.zeros_like(arrays)
+    sampling.slopes(points, samples, three(arrays), scale, g, three(found))
+    return found
 
 
 def _line(setting, axis, number, interpolation):

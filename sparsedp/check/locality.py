@@ -9,6 +9,7 @@ from sparsedp.check.probes import field
 from sparsedp.errors import DerivativeError
 from sparsedp.operators.boundary import interior
 from sparsedp.operators.difference import divergence, gradient
+from sparsedp.spacing import node_axes
 
 __all__ = ["integration_by_parts", "order_inside"]
 
@@ -18,7 +19,6 @@ INSIDE = 0.5, 0.3, 0.7  # shares of the way along an axis where a row is looked 
 FEWEST = 5  # cells along an axis: fewer, and no row is inside
 DEGREES = 7  # of the polynomials that a row is tried on
 ZERO = 1e-8  # of the sum of sizes: a moment below it is rounding
-NODES = {"cells": (), "nodes": (0, 1, 2)}  # axes along which values sit on nodes; faces and edges by component
 
 
 # ------------------------------------------------------------ integration by parts
@@ -36,7 +36,7 @@ def integration_by_parts(op, rng):
         return "not known: it is between no two real fields of one grid"
     kinds = one.kind, other.kind
     try:
-        if one == other:
+        if one == other and node_axes(one.kind, 0, one.grid.dim) is not None:
             return _words("self-adjoint in the volumes of its grid", _self_adjoint(op, rng))
         if kinds == ("cells", "faces"):
             return _words("with the divergence of its grid", _slope(op, rng))
@@ -99,6 +99,8 @@ def _no_stencil(op):
     for space in (op.domain, op.codomain):
         if space.grid is None:
             return "it is no operator between fields of a grid"
+        if node_axes(space.kind, 0, space.grid.dim) is None:
+            return f"values on {space.kind} have no places"
         if min(space.grid.shape) < FEWEST:
             return f"it needs {FEWEST} cells along each axis"
     return "it is complex" if op.dtype.kind == "c" else ""
@@ -159,7 +161,7 @@ def _moments(weights, away, components):
 
 
 def _terms(moments, degree, op):
-    """ "2 u_xx + u_yy"."""
+    """The moments of one degree as a sum of derivatives, such as 2 u_xx + u_yy."""
     axes, many = op.domain.grid.axes, len(op.domain.parts) > 1
     words = []
     for (component, power), moment in sorted(moments.items(), key=lambda pair: (pair[0][0], [-p for p in pair[0][1]])):
@@ -186,8 +188,7 @@ def _places(space):
     """Positions of all values, shape (size, dim)."""
     grid, lines = space.grid, []
     for component in range(len(space.parts)):
-        across = {"faces": (component,), "edges": tuple(a for a in range(grid.dim) if a != component)}
-        on_nodes = across.get(space.kind, NODES.get(space.kind, ()))
+        on_nodes = node_axes(space.kind, component, grid.dim)
         at = [grid.coordinates(a, "nodes" if a in on_nodes else "cells") for a in range(grid.dim)]
         lines.append(np.stack([full.ravel() for full in np.meshgrid(*at, indexing="ij")], axis=1))
     return np.concatenate(lines)

@@ -104,7 +104,7 @@ def hessian(loss, point, line, found, trials, extend):
     except Exception as error:  # a rule, ours or not, may lack a second derivative and say so in any way
         return Bend(None, np.nan, np.nan, f"Hessian product: not available ({type(error).__name__})")
     if not np.isfinite(bend):
-        return Bend("disagrees", bend, np.nan, f"Hessian product: disagrees, it is {bend} along {line.name}")
+        return _judged("disagrees", bend, np.nan, f"it is {bend} along {line.name}")
     with np.errstate(all="ignore"):
         third = _orders(line, found, bend, trials.eps, point.eps)
         if extend and 0 < third.used < FEWEST:
@@ -136,22 +136,21 @@ def _orders(line, found, bend, eps, spread):
     used, orders = rates(gaps.t, remainder, usable)
     value = f"d.Hd = {bend:.9g} along {line.name}"
     if not used:
-        return _Third(
-            used, Bend("agrees", bend, np.inf, f"Hessian product: agrees, {value}, the third Taylor remainder is noise")
-        )
+        return _Third(used, _judged("agrees", bend, np.inf, f"{value}, the third Taylor remainder is noise"))
     if used < FEWEST or not orders:
         few = f"the third Taylor remainder stands out of the noise on {used} steps, {FEWEST} are needed"
-        return _Third(used, Bend("inconclusive", bend, np.nan, f"Hessian product: inconclusive, {value}; {few}"))
+        return _Third(used, _judged("inconclusive", bend, np.nan, f"{value}; {few}"))
     rate = min(orders)
     last = int(np.flatnonzero(usable)[-1])
     text = f"{value}, third Taylor remainder of order {rate:.2f}"
     if rate >= THIRD:
-        return _Third(used, Bend("agrees", bend, rate, f"Hessian product: agrees, {text}"))
+        return _Third(used, _judged("agrees", bend, rate, text))
     if rate > SECOND or abs(ahead[last] - behind[last]) > ODD * abs(ahead[last] + behind[last]):
-        return _Third(
-            used,
-            Bend("inconclusive", bend, rate, f"Hessian product: inconclusive, {text}: not three times differentiable"),
-        )
+        return _Third(used, _judged("inconclusive", bend, rate, f"{text}: not three times differentiable"))
     off = abs(ahead[last] + behind[last]) / gaps.t[last] ** 2
     share = off / abs(bend) if bend else np.inf
-    return _Third(used, Bend("disagrees", bend, rate, f"Hessian product: disagrees, {text}: it is off by {share:.1e}"))
+    return _Third(used, _judged("disagrees", bend, rate, f"{text}: it is off by {share:.1e}"))
+
+
+def _judged(word, bend, rate, reason):
+    return Bend(word, bend, rate, f"Hessian product: {word}, {reason}")

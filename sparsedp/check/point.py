@@ -4,9 +4,9 @@ import numpy as np
 
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.tape import is_variable
-from sparsedp.tree import flatten
+from sparsedp.tree import flatten, norm
 
-__all__ = ["Point", "root_sum_squares"]
+__all__ = ["Point"]
 
 MOST_LEAVES = 8  # with more leaves than this, none gets a direction of its own
 
@@ -97,16 +97,8 @@ class Point:
         return moves
 
 
-def root_sum_squares(arrays):
-    """Euclidean norm over all arrays, without overflow or underflow."""
-    largest = max((float(np.max(np.abs(a), initial=0.0)) for a in arrays), default=0.0)
-    if largest == 0 or not np.isfinite(largest):
-        return largest
-    return largest * float(np.sqrt(sum(np.sum(np.abs(a / largest) ** 2) for a in arrays)))
-
-
 def _rms(values):
-    return root_sum_squares([values.astype(_wide(values))]) / np.sqrt(max(values.size, 1))
+    return norm(values.astype(_wide(values))) / np.sqrt(max(values.size, 1))
 
 
 def _wide(values):

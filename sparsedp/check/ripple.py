@@ -60,7 +60,8 @@ def hidden(line, found, slope_at, eps, point):
     noise = max(2.0, found.jitter) * eps * abs(line.base)
     if found.word != "disagrees" or not abs(found.gap) > 0 or not noise > 0:
         return found
-    usual = np.median([abs(le.plus + le.minus - 2 * line.base) / le.step**2 for le in line.usable[:3]])
+    coarse = sorted((level for level in line.usable if level.step >= found.step), key=lambda level: level.step)
+    usual = np.median([abs(le.plus + le.minus - 2 * line.base) / le.step**2 for le in coarse[:3]])  # far out it is 0
     for times in WITHIN:
         step = times * noise / abs(found.gap)
         if step >= found.step:

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.check.point import root_sum_squares
 from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.ledger import recording
+from sparsedp.tree import norm
 
 __all__ = ["Level", "Line", "Trials", "default_steps", "dot"]
 
@@ -114,12 +114,11 @@ class Line:
         self.name, self.direction, self.base = name, direction, base
         self.gradient, self.solved, self.tolerance = gradient, trials.solved, trials.tolerance
         self._point, self._trials = point, trials
-        self._length = root_sum_squares(direction)
+        self._length = norm(direction)
         self.slope = dot(gradient, direction)
-        self.typical = root_sum_squares([g * d for g, d in zip(gradient, direction, strict=True)])
+        self.typical = norm([g * d for g, d in zip(gradient, direction, strict=True)])
         self.levels = []
-        self.noise = 0.0  # of the loss, in units of its rounding, as a table of differences shows it
-        self.close = False  # whether steps far below the plateau are looked at as well, where there is noise
+        self.noise, self.close = 0.0, False
 
     def expected(self, displacement):
         """What the gradient says that the loss changes by."""
@@ -132,7 +131,7 @@ class Line:
     def _level(self, step):
         ends = [self._point.moved(self.direction, sign * step) for sign in (1, -1)]
         there, back = map(self._point.away, ends)
-        length = root_sum_squares([a - b for a, b in zip(there, back, strict=True)]) / (2 * step)
+        length = norm([a - b for a, b in zip(there, back, strict=True)]) / (2 * step)
         ahead, behind = self.expected(there), self.expected(back)
         if not abs(length / self._length - 1) < 0.1:
             return Level(step, np.nan, np.nan, ahead, behind, "the step is lost in the rounding of x")

@@ -93,14 +93,8 @@ class Audit:
         proved = [one.digits for one in judged if one.word in ("agrees", "vanishes")]
         digits = int(min(proved)) if verdict == "agrees" else None
         self.__dict__.update(verdict=verdict, reason=reason, digits=digits, culprit=culprit, hessian=hessian)
-        self.__dict__.update(
-            lines=tuple(judged),
-            value=value,
-            evaluations=evaluations,
-            size=size,
-            notes=tuple(notes),
-            _sweeps=tuple(lines),
-        )
+        self.__dict__.update(value=value, evaluations=evaluations, size=size)
+        self.__dict__.update(lines=tuple(judged), notes=tuple(notes), _sweeps=tuple(lines))
 
     def __setattr__(self, name, value):
         raise AttributeError(f"an audit is frozen; {name} cannot be set")

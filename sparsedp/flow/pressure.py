@@ -111,7 +111,7 @@ class Projected(Structure):
         return out
 
     def _project(self, x, out):
-        size, exponent = norm(x), 0
+        setup, size, exponent = self.setup, norm(x), 0
         if not in_range(size):
             top = largest(x)
             if not np.isfinite(top):
@@ -119,11 +119,13 @@ class Projected(Structure):
             exponent = int(np.frexp(top)[1])
             x = shifted(x, -exponent)
             size = norm(x)
-        if self.setup.passes is None or not self._by_transforms(x, out, size):
+        if setup.passes is None or not self._by_transforms(x, out, size):
             np.copyto(out, x)
-            out[self.setup.closed] = 0.0
+            out[setup.closed] = 0.0
             self._by_contract(out)
-        if exponent:
+        if setup.still:
+            out[:] = 0.0
+        elif exponent:
             out[:] = shifted(out, exponent)
 
     def _refuse(self, x):

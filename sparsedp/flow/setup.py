@@ -59,6 +59,12 @@ class Setup:
         return forward, forward if self.symmetric else Passes(self.grid, self.D, self.G, free, True)
 
     @cached_property
+    def still(self):
+        """Whether nothing can flow without divergence: one closed line of cells. P is 0, beside rounding."""
+        shut = all(words and all(word in CLOSED for word in words) for words in self.sides)
+        return shut and sum(n > 1 for n in self.grid.shape) <= 1
+
+    @cached_property
     def open(self):
         """Which faces are not closed."""
         found = []

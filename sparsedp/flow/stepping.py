@@ -94,21 +94,24 @@ def flow_step(
     >>> bool(np.allclose(state["v"], 1.0))
     True
     """
-    for name, number, least in (("dt", dt, "> 0"), ("viscosity", viscosity, ">= 0")):
-        if isbox(number):
-            raise DerivativeError(
-                f"flow_step needs a constant {name}, got a traced one; a derivative in the viscosity takes "
-                "viscosity=lambda params: ..."
-            )
-        if name == "viscosity" and callable(number):
-            if implicit:
-                raise ValueError("implicit viscosity of flow_step is a number, got a function; write implicit=False")
-            continue
-        if not is_number(number) or number < 0 or (name == "dt" and number == 0):
-            raise ValueError(f"flow_step needs {name} {least}, got {number!r}; write a number")
-        if not np.isfinite(number):
-            raise NonFiniteError(f"flow_step needs a finite {name}, got {number}; write a number")
+    _check_constant("dt", dt, "> 0")
+    if not callable(viscosity):
+        _check_constant("viscosity", viscosity, ">= 0")
+    elif implicit:
+        raise ValueError("implicit viscosity of flow_step is a number, got a function; write implicit=False")
     return FlowStep(grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary)
+
+
+def _check_constant(name, number, least):
+    if isbox(number):
+        raise DerivativeError(
+            f"flow_step needs a constant {name}, got a traced one; a derivative in the viscosity takes "
+            "viscosity=lambda params: ..."
+        )
+    if not is_number(number) or number < 0 or (least == "> 0" and number == 0):
+        raise ValueError(f"flow_step needs {name} {least}, got {number!r}; write a number")
+    if not np.isfinite(number):
+        raise NonFiniteError(f"flow_step needs a finite {name}, got {number}; write a number")
 
 
 class FlowStep:

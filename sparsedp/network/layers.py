@@ -98,16 +98,9 @@ _SOFTPLUS = _activation(
 def tanh(x):
     """Hyperbolic tangent of each number.
 
-    Parameters
-    ----------
-    x : array
+    in: x, an array of any shape.
+    out: an array like x.
 
-    Returns
-    -------
-    array like x
-
-    Examples
-    --------
     >>> float(tanh(np.array(0.0)))
     0.0
     """
@@ -117,16 +110,9 @@ def tanh(x):
 def relu(x):
     """max(x, 0) of each number; the derivative at 0 is 1/2, the mean of both sides.
 
-    Parameters
-    ----------
-    x : array
+    in: x, an array of any shape.
+    out: an array like x.
 
-    Returns
-    -------
-    array like x
-
-    Examples
-    --------
     >>> relu(np.array([-1.0, 2.0]))
     array([0., 2.])
     """
@@ -136,16 +122,9 @@ def relu(x):
 def softplus(x):
     """log(1 + exp(x)) of each number, without overflow.
 
-    Parameters
-    ----------
-    x : array
+    in: x, an array of any shape.
+    out: an array like x.
 
-    Returns
-    -------
-    array like x
-
-    Examples
-    --------
     >>> softplus(np.array([0.0, 1000.0]))
     array([6.93147181e-01, 1.00000000e+03])
     """

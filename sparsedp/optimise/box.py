@@ -39,7 +39,7 @@ class Box:
         if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
             raise ValueError(f"bounds must be a pair (lower, upper), got {bounds!r}; write (0.0, None) for x >= 0")
         lower, upper = (_side(side, packing, start, value) for side, value in zip(bounds, (-np.inf, np.inf)))
-        if np.any(np.isnan(lower) | np.isnan(upper)) or np.any(lower > upper):
+        if not np.all((lower <= upper) & (lower < np.inf) & (upper > -np.inf)):  # nor NaN
             raise ValueError("bounds must be numbers with lower <= upper; write None for a side without a bound")
         return cls(lower, upper)
 

@@ -13,7 +13,7 @@ import scipy.linalg
 from sparsedp.fields import check_function, is_number
 from sparsedp.optimise.flat import Packing
 from sparsedp.optimise.linearised import Linearised
-from sparsedp.optimise.singular_values import singular
+from sparsedp.optimise.singular_values import decomposed
 
 __all__ = ["Direction", "Family", "update_direction"]
 
@@ -94,14 +94,9 @@ class Family:
             return Direction(np.zeros(jacobian.shape[1]), np.zeros(0), 0, "dense")
         if self.truncation > 1e-7 and len(jacobian) <= jacobian.shape[1]:
             return self._gram(jacobian, g)
-        wide = len(jacobian) <= jacobian.shape[1]
-        if wide:
-            found = singular(jacobian)
-            weights, kept = self._weights(found.s, found.left.T @ g)
-            return Direction(found.along(weights), found.s, kept, "dense")
-        found = singular(jacobian.T)
-        weights, kept = self._weights(found.s, found.across(g))
-        return Direction(found.left @ weights, found.s, kept, "dense")
+        combine, s, parts = decomposed(jacobian, g)
+        weights, kept = self._weights(s, parts)
+        return Direction(combine(weights), s, kept, "dense")
 
     def _gram(self, jacobian, g):
         squares, u = scipy.linalg.eigh(jacobian @ jacobian.T, check_finite=False)

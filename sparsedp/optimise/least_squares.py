@@ -12,8 +12,9 @@ from scipy.sparse.linalg import LinearOperator, lsmr
 from sparsedp.fields import is_number
 from sparsedp.optimise.directions import DENSE, Family
 from sparsedp.optimise.first_order import HALVINGS, admissible, backtracked
-from sparsedp.optimise.singular_values import singular
-from sparsedp.optimise.trials import Stuck, Trial, norm
+from sparsedp.optimise.singular_values import decomposed
+from sparsedp.optimise.trials import Stuck, Trial
+from sparsedp.tree import norm
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 
@@ -55,8 +56,8 @@ class _Normal:
         if damping > EXACT * np.linalg.norm(self._jacobian) ** 2:
             return -self._damped(damping)
         if self._factor is None:
-            self._factor = _decomposed(self._jacobian, self._linearised.flat)
-        return -_solve(self._factor, damping)
+            self._factor = decomposed(self._jacobian, self._linearised.flat)
+        return -_solve(self._factor, damping, max(self._jacobian.shape))
 
     def fall(self, d):
         """How far the linearised problem falls along d, which a bound may have cut short."""
@@ -84,17 +85,9 @@ class _Normal:
         return lsmr(product, self._linearised.flat, damp=np.sqrt(damping), atol=FORCING, btol=FORCING, conlim=1e14)[0]
 
 
-def _decomposed(jacobian, r):
-    """What every damping shares: how to combine directions, singular values, the parts of r along them."""
-    if len(jacobian) < jacobian.shape[1]:
-        found = singular(jacobian)
-        return found.along, found.s, found.left.T @ r, max(jacobian.shape)
-    found = singular(jacobian.T)
-    return (lambda shares: found.left @ shares), found.s, found.across(r), max(jacobian.shape)
-
-
-def _solve(factor, damping):
-    combine, s, parts, size = factor
+def _solve(factor, damping, size):
+    """Damped least squares from a decomposition that every damping shares; `size` is the longer side of J."""
+    combine, s, parts = factor
     floor = np.finfo(float).eps * size * (s[0] if len(s) else 0.0)
     kept = s > floor
     shares = np.divide(s, s * s + damping, out=np.zeros_like(s), where=kept)

@@ -8,7 +8,7 @@ from scipy.linalg.lapack import dsyevd
 from sparsedp.errors import NonFiniteError
 from sparsedp.optimise.trials import power_of_two
 
-__all__ = ["Singular", "singular"]
+__all__ = ["Singular", "decomposed", "singular"]
 
 GRADE = 1e-4  # singular values below this share of the largest wait for a Gram matrix of their own
 PLAIN = 2.0**-500, 2.0**500  # entries of a Gram matrix that need no scaling
@@ -40,6 +40,19 @@ class Singular(NamedTuple):
         """(k,) -> right^T y."""
         shares = np.divide(y, self.s, out=np.zeros_like(self.s), where=self.s > 0)
         return sum((group.vectors @ part) @ group.rows for group, part in zip(self.groups, self._apart(shares)))
+
+
+def decomposed(jacobian, r):
+    """Jacobian (m, n), r (m,) -> weights -> the right singular vectors with these weights, added up; s; parts of r.
+
+    The parts are those along the left singular vectors; there are min(m, n) of each. A tall Jacobian is the
+    transpose of a wide one.
+    """
+    if len(jacobian) <= jacobian.shape[1]:
+        found = singular(jacobian)
+        return found.along, found.s, found.left.T @ r
+    found = singular(jacobian.T)
+    return found.left.__matmul__, found.s, found.across(r)
 
 
 def singular(matrix):

@@ -11,7 +11,7 @@ from sparsedp.optimise.box import Box
 from sparsedp.optimise.linearised import Linearised, Restricted
 from sparsedp.tape import isbox
 
-__all__ = ["Failure", "Stuck", "Trial", "Trials", "norm", "power_of_two"]
+__all__ = ["Failure", "Stuck", "Trial", "Trials", "power_of_two"]
 
 OPEN, WHOLE = Box(), Batches()
 REFUSED = (UnstableStepError, ConvergenceError, NonFiniteError)
@@ -144,12 +144,6 @@ class Trials:
         """The refused points since the last call."""
         failures, self.failures = tuple(self.failures), []
         return failures
-
-
-def norm(vector):
-    """Euclidean norm without overflow or underflow."""
-    largest = float(np.max(np.abs(vector), initial=0.0))
-    return largest * float(np.linalg.norm(vector / largest)) if 0 < largest < np.inf else largest
 
 
 def power_of_two(value):

@@ -4,7 +4,7 @@ import time
 
 from sparsedp.ledger import tally
 from sparsedp.optimise.result import Record
-from sparsedp.optimise.trials import norm
+from sparsedp.tree import norm
 
 __all__ = ["Watch"]
 

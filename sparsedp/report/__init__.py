@@ -1,5 +1,6 @@
-"""Side room: pictures, certificates, measurements, and the demo. It may import every floor; only __main__ and the
-shop window open it.
+"""Side room: pictures, certificates, measurements, and the demo.
+
+It may import every floor; only __main__ and the shop window open it.
 """
 
 from sparsedp.report.charts import convergence, v_curve

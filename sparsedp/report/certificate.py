@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from sparsedp.check.findings import table
-from sparsedp.check.point import root_sum_squares
 from sparsedp.fields import is_number
 from sparsedp.report.answers import Answers, run, seen
-from sparsedp.tree import leaves
+from sparsedp.tree import leaves, norm
 
 __all__ = ["Certificate", "certify", "distance", "products_of"]
 
@@ -77,7 +76,7 @@ def certify(loss, x, target=TARGET):
     again = Corrections(loss, x, first.found)
     *corrected, answers = again.run(lambda key: True)
     adjoint = again.run(lambda key: key[1] == "adjoint")[1]
-    size = _norm(gradient) or 1.0
+    size = norm(gradient) or 1.0
     total = distance(corrected[1], gradient) / size
     causes = {
         "forward solves": distance(corrected[1], adjoint) / size,
@@ -102,14 +101,10 @@ class Corrections:
         return *run(self.loss, self.x, answers), answers.found
 
 
-def _norm(gradient):
-    return root_sum_squares([np.asarray(leaf) for leaf in leaves(gradient) if leaf is not None])
-
-
 def distance(one, other):
     """Euclidean distance of two gradients."""
     pairs = zip(leaves(one), leaves(other), strict=True)
-    return root_sum_squares([np.asarray(a) - np.asarray(b) for a, b in pairs if a is not None])
+    return norm([np.asarray(a) - np.asarray(b) for a, b in pairs if a is not None])
 
 
 def _solver(key):

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sparsedp.report.pareto import unbeaten
 from sparsedp.report.plots import axes_or_current
 
 __all__ = ["convergence", "curves", "stability", "v_curve"]
@@ -17,7 +18,7 @@ def curves(lines, ax, x_label, y_label):
     ax : matplotlib Axes
     x_label, y_label : str
     """
-    best = _pareto([point for x, y in lines.values() for point in zip(x, y, strict=True)])
+    best = unbeaten([point for x, y in lines.values() for point in zip(x, y, strict=True)])
     ax.plot(*zip(*best, strict=True), color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
     for name, (x, y) in lines.items():
         ax.plot(x, y, marker=".", markersize=4, linewidth=1, label=name)
@@ -124,15 +125,6 @@ def v_curve(audit, ax=None):
     ax.grid(visible=True, which="major", color="0.93")
     ax.legend(frameon=False, fontsize="small")
     return ax
-
-
-def _pareto(points):
-    """Points that no other point beats in both coordinates, from left to right."""
-    kept: list = []
-    for x, y in sorted(points):
-        if not kept or y < kept[-1][1]:
-            kept.append((x, y))
-    return kept
 
 
 def stability(found, ax):

@@ -11,7 +11,7 @@ from sparsedp.report.certificate import certify
 from sparsedp.report.extremes import stress
 from sparsedp.report.plan import explain
 from sparsedp.report.precision import workprec
-from sparsedp.report.rows import Rows, settings_of
+from sparsedp.report.rows import Rows, cell, settings_of
 
 __all__ = ["write_report"]
 
@@ -75,17 +75,22 @@ def _chapters(chapters, found):
     yield from ("", "## What was left out, and why", "", *(f"- {one}" for one in left), "")
 
 
+def _judged_by(found):
+    """The error that methods are compared by, as a column and in words: that of the gradient, where there is one."""
+    errors = "gradient_error" if found.pareto() else "forward_error"
+    return errors, errors.replace("_", " ")
+
+
 def _goals(found):
     """The fastest method for each error, as a Markdown table."""
-    errors = "gradient_error" if found.pareto() else "forward_error"
-    what = errors.replace("_", " ")
+    errors, what = _judged_by(found)
     yield from (f"| {what} at most | fastest method | its settings | its {what} | seconds |", "|---|---|---|---|---|")
     for goal in GOALS:
         row = found.best(goal, errors)
         cells = ["none here", "", "", ""] if row is None else [
             row["method"], settings_of(row), f"{100 * row[errors]:.2g} %", f"{found.seconds(row, errors):.1e}"
         ]  # fmt: skip
-        yield f"| {100 * goal:g} % | {' | '.join(cells)} |"
+        yield f"| {100 * goal:g} % | {' | '.join(map(cell, cells))} |"
 
 
 def _claim(folder, force):
@@ -169,12 +174,11 @@ def _workprec(found, folder):
     if isinstance(found, str):
         return [f"error against run time: not measured, {found}"]
     found.save(folder)
-    errors = "gradient_error" if found.pareto() else "forward_error"
+    errors, what = _judged_by(found)
     best = found.best(GOAL, errors)
-    what = errors.replace("_", " ")
     left = [f"error against run time left out {sentence}" for sentence in found.left_out]
     if best is None:
-        return [f"error against run time: no method reaches a {what} of {GOAL:g}, see {found.scene}.md", *left]
+        return [f"error against run time: no method reaches a {what} of {GOAL:g}, see {found.stem}.md", *left]
     named = f"{best['method']} ({settings_of(best)}), {found.seconds(best, errors):.1e} s"
     return [f"fastest at a {what} of {100 * GOAL:g} %: {named}", *left]
 

@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp.check.point import root_sum_squares
 from sparsedp.check.probes import generator
 from sparsedp.derivative import NO_JVP, pushforward
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import loops
 from sparsedp.tape import is_variable
-from sparsedp.tree import flatten
+from sparsedp.tree import flatten, norm
 
 __all__ = ["STEADY", "Growth", "Loop", "growth_of", "loop_of"]
 
@@ -89,7 +88,7 @@ def _measured(loop, rng):
     sizes, signs = [], []
     for _ in range(STEPS):
         state, moved = _pushed(loop.advance, state, v)
-        size = root_sum_squares(moved)
+        size = norm(moved)
         if not np.isfinite(size):
             return Growth(np.inf, True)
         if size == 0:
@@ -105,7 +104,7 @@ def _floating(state):
 
 
 def _unit(parts):
-    size = root_sum_squares(parts) or 1.0
+    size = norm(parts) or 1.0
     return [part / size for part in parts]
 
 
@@ -123,7 +122,7 @@ def _pushed(advance, state, v):
         return after, [m for a, m in zip(flatten(after)[0], flatten(moved)[0], strict=True) if is_variable(a)]
     except NO_JVP:  # a rule without a JVP
         here = _floating(state)
-        t = SMALL * (root_sum_squares([np.asarray(leaf) for leaf in here]) or 1.0)
+        t = SMALL * (norm(here) or 1.0)
         after = advance(state)
         other = advance(_with(state, [a + t * b for a, b in zip(here, v, strict=True)]))
         return after, [(b - a) / t for a, b in zip(_floating(after), _floating(other), strict=True)]

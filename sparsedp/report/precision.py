@@ -6,11 +6,10 @@ import platform
 
 import numpy as np
 
-from sparsedp.check.point import root_sum_squares
 from sparsedp.fields import check_function, is_whole
 from sparsedp.report.measurement import FAILURES, failure_word, measured_row, task_of
 from sparsedp.report.rows import COLUMNS, Rows, kept_rows, write_row
-from sparsedp.tree import leaves
+from sparsedp.tree import leaves, norm
 
 __all__ = ["workprec"]
 
@@ -106,7 +105,7 @@ def workprec(
 def _runs(methods, over):
     for method, own in methods.items():
         for values in itertools.product(*over.values()):
-            yield method, {**dict(zip(over, values, strict=True)), **own}
+            yield str(method), {**dict(zip(over, values, strict=True)), **own}
 
 
 def _row(problem, settings, wanted, shared, repeats):
@@ -169,8 +168,8 @@ def _distance(found, wanted):
             raise ValueError(
                 f"workprec cannot compare shape {a.shape} with {b.shape}; give compare=function(found, wanted)"
             )
-    size = root_sum_squares([b for _, b in pairs])
-    gap = root_sum_squares([a - b for a, b in pairs])
+    size = norm([b for _, b in pairs])
+    gap = norm([a - b for a, b in pairs])
     return gap / size if size else gap
 
 

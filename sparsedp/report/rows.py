@@ -7,8 +7,9 @@ import math
 from pathlib import Path
 
 from sparsedp.check.findings import table
+from sparsedp.report.pareto import unbeaten
 
-__all__ = ["COLUMNS", "Rows", "kept_rows", "settings_of", "write_row"]
+__all__ = ["COLUMNS", "Rows", "cell", "kept_rows", "settings_of", "write_row"]
 
 COLUMNS = (
     "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
@@ -38,6 +39,11 @@ class Rows:
     def __init__(self, scene, rows, left_out):
         self.scene, self.rows, self.left_out = scene, rows, left_out
 
+    @property
+    def stem(self):
+        """What the files of `save` are called."""
+        return self.scene.replace("/", "-")
+
     def seconds(self, row, error="gradient_error"):
         """The run time that belongs to an error: of the value, or of value and gradient."""
         return row["seconds_forward"] + (row["seconds_backward"] if error == "gradient_error" else 0.0)
@@ -45,11 +51,7 @@ class Rows:
     def pareto(self, error="gradient_error"):
         """Rows that no other row beats in both time and error, the fastest first."""
         usable = [row for row in self.rows if row["status"] == "ok" and self._known(row, error)]
-        kept: list = []
-        for row in sorted(usable, key=lambda row: (self.seconds(row, error), row[error])):
-            if not kept or row[error] < kept[-1][error]:
-                kept.append(row)
-        return kept
+        return unbeaten(usable, lambda row: (self.seconds(row, error), row[error]))
 
     def _known(self, row, error):
         return math.isfinite(row[error]) and math.isfinite(self.seconds(row, error))
@@ -64,7 +66,7 @@ class Rows:
         used, cells_of = self._shown()
         lines = [f"| {' | '.join(used)} | best |", f"|{'---|' * (len(used) + 1)}"]
         for row, cells in zip(self.rows, cells_of, strict=True):
-            lines.append(f"| {' | '.join(cells)} | {'*' if id(row) in stars else ''} |")
+            lines.append(f"| {' | '.join(map(cell, cells))} | {'*' if id(row) in stars else ''} |")
         lines += ["", "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."]
         errors = [row["reference_error"] for row in self.rows if not _empty(row["reference_error"])]
         stated = [f"\nError of the reference: {max(errors):.1e}."] if errors else []
@@ -120,10 +122,13 @@ class Rows:
         return ax
 
     def save(self, folder):
-        """Write scene.md, scene.csv and, where matplotlib is installed, scene.png into a folder -> list of paths."""
+        """Write scene.md, scene.csv and, where matplotlib is installed, scene.png into a folder -> list of paths.
+
+        A scene may have a name that is no name of a file: "/" becomes "-".
+        """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        paths = [folder / f"{self.scene}.{kind}" for kind in ("md", "csv")]
+        paths = [folder / f"{self.stem}.{kind}" for kind in ("md", "csv")]
         for path, text in zip(paths, (self.markdown(), self.csv()), strict=True):
             path.write_text(text, encoding="utf-8")
         try:
@@ -131,11 +136,11 @@ class Rows:
 
             gradient = any(not _empty(row["gradient_error"]) for row in self.rows)
             ax = self.plot(plots.figure().add_subplot(), "gradient_error" if gradient else "forward_error")
-            with (folder / f"{self.scene}.png").open("wb") as stream:
+            with (folder / f"{self.stem}.png").open("wb") as stream:
                 plots.save(ax.figure, stream)
         except ImportError:
             return paths
-        return [*paths, folder / f"{self.scene}.png"]
+        return [*paths, folder / f"{self.stem}.png"]
 
     def __str__(self):
         used, lines = self._shown()
@@ -148,6 +153,11 @@ class Rows:
 def settings_of(row):
     """The settings of a row in words."""
     return ", ".join(f"{name}={value}" for name, value in json.loads(row["settings"]).items()) or "no settings"
+
+
+def cell(text):
+    """A text as it may stand in a table of Markdown."""
+    return " ".join(text.split()).replace("|", "\\|")
 
 
 def _empty(value):

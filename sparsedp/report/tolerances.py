@@ -6,13 +6,10 @@ the looseness times the last move. To the value y . r is added (certificate.py),
 order: a line search compares values that differ by little.
 """
 
-import numpy as np
-
-from sparsedp.check.point import root_sum_squares
 from sparsedp.fields import is_number
 from sparsedp.report.answers import Answers, run
 from sparsedp.report.certificate import distance, products_of
-from sparsedp.tree import leaves
+from sparsedp.tree import norm
 
 __all__ = ["Certified", "certified"]
 
@@ -118,7 +115,7 @@ class Certified:
 
     def _close(self, value, gradient, new_value, new_gradient):
         """Whether the error of the new value and gradient, share / (1 - share) times the last move, is allowed."""
-        size = root_sum_squares([np.asarray(leaf) for leaf in leaves(new_gradient) if leaf is not None])
+        size = norm(new_gradient)
         change = abs(self._values[-1] - new_value) if self._values else abs(new_value)
         allowed = max(self.fraction * change, ROUNDING * abs(new_value))
         left = self.share / (1.0 - self.share)

@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp.check.point import root_sum_squares
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import GrowthWarning, SparsedpError
 from sparsedp.tape import is_variable
-from sparsedp.tree import flatten
+from sparsedp.tree import flatten, norm
 
 __all__ = ["DEGRADED", "FAILED", "PASSED", "REFUSED", "Outcome", "finite", "must_refuse", "run", "same"]
 
@@ -77,7 +76,7 @@ def _slope(loss, x, out):
     places = [i for i, leaf in enumerate(found) if is_variable(leaf)]
     units = [_unit(found[i]) for i in places]
     slopes = [unit * g for unit, g in zip(units, out.gradient, strict=True)]
-    size = root_sum_squares(slopes)
+    size = norm(slopes)
     if size == 0:
         return PASSED, 0.0, "gradient 0"
     many = math.sqrt(sum(np.size(s) for s in slopes))
@@ -110,7 +109,7 @@ def _gap_word(best, gaps, noise, flagged):
 
 
 def _unit(leaf):
-    return root_sum_squares([np.asarray(leaf)]) / math.sqrt(max(np.size(leaf), 1)) or 1.0
+    return norm(leaf) / math.sqrt(max(np.size(leaf), 1)) or 1.0
 
 
 def _moved(found, rebuild, places, moves, t):
@@ -166,7 +165,7 @@ def same(loss, x, base, tolerance=0.0):
 def apart(out, base):
     """Largest relative distance of two outcomes, of value or gradient."""
     gaps = [abs(out.value - base.value) / abs(base.value) if base.value else abs(out.value)]
-    size = root_sum_squares(base.gradient)
-    moved = root_sum_squares([np.asarray(a, float) - b for a, b in zip(out.gradient, base.gradient, strict=True)])
+    size = norm(base.gradient)
+    moved = norm([np.asarray(a, float) - b for a, b in zip(out.gradient, base.gradient, strict=True)])
     gap = max(*gaps, moved / size if size else moved)
     return gap if math.isfinite(gap) else math.inf

@@ -3,13 +3,14 @@
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import NO_JVP, pullback, pushforward
-from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_plain
+from sparsedp.derivative import pullback
+from sparsedp.direction import push
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.fields import check_finite, check_plain
 from sparsedp.tape import dtype_of, is_variable, isbox, linear, plain
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["Equation", "Layout", "push", "vary"]
+__all__ = ["Equation", "Layout", "vary"]
 
 KINDS = "biuf"
 
@@ -162,28 +163,11 @@ class Equation:
 
     def tangent(self, x, values):
         """The function v -> J v."""
-        return lambda v: push(lambda y: self(y, *values), x, v)
+        return lambda v: push(lambda y: self(y, *values), x, [v])[1]
 
     def transposed(self, x, values):
         """The function g -> J^T g."""
         return pullback(lambda y: self(y, *values), x)[1]
-
-
-def push(fun, x, tangent):
-    """JVP of a function of a tree, forward; where a part of it has no JVP, by two reverse sweeps.
-
-    The pullback z -> pull(z) is linear in z, so the gradient in z of <pull(z), tangent> is the JVP.
-    """
-    try:
-        return pushforward(fun, x, tangent)[1]
-    except NO_JVP:
-        value, pull = pullback(fun, x)
-    directions = leaves(tangent)
-
-    def paired(z):
-        return sum(anp.sum(g * t) for g, t in zip(leaves(pull(z)), directions, strict=True))
-
-    return pullback(paired, np.zeros(np.shape(plain(value))))[1](1.0)
 
 
 def vary(fun, args, places):
@@ -196,12 +180,3 @@ def vary(fun, args, places):
         return fun(*values)
 
     return varied, [args[place] for place in places]
-
-
-def check_finite(what, value):
-    """Refuse NaN and infinity in a plain array, with the place of the first one."""
-    wrong = ~np.isfinite(value)
-    if np.any(wrong):
-        first = int(np.argmax(wrong.reshape(-1)))
-        many = np.count_nonzero(wrong)
-        raise NonFiniteError(f"{what} must be finite, got {many} that are NaN or infinite, the first at {first}")

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from sparsedp.direction import push
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
+from sparsedp.fields import check_finite
 from sparsedp.solvers.contract import norm
-from sparsedp.solvers.equation import check_finite, push
 from sparsedp.solvers.nullspace import ROUNDING
 
 __all__ = ["Newton", "length"]
@@ -178,7 +179,7 @@ class Newton:
         """F_p p: the sum of the terms of F in its parameters, each as often as its degree."""
         if not self.leaves:
             return np.zeros_like(self.x)
-        return push(lambda leaves: self.equation(self.x, *leaves), list(self.leaves), list(self.leaves))
+        return push(lambda leaves: self.equation(self.x, *leaves), list(self.leaves), self.leaves)[1]
 
     def _fail(self, word, reason=""):
         run, name = self.run, self.equation.name

@@ -27,6 +27,7 @@ from sparsedp.solvers.choose import build, check_settings
 from sparsedp.solvers.record import SolveLog
 from sparsedp.space import fits
 from sparsedp.structure.base import Structure
+from sparsedp.structure.lazy import Chain, Diagonal
 from sparsedp.tape import cast, differentiable, dtype_of, isbox, plain
 
 __all__ = ["EllipticSolver", "elliptic_solver"]
@@ -248,16 +249,15 @@ class Elliptic(Structure):
         self.dtype = np.result_type(assembly.D.dtype, assembly.G.dtype)
         self.has_entries = assembly.has_entries
 
-    def _members(self):
-        D, G = self.assembly.D.structure, self.assembly.G.structure
-        return (D.transpose(), G.transpose()) if self.transposed else (G, D)
+    @cached_property
+    def _product(self):
+        """D diag(k) G, which acts in one pass where D and G are differences of a grid."""
+        product = Chain([self.assembly.D.structure, Diagonal(self.k), self.assembly.G.structure])
+        return product.transpose() if self.transposed else product
 
     def apply(self, x, out):
-        first, second = self._members()
         wide = x.astype(np.result_type(x.dtype, np.float64), copy=False)
-        flux = first.product(wide)
-        flux *= self.k
-        np.copyto(out, self.shift * wide - second.product(flux), casting="same_kind")
+        np.copyto(out, self.shift * wide - self._product.product(wide), casting="same_kind")
 
     def magnitude(self):
         first, second = self.assembly.magnitudes[self.transposed]

@@ -14,10 +14,11 @@ derivative of any order takes one linear solve with J or J^T, and derivatives of
 """
 
 from sparsedp.derivative import pullback
+from sparsedp.direction import push
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import observers, tell
 from sparsedp.solvers.choose import check_settings
-from sparsedp.solvers.equation import Equation, Layout, push, vary
+from sparsedp.solvers.equation import Equation, Layout, vary
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Newton
 from sparsedp.solvers.record import Run, SolveLog
@@ -182,7 +183,7 @@ class Root:
 
     def _jvp(self, nums, tangents, ans, equation, guess, *leaves):
         varied, chosen = vary(lambda *values: equation(ans, *values), leaves, [num - 2 for num in nums])
-        return self._linear[False](equation, ans, -push(varied, chosen, list(tangents)), *leaves)
+        return self._linear[False](equation, ans, -push(varied, chosen, tangents)[1], *leaves)
 
     # ------------------------------------------------------------ solves with J and J^T, as rules of x, b and p
 
@@ -216,7 +217,7 @@ class Root:
             if places:
                 act = equation.transposed if transposed else equation.tangent
                 varied, chosen = vary(lambda x, *leaves: act(x, leaves)(ans), (x, *leaves), places)
-                total = total - push(varied, chosen, moves)
+                total = total - push(varied, chosen, moves)[1]
             return self._linear[transposed](equation, x, total, *leaves)
 
         return forward, vjp, jvp

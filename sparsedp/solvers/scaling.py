@@ -10,7 +10,10 @@ SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve comput
 
 
 def norm(x):
-    """2-norm of a flat array, without threads of BLAS: they would stall compiled kernels."""
+    """2-norm of a flat array in one pass, without threads of BLAS: they would stall compiled kernels.
+
+    Squares may leave the range of floats (`tree.norm` does not let them); the caller asks `in_range`, and scales.
+    """
     x = x.view(float) if x.dtype.kind == "c" else x
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
         return float(np.sqrt(kernels.squares(x)))

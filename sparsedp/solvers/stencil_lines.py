@@ -12,7 +12,7 @@ from sparsedp.solvers.stencil import CLEAN, Stencil, cleaned
 from sparsedp.structure.base import Scaled
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Chain, Diagonal
-from sparsedp.structure.through import beside
+from sparsedp.structure.through import entries_beside
 
 __all__ = ["Faces", "faces_of", "of_lines", "read_lines"]
 
@@ -43,15 +43,10 @@ def read_lines(left, middle, right, grid):
 
 
 def _of_axis(left, right, grid, axis):
-    terms, slopes = left.blocks.get((0, axis), ()), right.blocks.get((axis, 0), ())
-    if len(terms) != 1 or len(slopes) != 1 or terms[0].axes != (axis,) or slopes[0].axes != (axis,):
+    found = entries_beside(left, right, axis, grid.shape[axis], grid.periodic[axis])
+    if found is None:
         return None
-    n, faces = grid.shape[axis], grid.node_count(axis)
-    areas = beside(terms[0].factors[axis].T, terms[0].scale, n, faces, grid.periodic[axis])
-    slopes = beside(slopes[0].factors[axis], slopes[0].scale, n, faces, grid.periodic[axis])
-    if areas is None or slopes is None:
-        return None
-    (d_below, d_above), (g_below, g_above), h = areas, slopes, grid.widths[axis]
+    ((g_below, g_above), (d_below, d_above)), h, faces = found, grid.widths[axis], grid.node_count(axis)
     d_below, d_above = d_below * np.take(h, np.arange(faces) - 1, mode="wrap"), d_above * np.append(h, h)[:faces]
     one, two = d_below * g_above, d_above * g_below
     if not np.all(np.abs(one - two) <= CLEAN * np.abs(one)):  # not symmetric

@@ -13,6 +13,7 @@ from sparsedp.structure.through import through_faces
 __all__ = ["Chain", "Diagonal", "Functions", "Mask", "Sum"]
 
 FEW = 16384  # cells for which passes one after the other are quick
+SHORT = 80  # cells along the last axis, the inner loop of the fused pass: below, its rows cost more than they save
 
 
 class Diagonal(Structure):
@@ -65,7 +66,7 @@ class Chain(Structure):
 
     def apply(self, x, out):
         if x.dtype == float == self.dtype and x.size >= FEW and kernels.compiled():
-            if self._fused is not None and self._fused.apply(x, out):
+            if self._fused is not None and self._fused.shape[-1] >= SHORT and self._fused.apply(x, out):
                 return
         single = x.dtype.char in "fF"
         x = x.astype(np.result_type(x.dtype, np.float64)) if single else x

@@ -5,10 +5,34 @@ import numpy as np
 from sparsedp import kernels
 from sparsedp.structure.kronecker import Kronecker
 
-__all__ = ["ThroughFaces", "beside", "through_faces"]
+__all__ = ["ThroughFaces", "entries_beside", "through_faces"]
 
 
-def beside(factor, scale, n, faces, periodic):
+def entries_beside(left, right, axis, n, periodic):
+    """Entries of L (cells <- faces) and of R (faces <- cells) at each face across an axis, for the cells beside it.
+
+    Parameters
+    ----------
+    left, right : Kronecker
+    axis, n : int
+        n cells along the axis.
+    periodic : bool
+
+    Returns
+    -------
+    ((r_below, r_above), (l_below, l_above)), arrays of one number for each face, or None
+        None where another axis, a second term or a further cell takes part.
+    """
+    terms, slopes = left.blocks.get((0, axis), ()), right.blocks.get((axis, 0), ())
+    if len(terms) != 1 or len(slopes) != 1 or terms[0].axes != (axis,) or slopes[0].axes != (axis,):
+        return None
+    faces = n if periodic else n + 1
+    there = _beside(slopes[0].factors[axis], slopes[0].scale, n, faces, periodic)
+    back = _beside(terms[0].factors[axis].T, terms[0].scale, n, faces, periodic)
+    return None if there is None or back is None else (there, back)
+
+
+def _beside(factor, scale, n, faces, periodic):
     """A factor from cells to faces -> its entries for the cell below and the cell above each face, or None."""
     m = factor.matrix
     row = np.repeat(np.arange(faces), np.diff(m.indptr))
@@ -81,15 +105,11 @@ def through_faces(left, middle, right):
 def _line(left, right, shape, axis):
     """Entries of R and of L at the faces across an axis; None where they are not of that kind."""
     n, faces = shape[axis], right.out_parts[axis][axis]
-    terms, slopes = left.blocks.get((0, axis), ()), right.blocks.get((axis, 0), ())
-    if len(terms) != 1 or len(slopes) != 1 or terms[0].axes != (axis,) or slopes[0].axes != (axis,):
-        return None
     if faces not in (n, n + 1) or right.out_parts[axis] != (*shape[:axis], faces, *shape[axis + 1 :]):
         return None
-    there = beside(slopes[0].factors[axis], slopes[0].scale, n, faces, faces == n)
-    back = beside(terms[0].factors[axis].T, terms[0].scale, n, faces, faces == n)
-    if there is None or back is None:
+    found = entries_beside(left, right, axis, n, faces == n)
+    if found is None:
         return None
-    inner = slice(1, n)
+    (there, back), inner = found, slice(1, n)
     whole = all(np.all(side[inner] != 0) for side in (*there, *back))  # else what is not read could be NaN
     return (*there, *back) if whole else None

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.trajectory.direction import push, zero_like
+from sparsedp.direction import push, zero_like
 from sparsedp.trajectory.keep import Each
 from sparsedp.trajectory.layout import Layout
 from sparsedp.tree import leaves

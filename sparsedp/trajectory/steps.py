@@ -4,9 +4,8 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from sparsedp.direction import pull_ends, zero_like
 from sparsedp.tape import fit, reverse_root, split_box, trace
-from sparsedp.trajectory.direction import zero_like
-from sparsedp.trajectory.ends import pull_ends
 from sparsedp.trajectory.layout import frozen, owned, still
 from sparsedp.tree import flatten, leaves
 

@@ -1,6 +1,8 @@
 """Tapes of single steps, made on the way forward and kept for the way back while they fit: no step runs twice.
 
 The bytes of a tape are counted from above: every result, every array that went into a call, and CALL for the call.
+A step may write into an array of its own again and again; a tape that holds it is then no longer that of its step.
+So the arrays that the weighed steps use are looked at again, and if one has changed no tape is used.
 """
 
 from contextlib import contextmanager
@@ -27,10 +29,16 @@ def weighed(kind: Any):
         def __init__(self, value, fun, args, options, nums, parents):
             super().__init__(value, fun, args, options, nums, parents)
             self.scale = parents[0].scale
-            arrays = [value, *(arg for number, arg in enumerate(args) if number not in nums)]
-            self.scale.bytes += CALL + sum(array.nbytes for array in arrays if type(array) is np.ndarray)
+            self.scale.bytes += CALL + getattr(value, "nbytes", 0)
+            for number, arg in enumerate(args):
+                if number not in nums:
+                    self.scale.see(arg)
 
     return Weighed
+
+
+def _equal(array, copy):
+    return not np.any(array != copy)
 
 
 PLAIN = weighed(ReverseNode)
@@ -54,12 +62,14 @@ class Tapes:
         self.room, self.wanted, self.once = SMALL if room is None else room, wanted, once
         self.bytes, self._last, self._open = 0, 0, True
         self._kept: dict = {}
+        self._watched: dict = {}  # arrays that anybody may write into, and copies of them
+        self._copies, self._newest = 0, -1  # bytes of the copies that the present step added; the last step kept
         self._kind: Any = PLAIN
 
     @contextmanager
     def fresh(self):
         """A `with` block on the way forward, from which tapes are kept; those of a run before are forgotten."""
-        self.bytes, self._last, self._kept = 0, 0, {}
+        self.bytes, self._last, self._copies, self._newest, self._kept, self._watched = 0, 0, 0, -1, {}, {}
         kind = type(reverse_root())
         self._open = not getattr(kind, "asks_again", False)
         self._kind = PLAIN if kind is ReverseNode else weighed(kind)
@@ -85,17 +95,44 @@ class Tapes:
         root.scale = self
         return root
 
+    def see(self, arg):
+        """Weigh what a tape holds beside traced values, and notice when somebody writes into it."""
+        if type(arg) is np.ndarray:
+            self.bytes += arg.nbytes
+            self._watch(arg)
+        elif isinstance(arg, (tuple, list)):  # of indices
+            for one in arg:
+                self.see(one)
+
+    def _watch(self, array):
+        known = self._watched.get(id(array))
+        if known is not None:
+            self._open &= _equal(*known)
+        elif array.flags.writeable:
+            self._watched[id(array)] = array, array.copy()
+            self._copies += array.nbytes
+
+    def _look_again(self):
+        """Forget all tapes if an array has changed since."""
+        if not (self._open and all(_equal(*known) for known in self._watched.values())):
+            self._kept = {}
+        if self.once:
+            self._watched = {}
+
     def keep(self, i, ends, before):
         """Keep the ends of the tape of step i, unless it was one too many; `before`: the bytes before this step."""
         if self.weighs(i):
             self._last = self.bytes - before
+            self.bytes, self._copies = self.bytes + self._copies, 0
         else:
             self.bytes += self._last
         if self.fit:
-            self._kept[i] = ends
+            self._kept[i], self._newest = ends, i
 
     def take(self, i, wanted):
         """The ends of the tape of step i, or None."""
         if wanted != self.wanted:
             return None
+        if i == self._newest:
+            self._look_again()
         return self._kept.pop(i, None) if self.once else self._kept.get(i)

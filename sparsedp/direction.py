@@ -1,18 +1,20 @@
-"""Directional derivatives of functions between trees: forward, or by two reverse passes where a part has no JVP."""
+"""Derivatives of functions between trees: along tangents that some leaves have, and back from several results."""
 
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import NO_JVP
-from sparsedp.tape import backward, dtype_of, fit, forward_root, is_variable, plain, reverse_root, split_box, trace
-from sparsedp.trajectory.ends import pull_ends
+from sparsedp.derivative import NO_JVP, traced
+from sparsedp.tape import backward, dtype_of, fit, forward_root, is_variable, plain, reverse_root, split_box
 from sparsedp.tree import flatten
 
-__all__ = ["push", "zero_like"]
+__all__ = ["pull_ends", "push", "zero_like"]
 
 
 def push(fun, tree, tangents):
-    """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants)."""
+    """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants).
+
+    Forward, or by two reverse passes where a part of `fun` has no JVP.
+    """
     try:
         return _forward(fun, tree, tangents)
     except NO_JVP:
@@ -23,7 +25,7 @@ def push(fun, tree, tangents):
 
 def _forward(fun, tree, tangents):
     roots = [None if tangent is None else forward_root(tangent) for tangent in tangents]
-    result, number = trace(fun, tree, roots)
+    result, number = traced(fun, tree, roots)
     found, rebuild = flatten(result)
     parts = [split_box(leaf, number) for leaf in found]
     slopes = [_tangent(value, None if node is None else node.g) for value, node in parts]
@@ -33,7 +35,7 @@ def _forward(fun, tree, tangents):
 def _twice_reverse(fun, tree, tangents):
     """The pullback z -> J^T z is linear, so the gradient in z of <J^T z, tangent> is J tangent."""
     roots = [None if tangent is None else reverse_root() for tangent in tangents]
-    result, number = trace(fun, tree, roots)
+    result, number = traced(fun, tree, roots)
     found, rebuild = flatten(result)
     parts = [split_box(leaf, number) for leaf in found]
     used = [place for place, (_, node) in enumerate(parts) if node is not None]
@@ -45,7 +47,7 @@ def _twice_reverse(fun, tree, tangents):
         return sum(products[1:], products[0]) if products else 0.0
 
     starts = [reverse_root() for _ in used]
-    total, inner = trace(paired, [zero_like(parts[place][0]) for place in used], starts)
+    total, inner = traced(paired, [zero_like(parts[place][0]) for place in used], starts)
     _, end = split_box(total, inner)
     slopes = {} if end is None else backward(end, 1.0)
     known = dict(zip(used, starts, strict=True))
@@ -58,9 +60,30 @@ def _twice_reverse(fun, tree, tangents):
 def _tangent(value, slope):
     if not is_variable(value):
         return None
-    return zero_like(value) if slope is None else fit("the step", value, slope, slope)
+    return zero_like(value) if slope is None else fit("a rule", value, slope, slope)
 
 
 def zero_like(value):
     """A plain zero of the shape and dtype of a value, traced or not."""
     return np.zeros(np.shape(plain(value)), dtype_of(value))[()]
+
+
+class _Ends:
+    """Stands for the last node of a graph with several results: hands each its cotangent."""
+
+    __slots__ = ("_cotangents", "parents")
+
+    def __init__(self, nodes, cotangents):
+        self.parents, self._cotangents = nodes, cotangents
+
+    def vjp(self, g):
+        """The cotangents, in the order of the results."""
+        return self._cotangents
+
+
+def pull_ends(nodes, cotangents, roots):
+    """Nodes of results and their cotangents -> cotangent of each root, None where there is none."""
+    if not nodes:
+        return [None] * len(roots)
+    found = backward(_Ends(nodes, cotangents), None)
+    return [found.get(root) for root in roots]
