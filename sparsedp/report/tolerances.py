@@ -48,6 +48,7 @@ def certified(fraction=0.1, tolerance=1e-8):
     Examples
     --------
     >>> import autograd.numpy as anp
+    >>> import numpy as np
     >>> from sparsedp import Grid, dirichlet, inverse, laplacian, minimise
     >>> solve = inverse(-laplacian(Grid((8, 8)), dirichlet), "krylov")
     >>> loose = certified(0.1, tolerance=1e-4)
