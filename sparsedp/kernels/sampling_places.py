@@ -12,15 +12,20 @@ __all__ = ["cubic_place", "inside", "slope", "value"]
 
 
 @njit(error_model="numpy")
-def inside(p, n, wraps):
-    """Index coordinate -> [0, n] on a periodic axis, else [-3/2, n + 1/2]; NaN goes to the lower end."""
-    low, high = -1.5, n + 0.5
+def _clamped(p, n, wraps, low, high):
+    """Index coordinate -> [0, n] on a periodic axis, else [low, high]; NaN goes to the lower end."""
     if wraps:
         p -= n * floor(p / n)
         low, high = 0.0, float(n)
     if not p >= low:
         p = low
     return min(p, high)
+
+
+@njit(error_model="numpy")
+def inside(p, n, wraps):
+    """Index coordinate -> [0, n] on a periodic axis, else [-3/2, n + 1/2]; NaN goes to the lower end."""
+    return _clamped(p, n, wraps, -1.5, n + 0.5)
 
 
 def value(p, n, wraps, like):
@@ -72,12 +77,6 @@ def _slope_of(p, n, wraps, like):
 
 @njit(error_model="numpy")
 def cubic_place(p, n, wraps):
-    low, high = -2.0, n + 1.0
-    if wraps:
-        p -= n * floor(p / n)
-        low, high = 0.0, float(n)
-    if not p >= low:
-        p = low
-    p = min(p, high)
+    p = _clamped(p, n, wraps, -2.0, n + 1.0)
     i = min(floor(p), n)
     return int(i), p - i

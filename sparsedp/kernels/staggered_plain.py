@@ -36,13 +36,18 @@ def _add_flow(x, lower, upper, axis, n, b):
         wraps = last == n and x.shape[axis] == n
         ahead = x[_cut(axis, 0, 1)] if wraps and last - first == 1 else x[_cut(axis, first + 1, last + 1)]
         low, high = _spread(lower[first:last], axis), _spread(upper[first:last], axis)
-        if np.ndim(low) == np.ndim(high) == 0 and low == -high:
-            part = ahead - here
-            part *= high
-        else:
-            part = high * ahead
-            part += low * here
-        b[_cut(axis, first, last)] += part
+        b[_cut(axis, first, last)] += _both(low, here, high, ahead)
+
+
+def _both(low, here, high, ahead):
+    """low here + high ahead, with one product where the coefficients are a difference."""
+    if np.ndim(low) == np.ndim(high) == 0 and low == -high:
+        part = ahead - here
+        part *= high
+    else:
+        part = high * ahead
+        part += low * here
+    return part
 
 
 def push(x, p, keep, below, above, axis, out):
@@ -53,12 +58,7 @@ def push(x, p, keep, below, above, axis, out):
     if n > 1:
         a, b, c = (_spread(line[1:n], axis) for line in (stay, low, high))
         here, ahead = p[_cut(axis, 0, n - 1)], p[inner]
-        if np.ndim(b) == np.ndim(c) == 0 and b == -c:
-            part = ahead - here
-            part *= c
-        else:
-            part = b * here
-            part += c * ahead
+        part = _both(b, here, c, ahead)
         out[inner] = x[inner]
         if not (np.ndim(a) == 0 and a == 1):
             out[inner] *= a
