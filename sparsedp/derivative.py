@@ -7,18 +7,8 @@ import numpy as np
 
 from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.fields import check_function
-from sparsedp.tape import (
-    backward,
-    dtype_of,
-    fit,
-    forward_root,
-    is_variable,
-    isbox,
-    plain,
-    reverse_root,
-    split_box,
-    trace,
-)
+from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
+from sparsedp.traces import backward, forward_root, reverse_root, split_box, trace
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["NO_JVP", "pullback", "pushforward", "traced", "value_and_grad"]

@@ -4,7 +4,8 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.derivative import NO_JVP, traced
-from sparsedp.tape import backward, dtype_of, fit, forward_root, is_variable, plain, reverse_root, split_box
+from sparsedp.tape import dtype_of, fit, is_variable, plain
+from sparsedp.traces import backward, forward_root, reverse_root, split_box
 from sparsedp.tree import flatten
 
 __all__ = ["pull_ends", "push", "zero_like"]
@@ -85,5 +86,5 @@ def pull_ends(nodes, cotangents, roots):
     """Nodes of results and their cotangents -> cotangent of each root, None where there is none."""
     if not nodes:
         return [None] * len(roots)
-    found = backward(_Ends(nodes, cotangents), None)
+    found = backward(nodes[0], cotangents[0]) if len(nodes) == 1 else backward(_Ends(nodes, cotangents), None)
     return [found.get(root) for root in roots]

@@ -1,4 +1,4 @@
-"""The tape: rules with hand-written derivatives, and the traces that run through them.
+"""The tape: rules with hand-written derivatives.
 
 Only this file talks to autograd's extension interface. All rules go through one primitive (`_call`), all Operators
 through a lighter one (`apply_operator`): a primitive for each rule would stay in autograd's tables for ever.
@@ -11,19 +11,17 @@ from functools import partial
 
 import autograd.numpy as anp
 import numpy as np
-from autograd.core import JVPNode, VJPNode, add_outgrads
 from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
-from autograd.tracer import getval, isbox, new_box, notrace_primitives, toposort, trace_stack
+from autograd.tracer import box_types, getval, isbox, new_box
 
-from sparsedp.cotangents import added
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, tell, timed
-from sparsedp.tree import flatten, leaves
+from sparsedp.shortcuts import direct
+from sparsedp.tree import leaves
 
 __all__ = [
-    "ReverseNode", "Rule", "apply_operator", "backward", "called", "cast", "differentiable", "dtype_of", "fit",
-    "forward_root", "is_variable", "isbox", "linear", "plain", "reverse_root", "split_box", "trace", "untraced",
-    "witnesses",
+    "Rule", "apply_operator", "called", "cast", "differentiable", "dtype_of", "fit", "is_variable", "isbox", "linear",
+    "plain",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
@@ -97,14 +95,17 @@ class Rule:
         return f"<rule {self.name}>"
 
 
-@primitive
-def _call(rule, *args):
+def _run(rule, *args):
     for arg in args:
-        if isinstance(arg, (tuple, list, dict)) and any(map(isbox, leaves(arg))):
+        if type(arg) is not np.ndarray and isinstance(arg, (tuple, list, dict)) and any(map(isbox, leaves(arg))):
             raise DerivativeError(
                 f"{rule.name} got a traced value inside a {type(arg).__name__}; pass it as an argument"
             )
     return timed(rule.name, "forward", rule.forward, *args) if active else rule.forward(*args)
+
+
+_primitive = primitive(_run)
+_call = direct(_primitive, _run, box_types, new_box)
 
 
 def _call_vjp(argnums, ans, args, kwargs):
@@ -142,8 +143,8 @@ def _call_jvp(argnums, tangents, ans, args, kwargs):
     return tangent if isinstance(plain(ans), tuple) else _checked(rule.name, [ans], (tangent,), tangents[0])[0]
 
 
-defvjp_argnums(_call, _call_vjp)
-defjvp_argnums(_call, _call_jvp)
+defvjp_argnums(_primitive, _call_vjp)
+defjvp_argnums(_primitive, _call_jvp)
 
 
 def _checked(name, values, cotangents, g):
@@ -209,10 +210,12 @@ def _set_linear(rule, transposed):
     rule.vjp, rule.jvp = lambda nums, ans, x: lambda g: (transposed(g),), lambda nums, ts, ans, x: rule(ts[0])
 
 
-@primitive
-def apply_operator(op, u):
-    """The second primitive: a field through an Operator. Half the cost of a general rule."""
+def _apply(op, u):
     return timed(op.name, "forward", op.apply, u) if active else op.apply(u)
+
+
+_operator = primitive(_apply)
+apply_operator = direct(_operator, _apply, box_types, new_box)  # a field through an Operator: half a rule's cost
 
 
 def _operator_vjp(argnums, ans, args, kwargs):
@@ -234,8 +237,8 @@ def _operator_jvp(argnums, tangents, ans, args, kwargs):
     return apply_operator(op.tangent, tangent) if isbox(tangent) else op.tangent.apply(tangent)
 
 
-defvjp_argnums(apply_operator, _operator_vjp)
-defjvp_argnums(apply_operator, _operator_jvp)
+defvjp_argnums(_operator, _operator_vjp)
+defjvp_argnums(_operator, _operator_jvp)
 
 
 def is_variable(leaf):
@@ -244,50 +247,6 @@ def is_variable(leaf):
     return isbox(leaf) or isinstance(leaf, (float, complex)) or kind in ("f", "c")
 
 
-def trace(fun, tree, roots):
-    """Run fun(tree) with one box for every root; return the tree of results and the trace number."""
-    found, rebuild = flatten(tree)
-    top = trace_stack.top
-    try:
-        with trace_stack.new_trace() as number:
-            pairs = zip(found, roots, strict=True)
-            boxed = [leaf if root is None else new_box(leaf, number, root) for leaf, root in pairs]
-            result = fun(rebuild(boxed))
-    finally:
-        trace_stack.top = top  # autograd forgets this when `fun` raises
-    return result, number
-
-
-def split_box(value, number):
-    """The value below the box of this trace, and its node (None when it does not depend on x)."""
-    return (value._value, value._node) if isbox(value) and value._trace == number else (value, None)
-
-
-def backward(end, g):
-    """Accumulate cotangents from the node `end` to the roots; return {root: cotangent}."""
-    cotangents, found = {end: (g, False)}, {}
-    for node in toposort(end):
-        g = cotangents.pop(node)[0]
-        if not node.parents:
-            found[node] = g
-        for parent, back in zip(node.parents, node.vjp(g), strict=True):
-            known = cotangents.get(parent)
-            cotangents[parent] = added(known, back) or add_outgrads(known, back)
-    return found
-
-
-ReverseNode, untraced = VJPNode, notrace_primitives  # untraced: by kind of node, functions that leave the tape
-witnesses: list[type[VJPNode]] = []  # kinds of nodes that see what they stand for; the last one is used
-
-
-def reverse_root():
-    """A fresh start of a reverse-mode trace."""
-    return (witnesses[-1] if witnesses else VJPNode).new_root()
-
-
 def called(fun, args):
     """The rule or Operator behind a node that called fun(*args); for autograd's own functions `fun`."""
-    return args[0] if fun in (_call, apply_operator) else fun
-
-
-forward_root = JVPNode.new_root  # a fresh start of a forward-mode trace, with its tangent
+    return args[0] if fun in (_primitive, _operator) else fun

@@ -76,3 +76,20 @@ def test_shape():
     assert len(table) == 5 and max(row[-1] for row in table) < 1e-7
     assert all(row[4] > 0 > row[6] for row in table)  # wider: more drag, more slender: less
     assert rows(printed, r"^(\S+) of the drag")[0][0] == pytest.approx(0.75, abs=1e-3)
+
+
+def test_burgers():
+    """Cases A7 and A8: published forward figures; the start within 0.03 with the steepness as regulariser."""
+    printed = run("burgers.py")
+    assert "0.0057228 0.0171671 0.0286103 0.0400520 0.0514921" in printed
+    rows = re.findall(r"(50|200|L-BFGS)\b.* (\d\.\d+) +(\d\.\d+) +\d\.\d+$", printed, re.MULTILINE)
+    assert rows[0][1] == "0.0474" and rows[1][1:] == ("0.0105", "0.0443")
+    assert float(rows[2][2]) <= 0.03
+
+
+def test_burgers_from_an_observation_in_a_file(tmp_path):
+    """Case A8b but for its numbers: what is seen comes from a file. A constant stays what it is."""
+    (tmp_path / "seen.txt").write_text("0.5\n" * 128)
+    printed = run("burgers.py", "--observation", str(tmp_path / "seen.txt"))
+    losses = re.findall(r"\d\.\d{6}", re.search("^loss before .*", printed, re.MULTILINE)[0])
+    assert len(losses) == 14 and losses[0] == "0.250000" and losses == sorted(set(losses), reverse=True)

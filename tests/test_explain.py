@@ -279,7 +279,7 @@ def test_what_the_loss_raises_passes_through():
     with pytest.raises(ZeroDivisionError):
         dp.explain(lambda u: 1 / 0, U)
     from sparsedp.ledger import active
-    from sparsedp.tape import witnesses
+    from sparsedp.traces import witnesses
 
     assert not active and not witnesses
 

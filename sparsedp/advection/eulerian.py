@@ -34,17 +34,16 @@ class Eulerian(Law):
         return v if between is None else between[0] @ v
 
     def _check(self, wrong, u, v, dt, inflow, out, share=1.0):
-        """Name what a pass has found wrong, and what it has not met.
-
-        Inflow values at closed walls and velocities inside solids are not used by the loop.
-        """
-        unseen = inflow.sum() if inflow.size else 0.0
-        if self.setting.solid is not None:
-            unseen += v.sum()
-        if wrong or not isfinite(unseen):
+        """Name what a pass has found wrong, and what it has not met."""
+        if wrong or not isfinite(self._unseen(v, inflow)):
             check_numbers(self.setting, u, v, inflow)
             check_weights(self, dt, self.bilinear.rate(v), share)
             check_result(self.setting, out)
+
+    def _unseen(self, v, inflow):
+        """Sum over what a pass may leave out: inflow values at closed walls, velocities inside solids."""
+        unseen = inflow.sum() if inflow.size else 0.0
+        return unseen if self.setting.solid is None else unseen + v.sum()
 
     def _of_velocity(self, gw, kept, added):
         """Cotangent of the velocity as given, from that where it is needed; added to `kept` where there is one."""

@@ -209,7 +209,7 @@ class Transport:
                 f"{name}.operator needs constant v and dt, got traced ones; call move(u, v, dt) instead"
             )
         check_step(name, dt)
-        flat = flat_numbers(name, "v", v, *setting.velocity_shapes)
+        flat = flat_numbers(name, "v", v, setting.velocity_shapes)
         return Operator(Matrix(self.law.matrix(flat, float(dt))), self.space, self.space, name)
 
     def step(self, dt, inflow=0.0):

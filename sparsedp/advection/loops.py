@@ -8,7 +8,7 @@ import numpy as np
 from sparsedp.advection.segments import ARRAYS, Component
 from sparsedp.kernels.formulas import ADVECTIVE, FLUX, FORWARD, POINTS, number_of, streams_of
 from sparsedp.kernels.limited import JUMPS, PULL, PULL_ADDED, limited_number, limited_streams
-from sparsedp.kernels.streams import TILE, Table, run
+from sparsedp.kernels.streams import TILE, Table, march, run
 
 __all__ = ["Loops"]
 
@@ -71,6 +71,33 @@ class Loops:
 
     def run(self, task, dt, arrays):
         """Run a task on named flat arrays; return its sums."""
+        return run(*self._prepared(task, dt, arrays))
+
+    def march(self, task, dt, arrays, moving, n, results=None, aside=None):
+        """Run a task n times in one call; return how many went well, or None where that cannot be.
+
+        `moving` holds for the name of an array the numbers by which it moves on after even and odd runs. What
+        is in `aside` after a run goes to the points it was taken from, in the row of `results` just written.
+        """
+        table, known = self._prepared(task, dt, arrays)
+        strides = np.zeros((2, len(ARRAYS)), np.int64)
+        for name, steps in moving.items():
+            strides[:, ARRAYS.index(name)] = 8 * steps[0], 8 * steps[1]
+        turned = self._nowhere if results is None else (results, aside, *self._turned)
+        return march(table, known, strides, n, results is None, turned)
+
+    _nowhere = np.empty((2, 0)), np.empty(0), np.empty(0, np.int64), np.empty(0, np.int64)
+
+    @cached_property
+    def _turned(self):
+        """Places in the inflow, and the points that each goes back to."""
+        if not self._open_walls:
+            return self._nowhere[2:]
+        walls = np.concatenate([np.arange(wall.start, wall.stop) for wall, _ in self._open_walls])
+        return walls, np.concatenate([points for _, points in self._open_walls])
+
+    def _prepared(self, task, dt, arrays):
+        """The table of a task, and all arrays in their order."""
         if task not in self.kept:
             self.kept[task] = self._table(task)
         last, found = self.factors
@@ -80,7 +107,7 @@ class Loops:
         arrays.update(factors=found, zeros=self.zeros, dump=self.dump)
         if self.limited:
             arrays.update(ratios=self.ratios, spill=self.spill)
-        return run(self.kept[task], [arrays.get(name, self.nothing) for name in ARRAYS])
+        return self.kept[task], [arrays.get(name, self.nothing) for name in ARRAYS]
 
     def _table(self, task):
         dim, mode = len(self.matrices.lattices[0].axes), mode_of(self.matrices)

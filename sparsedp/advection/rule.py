@@ -22,11 +22,12 @@ def rule_of(law):
         def pull(g):
             flat = prepare(law, *args)
             g = raised(FIELD, law, g)
-            traced = isbox(g) or any(map(isbox, args))
+            traced = type(g) is not np.ndarray or any(map(isbox, flat))
             found = _traced_pull(law, nums, g, flat) if traced else law.pull(nums, g, *flat)
             for num, back in zip(nums, found, strict=True):
-                _check_slope(law, "the gradient in " + LETTERS.get(num, "dt"), back, (g,))
-            return tuple(unflatten(args[num], back) for num, back in zip(nums, found, strict=True))
+                if not surely_finite(plain(back)):
+                    _check_slope(law, "the gradient in " + LETTERS.get(num, "dt"), back, (g,))
+            return tuple([unflatten(args[num], back) for num, back in zip(nums, found, strict=True)])
 
         return pull
 

@@ -14,6 +14,7 @@ class Step:
     """``step(u, v)``: transport with fixed dt and inflow, made by ``Transport.step``."""
 
     __slots__ = ("dt", "inflow", "transport")
+    sparing = True  # `backward` is told what nobody wants
 
     def __init__(self, transport, dt, inflow):
         if isbox(dt) or isbox(inflow):
@@ -31,10 +32,13 @@ class Step:
         flat = law.forward(*prepare(law, u, v, self.dt, self.inflow), out=_target(out))
         return result_like(u, flat, law.setting.space.shape)
 
-    def backward(self, u, v, g, into=None):
-        """Cotangents of u and v, plain; that of v is added to the array `into` when it is given."""
+    def backward(self, u, v, g, into=None, new=None, wanted=True):
+        """Cotangents of u and v, plain; that of v is added to the array `into` when it is given, or not computed."""
         law, target = self.transport.law, _target(into)
         flat = prepare(law, u, v, self.dt, self.inflow)
+        if not wanted:
+            (of_u,) = law.pull((FIELD,), raised(FIELD, law, g), *flat)
+            return _rounded(u, unflatten(u, of_u)), into
         own = {} if target is None else {VELOCITY: target}
         of_u, of_v = law.pull((FIELD, VELOCITY), raised(FIELD, law, g), *flat, into=own)
         if into is None:
@@ -42,6 +46,19 @@ class Step:
         elif target is None:
             into += unflatten(v, of_v)
         return _rounded(u, unflatten(u, of_u)), into
+
+    def march(self, states, v):
+        """Fill the rows of the array `states` from the first: one step from each to the next."""
+        law = self.transport.law
+        _, *flat = prepare(law, states[0], v, self.dt, self.inflow)
+        law.march(states.reshape(len(states), -1), *flat)
+
+    def retreat(self, states, v, g, into=None):
+        """`backward` over all those steps; without `into` nothing is computed for v."""
+        law = self.transport.law
+        _, *flat = prepare(law, states[0], v, self.dt, self.inflow)
+        rows, target = states.reshape(len(states), -1), None if into is None else into.reshape(-1)
+        return law.retreat(rows, raised(FIELD, law, g), *flat, into=target).reshape(g.shape), into
 
     def tangent(self, u, v, du, dv):
         """Tangent of the moved field, plain."""

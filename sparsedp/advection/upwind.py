@@ -5,6 +5,8 @@ of the numbers and of the step in the same pass.
 Source: R. Courant, E. Isaacson, M. Rees, Comm. Pure Appl. Math. 5 (1952) 243-255.
 """
 
+from math import isfinite
+
 import numpy as np
 
 from sparsedp.advection.eulerian import Eulerian
@@ -52,6 +54,38 @@ class Upwind(Eulerian):
             found[VELOCITY] = self._of_velocity(arrays["gw"], kept, added)
         found[STEP] = sums[0] / dt
         return tuple(found[num] for num in nums)
+
+    def march(self, states, v, dt, inflow):
+        size, first, last = states.shape[1], 0, len(states) - 1
+        arrays, moving = {"inflow": inflow, "w": self._needed(v)}, {"u": (size, size), "out": (size, size)}
+        if last and not isfinite(self._unseen(v, inflow)):
+            self._step_along(states, first, v, dt, inflow)
+            first = 1
+        while first < last:
+            arrays.update(u=states[first], out=states[first + 1])
+            done = self._loops.march(FORWARD, dt, arrays, moving, last - first)
+            if done is None:
+                return super().march(states[first:], v, dt, inflow)
+            first += done
+            if first < last:  # a point objects: name what is wrong, or go on where that is allowed
+                self._step_along(states, first, v, dt, inflow)
+                first += 1
+
+    def _step_along(self, states, first, v, dt, inflow):
+        self.forward(states[first], v, dt, inflow, out=states[first + 1])
+
+    def retreat(self, states, g, v, dt, inflow, into=None):
+        size, last = states.shape[1], len(states) - 1
+        turns, aside = np.empty((2, size)), np.empty(inflow.size)
+        turns[0] = g
+        arrays = {"inflow": inflow, "w": self._needed(v), "g": turns[0], "out": turns[1], "ginflow": aside}
+        arrays.update(u=states[max(last - 1, 0)], gw=into)
+        moving = {"u": (-size, -size), "g": (size, -size), "out": (-size, size)}
+        if into is None or self.bilinear.between is None:
+            task = OF_FIELD if into is None else BOTH_ADDED
+            if self._loops.march(task, dt, arrays, moving, last, turns, aside) is not None:
+                return turns[last % 2]
+        return super().retreat(states, g, v, dt, inflow, into)
 
     def push(self, tangents, u, v, dt, inflow):
         return self.bilinear.push(tangents, u, v, dt, inflow)

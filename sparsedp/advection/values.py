@@ -17,15 +17,12 @@ LETTERS = {FIELD: "u", VELOCITY: "v", INFLOW: "inflow"}
 
 def prepare(law, u, v, dt, inflow):
     """Arguments of a step -> the arguments of a law."""
-    name, setting = law.name, law.setting
     if type(dt) is not float or not 0 < dt < np.inf:
-        check_step(name, plain(dt))
-    return (
-        flat_numbers(name, "u", u, setting.space.shape),
-        flat_numbers(name, "v", v, *setting.velocity_shapes),
-        dt if isbox(dt) else float(dt),
-        _inflow(name, inflow, law.walls),
-    )
+        check_step(law.name, plain(dt))
+        dt = dt if isbox(dt) else float(dt)
+    u = flat_numbers(law.name, "u", u, law.field_shapes)
+    v = flat_numbers(law.name, "v", v, law.velocity_shapes)
+    return u, v, dt, _inflow(law.name, inflow, law.walls)
 
 
 def check_step(name, dt):
@@ -37,7 +34,7 @@ def check_step(name, dt):
         raise ValueError(f"{name} needs dt > 0, got {dt:g}; to go back in time turn the velocity round")
 
 
-def flat_numbers(name, letter, value, *shapes):
+def flat_numbers(name, letter, value, shapes):
     """Array of one of the shapes -> flat contiguous float64; a traced one stays traced."""
     if type(value) is np.ndarray and value.shape in shapes and value.dtype == FLOAT and value.flags.c_contiguous:
         return value.reshape(-1)
@@ -59,19 +56,19 @@ def flat_numbers(name, letter, value, *shapes):
 
 
 def _inflow(name, inflow, walls):
+    if type(inflow) is float and -np.inf < inflow < np.inf:
+        return np.full(walls.size, inflow) if walls.size else NONE
     if not walls.size and np.shape(inflow) == () and not isbox(inflow) and np.isfinite(inflow):
         return NONE
-    if type(inflow) is float and -np.inf < inflow < np.inf:
-        return np.full(walls.size, inflow)
     if np.shape(inflow) == ():
-        inflow = flat_numbers(name, "inflow", inflow, ())
+        inflow = flat_numbers(name, "inflow", inflow, ((),))
         return inflow * np.ones(walls.size) if isbox(inflow) else np.full(walls.size, inflow[0])
-    return flat_numbers(name, "inflow", inflow, walls.shape)
+    return flat_numbers(name, "inflow", inflow, (walls.shape,))
 
 
 def result_like(u, flat, shape):
     """Flat float64 result -> field of the dtype of u (bool and int become float64)."""
-    kind = dtype_of(u)
+    kind = u.dtype if type(u) is np.ndarray else dtype_of(u)
     if kind == FLOAT:
         return flat.reshape(shape)
     flat = flat if kind.char != "f" else np.asarray(flat, kind.newbyteorder("="))
@@ -91,9 +88,9 @@ def raised(num, law, tangent):
 
 def unflatten(value, cotangent):
     """Flat cotangent -> the shape in which the argument was given; a number for all walls gets their sum."""
+    if type(cotangent) is np.ndarray and type(value) is np.ndarray and value.ndim:
+        return cotangent.reshape(value.shape)
     shape = np.shape(value)
-    if type(cotangent) is np.ndarray and shape:
-        return cotangent.reshape(shape)
     if shape == ():
-        return anp.sum(cotangent)
+        return cotangent if type(cotangent) is float else anp.sum(cotangent)
     return anp.reshape(cotangent, shape)

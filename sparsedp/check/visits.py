@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.tape import ReverseNode, called, isbox, untraced, witnesses
+from sparsedp.tape import called, isbox
+from sparsedp.traces import ReverseNode, untraced, witnesses
 
 __all__ = ["Visit", "bytes_held", "witnessed"]
 

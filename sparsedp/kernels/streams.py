@@ -11,7 +11,7 @@ import numpy as np
 from sparsedp import kernels
 from sparsedp.kernels.limited import FORMULAS
 
-__all__ = ["PLACE", "TILE", "Table", "run"]
+__all__ = ["PLACE", "TILE", "Table", "march", "run"]
 
 PLACE = 44  # bits of a place in its array; above them the number of the array
 TILE = 1024  # most points of a segment; streams of one number repeated are as long as this
@@ -69,3 +69,30 @@ def run(table, arrays):
     from sparsedp.kernels import streams_plain
 
     return streams_plain.run(table, arrays)
+
+
+def march(table, arrays, strides, n, checked, turned):
+    """Run the formula of a table n times in one call, for small arrays; None where there is no compiled loop.
+
+    Parameters
+    ----------
+    table : Table
+    arrays : list of flat float64 arrays
+    strides : int array, shape (2, arrays)
+        Bytes by which the start of each array moves on after an even and after an odd run.
+    n : int
+    checked : bool
+        Whether to stop at a run whose first sum is not 0.
+    turned : (results, aside, places, points)
+        After run k, ``aside[places]`` is added to ``results[(k + 1) % 2, points]`` and set to 0.
+
+    Returns
+    -------
+    int
+        How many runs came before the one that stopped, or n.
+    """
+    if not (table.points and table.long and kernels.compiled()):
+        return None
+    from sparsedp.kernels import streams_native
+
+    return streams_native.march(table, arrays, strides, n, checked, turned)

@@ -8,6 +8,7 @@ from sparsedp.ledger import loops
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.trajectory.keep import All, Each, Last
 from sparsedp.trajectory.layout import Layout, dense
+from sparsedp.trajectory.protocol import PLAIN, carries
 from sparsedp.trajectory.rules import rollout_rule
 from sparsedp.trajectory.run import Run
 from sparsedp.trajectory.schedule import room_within, slots_within
@@ -108,7 +109,7 @@ def rollout(
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
     run = Run(step, *forms, n, _kind(keep, forms[0]), slots, truncate, any(map(isbox, args)), progress, record)
     _check_values(run, args)
-    if run.store and (slots is None or slots >= n):
+    if run.store and (slots is None or slots >= n) and (inputs is not None or not carries(step, *PLAIN)):
         room = None if memory is None else room_within(memory, forms[0].nbytes, n, beside)
         run.tapes = Tapes(room, frozenset(k for k, arg in enumerate(args) if isbox(arg)), slots is not None)
     for told in loops:

@@ -1,5 +1,8 @@
 """Where the numbers of a state lie in its tree, and whether another tree has the same form."""
 
+from functools import cached_property
+from math import prod
+
 import numpy as np
 
 from sparsedp.errors import DerivativeError, ShapeError
@@ -7,7 +10,10 @@ from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten
 
-__all__ = ["Layout", "dense", "frozen", "owned", "refuse_mask", "still"]
+__all__ = ["NOTHING", "Layout", "dense", "frozen", "owned", "refuse_mask", "still"]
+
+
+NOTHING = (None,)  # the leaves beside one variable
 
 
 class Layout:
@@ -39,27 +45,31 @@ class Layout:
     rounds = False
 
     def __init__(self, tree, root):
-        found, rebuild = flatten(tree)
-        self.labels = _labels(tree, root)
+        self.root, self.bare = root, is_variable(tree) and not isinstance(tree, np.ma.MaskedArray)
+        found, rebuild = ([tree], None) if self.bare else flatten(tree)
+        self.labels = [root] if self.bare else _labels(tree, root)
         for label, leaf in zip(self.labels, found, strict=True):
-            refuse_mask(f"rollout takes plain arrays, got a masked array as {label}", leaf)
-        self.root = root
-        self.places = [place for place, leaf in enumerate(found) if is_variable(leaf)]
-        self.statics = tuple(None if is_variable(leaf) else leaf for leaf in found)
-        # Rebuilt without the variables: what is kept must not hold a trace or a large array.
-        self._template = rebuild(self.statics)
-        self._rebuild = flatten(self._template)[1]
-        self.bare = not isinstance(tree, (tuple, list, dict)) and bool(self.places)
+            if not self.bare:
+                refuse_mask(f"rollout takes plain arrays, got a masked array as {label}", leaf)
+        moving = [self.bare or is_variable(leaf) for leaf in found]
+        self.places = [place for place, moves in enumerate(moving) if moves]
+        self.statics = (
+            NOTHING if self.bare else tuple(None if m else leaf for leaf, m in zip(found, moving, strict=True))
+        )
+        if rebuild is not None:
+            # Rebuilt without the variables: what is kept must not hold a trace or a large array.
+            self._template = rebuild(self.statics)
+            self._rebuild = flatten(self._template)[1]
         self.names = [self.labels[place] for place in self.places]
         variables = [plain(found[place]) for place in self.places]
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
         self.shapes = [np.shape(leaf) for leaf in variables]
         self.dtypes = [dtype_of(leaf) for leaf in variables]
 
-    @property
+    @cached_property
     def nbytes(self):
         """Bytes of the variables."""
-        return sum(int(np.prod(s, dtype=int)) * d.itemsize for s, d in zip(self.shapes, self.dtypes, strict=True))
+        return sum(prod(shape) * dtype.itemsize for shape, dtype in zip(self.shapes, self.dtypes, strict=True))
 
     def build(self, variables, statics=None):
         """Variables and the other leaves -> the tree."""
@@ -91,7 +101,7 @@ class Layout:
             if isinstance(tree, (tuple, list, dict)):
                 raise ShapeError(_changed(self.root, "one array", _kind(tree), when))
             refuse_mask(f"{when} made a masked array of {self.root}", tree)
-            return [tree], (None,)
+            return [tree], NOTHING
         found: list = []
         self._collect(self._template, tree, self.root, when, found)
         variables = [found[place] for place in self.places]
@@ -200,7 +210,7 @@ def frozen(value):
 
 def still(statics):
     """Leaves that are no variables -> the same, arrays among them as copies nobody can write into."""
-    if any(type(leaf) is np.ndarray for leaf in statics):
+    if statics is not NOTHING and any(type(leaf) is np.ndarray for leaf in statics):
         return tuple(frozen(leaf.copy()) if type(leaf) is np.ndarray else leaf for leaf in statics)
     return statics
 

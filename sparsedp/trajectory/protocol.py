@@ -9,26 +9,51 @@ A step may have, beside its call,
 
 both on plain trees. Transport and the linear steppers do. Where `step.sparing` is true, backward also takes
 `new`, the result of the step when it is still known, or None, and `wanted`, whether params want a cotangent.
+Where the state is one array, and params another, it may have a time loop of its own as well, for small states:
+
+    step.march(states, params)                           fills the rows of `states`, one step from each to the next
+    step.retreat(states, params, g, into=None) -> (g_state, into)    backward over all of them; into=None: for g_state
 """
 
 import numpy as np
 
+from sparsedp.trajectory.keep import Last
+from sparsedp.trajectory.layout import NOTHING
 from sparsedp.trajectory.steps import Taped
 
-__all__ = ["Protocol", "engine_of"]
+__all__ = ["PLAIN", "Protocol", "carries", "engine_of"]
+
+SMALL = 2**16  # bytes of a state up to which calling Python for every step would be felt
+PLAIN, WHOLE = ("forward", "backward"), ("march", "retreat")
+FLOAT = np.dtype(float)
+CHUNK = 2**20  # bytes of states that are run at once where none is kept
+
+
+def carries(step, *names):
+    """Whether a step has methods of these names."""
+    return all(callable(getattr(step, name, None)) for name in names)
 
 
 def engine_of(run, args, wanted=(), recording=False):
     """What runs the steps of a run: the step's own plain forms where it has both, else the tape."""
-    plain = run.inputs is None and all(callable(getattr(run.step, name, None)) for name in ("forward", "backward"))
-    return Protocol(run, args, wanted) if plain else Taped(run, args, wanted, recording)
+    if run.engine is None:
+        plain = run.inputs is None and carries(run.step, *PLAIN)
+        run.engine = (Whole if _is_small(run) else Protocol) if plain else Taped
+    return run.engine(run, args, wanted, recording)
+
+
+def _is_small(run):
+    """Whether the time loop of the step itself does what is asked for."""
+    kinds = [form.bare and form.shapes[0] != () and form.dtypes[0] == FLOAT for form in (run.state, run.params)]
+    plain = run.slots is None and run.truncate is None and not (run.progress or run.silenced)
+    return plain and all(kinds) and run.state.nbytes <= SMALL and type(run.keep) is Last and carries(run.step, *WHOLE)
 
 
 class Protocol(Taped):
     """A step with plain forms. States are arrays of this engine: handed out to the step, taken back, used again."""
 
-    def __init__(self, run, args, wanted=()):
-        super().__init__(run, args, wanted)
+    def __init__(self, run, args, wanted=(), recording=False):
+        super().__init__(run, args, wanted, recording)
         self._pool: list = []
         self._arrays = bool(run.state.shapes) and all(run.state.shapes)
         self._recycles = run.keep.recycles
@@ -79,3 +104,46 @@ class Protocol(Taped):
             return [None] * len(self.p)
         found = self.run.params.take(self._into, "the backward form of the step")[0]
         return [np.asarray(value)[()] for value in found]
+
+
+class Whole(Protocol):
+    """A step with a time loop of its own: all states are rows of one array."""
+
+    whole = True
+
+    def march(self, state):
+        """Variables of the first state -> those of the last one, and all that are kept."""
+        run, left = self.run, self.run.n
+        many = left if run.store else min(left, max(CHUNK // max(run.state.nbytes, 1), 1))
+        states = np.empty((many + 1, *run.state.shapes[0]))
+        states[0], rows = state[0], states[:1]
+        while left:
+            rows = states[: min(many, left) + 1]
+            run.step.march(rows, self.params)
+            left -= len(rows) - 1
+            if left:
+                states[0] = rows[-1]
+        return [rows[-1]], Rows(states) if run.store else []
+
+    def retreat(self, states, g, growth):
+        """Cotangents of the last state -> those of the first."""
+        i, (g,) = self.run.n, g
+        while i:
+            first = (i - 1) // growth.every * growth.every
+            g, self._into = self.run.step.retreat(states[first : i + 1], self.params, g, self._into)
+            i = first
+            growth.see(i, [g])
+        return [g]
+
+
+class Rows:
+    """The states of a run as they are kept otherwise: (number, variables, other leaves)."""
+
+    def __init__(self, states):
+        self.states = states
+
+    def __len__(self):
+        return len(self.states) - 1
+
+    def __getitem__(self, i):
+        return i, [self.states[i]], NOTHING

@@ -12,7 +12,7 @@ import numpy as np
 
 from sparsedp.errors import GrowthWarning
 
-__all__ = ["Growth", "Record"]
+__all__ = ["LIMIT", "Growth", "Record"]
 
 LIMIT = 1e8  # half of the digits are gone
 SAMPLES = 32  # measurements of the cotangent in a long run
@@ -79,13 +79,16 @@ class Growth:
             if self._truncate is None or (self._n - i) // self._truncate == (self._n - j - 1) // self._truncate:
                 yield i - j, second - first
 
+    def grown(self):
+        """The largest norm over the first one."""
+        first = next((norm for _, norm in self.norms if norm > 0), 0.0)
+        return max(norm / first for _, norm in self.norms) if first > 0 else float("nan")
+
     def record(self, kept, recomputed):
         """The record of the way back; warns when the cotangent grew too much."""
-        pieces = list(self._pieces())
+        pieces, grown = list(self._pieces()), self.grown()
         steps = sum(length for length, _ in pieces)
         rate = float(sum(rise for _, rise in pieces) / steps) if steps else float("nan")
-        first = next((norm for _, norm in self.norms if norm > 0), 0.0)
-        grown = max((norm / first for _, norm in self.norms), default=float("nan")) if first > 0 else float("nan")
         found = Record("backward", self._n, kept, recomputed, tuple(self.norms), rate, float(grown))
         if found.flagged:
             warnings.warn(
@@ -104,5 +107,5 @@ def _largest(g):
         return 0.0
     if np.iscomplexobj(g):
         return float(np.max(np.abs(g)))
-    low, high = float(np.min(g)), float(np.max(g))
+    low, high = float(np.minimum.reduce(g, axis=None)), float(np.maximum.reduce(g, axis=None))
     return max(high, -low) if low == low else low

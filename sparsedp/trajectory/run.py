@@ -10,7 +10,7 @@ from sparsedp.ledger import active, count
 from sparsedp.trajectory.layout import still
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.protocol import engine_of
-from sparsedp.trajectory.record import Growth, Record
+from sparsedp.trajectory.record import LIMIT, Growth, Record
 from sparsedp.trajectory.schedule import stride
 from sparsedp.trajectory.tapes import Tapes
 
@@ -37,18 +37,7 @@ class Run:
     """
 
     def __init__(
-        self,
-        step,
-        state,
-        params,
-        inputs,
-        n,
-        keep,
-        slots=None,
-        truncate=None,
-        store=False,
-        progress=False,
-        record=None,
+        self, step, state, params, inputs, n, keep, slots=None, truncate=None, store=False, progress=False, record=None
     ):
         self.step, self.state, self.params, self.inputs = step, state, params, inputs
         state.rounds = any(any(form.floats) for form in (state, params, inputs) if form is not None)
@@ -57,6 +46,7 @@ class Run:
         self.tapes: Tapes | None = None  # of single steps, kept from the way forward
         self.place_of: dict = {}  # in a dual run: number of an argument of the run -> its number here
         self.silenced: tuple = ()  # variables that are zero for the step after a cut: tangents
+        self.engine: type | None = None  # what runs the steps, once that is known
         self.outcome = None  # what the user's tree holds beside the variables
         self.given: list = []  # the arguments of the last run whose states were kept
         self._kept: list | None = None
@@ -70,12 +60,12 @@ class Run:
         second = first + len(self.params.places)
         return list(args[:first]), list(args[first:second]), list(args[second:])
 
-    def input_at(self, i, x):
-        """The inputs of step i, in a list; empty when there are none."""
+    def input_at(self, i, x, traced=list):
+        """The inputs of step i, in a list; empty when there are none. `traced` makes traced values of the variables."""
         if self.inputs is None:
             return []
         statics = [leaf[i] if isinstance(leaf, np.ndarray) else leaf for leaf in self.inputs.statics]
-        return [self.inputs.build([_at(block, i) for block in x], statics)]
+        return [self.inputs.build(traced([_at(block, i) for block in x]), statics)]
 
     # ------------------------------------------------------------ forward
 
@@ -102,17 +92,21 @@ class Run:
     def _advance(self, engine, collector, args):
         """(last state, its statics, kept states) after all steps."""
         state, statics = self.split(args)[0], still(self.state.statics)
-        state = collector.see(0, state, statics)
+        if engine.whole:
+            state, rows = engine.march(state)
+            return collector.see(self.n, state, statics), statics, rows
+        state, along = collector.see(0, state, statics), self.keep.along
         kept: list = []
-        stop = 0 if self.store else -1
+        stop, last = 0 if self.store else -1, self.n - 1
         for i in shown_steps(self.progress, range(self.n), "forward"):
-            stored = i == stop or (stop >= 0 and i == self.n - 1)
+            stored = i == stop or (stop >= 0 and i == last)
             if stored:
                 kept.append((i, state if collector.shared or i == 0 else engine.store(state), statics))
                 stop = self._next(i, len(kept)) if i == stop else stop
             before = state
-            state, statics = engine.forward(i, state, statics, collector.room(i + 1))
-            state = collector.see(i + 1, state, statics)
+            state, statics = engine.forward(i, state, statics, collector.room(i + 1) if along else None)
+            if along or i == last:
+                state = collector.see(i + 1, state, statics)
             if not stored and i:
                 engine.release(before)
         return state, statics, kept
@@ -214,16 +208,19 @@ class Way:
         source = run.keep.source(run.n, g)
         total = source(run.n, *self.final)
         growth.see(run.n, total)
-        for i in shown_steps(run.progress, range(run.n - 1, -1, -1), "backward"):
+        if self.engine.whole:
+            total = self.engine.retreat(self.stack.states, total, growth)
+        for i in () if self.engine.whole else shown_steps(run.progress, range(run.n - 1, -1, -1), "backward"):
             if total is None and not run.keep.along:
                 break  # cut by truncation
             total = self._step(i, total, source, growth)
         if active:
             count("rollout.step", "vjp", run.n)
             count("rollout.step", "recomputed", self.recomputed)
-        known = growth.record(many, self.recomputed)
         if run.record is not None:
-            run.record(known)
+            run.record(growth.record(many, self.recomputed))
+        elif growth.grown() > LIMIT:
+            growth.record(many, self.recomputed)
         return total
 
     def _step(self, i, total, source, growth):

@@ -5,7 +5,8 @@ from contextlib import contextmanager
 import numpy as np
 
 from sparsedp.direction import pull_ends, zero_like
-from sparsedp.tape import fit, reverse_root, split_box, trace
+from sparsedp.tape import fit
+from sparsedp.traces import inside, new_box, reverse_root, split_box
 from sparsedp.trajectory.layout import frozen, owned, still
 from sparsedp.tree import flatten, leaves
 
@@ -25,12 +26,13 @@ class Taped:
     """
 
     known = None  # going back: variables of the state after this step, where every state is kept
-    keeps = True  # whether tapes of the way forward are of use on the way back
+    whole = False  # whether it runs all steps in one call
 
     def __init__(self, run, args, wanted=(), recording=False):
         self.run, self.recording = run, recording
         _, self.p, self.x = run.split(args)
-        self.params = run.params.build([frozen(value) for value in self.p], still(run.params.statics))
+        self._frozen, self._statics = [frozen(value) for value in self.p], still(run.params.statics)
+        self.params = run.params.build(self._frozen, self._statics)
         self._given = leaves(self.params)
         self._last: tuple = ()
         self.wanted = frozenset(wanted)
@@ -39,15 +41,15 @@ class Taped:
         self._x = [place for place in range(len(self.x)) if second + place in wanted]
         self.gp: list = [None] * len(self.p)
         self.gx: list = [np.zeros_like(x) if place in self._x else None for place, x in enumerate(self.x)]
-        flags = [(want, weighed) for want in (True, False) for weighed in {recording, False}] if wanted else []
-        self._roots = {flag: self._plan_roots(*flag) for flag in flags}
+        self._roots: dict = {}
 
     # ------------------------------------------------------------ forward
 
     def forward(self, i, values, statics, room=None):
         """Variables and statics of state i -> those of state i + 1. `room` is for steps that can use it."""
         run = self.run
-        values = self._silenced(i, values)
+        if run.silenced:
+            values = self._silenced(i, values)
         self._last = i, values, statics
         if self.recording and run.tapes.fit:
             return self._recorded(i, values, statics)
@@ -63,7 +65,7 @@ class Taped:
 
     def _silenced(self, i, values):
         """A dual run has no tangents where the derivative is cut."""
-        if not self.run.silenced or not self.run.is_cut(i):
+        if not self.run.is_cut(i):
             return values
         return [zero_like(value) if number in self.run.silenced else value for number, value in enumerate(values)]
 
@@ -116,7 +118,8 @@ class Taped:
     def backward(self, i, values, statics, g, want_state):
         """Cotangents of state i + 1 -> those of state i; those of params and inputs are added up."""
         run = self.run
-        values = self._silenced(i, values)
+        if run.silenced:
+            values = self._silenced(i, values)
         self._last = i, values, statics
         ends = run.tapes and run.tapes.take(i, self.wanted)
         if not ends:
@@ -134,10 +137,18 @@ class Taped:
     def _taped(self, i, values, statics, want_state, weighed=False):
         """A step on a tape of its own: (value, node) of each variable, the roots, the other leaves."""
         run = self.run
-        roots, spread = self._roots[want_state, weighed]
-        parts = [run.state.build([frozen(value) for value in values], statics), self.params]
-        parts += run.input_at(i, self.x)
-        result, number = trace(lambda parts: run.step(*parts), parts, spread)
+        if (want_state, weighed) not in self._roots:
+            self._roots[want_state, weighed] = self._plan_roots(want_state, weighed)
+        state, p, x, roots = self._roots[want_state, weighed]
+
+        def step(number):
+            tree = run.state.build(_boxed([frozen(value) for value in values], state, number), statics)
+            params = run.params.build(_boxed(self._frozen, p, number), self._statics) if self._p else self.params
+            if run.inputs is None:
+                return run.step(tree, params)
+            return run.step(tree, params, *run.input_at(i, self.x, lambda rows: _boxed(rows, x, number)))
+
+        result, number = inside(step)
         ends, others = run.state.take(result, "the step")
         return [split_box(end, number) for end in ends], roots, others
 
@@ -149,15 +160,12 @@ class Taped:
         return run.state.check([value for value, _ in pairs], "the step"), still(statics)
 
     def _plan_roots(self, want_state, weighed):
-        """The roots in use, and the roots in the order of all leaves. They hold nothing: every step uses them again."""
-        run = self.run
-        root = run.tapes.root if weighed else reverse_root
-        state = [root() if want_state else None for _ in run.state.places]
-        p, x = [root() for _ in self._p], [root() for _ in self._x]
-        spread = run.state.spread(state) + run.params.spread(_at(self._p, p, len(self.p)))
-        if run.inputs is not None:
-            spread += run.inputs.spread(_at(self._x, x, len(self.x)))
-        return [*(state if want_state else ()), *p, *x], spread
+        """A root for each variable that is traced, else None. They hold nothing: every step uses them again."""
+        root = self.run.tapes.root if weighed else reverse_root
+        state = [root() if want_state else None for _ in self.run.state.places]
+        p = [root() if place in self._p else None for place in range(len(self.p))]
+        x = [root() if place in self._x else None for place in range(len(self.x))]
+        return state, p, x, [root for root in (*state, *p, *x) if root is not None]
 
     def _sorted(self, i, values, backs, want_state):
         split = len(values) if want_state else 0
@@ -185,11 +193,9 @@ class Taped:
         return [*self.gp, *self.gx]
 
 
-def _at(places, values, count):
-    spread = [None] * count
-    for place, value in zip(places, values, strict=True):
-        spread[place] = value
-    return spread
+def _boxed(values, roots, number):
+    """Values -> the same, those with a root on the trace of this number."""
+    return [x if root is None else new_box(x, number, root) for x, root in zip(values, roots, strict=True)]
 
 
 def _fitted(back, value):

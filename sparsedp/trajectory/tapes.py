@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.tape import ReverseNode, reverse_root, untraced
+from sparsedp.traces import ReverseNode, reverse_root, untraced
 
 __all__ = ["Tapes"]
 
@@ -37,12 +37,40 @@ def weighed(kind: Any):
     return Weighed
 
 
-def _equal(array, copy):
-    return not np.any(array != copy)
-
-
 PLAIN = weighed(ReverseNode)
 untraced[PLAIN] = untraced[ReverseNode]  # comparisons, shapes, rounding: plain values for this kind too
+
+
+class Scale:
+    """What the nodes of a weighed tape add to. It knows no node: a circle would keep a tape for long."""
+
+    def __init__(self):
+        self.bytes, self.still = 0, True  # still: no array has changed since it was seen first
+        self.copies = 0  # bytes of the copies that the present step added
+        self.watched: dict = {}  # arrays that anybody may write into, and copies of them
+
+    def see(self, arg):
+        """Weigh what a tape holds beside traced values, and notice when somebody writes into it."""
+        if type(arg) is np.ndarray:
+            self.bytes += arg.nbytes
+            self._watch(arg)
+        elif isinstance(arg, (tuple, list)):  # of indices
+            for one in arg:
+                self.see(one)
+
+    def _watch(self, array):
+        known = self.watched.get(id(array))
+        if known is not None:
+            self.still &= not np.any(known[0] != known[1])
+        elif array.flags.writeable:
+            self.watched[id(array)] = array, array.copy()
+            self.copies += array.nbytes
+
+    def look_again(self):
+        """Whether all arrays are as they were."""
+        for array, copy in self.watched.values():
+            self.still &= not np.any(array != copy)
+        return self.still
 
 
 class Tapes:
@@ -60,16 +88,20 @@ class Tapes:
 
     def __init__(self, room, wanted, once):
         self.room, self.wanted, self.once = SMALL if room is None else room, wanted, once
-        self.bytes, self._last, self._open = 0, 0, True
+        self.scale, self._last, self._open = Scale(), 0, True
         self._kept: dict = {}
-        self._watched: dict = {}  # arrays that anybody may write into, and copies of them
-        self._copies, self._newest = 0, -1  # bytes of the copies that the present step added; the last step kept
+        self._newest = -1  # the last step kept
         self._kind: Any = PLAIN
+
+    @property
+    def bytes(self):
+        """Bytes of the tapes so far."""
+        return self.scale.bytes
 
     @contextmanager
     def fresh(self):
         """A `with` block on the way forward, from which tapes are kept; those of a run before are forgotten."""
-        self.bytes, self._last, self._copies, self._newest, self._kept, self._watched = 0, 0, 0, -1, {}, {}
+        self.scale, self._last, self._newest, self._kept = Scale(), 0, -1, {}
         kind = type(reverse_root())
         self._open = not getattr(kind, "asks_again", False)
         self._kind = PLAIN if kind is ReverseNode else weighed(kind)
@@ -87,45 +119,22 @@ class Tapes:
     @property
     def fit(self):
         """Whether there is room for the tape of one more step."""
-        return self._open and self.bytes < self.room
+        return self._open and self.scale.still and self.scale.bytes < self.room
 
     def root(self):
         """A root whose tape is weighed here."""
         root = self._kind.new_root()
-        root.scale = self
+        root.scale = self.scale
         return root
-
-    def see(self, arg):
-        """Weigh what a tape holds beside traced values, and notice when somebody writes into it."""
-        if type(arg) is np.ndarray:
-            self.bytes += arg.nbytes
-            self._watch(arg)
-        elif isinstance(arg, (tuple, list)):  # of indices
-            for one in arg:
-                self.see(one)
-
-    def _watch(self, array):
-        known = self._watched.get(id(array))
-        if known is not None:
-            self._open &= _equal(*known)
-        elif array.flags.writeable:
-            self._watched[id(array)] = array, array.copy()
-            self._copies += array.nbytes
-
-    def _look_again(self):
-        """Forget all tapes if an array has changed since."""
-        if not (self._open and all(_equal(*known) for known in self._watched.values())):
-            self._kept = {}
-        if self.once:
-            self._watched = {}
 
     def keep(self, i, ends, before):
         """Keep the ends of the tape of step i, unless it was one too many; `before`: the bytes before this step."""
+        scale = self.scale
         if self.weighs(i):
-            self._last = self.bytes - before
-            self.bytes, self._copies = self.bytes + self._copies, 0
+            self._last = scale.bytes - before
+            scale.bytes, scale.copies = scale.bytes + scale.copies, 0
         else:
-            self.bytes += self._last
+            scale.bytes += self._last
         if self.fit:
             self._kept[i], self._newest = ends, i
 
@@ -134,5 +143,8 @@ class Tapes:
         if wanted != self.wanted:
             return None
         if i == self._newest:
-            self._look_again()
+            if not (self._open and self.scale.look_again()):
+                self._kept = {}
+            if self.once:
+                self.scale.watched = {}
         return self._kept.pop(i, None) if self.once else self._kept.get(i)

@@ -1,0 +1,128 @@
+"""The commonest things that happen on a tape, without the detours that autograd takes for the rare ones."""
+
+from typing import Any
+
+import numpy as np
+
+__all__ = ["added", "arithmetic", "direct"]
+
+FLOAT = np.dtype(float)
+
+
+def added(known, back):
+    """(sum so far, whether it may be written to) or None, an array -> the new pair; None when not both are arrays.
+
+    The common cases of what autograd's ``add_outgrads`` does.
+    """
+    if type(back) is not np.ndarray:
+        return None
+    if known is None:
+        return back, False
+    total, own = known
+    if type(total) is not np.ndarray or total.dtype != back.dtype:
+        return None
+    return np.add(total, back, out=total if own else None), True
+
+
+def direct(primitive, raw, boxes, new_box):
+    """A primitive and the function below it -> the same, which asks autograd only where traces are nested.
+
+    Parameters
+    ----------
+    primitive, raw : callable
+    boxes : set of the types of traced values
+    new_box : callable
+        ``new_box(value, trace, node)``.
+    """
+
+    def call(*args):
+        nums = [num for num, arg in enumerate(args) if type(arg) in boxes]
+        if not nums:
+            return raw(*args)
+        trace, values, parents = args[nums[0]]._trace, list(args), []
+        for num in nums:
+            box = args[num]
+            values[num] = box._value
+            if box._trace != trace or type(values[num]) in boxes:
+                return primitive(*args)
+            parents.append(box._node)
+        ans = raw(*values)
+        return new_box(ans, trace, type(parents[0])(ans, primitive, tuple(values), {}, tuple(nums), tuple(parents)))
+
+    return call
+
+
+def arithmetic(fun, value, args, nums):
+    """A call ``value = fun(*args)`` -> the function from g to the cotangents of args `nums`; None: autograd knows.
+
+    For arrays of float64 that are not broadcast, and their sums; the formulas are those of autograd.
+    """
+    rule = FORMULAS.get(getattr(fun, "fun", None))  # the function of NumPy below autograd's
+    if rule is None or len(args) != rule.__code__.co_argcount - 1 or value.dtype != FLOAT:
+        return None
+    shape = args[0].shape if rule in TOTALS and type(args[0]) is np.ndarray else value.shape
+    for num in nums:
+        arg = args[num]
+        if type(arg) is not np.ndarray or arg.shape != shape or arg.dtype != FLOAT:
+            return None
+    return rule(nums, *args)
+
+
+def _add(nums, x, y):
+    return (lambda g: (g,)) if len(nums) == 1 else lambda g: (g, g)
+
+
+def _subtract(nums, x, y):
+    if len(nums) == 2:
+        return lambda g: (g, -g)
+    return (lambda g: (g,)) if nums[0] == 0 else lambda g: (-g,)
+
+
+def _multiply(nums, x, y):
+    if len(nums) == 2:
+        return lambda g: (y * g, x * g)
+    other = x if nums[0] else y
+    return lambda g: (other * g,)
+
+
+def _divide(nums, x, y):
+    if len(nums) == 2:
+        return lambda g: (g / y, -g * x / y**2)
+    return (lambda g: (-g * x / y**2,)) if nums[0] else lambda g: (g / y,)
+
+
+def _negative(nums, x):
+    return lambda g: (-g,)
+
+
+def _power(nums, x, y):
+    if nums != (0,) or type(y) not in (int, float):
+        return None
+    return lambda g: (g * y * x ** (y - 1 if y else 1.0),)
+
+
+def _sum(nums, x):
+    shape = x.shape
+    return lambda g: (_everywhere(g, shape),)
+
+
+def _mean(nums, x):
+    shape, many = x.shape, x.size
+    return (lambda g: (_everywhere(g / many, shape),)) if many else None
+
+
+def _everywhere(g, shape):
+    return np.full(shape, g) if type(g) in (float, np.float64) else g * np.ones(shape)
+
+
+TOTALS = _sum, _mean
+FORMULAS: dict[Any, Any] = {
+    np.add: _add,
+    np.subtract: _subtract,
+    np.multiply: _multiply,
+    np.true_divide: _divide,
+    np.negative: _negative,
+    np.power: _power,
+    np.sum: _sum,
+    np.mean: _mean,
+}

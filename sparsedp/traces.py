@@ -1,0 +1,71 @@
+"""Traces: programs run on traced values, and the way back from their results to where they began."""
+
+from typing import Any
+
+from autograd.core import JVPNode, VJPNode, add_outgrads
+from autograd.tracer import isbox, new_box, notrace_primitives, toposort, trace_stack
+
+from sparsedp.shortcuts import added, arithmetic
+from sparsedp.tree import flatten
+
+__all__ = ["ReverseNode", "backward", "forward_root", "inside", "new_box", "reverse_root", "split_box", "trace"]
+__all__ += ["untraced", "witnesses"]
+
+
+class ReverseNode(VJPNode):
+    """A call on a reverse-mode trace."""
+
+    __slots__ = ()
+    parents: Any
+    vjp: Any
+
+    def __init__(self, value, fun, args, options, nums, parents):
+        self.parents = parents
+        self.vjp = None if options else arithmetic(fun, value, args, nums)
+        if self.vjp is None:
+            super().__init__(value, fun, args, options, nums, parents)
+
+
+untraced = notrace_primitives  # by kind of node, functions that leave the tape
+untraced[ReverseNode] = untraced[VJPNode]
+witnesses: list[type[VJPNode]] = []  # kinds of nodes that see what they stand for; the last one is used
+forward_root = JVPNode.new_root  # a fresh start of a forward-mode trace, with its tangent
+
+
+def reverse_root():
+    """A fresh start of a reverse-mode trace."""
+    return (witnesses[-1] if witnesses else ReverseNode).new_root()
+
+
+def inside(fun):
+    """Run fun(number) inside a trace of its own; return the result and the number of the trace."""
+    number = trace_stack.top = trace_stack.top + 1
+    try:
+        return fun(number), number
+    finally:
+        trace_stack.top = number - 1  # autograd forgets this when `fun` raises
+
+
+def trace(fun, tree, roots):
+    """Run fun(tree) with one box for every root; return the tree of results and the trace number."""
+    found, rebuild = flatten(tree)
+    pairs = list(zip(found, roots, strict=True))
+    return inside(lambda number: fun(rebuild([x if root is None else new_box(x, number, root) for x, root in pairs])))
+
+
+def split_box(value, number):
+    """The value below the box of this trace, and its node (None when it does not depend on x)."""
+    return (value._value, value._node) if isbox(value) and value._trace == number else (value, None)
+
+
+def backward(end, g):
+    """Accumulate cotangents from the node `end` to the roots; return {root: cotangent}."""
+    cotangents, found = {end: (g, False)}, {}
+    for node in toposort(end):
+        g = cotangents.pop(node)[0]
+        if not node.parents:
+            found[node] = g
+        for parent, back in zip(node.parents, node.vjp(g), strict=True):
+            known = cotangents.get(parent)
+            cotangents[parent] = added(known, back) or add_outgrads(known, back)
+    return found

@@ -1,0 +1,190 @@
+"""Steps with a time loop of their own, and the shortcuts of the tape: each against the way round by Python, by bits."""
+
+import autograd
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.errors import NonFiniteError, UnstableStepError
+from sparsedp.trajectory import protocol
+
+N = 20
+RNG = np.random.default_rng(3)
+SCENES = {  # grid, arguments of transport, inflow
+    "ring": (dp.Grid(9, periodic=True), {}, 0.0),
+    "cells": (dp.Grid(7, periodic=True), {"velocity": "cells"}, 0.0),
+    "walls": (dp.Grid((5, 4)), {}, 0.0),
+    "inflow": (dp.Grid((5, 4), periodic=(True, False)), {"boundary": dp.dirichlet}, 0.7),
+    "faces": (dp.Grid((4, 5)), {"of": "faces"}, 0.0),
+    "solid": (dp.Grid((4, 5)), {"solid": np.eye(4, 5, dtype=bool)}, 0.0),
+    "box": (dp.Grid((3, 4, 2), periodic=(False, True, False)), {"velocity": "cells", "form": "flux"}, 0.0),
+    "van_leer": (dp.Grid((5, 4)), {"scheme": "van_leer"}, 0.0),
+    "semi_lagrangian": (dp.Grid((5, 4)), {"scheme": "semi_lagrangian", "boundary": dp.dirichlet}, 0.3),
+    "maccormack": (dp.Grid(9, periodic=True), {"scheme": "maccormack", "form": "unclamped midpoint"}, 0.0),
+}
+
+
+def scene(name):
+    grid, options, inflow = SCENES[name]
+    move = dp.transport(grid, **options)
+    u, v = RNG.standard_normal(move.space.shape), 0.4 * RNG.standard_normal(move.setting.velocity_shapes[0])
+    return move.step(0.15, inflow), u, v, RNG.standard_normal(u.shape)
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("wanted", ["u and v", "u", "v"])
+def test_the_loop_of_a_step_has_the_bits_of_single_steps(name, wanted, monkeypatch):
+    step, u, v, weights = scene(name)
+
+    def loss(x, **options):
+        a, b = x.get("u", u), x.get("v", v)
+        return anp.sum(weights * dp.rollout(step, a, b, N, **options) ** 2)
+
+    x = {"u": {"u": u}, "v": {"v": v}}.get(wanted, {"u": u, "v": v})
+    assert _engine(step, u, v) is protocol.Whole
+    value, g = dp.value_and_grad(loss)(x)
+    assert value == loss(x)
+    monkeypatch.setattr(protocol, "SMALL", 0)
+    assert _engine(step, u, v) is protocol.Protocol
+    for options in ({}, {"memory": 9 * u.nbytes + 2 * v.nbytes}):
+        other, h = dp.value_and_grad(lambda x, options=options: loss(x, **options))(x)
+        assert value == other
+        assert all(np.array_equal(g[key], h[key]) for key in g)
+    taped = dp.value_and_grad(lambda x: anp.sum(weights * _by_hand(step, x.get("u", u), x.get("v", v)) ** 2))(x)[1]
+    assert all(np.max(np.abs(g[key] - taped[key])) <= 1e-12 * np.max(np.abs(taped[key])) for key in g)
+
+
+def _by_hand(step, u, v):
+    for _ in range(N):
+        u = step(u, v)
+    return u
+
+
+def _engine(step, u, v):
+    seen = []
+    real = protocol.engine_of
+
+    def engine_of(run, *args):
+        engine = real(run, *args)
+        seen.append(type(engine))
+        return engine
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sparsedp.trajectory.run.engine_of", engine_of)
+        dp.rollout(step, u, v, 1)
+    return seen[0]
+
+
+def test_many_steps_without_a_way_back_run_in_pieces(monkeypatch):
+    step, u, v, _ = scene("walls")
+    whole = dp.rollout(step, u, v, N)
+    monkeypatch.setattr(protocol, "CHUNK", 3 * u.nbytes)
+    assert np.array_equal(whole, dp.rollout(step, u, v, N))
+    assert np.array_equal(dp.rollout(step, u, v, 0), u)
+
+
+def test_all_other_wishes_take_the_way_by_single_steps():
+    step, u, v, weights = scene("ring")
+    states = dp.rollout(step, u, v, N, keep="all")
+    assert np.array_equal(states[-1], dp.rollout(step, u, v, N))
+    cut = dp.value_and_grad(lambda u: anp.sum(weights * dp.rollout(step, u, v, N, truncate=N)))(u)[1]
+    full = dp.value_and_grad(lambda u: anp.sum(weights * dp.rollout(step, u, v, N)))(u)[1]
+    assert np.array_equal(cut, full)
+    runs = []
+    dp.value_and_grad(lambda u: anp.sum(weights * dp.rollout(step, u, v, N, record=runs.append)))(u)
+    assert [run.direction for run in runs] == ["forward", "backward"]
+    assert [i for i, _ in runs[1].norms] == [20, 16, 0] and runs[1].kept == N
+
+
+def test_second_derivatives_and_tangents_pass_through_the_loop():
+    step, u, v, weights = scene("ring")
+
+    def loss(u, v):
+        return anp.sum(weights * dp.rollout(step, u, v, 4) ** 2)
+
+    d = RNG.standard_normal(u.shape)
+    product = autograd.grad(lambda u: anp.sum(d * autograd.grad(loss)(u, v)))(u)
+    h = 1e-6
+    difference = (autograd.grad(loss)(u + h * d, v) - autograd.grad(loss)(u - h * d, v)) / (2 * h)
+    assert np.max(np.abs(product - difference)) <= 1e-8 * np.max(np.abs(product))
+
+
+def test_single_precision_and_other_kinds_take_the_way_by_single_steps():
+    step, u, v, _ = scene("ring")
+    value = dp.rollout(step, u.astype("f"), v, N)
+    assert value.dtype == np.float32 and np.max(np.abs(value - dp.rollout(step, u, v, N))) < 1e-5
+    assert np.max(np.abs(dp.rollout(step, u, v.astype("f"), N) - dp.rollout(step, u, v, N))) < 1e-5
+
+
+def test_the_loop_stops_at_the_step_that_goes_wrong():
+    move = dp.transport(dp.Grid(8, periodic=True))
+    u, v = np.arange(8.0), np.full(8, 1.5)
+    with pytest.raises(UnstableStepError, match="dt = 1 is too large at 8 of 8 points"):
+        dp.rollout(move.step(1.0), u, v, 5)
+    with pytest.raises(NonFiniteError, match="cannot represent the result"):
+        bold = dp.transport(dp.Grid(8, periodic=True), unstable="allow")
+        dp.rollout(bold.step(1e30), np.cos(np.arange(8.0)), v, 40)
+    with pytest.raises(NonFiniteError, match="finite inflow"):
+        open_ = dp.transport(dp.Grid(4), boundary=dp.dirichlet)
+        dp.rollout(open_.step(0.1, np.array([np.nan, 0.0])), u[:4], np.ones(5), 3)
+    bold = dp.transport(dp.Grid(8, periodic=True), unstable="allow")
+    sawtooth = dp.rollout(bold.step(1.0), np.tile([1.0, -1.0], 4), v, 3)
+    assert np.allclose(sawtooth, -8 * np.tile([1.0, -1.0], 4))  # grows by exactly 2 a step
+
+
+# ---------------------------------------------------------------- shortcuts of the tape
+
+X, Y = RNG.standard_normal((2, 3, 4))
+FORMULAS = {
+    "add": lambda x, y: x + y,
+    "itself": lambda x, y: x + x + y,
+    "number": lambda x, y: 2 + x * 3.0 - y,
+    "subtract": lambda x, y: 1.0 - x - y,
+    "multiply": lambda x, y: x * y * x,
+    "divide": lambda x, y: x / y + 1.0 / x + y / 2,
+    "negative": lambda x, y: -x + y,
+    "power": lambda x, y: x**2 + (y**2) ** 0.5 + x**0 + y**-3 + x**1,
+    "power of a power": lambda x, y: (x**2) ** y,
+    "mean": lambda x, y: anp.mean(x) * y + anp.sum(y) * x,
+    "axes": lambda x, y: anp.mean(x, axis=0) + anp.sum(y, axis=1, keepdims=True) + anp.sum(x, 0),
+    "broadcast": lambda x, y: x[0] * y + x[:, :1] + y[1, 1] * x,
+    "nothing": lambda x, y: anp.sum(x[:0]) + anp.mean(y[:, 1]) + x[0, 0] * y,
+    "plain neighbours": lambda x, y: x * np.arange(4) + y * np.float32(0.1) + x * [1, 2, 3, 4] + y * True,
+}
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_the_shortcuts_of_the_tape_have_the_bits_of_autograd(name):
+    def loss(z):
+        return anp.sum(anp.sin(FORMULAS[name](z[0], z[1])))
+
+    value, g = dp.value_and_grad(loss)((X, Y))
+    known = autograd.grad(loss)((X, Y))
+    assert value == loss((X, Y))
+    assert all(np.array_equal(a, b) for a, b in zip(g, known, strict=True))
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_second_derivatives_pass_through_the_shortcuts(name):
+    def loss(z):
+        return anp.sum(anp.sin(FORMULAS[name](z[0], z[1])))
+
+    def slope(z, gradient):
+        g = gradient(z)
+        return anp.sum(X * g[0] + Y * g[1])
+
+    ours = dp.value_and_grad(lambda z: slope(z, lambda z: dp.value_and_grad(loss)(z)[1]))((X, Y))[1]
+    known = autograd.grad(lambda z: slope(z, autograd.grad(loss)))((X, Y))
+    assert all(np.max(np.abs(a - b)) <= 1e-13 * np.max(np.abs(b)) for a, b in zip(ours, known, strict=True))
+
+
+@pytest.mark.parametrize("kind", ["f", "D"])
+def test_other_kinds_of_numbers_are_left_to_autograd(kind):
+    x, y = X.astype(kind), Y.astype(kind)
+
+    def loss(z):
+        return anp.sum(anp.real(z[0] * z[1] - z[0] / z[1]) ** 2)
+
+    ours, known = dp.value_and_grad(loss)((x, y))[1], autograd.grad(loss)((x, y))
+    assert all(a.dtype == kind and np.allclose(a, b, rtol=1e-6) for a, b in zip(ours, known, strict=True))
