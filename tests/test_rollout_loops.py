@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp.derivative import pullback
 from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.trajectory import protocol
 
@@ -131,6 +132,85 @@ def test_the_loop_stops_at_the_step_that_goes_wrong():
     bold = dp.transport(dp.Grid(8, periodic=True), unstable="allow")
     sawtooth = dp.rollout(bold.step(1.0), np.tile([1.0, -1.0], 4), v, 3)
     assert np.allclose(sawtooth, -8 * np.tile([1.0, -1.0], 4))  # grows by exactly 2 a step
+
+
+# ---------------------------------------------------------------- steps on one tape
+
+WHERE = np.linspace(0.0, 1.0, 6)
+NUMBERS = 0.1 * np.arange(6.0)
+
+
+def bend(u, p):
+    return 0.9 * u + 0.1 * anp.sin(p["rate"] * u) * anp.roll(u, 1) + p["shift"] * anp.cos(u) * u
+
+
+def now_and_then(u, p):
+    """Every few steps a result that is no contiguous array of its own."""
+    return (bend(u, p)[::-1] if plain_sum(u) > 1.0 else bend(u, p)) * 1.0
+
+
+def turned(u, p):
+    return anp.concatenate([bend(u, p)[3:], u[:3]])[::-1]
+
+
+def plain_sum(u):
+    return float(np.sum(getattr(u, "_value", u)))
+
+
+def forgetful(u, p):
+    """A state that depends on params only, wherever the one before is large."""
+    return p["rate"] * NUMBERS if plain_sum(u) > 2.0 else bend(u, p) + 0.5
+
+
+def constant(u, p):
+    return np.cos(NUMBERS) if plain_sum(u) > 2.0 else bend(u, p) + 0.5
+
+
+STEPS = {f.__name__: f for f in (bend, now_and_then, turned, forgetful, constant)}
+
+
+@pytest.mark.parametrize("name", STEPS)
+@pytest.mark.parametrize("n", [1, 2, 9, 40])
+def test_linked_steps_have_the_bits_of_single_steps(name, n):
+    def loss(x, **options):
+        u, p = x.get("u", WHERE), {"rate": x.get("rate", 0.7), "shift": x.get("shift", NUMBERS), "flag": None}
+        return anp.sum(NUMBERS * dp.rollout(STEPS[name], u, p, n, **options) ** 2)
+
+    for x in ({"u": WHERE}, {"rate": 0.7, "shift": NUMBERS}, {"u": WHERE, "rate": 0.7, "shift": NUMBERS}):
+        free, tight = [], []
+        value, g = dp.value_and_grad(lambda x, free=free: loss(x, record=free.append))(x)
+        other, h = dp.value_and_grad(lambda x, tight=tight: loss(x, memory=1200, record=tight.append))(x)
+        assert value == other == loss(x)
+        assert all(np.array_equal(g[key], h[key]) for key in g)
+        assert free[-1].norms == tight[-1].norms and (tight[-1].kept < n or n < 40)
+
+
+def test_a_linked_step_that_reuses_an_array_is_run_again():
+    room = np.zeros(6)
+
+    def step(u, p):
+        room[:] = getattr(p, "_value", p) * NUMBERS  # an array of the step's own, another one for other params
+        room[0] += plain_sum(u)
+        return u * room + p * u
+
+    slope = dp.value_and_grad(lambda p: anp.sum(dp.rollout(step, WHERE, p, 12)))(0.3)[1]
+    fresh = lambda u, p: u * (plain_sum(p) * NUMBERS + plain_sum(u) * (np.arange(6) == 0)) + p * u
+    known = WHERE
+    loss = lambda p: anp.sum(_chain(fresh, known, p, 12))
+    assert slope == pytest.approx(dp.value_and_grad(loss)(0.3)[1], rel=1e-12)
+
+
+def _chain(step, u, p, n):
+    for _ in range(n):
+        u = step(u, p)
+    return u
+
+
+def test_two_pullbacks_of_one_linked_run():
+    value, pull = pullback(lambda x: dp.rollout(lambda u, p: u + p * anp.sin(u), x[0], x[1], 20), (WHERE, NUMBERS))
+    first, second = pull(np.ones(6)), pull(2 * np.ones(6))
+    assert all(np.array_equal(2 * a, b) for a, b in zip(first, second, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(first, pull(np.ones(6)), strict=True))
 
 
 # ---------------------------------------------------------------- shortcuts of the tape

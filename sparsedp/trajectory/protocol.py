@@ -19,6 +19,7 @@ import numpy as np
 
 from sparsedp.trajectory.keep import Last
 from sparsedp.trajectory.layout import NOTHING
+from sparsedp.trajectory.linked import Linked
 from sparsedp.trajectory.steps import Taped
 
 __all__ = ["PLAIN", "Protocol", "carries", "engine_of"]
@@ -38,15 +39,24 @@ def engine_of(run, args, wanted=(), recording=False):
     """What runs the steps of a run: the step's own plain forms where it has both, else the tape."""
     if run.engine is None:
         plain = run.inputs is None and carries(run.step, *PLAIN)
-        run.engine = (Whole if _is_small(run) else Protocol) if plain else Taped
+        run.engine = (Whole if _is_small(run) else Protocol) if plain else Linked if _is_chain(run) else Taped
     return run.engine(run, args, wanted, recording)
 
 
 def _is_small(run):
     """Whether the time loop of the step itself does what is asked for."""
-    kinds = [form.bare and form.shapes[0] != () and form.dtypes[0] == FLOAT for form in (run.state, run.params)]
+    return _is_chain(run) and _is_field(run.params) and run.state.nbytes <= SMALL and carries(run.step, *WHOLE)
+
+
+def _is_chain(run):
+    """Whether one array is handed from step to step, and nothing is to be done in between."""
     plain = run.slots is None and run.truncate is None and not (run.progress or run.silenced)
-    return plain and all(kinds) and run.state.nbytes <= SMALL and type(run.keep) is Last and carries(run.step, *WHOLE)
+    return plain and _is_field(run.state) and type(run.keep) is Last and run.inputs is None
+
+
+def _is_field(form):
+    """Whether a tree is one array of float64."""
+    return form.bare and form.shapes[0] != () and form.dtypes[0] == FLOAT
 
 
 class Protocol(Taped):

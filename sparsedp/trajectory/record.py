@@ -12,7 +12,7 @@ import numpy as np
 
 from sparsedp.errors import GrowthWarning
 
-__all__ = ["LIMIT", "Growth", "Record"]
+__all__ = ["LIMIT", "Growth", "Record", "looked_at"]
 
 LIMIT = 1e8  # half of the digits are gone
 SAMPLES = 32  # measurements of the cotangent in a long run
@@ -58,11 +58,16 @@ class Record(NamedTuple):
         return self.amplification > LIMIT
 
 
+def looked_at(n):
+    """The cotangent of n steps is measured at states whose number is a multiple of this."""
+    return max(n // SAMPLES, APART)
+
+
 class Growth:
     """Measures the cotangent of the state now and then on the way back."""
 
     def __init__(self, n, truncate):
-        self._n, self.every, self._truncate = n, max(n // SAMPLES, APART), truncate
+        self._n, self.every, self._truncate = n, looked_at(n), truncate
         self.norms: list = []
 
     def see(self, i, g):

@@ -96,9 +96,11 @@ class Run:
             state, rows = engine.march(state)
             return collector.see(self.n, state, statics), statics, rows
         state, along = collector.see(0, state, statics), self.keep.along
-        kept: list = []
-        stop, last = 0 if self.store else -1, self.n - 1
-        for i in shown_steps(self.progress, range(self.n), "forward"):
+        first, state, kept = engine.link(state, statics) if engine.recording else (0, state, [])
+        stop, last = first if self.store else -1, self.n - 1
+        if first == self.n:
+            state = collector.see(first, state, statics)
+        for i in shown_steps(self.progress, range(first, self.n), "forward"):
             stored = i == stop or (stop >= 0 and i == last)
             if stored:
                 kept.append((i, state if collector.shared or i == 0 else engine.store(state), statics))
@@ -208,12 +210,15 @@ class Way:
         source = run.keep.source(run.n, g)
         total = source(run.n, *self.final)
         growth.see(run.n, total)
+        linked = run.tapes.linked(self.engine.wanted) if run.tapes else 0
         if self.engine.whole:
-            total = self.engine.retreat(self.stack.states, total, growth)
-        for i in () if self.engine.whole else shown_steps(run.progress, range(run.n - 1, -1, -1), "backward"):
+            total, linked = self.engine.retreat(self.stack.states, total, growth), run.n
+        for i in shown_steps(run.progress, range(run.n - 1, linked - 1, -1), "backward"):
             if total is None and not run.keep.along:
                 break  # cut by truncation
             total = self._step(i, total, source, growth)
+        if linked and not self.engine.whole and total is not None:
+            total = self.engine.unlink(total, self.stack[0][1], growth)
         if active:
             count("rollout.step", "vjp", run.n)
             count("rollout.step", "recomputed", self.recomputed)

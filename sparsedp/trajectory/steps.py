@@ -10,7 +10,7 @@ from sparsedp.traces import inside, new_box, reverse_root, split_box
 from sparsedp.trajectory.layout import frozen, owned, still
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["Taped"]
+__all__ = ["Taped", "boxed", "fitted"]
 
 
 class Taped:
@@ -44,6 +44,10 @@ class Taped:
         self._roots: dict = {}
 
     # ------------------------------------------------------------ forward
+
+    def link(self, state, statics):
+        """Steps that are run in one piece: (how many, the state after them, the states before each of them)."""
+        return 0, state, []
 
     def forward(self, i, values, statics, room=None):
         """Variables and statics of state i -> those of state i + 1. `room` is for steps that can use it."""
@@ -142,11 +146,11 @@ class Taped:
         state, p, x, roots = self._roots[want_state, weighed]
 
         def step(number):
-            tree = run.state.build(_boxed([frozen(value) for value in values], state, number), statics)
-            params = run.params.build(_boxed(self._frozen, p, number), self._statics) if self._p else self.params
+            tree = run.state.build(boxed([frozen(value) for value in values], state, number), statics)
+            params = run.params.build(boxed(self._frozen, p, number), self._statics) if self._p else self.params
             if run.inputs is None:
                 return run.step(tree, params)
-            return run.step(tree, params, *run.input_at(i, self.x, lambda rows: _boxed(rows, x, number)))
+            return run.step(tree, params, *run.input_at(i, self.x, lambda rows: boxed(rows, x, number)))
 
         result, number = inside(step)
         ends, others = run.state.take(result, "the step")
@@ -177,10 +181,10 @@ class Taped:
                 self.gx[place][i] = back
         if not want_state:
             return None
-        return [back if back is None else _fitted(back, value) for back, value in zip(backs, values, strict=False)]
+        return [back if back is None else fitted(back, value) for back, value in zip(backs, values, strict=False)]
 
     def _add(self, place, back):
-        back, total = _fitted(back, self.p[place]), self.gp[place]
+        back, total = fitted(back, self.p[place]), self.gp[place]
         if total is None:
             self.gp[place] = owned(back)
         elif type(total) is np.ndarray:
@@ -193,12 +197,12 @@ class Taped:
         return [*self.gp, *self.gx]
 
 
-def _boxed(values, roots, number):
+def boxed(values, roots, number):
     """Values -> the same, those with a root on the trace of this number."""
     return [x if root is None else new_box(x, number, root) for x, root in zip(values, roots, strict=True)]
 
 
-def _fitted(back, value):
+def fitted(back, value):
     """A cotangent in the dtype of its value."""
     if type(back) is type(value) and back.dtype == value.dtype and back.shape == value.shape:
         return back

@@ -90,6 +90,7 @@ class Tapes:
         self.room, self.wanted, self.once = SMALL if room is None else room, wanted, once
         self.scale, self._last, self._open = Scale(), 0, True
         self._kept: dict = {}
+        self.pieces: list = []  # tapes of several steps each, from the first step on
         self._newest = -1  # the last step kept
         self._kind: Any = PLAIN
 
@@ -101,7 +102,7 @@ class Tapes:
     @contextmanager
     def fresh(self):
         """A `with` block on the way forward, from which tapes are kept; those of a run before are forgotten."""
-        self.scale, self._last, self._newest, self._kept = Scale(), 0, -1, {}
+        self.scale, self._last, self._newest, self._kept, self.pieces = Scale(), 0, -1, {}, []
         kind = type(reverse_root())
         self._open = not getattr(kind, "asks_again", False)
         self._kind = PLAIN if kind is ReverseNode else weighed(kind)
@@ -129,14 +130,32 @@ class Tapes:
 
     def keep(self, i, ends, before):
         """Keep the ends of the tape of step i, unless it was one too many; `before`: the bytes before this step."""
+        self.add(self.weighs(i), before)
+        if self.fit:
+            self._kept[i], self._newest = ends, i
+
+    def add(self, weighed, before):
+        """Count the tape of one more step; `before`: the bytes before it, where it was weighed."""
         scale = self.scale
-        if self.weighs(i):
+        if weighed:
             self._last = scale.bytes - before
             scale.bytes, scale.copies = scale.bytes + scale.copies, 0
         else:
             scale.bytes += self._last
-        if self.fit:
-            self._kept[i], self._newest = ends, i
+
+    def next_weighed(self, i):
+        """The next step after i that is weighed."""
+        return next(k for k in range(i + 1, i + EVERY + 1) if self.weighs(k))
+
+    def steps_left(self):
+        """How many more steps like the last one there is room for."""
+        return int((self.room - self.scale.bytes) // max(self._last, 1))
+
+    def linked(self, wanted):
+        """How many steps from the first on are linked and as they were; 0 where other cotangents are wanted."""
+        if wanted != self.wanted or not self.pieces or not (self._open and self.scale.look_again()):
+            self.pieces = []
+        return self.pieces[-1].stop if self.pieces else 0
 
     def take(self, i, wanted):
         """The ends of the tape of step i, or None."""
