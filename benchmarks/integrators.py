@@ -3,7 +3,8 @@
 Allen-Cahn, u' = nu L u + u - u^3 on the closed unit square, nu = 0.01, from random waves. The error is that of
 the state at the end, in the largest entry; the gradient is that of sum(u_end^2)/2 in nu, against the same with
 far smaller steps. A row is marked * when no other row is both faster and closer. Explicit rows stay below
-their stable limit. The last table takes 1000 times the limit of Euler's method at 256 x 256.
+their stable limit. The second table takes 1000 times the limit of Euler's method at 256 x 256. Those after it put
+nonlinear steps beside plain SciPy (beside_scipy.py).
 
 Run ``python -m benchmarks.integrators [--quick]`` in the root of the repository.
 """
@@ -15,6 +16,7 @@ import autograd.numpy as anp
 import numpy as np
 
 import sparsedp as dp
+from benchmarks.beside_scipy import fields, kinetics, species, stages
 from sparsedp import kernels
 
 NU, END = 0.01, 1.0
@@ -130,6 +132,10 @@ def main():
         timed(method, L, start, 0.01, 2)  # the first call of a compiled kernel is not the price of a step
     table(32 if quick else 128)
     far_beyond(64 if quick else 256, 4)
+    fields((32,) if quick else (64, 128, 256))
+    kinetics(quick)
+    species(quick)
+    stages(steps=20 if quick else 200)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,10 @@
 Error: a wave on the periodic square is carried by a wind that is the same everywhere. The value is a mode of the
 field at the end, the gradient its derivative in the wind; both are known in closed form. Error and order stand
 beside the seconds of value and gradient.
-Cost: one step forward, and its value and gradient in field, velocity and time step on the tape. All rows of a
-table run in turn and the smallest time counts; only ratios of one run mean anything.
+Cost: one step forward, and value and gradient on the tape of a weighted sum of its result: in the field, in field and
+velocity, and in field, velocity and time step. The gate is for all three at once. What the weighted sum costs without
+a step is printed too: it is part of every gradient, and taken out in the column "less sum". All rows of a table run
+in turn and the smallest time counts; only ratios of one run mean anything.
 
 Run ``python -m benchmarks.transport [--quick]`` in the root of the repository.
 """
@@ -28,6 +30,7 @@ SCHEMES = {
     "semi_lagrangian, cubic": {"scheme": "semi_lagrangian", "interpolation": "cubic"},
     "maccormack": {"scheme": "maccormack"},
 }
+ASKED = {1: "u", 2: "u, v", 3: "u, v, dt"}  # the first so many arguments
 LIMIT = 3.5  # value and gradient on the tape, over the step forward
 
 
@@ -84,28 +87,37 @@ def errors(sizes):
 
 
 def cost(shape, rounds):
-    """Print one block: nanoseconds a cell of a step, and of value and gradient in field, velocity and time step."""
+    """Print one block: nanoseconds a cell of a step, and value and gradient over it for each set of arguments."""
     grid = dp.Grid(shape, size=1.0, periodic=True)
     rng = np.random.default_rng(0)
     u, v, weights = rng.random(shape), rng.uniform(-1, 1, grid.faces.size), rng.standard_normal(shape)
     dt = 0.15 / sum(shape)
-    tasks = {}
+    # Half a scalar product as one rule, so that what is timed is the step.
+    weigh = dp.differentiable("weigh", lambda u: np.vdot(u, weights), lambda nums, ans, u: lambda g: (g * weights,))
+    alone = dp.value_and_grad(weigh)
+    tasks = {("weighted sum alone", 0): lambda: alone(u)}
     for name, options in SCHEMES.items():
         move = dp.transport(grid, **options)
-        # Half a scalar product as one rule, so that what is timed is the step.
-        weigh = dp.differentiable("weigh", lambda u: np.vdot(u, weights), lambda nums, ans, u: lambda g: (g * weights,))
-        both = dp.value_and_grad(lambda p, move=move, weigh=weigh: weigh(move(*p)))
-        tasks[name, "forward"] = lambda move=move: move(u, v, dt)
-        tasks[name, "gradient"] = lambda both=both: both((u, v, dt))
+        tasks[name, 0] = lambda move=move: move(u, v, dt)
+        for many in ASKED:
+            both = dp.value_and_grad(lambda p, move=move, many=many: weigh(move(*p, *(u, v, dt)[many:])))
+            tasks[name, many] = lambda both=both, many=many: both((u, v, dt)[:many])
     for task in tasks.values():
         task()
     best, cells = best_times(tasks, rounds), np.prod(shape)
     kind = "numba" if kernels.compiled() else "NumPy"
-    print(f"\n{' x '.join(map(str, shape))} cells, {kernels.threads()} threads, kernels: {kind}; ns a cell")
-    print(f"{'scheme':26} {'forward':>9} {'with gradient':>14} {'ratio':>6} {'limit':>6}")
+    print(f"\n{' x '.join(map(str, shape))} cells, {kernels.threads()} threads, kernels: {kind}; ns a cell, and ratios")
+    print(
+        f"{'scheme':26} {'forward':>9}"
+        + "".join(f"{words:>10}" for words in ASKED.values())
+        + f"{'limit':>7}{'less sum':>10}"
+    )
+    alone = best["weighted sum alone", 0]
     for name in SCHEMES:
-        forward, gradient = (1e9 / cells * best[name, what] for what in ("forward", "gradient"))
-        print(f"{name:26} {forward:9.1f} {gradient:14.1f} {gradient / forward:6.2f} {LIMIT:6.1f}")
+        forward, *ratios = best[name, 0], *(best[name, many] / best[name, 0] for many in ASKED)
+        numbers = f"{1e9 / cells * forward:9.1f}" + "".join(f"{ratio:10.2f}" for ratio in ratios)
+        print(f"{name:26} {numbers}{LIMIT:7.1f}{ratios[-1] - alone / forward:10.2f}")
+    print(f"{'weighted sum alone':26} {1e9 / cells * alone:9.1f}")
 
 
 def main():

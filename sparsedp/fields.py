@@ -14,6 +14,7 @@ __all__ = [
     "field_array",
     "is_number",
     "is_whole",
+    "own",
     "place",
     "surely_finite",
 ]
@@ -93,6 +94,16 @@ def place(index, shape):
     """Number of an entry in C order -> its index: a number in 1-D, else a tuple."""
     found = tuple(map(int, np.unravel_index(index, shape)))
     return found[0] if len(found) == 1 else found
+
+
+def own(value, held, key):
+    """A constant for a pullback: a copy, since the caller may reuse the array before; `held` has the last one."""
+    if type(value) is not np.ndarray or not value.flags.writeable:
+        return value
+    known = held.get(key)
+    if known is None or known.dtype != value.dtype or not np.array_equal(known, value):
+        known = held[key] = value.copy()
+    return known
 
 
 def check_function(name, thing, example):

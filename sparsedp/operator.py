@@ -19,8 +19,8 @@ from sparsedp.tape import apply_operator, isbox
 
 __all__ = ["Operator"]
 
-# Most unknowns for which one sparse product costs less than a stencil pass: see benchmarks/apply.py.
-EXPLICIT_BELOW_COMPILED = 4096
+# Most unknowns for which one sparse product costs less than stencil passes, for each pass: see benchmarks/apply.py.
+EXPLICIT_BELOW_COMPILED = 4608
 EXPLICIT_BELOW_PLAIN = 262144
 
 
@@ -292,7 +292,7 @@ def _chosen_form(structure):
         return "explicit"
     if isinstance(structure, Diagonal) or not structure.has_entries:
         return "matrix-free"
-    limit = EXPLICIT_BELOW_COMPILED if kernels.compiled() else EXPLICIT_BELOW_PLAIN
+    limit = EXPLICIT_BELOW_COMPILED * structure.passes if kernels.compiled() else EXPLICIT_BELOW_PLAIN
     return "explicit" if max(structure.shape) <= limit else "matrix-free"
 
 

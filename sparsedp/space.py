@@ -8,7 +8,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.tape import dtype_of, isbox, linear
+from sparsedp.tape import differentiable, dtype_of, isbox, linear, plain
 
 __all__ = ["Space", "fits"]
 
@@ -101,7 +101,7 @@ class Space:
         if np.shape(v) != self.shape:
             raise ShapeError(f"split takes a field on {self.told}, got an array of shape {np.shape(v)}")
         if isbox(v):
-            return tuple(_part(self, axis)(v) for axis in range(len(self.parts)))
+            return tuple(rule(v) for rule in self._parted)
         flat = np.asarray(v).reshape(-1)
         spans = zip(self.offsets, self.offsets[1:], self.parts, strict=False)
         return tuple(flat[start:stop].reshape(part) for start, stop, part in spans)
@@ -125,12 +125,20 @@ class Space:
         """
         if len(parts) != len(self.parts):
             raise ShapeError(f"join on {self} takes {len(self.parts)} components, got {len(parts)}")
-        flat = []
-        for part, shape in zip(parts, self.parts, strict=True):
-            if np.shape(part) != shape:
-                part = _broadcast(self, part, shape)
-            flat.append(anp.reshape(part, (-1,)))
-        return anp.reshape(anp.concatenate(flat), self.shape)
+        found = [
+            part if np.shape(part) == shape else _broadcast(self, part, shape)
+            for part, shape in zip(parts, self.parts, strict=True)
+        ]
+        return _join(self, *found) if any(map(isbox, found)) else _joined(self, *found)
+
+    @cached_property
+    def _parted(self):
+        """The rules of `split`: one for each component."""
+        spans = zip(self.offsets, self.offsets[1:], self.parts, strict=False)
+        return [_part(self.kind, self.shape, *span) for span in spans]
+
+    def __getstate__(self):
+        return {name: getattr(self, name) for name in ("shape", "kind", "grid", "parts")}  # without what is derived
 
     def __eq__(self, other):
         if not isinstance(other, Space):
@@ -171,16 +179,35 @@ def _broadcast(space, part, shape):
         raise ShapeError(f"join on {space} needs components {space.parts}, got one of shape {np.shape(part)}") from None
 
 
-def _part(space, axis):
+def _part(kind, whole, start, stop, shape):
     """The rule that takes one component out of a traced field; its transpose puts it back."""
-    start, stop, shape = space.offsets[axis], space.offsets[axis + 1], space.parts[axis]
 
     def take(v):
         return v.reshape(-1)[start:stop].reshape(shape)
 
     def put(g):
-        v = np.zeros(space.size, dtype=g.dtype)
-        v[start:stop] = g.reshape(-1)
-        return v.reshape(space.shape)
+        v = np.zeros(whole, dtype=g.dtype)
+        v.reshape(-1)[start:stop] = g.reshape(-1)
+        return v
 
-    return linear(f"part of {space.kind}", take, put)[0]
+    return linear(f"part of {kind}", take, put)[0]
+
+
+def _joined(space, *parts):
+    return np.concatenate([np.reshape(part, -1) for part in parts]).reshape(space.shape)
+
+
+def _join_vjp(nums, ans, space, *parts):
+    def pull(g):
+        found = space.split(g)
+        return tuple(found[num - 1] for num in nums)
+
+    return pull
+
+
+def _join_jvp(nums, tangents, ans, space, *parts):
+    moved = dict(zip(nums, tangents, strict=True))
+    return space.join(*(moved.get(num, np.zeros_like(plain(part))) for num, part in enumerate(parts, 1)))
+
+
+_join = differentiable("join", _joined, _join_vjp, _join_jvp)

@@ -36,7 +36,13 @@ class Module:
         return ".".join(self.path.parent.relative_to(ROOT).parts)
 
     def nodes(self, kind):
-        return [node for node in ast.walk(self.tree) if isinstance(node, kind)]
+        return [node for node in walked(self.tree) if isinstance(node, kind)]
+
+
+@cache
+def walked(tree):
+    """All nodes of a tree."""
+    return tuple(ast.walk(tree))
 
 
 @cache
@@ -49,6 +55,7 @@ def modules():
     return tuple(found)
 
 
+@cache
 def names():
     """Dotted names of all modules and folders of modules."""
     return {module.name for module in modules()} | {module.package for module in modules()}
@@ -67,6 +74,7 @@ def called(node):
     return getattr(node.func, "id", None) or getattr(node.func, "attr", None)
 
 
+@cache
 def imports(module):
     """Pairs (absolute dotted name, line) of all a module imports, at its top or inside functions.
 
@@ -74,7 +82,7 @@ def imports(module):
     counts as the module it is taken from.
     """
     ours, found = names(), []
-    for node in ast.walk(module.tree):
+    for node in walked(module.tree):
         if isinstance(node, ast.Import):
             found += [(alias.name, node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -158,3 +158,24 @@ def test_message(call, error, message):
 
 def test_tangents_of_dicts_are_paired_by_name():
     assert pushforward(lambda x: x["a"] - x["b"], {"a": 1.0, "b": 1.0}, {"b": 1.0, "a": 5.0})[1] == 4.0
+
+
+def test_forces_and_walls_of_another_shape_are_refused():
+    grid = dp.Grid((2, 2))
+    rest = np.zeros(12)
+    with pytest.raises(TypeError, match="flow_step takes a function, got str; write force=lambda v, params: ..."):
+        dp.flow_step(grid, 0.1, force="up")
+    with pytest.raises(
+        dp.errors.ShapeError,
+        match="flow_step takes "
+        r"a force on faces\(2, 2\), got an array of shape \(2, 2\); join its components with grid\.join",
+    ):
+        dp.flow_step(grid, 0.1, force=lambda v, params: np.ones((2, 2))).start(rest)
+    with pytest.raises(
+        dp.errors.ShapeError,
+        match="flow_step takes "
+        r"walls on faces\(2, 2\), got an array of shape \(3,\); write face_lift\(grid, boundary\)\(values\)",
+    ):
+        dp.flow_step(grid, 0.1, walls=np.zeros(3))
+    by_number, by_field = (dp.flow_step(grid, 0.1, force=lambda v, g: g).start(rest, g) for g in (1.0, np.ones(12)))
+    assert np.array_equal(by_number["a"], by_field["a"])

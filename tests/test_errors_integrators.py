@@ -1,5 +1,7 @@
 """Every message of stepper, printed once."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -126,6 +128,22 @@ TABLE = [
         SHAPE,
         "a rate must have the shape of the state, (4,), got (1,)",
     ),
+    (
+        lambda: dp.stepper("rk4", decay, 0.6, tolerance=1e-9)(U.astype(np.float32), 1.0),
+        VALUE,
+        "stepper(rk4) cannot meet the tolerance 1e-09 with a state of float32, whose rounding is 1.2e-07; take a "
+        "larger tolerance or write u.astype(float)",
+    ),
+    (
+        lambda: dp.stepper("rk4", lambda u, p: u * np.nan, 0.6, tolerance=1e-3)(U),
+        FINITE,
+        "the rate of stepper(rk4) must be finite at the state given; take a state in its domain",
+    ),
+    (
+        lambda: dp.stepper("rk4", decay, 0.6, tolerance=1e-3)(U, np.nan),
+        FINITE,
+        "the params of stepper(rk4) must be finite, got nan; write a finite number",
+    ),
 ]
 
 
@@ -158,3 +176,16 @@ def test_no_step_meets_the_tolerance():
     )
     with pytest.raises(dp.errors.ConvergenceError, match=message):
         step(np.ones(1))
+
+
+@pytest.mark.parametrize("method", ["rk4", "backward_euler"])
+def test_a_rate_that_writes_into_the_state_is_named_when_only_params_are_traced(method):
+    def rate(u, p):
+        u *= p
+        return u
+
+    message = "the rate changes the state in place; write u = u + du instead of u += du, or work on a copy"
+    step = dp.stepper(method, rate, 0.1)
+    for last in (lambda p: sum(step(U, p)), lambda p: sum(dp.rollout(step, U, p, 2))):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            dp.value_and_grad(last)(1.0)

@@ -1,71 +1,16 @@
 """Every example is short, runs small, and says what its page promises."""
 
-import os
 import re
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 
 import pytest
+from scripts import EXAMPLES, run
 from sources import ROOT
 
-EXAMPLES = sorted(path.name for path in (ROOT / "examples").glob("*.py"))
-SMALL = {
-    "poisson_adjoint.py": "32",
-    "two_families.py": "24",
-    "poisson_control.py": "64",
-    "warm_start.py": "64",
-    "implicit_or_unrolled.py": "96",
-    "inexact_solves.py": "30",
-    "burgers.py": "128",
-    "shock.py": "64",
-    "stiff_chemistry.py": "50",
-    "pressure_projection.py": "80",
-    "plume.py": "32",
-    "plume_inverse.py": "6",
-    "taylor_green.py": "50",
-    "cavity.py": "32",
-    "convection.py": "32",
-    "obstacle.py": "10",
-    "shape.py": "12",
-    "velocity_recovery.py": "64",
-    "update_directions.py": "10",
-    "half_inverse.py": "1",
-    "inverse_heat.py": "6",
-    "control.py": "2",
-    "conductivity_design.py": "200",
-    "residual_or_physics.py": "10",
-    "solver_in_the_loop.py": "48",
-}  # cells, the end time, or gradients; the others run with 16
 LINES = {"solver_in_the_loop.py": 125}  # two solvers, a network and a study; the others stay below 60
 
 
-POOL = ThreadPoolExecutor(2)  # examples are processes of their own: two at a time
-
-
-@cache
-def started(name, *options_of_its_own):
-    """An example that runs small, or has run."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
-    command = [sys.executable, str(ROOT / "examples" / name), SMALL.get(name, "16"), *options_of_its_own]
-    options = {"capture_output": True, "text": True, "timeout": 240, "check": False}
-    return POOL.submit(subprocess.run, command, env=environment, **options)
-
-
-def run(name, *options):
-    """What an example prints when it runs small."""
-    done = started(name, *options).result()
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    return done.stdout
-
-
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_it_runs(name, request):
-    same = [item for item in request.session.items if getattr(item, "function", None) is request.function]
-    for item in same[same.index(request.node) :][:2]:
-        started(item.callspec.params["name"])
+def test_it_runs(name):
     assert run(name).strip()
 
 

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from test_examples import run
+from scripts import run
 
 
 def rows(text, pattern):

@@ -2,7 +2,7 @@
 
 import re
 
-from test_examples import run
+from scripts import run
 
 
 def rows(text, pattern):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sparsedp import kernels
 from sparsedp.kernels import staggered_plain
 
 SHAPES = [
@@ -16,35 +17,38 @@ SHAPES = [
 
 
 def numbers(shape, periodic, seed=0):
-    """Components, coefficients of cells and of faces, for axes of more than one cell."""
+    """The six lengths, and components and coefficients of cells and of faces for axes of more than one cell."""
     rng = np.random.default_rng(seed)
+    there = [n > 1 or axis == 2 for axis, n in enumerate(shape)]
+    counts = tuple((n + (not periodic)) * flag for n, flag in zip(shape, there))
     parts, cells, faces = [], [], []
-    for axis, n in enumerate(shape):
-        there = n > 1 or axis == 2
-        full = tuple(m + (a == axis and not periodic) for a, m in enumerate(shape))
-        parts.append(rng.standard_normal(full if there else (0, 0, 0)))
-        cells.append(rng.standard_normal((2, n if there else 0)))
-        lines = rng.standard_normal((3, full[axis] if there else 0))
-        if there and not periodic:
+    for axis, (n, m, flag) in enumerate(zip(shape, counts, there)):
+        parts.append(rng.standard_normal(tuple(m if a == axis else k for a, k in enumerate(shape))))
+        cells.append(rng.standard_normal((2, n)) * flag)
+        lines = rng.standard_normal((3, m))
+        if flag and not periodic:
             lines[1, 0] = lines[2, -1] = 0.0
         faces.append(lines)
-    return parts, [tuple(x) for x in zip(*cells)], [tuple(np.ascontiguousarray(y) for y in x) for x in zip(*faces)]
+    return (*shape, *counts), parts, cells, faces
 
 
-def wanted(parts, lower, upper, shape):
+def flat(parts):
+    return np.concatenate([part.ravel() for part in parts])
+
+
+def wanted(parts, cells, shape):
     b = np.zeros(shape)
     for axis, x in enumerate(parts):
         if x.size:
             n, m = shape[axis], x.shape[axis]
-            line = [-1 if a == axis else 1 for a in range(3)]
-            ahead = np.take(x, (np.arange(n) + 1) % m, axis)
-            b += upper[axis].reshape(line) * ahead + lower[axis].reshape(line) * np.take(x, np.arange(n), axis)
+            lower, upper = cells[axis].reshape([2] + [-1 if a == axis else 1 for a in range(3)])
+            b += upper * np.take(x, (np.arange(n) + 1) % m, axis) + lower * np.take(x, np.arange(n), axis)
     return b
 
 
 def modules():
     found = [staggered_plain]
-    if pytest.importorskip("numba"):
+    if kernels.compiled():
         from sparsedp.kernels import staggered
 
         found.append(staggered)
@@ -54,21 +58,19 @@ def modules():
 @pytest.mark.parametrize(("shape", "periodic"), SHAPES)
 @pytest.mark.parametrize("equal", [False, True])
 def test_compiled_and_plain(shape, periodic, equal):
-    parts, (lower, upper), (keep, below, above) = numbers(shape, periodic)
+    six, parts, cells, faces = numbers(shape, periodic)
     if equal:
-        lower, upper = (tuple(np.full_like(x, s) for x in lower) for s in (-2.0, 2.0))
-    p = np.random.default_rng(1).standard_normal(shape)
+        cells = [np.stack([np.full(n, -2.0), np.full(n, 2.0)]) for n in shape]
+    x, p = flat(parts), np.random.default_rng(1).standard_normal(shape)
+    pushed = []
+    for axis, part in enumerate(parts):
+        face, n = np.arange(part.shape[axis]), shape[axis]
+        keep, below, above = faces[axis].reshape([3] + [-1 if a == axis else 1 for a in range(3)])
+        pushed.append(keep * part + below * np.take(p, (face - 1) % n, axis) + above * np.take(p, face % n, axis))
     for module in modules():
-        b = np.empty(shape)
-        total = module.net_flow(*parts, lower, upper, b)
-        np.testing.assert_allclose(b, wanted(parts, lower, upper, shape), rtol=1e-13, atol=1e-13)
-        np.testing.assert_allclose(total, np.sum(b**2), rtol=1e-13)
-        for axis, x in enumerate(parts):
-            if x.size:
-                out = np.empty_like(x)
-                module.push(x, p, keep, below, above, axis, out)
-                n, m = shape[axis], x.shape[axis]
-                line, face = [-1 if a == axis else 1 for a in range(3)], np.arange(m)
-                last, first = np.take(p, (face - 1) % n, axis), np.take(p, face % n, axis)
-                a, b_, c = (coefficient[axis].reshape(line) for coefficient in (keep, below, above))
-                np.testing.assert_allclose(out, a * x + b_ * last + c * first, rtol=1e-13, atol=1e-13)
+        b, out = np.empty(p.size), np.empty(x.size)
+        flow, length = module.net_flow(x, six, np.concatenate(cells, axis=1), b)
+        np.testing.assert_allclose(b.reshape(shape), wanted(parts, cells, shape), rtol=1e-13, atol=1e-13)
+        np.testing.assert_allclose((flow, length), (np.sum(b**2), np.sum(x**2)), rtol=1e-13)
+        module.push(x, p.ravel(), six, np.concatenate(faces, axis=1), out)
+        np.testing.assert_allclose(out, flat(pushed), rtol=1e-13, atol=1e-13)

@@ -6,6 +6,7 @@ tests/test_errors*.py (the table, whose tests print the messages) or a ``match=`
 
 import ast
 import re
+from functools import cache
 
 from sources import FUNCTION, ROOT, called, modules
 
@@ -100,6 +101,7 @@ def expected():
     return {plain(text) for text in found}
 
 
+@cache
 def collected():
     return [(f"{m.place}:{line}", text) for m in modules() for line, text in errors_in(m.tree)]
 

@@ -10,17 +10,27 @@ import sparsedp as dp
 from sparsedp.derivative import pullback, pushforward, value_and_grad
 
 EPS = 10 * np.finfo(float).eps
-EVERY = pytest.mark.parametrize("entry", CATALOGUE, ids=LABELS)
 
 
-def cases(entry, shapes=SHAPES):
-    """Operators of one entry on all grids and boundaries, with a generator of its own."""
-    rng = np.random.default_rng(1)
-    for shape in shapes:
-        if len(shape) >= entry.least_dim:
-            for grid in grids(shape, rng):
-                for boundary in boundaries(grid):
-                    yield entry.make(grid, boundary), rng
+@pytest.fixture(scope="module", params=CATALOGUE, ids=LABELS)
+def entry(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def made(entry):
+    """Operators of one entry on all grids and boundaries, by shape: as made, explicit and matrix-free."""
+    rng, found = np.random.default_rng(1), {}
+    for shape in (shape for shape in SHAPES if len(shape) >= entry.least_dim):
+        operators = [
+            entry.make(grid, boundary) for grid in grids(shape, rng) for boundary in entry.conditions(boundaries(grid))
+        ]
+        found[shape] = [(op, op.explicit(), op.matrix_free()) for op in operators]
+    return found
+
+
+def some(made, *shapes):
+    return [operators for shape in shapes for operators in made.get(shape, ())]
 
 
 def random_field(rng, space, dtype):
@@ -30,15 +40,14 @@ def random_field(rng, space, dtype):
     return values.astype(dtype)
 
 
-@EVERY
-def test_transpose_and_twin_in_every_dtype(entry):
+def test_transpose_and_twin_in_every_dtype(made, rng):
     """Dot test and explicit against matrix-free, in the scaling of the gates: both at most 10."""
     worst = 0.0
-    for op, rng in cases(entry):
-        explicit, free = op.explicit(), op.matrix_free()
+    for op, explicit, free in some(made, *SHAPES):
         matrix = explicit.matrix
         assert matrix.indices.dtype == matrix.indptr.dtype == np.int32
-        size = np.sqrt(abs(matrix).sum(0).max(initial=0) * abs(matrix).sum(1).max(initial=0))
+        sizes = abs(matrix)
+        size = np.sqrt(sizes.sum(0).max(initial=0) * sizes.sum(1).max(initial=0))
         kinds = [np.float64] * 5 + [np.float32, np.complex128, np.complex64]  # five seeds in double precision
         for dtype in kinds:
             u, v = random_field(rng, op.domain, dtype), random_field(rng, op.codomain, dtype)
@@ -46,7 +55,7 @@ def test_transpose_and_twin_in_every_dtype(entry):
             assert one.dtype == other.dtype == u.dtype
             assert one.shape == other.shape == op.codomain.shape
             eps = np.finfo(dtype).eps
-            scale = (abs(matrix) @ abs(u.astype(complex)).ravel()).reshape(one.shape)
+            scale = (sizes @ abs(u.astype(complex)).ravel()).reshape(one.shape)
             gap = np.max(abs(one - other) / np.where(scale > 0, scale, 1), initial=0) / eps
             assert not np.any(one[scale == 0]) and not np.any(other[scale == 0])
             for form in (explicit, free):
@@ -57,21 +66,19 @@ def test_transpose_and_twin_in_every_dtype(entry):
     assert worst <= 10
 
 
-@EVERY
-def test_transposed_matrix_entry_by_entry(entry):
-    for op, _ in cases(entry, [(9,), (6, 4), (2, 2), (4, 3, 5)]):
-        difference = op.explicit().T.matrix - op.explicit().matrix.T
-        assert not difference.count_nonzero()
-        assert not (op.T.explicit().matrix - op.explicit().matrix.T).count_nonzero()
+def test_transposed_matrix_entry_by_entry(made):
+    for op, explicit, _ in some(made, (9,), (6, 4), (2, 2), (4, 3, 5)):
+        wanted = explicit.matrix.T
+        assert not (explicit.T.matrix - wanted).count_nonzero()
+        assert not (op.T.explicit().matrix - wanted).count_nonzero()
 
 
-@EVERY
-def test_derivatives_of_every_order(entry):
+def test_derivatives_of_every_order(made, rng):
     """JVP is the operator, VJP the transpose, and a Hessian product is A^T A, in both forms."""
-    for op, rng in cases(entry, [(9,), (6, 4), (4, 3, 5)]):
+    for op, *forms in some(made, (9,), (6, 4), (4, 3, 5)):
         u, du = random_field(rng, op.domain, float), random_field(rng, op.domain, float)
         g = random_field(rng, op.codomain, float)
-        for form in (op.explicit(), op.matrix_free()):
+        for form in forms:
             np.testing.assert_array_equal(pushforward(form, u, du)[1], form(du))
             np.testing.assert_array_equal(pullback(form, u)[1](g), form.T(g))
             slope = value_and_grad(lambda u, form=form: 0.5 * anp.sum(form(u) ** 2))
@@ -79,10 +86,9 @@ def test_derivatives_of_every_order(entry):
             np.testing.assert_allclose(product, form.T(form(du)), rtol=1e-12, atol=1e-12 * abs(product).max(initial=0))
 
 
-@EVERY
-def test_linear_and_fresh_and_untouched(entry):
-    for op, rng in cases(entry, [(9,), (6, 4)]):
-        for form in (op.explicit(), op.matrix_free()):
+def test_linear_and_fresh_and_untouched(made, rng):
+    for op, *forms in some(made, (9,), (6, 4)):
+        for form in forms:
             u, v = random_field(rng, op.domain, float), random_field(rng, op.domain, float)
             kept, result = u.copy(), form(u)
             np.testing.assert_array_equal(u, kept)
@@ -95,9 +101,8 @@ def test_linear_and_fresh_and_untouched(entry):
             np.testing.assert_array_equal(out, result)
 
 
-@EVERY
-def test_refuses_what_does_not_fit(entry):
-    op, _ = next(cases(entry, [(6, 4)]))
+def test_refuses_what_does_not_fit(made):
+    op = made[6, 4][0][0]
     for wrong in (np.zeros(op.domain.size + 1), np.zeros((*op.domain.shape, 1)), 1.0):
         with pytest.raises(dp.errors.ShapeError, match="takes a field on .*, got an array of shape"):
             op(wrong)
@@ -124,7 +129,7 @@ def test_interior_order(entry, periodic, stretched):
         sizes = {1: (128, 256, 512), 2: (64, 128, 256), 3: (32, 64, 96)}[dim]
         if entry.builder == "upwind":
             sizes = [4 * n for n in sizes]  # first order needs more cells to show its slope
-        for boundary in conditions_for(periodic)[: 1 if dim == 3 else None]:
+        for boundary in entry.conditions(conditions_for(periodic))[: 1 if dim == 3 else None]:
             errors = [interior_error(entry, n, dim, periodic, stretched, boundary) for n in sizes]
             slope = np.polyfit(np.log(sizes), np.log(errors), 1)[0]
             assert wanted[0] <= -slope <= wanted[1], (dim, boundary, errors)

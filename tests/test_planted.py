@@ -82,9 +82,9 @@ BUGS = {
         "tests/test_solvers_use.py::test_a_small_right_hand_side_gives_the_same_bits",
     ),
     "off by one in the last step": Bug(
-        "trajectory/run.py",
-        "range(run.n - 1, -1, -1)",
-        "range(run.n - 2, -1, -1)",
+        "trajectory/way.py",
+        "range(run.n - 1, linked - 1, -1)",
+        "range(run.n - 2, linked - 1, -1)",
         "tests/test_rollout.py",
     ),
     "a cotangent of the wrong dtype": Bug(

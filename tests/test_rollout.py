@@ -2,6 +2,7 @@
 
 import re
 
+import autograd
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -192,3 +193,49 @@ def test_masked_arrays_are_refused():
 
 def same(u, p):
     return u
+
+
+def puts_into_state(s, p):
+    s["u"] = s["u"] * p["k"]
+    return s
+
+
+def scales_params(s, p):
+    p["k"] = p["k"] * 1.1  # on a tape every step would start from the first value again
+    return {"u": s["u"] * p["k"]}
+
+
+def writes_times_params(s, p):
+    u = s["u"]
+    u *= p["k"]
+    return {"u": u}
+
+
+@pytest.mark.parametrize("memory", [None, 250])
+@pytest.mark.parametrize(
+    "step, message",
+    [
+        (puts_into_state, "the step changes the entries of state; return another dict or list"),
+        (scales_params, "the step changes the entries of params; make what changes a part of the state"),
+        (
+            writes_times_params,
+            "the step changes state['u'] in place; write u = u + du instead of u += du, or work on a copy",
+        ),
+    ],
+)
+def test_steps_that_change_their_arguments_are_refused_with_and_without_a_tape(step, message, memory):
+    def last(p):
+        return anp.sum(dp.rollout(step, {"u": np.ones(3)}, p, 9, memory=memory)["u"])
+
+    for run in (last, dp.value_and_grad(last)):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            run({"k": 0.5})
+
+
+@pytest.mark.parametrize("step", [lambda u, k: u - k * u**3, dp.stepper("euler", dp.laplacian(dp.Grid(5)), 0.1)])
+def test_second_derivative_in_a_number_of_python(step):
+    def slope(k):
+        return autograd.grad(lambda k: anp.sum(anp.sin(dp.rollout(step, START["u"], k, 4))))(k)
+
+    assert autograd.grad(slope)(0.1) == autograd.grad(slope)(np.float64(0.1))
+    assert autograd.grad(slope)(0.1) == pytest.approx((slope(0.1 + 1e-5) - slope(0.1 - 1e-5)) / 2e-5, rel=1e-6)

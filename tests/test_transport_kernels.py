@@ -7,6 +7,8 @@ import pytest
 
 import sparsedp as dp
 from sparsedp import kernels
+from sparsedp.advection.scratch import FEW, MOST, Scratch
+from sparsedp.derivative import pullback
 from sparsedp.kernels import streams_plain
 from sparsedp.kernels.streams import TILE
 
@@ -102,4 +104,31 @@ def test_numbers_of_the_numpy_twin():
     np.testing.assert_array_equal(x.step().value, [0.0, 0.5, 1.0, 0.0, 1.0])
     np.testing.assert_array_equal(x.short_of(0.0).value, [1.0, 0.0, 0.0, 1.0, 0.0])
     np.testing.assert_array_equal(x.infinite().value, [0.0, 0.0, 0.0, 1.0, 1.0])
+    np.testing.assert_array_equal(y.alike(streams_plain.Numbers(np.array([-3.0, 1.0, -1.0]))).value, [1.0, 0.0, 0.0])
     np.testing.assert_array_equal((y / 2.0 + y * y - y * 0.5).value, [1.0, 0.0, 4.0])
+
+
+def test_arrays_kept_between_calls_change_nothing():
+    grid = dp.Grid((150, 130), size=1.0)
+    move, rng = dp.transport(grid, "van_leer"), np.random.default_rng(2)
+    u, v, q = rng.normal(size=grid.shape), 0.02 * rng.normal(size=grid.faces.size), rng.normal(size=move.walls.size)
+    first = [x.tobytes() for x in results(move, u, v, q)]
+    for spare in (array for arrays in move.law.scratch.spare.values() for array in arrays):
+        spare[:] = np.nan
+    assert move.law.scratch.spare and first == [x.tobytes() for x in results(move, u, v, q)]
+
+
+def test_scratch_keeps_no_more_than_it_may():
+    scratch = Scratch()
+    scratch.give(np.empty(FEW), np.empty(MOST - FEW - 1), np.empty(2 * FEW))
+    assert list(scratch.spare) == [MOST - FEW - 1]  # small ones are cheap, and there is no room for the last
+
+
+def test_cotangents_need_not_be_contiguous():
+    for scheme in ("upwind", "van_leer", "semi_lagrangian", "maccormack"):
+        move, rng = dp.transport(dp.Grid(8, periodic=True), scheme), np.random.default_rng(0)
+        u, v, g = rng.random(8), rng.normal(size=8), rng.normal(size=16)
+        _, pull = pullback(lambda x, move=move, v=v: move(x, v, 0.1), u)
+        for strided in (g[::2], g[7::-1], np.broadcast_to(1.5, (8,))):
+            np.testing.assert_array_equal(pull(strided), pull(strided.copy()))
+            np.testing.assert_array_equal(move.step(0.1).backward(u, v, strided)[0], pull(strided.copy()))

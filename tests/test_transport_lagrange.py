@@ -138,3 +138,25 @@ def test_second_derivatives(without_numba):
     curved = lambda v: dp.value_and_grad(lambda w: (move(u, w, dt) ** 2).sum())(v)[1]
     with pytest.raises(DerivativeError, match="transport semi_lagrangian has first derivatives only"):
         dp.value_and_grad(lambda v: curved(v).sum())(v)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+@pytest.mark.parametrize("shape", [(5,), (4, 3), (3, 4, 2)])
+def test_nothing_is_read_beside_the_samples(shape, interpolation):
+    """Places far out on all sides; what lies in front of the samples and behind them is NaN."""
+    move = dp.transport(dp.Grid(shape), "semi_lagrangian", interpolation=interpolation)
+    points, n = move.law.points[0], int(np.prod(shape))
+    around = np.full(points.size + 200, np.nan)
+    samples, scale = around[100:-100], (1.0,) * 3
+    samples[:] = np.cos(np.arange(points.size))
+    for far in (-50.0, -1.0, 0.0, 0.3, 1.0, 50.0):
+        w, speeds = (np.full(n, far),) * 3, tuple(np.zeros((3, n)))
+        sampling.slopes(points, samples, w, scale, np.ones(n), speeds)
+        found = sampling.gather(points, samples, w, scale, np.empty(n))
+        sides = sampling.sides(points, samples, w, scale)
+        more = tuple(np.empty((3, n)))
+        back, rate = sampling.way_back(points, samples, (w, scale), np.ones(n), sides[1:], more, True)
+        here = slice(3 - len(shape), None)
+        assert np.isfinite([*speeds, found, *sides, *more[here]]).all() and np.isfinite([*back, rate]).all()
+        np.testing.assert_allclose(more[here], speeds[here], rtol=1e-13, atol=1e-13)
+        np.testing.assert_array_equal(found, sides[0])

@@ -8,7 +8,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.advection.upwind import Upwind
-from sparsedp.derivative import pushforward, value_and_grad
+from sparsedp.derivative import pullback, pushforward, value_and_grad
 from sparsedp.errors import DerivativeError
 from sparsedp.ledger import recording
 
@@ -204,3 +204,30 @@ def test_plain_forms_of_the_step(scheme, velocity, form, of):
     np.testing.assert_allclose(narrow, of_v, rtol=1e-6, atol=1e-6)
     tangent = step.tangent(u, v, u, v)
     np.testing.assert_array_equal(tangent, pushforward(lambda p: step(*p), (u, v), (u, v))[1])
+
+
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer", "semi_lagrangian", "maccormack", "convection"])
+def test_an_array_may_be_reused_before_the_pullback(scheme):
+    """What is constant on the tape counts as it was when the step was made."""
+    grid = dp.Grid((5, 4), size=1.0, periodic=(True, False))
+    carry = dp.convection(grid) if scheme == "convection" else dp.transport(grid, scheme, dp.dirichlet, of="faces")
+    buffers = [np.cos(np.arange(float(grid.faces.size))), 0.3 * np.sin(np.arange(float(grid.faces.size)))]
+    for number in (0, 1):
+        others = [buffer.copy() for buffer in buffers]
+
+        def moved(x, others=others, number=number):
+            args = [x if place == number else value for place, value in enumerate(others)]
+            return carry(*args) if scheme == "convection" else carry(*args, 0.1)
+
+        wanted = pullback(moved, buffers[number])[1](buffers[0])
+        pull = pullback(moved, buffers[number])[1]
+        others[1 - number][:] = 0.01
+        assert np.array_equal(pull(buffers[0]), wanted)
+
+
+def test_a_step_keeps_its_inflow():
+    move, u, v = dp.transport(dp.Grid(3), boundary=dp.dirichlet), np.ones(3), 0.5 * np.ones(4)
+    inflow = np.array([2.0, 0.0])
+    step, wanted = move.step(0.5, inflow), move(u, v, 0.5, inflow)
+    inflow[:] = 9.0
+    assert np.array_equal(step(u, v), wanted) and np.array_equal(dp.rollout(step, u, v, 1), wanted)

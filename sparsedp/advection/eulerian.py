@@ -4,9 +4,10 @@ from functools import cached_property
 from math import isfinite
 
 from sparsedp.advection.bilinear import Bilinear
-from sparsedp.advection.law import Law
+from sparsedp.advection.law import STEP, VELOCITY, Finite, Law
 from sparsedp.advection.loops import Loops
 from sparsedp.advection.stability import check_numbers, check_result, check_weights
+from sparsedp.fields import surely_finite
 
 __all__ = ["Eulerian"]
 
@@ -44,6 +45,13 @@ class Eulerian(Law):
         """Sum over what a pass may leave out: inflow values at closed walls, velocities inside solids."""
         unseen = inflow.sum() if inflow.size else 0.0
         return unseen if self.setting.solid is None else unseen + v.sum()
+
+    def _cotangents(self, nums, found, good):
+        """Those of the arguments `nums`; good: what the loops have written is finite."""
+        if good and VELOCITY in nums and self.bilinear.between is not None:
+            good = surely_finite(found[VELOCITY])
+        backs = tuple(found[num] for num in nums)
+        return Finite(backs) if good and isfinite(found[STEP]) else backs
 
     def _of_velocity(self, gw, kept, added):
         """Cotangent of the velocity as given, from that where it is needed; added to `kept` where there is one."""

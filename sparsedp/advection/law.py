@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from sparsedp.fields import place
 from sparsedp.space import Space
 
-__all__ = ["FIELD", "INFLOW", "STEP", "VELOCITY", "Law", "Setting", "component_shapes"]
+__all__ = ["FIELD", "INFLOW", "STEP", "VELOCITY", "Finite", "Law", "Setting", "component_shapes"]
 
 FIELD, VELOCITY, STEP, INFLOW = range(4)
 
@@ -48,13 +48,20 @@ class Setting(NamedTuple):
         return place(index, self.velocity_shapes[-1])
 
 
+class Finite(tuple):
+    """Cotangents that have been found to be finite on the way: nobody needs to look at them again."""
+
+    __slots__ = ()
+
+
 class Law:
     """Base of the schemes. A subclass sets the flags and has these methods:
 
     ``forward(u, v, dt, inflow, out=None)``
         The moved field, into `out` when it is given.
     ``pull(nums, g, u, v, dt, inflow, into=None)``
-        Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed.
+        Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed;
+        `Finite` when that is known.
         `into` maps the number of an argument to an array: its cotangent is added there and returned.
     ``push(tangents, u, v, dt, inflow)``
         {number of an argument: tangent} -> tangent of the result.

@@ -7,7 +7,7 @@ import numpy as np
 
 from sparsedp.advection.segments import ARRAYS, Component
 from sparsedp.kernels.formulas import ADVECTIVE, FLUX, FORWARD, POINTS, number_of, streams_of
-from sparsedp.kernels.limited import JUMPS, PULL, PULL_ADDED, limited_number, limited_streams
+from sparsedp.kernels.limited import JUMPS, LAST, PULL, PULL_ADDED, limited_number, limited_streams
 from sparsedp.kernels.streams import TILE, Table, march, run
 
 __all__ = ["Loops"]
@@ -66,7 +66,7 @@ class Loops:
         self.matrices, self.limited = matrices, limited
         self.lengths = factors(matrices, limited)
         self.kept = {}
-        self.factors = 0.0, self.lengths  # the last dt and dt / lengths
+        self.factors = {}  # dt / lengths for the last few dt
         self.zeros, self.dump, self.nothing = np.zeros(TILE), np.zeros(TILE), np.zeros(0)
 
     def run(self, task, dt, arrays):
@@ -100,10 +100,10 @@ class Loops:
         """The table of a task, and all arrays in their order."""
         if task not in self.kept:
             self.kept[task] = self._table(task)
-        last, found = self.factors
-        if last != dt:
+        found = self.factors.get(dt)
+        if found is None:
             found = dt / self.lengths
-            self.factors = dt, found
+            self.factors = {dt: found} if len(self.factors) > 2 else {**self.factors, dt: found}
         arrays.update(factors=found, zeros=self.zeros, dump=self.dump)
         if self.limited:
             arrays.update(ratios=self.ratios, spill=self.spill)
@@ -114,7 +114,7 @@ class Loops:
         if not self.limited:
             streams = streams_of(dim, mode, task)
             return table(self.matrices, number_of(dim, mode, task), streams, task != FORWARD)
-        streams, ghosts = limited_streams(dim, mode, task), task in (PULL, PULL_ADDED, JUMPS)
+        streams, ghosts = limited_streams(dim, mode, task), task in (PULL, PULL_ADDED, JUMPS, LAST)
         return table(self.matrices, limited_number(dim, mode, task), streams, ghosts, limited=True)
 
     @cached_property
@@ -142,7 +142,10 @@ class Loops:
         return found
 
     def return_inflow(self, out, inflow):
-        """Give the cotangent of what came from outside to the points that it was taken from."""
+        """Give the cotangent of what came from outside to the points it was taken from; whether they stay finite."""
+        total = 0.0
         for wall, points in self._open_walls:
-            out[points] += inflow[wall]
-            inflow[wall] = 0.0
+            found = out[points] + inflow[wall]
+            out[points], inflow[wall] = found, 0.0
+            total += float(np.vdot(found, np.zeros(found.size)))
+        return total == 0.0

@@ -14,6 +14,7 @@ Source: A. Selle, R. Fedkiw, B. Kim, Y. Liu, J. Rossignac, J. Scientific Computi
 
 import numpy as np
 
+from sparsedp.advection.ruler import three
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.kernels import sampling
 
@@ -60,22 +61,31 @@ class MacCormack(SemiLagrangian):
 
     def carry_back(self, number, g, u, outside, looks, into, wanted):
         """See the base class."""
-        points = self.points[number]
-        first, second, new = self._both(number, u, outside, looks)
-        free, bounds = self._bounds(number, first, new, looks[0])
-        own = free * g
-        of_f, of_b = own.copy(), -0.5 * own
-        outer = np.zeros(outside.size) if into is None else into[1]
-        self.fold(number, sampling.scatter(points, of_b, *looks[1]), of_f, outer)
+        points, first, inside = self.points[number], self.samples(number, u, outside), wanted and not self.stretched
+        f, *bounds = (
+            sampling.sides(points, first, *looks[0]) if self.clamped else (self.value(number, first, looks[0]),)
+        )
+        second, steep = self.samples(number, f, outside), self._room(g.size if inside else 0)
+        own, back, rate = sampling.miss(points, second, looks[1], f, u, g, bounds, three(steep[1]))
+        of_f, outer = own.copy(), np.zeros(outside.size) if into is None else into[1]
+        self.fold(number, back, of_f, outer)
+        if into is not None or inside:
+            fresh = steep[0] is not steep[1]
+            back, more = sampling.way_back(points, first, looks[0], of_f, bounds, three(steep[0]), fresh)
+            rate += more
         if into is not None:
-            w, scale = looks[0]
-            back = sampling.scatter(points, of_f, w, scale)
-            for bound, share in bounds:
-                sampling.spread_to_equal(points, first, bound, back, w, scale, share * g)
             self.fold(number, back, *into)
             np.add(into[0], 0.5 * own, out=into[0])
-        if wanted:
-            return self.steepness(number, first, looks[0], of_f), self.steepness(number, second, looks[1], of_b)
+        if not wanted or inside:
+            return steep[: 1 + fresh] if inside else (), rate
+        own *= -0.5
+        steep = self.steepness(number, first, looks[0], of_f), self.steepness(number, second, looks[1], own)
+        return steep, sum(float(np.sum(change * look.speeds)) for change, look in zip(steep, looks, strict=True))
+
+    def _room(self, size):
+        """Arrays for the cotangents of the velocities of both looks; the same one where these are the same."""
+        first = np.empty((self.setting.grid.dim, size))
+        return first, np.empty_like(first) if self.bent else first
 
     def carry_tangent(self, number, u, outside, looks, changes, speeds):
         """See the base class."""

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from sparsedp.advection.law import FIELD, INFLOW
+from sparsedp.advection.law import FIELD, INFLOW, Finite
 from sparsedp.advection.values import LETTERS, prepare, raised, result_like, unflatten
 from sparsedp.errors import DerivativeError
-from sparsedp.fields import check_finite, surely_finite
+from sparsedp.fields import check_finite, own, surely_finite
 from sparsedp.tape import differentiable, isbox, linear, plain
 
 __all__ = ["rule_of"]
@@ -14,17 +14,20 @@ __all__ = ["rule_of"]
 def rule_of(law):
     """Law -> Rule of (u, v, dt, inflow)."""
     name = f"transport {law.setting.scheme}"
+    held: dict = {}
 
     def forward(u, v, dt, inflow):
         return result_like(u, law.forward(*prepare(law, u, v, dt, inflow)), law.setting.space.shape)
 
     def vjp(nums, ans, *args):
+        args = tuple(value if num in nums else own(value, held, num) for num, value in enumerate(args))
+
         def pull(g):
             flat = prepare(law, *args)
             g = raised(FIELD, law, g)
             traced = type(g) is not np.ndarray or any(map(isbox, flat))
             found = _traced_pull(law, nums, g, flat) if traced else law.pull(nums, g, *flat)
-            for num, back in zip(nums, found, strict=True):
+            for num, back in zip(nums, () if type(found) is Finite else found):
                 if not surely_finite(plain(back)):
                     _check_slope(law, "the gradient in " + LETTERS.get(num, "dt"), back, (g,))
             return tuple([unflatten(args[num], back) for num, back in zip(nums, found, strict=True)])

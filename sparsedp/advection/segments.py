@@ -86,7 +86,7 @@ class Component:
         found = {"u": outside, "u0": outside, "g": zeros, "gu": axis.wall[side][here] + own, "out": zeros}
         for other in self.axes:
             some = {name: starts[here] for name, starts in other.streams().items()}
-            some |= dict.fromkeys(("gm", "gp", "wl", "wu", "c", "cl", "cu", "cm", "cp", *BESIDE), zeros)
+            some |= dict.fromkeys(("gm", "gp", "wl", "wu", "c", "cl", "cu", "cm", "cp", "da", "db", *BESIDE), zeros)
             some |= {"um": outside, "up": outside, "gw": zeros - NUMBER["zeros"] + NUMBER["dump"]}
             some |= dict.fromkeys("ab", zeros - NUMBER["zeros"] + NUMBER["spill"])
             if other is axis:
@@ -226,6 +226,7 @@ class Places:
         none, own = NUMBER["zeros"], self.slope + self.component.starts
         below, above = (self.slope + beside for beside in self.beside)
         found = {"s": NUMBER["slope"] + own, "a": NUMBER["a"] + own, "b": NUMBER["b"] + own}
+        found |= {"da": found["a"], "db": found["b"]}
         found |= {"sm": np.where(self._gone(0), none, NUMBER["slope"] + below)}
         found |= {"sp": np.where(self._gone(1), none, NUMBER["slope"] + above)}
         found |= {"al": np.where(self.shut[0], none, found["a"]), "bu": np.where(self.shut[1], none, found["b"])}

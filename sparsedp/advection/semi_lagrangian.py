@@ -23,6 +23,7 @@ from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
 from sparsedp.advection.look_matrix import block
 from sparsedp.advection.places import filling, points_of
 from sparsedp.advection.ruler import ruler_of, three
+from sparsedp.advection.scratch import FEW, Scratch
 from sparsedp.advection.wind import Euler, Midpoint, wind_of
 from sparsedp.fields import check_finite
 from sparsedp.kernels import sampling
@@ -48,6 +49,7 @@ class SemiLagrangian(Law):
             return
         self.points = points_of(setting, setting.interpolation)
         self.spans = [slice(*ends) for ends in zip(setting.space.offsets, setting.space.offsets[1:])]
+        self.scratch = Scratch()
         self.bent = setting.form.endswith("midpoint")
         self.trace = (Midpoint if self.bent else Euler)(setting)
         self.wind = wind_of(setting)
@@ -84,10 +86,10 @@ class SemiLagrangian(Law):
         """Component of a field and values from outside -> samples."""
         return sampling.extend(self.points[number], u if self.fill is None else self.fill[0] @ u, outside)
 
-    def fold(self, number, samples, u, outside):
-        """The transpose of `samples`, added to u and outside."""
+    def fold(self, number, samples, u, outside, fresh=False):
+        """The transpose of `samples`, added to u and outside, or written there when they are fresh."""
         if self.fill is None:
-            sampling.fold(self.points[number], samples, u, outside)
+            sampling.fold(self.points[number], samples, u, outside, fresh)
         else:
             filled = np.zeros_like(u)
             sampling.fold(self.points[number], samples, filled, outside)
@@ -109,22 +111,26 @@ class SemiLagrangian(Law):
         return sampling.advance(self.points[number], u, outside, w, scale, out)
 
     def carry_back(self, number, g, u, outside, looks, into, wanted):
-        """Add cotangents to `into` (u, outside; or None) and return those of the velocities of the looks, if wanted."""
+        """Add cotangents to `into` (u, outside; or None).
+
+        Returns, if wanted, those of the velocities of the looks, one for all where the looks share them, and their
+        product with these velocities.
+        """
         field, aside = (NOTHING, NOTHING) if into is None else into
         if wanted and self.stretched:
             speeds = self.steepness(number, self.samples(number, u, outside), looks[0], g)
             if into is not None:
                 self.carry_back(number, g, u, outside, looks, into, False)
-            return (speeds,)
-        speeds = np.zeros((self.setting.grid.dim, g.size)) if wanted else None
+            return (speeds,), float(np.sum(speeds * looks[0].speeds))
+        speeds = np.empty((self.setting.grid.dim, g.size)) if wanted else None
         filled = self.fill is not None and into is not None
         u, target = u if self.fill is None else self.fill[0] @ u, np.zeros_like(field) if filled else field
         axes = (NOTHING,) * 3 if speeds is None else three(speeds)
         w, scale = looks[0]
-        sampling.retreat(self.points[number], u, outside, w, scale, g, target, aside, axes)
+        rate = sampling.retreat(self.points[number], u, outside, w, scale, g, target, aside, axes, (False, True))
         if filled:
             field += self.fill[1] @ target
-        return (speeds,)
+        return (speeds,), rate
 
     def carry_tangent(self, number, u, outside, looks, changes, speeds):
         """Tangents of (u, outside), or None, and of the velocities of the looks, or None -> tangent."""
@@ -182,7 +188,7 @@ class SemiLagrangian(Law):
     def pull(self, nums, g, u, v, dt, inflow, into=None):
         """Cotangent of the moved field -> those of the arguments `nums`."""
         g, into = np.ascontiguousarray(g), into or {}
-        if not self.empty and self.direct and STEP not in nums:
+        if not self.empty and self.direct and not (STEP in nums and into):
             return self._pull_direct(nums, g, u, v, dt, inflow, into)
         sizes = {FIELD: u.size, VELOCITY: v.size, INFLOW: inflow.size}
         found = {num: into[num] if num in into else np.zeros(n) for num, n in sizes.items()}
@@ -196,24 +202,28 @@ class SemiLagrangian(Law):
 
     def _pull_direct(self, nums, g, u, v, dt, inflow, into):
         """The same in one call of the kernels."""
-        found = dict(into)
+        found, fresh = dict(into), FIELD not in into and INFLOW not in into
         for num, size in ((FIELD, u.size), (INFLOW, inflow.size)):
             if num not in found:
-                found[num] = np.zeros(size) if FIELD in nums or INFLOW in nums else NOTHING
-        w = v if self.wind is None else self.wind.apply(v)
+                found[num] = (np.empty if fresh else np.zeros)(size) if FIELD in nums or INFLOW in nums else NOTHING
+        taken: list[np.ndarray] = []
+        room = self.scratch.lender(taken) if u.size > FEW else np.empty
+        w = v if self.wind is None else self.wind.apply(v, out=room(self.wind.shape[0]) if u.size > FEW else None)
         speeds = NOTHING
-        if VELOCITY in nums:
-            speeds = into[VELOCITY] if self.wind is None and VELOCITY in into else np.zeros(w.size)
-        axes = self._axes(speeds)
-        sampling.retreat(
-            self.points[0], u, inflow, self._axes(w), self.ruler.scale(dt), g, found[FIELD], found[INFLOW], axes
-        )
+        added = self.wind is None and VELOCITY in into
+        if VELOCITY in nums or STEP in nums:
+            speeds = into[VELOCITY] if added else (np.empty if self.wind is None else room)(w.size)
+        targets = found[FIELD], found[INFLOW], self._axes(speeds), (fresh, not added)
+        rate = sampling.retreat(self.points[0], u, inflow, self._axes(w), self.ruler.scale(dt), g, *targets, room)
+        found[STEP] = rate / dt
         if VELOCITY in nums:
             back = speeds if self.wind is None else self.wind.T.apply(speeds)
             if VELOCITY in into and back is not into[VELOCITY]:
                 into[VELOCITY] += back
                 back = into[VELOCITY]
             found[VELOCITY] = back
+        if taken:
+            self.scratch.give(*taken)
         return tuple(found[num] for num in nums)
 
     def _pull(self, found, nums, g, u, v, dt, inflow):
@@ -226,23 +236,23 @@ class SemiLagrangian(Law):
                 part = np.where(solid, 0.0, part)
             looks = self._looks(number, w, dt)
             targets = (found[FIELD][span], found[INFLOW]) if field else None
-            steep = self.carry_back(number, part, u[span], inflow, looks, targets, speed)
+            steep, gain = self.carry_back(number, part, u[span], inflow, looks, targets, speed)
             if speed:
-                back, extra = self._against(number, w, looks, steep, STEP in nums)
+                back, extra = self._against(number, w, looks, steep)
                 backs.append(back)
-                rate += extra
+                rate += gain + extra
         if VELOCITY in nums:
             flat = np.concatenate([b.ravel() for b in backs]) if len(backs) > 1 else backs[0].reshape(-1)
             found[VELOCITY] += flat if self.wind is None else self.wind.T.apply(flat)
         return rate / dt
 
-    def _against(self, number, w, looks, steep, step):
-        """Cotangents of the velocities of the looks -> that of w, and dt times that of dt when it is wanted."""
+    def _against(self, number, w, looks, steep):
+        """Cotangents of the velocities of the looks -> that of w, and what dt adds to it by bending the looks."""
         total, rate = None, 0.0
-        for look, change in zip(looks, steep, strict=True):
+        for look, change in zip(looks, steep):
             back, extra = self.trace.pull(number, w, look.step, change)
             total = back if total is None else total + back
-            rate += extra + float(np.sum(change * look.speeds)) if step else 0.0
+            rate += extra
         return total, rate
 
     def push(self, tangents, u, v, dt, inflow):

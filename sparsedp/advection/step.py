@@ -21,7 +21,8 @@ class Step:
             raise DerivativeError(
                 "step needs constant dt and inflow, got traced ones; write lambda u, p: move(u, p[0], p[1]) instead"
             )
-        self.transport, self.dt, self.inflow = transport, dt, inflow
+        self.transport, self.dt = transport, dt
+        self.inflow = inflow.copy() if isinstance(inflow, np.ndarray) else inflow  # the caller may reuse the array
 
     def __call__(self, u, v):
         return self.transport(u, v, self.dt, self.inflow)

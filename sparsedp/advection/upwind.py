@@ -37,6 +37,7 @@ class Upwind(Eulerian):
     def pull(self, nums, g, u, v, dt, inflow, into=None):
         if any(map(isbox, (g, u, v, dt, inflow))):
             return self.bilinear.pull(nums, g, u, v, dt, inflow)
+        g = np.ascontiguousarray(g)
         kept, found = (into or {}).get(VELOCITY), {}
         added = self.bilinear.between is None and kept is not None
         of_field, of_velocity = FIELD in nums or INFLOW in nums, VELOCITY in nums
@@ -46,14 +47,15 @@ class Upwind(Eulerian):
             arrays["out"] = np.empty(u.size)
         if of_velocity:
             arrays["gw"] = kept if added else np.empty(arrays["w"].size)
-        sums = self._loops.run(task, dt, arrays)
+        total, spoiled = self._loops.run(task, dt, arrays)
+        good = spoiled == 0.0
         if of_field:
-            self._loops.return_inflow(arrays["out"], arrays["ginflow"])
+            good &= self._loops.return_inflow(arrays["out"], arrays["ginflow"])
             found[FIELD], found[INFLOW] = arrays["out"], arrays["ginflow"]
         if of_velocity:
             found[VELOCITY] = self._of_velocity(arrays["gw"], kept, added)
-        found[STEP] = sums[0] / dt
-        return tuple(found[num] for num in nums)
+        found[STEP] = total / dt
+        return self._cotangents(nums, found, good)
 
     def march(self, states, v, dt, inflow):
         size, first, last = states.shape[1], 0, len(states) - 1

@@ -18,13 +18,15 @@ Source: B. van Leer, J. Comput. Phys. 32 (1979) 101-136; stretched grids: A. Mig
 """
 
 from functools import cached_property
+from math import isfinite
 
 import numpy as np
 
 from sparsedp.advection.eulerian import Eulerian
 from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY
 from sparsedp.advection.reconstruction import Reconstruction
-from sparsedp.kernels.limited import FIRST, JUMPS, PULL, PULL_ADDED, SECOND, SLOPES
+from sparsedp.advection.scratch import Scratch
+from sparsedp.kernels.limited import FIRST, JUMPS, LAST, PULL, PULL_ADDED, SECOND, SLOPES, STEEP
 
 __all__ = ["VanLeer"]
 
@@ -34,12 +36,16 @@ class VanLeer(Eulerian):
 
     limited = True
 
+    def __init__(self, setting):
+        super().__init__(setting)
+        self.scratch = Scratch()
+
     @cached_property
     def _faces(self):
         return Reconstruction(self.setting, self.walls)
 
     def _arrays(self, u, v, inflow):
-        return {"u": u, "w": self._needed(v), "inflow": inflow, "slope": np.empty(self._slopes)}
+        return {"u": u, "w": self._needed(v), "inflow": inflow, "slope": self.scratch.take(self._slopes)}
 
     @cached_property
     def _slopes(self):
@@ -48,7 +54,7 @@ class VanLeer(Eulerian):
     def _first(self, arrays, dt):
         """The field after the first stage, and what is wrong."""
         self._loops.run(SLOPES, dt, arrays)
-        arrays["out"] = np.empty(arrays["u"].size)
+        arrays["out"] = self.scratch.take(arrays["u"].size)
         return arrays["out"], self._loops.run(FIRST, dt, arrays)[0]
 
     def forward(self, u, v, dt, inflow, out=None):
@@ -57,33 +63,39 @@ class VanLeer(Eulerian):
         arrays.update(u=first, u0=u, out=np.empty(u.size) if out is None else out)
         self._loops.run(SLOPES, dt, arrays)
         wrong += self._loops.run(SECOND, dt, arrays)[0]
+        self.scratch.give(first, arrays["slope"])
         self._check(wrong, u, v, dt, inflow, arrays["out"], share=0.5)
         return arrays["out"]
 
     def pull(self, nums, g, u, v, dt, inflow, into=None):
-        kept, half = (into or {}).get(VELOCITY), 0.5 * g
-        arrays = self._arrays(u, v, inflow)
+        kept, g = (into or {}).get(VELOCITY), np.ascontiguousarray(g)
+        arrays, take = self._arrays(u, v, inflow), self.scratch.take
         first, _ = self._first(arrays, dt)
         added = self.bilinear.between is None and kept is not None
         arrays["gw"] = kept if added else np.empty(arrays["w"].size)
-        arrays.update(u=first, g=half, a=np.empty(self._slopes), b=np.empty(self._slopes))
-        self._loops.run(SLOPES, dt, arrays)
-        of_first, of_inflow, by_second = self._pull_stage(PULL_ADDED if added else PULL, dt, arrays)
-        arrays.update(u=u, g=of_first)
-        self._loops.run(SLOPES, dt, arrays)
-        of_u, more, by_first = self._pull_stage(PULL_ADDED, dt, arrays)
-        found = {FIELD: of_u + half, INFLOW: of_inflow + more, STEP: (by_first + by_second) / dt}
+        arrays.update(u=first, g=g, a=take(self._slopes), b=take(self._slopes), out=take(u.size))
+        of_inflow, by_second, _ = self._pull_stage(PULL_ADDED if added else PULL, JUMPS, dt, arrays, g, 0.5)
+        of_first = arrays["out"]
+        arrays.update(u=u, g=of_first, out=np.empty(u.size))
+        more, by_first, good = self._pull_stage(PULL_ADDED, LAST, dt, arrays, g)
+        self.scratch.give(first, of_first, arrays["slope"], arrays["a"], arrays["b"])
+        found = {FIELD: arrays["out"], INFLOW: of_inflow + more, STEP: (by_first + by_second) / dt}
         if VELOCITY in nums:
             found[VELOCITY] = self._of_velocity(arrays["gw"], kept, added)
-        return tuple(found[num] for num in nums)
+        return self._cotangents(nums, found, good and isfinite(found[INFLOW].sum()))
 
-    def _pull_stage(self, task, dt, arrays):
-        """Cotangent g of u + dt L(u) -> those of u and the inflow, and g . dt L(u); that of w goes to gw."""
-        arrays.update(out=np.empty(arrays["u"].size), ginflow=np.empty(arrays["inflow"].size))
-        total = self._loops.run(task, dt, arrays)[0]
-        self._loops.run(JUMPS, dt, arrays)
-        self._loops.return_inflow(arrays["out"], arrays["ginflow"])
-        return arrays["out"], arrays["ginflow"], total
+    def _pull_stage(self, task, jumps, dt, arrays, g, share=1.0):
+        """Cotangent of u + dt L(u) -> that of u to out, of w to gw; that of the inflow, g . dt L(u), whether finite.
+
+        A share of the cotangent is asked for by a share of dt, and what is too much of g itself taken away by `jumps`.
+        """
+        arrays["ginflow"] = np.empty(arrays["inflow"].size)
+        self._loops.run(STEEP, dt, arrays)
+        total, spoiled = self._loops.run(task, share * dt, arrays)
+        arrays["g"] = g
+        spoiled += self._loops.run(jumps, dt, arrays)[0]
+        good = self._loops.return_inflow(arrays["out"], arrays["ginflow"])
+        return arrays["ginflow"], total, good and spoiled == 0.0
 
     def _velocity(self, v):
         """w, p, m and the derivative of p."""

@@ -7,6 +7,8 @@ with one coefficient for each cell (face) along its axis. The transposed project
 with the coefficients of G^T and K D^T.
 """
 
+from math import sqrt
+
 import numpy as np
 
 from sparsedp.kernels import passes
@@ -15,7 +17,7 @@ __all__ = ["Passes"]
 
 
 class Passes:
-    """Coefficients along the axes, and the passes with them.
+    """Coefficients along the axes, and the passes with them, on flat float64 arrays.
 
     Parameters
     ----------
@@ -29,33 +31,23 @@ class Passes:
 
     def __init__(self, grid, D, G, open_faces, transposed):
         pad = 3 - grid.dim
-        self.cells = (1,) * pad + grid.shape
-        self.spans: list = [None] * pad
-        self.spans += [
-            (start, stop, (1,) * pad + part)
-            for start, stop, part in zip(grid.faces.offsets, grid.faces.offsets[1:], grid.faces.parts, strict=False)
-        ]
-        none = np.zeros(0)
-        table: list[list] = [[none] * 3 for _ in range(5)]
+        cells, faces = (1,) * pad + grid.shape, (0,) * pad + tuple(free.size for free in open_faces)
+        self.shape = cells + faces
+        self.cells, self.faces = np.zeros((2, sum(cells))), np.zeros((3, sum(faces)))
+        ends = np.cumsum(cells), np.cumsum(faces)
         for axis, free in enumerate(open_faces):
             lines = _lines(_factor(D, (0, axis), axis), _factor(G, (axis, 0), axis), free, transposed)
-            for column, line in zip(table, lines, strict=True):
-                column[pad + axis] = np.ascontiguousarray(line)
-        self.lower, self.upper, self.keep, self.below, self.above = map(tuple, table)
-
-    def _parts(self, x):
-        return [np.zeros((0, 0, 0)) if span is None else x[span[0] : span[1]].reshape(span[2]) for span in self.spans]
+            for table, some, stop in zip((self.cells, self.faces), (lines[:2], lines[2:]), ends, strict=True):
+                table[:, stop[pad + axis] - some[0].size : stop[pad + axis]] = some
 
     def net_flow(self, x, b):
-        """b = D K x, and its norm."""
-        return float(np.sqrt(passes.net_flow(self._parts(x), self.lower, self.upper, b.reshape(self.cells))))
+        """b = D K x; the norms of b and of x."""
+        flow, whole = passes.net_flow(x, self.shape, self.cells, b)
+        return sqrt(flow), sqrt(whole)
 
     def push(self, x, p, out):
         """out = K x + G p."""
-        p, pairs = p.reshape(self.cells), zip(self._parts(x), self._parts(out), strict=True)
-        for axis, (given, found) in enumerate(pairs):
-            if given.size:
-                passes.push(given, p, self.keep, self.below, self.above, axis, found)
+        passes.push(x, p, self.shape, self.faces, out)
 
 
 def _factor(op, block, axis):

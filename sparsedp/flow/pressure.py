@@ -15,21 +15,15 @@ from functools import cached_property
 
 import numpy as np
 
-from sparsedp.fields import check_finite, place
+from sparsedp.fields import field_array
 from sparsedp.flow.setup import Setup
+from sparsedp.flow.splitting import Potential, Projected
 from sparsedp.grid import check_grid
-from sparsedp.ledger import active as recordings
-from sparsedp.ledger import count, tally
+from sparsedp.ledger import active, count
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import mask
 from sparsedp.solvers.choose import check_settings
-from sparsedp.solvers.record import Run
-from sparsedp.solvers.scaling import in_range, largest, norm, shifted
-from sparsedp.structure.base import Structure
 
 __all__ = ["Projection", "projection"]
-
-EPS = np.finfo(float).eps
 
 
 def projection(grid, solid=None, boundary="no_slip", method="auto", rtol=1e-10, maxiter=None, **options):
@@ -84,99 +78,6 @@ def projection(grid, solid=None, boundary="no_slip", method="auto", rtol=1e-10, 
     return Projection(Setup(grid, solid, boundary, settings))
 
 
-class Projected(Structure):
-    """P or P^T on flat face fields."""
-
-    has_entries = False
-
-    def __init__(self, setup, transposed=False):
-        self.setup, self.transposed = setup, transposed
-        self.shape = (setup.grid.faces.size,) * 2
-
-    def transpose(self):
-        return Projected(self.setup, not self.transposed)
-
-    def apply(self, x, out):
-        if x.dtype.kind == "c":
-            for part, target in ((x.real, out.real), (x.imag, out.imag)):
-                np.copyto(target, self._fresh(part), casting="same_kind")
-        elif x.dtype == np.float64 and out.dtype == np.float64:
-            self._project(x, out)
-        else:  # solved in double precision, rounded once
-            np.copyto(out, self._fresh(x), casting="same_kind")
-
-    def _fresh(self, x):
-        out = np.empty(x.size)
-        self._project(np.ascontiguousarray(x, dtype=np.float64), out)
-        return out
-
-    def _project(self, x, out):
-        setup, size, exponent = self.setup, norm(x), 0
-        if not in_range(size):
-            top = largest(x)
-            if not np.isfinite(top):
-                self._refuse(x)
-            exponent = int(np.frexp(top)[1])
-            x = shifted(x, -exponent)
-            size = norm(x)
-        if setup.passes is None or not self._by_transforms(x, out, size):
-            np.copyto(out, x)
-            out[setup.closed] = 0.0
-            self._by_contract(out)
-        if setup.still:
-            out[:] = 0.0
-        elif exponent:
-            out[:] = shifted(out, exponent)
-
-    def _refuse(self, x):
-        faces = self.setup.grid.faces
-
-        def where(index):
-            axis = int(np.searchsorted(faces.offsets, index, side="right")) - 1
-            return f"{faces.grid.axes[axis]}-face {place(index - faces.offsets[axis], faces.parts[axis])}"
-
-        check_finite("the cotangent of projection" if self.transposed else "the velocity in projection", x, where=where)
-
-    def _by_transforms(self, x, out, length):
-        """The solve without the contract's own passes: the divergence of the result is its true residual.
-
-        False when that is not below the tolerance: then the contract decides, and refines or raises.
-        """
-        setup, turned, run = self.setup, self.transposed, Run()
-        passes, engine = setup.passes[turned], setup.solver.engine
-        b = np.empty(setup.grid.cells.size)
-        size = passes.net_flow(x, b)
-        p = engine.solve(b, 0.0, turned and not setup.symmetric)[0]
-        passes.push(x, p, out)
-        residual, goal = passes.net_flow(out, np.ascontiguousarray(p)), setup.solver.system.rtol * size
-        if not residual <= max(goal, 8 * EPS * setup.reach[turned] * length):
-            return False
-        run.status = "converged" if residual <= goal else "converged_at_roundoff"
-        run.residual = residual / size if size else 0.0
-        tally.solves += 1
-        if recordings:
-            count(setup.solver.name, "adjoint" if turned else "solve")
-        setup.solver.log.note(run.info(), turned)
-        return True
-
-    def _by_contract(self, out):
-        """The solve inside the contract; the transposed one with the true transpose, unless that is the same."""
-        setup, turned, log = self.setup, self.transposed, self.setup.solver.log
-        b = setup.firsts[turned].product(out)
-        if turned and setup.symmetric:
-            before = log.forward
-            p = setup.solver.solve(b, False, checked=False)
-            log.adjoint, log.forward = log.forward, before
-        else:
-            p = setup.solver.solve(b, turned, checked=False)
-        self._add(p, out)
-
-    def _add(self, p, out):
-        out += self.setup.seconds[self.transposed].product(p)
-        if self.transposed and not self.setup.symmetric:  # D^T reaches the walls, G does not
-            out[self.setup.closed] = 0.0
-
-
 class Projection(Operator):
     """The Operator that `projection` makes, with its pressure and its records."""
 
@@ -203,9 +104,25 @@ class Projection(Operator):
     def pressure(self):
         """Operator faces -> cells: the p with P(v) = v + G(p) on the faces where the flow is free [velocity length]."""
         setup = self.structure.setup
-        solve = setup.inverse.tangent @ setup.D @ mask(setup.D.domain, setup.open)
-        chain = solve.structure.scaled(2.0**setup.exponent)
-        return Operator(chain, setup.grid.faces, setup.grid.cells, "pressure")
+        return Operator(Potential(setup), setup.grid.faces, setup.grid.cells, "pressure")
+
+    def parts(self, v):
+        """Face field -> (P(v), pressure(v)), by one solve; plain, of float64."""
+        setup, found = self.structure.setup, np.empty(self.domain.shape)
+        if active:
+            count(self.name, "forward")
+        p = self.structure.splitting(field_array(self, v), found)
+        p = self.structure.splitting.levelled(p) * 2.0**setup.exponent
+        return found, p.reshape(setup.grid.shape)
+
+    def merged(self, of_v, of_p):
+        """The transpose of `parts`: cotangents of its two results -> that of v, by one solve."""
+        found, scale = np.empty(self.domain.shape), 2.0**self.structure.setup.exponent
+        if active:
+            count(self.name, "vjp")
+        source = scale * field_array(self.pressure.T, of_p).reshape(-1)
+        self.T.structure.splitting(field_array(self, of_v), found, source)
+        return found
 
     def __str__(self):
         return str(self.structure.setup.inverse)

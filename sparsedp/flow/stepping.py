@@ -12,20 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import is_number
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
+from sparsedp.fields import check_function, is_number
+from sparsedp.flow.acceleration import Acceleration, Viscous, added_to
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
 from sparsedp.flow.walls import flow_sides, pressure_conditions
 from sparsedp.operators.boundary import identity, mask
 from sparsedp.operators.difference import gradient
 from sparsedp.solvers.choose import inverse
-from sparsedp.solvers.facts import magnitude
 from sparsedp.tape import isbox, plain
 
 __all__ = ["FlowStep", "flow_step"]
-
-ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
 
 
 def flow_step(
@@ -83,7 +81,7 @@ def flow_step(
     Notes
     -----
     A step of explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth); a longer one is refused.
-    Cost: one pressure solve, and one solve for implicit viscosity.
+    Cost: one pressure solve, and one solve for implicit viscosity; the same again backward. `rollout` needs no tape.
     Source: van Kan, SIAM J. Sci. Stat. Comput. 7 (1986).
 
     Examples
@@ -99,6 +97,13 @@ def flow_step(
         _check_constant("viscosity", viscosity, ">= 0")
     elif implicit:
         raise ValueError("implicit viscosity of flow_step is a number, got a function; write implicit=False")
+    if force is not None:
+        check_function("flow_step", force, "force=lambda v, params: ...")
+    if walls is not None and np.shape(plain(walls)) != grid.faces.shape:
+        raise ShapeError(
+            f"flow_step takes walls on {grid.faces}, got an array of shape {np.shape(plain(walls))}; write "
+            "face_lift(grid, boundary)(values)"
+        )
     return FlowStep(grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary)
 
 
@@ -119,7 +124,6 @@ class FlowStep:
 
     def __init__(self, grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary):
         self.grid, self.dt, self.viscosity = grid, dt, viscosity
-        self.force: Any = force
         self.project = projection(grid, solid, boundary)
         self.pressure = self.project.pressure
         self.slope = gradient(grid, pressure_conditions(flow_sides(grid, boundary)), solid)
@@ -132,67 +136,72 @@ class FlowStep:
         self.relax: Any = None
         if implicit and viscosity:
             self.relax = inverse(identity(grid.faces) - (0.5 * dt * viscosity) * self.laplacian)
-        elif viscosity:  # no eigenvalue is beyond the largest sum of a row
-            rows = magnitude(self.laplacian.structure)(np.ones(grid.faces.size))
-            self._steepest = float(np.max(rows, initial=0.0))
-            if not callable(viscosity):
-                self._check(viscosity)
-
-    def _check(self, viscosity):
-        """Adams-Bashforth is stable for dt nu |lambda| <= 1."""
-        rate = viscosity * self._steepest
-        if self.dt * rate > 1 + ROUNDING:
-            raise UnstableStepError(
-                f"flow_step is unstable for viscosity = {viscosity:.6g} with dt = {self.dt:.6g}: the largest "
-                f"stable dt is {1 / rate:.6g}; take smaller steps or write implicit=True"
-            )
+        explicit = viscosity and self.relax is None
+        self.viscous: Any = Viscous(self.laplacian, self.walls, viscosity, dt) if explicit else None
+        self.acceleration = Acceleration(grid.faces, self.convect, force, self.viscous)
 
     def start(self, v, params=None):
         """Velocity -> the first state: made incompressible, the pressure still unknown."""
         v = self.project(v)
         return {"v": v, "p": np.zeros(self.grid.shape), "a": self.acceleration(v, params)}
 
-    def acceleration(self, v, params):
-        """What is explicit: the force, less what is carried away, and explicit viscosity."""
-        a = 0.0 * v
-        if self.force is not None:
-            a = a + self.force(v, params)
-        if self.convect is not None:
-            a = a - self.convect(v, v)
-        if self.laplacian is not None and self.relax is None:
-            a = a + self._viscosity(params) * self._bend(v)
-        return a
-
-    def _viscosity(self, params):
-        if not callable(self.viscosity):
-            return self.viscosity
-        found = self.viscosity(params)
-        if not is_number(plain(found)) or not 0 <= plain(found) < np.inf:
-            raise ValueError(f"the viscosity in flow_step must be a finite number >= 0, got {plain(found)}")
-        self._check(float(plain(found)))
-        return found
-
-    def _bend(self, v):
-        return self.laplacian(v) if self.walls is None else self.laplacian(v) + self.walls
-
     def __call__(self, state, params=None):
+        return self._advanced(state, params, self._parted)
+
+    def _advanced(self, state, params, parted):
+        """The next state; `parted`: v* -> v_next and q."""
         if not isinstance(state, dict) or state.keys() != {"v", "p", "a"}:
             raise ShapeError("flow_step takes a dict of v, p and a as its state; make it with step.start")
         v, p, dt = state["v"], state["p"], self.dt
         a = self.acceleration(v, params)
         ahead = v + dt * (1.5 * a - 0.5 * state["a"] - self.slope(p))
         if self.relax is not None:
-            half = self._bend(v) if self.walls is None else self._bend(v) + self.walls  # of v and of v*
+            half = self.laplacian(v) if self.walls is None else self.laplacian(v) + 2.0 * self.walls  # of v and of v*
             ahead = self.relax(ahead + (0.5 * dt * self.viscosity) * half)
+        v, q = parted(ahead)
+        return {"v": v, "p": p - q / dt, "a": a}
+
+    def _parted(self, ahead):
         q = self.pressure(ahead)
-        return {"v": self.kept(ahead) + self.slope(q), "p": p - q / dt, "a": a}
+        return self.kept(ahead) + self.slope(q), q
+
+    # ------------------------------------------------------------ without the tape, for rollout
+
+    def forward(self, state, params, out=None):
+        """The next state, of plain values: that of a call, to rounding."""
+        return self._advanced(state, params, self._parted_plain)
+
+    def _parted_plain(self, ahead):
+        """The same in fewer passes, and in other bits: a call has those of a step on the tape, which are compared."""
+        at_once = not isbox(ahead) and ahead.dtype == np.float64
+        return self.project.parts(ahead) if at_once else self._parted(ahead)
+
+    def backward(self, state, params, g, into=None):
+        """Cotangents of a state and of params from that of the next state, plain; those of params are added to `into`.
+
+        The transpose of each line of the step, from the last to the first.
+        """
+        z = self._merged(g["v"], g["p"] / -self.dt)
+        v = z
+        if self.relax is not None:
+            z = self.relax.T(z)
+            v = z + (0.5 * self.dt * self.viscosity) * self.laplacian.T(z)
+        of_v, of_params = self.acceleration.backward(state["v"], params, g["a"] + 1.5 * self.dt * z)
+        back = {"v": v + of_v, "p": g["p"] - self.dt * self.slope.T(z), "a": -0.5 * self.dt * z}
+        return back, added_to(into, of_params)
+
+    def _merged(self, of_v, of_q):
+        """The transpose of `_parted`."""
+        if of_v.dtype != np.float64:
+            return self.kept.T(of_v) + self.pressure.T(of_q + self.slope.T(of_v))
+        return self.project.merged(of_v, of_q)
 
     def __repr__(self):
         parts = {
             "convection": self.convect,
             "viscosity": self.laplacian,
             "implicit": self.relax,
-            "force": self.force,
+            "force": self.acceleration.force,
             "moving walls": self.walls,
         }
         words = [word for word, part in parts.items() if part is not None]

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.integrators.combination import untraced
-from sparsedp.tape import plain
+from sparsedp.tape import dtype_of, is_variable, plain
 from sparsedp.tree import leaves
 
 __all__ = ["Adaptive"]
@@ -18,6 +18,7 @@ __all__ = ["Adaptive"]
 SAFETY, SMALLEST, LARGEST = 0.9, 0.2, 5.0  # of one change of the length
 LEAST = 1e-15  # share of the interval below which no step is tried
 MOST = 100_000  # trials in one interval
+WINDOW, FAR = 1000, 10  # trials at a pace that would need FAR * MOST for the rest: no use to go on
 
 
 class Adaptive:
@@ -50,8 +51,9 @@ class Adaptive:
 
     def __call__(self, u, params, t, h):
         """The state after the interval h."""
-        length, done, taken = self._first(u, params, t, h), 0.0, []
-        for _ in range(MOST):
+        self._check_tolerance(u)
+        length, done, taken, mark = self._first(u, params, t, h), 0.0, [], 0.0
+        for trial in range(1, MOST + 1):
             left = 1.0 - done
             length = self._allowed(length, left)
             at = t if t is None else t + done * h
@@ -63,12 +65,26 @@ class Adaptive:
                 self.taken = taken
                 return u
             length *= float(np.clip(SAFETY * max(error, 1e-10) ** (-1 / (self.order + 1)), SMALLEST, LARGEST))
+            if trial % WINDOW == 0:
+                if (1.0 - done) * WINDOW > FAR * MOST * (done - mark):
+                    break
+                mark = done
             if length < LEAST:
                 break
         raise ConvergenceError(
             f"{self.name} found no step that meets the tolerance {self.tolerance:g} at {done:.3g} of its interval "
             f"after {len(taken)} steps; take a larger tolerance or a method for stiff problems"
         )
+
+    def _check_tolerance(self, u):
+        """Steps of a state that cannot hold the digits asked for would shrink to nothing."""
+        for leaf in leaves(u):
+            rounding = np.finfo(dtype_of(leaf)).eps if is_variable(leaf) else 0.0
+            if self.tolerance < 4 * rounding:
+                raise ValueError(
+                    f"{self.name} cannot meet the tolerance {self.tolerance:g} with a state of {dtype_of(leaf)}, whose "
+                    f"rounding is {rounding:.1e}; take a larger tolerance or write u.astype(float)"
+                )
 
     def _allowed(self, length, left):
         """At most what is left, and not just short of it."""
@@ -114,6 +130,10 @@ class Adaptive:
         """A first length from the size of the rate: one that changes the state by a hundredth."""
         bare, of_params, at = (untraced(tree) for tree in (u, params, t))
         rate = leaves(self.scheme.problem(bare, of_params, at))
+        if not all(np.all(np.isfinite(plain(leaf))) for leaf in rate if leaf is not None):
+            raise NonFiniteError(
+                f"the rate of {self.name} must be finite at the state given; take a state in its domain"
+            )
         size = max((float(np.max(np.abs(leaf), initial=0.0)) for leaf in leaves(bare)), default=0.0)
         speed = max((float(np.max(np.abs(plain(leaf)), initial=0.0)) for leaf in rate), default=0.0)
         length = 0.01 * (size or 1.0) / (speed * float(plain(h))) if speed > 0 else 1.0

@@ -5,6 +5,7 @@ from sparsedp.integrators.adaptive import Adaptive
 from sparsedp.integrators.explicit import EXPLICIT, Explicit
 from sparsedp.integrators.fast import LinearStep
 from sparsedp.integrators.implicit_steps import IMPLICIT, Linear, Nonlinear
+from sparsedp.integrators.known_ends import NonlinearStep
 from sparsedp.integrators.problem import posed, positive
 from sparsedp.integrators.split_steps import SPLIT, Exponential, Imex
 from sparsedp.integrators.stability import Limit
@@ -127,7 +128,13 @@ def stepper(
         limit = Limit(problem.op, EXPLICIT[method].reach, method)
     dt = dt if callable(dt) else positive(dt, "dt")
     bare = problem.whole and source is None and tolerance is None and isinstance(dt, float)
-    return (LinearStep if bare else Step)(method, problem, dt, scheme, limit)
+    kind = LinearStep if bare else NonlinearStep if _ends_known(scheme, problem) else Step
+    return kind(method, problem, dt, scheme, limit)
+
+
+def _ends_known(scheme, problem):
+    """Whether the new state is the root of one stage, and nothing else."""
+    return isinstance(scheme, Nonlinear) and scheme.name != "tr_bdf2" and not problem.timed
 
 
 def _scheme(method, problem, jacobian, settings, maxiter, options, kept):

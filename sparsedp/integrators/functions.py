@@ -97,10 +97,18 @@ class Functions:
         self.op, self.name = op, name
         self.found, self.eigenvalues = _diagonalised(op, name)
         self._tables: dict = {}  # (function, z) -> weights; plain values only
+        self._rules: dict = {}  # (functions, transposed) -> rule; a scheme has a handful
 
     def __call__(self, functions, z, *fields):
         """The sum, differentiable in z and the fields."""
-        return self._rule(functions, False)(z, *fields)
+        return self._known(functions, False)(z, *fields)
+
+    def _known(self, functions, transposed):
+        """The rule for these functions: made once, for every z, step and adjoint."""
+        key = functions, transposed
+        if key not in self._rules:
+            self._rules[key] = self._rule(*key)
+        return self._rules[key]
 
     def plain(self, functions, z, *fields, transposed=False):
         """The same on plain values, or with the transpose of L."""
@@ -153,11 +161,13 @@ class Functions:
     def _rule(self, functions, transposed):
         """The sum as a rule in (z, *fields)."""
 
+        derivatives = tuple(f.derivative() for f in functions)
+
         def forward(z, *fields):
             return self.plain(functions, z, *fields, transposed=transposed)
 
         def slope(z, fields):
-            return self._rule(tuple(f.derivative() for f in functions), transposed)(z, *fields)
+            return self._known(derivatives, transposed)(z, *fields)
 
         def vjp(nums, ans, z, *fields):
             chosen = tuple(functions[num - 1] for num in nums if num)
@@ -165,7 +175,7 @@ class Functions:
             def backs(g):
                 if len(chosen) > 1 and not (isbox(g) or isbox(z) or z == 0 or np.iscomplexobj(g)):
                     return self._spread(chosen, float(z), g, not transposed)
-                return [self._rule((f,), not transposed)(z, g) for f in chosen]
+                return [self._known((f,), not transposed)(z, g) for f in chosen]
 
             def pull(g):
                 found = iter(backs(g))
@@ -178,7 +188,7 @@ class Functions:
             total = tangents[nums.index(0)] * slope(z, fields) if 0 in nums else 0.0
             if pairs:
                 chosen = tuple(functions[num - 1] for num, _ in pairs)
-                total = total + self._rule(chosen, transposed)(z, *(t for _, t in pairs))
+                total = total + self._known(chosen, transposed)(z, *(t for _, t in pairs))
             return total
 
         return differentiable(f"{self.name}.phi.T" if transposed else f"{self.name}.phi", forward, vjp, jvp)

@@ -8,6 +8,8 @@ b = u + (y - u) / (g (2 - g)): both stages have the same factor 1 - d z L.
 Sources: Bank et al., IEEE Trans. Electron Devices 32 (1985); Hosea and Shampine, Appl. Numer. Math. 20 (1996).
 """
 
+from contextlib import contextmanager
+
 import numpy as np
 import scipy.sparse as sp
 
@@ -122,6 +124,21 @@ class Nonlinear(Stage):
 
         residual.__name__ = name
         self.root = implicit(residual, jacobian and shifted(jacobian, problem.timed), **settings)
+
+    def __call__(self, u, params, t, h):
+        """The state after a step h. Its stages share a Jacobian while that is good enough; none outlives the step."""
+        with self.root.series():
+            return self.advance(self, u, params, t, h)
+
+    @contextmanager
+    def ending(self, new):
+        """A step of one stage inside ends at `new`, which need not be solved for; None, or a rounded array: it is."""
+        exact = type(new) is np.ndarray and new.dtype == np.float64
+        self.root.answers = [new] if exact else []
+        try:
+            yield
+        finally:
+            self.root.answers = []
 
     def solve(self, guess, b, params, t, h):
         """x of x = b + h f(x, t)."""

@@ -10,6 +10,7 @@ from sparsedp.integrators.combination import combine, frozen
 from sparsedp.operator import Operator
 from sparsedp.space import fits
 from sparsedp.tape import isbox, plain
+from sparsedp.tree import flatten
 
 __all__ = ["Problem", "positive", "posed"]
 
@@ -128,12 +129,26 @@ def _unchanged(rate, u, args):
     """The rate, which must not write into the state."""
     try:
         return rate(frozen(u), *args)
-    except ValueError as error:
-        if "read-only" not in str(error):
+    except (TypeError, ValueError) as error:
+        refused = "read-only" in str(error)
+        if not refused and not _writes(rate, u, args):
             raise
         raise ValueError(
             "the rate changes the state in place; write u = u + du instead of u += du, or work on a copy"
-        ) from error
+        ) from (error if refused else None)
+
+
+def _writes(rate, u, args):
+    """Whether a rate that fails on traced values writes into the state: on plain ones NumPy says so."""
+    found, rebuild = flatten((u, args))
+    if not any(map(isbox, found)):
+        return False
+    u, args = rebuild([plain(leaf) for leaf in found])
+    try:
+        rate(frozen(u), *args)
+    except Exception as error:
+        return "read-only" in str(error)
+    return False
 
 
 def _number(value, name):

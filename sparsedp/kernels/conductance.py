@@ -16,7 +16,7 @@ from sparsedp.kernels.unable import warn_unable
 
 __all__ = ["through_faces"]
 
-_inner = njit(error_model="numpy")
+_inner = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 @_inner

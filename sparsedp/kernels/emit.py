@@ -54,9 +54,13 @@ class Lane:
         """1, 1/2, 0 where the number is > 0, = 0, < 0."""
         return self.chosen(">", 0.0, 0.5, 0.0) + self.chosen(">=", 0.0, 0.5, 0.0)
 
-    def above(self):
-        """1 where the number is > 0, else 0."""
-        return self.chosen(">", 0.0, 1.0, 0.0)
+    def alike(self, other):
+        """1 where both numbers are > 0 or both < 0, else 0."""
+        zero, one, both = self.constant(0.0), self.constant(1.0), []
+        for word in "><":
+            tests = [self.builder.fcmp_ordered(word, lane.value, zero) for lane in (self, other)]
+            both.append(self.builder.and_(*tests))
+        return Lane(self.builder, self.builder.select(self.builder.or_(*both), one, zero))
 
     def zero(self):
         """1 where the number is 0, else 0."""

@@ -27,6 +27,7 @@ __all__ = [
     "VELOCITY_ADDED",
     "number_of",
     "parts",
+    "spoiled",
     "streams_of",
 ]
 
@@ -85,6 +86,11 @@ def parts(w):
     return positive, w - positive, step
 
 
+def spoiled(values):
+    """0, or NaN where one of the values is NaN or infinite."""
+    return reduce(add, [value - value for value in values])
+
+
 def _forward(dim, mode):
     def body(s):
         u, leaves, enters = s["u"], [], []
@@ -106,6 +112,7 @@ def _forward(dim, mode):
 
 def _pull(dim, mode, task):
     axis_of = {FLUX: _pull_flux, ADVECTIVE: _pull_advective, POINTS: _pull_points}[mode]
+    stored = [stream.name for stream in streams_of(dim, mode, task) if stream.write]
 
     def body(s):
         found, gu, totals = {}, s["g"], []
@@ -115,7 +122,7 @@ def _pull(dim, mode, task):
             totals.append(to_dt)
             found[f"gw{a}"] = s[f"gw{a}"] + to_w if task >= VELOCITY_ADDED else to_w
         found["gu"] = gu
-        return found, (reduce(add, totals),)
+        return found, (reduce(add, totals), spoiled([found[name] for name in stored]))
 
     return body
 
@@ -150,7 +157,7 @@ def _pull_points(s, u, g):
 
 def _formula(dim, mode, task):
     body = _forward(dim, mode) if task == FORWARD else _pull(dim, mode, task)
-    return Formula(streams_of(dim, mode, task), body, 1)
+    return Formula(streams_of(dim, mode, task), body, 1 if task == FORWARD else 2)
 
 
 FORMULAS = [_formula(dim, mode, task) for dim in (1, 2, 3) for mode in range(3) for task in range(6)]

@@ -2,45 +2,52 @@
 
 `s` is the limited difference from a point to its face (`sm`, `sp` of the points below and above), `c` and `e`
 the distances to both neighbours over half the width. A stage is R = dt L(u). Its cotangent goes to the field directly
-and through the slopes: `a` and `b` are what each slope hands on to the differences A and B.
+and through the slopes: `a` and `b` are what each slope hands on to the differences A and B. They stand where
+ds/dA and ds/dB stood, `da` and `db`, which are found together with the slopes.
 """
 
 from functools import reduce
 from operator import add
 
-from sparsedp.kernels.formulas import ADVECTIVE, FLUX, FORMULAS, POINTS, ROUNDING, Formula, Stream, parts
+from sparsedp.kernels.formulas import ADVECTIVE, FLUX, FORMULAS, POINTS, ROUNDING, Formula, Stream, parts, spoiled
 
-__all__ = ["FIRST", "FORMULAS", "JUMPS", "PULL", "PULL_ADDED", "SECOND", "SLOPES", "limited_number", "limited_streams"]
+__all__ = ["FIRST", "FORMULAS", "JUMPS", "LAST", "PULL", "PULL_ADDED", "SECOND", "SLOPES", "STEEP"]
+__all__ += ["limited_number", "limited_streams"]
 
-SLOPES, FIRST, SECOND, PULL, PULL_ADDED, JUMPS = range(6)
+SLOPES, STEEP, FIRST, SECOND, PULL, PULL_ADDED, JUMPS, LAST = range(
+    8
+)  # jumps: less half of g; the last ones: and half of g
+SHARED = SLOPES, STEEP, JUMPS, LAST
 START = len(FORMULAS)
 
 
 def limited_number(dim, mode, task):
     """Place in FORMULAS; slopes and jumps are the same in all modes."""
-    return START + ((dim - 1) * 3 + (FLUX if task in (SLOPES, JUMPS) else mode)) * 6 + task
+    return START + ((dim - 1) * 3 + (FLUX if task in SHARED else mode)) * 8 + task
 
 
 def limited_streams(dim, mode, task):
     """Streams of one formula."""
     found, speeds = [Stream("u")], ["c", "cl", "cu"] if mode == POINTS else ["wl", "wu"]
-    if task == JUMPS:
-        found = [Stream("gu", True, True)]
+    if task in (JUMPS, LAST):
+        found = [Stream("gu", True, True), Stream("g")]
     elif task in (PULL, PULL_ADDED):
         found += [Stream("g"), Stream("gu", False, True)]
-    elif task != SLOPES:
+    elif task not in (SLOPES, STEEP):
         found += [Stream("out", False, True)] + ([Stream("u0")] if task == SECOND else [])
     for a in range(dim):
-        names = {SLOPES: ["um", "up", "ratio", "ahead"], JUMPS: ["al", "bu", "ap", "bm"]}.get(task)
-        names = names or ["um", "up", "sm", "s", "sp", *speeds]
+        names = ["um", "up", "sm", "s", "sp", *speeds]
+        if task in SHARED:
+            names = ["um", "up", "ratio", "ahead"] if task in (SLOPES, STEEP) else ["al", "bu", "ap", "bm"]
         if task in (PULL, PULL_ADDED):
-            names = [*names, "gm", "gp", "ratio", "ahead"] + (["cm", "cp"] if mode == POINTS else [])
-            found += [Stream(f"{name}{a}", False, True) for name in "ab"]
+            names = [*names, "gm", "gp", "da", "db"] + (["cm", "cp"] if mode == POINTS else [])
             found += [Stream(f"gw{a}", task == PULL_ADDED, True)]
+        if task in (PULL, PULL_ADDED, STEEP):
+            found += [Stream(f"{name}{a}", False, True) for name in "ab"]
         found += [Stream(f"{name}{a}", fixed=name in ("ratio", "ahead") and a < dim - 1) for name in names]
-        if task == SLOPES:
+        if task in (SLOPES, STEEP):
             found += [Stream(f"s{a}", False, True)]
-        elif task != JUMPS:
+        elif task not in SHARED:
             factors = ["r", "rm", "rp"] if task in (PULL, PULL_ADDED) else ["r"]
             found += [Stream(f"{name}{a}", fixed=a < dim - 1) for name in factors]
     return tuple(found)
@@ -50,41 +57,51 @@ def _axis(s, a):
     return {name[:-1]: value for name, value in s.items() if name[-1] == str(a)}
 
 
-def _share(a, b, c, e):
-    """1 where A and B agree in sign, else 0; A + B, q, R and what its slope needs."""
-    same = a.above() * b.above() + (a * -1.0).above() * (b * -1.0).above()
-    other = same * -1.0 + 1.0
-    a, b = a * same + other, b * same + other
-    both = a + b
-    q, p = a / both, b / both
-    cc, ee, mixed = c * c, e * e, (c + e - 2.0) * c * e
-    top = q * p * (q * ee + p * cc)
-    under = q * q * ee + mixed * q * p + p * p * cc
-    return same, both, q, p, top / under, under, cc, ee, mixed
+class _Share:
+    """What s and its derivatives have in common; with E = q e^2, C = p c^2, p = 1 - q, m = (c + e - 2) c e
+
+    R = N / D,   N = q p (E + C),   D = q E + m q p + p C,   s = (A + B) R,
+    ds/dA = (p (2 E + C) - R (2 E + m p)) / D,   ds/dB = (q (E + 2 C) - R (2 C + m q)) / D.
+    """
+
+    def __init__(self, u, x):
+        self.a, self.b, c, e = u - x["um"], x["up"] - u, x["ratio"], x["ahead"]
+        self.same = same = self.a.alike(self.b)
+        mine = self.a * same
+        self.both = mine + (self.b * same + (same * -1.0 + 1.0))  # not 0
+        self.q = q = mine / self.both
+        self.p = p = q * -1.0 + 1.0
+        ce = c * e
+        mixed = (c + e) * ce - ce * 2.0
+        self.ahead, self.behind, self.of_p, self.of_q = q * (e * e), p * (c * c), mixed * p, mixed * q
+        under = q * (self.ahead + self.of_p) + p * self.behind
+        self.inverse = (under * 0.0 + 1.0) / under  # divisions take most of the time
+        self.ratio = q * p * (self.ahead + self.behind) * self.inverse
+
+    def slope(self):
+        """s, and 0 where A and B differ in sign."""
+        return self.both * self.ratio
+
+    def steepness(self):
+        """ds/dA and ds/dB; where one of A, B is 0 the mean of both sides."""
+        ahead, behind, zero_a, zero_b = self.ahead * 2.0, self.behind * 2.0, self.a.zero(), self.b.zero()
+        da = self.p * (ahead + self.behind) - self.ratio * (ahead + self.of_p)
+        db = self.q * (self.ahead + behind) - self.ratio * (behind + self.of_q)
+        scale, none = self.same * self.inverse, zero_a * zero_b
+        return da * scale + (zero_a - none) * 0.5, db * scale + (zero_b - none) * 0.5
 
 
-def _slopes(dim):
+def _slopes(dim, steep):
     def body(s):
         found = {}
         for a in range(dim):
-            x = _axis(s, a)
-            same, both, _, _, ratio, *_ = _share(s["u"] - x["um"], x["up"] - s["u"], x["ratio"], x["ahead"])
-            found[f"s{a}"] = same * (both * ratio)
+            share = _Share(s["u"], _axis(s, a))
+            found[f"s{a}"] = share.slope()
+            if steep:
+                found[f"a{a}"], found[f"b{a}"] = share.steepness()
         return found, (s["u"] * 0.0,)
 
     return body
-
-
-def _hands_on(u, x):
-    """ds/dA and ds/dB; where one of A, B is 0 the mean of both sides."""
-    a, b = u - x["um"], x["up"] - u
-    same, _, q, p, ratio, under, cc, ee, mixed = _share(a, b, x["ratio"], x["ahead"])
-    slope = ee * (q * 2.0 - q * q * 3.0) + cc * (p * p - q * p * 2.0)
-    slope = (slope - ratio * (q * ee * 2.0 + mixed * (p - q) - p * cc * 2.0)) / under
-    zero_a, zero_b = a.zero(), b.zero()
-    da = same * (ratio + p * slope) + zero_a * (zero_b * -1.0 + 1.0) * 0.5
-    db = same * (ratio - q * slope) + zero_b * (zero_a * -1.0 + 1.0) * 0.5
-    return da, db
 
 
 def _values(u, x):
@@ -127,13 +144,12 @@ def _pull(dim, mode, task):
         for a in range(dim):
             x = _axis(s, a)
             to_u, to_s, to_w, to_dt = axis_of(s["u"], s["g"], x, mode)
-            da, db = _hands_on(s["u"], x)
-            found[f"a{a}"], found[f"b{a}"] = da * to_s, db * to_s
+            found[f"a{a}"], found[f"b{a}"] = x["da"] * to_s, x["db"] * to_s
             found[f"gw{a}"] = x["gw"] + to_w if task == PULL_ADDED else to_w
             gu = gu + to_u
             totals.append(to_dt)
         found["gu"] = gu
-        return found, (reduce(add, totals),)
+        return found, (reduce(add, totals), spoiled([found[f"gw{a}"] for a in range(dim)]))
 
     return body
 
@@ -163,24 +179,25 @@ def _pull_points(u, g, x, mode):
     return to_u, to_s, own * -1.0 * (ahead + step * (behind - ahead)), own * -1.0 * (p * behind + m * ahead)
 
 
-def _jumps(dim):
+def _jumps(dim, last):
     def body(s):
-        new = s["gu"]
+        new = s["gu"] + s["g"] * (0.5 if last else -0.5)
         for a in range(dim):
             x = _axis(s, a)
             new = new + (x["al"] - x["bu"]) + (x["bm"] - x["ap"])
-        return {"gu": new}, (s["gu"] * 0.0,)
+        return {"gu": new}, (spoiled([new]),)
 
     return body
 
 
 def _formula(dim, mode, task):
-    bodies = {SLOPES: _slopes, JUMPS: _jumps}
-    if task in bodies:
-        body = bodies[task](dim)
+    if task in (SLOPES, STEEP):
+        body = _slopes(dim, task == STEEP)
+    elif task in (JUMPS, LAST):
+        body = _jumps(dim, task == LAST)
     else:
         body = (_stage if task in (FIRST, SECOND) else _pull)(dim, mode, task)
-    return Formula(limited_streams(dim, mode, task), body, 1)
+    return Formula(limited_streams(dim, mode, task), body, 2 if task in (PULL, PULL_ADDED) else 1)
 
 
-FORMULAS += [_formula(dim, mode, task) for dim in (1, 2, 3) for mode in range(3) for task in range(6)]
+FORMULAS += [_formula(dim, mode, task) for dim in (1, 2, 3) for mode in range(3) for task in range(8)]

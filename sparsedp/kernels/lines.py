@@ -17,7 +17,7 @@ THIN = 64  # lines with at most so many numbers are joined where their rows are 
 SHORT = 4  # lines with fewer numbers are not worth a vector
 PIECE = 256  # numbers summed at a time in a buffer when a row has many entries
 
-_inner = njit(error_model="numpy")
+_inner = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 _inlined = njit(error_model="numpy", inline="always")  # a compiled function is optimised again wherever it is called
 
 

@@ -11,7 +11,7 @@ from sparsedp.kernels.layout import CHUNK, LOWERED, REMAINDER
 __all__ = ["SIGNATURE", "run"]
 
 _REORDER = {"reassoc", "contract", "nsz"}  # NaN and infinity must stay what they are
-_inner = njit(error_model="numpy", fastmath=_REORDER)
+_inner = njit(error_model="numpy", fastmath=_REORDER, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 @_inner

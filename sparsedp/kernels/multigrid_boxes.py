@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.kernels.multigrid import inner
+from sparsedp.kernels.multigrid_rows import entry, inner
 
 __all__ = ["Boxes", "boxes", "galerkin", "sides"]
 
@@ -159,7 +159,7 @@ def _add_line(out, line, sign, shift, periodic):
         out[1] += sign * line[n - 1]
 
 
-@inner
+@entry
 def galerkin(links, extra, found, coarse, rest, periodic, deep, table, own, terms, between, pairs, corners, summed):
     """Add up the coarse links and extras (`rest`), line by line. Corners outside are added and ignored."""
     n0, n1, n2 = rest.shape[0] - 3, rest.shape[1] - 3 * deep, rest.shape[2] - 3

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.kernels.multigrid import inner
+from sparsedp.kernels.multigrid_rows import entry, inner
 
 __all__ = ["diagonal"]
 
@@ -30,7 +30,7 @@ def _count_weak(held, share, deep):
     return count
 
 
-@inner
+@entry
 def diagonal(links, steps, extra, scale, root, share, deep):
     """Fill one over the root of the diagonal, and the root; 0 where there is no unknown -> number of weak cells."""
     n0, n1, n = extra.shape[0] - 3, extra.shape[1] - 3 * deep, extra.shape[2] - 3

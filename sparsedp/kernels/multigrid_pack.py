@@ -7,7 +7,7 @@ index (1, j + lead, 1); in 2-D there is one j and lead is 0.
 
 import numpy as np
 
-from sparsedp.kernels.multigrid_rows import LANES, PAD, ends, inner, rows
+from sparsedp.kernels.multigrid_rows import LANES, PAD, ends, entry, inner, rows
 
 __all__ = [
     "inside",
@@ -59,7 +59,7 @@ def packed(*shape, dtype=float):
     return flat[first : first + size].reshape(shape)
 
 
-@inner
+@entry
 def pack_fine_links(before, after, a, scale, step, shape, periodic, lead):
     """Links a from a cell to the cell `step` in front -> c of the red cells, behind and in front of them."""
     half = (shape[2] + 1) // 2
@@ -84,7 +84,7 @@ def _thrice(out, a, b, c):
         out[k] = a[2 * k] * b[2 * k] * c[2 * k]
 
 
-@inner
+@entry
 def pack_coarse_links(out, a, scale, step, shape, periodic, lead):
     """Links a from a cell to the cell `step` in front -> c, rows split by column parity."""
     half = (shape[2] + 1) // 2
@@ -99,7 +99,7 @@ def pack_coarse_links(out, a, scale, step, shape, periodic, lead):
                 ends(rows(out)[0] + (2 * row + p) * rows(out)[1], half, out.dtype.type(0.0), periodic[2])
 
 
-@inner
+@entry
 def pack_weights(out, starts, number, weight, coarse, root, group, corner, column, shape, periodic, lead):
     """Weights of the cells of one group of rows and one column parity on one of their corners.
 
@@ -115,7 +115,7 @@ def pack_weights(out, starts, number, weight, coarse, root, group, corner, colum
             ends(rows(out)[0] + row * rows(out)[1], half, out.dtype.type(0.0), periodic[2])
 
 
-@inner
+@entry
 def pack_red(out, a, shape, lead):
     """The red cells of a natural array."""
     for i in range(shape[0]):

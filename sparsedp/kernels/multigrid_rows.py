@@ -25,6 +25,7 @@ __all__ = [
     "copy",
     "descend",
     "ends",
+    "entry",
     "inner",
     "merge",
     "mix",
@@ -252,7 +253,9 @@ def merge(row, places, factors):
 
 # ---------------------------------------------------------------- rows of arrays
 
-inner = njit(nogil=True, error_model="numpy", cache=True)
+# `entry` is called from Python; `inner` only from other compiled functions, so it needs no wrappers for that.
+entry = njit(nogil=True, error_model="numpy", cache=True)
+inner = njit(nogil=True, error_model="numpy", cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 @inner

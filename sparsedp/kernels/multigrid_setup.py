@@ -9,9 +9,9 @@ Coarse cells sit on the cells with even indices. Source: J. E. Dendy, Black box 
 Phys. 48 (1982) 366-386.
 """
 
-from sparsedp.kernels.multigrid import inner
 from sparsedp.kernels.multigrid_boxes import boxes, galerkin
 from sparsedp.kernels.multigrid_pack import padded, repeat
+from sparsedp.kernels.multigrid_rows import entry, inner
 
 __all__ = ["coarsen", "weights"]
 
@@ -37,7 +37,7 @@ def _set_line(out, a, b, extra, weak, i, j):
     out[2, i, j] = 1.0 if extra == 0.0 and scale > 0.0 else (a + b) * scale
 
 
-@inner
+@entry
 def _line_weights(links, extra, root, horizontal, vertical, nine):
     """Weights of cells between two coarse cells: the other axis summed up."""
     east, sw, south, se = links
@@ -58,7 +58,7 @@ def _line_weights(links, extra, root, horizontal, vertical, nine):
             _set_line(vertical, a, b, extra[k, j], WEAK * root[k, j] ** 2, k // 2, (j + 1) // 2)
 
 
-@inner
+@entry
 def _inner_weights(links, extra, scales, horizontal, vertical, inside, nine):
     """Weights of cells between four coarse cells, from their own equation, and their sum."""
     east, sw, south, se = links

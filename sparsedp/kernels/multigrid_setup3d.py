@@ -13,9 +13,9 @@ from itertools import product
 
 import numpy as np
 
-from sparsedp.kernels.multigrid import inner
 from sparsedp.kernels.multigrid_boxes import boxes, galerkin
 from sparsedp.kernels.multigrid_pack import padded, repeat
+from sparsedp.kernels.multigrid_rows import entry, inner
 from sparsedp.kernels.multigrid_setup import WEAK
 
 __all__ = ["coarsen", "weights"]
@@ -97,7 +97,7 @@ def _through(share, o, kind, i, j, first, found, lines):
                 number += 1
 
 
-@inner
+@entry
 def _weights_of_kind(kind, links, extra, root, offsets, first, found):
     """Weights of the cells of a kind, from their equations and the weights of the cells between, line by line."""
     n = (extra.shape[2] - 2 - kind[2]) // 2

@@ -23,50 +23,50 @@ def _staggered():
     return staggered_plain
 
 
-def net_flow(parts, lower, upper, b):
-    """Face components -> b = sum over the axes of upper v[i + 1] + lower v[i]; returns the sum of its squares.
+def net_flow(x, shape, lines, b):
+    """Face field -> b = sum over the axes of upper v[i + 1] + lower v[i]; returns the sums of squares of b and x.
 
     Parameters
     ----------
-    parts : three ndarrays
-        C-contiguous float64 with three axes, leading ones of length 1; the last component has entries,
-        a component that is not there none.
-    lower, upper : three ndarrays each
-        One coefficient for each cell along the axis.
-    b : ndarray, shape (n0, n1, n2)
-        C-contiguous float64.
+    x : flat float64 array
+        The components of a face field, one after the other.
+    shape : tuple of six
+        Cells (n0, n1, n2), leading ones where there are fewer axes, and faces along each axis: n, one more
+        between walls, 0 for an axis that is not there.
+    lines : array, shape (2, n0 + n1 + n2)
+        Lower and upper coefficients of the cells along each axis.
+    b : flat float64 array, one number for each cell
 
     Examples
     --------
     >>> import numpy as np
-    >>> v, b, none = np.array([[[0.0, 1.0, 3.0]]]), np.zeros((1, 1, 2)), np.zeros((0, 0, 0))
-    >>> ones = (np.ones(1), np.ones(1), np.ones(2))
-    >>> net_flow((none, none, v), tuple(-line for line in ones), ones, b)
-    5.0
+    >>> b, lines = np.zeros(2), np.array([[0.0, 0.0, -1.0, -1.0], [0.0, 0.0, 1.0, 1.0]])
+    >>> net_flow(np.array([0.0, 1.0, 3.0]), (1, 1, 2, 0, 0, 3), lines, b)
+    (5.0, 10.0)
     >>> b
-    array([[[1., 2.]]])
+    array([1., 2.])
     """
-    return _staggered().net_flow(*parts, lower, upper, b)
+    return _staggered().net_flow(x, shape, lines, b)
 
 
-def push(x, p, keep, below, above, axis, out):
-    """One face component -> out = keep x + below p[i - 1] + above p[i], one coefficient for each face along `axis`.
+def push(x, p, shape, lines, out):
+    """Face and cell field -> out = keep x + below p[i - 1] + above p[i], one coefficient for each face along its axis.
 
     Parameters
     ----------
-    x, p, out : ndarrays
-        As in `net_flow`: a component, a cell field, the result in the shape of x.
-    keep, below, above : three ndarrays each
-    axis : int
-        0, 1 or 2.
+    x, p, out : flat float64 arrays
+        A face field, a cell field, the result.
+    shape : tuple of six
+        As in `net_flow`.
+    lines : array, shape (3, faces along the axes)
+        keep, below and above of the faces along each axis, one axis after the other.
 
     Examples
     --------
     >>> import numpy as np
-    >>> x, p, out = np.ones((1, 1, 3)), np.array([[[2.0, 5.0]]]), np.zeros((1, 1, 3))
-    >>> inside = (np.array([0.0, 1.0, 0.0]),) * 3
-    >>> push(x, p, inside, tuple(-line for line in inside), inside, 2, out)
+    >>> out, lines = np.zeros(3), np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+    >>> push(np.ones(3), np.array([2.0, 5.0]), (1, 1, 2, 0, 0, 3), lines, out)
     >>> out
-    array([[[0., 4., 0.]]])
+    array([0., 4., 0.])
     """
-    _staggered().push(x, p, keep, below, above, axis, out)
+    _staggered().push(x, p, shape, lines, out)

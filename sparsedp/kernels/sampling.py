@@ -19,8 +19,9 @@ from sparsedp.kernels import compiled, sampling_plain
 from sparsedp.kernels.unable import warn_unable
 
 __all__ = ["Points", "advance", "extend", "extrema", "fold", "gather", "layers", "mean_of_equal", "scatter", "slopes"]
-__all__ += ["finite", "retreat", "spread_to_equal"]
+__all__ += ["finite", "miss", "retreat", "sides", "spread_to_equal", "way_back"]
 
+NONE = np.empty(0)
 LIKE = {1: (0.0,), 2: (0.0, 0.0), 4: (0.0,) * 4}  # their lengths tell the compiler how many weights there are
 
 
@@ -74,9 +75,9 @@ def extend(points, u, outside):
     return samples
 
 
-def fold(points, samples, u, outside):
-    """The transpose of `extend`, added to u and outside (which may be empty)."""
-    _loop("fold")(u, outside, *points[:1], *points[3:5], *points[6:], samples)
+def fold(points, samples, u, outside, fresh=False):
+    """The transpose of `extend`, added to u and outside (which may be empty), or written there when they are fresh."""
+    _loop("fold")(u, outside, *points[:1], *points[3:5], *points[6:], samples, fresh)
 
 
 def gather(points, samples, w, scale, out):
@@ -125,9 +126,46 @@ def advance(points, u, outside, w, scale, out):
     return _loop("advance", like)(u, outside, *ghosts, np.empty(size), w, scale, wraps, like, out)
 
 
-def retreat(points, u, outside, w, scale, g, field, aside, speeds):
-    """The transpose of `advance` and the slopes: added to field and aside, and to speeds; what is empty is left out."""
+def retreat(points, u, outside, w, scale, g, field, aside, speeds, fresh, room=np.empty):
+    """The transpose of `advance` and the slopes: added to field and aside, and to speeds; what is empty is left out.
+
+    What is fresh, (field and aside, speeds), is written instead. Returns what speeds gained, times w, in total.
+    room: size -> an array, for the samples and their cotangents.
+    """
     shape, wraps, like, strides, corner, size, targets, sources = points
-    ghosts, scratch = (shape, strides, corner, targets, sources), np.empty((2, size))
-    places = w, scale, wraps, like
-    _loop("retreat", like)(u, outside, *ghosts, scratch[0], *places, g, scratch[1], field, aside, speeds)
+    ghosts, places = (shape, strides, corner, targets, sources), (w, scale, wraps, like)
+    samples, back = room(size) if speeds[2].size else NONE, room(size) if field.size else NONE
+    return _loop("retreat", like)(u, outside, *ghosts, samples, places, g, back, field, aside, speeds, fresh)
+
+
+def sides(points, samples, w, scale):
+    """Interpolated values at all places, and the least and greatest sample of the cell around each."""
+    out, low, high = np.empty(w[0].size), np.empty(w[0].size), np.empty(w[0].size)
+    _loop("sides", points.like)(samples, *_looked_up(points, w, scale), out, low, high)
+    return out, low, high
+
+
+def way_back(points, samples, look, g, shares, speeds, fresh):
+    """`scatter` of g -> samples; `slopes` added to speeds, or written when fresh; their product with w, in total.
+
+    shares, if any: two arrays that go to the least and to the greatest sample of each cell. speeds may be empty.
+    """
+    back, (low, high) = np.zeros(points.size), shares or (NONE, NONE)
+    rest = _looked_up(points, *look)
+    return back, _loop("way_back", points.like)(samples, *rest, g, back, low, high, speeds, fresh)
+
+
+def miss(points, samples, look, found, u, g, bounds, speeds):
+    """The look ahead of MacCormack's way back.
+
+    found: f, at the places of the first look; samples: those of f. bounds: least and greatest value, or nothing; they
+    are overwritten by the parts of g that belong to them. What is left of g is own; -own / 2 goes back to the samples
+    and gives the slopes, written to speeds, which may be empty.
+
+    Returns
+    -------
+    own, samples, product of speeds and w
+    """
+    own, back, (low, high) = np.empty(g.size), np.zeros(points.size), bounds or (NONE, NONE)
+    rest = _looked_up(points, *look)
+    return own, back, _loop("miss", points.like)(samples, *rest, found, u, g, own, back, low, high, speeds)

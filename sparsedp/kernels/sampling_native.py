@@ -9,42 +9,18 @@ import functools
 from numba import njit, types
 from numba.extending import register_jitable
 
+from sparsedp.kernels.pointers import address, pointer
 from sparsedp.kernels.sampling_bounds import extrema, mean_of_equal, spread_to_equal
+from sparsedp.kernels.sampling_looks import add, miss, sides, total, way_back
 from sparsedp.kernels.sampling_places import slope, value
 
 __all__ = ["kernel"]
 
 
-@njit(error_model="numpy")
-def _sum(samples, one, two, three, strides):
-    """Product of the weights of three axes with the samples."""
-    total = 0.0
-    first = one[0] * strides[0] + two[0] * strides[1] + three[0]
-    for i in range(len(one[1])):
-        plane = 0.0
-        for j in range(len(two[1])):
-            at, line = first + i * strides[0] + j * strides[1], 0.0
-            for k in range(len(three[1])):
-                line += three[1][k] * samples[at + k]
-            plane += two[1][j] * line
-        total += one[1][i] * plane
-    return total
-
-
-@njit(error_model="numpy")
-def _add(samples, one, two, three, strides, number):
-    first = one[0] * strides[0] + two[0] * strides[1] + three[0]
-    for i in range(len(one[1])):
-        for j in range(len(two[1])):
-            at, share = first + i * strides[0] + j * strides[1], number * one[1][i] * two[1][j]
-            for k in range(len(three[1])):
-                samples[at + k] += share * three[1][k]
-
-
 @register_jitable(error_model="numpy")
 def gather(samples, w, scale, shape, strides, wraps, like, start, stop, out):
     """out = interpolated samples at i - scale w, for the rows start:stop."""
-    n = shape[2]
+    n, numbers = shape[2], pointer(address(samples), 1.0)
     for row in range(start, stop):
         i, j = divmod(row, shape[1])
         here = row * n
@@ -52,13 +28,13 @@ def gather(samples, w, scale, shape, strides, wraps, like, start, stop, out):
             one = value(i - scale[0] * w[0][here + k], shape[0], wraps[0], like[0])
             two = value(j - scale[1] * w[1][here + k], shape[1], wraps[1], like[1])
             three = value(k - scale[2] * w[2][here + k], n, wraps[2], like[2])
-            out[here + k] = _sum(samples, one, two, three, strides)
+            out[here + k] = total(numbers, one, two, three, strides)
 
 
 @register_jitable(error_model="numpy")
 def scatter(samples, w, scale, shape, strides, wraps, like, start, stop, g):
     """The transpose of `gather`: samples += weights times g."""
-    n = shape[2]
+    n, numbers = shape[2], pointer(address(samples), 1.0)
     for row in range(start, stop):
         i, j = divmod(row, shape[1])
         here = row * n
@@ -67,13 +43,13 @@ def scatter(samples, w, scale, shape, strides, wraps, like, start, stop, g):
                 one = value(i - scale[0] * w[0][here + k], shape[0], wraps[0], like[0])
                 two = value(j - scale[1] * w[1][here + k], shape[1], wraps[1], like[1])
                 three = value(k - scale[2] * w[2][here + k], n, wraps[2], like[2])
-                _add(samples, one, two, three, strides, g[here + k])
+                add(numbers, one, two, three, strides, g[here + k])
 
 
 @register_jitable(error_model="numpy")
 def slopes(samples, w, scale, shape, strides, wraps, like, start, stop, g, out):
     """out += g times the derivative of `gather` in w, axis by axis; an axis that is not there adds nothing."""
-    n = shape[2]
+    n, numbers = shape[2], pointer(address(samples), 1.0)
     for row in range(start, stop):
         i, j = divmod(row, shape[1])
         here = row * n
@@ -88,12 +64,12 @@ def slopes(samples, w, scale, shape, strides, wraps, like, start, stop, g, out):
             number = g[at]
             if len(like[0]) > 1:
                 steep = slope(p, shape[0], wraps[0], like[0])
-                out[0][at] -= scale[0] * number * _sum(samples, steep, two, three, strides)
+                out[0][at] -= scale[0] * number * total(numbers, steep, two, three, strides)
             if len(like[1]) > 1:
                 steep = slope(q, shape[1], wraps[1], like[1])
-                out[1][at] -= scale[1] * number * _sum(samples, one, steep, three, strides)
+                out[1][at] -= scale[1] * number * total(numbers, one, steep, three, strides)
             steep = slope(r, n, wraps[2], like[2])
-            out[2][at] -= scale[2] * number * _sum(samples, one, two, steep, strides)
+            out[2][at] -= scale[2] * number * total(numbers, one, two, steep, strides)
 
 
 @register_jitable(error_model="numpy")
@@ -110,13 +86,19 @@ def extend(u, outside, shape, strides, corner, targets, sources, samples):
 
 
 @register_jitable(error_model="numpy")
-def fold(u, outside, shape, strides, corner, targets, sources, samples):
-    """The transpose of `extend`: added to u and outside."""
+def fold(u, outside, shape, strides, corner, targets, sources, samples, fresh):
+    """The transpose of `extend`: added to u and outside, or written there when they are fresh."""
+    if fresh:
+        outside[:] = 0.0
     for row in range(shape[0] * shape[1]):
         i, j = divmod(row, shape[1])
         at, own = corner + i * strides[0] + j * strides[1], row * shape[2]
-        for k in range(shape[2]):
-            u[own + k] += samples[at + k]
+        if fresh:
+            for k in range(shape[2]):
+                u[own + k] = samples[at + k]
+        else:
+            for k in range(shape[2]):
+                u[own + k] += samples[at + k]
     for k in range(targets.size):
         source = sources[k]
         if source < u.size:
@@ -145,17 +127,23 @@ def advance(u, outside, shape, strides, corner, targets, sources, samples, w, sc
 
 
 def retreat(
-    u, outside, shape, strides, corner, targets, sources, samples, w, scale, wraps, like, g, back, field, aside, speeds
+    u, outside, shape, strides, corner, targets, sources, samples, places, g, back, field, aside, speeds, fresh
 ):
-    """Cotangent of the moved field -> added to field and aside, and to speeds; what is empty is left out."""
-    many = shape[0] * shape[1]
+    """Cotangent of the moved field -> added to field and aside, and to speeds; what is empty is left out.
+
+    What is fresh, (field and aside, speeds), is written instead. Returns what the speeds gained, times w, in total.
+    """
+    (w, scale, wraps, like), many, rate = places, shape[0] * shape[1], 0.0
+    back[:] = 0.0
     if speeds[2].size:
         extend(u, outside, shape, strides, corner, targets, sources, samples)
-        slopes(samples, w, scale, shape, strides, wraps, like, 0, many, g, speeds)
-    if field.size:
-        back[:] = 0.0
+        none = field[:0]
+        rate = way_back(samples, w, scale, shape, strides, wraps, like, 0, many, g, back, none, none, speeds, fresh[1])
+    else:
         scatter(back, w, scale, shape, strides, wraps, like, 0, many, g)
-        fold(field, aside, shape, strides, corner, targets, sources, back)
+    if field.size:
+        fold(field, aside, shape, strides, corner, targets, sources, back, fresh[0])
+    return rate
 
 
 # ---------------------------------------------------------------- compiling
@@ -172,31 +160,36 @@ def _looked_up(like):
     return types.UniTuple(_read, 3), _scale, _threes, _pair, _flags, kinds, _int, _int
 
 
-_first, _last = (_read, _read, *_ghosts, _write), (_write, _write, _write, types.UniTuple(_write, 3))
-_KERNELS = {  # name: function, its arguments before and after the places, or all of them
-    "gather": (gather, (_read,), (_write,)),
-    "scatter": (scatter, (_write,), (_read,)),
-    "slopes": (slopes, (_read,), (_read, types.UniTuple(_write, 3))),
-    "extrema": (extrema, (_read,), (_write, _write)),
-    "mean_of_equal": (mean_of_equal, (_read, _read, _read), (_write,)),
-    "spread_to_equal": (spread_to_equal, (_read, _read, _write), (_read,)),
-    "extend": (extend, (_read, _read, *_ghosts, _write), None),
-    "fold": (fold, (_write, _write, *_ghosts, _read), None),
-    "finite": (finite, (_read,), None),
-    "advance": (advance, _first, (_write,)),
-    "retreat": (retreat, _first, (_read, *_last)),
+_axes, _flag = types.UniTuple(_write, 3), types.boolean
+_back = (_write, _write, _write, _axes)  # where cotangents go
+_KERNELS = {  # name: function, result, its arguments before and after the places, or all of them
+    "gather": (gather, types.void, (_read,), (_write,)),
+    "scatter": (scatter, types.void, (_write,), (_read,)),
+    "slopes": (slopes, types.void, (_read,), (_read, _axes)),
+    "extrema": (extrema, types.void, (_read,), (_write, _write)),
+    "mean_of_equal": (mean_of_equal, types.void, (_read, _read, _read), (_write,)),
+    "spread_to_equal": (spread_to_equal, types.void, (_read, _read, _write), (_read,)),
+    "sides": (sides, types.void, (_read,), (_write, _write, _write)),
+    "miss": (miss, _real, (_read,), (_read, _read, _read, _write, *_back)),
+    "way_back": (way_back, _real, (_read,), (_read, *_back, _flag)),
+    "extend": (extend, types.void, (_read, _read, *_ghosts, _write), None),
+    "fold": (fold, types.void, (_write, _write, *_ghosts, _read, _flag), None),
+    "finite": (finite, _flag, (_read,), None),
+    "advance": (advance, _flag, (_read, _read, *_ghosts, _write), (_write,)),
+    "retreat": (retreat, _real, (_read, _read, *_ghosts, _write), (_read, *_back, types.UniTuple(_flag, 2))),
 }
 
 
 @functools.cache
 def kernel(name, like):
     """The compiled function, kept on disk where there is a place to keep it."""
-    function, first, last = _KERNELS[name]
+    function, kind, first, last = _KERNELS[name]
     places = _looked_up(like)
-    if name in ("advance", "retreat"):
+    if name == "advance":
         places = *places[:2], *places[4:6]
+    if name == "retreat":
+        places = (types.Tuple([*places[:2], *places[4:6]]),)
     signature = first if last is None else first + places + last
-    kind = types.boolean if name in ("finite", "advance") else types.void
     try:
         return njit([kind(*signature)], nogil=True, cache=True, error_model="numpy")(function)
     except (OSError, RuntimeError):

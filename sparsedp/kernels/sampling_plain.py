@@ -13,10 +13,13 @@ __all__ = [
     "fold",
     "gather",
     "mean_of_equal",
-    "scatter",
-    "slopes",
+    "miss",
     "retreat",
+    "scatter",
+    "sides",
+    "slopes",
     "spread_to_equal",
+    "way_back",
 ]
 
 
@@ -117,8 +120,10 @@ def extend(u, outside, shape, strides, corner, targets, sources, samples):
     samples[targets] = np.concatenate([u, outside])[sources]
 
 
-def fold(u, outside, shape, strides, corner, targets, sources, samples):
+def fold(u, outside, shape, strides, corner, targets, sources, samples, fresh):
     """See `sampling_native`."""
+    if fresh:
+        u[:], outside[:] = 0.0, 0.0
     view = u.reshape(shape)
     view += _inner(corner, shape, strides, samples)
     ghosts = np.bincount(sources, samples[targets], u.size + outside.size)
@@ -179,13 +184,61 @@ def advance(u, outside, shape, strides, corner, targets, sources, samples, w, sc
 
 
 def retreat(
-    u, outside, shape, strides, corner, targets, sources, samples, w, scale, wraps, like, g, back, field, aside, speeds
+    u, outside, shape, strides, corner, targets, sources, samples, places, g, back, field, aside, speeds, fresh
 ):
     """See `sampling_native`."""
+    (w, scale, wraps, like), rate = places, 0.0
+    rest = w, scale, shape, strides, wraps, like, 0, 0
+    back[:] = 0.0
     if speeds[2].size:
         extend(u, outside, shape, strides, corner, targets, sources, samples)
-        slopes(samples, w, scale, shape, strides, wraps, like, 0, 0, g, speeds)
+    rate = way_back(samples, *rest, g, back, back[:0], back[:0], speeds, fresh[1])
     if field.size:
-        back[:] = 0.0
-        scatter(back, w, scale, shape, strides, wraps, like, 0, 0, g)
-        fold(field, aside, shape, strides, corner, targets, sources, back)
+        fold(field, aside, shape, strides, corner, targets, sources, back, fresh[0])
+    return rate
+
+
+def sides(samples, w, scale, shape, strides, wraps, like, start, stop, out, low, high):
+    """See `sampling_looks`."""
+    places = w, scale, shape, strides, wraps, like, start, stop
+    gather(samples, *places, out)
+    extrema(samples, *places, low, high)
+
+
+def way_back(samples, w, scale, shape, strides, wraps, like, start, stop, g, back, low, high, out, fresh):
+    """See `sampling_looks`."""
+    places = w, scale, shape, strides, wraps, like, start, stop
+    if back.size:
+        scatter(back, *places, g)
+    if low.size:
+        least, most = np.empty((2, low.size))
+        extrema(samples, *places, least, most)
+        for bound, share in ((least, low), (most, high)):
+            spread_to_equal(samples, bound, back, *places, share)
+    return _gained(samples, places, g, out, fresh) if out[2].size else 0.0
+
+
+def _gained(samples, places, g, out, fresh):
+    """Slopes to out, and what they add to it times w."""
+    w, like = places[0], places[5]
+    gain = [np.zeros(g.size) if len(n) > 1 else g[:0] for n in like]
+    slopes(samples, *(*places, g, gain))
+    total = 0.0
+    for axis, change in enumerate(gain):
+        if len(like[axis]) > 1:
+            np.add(out[axis], change, out=out[axis]) if not fresh else np.copyto(out[axis], change)
+            total += float(np.sum(change * w[axis]))
+    return total
+
+
+def miss(samples, w, scale, shape, strides, wraps, like, start, stop, f, u, g, own, back, low, high, out):
+    """See `sampling_looks`."""
+    places, free = (w, scale, shape, strides, wraps, like, start, stop), 1.0
+    gather(samples, *places, own)
+    if low.size:
+        new = f + 0.5 * (u - own)
+        under, over = np.heaviside(low - new, 0.5), np.heaviside(new - high, 0.5)
+        low[:], high[:], free = under * g, over * g, 1.0 - under - over
+    own[:] = free * g
+    scatter(back, *places, -0.5 * own)
+    return _gained(samples, places, -0.5 * own, out, True) if out[2].size else 0.0

@@ -1,6 +1,10 @@
 """NumPy twins of the passes in staggered.py, as a careful user writes them: slices."""
 
+from math import prod
+
 import numpy as np
+
+from sparsedp.kernels import squares
 
 __all__ = ["net_flow", "push"]
 
@@ -19,14 +23,25 @@ def _cut(axis, start, stop):
     return tuple(slice(start, stop) if a == axis else slice(None) for a in range(3))
 
 
-def net_flow(x0, x1, x2, lower, upper, b):
-    """See `sparsedp.kernels.net_flow`."""
+def net_flow(x, shape, lines, b):
+    """See `sparsedp.kernels.passes.net_flow`."""
     b[...] = 0.0
-    for axis, x in enumerate((x0, x1, x2)):
-        if x.size:
-            n = b.shape[axis]
-            _add_flow(x, lower[axis], upper[axis], axis, n, b)
-    return float(np.einsum("ijk,ijk->", b, b))
+    cells = b.reshape(shape[:3])
+    (lower, upper), ends = lines, np.cumsum(shape[:3])
+    for axis, part in _components(x, shape):
+        here = slice(ends[axis] - shape[axis], ends[axis])
+        _add_flow(part, lower[here], upper[here], axis, shape[axis], cells)
+    return float(squares(b)), float(squares(x))
+
+
+def _components(x, shape):
+    """Pairs (axis, component) of a flat face field."""
+    start = 0
+    for axis, faces in enumerate(shape[3:]):
+        part = tuple(faces if a == axis else n for a, n in enumerate(shape[:3]))
+        start, stop = start + prod(part), start
+        if faces:
+            yield axis, x[stop:start].reshape(part)
 
 
 def _add_flow(x, lower, upper, axis, n, b):
@@ -50,10 +65,16 @@ def _both(low, here, high, ahead):
     return part
 
 
-def push(x, p, keep, below, above, axis, out):
-    """See `sparsedp.kernels.push`."""
+def push(x, p, shape, lines, out):
+    """See `sparsedp.kernels.passes.push`."""
+    p, ends = p.reshape(shape[:3]), np.cumsum(shape[3:])
+    for (axis, given), (_, found) in zip(_components(x, shape), _components(out, shape), strict=True):
+        keep, below, above = lines[:, ends[axis] - shape[3 + axis] : ends[axis]]
+        _push_along(axis, given, p, keep, below, above, found)
+
+
+def _push_along(axis, x, p, stay, low, high, out):
     n, m = p.shape[axis], x.shape[axis]
-    stay, low, high = keep[axis], below[axis], above[axis]
     inner = _cut(axis, 1, n)
     if n > 1:
         a, b, c = (_spread(line[1:n], axis) for line in (stay, low, high))

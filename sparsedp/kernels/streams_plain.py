@@ -28,8 +28,9 @@ class Numbers:
     def step(self):
         return Numbers(0.5 * (self.value > 0) + 0.5 * (self.value >= 0))
 
-    def above(self):
-        return Numbers(1.0 * (self.value > 0))
+    def alike(self, other):
+        here, there = self.value, other.value
+        return Numbers(1.0 * (((here > 0) & (there > 0)) | ((here < 0) & (there < 0))))
 
     def zero(self):
         return Numbers(1.0 * (self.value == 0))

@@ -17,7 +17,7 @@ TILE = 16384  # numbers of a line handled at a time, so that neighbouring lines 
 BAND = 32768  # numbers of a band of columns that is eliminated at a time: solution and pivots stay in L2
 PLANE = 32768  # numbers of a plane handled at a time: three planes and the output fit in L2
 
-_inner = njit(error_model="numpy")
+_inner = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 _inlined = njit(error_model="numpy", inline="always")  # a compiled function is optimised again wherever it is called
 
 

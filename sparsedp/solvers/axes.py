@@ -6,10 +6,11 @@ Fourier transform). For a stretched grid S is the square root of the cell widths
 Sources: Lynch, Rice, Thomas, Numer. Math. 6 (1964), direct solution by tensor products;
 Strang, SIAM Review 41 (1999), the discrete cosine transform; Hockney, J. ACM 12 (1965), transforms along one
 axis and elimination along the other; Grassmann, Taksar, Heyman, Operations Research 33 (1985), pivots without
-subtractions.
+subtractions; Bracewell, J. Opt. Soc. Am. 73 (1983), the real form of the Fourier transform.
 """
 
 from functools import cached_property
+from math import prod
 
 import numpy as np
 import scipy.fft as fft
@@ -40,6 +41,17 @@ class Axis:
         self.scaling = scaling
         self.vectors = vectors
 
+    def dense(self):
+        """The same axis, its transform written as a matrix: on a short axis one product is less than one call."""
+        n = self.eigenvalues.size
+        if self.kind == "fourier":  # the real form of it: both modes of a pair have the same eigenvalue
+            angle = 2 * np.pi / n * (np.outer(np.arange(n), np.arange(n)) % n)
+            return Axis(self.kind, self.eigenvalues, vectors=(np.cos(angle) + np.sin(angle)) / np.sqrt(n))
+        if self.kind in ("identity", "eigenvectors"):
+            return self
+        _, back, number = self._transforms
+        return Axis(self.kind, self.eigenvalues, vectors=back(np.eye(n), number, axis=0, norm="ortho"))
+
     @cached_property
     def _transforms(self):
         function = {"c": (fft.dct, fft.idct), "s": (fft.dst, fft.idst)}[self.kind[1]]
@@ -47,17 +59,17 @@ class Axis:
 
     def forward(self, x, axis, transposed, workers, overwrite):
         """Field along `axis` -> coefficients. `overwrite`: the memory of x may be used."""
-        if self.kind == "eigenvectors":
+        if self.vectors is not None:
             return self._turn(x, axis, self._scale(transposed), self.vectors.T, None)
         there, _, number = self._transforms
         return there(x, number, axis=axis, norm="ortho", overwrite_x=overwrite, workers=workers)
 
     def backward(self, y, axis, transposed, workers):
         """Coefficients along `axis` -> field. May overwrite y."""
+        if self.vectors is not None:
+            return self._turn(y, axis, None, self.vectors, self._scale(not transposed))
         if self.kind in ("identity", "fourier"):
             return y
-        if self.kind == "eigenvectors":
-            return self._turn(y, axis, None, self.vectors, self._scale(not transposed))
         _, back, number = self._transforms
         return back(y, number, axis=axis, norm="ortho", overwrite_x=True, workers=workers)
 
@@ -72,9 +84,11 @@ class Axis:
             matrix = matrix * before
         if after is not None:
             matrix = after[:, None] * matrix
-        n, tail = x.shape[axis], x.shape[axis + 1 :]
-        flat = x.reshape(-1, n, int(np.prod(tail)))
-        return (np.matmul(matrix, flat) if tail else flat[:, :, 0] @ matrix.T).reshape(x.shape)
+        n = x.shape[axis]
+        if axis == x.ndim - 1:
+            return (x.reshape(-1, n) @ matrix.T).reshape(x.shape)
+        flat = x.reshape(n, -1) if axis == 0 else x.reshape(-1, n, prod(x.shape[axis + 1 :]))
+        return np.matmul(matrix, flat).reshape(x.shape)
 
 
 def diagonalise(factor):

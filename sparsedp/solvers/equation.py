@@ -58,6 +58,8 @@ class Layout:
             return float(x[0])
         starts = [0, *self.ends]
         parts = zip(starts, self.ends, self.shapes, self.dtypes)
+        if not isbox(x):
+            return self.rebuild(x[a:b].astype(kind).reshape(shape) for a, b, shape, kind in parts)
         return self.rebuild(_part(self.size, *part)(x) for part in parts)
 
 

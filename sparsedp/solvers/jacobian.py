@@ -4,6 +4,7 @@ Set-ups are kept by content, the last two: of the point (x and the parameters, f
 and of the entries (a residual that is linear in x is set up once). Forward solves never look a point up.
 """
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,9 @@ from sparsedp.solvers.choose import build
 from sparsedp.solvers.colouring import Coloured
 from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.linearisation import Linearisation
+from sparsedp.solvers.small import Small
 from sparsedp.solvers.sparsity import dense_pattern, find_pattern
+from sparsedp.solvers.surroundings import Surroundings, cells_met
 from sparsedp.tape import isbox
 
 __all__ = ["Jacobians"]
@@ -45,8 +48,9 @@ class Jacobians:
         self.name, self.given, self.settings = name, jacobian, settings
         self.sparsity: Any = None if sparsity is None else _pattern(sparsity)
         self.by_rows = None  # True: the residual has no JVP
-        self.way = ""
+        self.way, self._space = "", None
         self._patterns: dict = {}  # size -> Coloured, or None when only products will do
+        self._around: dict = {}  # size -> Surroundings, where Operators tell that the unknowns lie on cells
         self._points, self._matrices = Kept(), Kept()
 
     def __str__(self):
@@ -58,10 +62,10 @@ class Jacobians:
 
     def fresh(self, equation, x, leaves):
         """The Jacobian at this point, made now."""
-        op = self._operator(equation, x, leaves)
+        op, small, exact = self._made(equation, x, leaves)
         point = equation, x.copy(), [np.array(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
-        ours = self.given is None and not op.structure.has_entries  # bare products are the derivative itself
-        return self._points.put(_key(equation, x, leaves), Linearisation(op, self._inverse(op), point, ours))
+        known = Linearisation(op, self._inverse, point, exact, self.settings["rtol"], small)
+        return self._points.put(_key(equation, x, leaves), known)
 
     def kept(self, equation, x, leaves):
         """The Jacobian at this point for a derivative: kept or made, and checked against the residual."""
@@ -115,17 +119,25 @@ class Jacobians:
 
     # ------------------------------------------------------------ three ways to a Jacobian
 
-    def _operator(self, equation, x, leaves):
+    def _made(self, equation, x, leaves):
+        """(Operator or what makes it, dense factors or None, whether it is the derivative itself)."""
         name = f"{self.name}.jacobian"
         if self.given is not None:
             self.way = "given"
             given = self.given(equation.layout.split(x), *equation.params(leaves))
-            return self._as_operator(given, equation.size, name)
+            return self._as_operator(given, equation.size, name), None, False
         coloured = self._coloured(equation, x, leaves)
         if coloured is None:
             forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
-            return from_functions(forward, backward, equation.size, equation.size, name)
-        return from_matrix(coloured.matrix(self._product(equation, x, leaves, coloured.by_rows)), name=name)
+            return from_functions(forward, backward, equation.size, equation.size, name), None, True
+        matrix = coloured.matrix(self._product(equation, x, leaves, coloured.by_rows))
+        small = None
+        if equation.size <= Small.most and self.settings["method"] in ("auto", "direct"):
+            small = Small(matrix.toarray())
+        around = self._around.get(equation.size)
+        space = around.space if around is not None and around.suit(matrix) else equation.size
+        full = coloured.by_rows and coloured.pattern.nnz == equation.size**2
+        return partial(from_matrix, matrix, space, space, name), small, full
 
     def _as_operator(self, given, size, name):
         if isbox(given):
@@ -166,9 +178,9 @@ class Jacobians:
             elif size <= FULL_UP_TO:
                 found, self.way = dense_pattern(size, size), "assembled, all entries"
             else:
-                found = self._search(equation, x, leaves)
+                found, self._space = self._search(equation, x, leaves), cells_met(equation, x, leaves)
                 found = self._not_sparse(found, size, method)
-            self._colour(found, equation)
+            self._colour(found, equation, x, leaves)
         return self._patterns[size]
 
     def _given_pattern(self, size):
@@ -187,10 +199,14 @@ class Jacobians:
         self.way = "assembled, all entries: it is not sparse"
         return dense_pattern(size, size)
 
-    def _colour(self, pattern, equation):
+    def _colour(self, pattern, equation, x, leaves):
         shapes = equation.layout.shapes
         shape = shapes[0] if len(shapes) == 1 else None
-        coloured = None if pattern is None else Coloured(pattern, shape, self.by_rows or None)
+        # One tape serves all products with J^T; each with J takes a run of its own.
+        mirrored = pattern is not None and _mirrored(pattern) and _has_vjp(equation, x, leaves)
+        coloured = None if pattern is None else Coloured(pattern, shape, True if self.by_rows or mirrored else None)
+        space = self._space if mirrored else None
+        self._around[equation.size] = None if space is None else Surroundings(space, pattern)
         self._patterns[equation.size] = coloured
 
     def _search(self, equation, x, leaves):
@@ -213,11 +229,18 @@ class Jacobians:
         if total.nnz == old.nnz:
             raise DerivativeError(f"the derivative of {self.name} is not linear in its direction in row {row}")
         total.data[:] = 1.0
-        self._colour(total, equation)
+        self._colour(total, equation, x, leaves)
 
 
 def _key(equation, x, leaves):
     return (x, *leaves, *equation.statics, *equation.layout.shapes)
+
+
+def _mirrored(pattern):
+    """Whether a pattern is its own transpose."""
+    turned = pattern.T.tocsr()
+    turned.sort_indices()
+    return np.array_equal(turned.indptr, pattern.indptr) and np.array_equal(turned.indices, pattern.indices)
 
 
 def _pattern(sparsity):
@@ -246,6 +269,14 @@ def _is_valid(equation, x, leaves):
 def _has_jvp(equation, x, leaves):
     try:
         pushforward(lambda y: equation(y, *leaves), x, np.ones_like(x))
+    except NO_JVP:
+        return False
+    return True
+
+
+def _has_vjp(equation, x, leaves):
+    try:
+        equation.transposed(x, leaves)(np.ones_like(x))
     except NO_JVP:
         return False
     return True

@@ -1,10 +1,12 @@
 """The Jacobian of a residual at one point, as Newton's method and the derivative rules use it."""
 
 from copy import copy
+from functools import cached_property
 
 import numpy as np
 
 from sparsedp.errors import ConvergenceError
+from sparsedp.ledger import active as recordings
 from sparsedp.solvers import facts
 from sparsedp.solvers.record import failure
 
@@ -16,19 +18,54 @@ class Linearisation:
 
     Parameters
     ----------
-    op : Operator
-    inv : Inverse of `op`
+    op : Operator, or a function that makes it
+        Where `small` serves, it is not made until somebody asks.
+    setup : callable
+        ``setup(op)``: its Inverse.
     point : (equation, x, leaves)
         Plain copies.
     checked : bool
         Whether J is known to be the derivative of the residual.
+    rtol : float
+        Tolerance of `solve`.
+    small : Small or None
+        Its dense factors. While calls are counted the general path runs, which everything counts and observes.
     """
 
-    def __init__(self, op, inv, point, checked):
-        self.op, self.inv, self.point, self.checked = op, inv, point, checked
+    def __init__(self, op, setup, point, checked, rtol, small=None):
+        self._op, self._setup = op, setup
+        self.point, self.checked, self.rtol = point, checked, rtol
+        self._small = small if small is not None and small.sound else None
+        if self.small is None:
+            self.inv  # noqa: B018  a set-up that fails must fail here
+
+    @property
+    def small(self):
+        """The dense factors, when they serve."""
+        return None if recordings else self._small
+
+    @cached_property
+    def op(self):
+        """J as an Operator."""
+        return self._op() if not hasattr(self._op, "structure") else self._op
+
+    @cached_property
+    def inv(self):
+        """Its Inverse."""
+        return self._setup(self.op)
+
+    @property
+    def told(self):
+        """(seconds of the set-up, what was set up)."""
+        if self.small is not None:
+            return self.small.seconds, str(self.small)
+        return self.inv.info.setup_seconds, self.inv.info.hierarchy
 
     def step(self, F, forcing):
         """The Newton step -J^-1 F, up to the relative residual `forcing`. Never refused: the next residual judges."""
+        found = None if self.small is None else self.small.solve(-F, forcing)
+        if found is not None:
+            return found[0]
         solver = copy(self.inv.solver)
         solver.system = copy(solver.system)
         solver.system.rtol = max(forcing, solver.system.rtol)
@@ -41,7 +78,10 @@ class Linearisation:
             return error.best.reshape(-1)  # a step that is not exact may still lead downhill
 
     def solve(self, b, transposed):
-        """J^-1 b or J^-T b, to the full tolerance. Refused when the root is not isolated."""
+        """(J^-1 b or J^-T b to the full tolerance, its record). Refused when the root is not isolated."""
+        found = None if self.small is None else self.small.solve(b, self.rtol, transposed)
+        if found is not None:
+            return found
         solver = self.inv.solver
         if self.singular and solver.nullspace == "raise":
             raise ConvergenceError(
@@ -49,21 +89,26 @@ class Linearisation:
                 "derivative; add an equation that fixes it or write nullspace='project'",
                 info=failure("setup_failed"),
             )
-        return solver.solve(b, transposed, checked=False)
+        x = solver.solve(b, transposed, checked=False)
+        return x, self.inv.info.adjoint if transposed else self.inv.info.forward
 
     @property
     def singular(self):
         """Whether a null space of J, or an unknown that no equation uses, is known."""
+        if self.small is not None:
+            return False
         system = self.inv.solver.system
         return system.active is not None or system.null_space.count > 0
 
     def product(self, x):
         """J x."""
-        return self.op._flat.apply(x)
+        return self.op._flat.apply(x) if self.small is None else self.small.product(x)
 
     @property
     def norm(self):
         """|J|_inf, or an upper bound."""
+        if self.small is not None:
+            return self.small.norm
         system = self.inv.solver.system
         return float(np.ldexp(system.norm(False), system.exponent))
 

@@ -5,6 +5,10 @@ for linear systems (see contract.py), x is accepted when
 
     |F| <= rtol |b|,    or    |F| <= 8 eps (|J| |x| + |b|)    (converged_at_roundoff).
 
+A Jacobian serves further steps (simplified Newton) while they leave at most a tenth of the residual and the rest
+of the way is short. Such steps gain digits at a fixed rate, where a Newton step doubles them and most often ends
+far below the tolerance; they go on to rtol / 1000, so that roots found either way are as good.
+
 Where no step lowers the residual any more, F may be rounding of terms that cancel (the 1 in exp(x) - 1).
 It is taken for that, and x for converged_at_roundoff, when |F| <= 64 eps (|J| |x| + |b| + the largest |F|
 met + |F_p p|) and J is right about F a thousand steps further: then neither J nor a kink is to blame.
@@ -19,6 +23,8 @@ from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import check_finite
 from sparsedp.solvers.contract import norm
 from sparsedp.solvers.nullspace import ROUNDING
+from sparsedp.solvers.scaling import in_range
+from sparsedp.solvers.small import Small, size_of
 
 __all__ = ["Newton", "length"]
 
@@ -27,6 +33,8 @@ DECREASE = 1e-4  # share of the decrease a linear residual would show that a ste
 SLOW = 0.25  # a residual that falls by less makes a Jacobian suspect
 FAR = 1024.0  # Newton steps: where rounding is no longer seen
 LOOSEST = 1e-2  # relative residual of the linear solve of a first step
+KEPT, MOST_KEPT = 0.1, 8  # a Jacobian is kept while a step leaves less, and for as many steps to the end
+FURTHER = 1e-3  # of the tolerance, for steps with a Jacobian that was kept
 TINY = 1e-8  # an iterate that is smaller than the last one by this share may be on its way to 0
 
 
@@ -42,43 +50,72 @@ class Newton:
     maxiter : int
     run : Run
         Its figures are filled in.
+    steps : bool
+        Whether it is one of many solves of steps in time. Then the guess, the state before, is only taken for the
+        root where it is one to rounding: what little changes in each of many short steps adds up. And a Jacobian
+        may serve several Newton steps; of larger systems it always may.
     """
 
-    def __init__(self, equation, leaves, jacobians, rtol, maxiter, run):
+    def __init__(self, equation, leaves, jacobians, rtol, maxiter, run, steps=False):
         self.equation, self.leaves, self.jacobians = equation, leaves, jacobians
         self.rtol, self.maxiter, self.run = rtol, maxiter, run
         self.x: np.ndarray
         self.F: np.ndarray
+        self.size = 0.0  # |F|
+        self.steps, self.keeps = steps, steps or equation.size > Small.most
         self.J: Any = None
+        self.stale = False  # whether J is that of an earlier iterate
         self.largest = 0.0  # residual met
 
-    def solve(self, guess):
-        """From a guess to a root. Raises ConvergenceError with the best iterate."""
+    def solve(self, guess, start=None):
+        """From a guess to a root, the first steps with the Jacobian `start` where there is one.
+
+        Raises ConvergenceError with the best iterate.
+        """
         self.x, self.F = guess, self._first(guess)
+        self.size = length(self.F)
         word, forcing = "" if self.F.any() else "converged", LOOSEST
         if not word:
-            self._linearise()
-            word = self._accepted()
+            self._begin(start)
+            word = self._accepted(0.0 if self.steps else 1.0)
         while not word:
-            before = length(self.F)
+            before = self.size
             if self.run.iterations == self.maxiter:
                 self._fail("max_iterations")
             step = self._step(forcing)
             if self._moved(step):
                 self.run.iterations += 1
-                ratio = length(self.F) / before
-                word = self._accepted()
-                if not word:
-                    if ratio > SLOW:
-                        self.jacobians.suspected(self.J)
-                    self._linearise()
-                    forcing = float(np.clip(0.9 * ratio**2, self.rtol, LOOSEST))
-            elif self.jacobians.suspected(self.J):
+                word, forcing = self._after(self.size / before, forcing)
+            elif self.stale or self.jacobians.suspected(self.J):
                 self._linearise()
             else:
                 word = self._rounding(step) or self._fail("stagnated")
         self.run.status = word
         return self.x
+
+    def _begin(self, start):
+        if start is None:
+            self._linearise()
+        else:
+            self.J, self.stale = start, True
+
+    def _after(self, ratio, forcing):
+        """The status word after a step that left the share `ratio`, and how closely the next one is solved for."""
+        fresh, self.stale = not self.stale, True
+        word = self._accepted(1.0 if fresh else FURTHER)
+        if word or self._keeps(ratio):
+            return word, LOOSEST
+        if ratio > SLOW and fresh:
+            self.jacobians.suspected(self.J)
+        self._linearise()
+        return "", float(np.clip(0.9 * ratio**2, self.rtol, LOOSEST)) if fresh else LOOSEST
+
+    def _keeps(self, ratio):
+        """Whether the Jacobian is good enough for the rest of the way."""
+        if not self.keeps or ratio > KEPT or not self.run.residual > 0:
+            return False
+        left = np.log(FURTHER * self.rtol / self.run.residual) / np.log(ratio)
+        return bool(left <= MOST_KEPT)
 
     def _first(self, guess):
         name = self.equation.name
@@ -96,7 +133,7 @@ class Newton:
 
     def _linearise(self):
         try:
-            self.J = self.jacobians.fresh(self.equation, self.x, self.leaves)
+            self.J, self.stale = self.jacobians.fresh(self.equation, self.x, self.leaves), False
         except ConvergenceError as error:
             self._fail("setup_failed", f"its Jacobian has no inverse there: {error}; start from another guess")
 
@@ -108,25 +145,26 @@ class Newton:
 
     def _moved(self, step):
         """Go along the step, half of it, a quarter ... until the residual falls. False: it never does."""
-        size, share = length(self.F), 1.0
+        share = 1.0
         for _ in range(HALVINGS):
             x = self.x + share * step
             if np.array_equal(x, self.x):
                 return False
             F = self._value(x)
-            if F is not None and length(F) <= (1 - DECREASE * share) * size:
-                self.x, self.F = self._at_zero(x, F)
+            size = np.inf if F is None else length(F)
+            if size <= (1 - DECREASE * share) * self.size:
+                self.x, self.F, self.size = self._at_zero(x, F, size)
                 return True
             share /= 2
         return False
 
-    def _at_zero(self, x, F):
+    def _at_zero(self, x, F, size):
         """Iterates that shrink to 0 have no scale of their own: 0 itself is tried."""
-        if F.any() and length(x) <= TINY * length(self.x):
+        if size and length(x) <= TINY * length(self.x):
             at_zero = self._value(np.zeros_like(x))
             if at_zero is not None and not at_zero.any():
-                return np.zeros_like(x), at_zero
-        return x, F
+                return np.zeros_like(x), at_zero, 0.0
+        return x, F, size
 
     def _value(self, x):
         """The residual at a trial point, or None where there is none."""
@@ -138,33 +176,35 @@ class Newton:
 
     # ------------------------------------------------------------ the verdict
 
-    def _accepted(self):
-        """The status word, or "" while x is not accepted."""
-        if not self.F.any():
+    def _accepted(self, share=1.0):
+        """The status word, or "" while x is not accepted; `share` of the tolerance."""
+        if not self.size:
             self.run.residual = self.run.backward_error = 0.0
             return "converged"
         residual, data, size = self._sizes()
         self.run.residual, self.run.backward_error = residual / data if data else 1.0, residual / size
-        self.largest = max(self.largest, length(self.F))
+        self.largest = max(self.largest, self.size)
         if not np.isfinite(size):
             return ""
-        if residual <= self.rtol * data:
+        if residual <= share * self.rtol * data:
             return "converged"
         return "converged_at_roundoff" if residual <= ROUNDING * size else ""
 
     def _sizes(self):
         """|F|, |b| and |J| |x| + |b|, in a unit in which the first is near 1."""
-        unit = -_exponent(self.F)  # so that no square leaves the range of floats
         with np.errstate(over="ignore", invalid="ignore"):
+            if in_range(self.size):
+                data = length(self.J.product(self.x) - self.F)
+                return self.size, data, self.J.norm * length(self.x) + data
+            unit = -_exponent(self.F)  # so that no square leaves the range of floats
             F = np.ldexp(self.F, unit)
-            b = np.ldexp(self.J.product(self.x), unit) - F
-            data = length(b)
+            data = length(np.ldexp(self.J.product(self.x), unit) - F)
             return norm(F), data, float(np.ldexp(self.J.norm, unit)) * length(self.x) + data
 
     def _rounding(self, step):
         """The status word when what is left of F is rounding, else ""."""
         residual, _, size = self._sizes()
-        unit = -_exponent(self.F)
+        unit = 0 if in_range(self.size) else -_exponent(self.F)
         size += float(np.ldexp(self.largest + length(self._terms()), unit))
         far = self._value(self.x + FAR * step)
         if far is None or not residual <= 8 * ROUNDING * size:
@@ -197,6 +237,9 @@ class Newton:
 
 def length(v):
     """2-norm of a flat array of any magnitude."""
+    size = size_of(v) if v.size <= Small.most else norm(v)
+    if in_range(size):
+        return size
     exponent = _exponent(v)
     return float(np.ldexp(norm(np.ldexp(v, -exponent)), exponent))
 

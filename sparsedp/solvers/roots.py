@@ -13,6 +13,8 @@ The gradient of <o, J s> = <s, J^T o> is the pullback of (x, p) -> J^T o for the
 derivative of any order takes one linear solve with J or J^T, and derivatives of F.
 """
 
+from contextlib import contextmanager
+
 from sparsedp.derivative import pullback
 from sparsedp.direction import push
 from sparsedp.ledger import active as recordings
@@ -83,8 +85,10 @@ def implicit(
     Formula: J x' = -F_p p'; one adjoint solve with J^T serves all parameters. Derivatives of every order.
     Tolerance: see newton.py; the residual may be scaled by any power of two. A trial point where the
     residual raises UnstableStepError, NonFiniteError or ConvergenceError, or is not finite, is not taken.
-    Cost: per Newton step one product with J per colour (3 for three points in 1-D, 5 in 2-D, 7 in 3-D)
-    and one set-up. The first call also searches the pattern.
+    Cost: per Jacobian one product per colour (3 for three points in 1-D, 5 in 2-D, 7 in 3-D) and one set-up: one
+    for each Newton step, or for several while they contract (more than 64 unknowns, steps of `stepper`); one for
+    each adjoint solve. Products with J^T share one tape. The first call also searches the pattern. J is set up on
+    the grid of the Operators in the residual where it is symmetric there; up to 64 unknowns by dense LU.
 
     Examples
     --------
@@ -119,12 +123,23 @@ class Root:
         self.residual, self.rtol, self.maxiter = residual, rtol, maxiter
         self.name = f"implicit({getattr(residual, '__name__', type(residual).__name__)})"
         self.info = SolveLog()
+        self._series: dict | None = None  # size -> Jacobian of the last solve
+        self.answers: list = []  # roots of the next solves, where the caller knows them
         self._jacobians = Jacobians(self.name, jacobian, sparsity, dict(rtol=rtol, maxiter=None, **settings))
         self._solution = differentiable(self.name, self._newton, self._vjp, self._jvp)
         self._linear = [
             differentiable(f"{self.name}{suffix}", *self._linear_rule(transposed))
             for suffix, transposed in ((".tangent", False), (".T", True))
         ]
+
+    @contextmanager
+    def series(self):
+        """Solves inside have nearly the same Jacobian: each starts with that of the one before."""
+        self._series = {}
+        try:
+            yield
+        finally:
+            self._series = None
 
     def __call__(self, guess, *params):
         """Solve residual(x, *params) = 0 from a guess.
@@ -145,6 +160,8 @@ class Root:
     # ------------------------------------------------------------ the root as a rule of the parameters
 
     def _newton(self, equation, guess, *leaves):
+        if self.answers:
+            return self.answers.pop(0).reshape(-1).copy()
         solved = observers[-1].root if recordings and observers else Root.solved
         x = solved(self, equation, guess, leaves)
         if recordings:
@@ -159,17 +176,19 @@ class Root:
     def solved(self, equation, guess, leaves):
         """Newton's method on flat arrays, recorded in the log."""
         run = Run()
-        newton = Newton(equation, leaves, self._jacobians, self.rtol, self.maxiter, run)
+        newton = Newton(equation, leaves, self._jacobians, self.rtol, self.maxiter, run, self._series is not None)
         try:
-            return newton.solve(guess)
+            return newton.solve(guess, (self._series or {}).get(equation.size))
         finally:
             if run.status:  # else it is an error of the residual
                 self.info.note(run.info(), False)
             if newton.J is not None:
                 self._note_setup(newton.J)
+                if self._series is not None:
+                    self._series[equation.size] = newton.J
 
     def _note_setup(self, known):
-        self.info.setup_seconds, self.info.hierarchy = known.inv.info.setup_seconds, known.inv.info.hierarchy
+        self.info.setup_seconds, self.info.hierarchy = known.told
 
     def _vjp(self, nums, ans, equation, guess, *leaves):
         places = [num - 2 for num in nums]
@@ -193,9 +212,9 @@ class Root:
         def forward(equation, x, b, *leaves):
             known = self._jacobians.kept(equation, x, leaves)
             self._note_setup(known)
-            s = known.solve(b, transposed)
+            s, info = known.solve(b, transposed)
             if transposed:
-                self.info.note(known.inv.info.adjoint, True)
+                self.info.note(info, True)
             return s
 
         def vjp(nums, ans, equation, x, b, *leaves):

@@ -21,6 +21,7 @@ __all__ = ["Separable", "Spectrum", "separable_engine", "spectrum"]
 
 WORTH_THREADS = 131072  # unknowns below which a second thread costs more than it brings
 WIDE_COMPILED, WIDE_PLAIN = 16, 1024  # modes from which elimination along the first axis beats transforms
+SHORT, WORK = 64, 2**18  # points of an axis, and its points times all unknowns, up to which a transform is a matrix
 ZERO = 4 * np.finfo(float).eps  # a sum of eigenvalues below this share of the largest one is 0
 
 
@@ -36,8 +37,10 @@ class Spectrum:
     """
 
     def __init__(self, shape, axes, shift):
+        short = [n <= SHORT and n * prod(shape) <= WORK for n in shape]
+        axes = tuple(axis.dense() if few else axis for axis, few in zip(axes, short, strict=True))
         self.shape, self.axes, self.shift = shape, axes, shift
-        self.fourier = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier")
+        self.fourier = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier" and axis.vectors is None)
         total = np.full((1,) * len(shape), float(shift))
         for a, axis in enumerate(axes):
             if a == 0 and len(axes) > 1 and not np.any(axis.eigenvalues):
@@ -64,7 +67,7 @@ class Spectrum:
         """Flat field -> its coefficients, as a fresh array."""
         x, fresh = x.reshape(self.shape), False
         for a, axis in enumerate(self.axes):
-            if axis.kind not in ("identity", "fourier"):  # Fourier axes are transformed together
+            if a not in self.fourier and axis.kind != "identity":  # Fourier axes are transformed together
                 x, fresh = axis.forward(x, a, transposed, self.workers, fresh), True
         if self.fourier:
             return fft.rfftn(x, axes=self.fourier, workers=self.workers)

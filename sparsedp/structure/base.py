@@ -18,12 +18,15 @@ class Structure:
         float64 or complex128: the field the entries live in.
     has_entries : bool
         Whether `explicit()` can list the entries without applying the map to every unit vector.
+    passes : int
+        How many passes over memory the map takes where it is not fused: for the choice of a form.
     """
 
     shape: tuple[int, int]
     dtype = np.dtype(float)
     has_entries = True
     is_identity = False
+    passes = 1  # over memory, of the matrix-free form
 
     def apply(self, x, out):
         """Write A x into `out`. Both flat and contiguous, out of dtype result_dtype(self, x.dtype)."""
@@ -60,7 +63,7 @@ class Scaled(Structure):
         self.factor = factor
         self.shape = inner.shape
         self.dtype = np.result_type(inner.dtype, complex if np.iscomplexobj(factor) else float)
-        self.has_entries = inner.has_entries
+        self.has_entries, self.passes = inner.has_entries, inner.passes
 
     def apply(self, x, out):
         np.multiply(self.inner.product(x), self.factor, out=out, casting="same_kind")

@@ -30,7 +30,7 @@ class Matrix(Structure):
 
     def apply(self, x, out):
         m = self.matrix
-        if x.dtype == m.dtype == out.dtype:
+        if x.dtype == self.dtype == out.dtype:
             # SciPy's own product spends four times as long on checks as on a small row.
             out.fill(0)
             csr_matvec(*self.shape, m.indptr, m.indices, m.data, x, out)

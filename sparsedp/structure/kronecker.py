@@ -53,6 +53,7 @@ class Kronecker(Structure):
         merged = {key: _merge(terms) for key, terms in blocks.items()}
         self.blocks = {key: terms for key, terms in sorted(merged.items()) if terms}
         self.shape = (sum(map(prod, self.out_parts)), sum(map(prod, self.in_parts)))
+        self.passes = max(1, len(self.blocks))
 
     @classmethod
     def identity(cls, parts):

@@ -63,6 +63,7 @@ class Chain(Structure):
         self.shape = (members[0].shape[0], members[-1].shape[1])
         self.dtype = np.result_type(*(member.dtype for member in members))
         self.has_entries = all(member.has_entries for member in members)
+        self.passes = max(member.passes for member in members)
 
     def apply(self, x, out):
         if x.dtype == float == self.dtype and x.size >= FEW and kernels.compiled():

@@ -35,6 +35,8 @@ class Layout:
         Of all leaves and of the variables, as one would write them: ``state["ink"][0]``.
     bare : bool
         The tree is one variable leaf and nothing else.
+    open : bool
+        Some branch is a dict or a list, whose entries could be changed.
     shapes, dtypes, floats : list
         Of the variable leaves.
     rounds : bool
@@ -60,6 +62,7 @@ class Layout:
             # Rebuilt without the variables: what is kept must not hold a trace or a large array.
             self._template = rebuild(self.statics)
             self._rebuild = flatten(self._template)[1]
+        self.open = not self.bare and _is_open(tree)
         self.names = [self.labels[place] for place in self.places]
         variables = [plain(found[place]) for place in self.places]
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
@@ -176,6 +179,10 @@ class Layout:
     def is_finite(self, values):
         """Whether all variables are finite."""
         return all(surely_finite(value) or bool(np.all(np.isfinite(value))) for value in values)
+
+
+def _is_open(tree):
+    return isinstance(tree, (dict, list)) or (isinstance(tree, tuple) and any(map(_is_open, tree)))
 
 
 def _brief(value):

@@ -66,7 +66,7 @@ class Linked(Taped):
                 p = [start() if place in self._p else None for place in range(len(self.p))]
                 tree = run.params.build(boxed(self._frozen, p, number), self._statics) if self._p else self.params
                 self._last = i, [value], run.state.statics
-                result = run.step(state, tree)
+                result = self._applied(state, tree)
                 if not isbox(result) or result._trace != number or not run.state.is_one(result._value):
                     return value
                 kept.append(owned(value) if i else value)

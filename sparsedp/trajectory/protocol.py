@@ -7,7 +7,7 @@ A step may have, beside its call,
                                                          `into`: a tree like params; the gradient is added to its
                                                          arrays in place, and it is returned as g_params
 
-both on plain trees. Transport and the linear steppers do. Where `step.sparing` is true, backward also takes
+both on plain trees. Transport, the linear steppers and flow_step do. Where `step.sparing` is true, backward also takes
 `new`, the result of the step when it is still known, or None, and `wanted`, whether params want a cotangent.
 Where the state is one array, and params another, it may have a time loop of its own as well, for small states:
 
@@ -17,6 +17,7 @@ Where the state is one array, and params another, it may have a time loop of its
 
 import numpy as np
 
+from sparsedp.tape import dtype_of
 from sparsedp.trajectory.keep import Last
 from sparsedp.trajectory.layout import NOTHING
 from sparsedp.trajectory.linked import Linked
@@ -68,11 +69,11 @@ class Protocol(Taped):
         self._arrays = bool(run.state.shapes) and all(run.state.shapes)
         self._recycles = run.keep.recycles
         self._sparing = run.state.bare and getattr(run.step, "sparing", False)
-        self._into = run.params.build([np.zeros(np.shape(v), v.dtype) for v in self.p]) if self._p else None
+        self._into = run.params.build([np.zeros(np.shape(v), dtype_of(v)) for v in self.p]) if self._p else None
 
     def forward(self, i, values, statics, room=None):
         """Variables and statics of state i -> those of state i + 1."""
-        layout = self.run.state
+        layout, self._last = self.run.state, (i, values, statics)
         if room is None and self._arrays and self._recycles:
             room = self._pool.pop() if self._pool else self._fresh()
         if layout.bare:
@@ -97,7 +98,7 @@ class Protocol(Taped):
 
     def backward(self, i, values, statics, g, want_state):
         """Cotangents of state i + 1 -> those of state i; those of params are added up."""
-        layout, step = self.run.state, self.run.step
+        layout, step, self._last = self.run.state, self.run.step, (i, values, statics)
         if layout.bare:
             more = {"new": self.known and self.known[0], "wanted": bool(self._p)} if self._sparing else {}
             back, self._into = step.backward(values[0], self.params, g[0], self._into, **more)
@@ -129,11 +130,21 @@ class Whole(Protocol):
         states[0], rows = state[0], states[:1]
         while left:
             rows = states[: min(many, left) + 1]
-            run.step.march(rows, self.params)
+            self._march(run.n - left, rows)
             left -= len(rows) - 1
             if left:
                 states[0] = rows[-1]
         return [rows[-1]], Rows(states) if run.store else []
+
+    def _march(self, first, rows):
+        """Fill the rows; where that fails, step by step, so that `guarded` can name the step."""
+        try:
+            self.run.step.march(rows, self.params)
+        except Exception:
+            for i in range(len(rows) - 1):
+                self._last = first + i, [rows[i]], NOTHING
+                self.run.step.march(rows[i : i + 2], self.params)
+            raise
 
     def retreat(self, states, g, growth):
         """Cotangents of the last state -> those of the first."""

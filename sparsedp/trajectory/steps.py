@@ -5,12 +5,20 @@ from contextlib import contextmanager
 import numpy as np
 
 from sparsedp.direction import pull_ends, zero_like
+from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.tape import fit
 from sparsedp.traces import inside, new_box, reverse_root, split_box
 from sparsedp.trajectory.layout import frozen, owned, still
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["Taped", "boxed", "fitted"]
+
+
+_REMEDY = {
+    "state": "return another dict or list",
+    "params": "make what changes a part of the state",
+    "inputs": "make what changes a part of the state",
+}
 
 
 class Taped:
@@ -35,6 +43,7 @@ class Taped:
         self.params = run.params.build(self._frozen, self._statics)
         self._given = leaves(self.params)
         self._last: tuple = ()
+        self._open = any(layout is not None and layout.open for layout in (run.state, run.params, run.inputs))
         self.wanted = frozenset(wanted)
         first, second = len(run.state.places), len(run.state.places) + len(self.p)
         self._p = [place for place in range(len(self.p)) if first + place in wanted]
@@ -58,12 +67,12 @@ class Taped:
         if self.recording and run.tapes.fit:
             return self._recorded(i, values, statics)
         if run.state.bare:
-            result = run.step(frozen(values[0]), self.params, *run.input_at(i, self.x))
+            result = self._applied(frozen(values[0]), self.params, *run.input_at(i, self.x))
             if run.state.is_one(result):
                 return [result], statics
         else:
             state = run.state.build([frozen(value) for value in values], statics)
-            result = run.step(state, self.params, *run.input_at(i, self.x))
+            result = self._applied(state, self.params, *run.input_at(i, self.x))
         values, statics = run.state.take(result, "the step")
         return run.state.check(values, "the step"), still(statics)
 
@@ -74,16 +83,20 @@ class Taped:
         return [zero_like(value) if number in self.run.silenced else value for number, value in enumerate(values)]
 
     @contextmanager
-    def guarded(self):
-        """Turn NumPy's refusal to write into an argument into an error that names it."""
+    def guarded(self, way="in step"):
+        """Say in which step an error arose; turn NumPy's refusal to write into an argument into one that names it."""
         try:
             yield
+        except (ConvergenceError, NonFiniteError, UnstableStepError) as error:
+            if self._last:
+                error.args = f"{way} {self._last[0]} of rollout: {error}", *error.args[1:]
+            raise
         except (ValueError, TypeError) as error:
-            if "read-only" not in str(error) and "readonly" not in str(error):
+            if not _refuses_writing(error) and not self._writes():
                 raise
             raise ValueError(
                 f"{self._culprit()} in place; write u = u + du instead of u += du, or work on a copy"
-            ) from error
+            ) from (error if _refuses_writing(error) else None)
 
     def _culprit(self):
         """Which array the step writes into: the one that stops it when all others may be written."""
@@ -104,11 +117,33 @@ class Taped:
                     return f"the step changes {name}"
         return "keep changes the state"
 
+    def _writes(self):
+        """Whether the step, on plain values, writes into an argument: a traced value stops it with other words."""
+        if not self._last:
+            return False
+        i, values, statics = self._last
+        state = self.run.state.build([frozen(value) for value in values], statics)
+        try:
+            self.run.step(state, self.params, *self.run.input_at(i, self.x))
+        except Exception as error:
+            return _refuses_writing(error)
+        return False
+
+    def _applied(self, *parts):
+        """The step; refused if it changes the dicts and lists it is given, which a tape would not see."""
+        if not self._open:
+            return self.run.step(*parts)
+        given = [leaves(part) for part in parts]
+        result = self.run.step(*parts)
+        for name, part, before in zip(("state", "params", "inputs"), parts, given, strict=False):
+            if not _same(leaves(part), before):
+                raise ValueError(f"the step changes the entries of {name}; {_REMEDY[name]}")
+        return result
+
     def check_params(self):
         """Refuse a step that puts other things into the dicts and lists of params."""
-        found = leaves(self.params)
-        if len(found) != len(self._given) or any(a is not b for a, b in zip(found, self._given, strict=True)):
-            raise ValueError("the step changes the entries of params; make what changes a part of the state")
+        if not _same(leaves(self.params), self._given):
+            raise ValueError(f"the step changes the entries of params; {_REMEDY['params']}")
 
     def store(self, values):
         """A copy that nobody else can write into."""
@@ -149,8 +184,8 @@ class Taped:
             tree = run.state.build(boxed([frozen(value) for value in values], state, number), statics)
             params = run.params.build(boxed(self._frozen, p, number), self._statics) if self._p else self.params
             if run.inputs is None:
-                return run.step(tree, params)
-            return run.step(tree, params, *run.input_at(i, self.x, lambda rows: boxed(rows, x, number)))
+                return self._applied(tree, params)
+            return self._applied(tree, params, *run.input_at(i, self.x, lambda rows: boxed(rows, x, number)))
 
         result, number = inside(step)
         ends, others = run.state.take(result, "the step")
@@ -197,6 +232,14 @@ class Taped:
         return [*self.gp, *self.gx]
 
 
+def _refuses_writing(error):
+    return "read-only" in str(error) or "readonly" in str(error)
+
+
+def _same(found, given):
+    return len(found) == len(given) and all(a is b for a, b in zip(found, given, strict=True))
+
+
 def boxed(values, roots, number):
     """Values -> the same, those with a root on the trace of this number."""
     return [x if root is None else new_box(x, number, root) for x, root in zip(values, roots, strict=True)]
@@ -204,6 +247,6 @@ def boxed(values, roots, number):
 
 def fitted(back, value):
     """A cotangent in the dtype of its value."""
-    if type(back) is type(value) and back.dtype == value.dtype and back.shape == value.shape:
+    if type(back) is type(value) and type(back) is not float and (back.dtype, back.shape) == (value.dtype, value.shape):
         return back
     return fit("the step", value, back, back)
