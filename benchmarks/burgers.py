@@ -3,7 +3,7 @@
 128 cells, 16 steps; the loss is the mean square of the miss at the end. All rows run in turn, the smallest time counts.
 Beside it stands the largest difference of the gradient to that of the tape of autograd, relative to the largest entry.
 
-Run ``python -m benchmarks.burgers`` in the root of the repository. Limits: shared/performance.md, section 2.
+Run ``python -m benchmarks.burgers`` in the root of the repository.
 """
 
 import subprocess

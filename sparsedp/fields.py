@@ -1,6 +1,9 @@
 """What may be given: the checks of fields, of numbers and of reused result arrays."""
 
+from decimal import ROUND_FLOOR, Context
+from inspect import CO_VARARGS
 from math import isfinite
+from types import FunctionType
 
 import numpy as np
 
@@ -11,11 +14,13 @@ __all__ = [
     "check_function",
     "check_out",
     "check_plain",
+    "check_takes",
     "field_array",
     "is_number",
     "is_whole",
     "own",
     "place",
+    "rounded_down",
     "surely_finite",
 ]
 
@@ -112,6 +117,15 @@ def check_function(name, thing, example):
         raise TypeError(f"{name} takes a function, got {type(thing).__name__}; write {example}")
 
 
+def check_takes(name, fun, count, example):
+    """Refuse a function written in Python that does not take this many arguments."""
+    if type(fun) is not FunctionType or fun.__code__.co_flags & CO_VARARGS:
+        return
+    most = fun.__code__.co_argcount
+    if not most - len(fun.__defaults__ or ()) <= count <= most:
+        raise TypeError(f"{name} calls a function with {count} arguments, got one that takes {most}; write {example}")
+
+
 def is_number(value):
     """Whether a value is one real number, NaN and infinity included; a flag is none."""
     return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
@@ -120,3 +134,9 @@ def is_number(value):
 def is_whole(value, least):
     """Whether a value is a whole number from `least` on; 2.0 counts."""
     return bool(is_number(value) and value % 1 == 0 and value >= least)  # the rest of NaN and infinity is NaN
+
+
+def rounded_down(number):
+    """A bound > 0 as a text of six digits that keeps it: rounded to nearest it would be refused when it is written."""
+    near = float(number) * (1 + 4 * np.finfo(float).eps)
+    return f"{float(Context(prec=6, rounding=ROUND_FLOOR).create_decimal(near)):.6g}"

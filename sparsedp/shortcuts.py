@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import autograd.numpy as anp
 import numpy as np
 
 __all__ = ["added", "arithmetic", "direct"]
@@ -57,7 +58,7 @@ def arithmetic(fun, value, args, nums):
 
     For arrays of float64 that are not broadcast, and their sums; the formulas are those of autograd.
     """
-    rule = FORMULAS.get(getattr(fun, "fun", None))  # the function of NumPy below autograd's
+    rule = FORMULAS.get(fun)  # autograd's own: a primitive that a user made of NumPy's has other derivatives
     if rule is None or len(args) != rule.__code__.co_argcount - 1 or value.dtype != FLOAT:
         return None
     shape = args[0].shape if rule in TOTALS and type(args[0]) is np.ndarray else value.shape
@@ -65,7 +66,13 @@ def arithmetic(fun, value, args, nums):
         arg = args[num]
         if type(arg) is not np.ndarray or arg.shape != shape or arg.dtype != FLOAT:
             return None
-    return rule(nums, *args)
+    back = rule(nums, *args)
+    return back and (lambda g: back(g if getattr(g, "dtype", FLOAT) == FLOAT else _real(g)))
+
+
+def _real(g):
+    """Beside complex values autograd hands complex cotangents on to real ones."""
+    return anp.real(g) if g.dtype.kind == "c" else g
 
 
 def _add(nums, x, y):
@@ -117,12 +124,13 @@ def _everywhere(g, shape):
 
 TOTALS = _sum, _mean
 FORMULAS: dict[Any, Any] = {
-    np.add: _add,
-    np.subtract: _subtract,
-    np.multiply: _multiply,
-    np.true_divide: _divide,
-    np.negative: _negative,
-    np.power: _power,
-    np.sum: _sum,
-    np.mean: _mean,
+    anp.add: _add,
+    anp.subtract: _subtract,
+    anp.multiply: _multiply,
+    anp.true_divide: _divide,
+    anp.divide: _divide,
+    anp.negative: _negative,
+    anp.power: _power,
+    anp.sum: _sum,
+    getattr(anp.numpy_wrapper, "_primitive_mean", anp.mean): _mean,  # in newer versions anp.mean only calls it
 }

@@ -139,3 +139,22 @@ def test_hessians_that_are_not_known():
     cube = dp.differentiable("cube", lambda u: u**3, once)
     found = AUDIT(lambda u: anp.sum(cube(u)), X)
     assert found and found.hessian is None and "Hessian product: not available (TypeError)" in str(found)
+
+
+def test_a_right_gradient_among_kinks_is_not_accused_and_a_wrong_one_is():
+    """Clamped MacCormack on a field with ties: along one of the directions the kinks lie too close to be split."""
+    grid = dp.Grid((24, 24), size=1.0, periodic=True)
+    x, y = grid.centres()
+    wind = dp.projection(grid)(0.3 * np.random.default_rng(1).standard_normal(grid.faces.size))
+    ink = np.exp(-((x - 0.5) ** 2 + (y - 0.5) ** 2) / 0.02) + 0.1 * np.sin(5 * x)
+    move = dp.transport(grid, "maccormack")
+    wrong = dp.differentiable("wrong", lambda u: u**2, lambda nums, ans, u: lambda g: (2.02 * u * g,))
+
+    def end(p):
+        return dp.rollout(lambda u, q: move(u, q["wind"], q["dt"]), p["ink"], p, 5)
+
+    start = {"ink": ink, "wind": wind, "dt": 0.01}
+    found = dp.check.gradient(lambda p: anp.sum(end(p) ** 2), start)
+    assert "a kink: the one-sided" in str(found) and found.verdict == "inconclusive"
+    found = dp.check.gradient(lambda p: anp.sum(wrong(end(p))), start)
+    assert found.verdict == "disagrees" and found.culprit == "wrong"

@@ -54,7 +54,19 @@ TABLE = [
     (
         lambda: dp.stepper("euler", 3.0, 0.1),
         TYPE,
-        "rate must be a function or, for rate, an Operator, got float",
+        "rate must be a function or an Operator, got float",
+    ),
+    (
+        lambda: dp.stepper("rk4", lambda u: -u, 0.1),
+        TYPE,
+        "stepper calls a function with 2 arguments, got one that takes 1; "
+        "write lambda u, params: ... or lambda u, params, t: ...",
+    ),
+    (
+        lambda: dp.stepper("imex", decay, 0.1, linear=L)({"a": U}),
+        TYPE,
+        "stepper(imex) has an Operator, which acts on one array, got a dict as u; "
+        "stack its parts into one array, or apply the Operator inside the rate of an implicit method",
     ),
     (
         lambda: dp.stepper("euler", None, 0.1),
@@ -189,3 +201,10 @@ def test_a_rate_that_writes_into_the_state_is_named_when_only_params_are_traced(
     for last in (lambda p: sum(step(U, p)), lambda p: sum(dp.rollout(step, U, p, 2))):
         with pytest.raises(ValueError, match=re.escape(message)):
             dp.value_and_grad(last)(1.0)
+
+
+def test_a_stage_without_a_root_says_what_to_change():
+    """x = -(1 + x^2) has no real root."""
+    step = dp.stepper("backward_euler", lambda u, p: -1.0 - u**2, 1.0)
+    with pytest.raises(dp.errors.ConvergenceError, match=r"; take a smaller dt, or give stepper a tolerance$"):
+        step(np.zeros(2))

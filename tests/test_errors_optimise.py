@@ -36,7 +36,12 @@ WRONG = [
         "batches must be a list or a function of the iteration, got int; write list(batches)",
     ),
     (run(method="adam", batches=[]), ValueError, "batches is empty; leave it out, and the loss is called with x alone"),
-    (run(bounds=3), ValueError, "bounds must be a pair (lower, upper), got 3; write (0.0, None) for x >= 0"),
+    (
+        run(bounds=3),
+        ValueError,
+        "bounds must be a pair (lower, upper), each a number, None or a tree like start, "
+        "got 3; write (0.0, None) for x >= 0",
+    ),
     (
         run(bounds=(2.0, 1.0)), ValueError,
         "bounds must be numbers with lower <= upper; write None for "

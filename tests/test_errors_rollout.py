@@ -193,6 +193,16 @@ TABLE = [
         "for example state.astype(float)",
     ),
     (
+        roll(lambda u: u),
+        TypeError,
+        "rollout calls a function with 2 arguments, got one that takes 1; write lambda state, params: ...",
+    ),
+    (
+        roll(lambda u, p: u.astype(object)),
+        SHAPE,
+        "state must keep its form: the step made an array of objects; use autograd.numpy as np in it",
+    ),
+    (
         roll(writes_state),
         VALUE,
         "the step changes state in place; write u = u + du instead of u += du, or work on a copy",

@@ -61,7 +61,23 @@ CASES = [
     ),
     (call(dt=np.nan), NonFiniteError, "transport upwind needs a finite dt, got nan; write a finite number"),
     (call(u=U[0]), ShapeError, "transport upwind takes u of shape (3, 2), got an array of shape (2,)"),
-    (call(v=U), ShapeError, "transport upwind takes v of shape (17,), got an array of shape (3, 2)"),
+    (
+        call(v=U),
+        ShapeError,
+        "transport upwind takes v of shape (17,), got an array of shape (3, 2); "
+        "write grid.join(...) for the components on faces, or velocity='cells'",
+    ),
+    (
+        call(v=GRID.split(V)),
+        ShapeError,
+        "transport upwind takes v as one array, got a tuple of 2 parts; write grid.join(...) for faces",
+    ),
+    (
+        lambda: dp.transport(dp.Grid(4, size=4 / 3, periodic=True))(np.ones(4), 3 * np.ones(4), 0.12),
+        UnstableStepError,
+        "transport upwind: dt = 0.12 is too large at 4 of 4 points, most at 0; "
+        "the largest stable dt is 0.111111, or write unstable='allow'",
+    ),
     (call(inflow=np.ones(3)), ShapeError, "transport upwind takes inflow of shape (10,), got an array of shape (3,)"),
     (
         call(u=1j * U),

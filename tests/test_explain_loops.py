@@ -68,3 +68,14 @@ def test_each_scene_leaves_out_what_it_does_not_need():
     assert np.array_equal(dp.rollout(step, U, 0.0, n), U)
     only = dp.explain(lambda u: anp.sum(dp.rollout(step, u, 0.5, n) ** 2), U, gradient=False)
     assert only.totals["forward solves"] == n and only.totals["adjoint solves"] == only.tape_nodes == 0
+
+
+def test_an_operator_whose_transpose_ran_without_a_tape_is_not_called_independent_of_x():
+    grid = dp.Grid((4, 4), periodic=True)
+    step = dp.flow_step(grid, 0.1, 0.01)
+
+    def energy(v):
+        return anp.sum(dp.rollout(step, step.start(v), None, 3)["v"] ** 2)
+
+    plan = dp.explain(energy, np.arange(32.0) / 32)
+    assert not [sentence for sentence in plan.left_out if "does not depend on x" in sentence]

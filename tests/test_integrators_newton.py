@@ -1,5 +1,8 @@
 """Nonlinear implicit steps: what one Jacobian serves for, on which grid it stands, and that nothing else changes."""
 
+from functools import cache
+from threading import Thread
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -103,6 +106,19 @@ def test_the_end_of_a_step_is_not_solved_for_again(method):
     np.testing.assert_array_equal(only, state)
 
 
+def test_a_known_end_is_that_of_its_own_thread():
+    """While one thread goes back through a step, another one may use the same step."""
+    step = dp.stepper("backward_euler", lambda u, p: -p * u**3, 0.1)
+    u, found = np.array([1.0, 2.0, 3.0]), []
+    wanted = step(u, 1.0)
+    with step.scheme.ending(np.zeros(3)):
+        thread = Thread(target=lambda: found.append(step(u, 1.0)))
+        thread.start(), thread.join()
+        assert not np.any(step(u, 1.0))  # the end that is known, once
+        np.testing.assert_array_equal(step(u, 1.0), wanted)
+    np.testing.assert_array_equal(found, [wanted])
+
+
 def test_loops_of_trees_and_single_precision():
     """A tree as state and float32 fields: the end of a step is solved for again, with the same result."""
     step = dp.stepper("backward_euler", lambda u, p: {"a": u["s"], "s": -p * anp.sin(u["a"])}, 0.1)
@@ -195,6 +211,16 @@ def test_a_jacobian_that_is_not_symmetric_does_not():
     step = dp.stepper("backward_euler", lambda u, p: -out(0.5 * p * average(u) ** 2), 0.01)
     step(np.sin(grid.centres()[0]), 1.0)
     assert "space(30) -> space(30)" in str(step.scheme.root)
+
+
+def test_one_residual_for_fields_of_several_sizes():
+    """The grid that was found for one size is none for another, or for another shape of that size."""
+    op = cache(lambda shape: dp.laplacian(dp.Grid(shape)))
+    make = lambda: dp.implicit(lambda x, p: x - 0.1 * op(x.shape)(x) + 0.1 * x**3 - p)
+    root = make()
+    for shape in ((6, 6), (3, 3), (4, 9), (6, 6)):
+        b = np.cos(np.arange(np.prod(shape))).reshape(shape)
+        np.testing.assert_allclose(root(0 * b, b), make()(0 * b, b), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("case", ["stretched", "two fields"])

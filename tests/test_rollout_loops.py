@@ -1,4 +1,4 @@
-"""Steps with a time loop of their own, and the shortcuts of the tape: each against the way round by Python, by bits."""
+"""Steps with a time loop of their own, and steps that share a tape: each against single steps, by bits."""
 
 import autograd
 import autograd.numpy as anp
@@ -7,7 +7,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.derivative import pullback
-from sparsedp.errors import NonFiniteError, UnstableStepError
+from sparsedp.errors import DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.trajectory import protocol
 
 N = 20
@@ -118,6 +118,25 @@ def test_single_precision_and_other_kinds_take_the_way_by_single_steps():
     assert np.max(np.abs(dp.rollout(step, u, v.astype("f"), N) - dp.rollout(step, u, v, N))) < 1e-5
 
 
+def test_a_loop_that_does_not_add_to_what_it_is_given_is_refused():
+    class Forgetful:
+        __call__ = forward = staticmethod(lambda u, p, out=None: u + p)
+        backward = staticmethod(lambda u, p, g, into=None: (g, into))
+
+        def march(self, states, p):
+            states[1:] = states[0] + p * np.arange(1, len(states))[:, None]
+
+        def retreat(self, states, p, g, into=None):
+            return g, (len(states) - 1) * g
+
+    with pytest.raises(
+        DerivativeError,
+        match="the backward form of the step returned another array for params than the one it was given; add to "
+        "`into` and return it",
+    ):
+        dp.value_and_grad(lambda p: anp.sum(dp.rollout(Forgetful(), np.ones(3), p, 20)))(np.ones(3))
+
+
 def test_the_loop_stops_at_the_step_that_goes_wrong():
     move = dp.transport(dp.Grid(8, periodic=True))
     u, v = np.arange(8.0), np.full(8, 1.5)
@@ -185,6 +204,29 @@ def test_linked_steps_have_the_bits_of_single_steps(name, n):
         assert free[-1].norms == tight[-1].norms and (tight[-1].kept < n or n < 40)
 
 
+@pytest.mark.parametrize("step", [lambda u, p: (u + p).T, lambda u, p: u + 1.0, lambda u, p: np.cos(NUMBERS) + 0 * p])
+def test_a_step_that_cannot_be_linked_is_not_run_twice(step):
+    calls = []
+    counted = lambda u, p: (calls.append(0), step(u, p))[1]
+    dp.value_and_grad(lambda p: anp.sum(dp.rollout(counted, WHERE, p, 12)))(0.3)
+    assert len(calls) == 12
+
+
+def test_a_linked_step_that_keeps_a_traced_value_is_refused():
+    seen = []
+
+    def step(u, p):
+        seen.append(p * u)
+        return u + p * u + (seen[0] if len(seen) == 6 else 0.0)
+
+    with pytest.raises(
+        DerivativeError,
+        match="the step uses a traced value that it kept from an earlier step, and its derivative would be lost; make "
+        "it a part of the state",
+    ):
+        dp.value_and_grad(lambda p: anp.sum(dp.rollout(step, WHERE, p, 12)))(0.3)
+
+
 def test_a_linked_step_that_reuses_an_array_is_run_again():
     room = np.zeros(6)
 
@@ -211,60 +253,3 @@ def test_two_pullbacks_of_one_linked_run():
     first, second = pull(np.ones(6)), pull(2 * np.ones(6))
     assert all(np.array_equal(2 * a, b) for a, b in zip(first, second, strict=True))
     assert all(np.array_equal(a, b) for a, b in zip(first, pull(np.ones(6)), strict=True))
-
-
-# ---------------------------------------------------------------- shortcuts of the tape
-
-X, Y = RNG.standard_normal((2, 3, 4))
-FORMULAS = {
-    "add": lambda x, y: x + y,
-    "itself": lambda x, y: x + x + y,
-    "number": lambda x, y: 2 + x * 3.0 - y,
-    "subtract": lambda x, y: 1.0 - x - y,
-    "multiply": lambda x, y: x * y * x,
-    "divide": lambda x, y: x / y + 1.0 / x + y / 2,
-    "negative": lambda x, y: -x + y,
-    "power": lambda x, y: x**2 + (y**2) ** 0.5 + x**0 + y**-3 + x**1,
-    "power of a power": lambda x, y: (x**2) ** y,
-    "mean": lambda x, y: anp.mean(x) * y + anp.sum(y) * x,
-    "axes": lambda x, y: anp.mean(x, axis=0) + anp.sum(y, axis=1, keepdims=True) + anp.sum(x, 0),
-    "broadcast": lambda x, y: x[0] * y + x[:, :1] + y[1, 1] * x,
-    "nothing": lambda x, y: anp.sum(x[:0]) + anp.mean(y[:, 1]) + x[0, 0] * y,
-    "plain neighbours": lambda x, y: x * np.arange(4) + y * np.float32(0.1) + x * [1, 2, 3, 4] + y * True,
-}
-
-
-@pytest.mark.parametrize("name", FORMULAS)
-def test_the_shortcuts_of_the_tape_have_the_bits_of_autograd(name):
-    def loss(z):
-        return anp.sum(anp.sin(FORMULAS[name](z[0], z[1])))
-
-    value, g = dp.value_and_grad(loss)((X, Y))
-    known = autograd.grad(loss)((X, Y))
-    assert value == loss((X, Y))
-    assert all(np.array_equal(a, b) for a, b in zip(g, known, strict=True))
-
-
-@pytest.mark.parametrize("name", FORMULAS)
-def test_second_derivatives_pass_through_the_shortcuts(name):
-    def loss(z):
-        return anp.sum(anp.sin(FORMULAS[name](z[0], z[1])))
-
-    def slope(z, gradient):
-        g = gradient(z)
-        return anp.sum(X * g[0] + Y * g[1])
-
-    ours = dp.value_and_grad(lambda z: slope(z, lambda z: dp.value_and_grad(loss)(z)[1]))((X, Y))[1]
-    known = autograd.grad(lambda z: slope(z, autograd.grad(loss)))((X, Y))
-    assert all(np.max(np.abs(a - b)) <= 1e-13 * np.max(np.abs(b)) for a, b in zip(ours, known, strict=True))
-
-
-@pytest.mark.parametrize("kind", ["f", "D"])
-def test_other_kinds_of_numbers_are_left_to_autograd(kind):
-    x, y = X.astype(kind), Y.astype(kind)
-
-    def loss(z):
-        return anp.sum(anp.real(z[0] * z[1] - z[0] / z[1]) ** 2)
-
-    ours, known = dp.value_and_grad(loss)((x, y))[1], autograd.grad(loss)((x, y))
-    assert all(a.dtype == kind and np.allclose(a, b, rtol=1e-6) for a, b in zip(ours, known, strict=True))

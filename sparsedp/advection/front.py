@@ -96,6 +96,11 @@ def transport(
     DerivativeError
         If `solid` is traced.
 
+    Notes
+    -----
+    Limiters and clamps (van_leer, maccormack but for "unclamped") have kinks in u where neighbours are equal, as in a
+    field that is 0 in places. The derivative is one of several there, and `check.gradient` says "inconclusive".
+
     Source
     ------
     R. Courant, E. Isaacson, M. Rees, Comm. Pure Appl. Math. 5 (1952) 243-255.

@@ -35,5 +35,6 @@ class Scratch:
     def give(self, *arrays):
         """Keep arrays for later, as long as they are not too many."""
         for array in arrays:
-            if array.size > FEW and array.size + sum(n * len(kept) for n, kept in self.spare.items()) <= MOST:
+            known = list(self.spare.items())  # in one go: another thread may bring a new size
+            if array.size > FEW and array.size + sum(n * len(kept) for n, kept in known) <= MOST:
                 self.spare.setdefault(array.size, []).append(array)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sparsedp.errors import UnstableStepError
-from sparsedp.fields import check_finite
+from sparsedp.fields import check_finite, rounded_down
 
 __all__ = ["check_numbers", "check_result", "check_weights"]
 
@@ -23,9 +23,10 @@ def check_weights(law, dt, rate, share=1.0):
     bad = ~(share - dt * rate >= -ROUNDING)
     if law.setting.unstable == "raise" and np.any(bad):
         worst = int(np.argmax(rate))
+        largest = rounded_down(share / rate[worst])
         raise UnstableStepError(
-            f"transport {law.setting.scheme}: dt = {dt:g} is too large at {np.count_nonzero(bad)} of {rate.size} "
-            f"points, most at {law.matrices.place(worst)}; the largest stable dt is {share / rate[worst]:.6g}, "
+            f"transport {law.setting.scheme}: dt = {dt:.12g} is too large at {np.count_nonzero(bad)} of {rate.size} "
+            f"points, most at {law.matrices.place(worst)}; the largest stable dt is {largest}, "
             "or write unstable='allow'"
         )
 

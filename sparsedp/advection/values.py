@@ -38,9 +38,12 @@ def flat_numbers(name, letter, value, shapes):
     """Array of one of the shapes -> flat contiguous float64; a traced one stays traced."""
     if type(value) is np.ndarray and value.shape in shapes and value.dtype == FLOAT and value.flags.c_contiguous:
         return value.reshape(-1)
-    shape = np.shape(value)
+    shape = _shape(name, letter, value)
     if shape not in shapes:
-        raise ShapeError(f"{name} takes {letter} of shape {shapes[0]}, got an array of shape {shape}")
+        parts = len(shapes[0]) == 1 < len(shape)
+        hint = "; write grid.join(...) for the components on faces" if parts else ""
+        hint += ", or velocity='cells'" if parts and letter == "v" else ""
+        raise ShapeError(f"{name} takes {letter} of shape {shapes[0]}, got an array of shape {shape}{hint}")
     if type(plain(value)) is not np.ndarray:
         if isinstance(value, np.ma.MaskedArray):
             raise TypeError(f"{name} takes plain arrays, got a masked array as {letter}; fill it first")
@@ -53,6 +56,14 @@ def flat_numbers(name, letter, value, shapes):
     if isbox(value):
         return anp.reshape(cast(value, np.dtype(float)), (-1,))
     return np.ascontiguousarray(value, dtype=float).reshape(-1)
+
+
+def _shape(name, letter, value):
+    try:
+        return np.shape(value)
+    except ValueError:  # the components of a face field, which grid.split hands out, have different shapes
+        given = f"a {type(value).__name__} of {len(value)} parts"
+        raise ShapeError(f"{name} takes {letter} as one array, got {given}; write grid.join(...) for faces") from None
 
 
 def _inflow(name, inflow, walls):

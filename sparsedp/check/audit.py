@@ -112,7 +112,7 @@ def _audit(loss, x, gradient, steps, directions, rng, beside):
         judged = [measured(line, chosen, point, trials, extend=steps is None) for line in lines]
         if callable(evaluate):
             judged = [_once_more(*pair, evaluate, trials, point) for pair in zip(lines, judged, strict=True)]
-        if any(one.word == "outside" for one in judged) and callable(evaluate) and not beside:
+        if _at_kinks(judged) and callable(evaluate) and not beside:
             judged = _beside(loss, point, gradient, directions, judged)
         if gradient is None:
             doubts += forward_mode(loss, point, lines[:directions], judged)
@@ -159,6 +159,12 @@ def _once_more(line, found, evaluate, trials, point):
         return hidden(line, found, slope_at, trials.eps, point)
 
 
+def _at_kinks(judged):
+    """Whether kinks may explain what speaks against a gradient; one that is far in one direction is seen in others."""
+    words = {one.word for one in judged}
+    return "outside" in words or {"disagrees", "kink"} <= words
+
+
 def _beside(loss, point, gradient, directions, judged):
     """At several kinks at once a derivative may lie outside the one-sided ones and follow a convention all the same.
 
@@ -168,7 +174,8 @@ def _beside(loss, point, gradient, directions, judged):
     with suppress(*REFUSALS):
         if _audit(loss, point.tree(moved), gradient, None, directions, None, beside=True).verdict != "disagrees":
             note = "several kinks; beside them nothing speaks against the gradient"
-            return [one._replace(word="kink", note=note) if one.word == "outside" else one for one in judged]
+            doubtful = ("outside", "disagrees")
+            return [one._replace(word="kink", note=note) if one.word in doubtful else one for one in judged]
     return judged
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from sparsedp.derivative import pullback
 from sparsedp.errors import ShapeError, UnstableStepError
-from sparsedp.fields import is_number
+from sparsedp.fields import is_number, rounded_down
 from sparsedp.solvers.facts import magnitude
 from sparsedp.tape import dtype_of, is_variable, plain
 from sparsedp.tree import flatten, leaves
@@ -46,8 +46,8 @@ class Viscous:
         rate = viscosity * self._steepest
         if self.dt * rate > 1 + ROUNDING:
             raise UnstableStepError(
-                f"flow_step is unstable for viscosity = {viscosity:.6g} with dt = {self.dt:.6g}: the largest "
-                f"stable dt is {1 / rate:.6g}; take smaller steps or write implicit=True"
+                f"flow_step is unstable for viscosity = {viscosity:.6g} with dt = {self.dt:.12g}: the largest "
+                f"stable dt is {rounded_down(1 / rate)}; take smaller steps or write implicit=True"
             )
 
     def number(self, params):

@@ -81,6 +81,8 @@ def flow_step(
     Notes
     -----
     A step of explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth); a longer one is refused.
+    Convection is explicit and no step is refused for it: where there is little viscosity, keep dt times the sum over
+    axes of the largest |v| / h below 0.5. A longer step grows until the velocity overflows.
     Cost: one pressure solve, and one solve for implicit viscosity; the same again backward. `rollout` needs no tape.
     Source: van Kan, SIAM J. Sci. Stat. Comput. 7 (1986).
 

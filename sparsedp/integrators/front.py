@@ -55,7 +55,7 @@ def stepper(
     dt : float, traced number, or function of params
         Length of a step [time], > 0. To differentiate in dt inside a loop write ``lambda params: params["dt"]``.
     linear : Operator or (Operator, coefficient), optional
-        A term c L u beside the rate; `coefficient` is a number >= 0 or a function of params.
+        A term c L u beside the rate, with u one array; `coefficient` is a number >= 0 or a function of params.
     source : callable, optional
         ``source(params)`` or ``source(params, t)``: a term that does not depend on u. A problem of operator
         and source only is linear: one set-up for each c dt serves all stages, steps and adjoint solves.
@@ -65,7 +65,8 @@ def stepper(
         Error control: dt is an interval, crossed in as many steps as keep the relative error of each below
         this. Derivatives follow the steps that were taken; `step.taken` lists them.
     floor : number or tree like u, optional
-        Errors are relative to |u| + floor. Default: the largest entry of each array.
+        Errors are relative to |u| + floor. Default: the largest entry of each array. What dies out is then followed
+        down to nothing, in many steps: give the size below which it no longer matters.
     unstable : "raise" or "allow"
         Explicit steps of an Operator whose spectrum is known: refuse a dt beyond the stable limit, or take it.
     jacobian : callable, optional

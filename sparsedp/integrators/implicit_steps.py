@@ -8,11 +8,12 @@ b = u + (y - u) / (g (2 - g)): both stages have the same factor 1 - d z L.
 Sources: Bank et al., IEEE Trans. Electron Devices 32 (1985); Hosea and Shampine, Appl. Numer. Math. 20 (1996).
 """
 
-from contextlib import contextmanager
+from contextlib import nullcontext
 
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.errors import ConvergenceError
 from sparsedp.integrators.combination import combine, untraced
 from sparsedp.integrators.resolvent import Resolvent
 from sparsedp.operator import Operator
@@ -130,19 +131,18 @@ class Nonlinear(Stage):
         with self.root.series():
             return self.advance(self, u, params, t, h)
 
-    @contextmanager
     def ending(self, new):
         """A step of one stage inside ends at `new`, which need not be solved for; None, or a rounded array: it is."""
         exact = type(new) is np.ndarray and new.dtype == np.float64
-        self.root.answers = [new] if exact else []
-        try:
-            yield
-        finally:
-            self.root.answers = []
+        return self.root.answered(new) if exact else nullcontext()
 
     def solve(self, guess, b, params, t, h):
         """x of x = b + h f(x, t)."""
-        return self.root(untraced(guess), b, h, params, t)
+        try:
+            return self.root(untraced(guess), b, h, params, t)
+        except ConvergenceError as error:  # often there is no root: a quadratic rate may leave none for a large dt
+            error.args = f"{error}; take a smaller dt, or give stepper a tolerance", *error.args[1:]
+            raise
 
     def trapezium(self, u, params, t, h):
         """x of x = u + h/2 (f(u, t) + f(x, t + h))."""

@@ -5,7 +5,7 @@ import inspect
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import is_number
+from sparsedp.fields import check_takes, is_number
 from sparsedp.integrators.combination import combine, frozen
 from sparsedp.operator import Operator
 from sparsedp.space import fits
@@ -83,7 +83,11 @@ def posed(rate, linear, source, timed):
     rate = None if whole else rate
     for name, fun in (("rate", rate), ("source", source)):
         if fun is not None and not callable(fun):
-            raise TypeError(f"{name} must be a function or, for rate, an Operator, got {type(fun).__name__}")
+            raise TypeError(
+                f"{name} must be a function{' or an Operator' * (name == 'rate')}, got {type(fun).__name__}"
+            )
+    if rate is not None:
+        check_takes("stepper", rate, 3 if _takes(rate, 3) else 2, "lambda u, params: ... or lambda u, params, t: ...")
     if rate is None and op is None:
         raise TypeError("stepper needs a rate, a function rate(u, params) or an Operator, or the option linear")
     if timed is None:

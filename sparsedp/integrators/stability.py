@@ -3,6 +3,7 @@
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, UnstableStepError
+from sparsedp.fields import rounded_down
 from sparsedp.solvers.separable import spectrum
 from sparsedp.tape import plain
 
@@ -37,8 +38,8 @@ class Limit:
         h, c = float(plain(h)), float(plain(c))
         if h * c > self.largest * (1 + ROUNDING):
             raise UnstableStepError(
-                f"{self.name} is unstable for {self.op.name} with dt = {h:.6g}: the largest stable dt is "
-                f"{self.largest / c:.6g}; take smaller steps or an implicit method, or write unstable='allow'"
+                f"{self.name} is unstable for {self.op.name} with dt = {h:.12g}: the largest stable dt is "
+                f"{rounded_down(self.largest / c)}; take smaller steps or an implicit method, or write unstable='allow'"
             )
 
 

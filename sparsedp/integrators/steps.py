@@ -69,6 +69,11 @@ class Step:
         """
         params = (params, *inputs) if inputs else params
         u, t = self._parts(state)
+        if self.problem.op is not None and isinstance(u, (dict, list, tuple)):
+            raise TypeError(
+                f"{self.name} has an Operator, which acts on one array, got a {type(u).__name__} as u; "
+                "stack its parts into one array, or apply the Operator inside the rate of an implicit method"
+            )
         h = positive(self.dt(params), "dt") if callable(self.dt) else self.dt
         if self.limit is not None:
             self.limit.check(h, self.problem.coefficient(params))

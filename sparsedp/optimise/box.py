@@ -37,7 +37,10 @@ class Box:
         if bounds is None:
             return cls()
         if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
-            raise ValueError(f"bounds must be a pair (lower, upper), got {bounds!r}; write (0.0, None) for x >= 0")
+            raise ValueError(
+                "bounds must be a pair (lower, upper), each a number, None or a tree like start, "
+                f"got {bounds!r}; write (0.0, None) for x >= 0"
+            )
         lower, upper = (_side(side, packing, start, value) for side, value in zip(bounds, (-np.inf, np.inf)))
         if not np.all((lower <= upper) & (lower < np.inf) & (upper > -np.inf)):  # nor NaN
             raise ValueError("bounds must be numbers with lower <= upper; write None for a side without a bound")

@@ -37,7 +37,8 @@ def _derivatives(calls, forward, gradient):
         if what == "not asked":
             found.append(f"derivative of {name} in {', '.join(map(str, arguments))}: not asked")
     for (name, kind), many in calls.items():
-        if gradient and kind == "forward" and name in forward and not calls[name, "vjp"] + calls[name, "jvp"]:
+        backward = calls[name, "vjp"] + calls[name, "jvp"] + calls[f"{name}.T", "forward"]  # the last: without a tape
+        if gradient and kind == "forward" and name in forward and not backward:
             found.append(f"VJP of {name}: never called, its argument does not depend on x ({many} calls)")
     if gradient and not any(kind == "jvp" for _, kind in calls):
         found.append("JVPs: forward mode was not asked")

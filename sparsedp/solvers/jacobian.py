@@ -48,7 +48,8 @@ class Jacobians:
         self.name, self.given, self.settings = name, jacobian, settings
         self.sparsity: Any = None if sparsity is None else _pattern(sparsity)
         self.by_rows = None  # True: the residual has no JVP
-        self.way, self._space = "", None
+        self.way = ""
+        self._spaces: dict = {}  # size -> the cells that the unknowns were found to lie on
         self._patterns: dict = {}  # size -> Coloured, or None when only products will do
         self._around: dict = {}  # size -> Surroundings, where Operators tell that the unknowns lie on cells
         self._points, self._matrices = Kept(), Kept()
@@ -135,7 +136,8 @@ class Jacobians:
         if equation.size <= Small.most and self.settings["method"] in ("auto", "direct"):
             small = Small(matrix.toarray())
         around = self._around.get(equation.size)
-        space = around.space if around is not None and around.suit(matrix) else equation.size
+        shape = equation.layout.shapes[0]  # a field of another shape may have as many unknowns
+        space = around.space if around is not None and around.suit(matrix, shape) else equation.size
         full = coloured.by_rows and coloured.pattern.nnz == equation.size**2
         return partial(from_matrix, matrix, space, space, name), small, full
 
@@ -178,7 +180,7 @@ class Jacobians:
             elif size <= FULL_UP_TO:
                 found, self.way = dense_pattern(size, size), "assembled, all entries"
             else:
-                found, self._space = self._search(equation, x, leaves), cells_met(equation, x, leaves)
+                found, self._spaces[size] = self._search(equation, x, leaves), cells_met(equation, x, leaves)
                 found = self._not_sparse(found, size, method)
             self._colour(found, equation, x, leaves)
         return self._patterns[size]
@@ -205,7 +207,7 @@ class Jacobians:
         # One tape serves all products with J^T; each with J takes a run of its own.
         mirrored = pattern is not None and _mirrored(pattern) and _has_vjp(equation, x, leaves)
         coloured = None if pattern is None else Coloured(pattern, shape, True if self.by_rows or mirrored else None)
-        space = self._space if mirrored else None
+        space = self._spaces.get(equation.size) if mirrored else None
         self._around[equation.size] = None if space is None else Surroundings(space, pattern)
         self._patterns[equation.size] = coloured
 

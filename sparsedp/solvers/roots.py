@@ -14,6 +14,7 @@ derivative of any order takes one linear solve with J or J^T, and derivatives of
 """
 
 from contextlib import contextmanager
+from threading import get_ident
 
 from sparsedp.derivative import pullback
 from sparsedp.direction import push
@@ -123,8 +124,8 @@ class Root:
         self.residual, self.rtol, self.maxiter = residual, rtol, maxiter
         self.name = f"implicit({getattr(residual, '__name__', type(residual).__name__)})"
         self.info = SolveLog()
-        self._series: dict | None = None  # size -> Jacobian of the last solve
-        self.answers: list = []  # roots of the next solves, where the caller knows them
+        self._series: dict = {}  # by thread, inside `series`: size -> Jacobian of the last solve
+        self._answers: dict = {}  # by thread, inside `answered`: the root
         self._jacobians = Jacobians(self.name, jacobian, sparsity, dict(rtol=rtol, maxiter=None, **settings))
         self._solution = differentiable(self.name, self._newton, self._vjp, self._jvp)
         self._linear = [
@@ -135,11 +136,20 @@ class Root:
     @contextmanager
     def series(self):
         """Solves inside have nearly the same Jacobian: each starts with that of the one before."""
-        self._series = {}
+        self._series[get_ident()] = {}
         try:
             yield
         finally:
-            self._series = None
+            del self._series[get_ident()]
+
+    @contextmanager
+    def answered(self, x):
+        """The next solve of this thread has the root x, which the caller knows."""
+        self._answers[get_ident()] = x
+        try:
+            yield
+        finally:
+            self._answers.pop(get_ident(), None)
 
     def __call__(self, guess, *params):
         """Solve residual(x, *params) = 0 from a guess.
@@ -160,8 +170,9 @@ class Root:
     # ------------------------------------------------------------ the root as a rule of the parameters
 
     def _newton(self, equation, guess, *leaves):
-        if self.answers:
-            return self.answers.pop(0).reshape(-1).copy()
+        known = self._answers.pop(get_ident(), None)
+        if known is not None:
+            return known.reshape(-1).copy()
         solved = observers[-1].root if recordings and observers else Root.solved
         x = solved(self, equation, guess, leaves)
         if recordings:
@@ -175,17 +186,17 @@ class Root:
 
     def solved(self, equation, guess, leaves):
         """Newton's method on flat arrays, recorded in the log."""
-        run = Run()
-        newton = Newton(equation, leaves, self._jacobians, self.rtol, self.maxiter, run, self._series is not None)
+        run, series = Run(), self._series.get(get_ident())
+        newton = Newton(equation, leaves, self._jacobians, self.rtol, self.maxiter, run, series is not None)
         try:
-            return newton.solve(guess, (self._series or {}).get(equation.size))
+            return newton.solve(guess, (series or {}).get(equation.size))
         finally:
             if run.status:  # else it is an error of the residual
                 self.info.note(run.info(), False)
             if newton.J is not None:
                 self._note_setup(newton.J)
-                if self._series is not None:
-                    self._series[equation.size] = newton.J
+                if series is not None:
+                    series[equation.size] = newton.J
 
     def _note_setup(self, known):
         self.info.setup_seconds, self.info.hierarchy = known.told

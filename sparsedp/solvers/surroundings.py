@@ -34,8 +34,10 @@ class Surroundings:
         self._turned = places.T.tocsr().data  # where the mirror image of each entry stands
         self._volumes = np.repeat(space.grid.volumes.reshape(-1), np.diff(pattern.indptr))
 
-    def suit(self, matrix):
-        """Whether the matrix, times the volumes, is symmetric: multigrid on the grid needs that."""
+    def suit(self, matrix, shape):
+        """Whether x is a field on the cells, and the matrix, times the volumes, symmetric: multigrid needs that."""
+        if shape != self.space.shape:
+            return False
         weighed = self._volumes * matrix.data
         gap = np.max(np.abs(weighed - weighed[self._turned]), initial=0.0)
         return bool(gap <= ROUNDING * np.max(np.abs(weighed), initial=0.0))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_function, is_whole
+from sparsedp.fields import check_function, check_takes, is_whole
 from sparsedp.ledger import loops
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.trajectory.keep import All, Each, Last
@@ -101,6 +101,8 @@ def rollout(
     n = _number_of_steps(n)
     forms = Layout(state, "state"), Layout(params, "params"), None if inputs is None else Layout(inputs, "inputs")
     _check_inputs(inputs, n)
+    example = "lambda state, params: ..." if inputs is None else "lambda state, params, input: ..."
+    check_takes("rollout", step, 2 if inputs is None else 3, example)
     args = _variables(state, forms[0]) + _variables(params, forms[1])
     args += [] if inputs is None else _variables(inputs, forms[2])
     beside = 2 * sum(form.nbytes for form in forms[1:] if form is not None)  # a copy and a gradient

@@ -166,6 +166,10 @@ class Layout:
             raise ShapeError(_changed(name, f"shape {shape}", f"shape {np.shape(value)}", when))
         if self.rounds and dtype_of(value) == np.result_type(dtype, np.float64):
             value = np.asarray(value, dtype)
+        if dtype_of(value).kind == "O":
+            raise ShapeError(
+                f"{name} must keep its form: {when} made an array of objects; use autograd.numpy as np in it"
+            )
         if dtype_of(value) != dtype:
             raise ShapeError(_changed(name, f"dtype {dtype}", f"dtype {dtype_of(value)}", when))
         return dense(value)

@@ -7,8 +7,8 @@ bits are the same. A piece ends where the cotangent is looked at, and before and
 
 from typing import Any, NamedTuple
 
-from sparsedp.tape import isbox
-from sparsedp.traces import backward, inside, new_box, reverse_root
+from sparsedp.errors import DerivativeError
+from sparsedp.traces import backward, inside, new_box, reverse_root, split_box
 from sparsedp.trajectory.layout import frozen, owned
 from sparsedp.trajectory.record import looked_at
 from sparsedp.trajectory.steps import Taped, boxed, fitted
@@ -26,7 +26,7 @@ class Piece(NamedTuple):
     stop: int
     root: Any  # of the state at its start, or None
     params: list  # for each step the roots of all params, None where a constant is
-    end: Any  # the node of the state at its end
+    end: Any  # the node of the state at its end, or None
 
 
 class Linked(Taped):
@@ -38,8 +38,6 @@ class Linked(Taped):
         while first < self.run.n and tapes.fit and tapes.steps_left():
             before, weighed = tapes.bytes, tapes.weighs(first)
             piece, value = self._piece(first, self._stop(first, weighed), weighed, value, kept)
-            if piece.stop == first:
-                break
             for _ in range(first, piece.stop):
                 tapes.add(weighed, before)
             tapes.pieces.append(piece)
@@ -56,7 +54,7 @@ class Linked(Taped):
         return min(n, first + most, tapes.next_weighed(first), (first // every + 1) * every)
 
     def _piece(self, first, stop, weighed, value, kept):
-        """Steps on one tape, up to the first whose result is not one array that depends on what is asked for."""
+        """Steps on one tape, up to one whose result is rearranged, or of nothing that is asked for."""
         run, start = self.run, self.run.tapes.root if weighed else reverse_root
         root, params, ends = start() if run.wants(first, self.wanted) else None, [], [None]
 
@@ -66,13 +64,13 @@ class Linked(Taped):
                 p = [start() if place in self._p else None for place in range(len(self.p))]
                 tree = run.params.build(boxed(self._frozen, p, number), self._statics) if self._p else self.params
                 self._last = i, [value], run.state.statics
-                result = self._applied(state, tree)
-                if not isbox(result) or result._trace != number or not run.state.is_one(result._value):
-                    return value
-                kept.append(owned(value) if i else value)
+                state, before = self._applied(state, tree), value
+                value, node = split_box(run.state.take(state, "the step")[0][0], number)
+                kept.append(owned(before) if i else before)
                 params.append(p)
-                state, value = result, result._value
-                ends.append(result._node)
+                ends.append(node)
+                if node is None or not run.state.is_one(value):
+                    return run.state.check([value], "the step")[0]
             return value
 
         value, _ = inside(steps)
@@ -81,14 +79,19 @@ class Linked(Taped):
     def unlink(self, g, values, growth):
         """Cotangents of the state at the end of the pieces -> those of the first state, and of params."""
         for piece in reversed(self.run.tapes.pieces):
-            found = {} if g[0] is None else backward(piece.end, g[0])
+            found = {} if g[0] is None or piece.end is None else backward(piece.end, g[0])
             for roots in reversed(piece.params):
                 for place in self._p:
-                    if (back := found.get(roots[place])) is not None:
+                    if (back := found.pop(roots[place], None)) is not None:
                         self._add(place, back)
+            back = found.pop(piece.root, None)
+            if found:  # roots of another piece
+                raise DerivativeError(
+                    "the step uses a traced value that it kept from an earlier step, and its derivative would be "
+                    "lost; make it a part of the state"
+                )
             if piece.root is None:
                 return None
-            back = found.get(piece.root)
             g = [None if back is None else fitted(back, values[0])]
             if piece.first % growth.every == 0:
                 growth.see(piece.first, g)

@@ -7,8 +7,9 @@ A step may have, beside its call,
                                                          `into`: a tree like params; the gradient is added to its
                                                          arrays in place, and it is returned as g_params
 
-both on plain trees. Transport, the linear steppers and flow_step do. Where `step.sparing` is true, backward also takes
-`new`, the result of the step when it is still known, or None, and `wanted`, whether params want a cotangent.
+both on plain trees. Transport, linear steppers, nonlinear implicit ones of one stage, and flow_step do. Where
+`step.sparing` is true, backward also takes `new`, the result of the step when it is still known, or None, and `wanted`,
+whether params want a cotangent.
 Where the state is one array, and params another, it may have a time loop of its own as well, for small states:
 
     step.march(states, params)                           fills the rows of `states`, one step from each to the next
@@ -17,6 +18,7 @@ Where the state is one array, and params another, it may have a time loop of its
 
 import numpy as np
 
+from sparsedp.errors import DerivativeError
 from sparsedp.tape import dtype_of
 from sparsedp.trajectory.keep import Last
 from sparsedp.trajectory.layout import NOTHING
@@ -151,7 +153,12 @@ class Whole(Protocol):
         i, (g,) = self.run.n, g
         while i:
             first = (i - 1) // growth.every * growth.every
-            g, self._into = self.run.step.retreat(states[first : i + 1], self.params, g, self._into)
+            g, into = self.run.step.retreat(states[first : i + 1], self.params, g, self._into)
+            if into is not self._into:
+                raise DerivativeError(
+                    "the backward form of the step returned another array for params than the one it was given; add "
+                    "to `into` and return it"
+                )
             i = first
             growth.see(i, [g])
         return [g]
