@@ -97,6 +97,21 @@ def descents(gradient):
     return run
 
 
+def of_autograd():
+    """Microseconds that autograd takes for one primitive of one short array, forward and backward."""
+
+    def chain(many):
+        def loss(u):
+            for _ in range(many):
+                u = -u
+            return anp.sum(u)
+
+        return lambda: autograd.grad(loss)(START)
+
+    best = best_times({many: chain(many) for many in (20, 120)}, 300)
+    return 1e6 * (best[120] - best[20]) / 100
+
+
 def main():
     ours = lambda loss: lambda u: dp.value_and_grad(loss)(u)[1]
     slices, rule = donor_cell()
@@ -122,6 +137,7 @@ def main():
     tasks = {"on the tape": descents(gradients[1]), "rollout": descents(gradients[2])}
     for name, seconds in best_times(tasks, 10).items():
         print(f"51 gradients, composed step, {name:12} {1e3 * seconds:7.1f} ms, limit 100")
+    print(f"autograd's own tape takes {of_autograd():.1f} us a primitive, 5 where the limits were measured")
     first = subprocess.run([sys.executable, "-c", FIRST], capture_output=True, text=True, check=True)
     print(f"first gradient of a process, numba loaded {1e3 * float(first.stdout):7.1f} ms, limit 50")
 

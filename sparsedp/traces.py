@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 from autograd.core import JVPNode, VJPNode, add_outgrads
 from autograd.tracer import isbox, new_box, notrace_primitives, toposort, trace_stack
 
@@ -65,7 +66,11 @@ def backward(end, g):
         g = cotangents.pop(node)[0]
         if not node.parents:
             found[node] = g
+            continue
         for parent, back in zip(node.parents, node.vjp(g), strict=True):
             known = cotangents.get(parent)
-            cotangents[parent] = added(known, back) or add_outgrads(known, back)
+            if known is None and type(back) is np.ndarray:
+                cotangents[parent] = back, False
+            else:
+                cotangents[parent] = added(known, back) or add_outgrads(known, back)
     return found

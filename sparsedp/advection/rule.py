@@ -20,7 +20,9 @@ def rule_of(law):
         return result_like(u, law.forward(*prepare(law, u, v, dt, inflow)), law.setting.space.shape)
 
     def vjp(nums, ans, *args):
-        args = tuple(value if num in nums else own(value, held, num) for num, value in enumerate(args))
+        fixed = [num for num, value in enumerate(args) if type(value) is np.ndarray and num not in nums]
+        if fixed:
+            args = tuple([own(value, held, num) if num in fixed else value for num, value in enumerate(args)])
 
         def pull(g):
             flat = prepare(law, *args)
