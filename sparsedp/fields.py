@@ -16,6 +16,7 @@ __all__ = [
     "check_plain",
     "check_takes",
     "field_array",
+    "frozen",
     "is_number",
     "is_whole",
     "own",
@@ -99,6 +100,15 @@ def place(index, shape):
     """Number of an entry in C order -> its index: a number in 1-D, else a tuple."""
     found = tuple(map(int, np.unravel_index(index, shape)))
     return found[0] if len(found) == 1 else found
+
+
+def frozen(value):
+    """Array -> a view nobody can write through; numbers as they are."""
+    if type(value) is not np.ndarray:
+        return value
+    view = value.view()
+    view.flags.writeable = False
+    return view
 
 
 def own(value, held, key):

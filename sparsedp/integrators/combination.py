@@ -4,6 +4,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ShapeError
+from sparsedp.fields import frozen as frozen_array
 from sparsedp.tape import cast, differentiable, dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten, leaves
 
@@ -114,17 +115,9 @@ def _rounded(leaf, old):
 def frozen(tree):
     """The same tree with arrays that nobody can write into: a rate must not change the state."""
     if not isinstance(tree, (tuple, list, dict)):
-        return _view(tree)
+        return frozen_array(tree)
     found, rebuild = flatten(tree)
-    return rebuild(map(_view, found))
-
-
-def _view(leaf):
-    if type(leaf) is not np.ndarray or not leaf.flags.writeable:
-        return leaf
-    view = leaf.view()
-    view.flags.writeable = False
-    return view
+    return rebuild(map(frozen_array, found))
 
 
 def untraced(tree):

@@ -8,9 +8,10 @@ import numpy as np
 
 from sparsedp.direction import pull_ends
 from sparsedp.errors import DerivativeError
+from sparsedp.fields import frozen
 from sparsedp.tape import dtype_of, is_variable, isbox
 from sparsedp.traces import reverse_root, split_box, trace
-from sparsedp.trajectory.layout import frozen, owned, refuse_mask
+from sparsedp.trajectory.layout import owned, refuse_mask
 from sparsedp.tree import flatten
 
 __all__ = ["All", "Each", "Last"]

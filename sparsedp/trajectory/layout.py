@@ -6,11 +6,11 @@ from math import prod
 import numpy as np
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, surely_finite
+from sparsedp.fields import check_finite, frozen, surely_finite
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten
 
-__all__ = ["NOTHING", "Layout", "dense", "frozen", "owned", "refuse_mask", "still"]
+__all__ = ["NOTHING", "Layout", "dense", "owned", "refuse_mask", "still"]
 
 
 NOTHING = (None,)  # the leaves beside one variable
@@ -53,7 +53,7 @@ class Layout:
         for label, leaf in zip(self.labels, found, strict=True):
             if not self.bare:
                 refuse_mask(f"rollout takes plain arrays, got a masked array as {label}", leaf)
-        moving = [self.bare or is_variable(leaf) for leaf in found]
+        moving = [is_variable(leaf) for leaf in found]
         self.places = [place for place, moves in enumerate(moving) if moves]
         self.statics = (
             NOTHING if self.bare else tuple(None if m else leaf for leaf, m in zip(found, moving, strict=True))
@@ -208,15 +208,6 @@ def refuse_mask(what, leaf):
     """The mask of an array would be lost on the way."""
     if isinstance(leaf, np.ma.MaskedArray):
         raise TypeError(f"{what}; fill it first, and hand the mask along as an array of its own")
-
-
-def frozen(value):
-    """Array -> a view nobody can write through; numbers as they are."""
-    if type(value) is not np.ndarray:
-        return value
-    view = value.view()
-    view.flags.writeable = False
-    return view
 
 
 def still(statics):

@@ -8,8 +8,9 @@ bits are the same. A piece ends where the cotangent is looked at, and before and
 from typing import Any, NamedTuple
 
 from sparsedp.errors import DerivativeError
+from sparsedp.fields import frozen
 from sparsedp.traces import backward, inside, new_box, reverse_root, split_box
-from sparsedp.trajectory.layout import frozen, owned
+from sparsedp.trajectory.layout import owned
 from sparsedp.trajectory.record import looked_at
 from sparsedp.trajectory.steps import Taped, boxed, fitted
 
@@ -34,6 +35,8 @@ class Linked(Taped):
 
     def link(self, state, statics):
         """Run as many steps as can be linked: (how many, the state after them, the states before each of them)."""
+        if not self.recording:
+            return super().link(state, statics)
         value, tapes, kept, first = state[0], self.run.tapes, [], 0  # type: Any, Any, list, int
         while first < self.run.n and tapes.fit and tapes.steps_left():
             before, weighed = tapes.bytes, tapes.weighs(first)
@@ -76,8 +79,13 @@ class Linked(Taped):
         value, _ = inside(steps)
         return Piece(first, first + len(params), root, params, ends[-1]), value
 
-    def unlink(self, g, values, growth):
+    def linked(self):
+        """How many steps from the first on are linked, for the cotangents that are wanted."""
+        return self.run.tapes.linked(self.wanted) if self.run.tapes else 0
+
+    def unlink(self, g, stack, growth):
         """Cotangents of the state at the end of the pieces -> those of the first state, and of params."""
+        ((value,),) = stack[0][1:2]
         for piece in reversed(self.run.tapes.pieces):
             found = {} if g[0] is None or piece.end is None else backward(piece.end, g[0])
             for roots in reversed(piece.params):
@@ -92,7 +100,7 @@ class Linked(Taped):
                 )
             if piece.root is None:
                 return None
-            g = [None if back is None else fitted(back, values[0])]
+            g = [None if back is None else fitted(back, value)]
             if piece.first % growth.every == 0:
                 growth.see(piece.first, g)
         return g

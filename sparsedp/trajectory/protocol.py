@@ -122,10 +122,8 @@ class Protocol(Taped):
 class Whole(Protocol):
     """A step with a time loop of its own: all states are rows of one array."""
 
-    whole = True
-
-    def march(self, state):
-        """Variables of the first state -> those of the last one, and all that are kept."""
+    def link(self, state, statics):
+        """All steps in one piece."""
         run, left = self.run, self.run.n
         many = left if run.store else min(left, max(CHUNK // max(run.state.nbytes, 1), 1))
         states = np.empty((many + 1, *run.state.shapes[0]))
@@ -136,7 +134,7 @@ class Whole(Protocol):
             left -= len(rows) - 1
             if left:
                 states[0] = rows[-1]
-        return [rows[-1]], Rows(states) if run.store else []
+        return run.n, [rows[-1]], Rows(states) if run.store else []
 
     def _march(self, first, rows):
         """Fill the rows; where that fails, step by step, so that `guarded` can name the step."""
@@ -148,9 +146,13 @@ class Whole(Protocol):
                 self.run.step.march(rows[i : i + 2], self.params)
             raise
 
-    def retreat(self, states, g, growth):
+    def linked(self):
+        """All of them."""
+        return self.run.n
+
+    def unlink(self, g, stack, growth):
         """Cotangents of the last state -> those of the first."""
-        i, (g,) = self.run.n, g
+        i, (g,), states = self.run.n, g, stack.states
         while i:
             first = (i - 1) // growth.every * growth.every
             g, into = self.run.step.retreat(states[first : i + 1], self.params, g, self._into)

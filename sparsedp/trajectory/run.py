@@ -93,11 +93,8 @@ class Run:
     def _advance(self, engine, collector, args):
         """(last state, its statics, kept states) after all steps."""
         state, statics = self.split(args)[0], still(self.state.statics)
-        if engine.whole:
-            state, rows = engine.march(state)
-            return collector.see(self.n, state, statics), statics, rows
         state, along = collector.see(0, state, statics), self.keep.along
-        first, state, kept = engine.link(state, statics) if engine.recording else (0, state, [])
+        first, state, kept = engine.link(state, statics)
         stop, last = first if self.store else -1, self.n - 1
         if first == self.n:
             state = collector.see(first, state, statics)

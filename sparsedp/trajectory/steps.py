@@ -6,9 +6,10 @@ import numpy as np
 
 from sparsedp.direction import pull_ends, zero_like
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
+from sparsedp.fields import frozen
 from sparsedp.tape import fit
 from sparsedp.traces import inside, new_box, reverse_root, split_box
-from sparsedp.trajectory.layout import frozen, owned, still
+from sparsedp.trajectory.layout import owned, still
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["Taped", "boxed", "fitted"]
@@ -34,7 +35,6 @@ class Taped:
     """
 
     known = None  # going back: variables of the state after this step, where every state is kept
-    whole = False  # whether it runs all steps in one call
 
     def __init__(self, run, args, wanted=(), recording=False):
         self.run, self.recording = run, recording
@@ -57,6 +57,10 @@ class Taped:
     def link(self, state, statics):
         """Steps that are run in one piece: (how many, the state after them, the states before each of them)."""
         return 0, state, []
+
+    def linked(self):
+        """How many steps, from the first on, `unlink` goes back through in one piece."""
+        return 0
 
     def forward(self, i, values, statics, room=None):
         """Variables and statics of state i -> those of state i + 1. `room` is for steps that can use it."""

@@ -31,14 +31,12 @@ class Way:
         source = run.keep.source(run.n, g)
         total = source(run.n, *self.final)
         growth.see(run.n, total)
-        linked = run.tapes.linked(self.engine.wanted) if run.tapes else 0
-        if self.engine.whole:
-            total, linked = self.engine.retreat(self.stack.states, total, growth), run.n
+        linked = self.engine.linked()
         for i in shown_steps(run.progress, range(run.n - 1, linked - 1, -1), "backward"):
             if total is None and not run.keep.along:
                 break  # cut by truncation
             total = self._step(i, total, source, growth)
-        if linked and not self.engine.whole and total is not None:
+        if linked and total is not None:
             total = self._unlinked(linked, total, source, growth)
         if active:
             count("rollout.step", "vjp", run.n)
@@ -50,9 +48,9 @@ class Way:
         return total
 
     def _unlinked(self, linked, total, source, growth):
-        """Through the steps on one tape; where that fails, step by step, so that `guarded` can name the step."""
+        """Through the steps of one piece; where that fails, step by step, so that `guarded` can name the step."""
         try:
-            return self.engine.unlink(total, self.stack[0][1], growth)
+            return self.engine.unlink(total, self.stack, growth)
         except Exception:
             for i in range(linked - 1, -1, -1):
                 total = self._step(i, total, source, growth)
