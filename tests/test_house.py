@@ -58,7 +58,7 @@ DOORS = [
 ]
 TALKS = r"report/.*|__main__\.py"  # may print
 NOWHERE = {"utils.py", "util.py", "helpers.py", "helper.py", "misc.py", "common.py"}
-LENGTHS = {"sparsedp": 300, "tests": 300, "benchmarks": 300, "examples": 60}
+LENGTHS = {"sparsedp": 600, "tests": 600, "benchmarks": 300, "examples": 60}
 LONGER = {"solver_in_the_loop.py": 125}  # two solvers, a network and a study
 EXTRAS = ("numba", "llvmlite", "matplotlib", "tqdm")  # foreign libraries that need not be there
 LAZY = ("pyamg", "numba", "matplotlib", "tqdm", "scipy", "autograd", "numpy")  # not touched by `import sparsedp`
@@ -163,7 +163,9 @@ def test_floors_rule_sees_a_wrong_import():
 
 
 def test_no_rooms_for_leftovers():
-    none(f"{path}: name it after what it does" for path in ROOT.rglob("*.py") if path.name in NOWHERE)
+    # only what is ours: a virtual environment in the checkout holds the files of others
+    found = [*ROOT.glob("*.py"), *(path for folder in LENGTHS for path in (ROOT / folder).rglob("*.py"))]
+    none(f"{path}: name it after what it does" for path in found if path.name in NOWHERE)
 
 
 def test_no_star_imports():
@@ -224,7 +226,7 @@ def test_length_of_files(folder):
 
 
 def test_length_of_bodies():
-    none(f"{m.place}:{f.lineno} {f.name} has {body_length(f)} lines" for m, f in functions() if body_length(f) > 40)
+    none(f"{m.place}:{f.lineno} {f.name} has {body_length(f)} lines" for m, f in functions() if body_length(f) > 60)
 
 
 def test_median_length_of_bodies():
