@@ -10,6 +10,7 @@ with the coefficients of G^T and K D^T.
 from math import sqrt
 
 import numpy as np
+import scipy.sparse as sp
 
 from sparsedp.kernels import passes
 
@@ -35,8 +36,9 @@ class Passes:
         self.shape = cells + faces
         self.cells, self.faces = np.zeros((2, sum(cells))), np.zeros((3, sum(faces)))
         ends = np.cumsum(cells), np.cumsum(faces)
-        for axis, free in enumerate(open_faces):
-            lines = _lines(_factor(D, (0, axis), axis), _factor(G, (axis, 0), axis), free, transposed)
+        for axis, (n, free) in enumerate(zip(grid.shape, open_faces, strict=True)):
+            pair = _factor(D, (0, axis), (n, free.size)), _factor(G, (axis, 0), (free.size, n))
+            lines = _lines(*pair, free, transposed)
             for table, some, stop in zip((self.cells, self.faces), (lines[:2], lines[2:]), ends, strict=True):
                 table[:, stop[pad + axis] - some[0].size : stop[pad + axis]] = some
 
@@ -50,18 +52,16 @@ class Passes:
         passes.push(x, p, self.shape, self.faces, out)
 
 
-def _factor(op, block, axis):
+def _factor(op, block, shape):
+    """The matrix along the axis of a component; a block that is missing is 0: the slope along one closed cell."""
     terms = op.structure.blocks.get(block, ())
-    return terms[0].factors[axis].scaled(terms[0].scale).matrix if terms else None
+    return terms[0].factors[max(block)].scaled(terms[0].scale).matrix if terms else sp.csr_array(shape)
 
 
 def _lines(D, G, free, transposed):
     """Factors of one axis -> (lower, upper) for cells, (keep, below, above) for faces."""
-    m, n = free.size, free.size if D is None else D.shape[0]
-    cell, face = np.arange(n), np.arange(m)
-    zero = np.zeros(m)
-    if D is None or G is None:  # one periodic cell: what leaves comes in
-        return zero[:n], zero[:n], free * 1.0, zero, zero
+    n, m = D.shape
+    cell, face, zero = np.arange(n), np.arange(m), np.zeros(m)
     lower, upper = np.asarray(D[cell, cell]), np.asarray(D[cell, (cell + 1) % m])
     above, below = zero.copy(), np.asarray(G[face, (face - 1) % n])
     above[:n] = G[cell, cell]

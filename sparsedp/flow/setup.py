@@ -15,6 +15,7 @@ from sparsedp.solvers.scaling import largest
 
 __all__ = ["Setup"]
 
+EPS = np.finfo(float).eps
 FEW = 1024  # cells below which transforms are tried even where `inverse` would factor
 
 
@@ -43,12 +44,12 @@ class Setup:
             forward if self.symmetric else (self.G.structure.transpose(), self.D.structure.transpose()),
             strict=True,
         )
+        self.reach = tuple(largest(magnitude(first)(np.ones(grid.faces.size))) for first in self.firsts)
         fast = self.solver.engine.method == "separable" and self.grid.cells.size > 0
         self.passes = self._make_passes() if fast else None
-        self.reach = tuple(largest(magnitude(first)(np.ones(grid.faces.size))) for first in self.firsts)
 
     def _make_passes(self):
-        """The forward pair of passes, and the transposed one."""
+        """The forward pair of passes, and the transposed one; None where they are not what the operators do."""
         free = []
         for axis, words in enumerate(self.sides):
             line = np.ones(self.grid.node_count(axis), dtype=bool)
@@ -56,7 +57,22 @@ class Setup:
                 line[[0, -1]] = [word not in CLOSED for word in words]
             free.append(line)
         forward = Passes(self.grid, self.D, self.G, free, False)
-        return forward, forward if self.symmetric else Passes(self.grid, self.D, self.G, free, True)
+        both = forward, forward if self.symmetric else Passes(self.grid, self.D, self.G, free, True)
+        return both if all(map(self._agree, both, self.firsts, self.seconds)) else None
+
+    def _agree(self, passes, first, second):
+        """Whether passes act as the operators D and G do, to rounding.
+
+        Linear maps that agree on random fields agree everywhere: the residual of a solve, which the passes take, is
+        then that of the operators themselves.
+        """
+        generator = np.random.default_rng(0)
+        x, p = generator.random(self.grid.faces.size), generator.random(self.grid.cells.size)
+        flow, whole = np.empty(p.size), np.empty(x.size)
+        passes.net_flow(x, flow)
+        passes.push(x, p, whole)
+        inner = self.open * x
+        return _equal(flow, first, inner) and _equal(whole - inner, second, p, self.open)
 
     @cached_property
     def still(self):
@@ -111,3 +127,9 @@ def _inverse(op, method, rtol, maxiter, options):
         except ValueError:  # an axis that cannot be diagonalised with all its digits
             pass
     return build(op, method, *settings)
+
+
+def _equal(found, structure, x, kept=1.0):
+    """Whether found is kept A x, each entry to the rounding of its own row; 0 <= x <= 1."""
+    rows = magnitude(structure)(np.ones(x.size)) + 1.0  # beside a field of that size
+    return bool(np.all(np.abs(found - kept * structure.product(x)) <= 8 * EPS * rows))
