@@ -47,7 +47,7 @@ class Splitting:
             p = self._by_transforms(x, out, source)
         if p is None:
             p = self._with_care(x, out, source)
-        if setup.still:
+        if setup.still and source is None:  # P; the transposed pressure alone makes something of a source
             out[:] = 0.0
         return p
 
