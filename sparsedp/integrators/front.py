@@ -45,7 +45,7 @@ def stepper(
         backward_euler          1     L-stable: any dt, what is stiff dies out
         crank_nicolson          2     any dt, but what is stiff keeps its size and changes sign (it rings)
         tr_bdf2                 2     L-stable, two stages with one factor
-        imex                    2     the operator `linear` implicit (L-stable), the rate explicit
+        imex                    2     `linear` and source implicit (L-stable), the rate explicit
         etdrk4                  4     `linear` exact by transforms (separable only), the rate explicit
         ======================= ===== ==============================================================
     rate : callable or Operator
@@ -57,8 +57,9 @@ def stepper(
     linear : Operator or (Operator, coefficient), optional
         A term c L u beside the rate, with u one array; `coefficient` is a number >= 0 or a function of params.
     source : callable, optional
-        ``source(params)`` or ``source(params, t)``: a term that does not depend on u. A problem of operator
-        and source only is linear: one set-up for each c dt serves all stages, steps and adjoint solves.
+        ``source(params)`` or ``source(params, t)``: a term that does not depend on u, such as nu D(B(values)) of walls
+        that move, with B a `lift`; implicit methods keep their order with it, imex and etdrk4 too. A problem of
+        operator and source only is linear: one set-up for each c dt serves all stages, steps and adjoint solves.
     timed : bool, optional
         Whether rate or source takes the time; default: by its number of arguments.
     tolerance : float, optional

@@ -19,7 +19,7 @@ from sparsedp.integrators.resolvent import Resolvent
 from sparsedp.operator import Operator
 from sparsedp.solvers.roots import implicit
 
-__all__ = ["IMPLICIT", "Linear", "Nonlinear"]
+__all__ = ["IMPLICIT", "Linear", "Nonlinear", "later"]
 
 G = 2 - np.sqrt(2.0)
 D = float(G / 2)
@@ -29,7 +29,7 @@ G = float(G)
 
 def backward_euler(stage, u, params, t, h):
     """Order 1, L-stable."""
-    return stage.solve(u, u, params, stage.later(t, h), h)
+    return stage.solve(u, u, params, later(t, h), h)
 
 
 def crank_nicolson(stage, u, params, t, h):
@@ -40,7 +40,7 @@ def crank_nicolson(stage, u, params, t, h):
 def tr_bdf2(stage, u, params, t, h):
     """Order 2, L-stable."""
     y = stage.trapezium(u, params, t, G * h)
-    return stage.solve(y, combine(u, (C, combine(y, (-1.0, u)))), params, stage.later(t, h), D * h)
+    return stage.solve(y, combine(u, (C, combine(y, (-1.0, u)))), params, later(t, h), D * h)
 
 
 IMPLICIT = {"backward_euler": (backward_euler, 1), "crank_nicolson": (crank_nicolson, 2), "tr_bdf2": (tr_bdf2, 2)}
@@ -56,10 +56,6 @@ class Stage:
     def __call__(self, u, params, t, h):
         """The state after a step h."""
         return self.advance(self, u, params, t, h)
-
-    @staticmethod
-    def later(t, h):
-        return t if t is None else t + h
 
 
 class Linear(Stage):
@@ -92,7 +88,7 @@ class Linear(Stage):
         """x of x = u + h/2 (f(u, t) + f(x, t + h))."""
         b = u
         if self.problem.source is not None:
-            ends = self.problem.given(params, t), self.problem.given(params, self.later(t, h))
+            ends = self.problem.given(params, t), self.problem.given(params, later(t, h))
             b = combine(u, *((0.25 * h, source) for source in ends))
         w = self.resolvent(0.5 * h * self.problem.coefficient(params), b)
         return 2.0 * w - u
@@ -147,11 +143,16 @@ class Nonlinear(Stage):
     def trapezium(self, u, params, t, h):
         """x of x = u + h/2 (f(u, t) + f(x, t + h))."""
         b = combine(u, (0.5 * h, self.problem(u, params, t)))
-        return self.solve(u, b, params, self.later(t, h), 0.5 * h)
+        return self.solve(u, b, params, later(t, h), 0.5 * h)
 
     @property
     def info(self):
         return self.root.info
+
+
+def later(t, h):
+    """The time t + h, or None where nothing takes a time."""
+    return t if t is None else t + h
 
 
 def shifted(jacobian, timed):

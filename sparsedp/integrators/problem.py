@@ -34,12 +34,14 @@ class Problem:
     ----------
     linear : bool
         Whether the right-hand side is c L u + source: a step is a linear solve.
+    driven, moving : bool
+        Whether the rate, and whether the source, takes the time.
     """
 
     def __init__(self, rate, op, coefficient, source, timed, whole=False):
         self.rate, self.op, self.source, self.timed, self.whole = rate, op, source, timed, whole
         self._coefficient = coefficient
-        self._calls = [(fun, _takes(fun, least)) for fun, least in ((rate, 3), (source, 2)) if fun is not None]
+        self.driven, self.moving = (f is not None and _takes(f, least) for f, least in ((rate, 3), (source, 2)))
         self.linear = op is not None and rate is None
 
     def coefficient(self, params):
@@ -53,16 +55,16 @@ class Problem:
 
     def rest(self, u, params, t):
         """rate + source, or None when there is neither."""
-        total = None
-        for fun, with_time in self._calls:
-            args = (params, t) if with_time else (params,)
-            value = fun(*args) if fun is self.source else _unchanged(fun, u, args)
-            total = value if total is None else combine(total, (1.0, value))
-        return total
+        parts = [part for part in (self.explicit(u, params, t), self.given(params, t)) if part is not None]
+        return combine(parts[0], (1.0, parts[1])) if len(parts) == 2 else parts[0] if parts else None
+
+    def explicit(self, u, params, t):
+        """The rate alone, or None."""
+        return None if self.rate is None else _unchanged(self.rate, u, (params, t) if self.driven else (params,))
 
     def given(self, params, t):
         """The source alone, or None."""
-        return self.rest(None, params, t) if self.source is not None else None
+        return None if self.source is None else self.source(*((params, t) if self.moving else (params,)))
 
     def __call__(self, u, params, t):
         """The whole right-hand side."""
