@@ -14,6 +14,7 @@ from sparsedp.solvers.probing import REFUSED, changes, points_near, typical
 from sparsedp.solvers.sparsity import dense_pattern, find_pattern, pattern_of
 from sparsedp.solvers.translates import translated_pattern
 from sparsedp.tape import Rule, differentiable, plain
+from sparsedp.tree import copied
 
 __all__ = ["Adopted", "adopt"]
 
@@ -80,7 +81,7 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
         raise TypeError(f"adopt takes a function of one array, got {type(f).__name__}; write dp.adopt(lambda x: ...)")
     if derivative not in ("auto", "complex", "difference"):
         raise ValueError(f"derivative must be auto, complex or difference, got {derivative!r}")
-    return Adopted(f, sparsity, derivative, name or getattr(f, "__name__", "simulator"))
+    return Adopted(f, copied(sparsity), derivative, name or getattr(f, "__name__", "simulator"))
 
 
 class Adopted:

@@ -7,8 +7,9 @@ Dict entries keep their order.
 from math import hypot, isfinite
 
 import numpy as np
+import scipy.sparse as sp
 
-__all__ = ["flatten", "leaves", "norm"]
+__all__ = ["copied", "flatten", "leaves", "norm"]
 
 
 def flatten(tree):
@@ -40,6 +41,12 @@ def flatten(tree):
         return _build(tree, iter(values))
 
     return found, rebuild
+
+
+def copied(tree):
+    """Tree -> the same tree with copies of its arrays and sparse matrices: the caller may reuse them."""
+    found, rebuild = flatten(tree)
+    return rebuild(leaf.copy() if isinstance(leaf, np.ndarray) or sp.issparse(leaf) else leaf for leaf in found)
 
 
 def leaves(tree):

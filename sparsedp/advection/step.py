@@ -6,6 +6,7 @@ from sparsedp.advection.law import FIELD, VELOCITY
 from sparsedp.advection.values import prepare, raised, result_like, unflatten
 from sparsedp.errors import DerivativeError
 from sparsedp.tape import dtype_of, isbox
+from sparsedp.tree import copied
 
 __all__ = ["Step"]
 
@@ -21,8 +22,8 @@ class Step:
             raise DerivativeError(
                 "step needs constant dt and inflow, got traced ones; write lambda u, p: move(u, p[0], p[1]) instead"
             )
-        self.transport, self.dt = transport, dt
-        self.inflow = inflow.copy() if isinstance(inflow, np.ndarray) else inflow  # the caller may reuse the array
+        self.transport = transport
+        self.dt, self.inflow = copied((dt, inflow))  # the caller may reuse the arrays
 
     def __call__(self, u, v):
         return self.transport(u, v, self.dt, self.inflow)

@@ -22,6 +22,7 @@ from sparsedp.grid import check_grid
 from sparsedp.ledger import active, count
 from sparsedp.operator import Operator
 from sparsedp.solvers.choose import check_settings
+from sparsedp.tree import copied
 
 __all__ = ["Projection", "projection"]
 
@@ -74,7 +75,7 @@ def projection(grid, solid=None, boundary="no_slip", method="auto", rtol=1e-10, 
     """
     check_grid("projection", grid)
     check_settings(method, rtol, maxiter, "project")
-    settings = (method, rtol, maxiter, options)
+    settings = (method, float(rtol), maxiter, copied(options))
     return Projection(Setup(grid, solid, boundary, settings))
 
 

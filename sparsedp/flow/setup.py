@@ -27,9 +27,10 @@ class Setup:
     """
 
     def __init__(self, grid, solid, boundary, settings):
-        self.recipe = grid, solid, boundary, settings
         self.grid, self.sides = grid, flow_sides(grid, boundary)
         self.solid = None if solid is None else check_solid(grid, solid).copy()
+        words = {axis: pair for axis, pair in zip(grid.axes, self.sides, strict=True) if pair}
+        self.recipe = grid, self.solid, words, settings  # nothing that the caller may change
         self.exponent = int(np.frexp(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))[1])
         near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
         self.D = divergence(near)

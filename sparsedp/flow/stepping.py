@@ -22,6 +22,7 @@ from sparsedp.operators.boundary import identity, mask
 from sparsedp.operators.difference import gradient
 from sparsedp.solvers.choose import inverse
 from sparsedp.tape import isbox, plain
+from sparsedp.tree import copied
 
 __all__ = ["FlowStep", "flow_step"]
 
@@ -106,7 +107,11 @@ def flow_step(
             f"flow_step takes walls on {grid.faces}, got an array of shape {np.shape(plain(walls))}; write "
             "face_lift(grid, boundary)(values)"
         )
-    return FlowStep(grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary)
+    viscosity, walls = (
+        viscosity if callable(viscosity) else float(viscosity),
+        copied(walls),
+    )  # the caller may reuse them
+    return FlowStep(grid, float(dt), viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary)
 
 
 def _check_constant(name, number, least):

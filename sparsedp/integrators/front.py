@@ -11,6 +11,7 @@ from sparsedp.integrators.split_steps import SPLIT, Exponential, Imex
 from sparsedp.integrators.stability import Limit
 from sparsedp.integrators.steps import Step
 from sparsedp.solvers.choose import check_settings
+from sparsedp.tree import copied
 
 __all__ = ["METHODS", "stepper"]
 
@@ -121,11 +122,11 @@ def stepper(
     if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
         raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
     problem = posed(rate, linear, source, timed)
-    settings = dict(method=solver, rtol=rtol, nullspace="raise")
+    settings, options = dict(method=solver, rtol=float(rtol), nullspace="raise"), copied(options)
     scheme = _scheme(method, problem, jacobian, settings, maxiter, options, KEPT[tolerance is not None])
     limit = None
     if tolerance is not None:
-        scheme = Adaptive(scheme, tolerance, floor, f"stepper({method})")
+        scheme = Adaptive(scheme, float(tolerance), copied(floor), f"stepper({method})")
     elif method in EXPLICIT and problem.op is not None and unstable == "raise":
         limit = Limit(problem.op, EXPLICIT[method].reach, method)
     dt = dt if callable(dt) else positive(dt, "dt")

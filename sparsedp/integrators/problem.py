@@ -10,7 +10,7 @@ from sparsedp.integrators.combination import combine, frozen
 from sparsedp.operator import Operator
 from sparsedp.space import fits
 from sparsedp.tape import isbox, plain
-from sparsedp.tree import flatten
+from sparsedp.tree import copied, flatten
 
 __all__ = ["Problem", "positive", "posed"]
 
@@ -101,7 +101,7 @@ def _linear(given, whole):
     """(Operator or None, function params -> coefficient)."""
     if given is None:
         return None, None
-    op, coefficient = given if isinstance(given, tuple) and len(given) == 2 else (given, 1.0)
+    op, coefficient = copied(given) if isinstance(given, tuple) and len(given) == 2 else (given, 1.0)
     if not isinstance(op, Operator):
         raise TypeError(f"linear takes an Operator or a pair (Operator, coefficient), got {type(op).__name__}")
     if not fits(op.domain, op.codomain):

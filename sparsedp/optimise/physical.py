@@ -60,6 +60,7 @@ def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
     """
     if not (is_number(rate) and rate > 0):
         raise ValueError(f"physical_gradient needs a positive rate, got {rate!r}; the default is 1")
+    rate = float(rate)
 
     def vjp(nums, y, x):
         def pull(g):

@@ -18,6 +18,7 @@ from sparsedp.solvers.solution import Inverse
 from sparsedp.solvers.structured import structured_engine, structured_if_suited
 from sparsedp.solvers.system import System
 from sparsedp.space import fits
+from sparsedp.tree import copied
 
 __all__ = ["METHODS", "build", "check_settings", "inverse"]
 
@@ -113,7 +114,7 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     if not fits(op.domain, op.codomain):
         raise ShapeError(f"inverse takes a square operator, got one from {op.domain} to {op.codomain}; write op.T @ op")
     check_settings(method, rtol, maxiter, nullspace)
-    return build(op, method, rtol, maxiter, nullspace, options)
+    return build(op, method, float(rtol), maxiter, nullspace, copied(options))
 
 
 def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, solves="many"):

@@ -24,6 +24,7 @@ from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.record import SolveLog
 from sparsedp.space import Space
 from sparsedp.tape import cast, differentiable, dtype_of, isbox, plain
+from sparsedp.tree import copied
 
 __all__ = ["MatrixSolver", "matrix_solver"]
 
@@ -81,9 +82,8 @@ def matrix_solver(pattern, method="auto", rtol=1e-10, maxiter=None, nullspace="r
     domain = domain if isinstance(domain, Space) else Space(pattern.shape[0] if domain is None else domain)
     if pattern.shape != (domain.size, domain.size):
         raise ShapeError(f"matrix_solver takes a square pattern of {domain.size} rows, got shape {pattern.shape}")
-    return MatrixSolver(
-        pattern, domain, dict(method=method, rtol=rtol, maxiter=maxiter, nullspace=nullspace, options=options)
-    )
+    settings = dict(method=method, rtol=float(rtol), maxiter=maxiter, nullspace=nullspace, options=copied(options))
+    return MatrixSolver(pattern, domain, settings)
 
 
 def _canonical(pattern):

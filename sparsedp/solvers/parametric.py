@@ -29,6 +29,7 @@ from sparsedp.space import fits
 from sparsedp.structure.base import Structure
 from sparsedp.structure.lazy import Chain, Diagonal
 from sparsedp.tape import cast, differentiable, dtype_of, isbox, plain
+from sparsedp.tree import copied
 
 __all__ = ["EllipticSolver", "elliptic_solver"]
 
@@ -93,7 +94,8 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
             f"{G.name} {G.domain} to {G.codomain}"
         )
     check_settings(method, rtol, maxiter, nullspace)
-    return EllipticSolver(D, G, dict(method=method, rtol=rtol, maxiter=maxiter, nullspace=nullspace, options=options))
+    settings = dict(method=method, rtol=float(rtol), maxiter=maxiter, nullspace=nullspace, options=copied(options))
+    return EllipticSolver(D, G, settings)
 
 
 class EllipticSolver:

@@ -26,6 +26,7 @@ from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Newton
 from sparsedp.solvers.record import Run, SolveLog
 from sparsedp.tape import differentiable
+from sparsedp.tree import copied
 
 __all__ = ["Root", "implicit"]
 
@@ -106,9 +107,8 @@ def implicit(
     check_settings(method, rtol, maxiter, nullspace)
     if maxiter is None:
         raise ValueError("maxiter must be a whole number >= 1, got None")
-    return Root(
-        residual, jacobian, sparsity, rtol, int(maxiter), dict(method=method, nullspace=nullspace, options=options)
-    )
+    settings = dict(method=method, nullspace=nullspace, options=copied(options))
+    return Root(residual, jacobian, sparsity, float(rtol), int(maxiter), settings)
 
 
 class Root:

@@ -1,0 +1,197 @@
+"""Builders keep none of the arrays, lists and dicts that they are given: the caller may reuse them."""
+
+import pickle
+from copy import deepcopy
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+import sparsedp as dp
+from sparsedp.derivative import value_and_grad
+from sparsedp.tree import leaves
+
+GRID = dp.Grid((4, 3), size=1.0)
+L = dp.laplacian(GRID, dp.dirichlet)
+SOLID = np.zeros(GRID.shape, bool)
+SOLID[1, 1] = True
+K = np.linspace(1.0, 2.0, GRID.faces.size)
+CELLS = np.linspace(1.0, 2.0, 12).reshape(GRID.shape)
+ROWS = np.eye(12) * 4 + np.eye(12, k=1) + np.eye(12, k=-1)
+
+
+def cells(op):
+    return op(CELLS)
+
+
+def flow(step):
+    state = step.start(np.cos(np.arange(GRID.faces.size)))
+    return leaves(dp.rollout(step, state, None, 2))
+
+
+def moved(move):
+    return move(CELLS, 0.1 * K, 0.01, 0.5)
+
+
+def stepped(step):
+    return value_and_grad(lambda u: anp.sum(dp.rollout(step, u, 0.5, 2) ** 2))(CELLS)
+
+
+def squares(x):
+    return x**2 + 0.5 * np.roll(x, 1)
+
+
+def cubic(x, p):
+    return x**3 + x - p
+
+
+def walls(name):
+    return {"x": (dp.neumann, dp.dirichlet)} if name == "pressure" else {"x": ["inflow", "outflow"]}
+
+
+# name -> (arguments that hold arrays, lists or dicts; builder; what it is used for)
+BUILDERS = {
+    "Grid": ((np.linspace(1, 2, 4), [1.0, 2.0]), lambda h, o: dp.Grid((4, 3), spacing=[h, 1.0], origin=o), repr),
+    "Grid, widths": (
+        (np.linspace(1, 2, 4),),
+        lambda h: dp.Grid(4, spacing=h),
+        lambda grid: dp.laplacian(grid)(np.arange(4.0)),
+    ),
+    "Grid, lists": (([4, 3], [2.0, 1.0], [True, False]), lambda n, s, p: dp.Grid(n, size=s, periodic=p), repr),
+    "Space": (([4, 3],), lambda n: dp.Space(n), lambda space: space.volumes),
+    "gradient": ((SOLID, walls("pressure")), lambda s, b: dp.gradient(GRID, b, s), cells),
+    "laplacian": ((SOLID, walls("pressure")), lambda s, b: dp.laplacian(GRID, b, s, dp.dirichlet), cells),
+    "robin": ((np.array(2.0), np.array(0.5)), dp.robin, lambda c: dp.laplacian(GRID, c)(CELLS)),
+    "lift": ((walls("pressure"),), lambda b: dp.lift(GRID, b), lambda op: op(np.ones(op.domain.shape))),
+    "average": ((walls("pressure"),), lambda b: dp.average(GRID, b), cells),
+    "interior": ((SOLID,), lambda s: dp.interior(GRID, s), lambda op: op(K)),
+    "mask": ((SOLID,), lambda s: dp.mask(GRID.cells, s), cells),
+    "diagonal": ((CELLS,), lambda v: dp.diagonal(GRID.cells, v), cells),
+    "scaled": ((np.array(2.0),), lambda c: c * dp.from_functions(np.sin, np.cos, 12, 12), lambda op: op(CELLS.ravel())),
+    "sample": ((np.array([[0.2, 0.3], [0.5, 0.6]]),), lambda p: dp.sample(GRID, p), cells),
+    "restrict": (([2, 3],), lambda f: dp.restrict(GRID, f), cells),
+    "from_matrix, dense": ((ROWS,), dp.from_matrix, lambda op: op(CELLS.ravel())),
+    "from_matrix, csr": ((sp.csr_array(ROWS),), dp.from_matrix, lambda op: op(CELLS.ravel())),
+    "from_matrix, coo": ((sp.coo_array(ROWS),), dp.from_matrix, lambda op: op.T(CELLS.ravel())),
+    "matrix_solver": ((sp.csr_array(ROWS),), dp.matrix_solver, lambda solve: solve(ROWS[ROWS != 0], CELLS.ravel())),
+    "inverse": (
+        ([["forward"], ["backward"]],),
+        lambda sweeps: dp.inverse(-L, "multigrid", sweeps=sweeps),
+        lambda inv: pickle.loads(pickle.dumps(inv))(CELLS),
+    ),
+    "inverse, rtol": ((np.array(1e-3),), lambda rtol: dp.inverse(-L, "krylov", rtol), cells),
+    "elliptic_solver": (
+        (np.array(1e-3),),
+        lambda rtol: dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet), "krylov", rtol),
+        lambda solve: solve(K, CELLS),
+    ),
+    "implicit": ((sp.csr_array(np.eye(12)),), lambda s: dp.implicit(cubic, sparsity=s), lambda f: f(CELLS, CELLS)),
+    "adopt": (
+        (sp.csr_array(np.eye(12) + np.roll(np.eye(12), -1, 1)),),
+        lambda s: dp.adopt(squares, s),
+        lambda f: value_and_grad(lambda x: anp.sum(f(x)))(np.arange(12.0)),
+    ),
+    "exponential": ((np.array(0.3),), lambda t: dp.exponential(L, t), cells),
+    "power": ((np.array(0.5),), lambda t: dp.power(-L, t), cells),
+    "face_laplacian": ((SOLID, walls("flow")), lambda s, b: dp.face_laplacian(GRID, b, s), lambda op: op(K)),
+    "face_lift": ((walls("flow"),), lambda b: dp.face_lift(GRID, b), lambda op: op(np.ones(op.domain.shape))),
+    "convection": ((SOLID, walls("flow")), lambda s, b: dp.convection(GRID, b, s), lambda f: f(K, K)),
+    "projection": ((SOLID, walls("flow")), lambda s, b: dp.projection(GRID, s, b), lambda P: P(K)),
+    "projection, sent": (
+        (SOLID, walls("flow")),
+        lambda s, b: dp.projection(GRID, s, b),
+        lambda P: pickle.loads(pickle.dumps(P))(K),
+    ),
+    "flow_step": (
+        (np.sin(K), SOLID, walls("flow"), np.array(0.01), np.array(0.02)),
+        lambda w, s, b, dt, nu: dp.flow_step(GRID, dt, nu, boundary=b, solid=s, walls=w),
+        flow,
+    ),
+    "flow_step, implicit": (
+        (np.sin(K), np.array(0.02)),
+        lambda w, nu: dp.flow_step(GRID, 0.01, nu, implicit=True, walls=w),
+        flow,
+    ),
+    "transport": (
+        (SOLID, {"x": [dp.dirichlet, dp.neumann]}),
+        lambda s, b: dp.transport(GRID, "van_leer", b, solid=s),
+        moved,
+    ),
+    "semi_lagrangian": ((SOLID,), lambda s: dp.transport(GRID, "semi_lagrangian", solid=s), lambda m: m(CELLS, K, 0.1)),
+    "transport step": (
+        (np.array(0.01), np.linspace(1.0, 2.0, 14)),
+        lambda dt, inflow: dp.transport(GRID, boundary=dp.dirichlet).step(dt, inflow),
+        lambda step: step(CELLS, 0.1 * K),
+    ),
+    "transport operator": ((0.1 * K,), lambda v: dp.transport(GRID).operator(v, 0.01), cells),
+    "stepper": (
+        (np.array(0.01), np.array(1e-3)),
+        lambda dt, r: dp.stepper("tr_bdf2", L, dt, solver="krylov", rtol=r),
+        stepped,
+    ),
+    "stepper, coefficient": (
+        (np.array(0.3),),
+        lambda c: dp.stepper("imex", lambda u, p: p * u * u, 0.01, linear=(L, c)),
+        stepped,
+    ),
+    "stepper, error control": (
+        (np.array(1e-4), 0.1 * CELLS),
+        lambda tolerance, floor: dp.stepper("heun", lambda u, p: -p * u**2, 0.5, tolerance=tolerance, floor=floor),
+        stepped,
+    ),
+    "physical_gradient": (
+        (np.array(0.5),),
+        lambda rate: dp.physical_gradient(lambda x: x**3, lambda y, x: np.cbrt(y), rate),
+        lambda cube: value_and_grad(lambda x: anp.sum(cube(x)))(CELLS),
+    ),
+}
+
+
+def spoil(thing):
+    """Other numbers in every array, and other entries in every list and dict."""
+    if isinstance(thing, dict):
+        thing.clear()
+    elif isinstance(thing, list):
+        for part in thing:
+            spoil(part)
+        thing[:] = thing[::-1]
+    elif isinstance(thing, tuple):
+        for part in thing:
+            spoil(part)
+    elif sp.issparse(thing):
+        thing.data[:] = 0.0
+        for name in ("indices", "row", "col"):
+            if hasattr(thing, name):
+                getattr(thing, name)[:] = 0
+    elif isinstance(thing, np.ndarray):
+        thing[...] = ~thing if thing.dtype == bool else 1e-7 * thing
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_arrays_may_be_reused(name):
+    """The same bits, whether the arguments are overwritten before the first use, after it, or never."""
+    given, build, use = BUILDERS[name]
+    wanted = use(build(*deepcopy(given)))
+    for used in (False, True):
+        mine = deepcopy(given)
+        made = build(*mine)
+        if used:
+            use(made)
+        spoil(mine)
+        found = use(made)
+        if isinstance(wanted, str):
+            assert found == wanted
+            continue
+        for one, other in zip(leaves(found), leaves(wanted), strict=True):
+            assert np.array_equal(one, other)
+
+
+def test_every_builder_is_here():
+    """The others are built of no arrays (a LinearOperator and functions are used as they are), or build nothing."""
+    unbuilt = "identity divergence curl upwind embed part prolong harmonic_average from_functions from_linear_operator"
+    calls = "adopt minimise certify certified explain stress workprec rollout value_and_grad differentiable set_threads"
+    shown = "animate plot convergence v_curve update_direction"
+    public = {name for name in dir(dp) if callable(getattr(dp, name)) and name.islower() and name[0] != "_"}
+    here = {name.split(",")[0].split(" ")[0] for name in BUILDERS}
+    assert public - here == set(f"{unbuilt} {calls} {shown}".split()) - here
