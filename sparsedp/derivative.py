@@ -5,6 +5,7 @@ from numbers import Number
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.constants import is_fixed
 from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.fields import check_function
 from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
@@ -40,6 +41,10 @@ def pullback(fun, x):
     ShapeError
         On use of `pull`, if `g` has another shape than the value.
 
+    Notes
+    -----
+    The caller may write into `x`, the value, `g` and the results: the tape and they share no memory.
+
     Examples
     --------
     >>> value, pull = pullback(lambda x: x[0] * x[1], (2.0, 5.0))
@@ -48,12 +53,13 @@ def pullback(fun, x):
     """
     found, rebuild = flatten(x)
     roots = [reverse_root() if is_variable(leaf) else None for leaf in found]
+    found = [_apart_from_caller(leaf) if root else leaf for leaf, root in zip(found, roots, strict=True)]
     if not any(roots):
         kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in found})
         raise DerivativeError(
             f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write x.astype(float)"
         )
-    result, number = traced(fun, x, roots)
+    result, number = traced(fun, rebuild(found), roots)
     if not _is_array(result):
         raise DerivativeError(
             f"the function must return one array or number, got {type(result).__name__}; sum or join it"
@@ -66,10 +72,10 @@ def pullback(fun, x):
         cotangents = {} if node is None else backward(node, g)
         pairs = zip(found, roots, strict=True)
         return rebuild(
-            _apart([None if root is None else _gradient(leaf, cotangents.get(root)) for leaf, root in pairs])
+            _apart([None if root is None else _gradient(leaf, cotangents.get(root)) for leaf, root in pairs], g)
         )
 
-    return value, pull
+    return _apart_from_caller(value), pull
 
 
 def traced(fun, x, roots):
@@ -86,14 +92,24 @@ def traced(fun, x, roots):
         ) from error
 
 
-def _apart(gradients):
-    """autograd hands one array to both terms of a sum; a caller may write into the one without the other."""
-    seen: set[int] = set()
-    for place, g in enumerate(gradients):
-        if isinstance(g, np.ndarray) and id(g) in seen:
-            gradients[place] = g.copy()
-        seen.add(id(g))
+def _apart(gradients, g):
+    """autograd hands one array to both terms of a sum, and g on; a caller may write into the one without the other."""
+    seen = {id(_owner(g))}
+    for place, back in enumerate(gradients):
+        if isinstance(back, np.ndarray) and (id(_owner(back)) in seen or not back.flags.writeable):
+            gradients[place] = back.copy()
+        seen.add(id(_owner(back)))
     return gradients
+
+
+def _apart_from_caller(value):
+    """An array as it is now: pullbacks need it, and the caller may write into it before they run."""
+    return value if not isinstance(value, np.ndarray) or is_fixed(value) else value.copy("K")
+
+
+def _owner(value):
+    """The array whose memory an array shows."""
+    return _owner(value.base) if isinstance(value, np.ndarray) and value.base is not None else value
 
 
 def _gradient(leaf, cotangent):
@@ -197,6 +213,13 @@ def value_and_grad(loss):
         If the loss is not a scalar.
     DerivativeError
         If the loss is complex, or `x` holds no floating value.
+
+    Notes
+    -----
+    `x` and the constant arrays that the loss uses in calls may be written into at once after a call (``work[:] = c`` in
+    a loop): what the backward pass needs is copied. An array that is read-only with all its memory is not copied;
+    ``mask.flags.writeable = False`` saves the time, that of one product with the mask for each call. Other objects,
+    sparse matrices too, must stay as they are until the gradient is there.
 
     Examples
     --------

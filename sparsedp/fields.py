@@ -19,7 +19,6 @@ __all__ = [
     "frozen",
     "is_number",
     "is_whole",
-    "own",
     "place",
     "rounded_down",
     "surely_finite",
@@ -109,16 +108,6 @@ def frozen(value):
     view = value.view()
     view.flags.writeable = False
     return view
-
-
-def own(value, held, key):
-    """A constant for a pullback: a copy, since the caller may reuse the array before; `held` has the last one."""
-    if type(value) is not np.ndarray or not value.flags.writeable:
-        return value
-    known = held.get(key)
-    if known is None or known.dtype != value.dtype or not np.array_equal(known, value):
-        known = held[key] = value.copy()
-    return known
 
 
 def check_function(name, thing, example):

@@ -14,6 +14,7 @@ import numpy as np
 from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
 from autograd.tracer import box_types, getval, isbox, new_box
 
+from sparsedp.constants import constant_args, sparing
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, tell, timed
 from sparsedp.shortcuts import direct
@@ -54,6 +55,12 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     ------
     DerivativeError
         When a traced value comes where there is no derivative, or a cotangent has a wrong number, shape or dtype.
+
+    Notes
+    -----
+    `vjp` gets read-only copies of the arrays in `args` that are not traced, also of those in tuples, lists and dicts:
+    a caller may write into them before the backward pass. Other objects must stay as they are. `forward` returns a
+    fresh array, not one that its next call writes into.
 
     Examples
     --------
@@ -109,10 +116,10 @@ _call = direct(_primitive, _run, box_types, new_box)
 
 
 def _call_vjp(argnums, ans, args, kwargs):
-    rule, values = args[0], args[1:]
+    rule, nums = args[0], tuple([num - 1 for num in argnums])
     if rule.vjp is None:
         raise DerivativeError(f"{rule.name} has no VJP; give differentiable(...) a vjp")
-    nums = tuple(num - 1 for num in argnums)
+    values = constant_args(args[1:], nums)
     if active:
         _tell_unasked(rule, nums, values)
     pull = rule.vjp(nums, ans, *values)
@@ -136,6 +143,8 @@ def _call_jvp(argnums, tangents, ans, args, kwargs):
     rule = args[0]
     if rule.jvp is None:
         raise DerivativeError(f"{rule.name} has no JVP; give differentiable(...) a jvp")
+    if any(map(isbox, (*tangents, *args))):  # inside a reverse-mode trace: its pullback runs later
+        args = constant_args(args, argnums)
     if active:
         count(rule.name, "jvp")
     tangent = rule.jvp(tuple(num - 1 for num in argnums), tangents, ans, *args[1:])
@@ -237,6 +246,7 @@ def _operator_jvp(argnums, tangents, ans, args, kwargs):
     return apply_operator(op.tangent, tangent) if isbox(tangent) else op.tangent.apply(tangent)
 
 
+sparing.update((_primitive, _operator))
 defvjp_argnums(_operator, _operator_vjp)
 defjvp_argnums(_operator, _operator_jvp)
 

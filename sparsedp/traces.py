@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import autograd.numpy as anp
 import numpy as np
 from autograd.core import JVPNode, VJPNode, add_outgrads
 from autograd.tracer import isbox, new_box, notrace_primitives, toposort, trace_stack
 
+from sparsedp.constants import constant, constant_args, sparing
 from sparsedp.shortcuts import added, arithmetic
 from sparsedp.tree import flatten
 
@@ -14,7 +16,7 @@ __all__ += ["untraced", "witnesses"]
 
 
 class ReverseNode(VJPNode):
-    """A call on a reverse-mode trace."""
+    """A call on a reverse-mode trace. Its pullback sees the constants of the call as they are now."""
 
     __slots__ = ()
     parents: Any
@@ -22,11 +24,16 @@ class ReverseNode(VJPNode):
 
     def __init__(self, value, fun, args, options, nums, parents):
         self.parents = parents
+        if len(nums) < len(args) and fun not in sparing:
+            args = constant_args(args, nums)
+        if options:
+            options = constant(options)
         self.vjp = None if options else arithmetic(fun, value, args, nums)
         if self.vjp is None:
             super().__init__(value, fun, args, options, nums, parents)
 
 
+sparing.update((anp.add, anp.subtract, anp.concatenate_args, anp.array_from_args))  # shapes are all they need
 untraced = notrace_primitives  # by kind of node, functions that leave the tape
 untraced[ReverseNode] = untraced[VJPNode]
 witnesses: list[type[VJPNode]] = []  # kinds of nodes that see what they stand for; the last one is used

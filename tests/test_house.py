@@ -14,6 +14,7 @@ from sources import FUNCTION, PACKAGE, ROOT, body_length, definitions, exported,
 import sparsedp
 
 FLOORS = [
+    ("constants", 0),
     ("errors", 0),
     ("shortcuts", 0),
     ("tree", 0),

@@ -5,7 +5,7 @@ import numpy as np
 from sparsedp.advection.law import FIELD, INFLOW, Finite
 from sparsedp.advection.values import LETTERS, prepare, raised, result_like, unflatten
 from sparsedp.errors import DerivativeError
-from sparsedp.fields import check_finite, own, surely_finite
+from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import differentiable, isbox, linear, plain
 
 __all__ = ["rule_of"]
@@ -14,16 +14,11 @@ __all__ = ["rule_of"]
 def rule_of(law):
     """Law -> Rule of (u, v, dt, inflow)."""
     name = f"transport {law.setting.scheme}"
-    held: dict = {}
 
     def forward(u, v, dt, inflow):
         return result_like(u, law.forward(*prepare(law, u, v, dt, inflow)), law.setting.space.shape)
 
     def vjp(nums, ans, *args):
-        fixed = [num for num, value in enumerate(args) if type(value) is np.ndarray and num not in nums]
-        if fixed:
-            args = tuple([own(value, held, num) if num in fixed else value for num, value in enumerate(args)])
-
         def pull(g):
             flat = prepare(law, *args)
             g = raised(FIELD, law, g)

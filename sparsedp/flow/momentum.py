@@ -9,7 +9,6 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.conditions import dirichlet, neumann
-from sparsedp.fields import own
 from sparsedp.flow.walls import CLOSED, flow_sides
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
@@ -183,11 +182,8 @@ def convection(grid, boundary="no_slip", solid=None):
 
 def _bilinear(name, A, B, C):
     """The rule of C((A v) (B w))."""
-    held: dict = {}
 
     def vjp(nums, ans, v, w):
-        v, w = (value if num in nums else own(value, held, num) for num, value in enumerate((v, w)))
-
         def pull(g):
             g = C.T(g)
             return tuple(B.T(A(v) * g) if num else A.T(B(w) * g) for num in nums)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_function, is_number
 from sparsedp.flow.acceleration import Acceleration, Viscous, added_to
@@ -139,7 +140,7 @@ class FlowStep:
         self.laplacian: Any = None
         if viscosity:
             self.laplacian = face_laplacian(grid, boundary, solid, solid_boundary)
-        self.walls = walls if viscosity else None
+        self.walls = constant(walls) if viscosity else None
         self.relax: Any = None
         if implicit and viscosity:
             self.relax = inverse(identity(grid.faces) - (0.5 * dt * viscosity) * self.laplacian)

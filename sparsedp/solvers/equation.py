@@ -3,6 +3,7 @@
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.constants import constant
 from sparsedp.derivative import pullback
 from sparsedp.direction import push
 from sparsedp.errors import DerivativeError, ShapeError
@@ -108,7 +109,7 @@ class Equation:
         self.residual, self.layout, self.name = residual, layout, name
         found, rebuild = flatten(params)
         self._places = [place for place, leaf in enumerate(found) if is_variable(leaf)]
-        self.statics = [None if is_variable(leaf) else leaf for leaf in found]
+        self.statics = [None if is_variable(leaf) else constant(leaf) for leaf in found]
         _, self._rebuild = flatten(rebuild(self.statics))  # of what is not traced only: equations are kept
 
     @property

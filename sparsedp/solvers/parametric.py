@@ -150,7 +150,7 @@ class EllipticSolver:
             raise ValueError(f"k must be >= 0, got {values.min():g} at {np.argmin(values)}")
         if values.ndim == 0:
             return k * np.ones(space.shape)
-        return k if isbox(k) else values.copy()  # the caller may reuse the array before the pullback
+        return k if isbox(k) else values
 
     # ------------------------------------------------------------ rules
 

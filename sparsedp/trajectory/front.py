@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sparsedp.constants import constant_args
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_function, check_takes, is_whole
 from sparsedp.ledger import loops
@@ -105,15 +106,18 @@ def rollout(
     check_takes("rollout", step, 2 if inputs is None else 3, example)
     args = _variables(state, forms[0]) + _variables(params, forms[1])
     args += [] if inputs is None else _variables(inputs, forms[2])
+    traced = [k for k, arg in enumerate(args) if isbox(arg)]
+    if traced:  # what is kept on the way forward must be what the way back sees
+        args = constant_args(args, traced)
     beside = 2 * sum(form.nbytes for form in forms[1:] if form is not None)  # a copy and a gradient
     slots = None if memory is None else slots_within(memory, forms[0].nbytes, n, beside)
     if truncate is not None and not is_whole(truncate, 1):
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
-    run = Run(step, *forms, n, _kind(keep, forms[0]), slots, truncate, any(map(isbox, args)), progress, record)
+    run = Run(step, *forms, n, _kind(keep, forms[0]), slots, truncate, bool(traced), progress, record)
     _check_values(run, args)
     if run.store and (slots is None or slots >= n) and (inputs is not None or not carries(step, *PLAIN)):
         room = None if memory is None else room_within(memory, forms[0].nbytes, n, beside)
-        run.tapes = Tapes(room, frozenset(k for k, arg in enumerate(args) if isbox(arg)), slots is not None)
+        run.tapes = Tapes(room, frozenset(traced), slots is not None)
     for told in loops:
         told(step, state, params, inputs, n)
     outputs = rollout_rule(run, *args)

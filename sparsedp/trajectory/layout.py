@@ -5,8 +5,9 @@ from math import prod
 
 import numpy as np
 
+from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, frozen, surely_finite
+from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten
 
@@ -56,7 +57,9 @@ class Layout:
         moving = [is_variable(leaf) for leaf in found]
         self.places = [place for place, moves in enumerate(moving) if moves]
         self.statics = (
-            NOTHING if self.bare else tuple(None if m else leaf for leaf, m in zip(found, moving, strict=True))
+            NOTHING
+            if self.bare
+            else tuple(None if m else constant(leaf) for leaf, m in zip(found, moving, strict=True))
         )
         if rebuild is not None:
             # Rebuilt without the variables: what is kept must not hold a trace or a large array.
@@ -212,9 +215,7 @@ def refuse_mask(what, leaf):
 
 def still(statics):
     """Leaves that are no variables -> the same, arrays among them as copies nobody can write into."""
-    if statics is not NOTHING and any(type(leaf) is np.ndarray for leaf in statics):
-        return tuple(frozen(leaf.copy()) if type(leaf) is np.ndarray else leaf for leaf in statics)
-    return statics
+    return statics if statics is NOTHING else constant(statics)
 
 
 def _labels(tree, name):

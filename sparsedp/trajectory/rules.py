@@ -13,7 +13,7 @@ since B is linear in g and <c, B(z, g)> = <g, R'(z) c>.
 
 from sparsedp.tape import differentiable, isbox, plain
 from sparsedp.trajectory.duality import dual
-from sparsedp.trajectory.layout import owned
+from sparsedp.trajectory.layout import dense
 
 __all__ = ["rollout_rule"]
 
@@ -39,14 +39,11 @@ def _list(values, many):
 
 
 def _forward(run, *args):
-    return _one(run.forward([owned(arg) for arg in args]))
+    return _one(run.forward([dense(arg) for arg in args]))
 
 
 def _vjp(nums, ans, run, *args):
     wanted = [num - 1 for num in nums]
-    # Copies, for the caller may change an array before the pullback runs.
-    kept = run.given or map(owned, args)
-    args = tuple(arg if isbox(arg) else own for arg, own in zip(args, kept, strict=True))
     many = _count(ans)
 
     def pull(g):

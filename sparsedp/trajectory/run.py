@@ -7,7 +7,6 @@ import numpy as np
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.fields import place, surely_finite
 from sparsedp.ledger import active, count
-from sparsedp.trajectory.layout import still
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.protocol import engine_of
 from sparsedp.trajectory.record import Record
@@ -49,7 +48,6 @@ class Run:
         self.silenced: tuple = ()  # variables that are zero for the step after a cut: tangents
         self.engine: type | None = None  # what runs the steps, once that is known
         self.outcome = None  # what the user's tree holds beside the variables
-        self.given: list = []  # the arguments of the last run whose states were kept
         self._kept: list | None = None
         self._final: tuple = ()
 
@@ -80,7 +78,6 @@ class Run:
         engine.check_params()
         self._check_end(args, state)
         if self.store:
-            self.given = list(args)
             self._kept, self._final = kept, (state if collector.shared else engine.store(state), statics)
         if active:
             count("rollout.step", "forward", self.n)
@@ -92,7 +89,7 @@ class Run:
 
     def _advance(self, engine, collector, args):
         """(last state, its statics, kept states) after all steps."""
-        state, statics = self.split(args)[0], still(self.state.statics)
+        state, statics = self.split(args)[0], self.state.statics
         state, along = collector.see(0, state, statics), self.keep.along
         first, state, kept = engine.link(state, statics)
         stop, last = first if self.store else -1, self.n - 1
@@ -122,7 +119,7 @@ class Run:
         if self.state.is_finite(state):
             return
         engine = engine_of(self, args)
-        state, statics = self.split(args)[0], still(self.state.statics)
+        state, statics = self.split(args)[0], self.state.statics
         for i in range(self.n):
             state, statics = engine.forward(i, state, statics)
             for name, value in zip(self.state.names, state, strict=True):

@@ -39,7 +39,7 @@ class Taped:
     def __init__(self, run, args, wanted=(), recording=False):
         self.run, self.recording = run, recording
         _, self.p, self.x = run.split(args)
-        self._frozen, self._statics = [frozen(value) for value in self.p], still(run.params.statics)
+        self._frozen, self._statics = [frozen(value) for value in self.p], run.params.statics
         self.params = run.params.build(self._frozen, self._statics)
         self._given = leaves(self.params)
         self._last: tuple = ()

@@ -1,8 +1,7 @@
 """Tapes of single steps, made on the way forward and kept for the way back while they fit: no step runs twice.
 
 The bytes of a tape are counted from above: every result, every array that went into a call, and CALL for the call.
-A step may write into an array of its own again and again; a tape that holds it is then no longer that of its step.
-So the arrays that the weighed steps use are looked at again, and if one has changed no tape is used.
+A step may write into an array of its own again and again: its tape holds a copy of what was there.
 """
 
 from contextlib import contextmanager
@@ -45,32 +44,15 @@ class Scale:
     """What the nodes of a weighed tape add to. It knows no node: a circle would keep a tape for long."""
 
     def __init__(self):
-        self.bytes, self.still = 0, True  # still: no array has changed since it was seen first
-        self.copies = 0  # bytes of the copies that the present step added
-        self.watched: dict = {}  # arrays that anybody may write into, and copies of them
+        self.bytes = 0
 
     def see(self, arg):
-        """Weigh what a tape holds beside traced values, and notice when somebody writes into it."""
+        """Weigh what a tape holds beside traced values."""
         if type(arg) is np.ndarray:
             self.bytes += arg.nbytes
-            self._watch(arg)
         elif isinstance(arg, (tuple, list)):  # of indices
             for one in arg:
                 self.see(one)
-
-    def _watch(self, array):
-        known = self.watched.get(id(array))
-        if known is not None:
-            self.still &= not np.any(known[0] != known[1])
-        elif array.flags.writeable:
-            self.watched[id(array)] = array, array.copy()
-            self.copies += array.nbytes
-
-    def look_again(self):
-        """Whether all arrays are as they were."""
-        for array, copy in self.watched.values():
-            self.still &= not np.any(array != copy)
-        return self.still
 
 
 class Tapes:
@@ -91,7 +73,6 @@ class Tapes:
         self.scale, self._last, self._open = Scale(), 0, True
         self._kept: dict = {}
         self.pieces: list = []  # tapes of several steps each, from the first step on
-        self._newest = -1  # the last step kept
         self._kind: Any = PLAIN
 
     @property
@@ -102,7 +83,7 @@ class Tapes:
     @contextmanager
     def fresh(self):
         """A `with` block on the way forward, from which tapes are kept; those of a run before are forgotten."""
-        self.scale, self._last, self._newest, self._kept, self.pieces = Scale(), 0, -1, {}, []
+        self.scale, self._last, self._kept, self.pieces = Scale(), 0, {}, []
         kind = type(reverse_root())
         self._open = not getattr(kind, "asks_again", False)
         self._kind = PLAIN if kind is ReverseNode else weighed(kind)
@@ -120,7 +101,7 @@ class Tapes:
     @property
     def fit(self):
         """Whether there is room for the tape of one more step."""
-        return self._open and self.scale.still and self.scale.bytes < self.room
+        return self._open and self.scale.bytes < self.room
 
     def root(self):
         """A root whose tape is weighed here."""
@@ -132,14 +113,13 @@ class Tapes:
         """Keep the ends of the tape of step i, unless it was one too many; `before`: the bytes before this step."""
         self.add(self.weighs(i), before)
         if self.fit:
-            self._kept[i], self._newest = ends, i
+            self._kept[i] = ends
 
     def add(self, weighed, before):
         """Count the tape of one more step; `before`: the bytes before it, where it was weighed."""
         scale = self.scale
         if weighed:
             self._last = scale.bytes - before
-            scale.bytes, scale.copies = scale.bytes + scale.copies, 0
         else:
             scale.bytes += self._last
 
@@ -152,8 +132,8 @@ class Tapes:
         return int((self.room - self.scale.bytes) // max(self._last, 1))
 
     def linked(self, wanted):
-        """How many steps from the first on are linked and as they were; 0 where other cotangents are wanted."""
-        if wanted != self.wanted or not self.pieces or not (self._open and self.scale.look_again()):
+        """How many steps from the first on are linked; 0 where other cotangents are wanted."""
+        if wanted != self.wanted:
             self.pieces = []
         return self.pieces[-1].stop if self.pieces else 0
 
@@ -161,9 +141,4 @@ class Tapes:
         """The ends of the tape of step i, or None."""
         if wanted != self.wanted:
             return None
-        if i == self._newest:
-            if not (self._open and self.scale.look_again()):
-                self._kept = {}
-            if self.once:
-                self.scale.watched = {}
         return self._kept.pop(i, None) if self.once else self._kept.get(i)

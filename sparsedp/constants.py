@@ -1,0 +1,99 @@
+"""Constants of a tape: what the backward pass needs from the caller, kept apart from the caller's arrays.
+
+A pullback runs later than its call, and the caller may have written into an array in between (`work[:] = c` in a
+loop). So every array that goes into a node of a tape without being traced is replaced by a read-only copy.
+
+A large array that many nodes use is copied once: the last copy of the array at one place in memory is found again and
+compared bit by bit. That takes as long as a copy and saves the memory. Copies live as long as the tapes that hold them.
+"""
+
+from weakref import WeakValueDictionary
+
+import numpy as np
+
+__all__ = ["constant", "constant_args", "is_fixed", "sparing"]
+
+SMALL = 2**16  # bytes up to which a copy of its own takes less time than a comparison with an older one
+CHUNK = 2**15  # entries that are compared at once: two pieces of them stay in the cache of a core
+BITS = {1: np.int8, 2: np.int16, 4: np.int32, 8: np.int64}  # by size of an entry: what its bits are compared as
+FIXED = {float, int, bool, str, slice, type(None), type(Ellipsis), np.float64}
+
+sparing: set = (
+    set()
+)  # functions whose pullbacks need no numbers of their constants, and those that call `constant_args`
+copies: WeakValueDictionary = WeakValueDictionary()  # (address, shape, strides) of an array -> the last copy of it
+
+
+def constant_args(args, nums):
+    """Arguments of a call -> the same, those not traced (not at the places `nums`) as constants."""
+    held = None
+    for num, arg in enumerate(args):
+        if type(arg) not in FIXED and num not in nums:
+            value = constant(arg)
+            if value is not arg:
+                held = held or list(args)
+                held[num] = value
+    return args if held is None else tuple(held)
+
+
+def constant(value):
+    """The same value in arrays that nobody writes into; also in tuples, lists and dicts.
+
+    What can change no more is handed back as it is. Other objects are the business of who made them.
+
+    Examples
+    --------
+    >>> work = np.array([1.0, 2.0])
+    >>> kept = constant(work)
+    >>> work[:] = 0.0
+    >>> kept
+    array([1., 2.])
+    """
+    kind = type(value)
+    if kind is np.ndarray or isinstance(value, np.ndarray):
+        return value if is_fixed(value) else _copied(value)
+    if kind is tuple and all(type(one) in FIXED for one in value):
+        return value
+    if kind is tuple or kind is list:
+        return kind(map(constant, value))
+    if kind is dict:
+        return {name: constant(one) for name, one in value.items()}
+    return kind(*map(constant, value)) if isinstance(value, tuple) and hasattr(kind, "_fields") else value
+
+
+def is_fixed(array):
+    """Whether nobody can write into an array: a read-only view of one that is writeable does not count."""
+    while isinstance(array, np.ndarray):
+        if array.flags.writeable:
+            return False
+        array = array.base
+    return array is None or type(array) is bytes
+
+
+def _copied(value):
+    if value.nbytes <= SMALL or value.dtype.kind not in "biufc" or value.real.itemsize not in BITS:
+        return _frozen_copy(value)
+    place = value.__array_interface__["data"][0], value.shape, value.strides
+    known = copies.get(place)
+    if known is None or not _same_bits(known, value):
+        known = copies[place] = _frozen_copy(value)
+    return known
+
+
+def _frozen_copy(value):
+    copy = value.copy("K")
+    copy.setflags(False)
+    return copy
+
+
+def _same_bits(known, value):
+    """Whether two arrays of one shape hold the same bits: 0.0 and -0.0 have different reciprocals."""
+    if known.dtype != value.dtype or type(known) is not type(value):
+        return False
+    if value.dtype.kind == "c":
+        return _same_bits(known.real, value.real) and _same_bits(known.imag, value.imag)
+    known, value = known.view(BITS[value.itemsize]), value.view(BITS[value.itemsize])
+    if not (known.flags.c_contiguous and value.flags.c_contiguous):
+        return bool((known == value).all())
+    known, value = known.reshape(-1), value.reshape(-1)
+    return all((known[k : k + CHUNK] == value[k : k + CHUNK]).all() for k in range(0, known.size, CHUNK))
