@@ -8,6 +8,7 @@ Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I (1993
 
 import numpy as np
 
+from sparsedp.constants import constant
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.integrators.combination import untraced
 from sparsedp.tape import dtype_of, is_variable, plain
@@ -42,7 +43,7 @@ class Adaptive:
     """
 
     def __init__(self, scheme, tolerance, floor, name):
-        self.scheme, self.tolerance, self.floor, self.name = scheme, tolerance, floor, name
+        self.scheme, self.tolerance, self.floor, self.name = scheme, tolerance, constant(floor), name
         self.order, self.dyadic, self.taken = scheme.order, scheme.dyadic, []
 
     @property

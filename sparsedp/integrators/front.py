@@ -52,7 +52,8 @@ def stepper(
     rate : callable or Operator
         u' = ``rate(u, params)``, or ``rate(u, params, t)``: then the state is the pair (u, t). Written with
         autograd.numpy, Operators and other rules; u an array or a tree of arrays. An Operator L means
-        u' = c L u, with the number c >= 0 as params (None: 1).
+        u' = c L u, with the number c >= 0 as params (None: 1). What changes from call to call belongs into params:
+        implicit methods run the rate again on the way back.
     dt : float, traced number, or function of params
         Length of a step [time], > 0. To differentiate in dt inside a loop write ``lambda params: params["dt"]``.
     linear : Operator or (Operator, coefficient), optional

@@ -40,7 +40,8 @@ def implicit(
     ----------
     residual : callable
         ``residual(x, *params)``: as many real numbers as x has, written with autograd.numpy, Operators
-        and other rules. It uses only its arguments and constants.
+        and other rules. It uses only its arguments and constants; the backward pass runs it again, so arrays that are
+        no arguments must stay as they are until then.
     jacobian : callable, optional
         ``jacobian(x, *params)``: the derivative of the residual in x as a sparse matrix, 2-D array or
         Operator, rows and columns in the order of the flat x. Default: from derivatives of the residual.
