@@ -50,6 +50,12 @@ class Box:
         """The nearest point of the box."""
         return vector if self.open else np.clip(vector, self.lower, self.upper)
 
+    def room(self, vector):
+        """How far each entry may go down, <= 0, and up, >= 0."""
+        if self.open:
+            return np.full(vector.shape, -np.inf), np.full(vector.shape, np.inf)
+        return np.minimum(self.lower - vector, 0.0), np.maximum(self.upper - vector, 0.0)
+
     def free_mask(self, vector, slope):
         """Which entries can go downhill: not those at which the gradient pushes against a bound. None: all."""
         if self.open:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import is_whole
+from sparsedp.optimise.quadratic import Quadratic
 from sparsedp.optimise.trials import Stuck, Trial, power_of_two
 from sparsedp.optimise.wolfe import line_search
 from sparsedp.tree import norm
@@ -43,9 +44,9 @@ class Quasi:
 
     Notes
     -----
-    Source: D. C. Liu, J. Nocedal, On the limited memory BFGS method, Math. Program. 45, 1989. With bounds the
-    entries at which the gradient pushes against a bound are left out of the step: D. P. Bertsekas, SIAM J.
-    Control Optim. 20, 1982.
+    Each step ends at the minimum of the quadratic model inside the bounds, on the face of the box that the model's
+    path of steepest descent leads to. Source: R. H. Byrd, P. Lu, J. Nocedal, C. Zhu, A limited memory algorithm for
+    bound constrained optimization, SIAM J. Sci. Comput. 16, 1995.
     """
 
     residuals, searches = False, True
@@ -71,28 +72,22 @@ class Quasi:
         Stuck
             When there is no lower point along the gradient either.
         """
+        here = state.trial
         for kept in (state, self._forgetful(state)):
-            trial = self._search(kept, trials)
+            step = _step(kept, trials.box)
+            promised = -float(np.dot(here.slope, step))
+            trial = line_search(here, step, trials, self.line_search, trials.box) if promised > 0 else None
             if trial is not None:
                 return self._remember(kept, trial)
             if not len(state.steps):
                 break
-        raise Stuck(
-            "rounding" if _at_rounding(state, trials.downhill(state.trial)) else "the line search found no lower point"
-        )
+        # What the quasi-Newton step promises is lost in the rounding of the loss.
+        hopeless = abs(np.dot(_step(state, trials.box), here.slope / 2)) <= 100 * here.rounding
+        raise Stuck("rounding" if hopeless else "the line search found no lower point")
 
     @staticmethod
     def _forgetful(state):
         return state._replace(steps=state.steps[:0], changes=state.changes[:0])
-
-    def _search(self, state, trials):
-        """A lower trial along the quasi-Newton direction, or None."""
-        here, box = state.trial, trials.box
-        slope = trials.downhill(here)
-        step = -box.free(here.vector, _product(state, slope))
-        if not np.dot(step, slope) < 0:
-            return None
-        return line_search(here, step, trials, self.line_search, box)
 
     def _remember(self, state, trial):
         step = (trial.vector - state.trial.vector) / state.length
@@ -104,27 +99,16 @@ class Quasi:
         return state._replace(steps=steps, changes=np.concatenate([state.changes, change[None]])[-self.memory :])
 
 
-def _product(state, slope):
-    """Inverse Hessian of the memory times a gradient, by the two loops."""
-    g = slope / state.height
-    if not len(state.steps):
-        size = norm(g)
-        return (_first_length(state.trial) / size if size else 1.0) * g
-    weights = [1.0 / float(np.dot(s, y)) for s, y in zip(state.steps, state.changes)]
-    shares = []
-    for s, y, weight in reversed(list(zip(state.steps, state.changes, weights))):
-        shares.append(weight * float(np.dot(s, g)))
-        g = g - shares[-1] * y
-    last = state.changes[-1]
-    g = g / (weights[-1] * float(np.dot(last, last)))
-    for s, y, weight, share in zip(state.steps, state.changes, weights, reversed(shares)):
-        g = g + (share - weight * float(np.dot(y, g))) * s
-    return state.length * g
-
-
-def _at_rounding(state, slope):
-    """Whether the fall that the quasi-Newton step promises is lost in the rounding of the loss."""
-    return abs(float(np.dot(_product(state, slope), slope / 2))) <= 100 * state.trial.rounding
+def _step(state, box):
+    """From the point of a state to the minimum of its model."""
+    here, g = state.trial, state.trial.slope / state.height
+    bend = norm(g) * state.length / _first_length(here)  # without a memory the step is this long
+    lower, upper = (side / state.length for side in box.room(here.vector))
+    try:
+        model = Quadratic(state.steps, state.changes, bend)
+        return state.length * model.minimum(g, lower, upper, box.free_mask(here.vector, here.slope))
+    except np.linalg.LinAlgError:  # steps that depend on each other; the memory is given up
+        return np.zeros_like(g)
 
 
 def _first_length(first):

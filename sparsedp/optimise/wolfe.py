@@ -59,7 +59,7 @@ def line_search(start, step, trials, limit, box):
         else:
             high = point
         t = _next(low, high)
-        if not low.t < t < (high.t if high else np.inf):
+        if not low.t < t < (high.t if high else np.inf) or -fall * t <= start.rounding:
             break
     return None if best is None else best.trial
 
