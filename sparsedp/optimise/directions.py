@@ -82,11 +82,13 @@ class Family:
 
     def __call__(self, linearised, g):
         """Flat Direction for a flat cotangent g of the outputs."""
-        rows, columns = linearised.shape
-        dense = self.method == "dense" or (self.method == "auto" and rows * columns <= DENSE)
-        if dense:
+        if self.forms(*linearised.shape):
             return self.dense(linearised.rows(self.apart), g)
-        return self.krylov(linearised.push, linearised.pull, g, min(rows, columns))
+        return self.krylov(linearised.push, linearised.pull, g, min(linearised.shape))
+
+    def forms(self, rows, columns):
+        """Whether J is formed."""
+        return self.method == "dense" or (self.method == "auto" and rows * columns <= DENSE)
 
     def dense(self, jacobian, g):
         """Direction from J itself, m x n."""

@@ -89,7 +89,7 @@ def backtracked(here, step, trials, along):
         share = 0.5**halvings
         point = trials.box.inside(here.vector + share * step)
         fall = float(np.dot(here.vector - point, here.slope))
-        trial = trials(point)
+        trial = trials(point, here.value)
         refused |= trial.refused
         if not trial.refused and _lower(trial, here, ENOUGH * fall):
             return trial, share

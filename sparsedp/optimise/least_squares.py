@@ -34,16 +34,13 @@ class SquaresState(NamedTuple):
 class _Normal:
     """Solves min |J d + r|^2 + damping |d|^2 at one point, for several dampings."""
 
-    def __init__(self, linearised, apart, dense):
+    def __init__(self, linearised, method):
         self._linearised = linearised
         self._jacobian: Any = None
         self._gram: Any = None
         self._factor: Any = None
-        rows, columns = linearised.shape
-        if dense is None:
-            dense = rows * columns <= DENSE and min(rows, columns) <= 4000
-        if dense:
-            self._jacobian = jacobian = linearised.rows(apart)
+        if method.forms(*linearised.shape):
+            self._jacobian = jacobian = linearised.rows(method.apart)
             self.largest = float(np.max(np.einsum("ij,ij->j", jacobian, jacobian), initial=0.0))
         else:
             slope = linearised.pull(linearised.flat)
@@ -94,6 +91,10 @@ def _solve(factor, damping, size):
     return combine(shares * parts)
 
 
+def _formed(dense, rows, columns):
+    return rows * columns <= DENSE and min(rows, columns) <= 4000 if dense is None else dense
+
+
 class GaussNewton:
     """Gauss-Newton: the step that solves the linearised problem, halved until the loss falls.
 
@@ -102,7 +103,8 @@ class GaussNewton:
     apart : bool
         Residuals along axis 0 are samples that see x independently: J by a few products.
     dense : bool or None
-        Whether J is formed; None: when it has at most 3e7 entries. Else LSMR on products with J and J^T.
+        Whether J is formed, by products forward or in reverse, whichever are fewer; None: when it has at most 3e7
+        entries and 4000 rows or columns. Else LSMR on products with J and J^T.
     """
 
     residuals, searches = True, True
@@ -110,13 +112,17 @@ class GaussNewton:
     def __init__(self, apart=False, dense=None):
         self.apart, self.dense = bool(apart), dense
 
+    def forms(self, rows, columns):
+        """Whether J is formed."""
+        return _formed(self.dense, rows, columns)
+
     def begin(self, first):
         """State at the start."""
         return SquaresState(first)
 
     def advance(self, state, trials):
         """One iteration. Raises Stuck when no lower point is found."""
-        step = _Normal(trials.linearised(state.trial), self.apart, self.dense).step(0.0)
+        step = _Normal(trials.linearised(state.trial), self).step(0.0)
         trial, _ = backtracked(state.trial, step, trials, "the Gauss-Newton step")
         return state._replace(trial=trial)
 
@@ -143,6 +149,10 @@ class LevenbergMarquardt:
             raise ValueError(f"levenberg_marquardt needs a positive damping, got {damping!r}; the default is 1e-3")
         self.damping, self.apart, self.dense = damping, bool(apart), dense
 
+    def forms(self, rows, columns):
+        """Whether J is formed."""
+        return _formed(self.dense, rows, columns)
+
     def begin(self, first):
         """State at the start; the damping is scaled at the first step."""
         return SquaresState(first, 0.0)
@@ -150,12 +160,12 @@ class LevenbergMarquardt:
     def advance(self, state, trials):
         """One iteration: one Jacobian, as many dampings as it takes. Raises Stuck when none is large enough."""
         here = state.trial
-        normal = _Normal(trials.linearised(here), self.apart, self.dense)
+        normal = _Normal(trials.linearised(here), self)
         damping = state.damping or self.damping * normal.largest or 1.0
         growth = 2.0
         for _ in range(HALVINGS):
             step = normal.step(damping)
-            trial = trials(trials.box.inside(here.vector + step))
+            trial = trials(trials.box.inside(here.vector + step), here.value)
             predicted = 0.5 * float(np.dot(step, damping * step - here.slope))
             if not trial.refused and trial.value < here.value:
                 fall = predicted if trials.box.open else normal.fall(trial.vector - here.vector)
@@ -191,6 +201,11 @@ class HalfInverse:
             raise ValueError(f"half_inverse needs a positive rate, got {rate!r}; the default is 1")
         self.rate = rate
         self.family = Family(power, 0.0, truncation, form, rank, apart)
+        self.apart = self.family.apart
+
+    def forms(self, rows, columns):
+        """Whether J is formed."""
+        return self.family.forms(rows, columns)
 
     def begin(self, first):
         """State at the start."""

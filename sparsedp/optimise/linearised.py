@@ -1,10 +1,14 @@
-"""The Jacobian of a function of a tree at one point: products with it, and its rows when they fit."""
+"""The Jacobian of a function of a tree at one point: products with it, and all of it when it fits."""
 
 import numpy as np
+from scipy.linalg.lapack import dtrtri
 
-from sparsedp.derivative import pullback, pushforward
+from sparsedp.derivative import pullback
+from sparsedp.direction import push
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite
+from sparsedp.tape import is_variable
+from sparsedp.tree import leaves
 
 __all__ = ["Linearised", "Restricted"]
 
@@ -25,6 +29,8 @@ class Linearised:
     vector : (n,) array
     rest : tuple
         What `outputs` is given after x.
+    forward : bool
+        No tape is made before J^T is asked for.
 
     Raises
     ------
@@ -34,10 +40,13 @@ class Linearised:
         If an output is NaN or infinite.
     """
 
-    def __init__(self, outputs, packing, vector, rest=()):
-        self._outputs, self._packing = outputs, packing
-        self._tree, self._rest = packing.unpack(vector), rest
-        self.value, self._pull = pullback(lambda x: outputs(x, *rest), self._tree)
+    def __init__(self, outputs, packing, vector, rest=(), forward=False):
+        self._outputs, self._packing = lambda x: outputs(x, *rest), packing
+        self._tree, self._pull, self._jacobian = packing.unpack(vector), None, None
+        if forward:
+            self.value = self._outputs(self._tree)
+        else:
+            self.value, self._pull = pullback(self._outputs, self._tree)
         if np.ndim(self.value) == 0:
             raise DerivativeError("the outputs are one number; return the residuals as an array, do not sum them")
         if np.iscomplexobj(self.value) or packing.complex:
@@ -55,33 +64,50 @@ class Linearised:
 
     def pull(self, w):
         """(m,) -> J^T w, (n,)."""
+        if self._pull is None:
+            self._pull = pullback(self._outputs, self._tree)[1]
         return self._packing.pack_gradient(self._pull(w.reshape(self.value.shape).astype(self.value.dtype)))
 
     def push(self, v):
         """(n,) -> J v, (m,)."""
-        direction = self._packing.unpack(v)
-        return pushforward(lambda x: self._outputs(x, *self._rest), self._tree, direction)[1].reshape(-1).astype(float)
+        tangents = [leaf if is_variable(leaf) else None for leaf in leaves(self._packing.unpack(v))]
+        return push(self._outputs, self._tree, tangents)[1].reshape(-1).astype(float)
+
+    def slope(self, formed):
+        """J^T times the outputs, (n,); `formed`: from J itself."""
+        return self.flat @ self.rows() if formed else self.pull(self.flat)
 
     def rows(self, apart=False):
-        """J, m x n. `apart`: the outputs along axis 0 depend on nothing but their own copy of x.
+        """J, m x n, by a product for each column or for each row, whichever are fewer.
 
-        Then x is handed over with a leading axis of copies, one for each of the s samples, and m / s products with
-        J^T give all rows.
+        `apart`: the outputs along axis 0 depend on nothing but their own copy of x. Then x is handed over with a
+        leading axis of copies, one for each of the s samples, and m / s products with J^T give all rows.
         """
-        return self._rows_apart() if apart else self._rows_one_by_one()
+        if self._jacobian is None:
+            rows, columns = self.shape
+            if apart:
+                self._jacobian = self._rows_apart()
+            elif columns < rows:
+                self._jacobian = _by_products(self.push, columns, rows).T
+            else:
+                self._jacobian = _by_products(self.pull, rows, columns)
+        return self._jacobian
 
-    def _rows_one_by_one(self):
-        jacobian, unit = np.empty(self.shape), np.zeros(self.shape[0])
-        for row in range(self.shape[0]):
-            unit[row] = 1.0
-            jacobian[row] = self.pull(unit)
-            unit[row] = 0.0
-        return jacobian
+    def covariance(self, apart=False):
+        """s^2 (J^T J)^(-1), n x n, with s^2 = |outputs|^2 / (m - n); infinite where J has not the rank n."""
+        jacobian, (rows, columns) = self.rows(apart), self.shape
+        sizes = np.linalg.norm(jacobian, axis=0)  # in units of its columns no unknown is small beside another
+        r = np.linalg.qr(np.divide(jacobian, sizes, out=np.zeros(self.shape), where=sizes > 0), mode="r")
+        with np.errstate(all="ignore"):
+            inverse = dtrtri(r)[0] / sizes[:, None]
+            if not np.linalg.norm(r) * np.linalg.norm(inverse * sizes[:, None]) < 1 / (rows * np.finfo(float).eps):
+                return np.full((columns, columns), np.inf)
+        return float(np.dot(self.flat, self.flat)) / (rows - columns) * (inverse @ inverse.T)
 
     def _rows_apart(self):
         samples = len(self.value)
         copies = self._packing.copies(self._tree, samples)
-        value, pull = pullback(lambda x: self._outputs(x, *self._rest), copies)
+        value, pull = pullback(self._outputs, copies)
         if value.shape != self.value.shape:
             raise ShapeError(NOT_APART.format(samples))
         width = value.size // samples if samples else 0
@@ -98,6 +124,16 @@ class Linearised:
         if not np.linalg.norm(found - known) <= 1e-6 * np.linalg.norm(known):
             raise ShapeError(NOT_APART.format(samples))
         return jacobian
+
+
+def _by_products(product, many, size):
+    """The products with each unit vector, (many, size)."""
+    found, unit = np.empty((many, size)), np.zeros(many)
+    for row in range(many):
+        unit[row] = 1.0
+        found[row] = product(unit)
+        unit[row] = 0.0
+    return found
 
 
 class Restricted:

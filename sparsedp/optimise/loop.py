@@ -98,7 +98,7 @@ def minimise(
     -------
     Minimum
         `.x`, `.value`, `.history` (a record for each iteration), `.message`, `.converged`,
-        `.evaluations`; str() is a table. `.x` is the best point seen.
+        `.evaluations`; str() is a table. `.x` is the best point seen. `.covariance` of a least-squares problem.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def minimise(
     if project is not None:
         loss = _composed(loss, project)
     box = Box.of(bounds, packing, start)
-    trials = Trials(loss, gradient, packing, box, batches, stepper.residuals)
+    trials = Trials(loss, gradient, packing, box, batches, stepper if stepper.residuals else None)
     settings = {"method": method, "options": repr(sorted(options.items())), "bounds": repr(bounds)}
     journal = Journal(checkpoint, settings)
     watch = Watch(trials, packing, tolerance, callback, progress_bar(progress, int(maxiter)))
@@ -152,7 +152,8 @@ def minimise(
     message, converged = watch.reason(stuck)
     best, x = trials.best, packing.unpack(trials.best.vector)
     x = x if project is None else _like(project(x), x)
-    return Minimum(x, best.value, watch.history, method, message, converged, trials.count, journal.told)
+    told, covariance = journal.told, trials.covariance(best)
+    return Minimum(x, best.value, watch.history, method, message, converged, trials.count, told, covariance)
 
 
 def _run(stepper, trials, watch, journal, start, maxiter):

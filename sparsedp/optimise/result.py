@@ -44,6 +44,10 @@ class Minimum:
         Evaluations of loss and gradient, refused ones included.
     resumed : str
         What was found in the checkpoint folder; empty without one.
+    covariance : (n, n) array or None
+        Of the n unknowns of a least-squares problem, in the order of the leaves of x: s^2 (J^T J)^(-1) with
+        s^2 = |r|^2 / (m - n) for m residuals r. Infinite where J has not the rank n; bounds are not looked at. None
+        for other methods, with batches, where J is not formed, and when m <= n or n > 4000.
     """
 
     x: Any
@@ -54,11 +58,12 @@ class Minimum:
     converged: bool
     evaluations: int
     resumed: str
+    covariance: Any
 
-    def __init__(self, x, value, history, method, message, converged, evaluations, resumed=""):
+    def __init__(self, x, value, history, method, message, converged, evaluations, resumed="", covariance=None):
         self.__dict__.update(x=x, value=value, history=tuple(history), method=method)
         self.__dict__.update(message=message, converged=converged, evaluations=evaluations)
-        self.__dict__.update(resumed=resumed)
+        self.__dict__.update(resumed=resumed, covariance=covariance)
 
     def __setattr__(self, name, value):
         raise AttributeError(f"the result of minimise is frozen; {name} cannot be set")

@@ -14,6 +14,7 @@ from sparsedp.tape import isbox
 __all__ = ["Failure", "Stuck", "Trial", "Trials", "power_of_two"]
 
 OPEN, WHOLE = Box(), Batches()
+MOST = 4000  # unknowns of which the covariance is found, 128 MB
 REFUSED = (UnstableStepError, ConvergenceError, NonFiniteError)
 
 
@@ -29,7 +30,10 @@ class Failure(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A point, the loss and the flat gradient there. A refused point has the value infinity and no gradient."""
+    """A point, the loss and the flat gradient there. A refused point has the value infinity.
+
+    It has no gradient, nor has a point that is not low enough for whoever asked.
+    """
 
     vector: np.ndarray
     value: float
@@ -39,7 +43,7 @@ class Trial(NamedTuple):
     @property
     def refused(self):
         """Whether the loss has no value here."""
-        return self.slope is None
+        return self.value == np.inf
 
 
 class Trials:
@@ -55,15 +59,16 @@ class Trials:
         The points that are allowed.
     batches : Batches
         What the loss is given after x; `batches.number` is moved by the loop.
-    residuals : bool
-        The loss returns residuals r, and what falls is |r|^2 / 2.
+    squares : method of least squares, or None
+        With one, the loss returns residuals r, and what falls is |r|^2 / 2; ``squares.forms(rows, columns)`` tells
+        whether it forms their Jacobian.
     """
 
     best: Trial
 
-    def __init__(self, loss, gradient, packing, box=OPEN, batches=WHOLE, residuals=False):
-        self._loss, self._gradient, self._residuals = loss, gradient, residuals
-        self._packing = packing
+    def __init__(self, loss, gradient, packing, box=OPEN, batches=WHOLE, squares=None):
+        self._loss, self._gradient, self._packing = loss, gradient, packing
+        self._squares, self._forward = squares, False
         self.box, self.batches = box, batches
         self.count = 0
         self.failures = []
@@ -74,10 +79,13 @@ class Trials:
         self.best = self._evaluate(vector)
         return self.best
 
-    def __call__(self, vector):
-        """The trial at a point. An error that is part of searching counts as the value infinity."""
+    def __call__(self, vector, below=np.inf):
+        """The trial at a point. An error that is part of searching counts as the value infinity.
+
+        The gradient of residuals is left out unless their loss is below what is asked for.
+        """
         try:
-            trial = self._evaluate(vector)
+            trial = self._evaluate(vector, below)
         except REFUSED as error:
             self.failures.append(Failure(type(error).__name__, str(error)))
             return Trial(np.array(vector), np.inf, None)
@@ -85,19 +93,32 @@ class Trials:
             self.best = trial  # losses of two batches cannot be compared: the last point stands
         return trial
 
-    def _evaluate(self, vector):
+    def _evaluate(self, vector, below=np.inf):
         self.count += 1
-        value, slope = self._squares(vector) if self._residuals else self._both(vector)
+        value, slope = self._both(vector) if self._squares is None else self._summed(vector, below)
         if not np.isfinite(value):
             raise NonFiniteError(f"the loss is {value}; it must be finite at the start, and elsewhere it is avoided")
         rounded = self._packing.pack(self._packing.unpack(vector))  # single-precision leaves round
         return Trial(rounded, value, slope, self._packing.eps * abs(value))
 
-    def _squares(self, vector):
-        """Half the sum of squares of the residuals, and its gradient J^T r."""
-        here = Linearised(self._loss, self._packing, vector, self.batches.now())
+    def _summed(self, vector, below):
+        """Half the sum of squares of the residuals, and its gradient J^T r.
+
+        A Jacobian with fewer columns than rows that is formed anyway is formed at once, by forward products.
+        """
+        here = self._linearise(vector, self.batches.now())
+        with np.errstate(over="ignore"):  # infinity is refused
+            value = 0.5 * float(np.dot(here.flat, here.flat))
+        if not value < below:
+            return value, None
+        few = not self._squares.apart and here.shape[1] < here.shape[0]
+        self._forward = few and self._squares.forms(*here.shape)
+        slope = here.slope(self._forward)
         self._last = here, np.array(vector), self.batches.number
-        return 0.5 * float(np.dot(here.flat, here.flat)), here.pull(here.flat)
+        return value, slope
+
+    def _linearise(self, vector, batch):
+        return Linearised(self._loss, self._packing, vector, batch, self._forward)
 
     def _both(self, vector):
         """Loss and flat gradient, each from a fresh tree."""
@@ -123,7 +144,16 @@ class Trials:
             here, vector, number = self._last
             if number == self.batches.number - 1 and np.array_equal(vector, trial.vector):
                 return here
-        return Linearised(self._loss, self._packing, trial.vector, self.batches.now(back=1))
+        return self._linearise(trial.vector, self.batches.now(back=1))
+
+    def covariance(self, trial):
+        """That of the unknowns of a least-squares problem at a point; None where its Jacobian is not formed."""
+        if self._squares is None or self.batches.varied:
+            return None
+        here = self._linearised(trial)
+        rows, columns = here.shape
+        enough = columns < rows and columns <= MOST and self._squares.forms(rows, columns)
+        return here.covariance(self._squares.apart) if enough else None
 
     def curvature(self, trial):
         """Function from a flat vector to the Hessian times it, at a point: one tape, one backward pass a product."""
