@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp.tree import leaves
 
 
 def valley(x):
@@ -37,7 +38,7 @@ RUNS = [
 
 def same(a, b):
     return (
-        np.array_equal(a.x, b.x)
+        all(np.array_equal(p, q) for p, q in zip(leaves(a.x), leaves(b.x), strict=True))
         and a.value == b.value
         and a.evaluations == b.evaluations
         and a.message == b.message
@@ -111,26 +112,126 @@ def test_a_missing_file_and_a_manifest_that_was_changed(tmp_path, monkeypatch):
     "change, name",
     [
         ({"method": "gd"}, "method"),
-        ({"memory": 3}, "options"),
-        ({"bounds": (-3.0, None)}, "bounds"),
-        ({"start": START + 1}, "start, or loss at the start"),
-        ({"loss": lambda x: 2 * valley(x)}, "start, or loss at the start"),
+        ({"memory": 3}, "set of options"),
+        ({"bounds": (-3.0, None)}, "pair of bounds"),
+        ({"start": START + 1}, "start"),
+        ({"start": START.astype(np.float32)}, "start"),
+        ({"loss": lambda x: 2 * valley(x)}, "loss at the start"),
     ],
 )
 def test_another_run_is_refused(tmp_path, change, name):
     run = {"loss": valley, "start": START, "maxiter": 2, "checkpoint": tmp_path}
     dp.minimise(**run)
     with pytest.raises(
-        ValueError, match=".* holds a run with another .*: .*, not .*; write another checkpoint folder"
+        ValueError,
+        match=".* holds a run with another .* than the one given; give what it was begun with, or write another "
+        "checkpoint folder",
     ) as refused:
         dp.minimise(**{**run, **change})
-    assert f"another {name}:" in str(refused.value)
+    assert f"another {name} than" in str(refused.value)
+
+
+def refused(tmp_path, name, begun, given, **both):
+    """Whether a run is refused that was begun with other arguments, and goes on with its own."""
+    both = {"maxiter": 6, "tolerance": 0, "checkpoint": tmp_path, **both}
+    dp.minimise(**begun, **{**both, "maxiter": 3})
+    with pytest.raises(ValueError, match=f"another {name} than the one given; give what it was begun with, or write"):
+        dp.minimise(**given, **both)
+    whole = dp.minimise(**begun, **{**both, "checkpoint": None})
+    assert same(dp.minimise(**begun, **both), whole)
+
+
+TREE = {"x": START, "n": 2, "word": "a", "none": None, "flag": True, "pair": (1.0, np.arange(3))}
+
+
+@pytest.mark.parametrize(
+    "leaf",
+    [{"n": 3}, {"n": 2.0}, {"word": "b"}, {"none": 0}, {"flag": False}, {"pair": [1.0, np.arange(3)]},
+     {"pair": (1.0, np.arange(3) + 1)}, {"pair": (np.float64(1.0), np.arange(3))},
+     {"pair": (1.0, np.arange(3, dtype=np.int32))}, {"more": 1}],
+)  # fmt: skip
+def test_another_leaf_that_is_not_an_unknown_is_refused(tmp_path, leaf):
+    """Also where the loss at the start is the same: it is asked for the unknowns alone."""
+    loss = lambda tree: valley(tree["x"]) + tree["pair"][0] ** 2
+    refused(tmp_path, "start", {"start": TREE}, {"start": {**TREE, **leaf}}, loss=loss)
+
+
+def test_the_order_of_names_is_part_of_the_start(tmp_path):
+    loss = lambda tree: anp.sum(tree["a"] ** 2) + anp.sum(tree["b"] ** 2)
+    a, b = {"a": START, "b": START}, {"b": START, "a": START}
+    refused(tmp_path, "start", {"start": a}, {"start": b}, loss=loss)
+
+
+BATCHES = [np.full(1, 1e-3 * i) for i in range(5)]
+
+
+@pytest.mark.parametrize("given", [
+    [BATCHES[0], BATCHES[1], BATCHES[1], BATCHES[3], BATCHES[4]], BATCHES[:2], lambda i: BATCHES[(2 * i) % 5],
+])  # fmt: skip
+@pytest.mark.parametrize("begun", [BATCHES, lambda i: BATCHES[i % 5]])
+def test_other_batches_are_refused(tmp_path, begun, given):
+    run = {"loss": residuals, "start": START, "method": "half_inverse", "rate": 0.1}
+    refused(tmp_path, "list of batches", {"batches": begun}, {"batches": given}, **run)
+
+
+def test_batches_that_were_not_seen_yet_may_be_others(tmp_path):
+    run = {"loss": residuals, "start": START, "method": "half_inverse", "rate": 0.1, "tolerance": 0}
+    dp.minimise(**run, batches=BATCHES, maxiter=2, checkpoint=tmp_path)
+    other = [*BATCHES[:3], BATCHES[0]]
+    again = dp.minimise(**run, batches=other, maxiter=6, checkpoint=tmp_path)
+    assert again.resumed.startswith("resumed") and same(again, dp.minimise(**run, batches=other, maxiter=6))
+
+
+def test_each_batch_is_asked_for_once():
+    asked = []
+    run = {"loss": residuals, "start": START, "method": "half_inverse", "rate": 0.1, "tolerance": 0, "maxiter": 4}
+    dp.minimise(**run, batches=lambda i: asked.append(i) or BATCHES[i])
+    assert asked == [0, 1, 2, 3, 4]
+
+
+def test_bounds_that_print_alike_are_others(tmp_path):
+    """NumPy prints the ends of a long array and eight digits."""
+    start, lower = np.full(2000, 0.5), np.full(2000, -1.0)
+    for place, change in ((1000, 0.5), (0, 1e-12)):
+        other = lower.copy()
+        other[place] += change
+        assert repr(other) == repr(lower)
+        folder = tmp_path / str(place)
+        begun, given = {"bounds": (lower, None)}, {"bounds": (other, None)}
+        refused(folder, "pair of bounds", begun, given, loss=valley, start=start)
+
+
+def test_a_loss_that_is_another_one_away_from_the_start(tmp_path):
+    """The same value and gradient at the start, others at the last point."""
+    other = lambda x: valley(x) + anp.sum((x - START) ** 4)
+    assert other(START) == valley(START)
+    refused(tmp_path, "loss at the last point", {"loss": valley}, {"loss": other}, start=START)
+
+
+def test_functions_among_the_options_do_not_hinder_the_next_process(tmp_path):
+    """They have no address in the folder."""
+    run = lambda maxiter, **more: dp.minimise(
+        lambda y: anp.sum((y - 2.0) ** 2), START, "physical_gradient", maxiter, 0, rate=0.3,
+        physics=lambda x: 2 * x, inverse=lambda y, x: y / 2, **more,
+    )  # fmt: skip
+    run(3, checkpoint=tmp_path)
+    assert same(run(6, checkpoint=tmp_path), run(6))
+
+
+def test_a_tolerance_with_a_memory_takes_no_checkpoint(tmp_path):
+    with pytest.raises(
+        ValueError,
+        match="certified keeps answers that a checkpoint does not hold; leave checkpoint out, or give tolerance a "
+        "number",
+    ):
+        dp.minimise(valley, START, tolerance=dp.certified(), checkpoint=tmp_path)
 
 
 SCRIPT = """
 import sys
 import autograd.numpy as anp, numpy as np, time
 import sparsedp as dp
+from sparsedp.tree import leaves
 import sparsedp.optimise.resume as resume
 resume.SHARE = np.inf
 def valley(x):
@@ -172,3 +273,87 @@ def test_killed_at_ten_random_instants(tmp_path, rng, bounds):
     for name in ("npy", "npy.values.npy"):
         whole, resumed = (np.load(tmp_path / f"{part}.{name}") for part in ("whole", "parts"))
         assert np.array_equal(whole, resumed) and len(whole) > 50
+
+
+# ---- Ctrl-C --------------------------------------------------------------------------------------------------------
+
+PRESSED = """
+import sys, time
+import autograd.numpy as anp, numpy as np
+import sparsedp as dp
+def valley(x):
+    time.sleep(2e-3)
+    return anp.sum(100 * (x[1:] - x[:-1] ** 2) ** 2 + (1 - x[:-1]) ** 2)
+def slow_end(x):
+    if sys.argv[2:] and isinstance(x, np.ndarray):  # not traced: the result
+        print("waiting", flush=True)
+        time.sleep(60)
+    return x
+seen = lambda record, x: record.iteration == 10 and print("running", flush=True)
+start = np.linspace(-1.2, 1.0, 60)
+best = dp.minimise(valley, start, maxiter=150, tolerance=0, callback=seen, project=slow_end, checkpoint=sys.argv[1])
+print(best.message, best.converged, len(best.history), best.value, valley(best.x) == best.value)
+"""
+
+
+def pressed(words, *arguments):
+    """What a script prints that gets SIGINT each time it has printed one of the words, and its exit code."""
+    run = [sys.executable, "-c", PRESSED, *map(str, arguments)]
+    with subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        for word in words:
+            assert process.stdout.readline().strip() == word
+            process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=100)
+    return out, err, process.returncode
+
+
+def test_an_interrupted_run_returns_its_best_point_and_can_go_on(tmp_path):
+    out, err, code = pressed(["running"], tmp_path / "parts")
+    message, converged, many, value, right = out.split()
+    assert (code, err) == (0, "") and (message, converged, right) == ("interrupted", "False", "True")
+    assert 11 <= int(many) < 150 and newest(tmp_path / "parts") == int(many) - 1
+    assert float(value) < valley(np.linspace(-1.2, 1.0, 60))
+    again, whole = (dp.minimise(valley, np.linspace(-1.2, 1.0, 60), maxiter=150, tolerance=0, checkpoint=folder)
+                    for folder in (tmp_path / "parts", None))  # fmt: skip
+    assert again.resumed.startswith(f"resumed from iteration {int(many) - 1} in") and same(again, whole)
+
+
+def test_a_second_interrupt_stops_at_once(tmp_path):
+    clock = time.perf_counter()
+    out, err, code = pressed(["running", "waiting"], tmp_path, "slow")
+    assert out == "" and err.strip().endswith("KeyboardInterrupt") and code != 0
+    assert time.perf_counter() - clock < 50
+
+
+@pytest.mark.parametrize("method, loss", [("adam", valley), ("levenberg_marquardt", residuals), ("lbfgs", valley)])
+@pytest.mark.parametrize("at", [1, 8, 12])
+def test_interrupted_inside_an_evaluation(tmp_path, monkeypatch, method, loss, at):
+    """The evaluation that was cut short is made again: the resumed run has the bits and counts of the whole one."""
+    monkeypatch.setattr("sparsedp.optimise.resume.SHARE", 0.0)  # no state is written before the end
+    calls = []
+
+    def cut(x):
+        calls.append(1)
+        if len(calls) == at:
+            raise KeyboardInterrupt
+        return loss(x)
+
+    run = {"start": START, "method": method, "maxiter": 12, "tolerance": 0}
+    if at == 1:
+        with pytest.raises(KeyboardInterrupt):
+            dp.minimise(cut, **run, checkpoint=tmp_path)
+        return
+    best = dp.minimise(cut, **run, checkpoint=tmp_path)
+    assert best.message == "interrupted" and not best.converged and best.covariance is None
+    whole = dp.minimise(loss, **run)
+    assert [record.value for record in best.history] == [r.value for r in whole.history[: len(best.history)]]
+    assert same(dp.minimise(loss, **run, checkpoint=tmp_path), whole)
+
+
+def test_interrupted_in_the_callback():
+    def callback(record, x):
+        if record.iteration == 4:
+            raise KeyboardInterrupt
+
+    best = dp.minimise(valley, START, callback=callback)
+    assert best.message == "interrupted" and len(best.history) == 5 and str(best).endswith("interrupted")

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+from sparsedp.optimise.checkpoint import fingerprint
+
 __all__ = ["Batches"]
 
 
@@ -28,6 +30,8 @@ class Batches:
         if given is not None and not callable(given) and not len(given):
             raise ValueError("batches is empty; leave it out, and the loss is called with x alone")
         self._given, self.number = given, 0
+        self._last = -1, None  # a function is asked once for a batch that is used several times in a row
+        self._marks = {}
 
     @property
     def varied(self):
@@ -38,5 +42,22 @@ class Batches:
         """The arguments of the loss after x in this iteration, or so many iterations earlier."""
         if self._given is None:
             return ()
-        number = self.number - back
-        return (self._given(number) if callable(self._given) else self._given[number % len(self._given)],)
+        return (self._batch(self.number - back),)
+
+    def _batch(self, number):
+        if not callable(self._given):
+            return self._given[number % len(self._given)]
+        if self._last[0] != number:
+            self._last = number, self._given(number)
+        return self._last[1]
+
+    def mark(self, number):
+        """A hash of the batch of an iteration."""
+        if self._given is None:
+            return ""
+        if callable(self._given):
+            return fingerprint(self._batch(number))
+        place = number % len(self._given)
+        if place not in self._marks:
+            self._marks[place] = fingerprint(self._given[place])
+        return self._marks[place]

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparsedp.tree import flatten
 
-__all__ = ["Checkpoint", "Found", "digest"]
+__all__ = ["Checkpoint", "Found", "digest", "fingerprint"]
 
 FORMAT = "sparsedp optimisation 1"
 KEPT = 2
@@ -36,7 +36,7 @@ class Checkpoint:
     ----------
     folder : path
     settings : dict
-        What the run depends on: name -> word or hash. A folder of another run is refused.
+        What the run depends on: name -> hash. A folder of another run is refused.
     """
 
     def __init__(self, folder, settings):
@@ -99,16 +99,46 @@ class Checkpoint:
 
     def _compare(self, settings):
         for name in {**self._settings, **settings}:
-            if settings.get(name) != self._settings.get(name):
-                raise ValueError(
-                    f"{self._folder} holds a run with another {name}: {settings.get(name)}, not "
-                    f"{self._settings.get(name)}; write another checkpoint folder"
-                )
+            self.check(name, settings.get(name) == self._settings.get(name))
+
+    def check(self, name, same):
+        """Refuse the folder unless what it holds is the same.
+
+        Raises
+        ------
+        ValueError
+            If it is not.
+        """
+        if not same:
+            raise ValueError(
+                f"{self._folder} holds a run with another {name} than the one given; give what it was begun with, or "
+                "write another checkpoint folder"
+            )
 
 
 def digest(content):
     """Bytes -> SHA-256 in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
+
+
+def fingerprint(tree):
+    """Any value -> a hash of its kind and content: of every leaf of a tree, of a function its name."""
+    return digest("\n".join(_words(tree)).encode())
+
+
+def _words(value):
+    kind = type(value).__qualname__
+    if isinstance(value, dict):
+        yield from (word for item in value.items() for word in _words(item))
+    elif isinstance(value, (tuple, list)):
+        yield from (word for item in value for word in _words(item))
+    elif isinstance(value, (np.ndarray, np.generic)) and value.dtype != object:
+        kind = f"{kind} {value.dtype} {value.shape} {digest(np.ascontiguousarray(value).tobytes())}"
+    elif callable(value):
+        kind = f"{getattr(value, '__module__', '')} {getattr(value, '__qualname__', kind)}"
+    elif " at 0x" not in repr(value):  # an address is another one in the next process
+        kind = f"{kind} {value!r}"
+    yield f"{kind} ends"
 
 
 def _text(manifest):

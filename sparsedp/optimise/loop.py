@@ -84,7 +84,7 @@ def minimise(
         rate, adam and half_inverse; the result is the last point, not the best one.
     checkpoint : path, optional
         A folder that keeps the last two states. The same call goes on from the last one, to the same bits, when the
-        run was killed, stopped by its callback or by maxiter; a new problem needs a new folder.
+        run was killed, interrupted, stopped by its callback or by maxiter; a new problem needs a new folder.
     **options
         lbfgs: memory=10, line_search=20. gd: rate=None (found by backtracking), momentum=0.0,
         line_search=None or "backtracking". adam: rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8. newton_cg: inner=200.
@@ -99,12 +99,15 @@ def minimise(
     Minimum
         `.x`, `.value`, `.history` (a record for each iteration), `.message`, `.converged`,
         `.evaluations`; str() is a table. `.x` is the best point seen. `.covariance` of a least-squares problem.
+        Ctrl-C ends the run with the best point so far and the message "interrupted"; a second one stops at once.
 
     Raises
     ------
     ValueError
         If the method is not known, or maxiter, tolerance, bounds or an option is out of range, or the checkpoint
-        folder holds another run.
+        folder holds another run: another method, options, bounds, start (static leaves too), loss or batches.
+    KeyboardInterrupt
+        If Ctrl-C comes before the loss is known at the start, or a second time.
     TypeError
         If the method has no such option.
     UnstableStepError, ConvergenceError, NonFiniteError
@@ -132,6 +135,11 @@ def minimise(
     if not callable(tolerance) and not (is_number(tolerance) and tolerance >= 0):
         raise ValueError(f"minimise needs a tolerance >= 0, got {tolerance!r}; the default is 1e-8")
     if hasattr(tolerance, "inside"):  # it takes part in the evaluations
+        if checkpoint is not None:
+            raise ValueError(
+                "certified keeps answers that a checkpoint does not hold; leave checkpoint out, or give tolerance a "
+                "number"
+            )
         loss, gradient = tolerance.inside(loss, gradient)
     packing, batches = Packing(start), Batches(batches)
     if batches.varied and stepper.searches:
@@ -142,17 +150,24 @@ def minimise(
         loss = _composed(loss, project)
     box = Box.of(bounds, packing, start)
     trials = Trials(loss, gradient, packing, box, batches, stepper if stepper.residuals else None)
-    settings = {"method": method, "options": repr(sorted(options.items())), "bounds": repr(bounds)}
+    sides = None if box.open else (box.lower, box.upper)
+    settings = {"method": method, "set of options": sorted(options.items()), "pair of bounds": sides, "start": start}
     journal = Journal(checkpoint, settings)
     watch = Watch(trials, packing, tolerance, callback, progress_bar(progress, int(maxiter)))
+    stuck, covariance = None, None
     try:
         stuck = _run(stepper, trials, watch, journal, box.inside(packing.pack(start)), int(maxiter))
+        covariance = trials.covariance(trials.best)
+    except KeyboardInterrupt:
+        if not watch.history:
+            raise
+        watch.stopped = watch.stopped or "interrupted"
     finally:
         watch.bar.close()
+        journal.write(watch.history)
     message, converged = watch.reason(stuck)
     best, x = trials.best, packing.unpack(trials.best.vector)
-    x = x if project is None else _like(project(x), x)
-    told, covariance = journal.told, trials.covariance(best)
+    x, told = x if project is None else _like(project(x), x), journal.told
     return Minimum(x, best.value, watch.history, method, message, converged, trials.count, told, covariance)
 
 

@@ -44,7 +44,7 @@ class Watch:
             self.stopped = "converged"
         elif self._callback is not None and record.iteration > 0:
             if self._callback(record, self._packing.unpack(trial.vector)):
-                self.stopped = "callback"
+                self.stopped = "stopped by the callback"
         return bool(self.stopped)
 
     def _met(self, record):
@@ -67,7 +67,7 @@ class Watch:
                 True,
             )
         if self.stopped:
-            return "stopped by the callback", False
+            return self.stopped, False
         if stuck == "rounding":
             return "converged to rounding: the loss cannot fall further in floating point numbers", True
         if stuck:
