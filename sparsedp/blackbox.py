@@ -1,6 +1,7 @@
 """A simulator without derivatives becomes differentiable: sparse Jacobians by coloured differences."""
 
 import warnings
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -100,7 +101,7 @@ class Adopted:
         self.runs, self.way = 0, ""
         self._shapes: Any = None
         self._coloured: Any = None
-        self._points = Kept()
+        self._points, self._alone = Kept(), RLock()  # foreign code may work in arrays of its own: one thread at a time
         direct: Rule
         transposed = differentiable(f"{name}.T", self._back, self._only_in_g(lambda h, x: direct(h, x)))
         direct = differentiable(f"{name}.J", self._along, self._only_in_g(lambda h, x: transposed(h, x)))
@@ -141,10 +142,11 @@ class Adopted:
 
     def _run(self, x):
         """One run on plain values."""
-        self.runs += 1
         if active:
             count(f"{self.name}.run", "forward")
-        y = np.asarray(self._f(np.array(x)))
+        with self._alone:
+            self.runs += 1
+            y = np.array(self._f(np.array(x)))
         if y.dtype.kind not in "biuf" and np.asarray(x).dtype.kind != "c":
             raise TypeError(f"{self.name} must return real numbers, got dtype {y.dtype}; take the real part")
         return y.astype(float) if y.dtype.kind in "biu" else y
@@ -167,8 +169,9 @@ class Adopted:
         csr_array, (y.size, x.size)
         """
         x = np.asarray(plain(x), dtype=float)
-        known = self._points.find((x,))
-        return self._points.put((x,), self._made(x)) if known is None else known
+        with self._alone:
+            known = self._points.find((x,))
+            return self._points.put((x,), self._made(x)) if known is None else known
 
     def _made(self, x):
         check_finite(f"the argument of {self.name}", x)

@@ -3,28 +3,49 @@
 Kinds of calls: forward, vjp, jvp; of solves: solve, adjoint, iterations, setup, reused, hierarchy, skipped
 (nothing to solve); of operators: assembled (its matrix was built). A time loop counts its steps as forward, vjp
 and recomputed (run again for the backward pass), and the bytes it keeps beside the tape.
+
+Each thread has a ledger of its own: what other threads do at the same time is neither counted nor changed.
 """
 
 from collections import Counter
 from contextlib import contextmanager
+from threading import local
 from time import perf_counter
 from typing import Any
 
-__all__ = ["Calls", "active", "count", "loops", "observers", "recording", "spent", "tally", "tell", "timed"]
-
-active: list["Calls"] = []  # the open `recording()` blocks
-observers: list[Any] = []  # who takes part in every solve, the last one first; asked inside recordings only
-loops: list[Any] = []  # who is told of every time loop before it runs: called with (step, state, params, inputs, n)
-_inner: list[float] = []  # for each timed call that is under way, the seconds of the calls inside it
+__all__ = ["Calls", "active", "count", "recording", "spent", "tell", "thread", "timed"]
 
 
-class Tally:
-    """Solves since the program began, forward and adjoint: counted always, for one addition a solve."""
+class Thread(local):
+    """The ledger of the thread that asks.
 
-    solves = 0
+    Attributes
+    ----------
+    calls : list of Calls
+        The open `recording()` blocks.
+    observers : list
+        Who takes part in every solve, the last one first; asked inside recordings only.
+    loops : list of callables
+        Who is told of every time loop before it runs: called with (step, state, params, inputs, n).
+    witnesses : list of types
+        Kinds of nodes of a tape that see what they stand for; the last one is used.
+    solves : int
+        Since the thread began, forward and adjoint: counted always, for one addition a solve.
+    inner : list of float
+        For each timed call that is under way, the seconds of the calls inside it.
+    """
+
+    def __init__(self):
+        self.calls: list[Calls] = []
+        self.observers: list[Any] = []
+        self.loops: list[Any] = []
+        self.witnesses: list[Any] = []
+        self.inner: list[float] = []
+        self.solves = 0
 
 
-tally = Tally()
+thread = Thread()
+active: list[None] = []  # one for each open block of any thread: while it is empty, nobody need look at `thread`
 
 
 class Calls(Counter):
@@ -54,40 +75,42 @@ def recording():
     {('gradient', 'forward'): 1}
     """
     calls = Calls()
-    active.append(calls)
+    active.append(None)
+    thread.calls.append(calls)
     try:
         yield calls
     finally:
         # By identity: two nested blocks with equal counts are equal Counters.
-        active[:] = [other for other in active if other is not calls]
+        thread.calls[:] = [other for other in thread.calls if other is not calls]
+        active.pop()
 
 
 def count(name, kind, times=1):
     """Add a call of `name`, or several, to every open block. Callers test `active` first: it is on hot paths."""
-    for calls in active if times else ():
+    for calls in thread.calls if times else ():
         calls[name, kind] += times
 
 
 def tell(name, what, value):
     """Note a fact about `name`, such as the method that was chosen. Callers test `active` first."""
-    for calls in active:
+    for calls in thread.calls:
         calls.told.setdefault((name, what), Counter())[value] += 1
 
 
 def timed(name, kind, function, *args):
     """Count one call, run it, and add its seconds. Of a method, the object it belongs to is noted too."""
     actor = getattr(function, "__self__", None)
-    for calls in active:
+    for calls in thread.calls:
         calls[name, kind] += 1
         if actor is not None:
             calls.actors.setdefault(name, {})[id(actor)] = actor
-    _inner.append(0.0)
+    thread.inner.append(0.0)
     clock = perf_counter()
     try:
         return function(*args)
     finally:
         whole = perf_counter() - clock
-        _add(name, kind, whole - _inner.pop(), whole)
+        _add(name, kind, whole - thread.inner.pop(), whole)
 
 
 def spent(name, kind, seconds):
@@ -96,7 +119,7 @@ def spent(name, kind, seconds):
 
 
 def _add(name, kind, own, whole):
-    if _inner:
-        _inner[-1] += whole
-    for calls in active:
+    if thread.inner:
+        thread.inner[-1] += whole
+    for calls in thread.calls:
         calls.seconds[name, kind] += own

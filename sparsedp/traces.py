@@ -1,5 +1,7 @@
 """Traces: programs run on traced values, and the way back from their results to where they began."""
 
+from contextlib import contextmanager
+from itertools import count
 from typing import Any
 
 import autograd.numpy as anp
@@ -8,11 +10,12 @@ from autograd.core import JVPNode, VJPNode, add_outgrads
 from autograd.tracer import isbox, new_box, notrace_primitives, toposort, trace_stack
 
 from sparsedp.constants import constant, constant_args, sparing
+from sparsedp.ledger import thread
 from sparsedp.shortcuts import added, arithmetic
 from sparsedp.tree import flatten
 
 __all__ = ["ReverseNode", "backward", "forward_root", "inside", "new_box", "reverse_root", "split_box", "trace"]
-__all__ += ["untraced", "witnesses"]
+__all__ += ["untraced"]
 
 
 class ReverseNode(VJPNode):
@@ -36,22 +39,34 @@ class ReverseNode(VJPNode):
 sparing.update((anp.add, anp.subtract, anp.concatenate_args, anp.array_from_args))  # shapes are all they need
 untraced = notrace_primitives  # by kind of node, functions that leave the tape
 untraced[ReverseNode] = untraced[VJPNode]
-witnesses: list[type[VJPNode]] = []  # kinds of nodes that see what they stand for; the last one is used
 forward_root = JVPNode.new_root  # a fresh start of a forward-mode trace, with its tangent
 
 
 def reverse_root():
     """A fresh start of a reverse-mode trace."""
-    return (witnesses[-1] if witnesses else ReverseNode).new_root()
+    return (thread.witnesses[-1] if thread.witnesses else ReverseNode).new_root()
+
+
+_numbers = count(trace_stack.top + 1)
+
+
+@contextmanager
+def _new_trace():
+    """A number for a trace: larger than those of the traces it is nested in, and never given twice.
+
+    autograd counts up and down, for all threads together: of two nested traces the inner one could get the smaller
+    number, and its derivative be that of the other.
+    """
+    yield next(_numbers)
+
+
+trace_stack.new_trace = _new_trace
 
 
 def inside(fun):
     """Run fun(number) inside a trace of its own; return the result and the number of the trace."""
-    number = trace_stack.top = trace_stack.top + 1
-    try:
+    with trace_stack.new_trace() as number:
         return fun(number), number
-    finally:
-        trace_stack.top = number - 1  # autograd forgets this when `fun` raises
 
 
 def trace(fun, tree, roots):

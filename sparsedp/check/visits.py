@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from sparsedp.ledger import thread
 from sparsedp.tape import called, isbox
-from sparsedp.traces import ReverseNode, untraced, witnesses
+from sparsedp.traces import ReverseNode, untraced
 
 __all__ = ["Visit", "bytes_held", "witnessed"]
 
@@ -100,11 +101,11 @@ def witnessed(nodes=None):
             self.vjp = watched
 
     untraced[Witness] = untraced[ReverseNode]  # comparisons, shapes, rounding: plain values for this kind too
-    witnesses.append(Witness)
+    thread.witnesses.append(Witness)
     try:
         yield found
     finally:
-        witnesses.remove(Witness)
+        thread.witnesses.remove(Witness)
         del untraced[Witness]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sparsedp.fields import check_finite, place
 from sparsedp.ledger import active as recordings
-from sparsedp.ledger import count, tally
+from sparsedp.ledger import count, thread
 from sparsedp.solvers.record import Run
 from sparsedp.solvers.scaling import in_range, largest, norm, shifted
 from sparsedp.structure.base import Structure
@@ -88,7 +88,7 @@ class Splitting:
     def _note(self, run, residual, goal, flow):
         run.status = "converged" if residual <= goal else "converged_at_roundoff"
         run.residual = residual / flow if flow else 0.0
-        tally.solves += 1
+        thread.solves += 1
         solver = self.setup.solver
         if recordings:
             count(solver.name, "adjoint" if self.transposed else "solve")

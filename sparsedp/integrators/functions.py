@@ -146,17 +146,16 @@ class Functions:
         return total
 
     def _table(self, function, z):
-        key = function, z
-        if key not in self._tables:
-            if len(self._tables) >= KEPT:
-                del self._tables[next(iter(self._tables))]  # the oldest
+        key, known = (function, z), self._tables
+        values = known.get(key)
+        if values is None:
             values = function.values(z, self.eigenvalues)
             if not np.all(np.isfinite(values)):
                 raise NonFiniteError(
                     f"{self.name}: exp({z:g} * {self.op.name}) is beyond 1.8e308; take a smaller dt or the other sign"
                 )
-            self._tables[key] = values
-        return self._tables[key]
+            self._tables = {**dict([*known.items()][1 - KEPT :]), key: values}  # without the oldest
+        return values
 
     def _rule(self, functions, transposed):
         """The sum as a rule in (z, *fields)."""

@@ -19,7 +19,7 @@ from sparsedp.kernels.pointers import address, call
 from sparsedp.kernels.sums import sum_worker, sweep_worker
 from sparsedp.kernels.unable import warn_unable
 
-__all__ = ["along_axis", "kronecker_sum", "measure", "sweep"]
+__all__ = ["along_axis", "in_team", "kronecker_sum", "measure", "sweep"]
 
 SERIAL = (
     1 << 19
@@ -149,15 +149,20 @@ _lock, _home = threading.Lock(), os.getpid()
 
 
 def _run(kernel, arguments, size, threads):
-    """Run a kernel with a team of threads, or alone where a team is not worth it or not safe.
+    """Run a kernel with a team of threads where it is worth one."""
+    return in_team(kernel[0], arguments, threads if size >= SERIAL else 1)
+
+
+def in_team(kernel, arguments, threads):
+    """Run a kernel with a team of threads, or alone where a team is not safe.
 
     Some threading layers of numba end the process when a second Python thread enters, or when a
     forked child does. Who finds the team taken, or is a child, works alone; the bits are the same.
     """
-    if threads == 1 or size < SERIAL or os.getpid() != _home or not _lock.acquire(blocking=False):
-        return kernel[0](*arguments, 1)
+    if threads == 1 or os.getpid() != _home or not _lock.acquire(blocking=False):
+        return kernel(*arguments, 1)
     try:
-        return kernel[0](*arguments, threads)
+        return kernel(*arguments, threads)
     finally:
         _lock.release()
 

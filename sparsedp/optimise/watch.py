@@ -2,7 +2,7 @@
 
 import time
 
-from sparsedp.ledger import tally
+from sparsedp.ledger import thread
 from sparsedp.optimise.result import Record
 from sparsedp.tree import norm
 
@@ -16,7 +16,7 @@ class Watch:
         self._trials, self._packing = trials, packing
         self._tolerance, self._callback, self.bar = tolerance, callback, bar
         self._clock = time.perf_counter()
-        self._before, self._solves = 0.0, -tally.solves
+        self._before, self._solves = 0.0, -thread.solves
         self.history = []
         self.stopped = ""
 
@@ -24,7 +24,7 @@ class Watch:
         """Go on from a history that was kept. A callback stops one run, and a tolerance that is met, this one."""
         self.history = list(history)
         self._before = self.history[-1].seconds
-        self._solves = self.history[-1].solves - tally.solves
+        self._solves = self.history[-1].solves - thread.solves
         if stopped == "converged" and (callable(self._tolerance) or self._met(self.history[-1])):
             self.stopped = stopped
 
@@ -36,7 +36,7 @@ class Watch:
     def __call__(self, trial):
         seconds = self._before + time.perf_counter() - self._clock
         failed = self._trials.pop_failures()
-        size, solves = norm(self._trials.downhill(trial)), self._solves + tally.solves
+        size, solves = norm(self._trials.downhill(trial)), self._solves + thread.solves
         record = Record(len(self.history), trial.value, size, seconds, self._trials.count, failed, solves)
         self.history.append(record)
         self.bar.show(record)

@@ -14,7 +14,7 @@ import numpy as np
 
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import ConvergenceError
-from sparsedp.ledger import observers, recording
+from sparsedp.ledger import recording, thread
 from sparsedp.solvers.record import SolveLog
 
 __all__ = ["Answer", "Answers", "run", "seen"]
@@ -115,9 +115,9 @@ def run(loss, x, answers):
 
 def seen(function, x, answers):
     """function(x) with the answers taking part in its solves."""
-    observers.append(answers)
+    thread.observers.append(answers)
     try:
         with recording() as answers.calls:
             return function(x)
     finally:
-        observers.remove(answers)
+        thread.observers.remove(answers)

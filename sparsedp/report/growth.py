@@ -13,7 +13,7 @@ import numpy as np
 from sparsedp.check.probes import generator
 from sparsedp.derivative import NO_JVP, pushforward
 from sparsedp.errors import SparsedpError
-from sparsedp.ledger import loops
+from sparsedp.ledger import thread
 from sparsedp.tape import is_variable
 from sparsedp.tree import flatten, norm
 
@@ -54,13 +54,13 @@ def loop_of(loss, x, step=None):
             found.append(Loop(_advance(step, params, inputs), state))
             raise Found
 
-    loops.append(told)
+    thread.loops.append(told)
     try:
         loss(x)
     except Found:
         return found[0]
     finally:
-        loops.remove(told)
+        thread.loops.remove(told)
     return None
 
 

@@ -39,8 +39,7 @@ import numpy as np
 
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
 from sparsedp.fields import check_finite, place
-from sparsedp.ledger import active as recordings
-from sparsedp.ledger import count, observers, tally, timed
+from sparsedp.ledger import count, thread, timed
 from sparsedp.solvers.record import Run, merged
 from sparsedp.solvers.scaling import in_range, largest, measured, norm, shifted
 from sparsedp.tape import plain
@@ -92,7 +91,7 @@ class Solver:
 
     def __init__(self, system, engine, nullspace, log, name, recipe, reason=""):
         self.recipe, self.reason = recipe, reason
-        self.served = not recordings  # whether a solve was counted for this set-up
+        self.served = not thread.calls  # whether a solve was counted for this set-up
         self.system, self.engine = system, engine
         self.nullspace, self.log, self.name = nullspace, log, name
 
@@ -102,25 +101,25 @@ class Solver:
             return self._in_parts(b, transposed, checked, start)
         if self.system.complex:
             b = b.astype(complex)
-        return (self._counted if recordings else self.solved)(b, transposed, checked, start)
+        return (self._counted if thread.calls else self.solved)(b, transposed, checked, start)
 
     def _counted(self, b, transposed, checked, start):
         """As `solved`, seen by the ledger and by those who take part in solves."""
         if self.served:
             count(self.name, "reused")
         self.served = True
-        act = partial(observers[-1].linear, self) if observers and self.observed else self.solved
+        act = partial(thread.observers[-1].linear, self) if thread.observers and self.observed else self.solved
         return timed(self.name, "adjoint" if transposed else "solve", act, b, transposed, checked, start)
 
     def solved(self, b, transposed=False, checked=True, start=None):
         """The solve itself, recorded in the log."""
         run = Run()
-        tally.solves += 1
+        thread.solves += 1
         try:
             return self._scaled(b, run, transposed, checked and not transposed, start)
         finally:
             self.log.note(run.info(), transposed)
-            if recordings:
+            if thread.calls:
                 count(self.name, "iterations", run.iterations)
                 count(self.name, "skipped", int(run.status == "exact_zero_rhs"))
 

@@ -2,9 +2,10 @@
 
 Dense LU up to 64 unknowns, banded LU for 1-D chains, sparse LU (SuperLU) otherwise. A singular system
 is factored with one unknown of each component pinned. Rounding is left to the contract's refinement.
+SciPy changes the pivots of LAPACK while a solve runs, and back: every solve gets pivots of its own, for another
+thread may be solving with the same factors.
 """
 
-import warnings
 from functools import partial
 
 import numpy as np
@@ -53,14 +54,12 @@ class Direct(Engine):
         matrix = system.regular_matrix
         self._anchors = system.null_space.anchors()
         lower, upper = _bandwidths(matrix)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", la.LinAlgWarning)  # what is singular is found below
-            if system.size <= DENSE_UP_TO:
-                self._solve, words = _dense(matrix)
-            elif max(lower, upper) <= BAND_UP_TO:
-                self._solve, words = _banded(matrix, lower, upper)
-            else:
-                self._solve, words = _sparse(matrix, system)
+        if system.size <= DENSE_UP_TO:
+            self._solve, words = _dense(matrix)
+        elif max(lower, upper) <= BAND_UP_TO:
+            self._solve, words = _banded(matrix, lower, upper)
+        else:
+            self._solve, words = _sparse(matrix, system)
         self.hierarchy = f"{words}, {system.size} rows, {matrix.nnz} entries"
         self._refuse_singular(system, matrix)
 
@@ -91,7 +90,7 @@ class Direct(Engine):
 def _dense(matrix):
     factors, pivots = la.lapack.get_lapack_funcs("getrf", dtype=matrix.dtype)(matrix.toarray())[:2]
     getrs = la.lapack.get_lapack_funcs("getrs", dtype=matrix.dtype)
-    return (lambda b, transposed: getrs(factors, pivots, b, trans=int(transposed))[0]), "dense LU"
+    return (lambda b, transposed: getrs(factors, pivots.copy(), b, trans=int(transposed))[0]), "dense LU"
 
 
 def _bandwidths(matrix):
@@ -108,7 +107,7 @@ def _banded(matrix, lower, upper):
     factor, solve = la.lapack.get_lapack_funcs(("gbtrf", "gbtrs"), dtype=matrix.dtype)
     factors, pivots, _ = factor(bands, lower, upper)
     return (
-        lambda b, transposed: solve(factors, lower, upper, b, pivots, trans=int(transposed))[0]
+        lambda b, transposed: solve(factors, lower, upper, b, pivots.copy(), trans=int(transposed))[0]
     ), f"banded LU of {lower + upper + 1} diagonals"
 
 

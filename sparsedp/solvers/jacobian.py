@@ -5,6 +5,7 @@ and of the entries (a residual that is linear in x is set up once). Forward solv
 """
 
 from functools import partial
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ class Jacobians:
         self._patterns: dict = {}  # size -> Coloured, or None when only products will do
         self._around: dict = {}  # size -> Surroundings, where Operators tell that the unknowns lie on cells
         self._points, self._matrices = Kept(), Kept()
+        self._alone = RLock()  # held by the thread that looks for a pattern
 
     def __str__(self):
         counts = {size: "" if c is None else f", {c.count} products" for size, c in self._patterns.items()}
@@ -115,7 +117,8 @@ class Jacobians:
                 f"the sparsity given for {self.name} lacks entries in row {row}; add them or leave it out"
             )
         equation, x, leaves = known.point
-        self._enlarge(equation, x, leaves, row)
+        with self._alone:
+            self._enlarge(equation, x, leaves, row)
         return True
 
     # ------------------------------------------------------------ three ways to a Jacobian
@@ -127,7 +130,8 @@ class Jacobians:
             self.way = "given"
             given = self.given(equation.layout.split(x), *equation.params(leaves))
             return self._as_operator(given, equation.size, name), None, False
-        coloured = self._coloured(equation, x, leaves)
+        with self._alone:
+            coloured = self._coloured(equation, x, leaves)
         if coloured is None:
             forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
             return from_functions(forward, backward, equation.size, equation.size, name), None, True

@@ -8,6 +8,8 @@ __all__ = ["Kept"]
 class Kept:
     """Values keyed by content. Holds copies of the keys; keys must be plain, never traced.
 
+    The list of entries is replaced, never changed: other threads may be looking through it.
+
     Parameters
     ----------
     most : int
@@ -21,10 +23,11 @@ class Kept:
 
     def find(self, key):
         """The value of an equal key, or None."""
-        for place, (known, value) in enumerate(self._entries):
-            if len(known) == len(key) and all(map(_same, known, key)):
-                self._entries.insert(0, self._entries.pop(place))
-                return value
+        entries = self._entries
+        for entry in entries:
+            if len(entry[0]) == len(key) and all(map(_same, entry[0], key)):
+                self._entries = [entry, *(other for other in entries if other is not entry)]
+                return entry[1]
         return None
 
     def put(self, key, value):
@@ -39,7 +42,7 @@ class Kept:
     @property
     def last(self):
         """The value that was used last, or None."""
-        return self._entries[0][1] if self._entries else None
+        return next((value for _, value in self._entries), None)
 
 
 def _same(one, other):

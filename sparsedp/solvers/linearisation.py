@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from sparsedp.errors import ConvergenceError
-from sparsedp.ledger import active as recordings
+from sparsedp.ledger import thread
 from sparsedp.solvers import facts
 from sparsedp.solvers.record import failure
 
@@ -42,7 +42,7 @@ class Linearisation:
     @property
     def small(self):
         """The dense factors, when they serve."""
-        return None if recordings else self._small
+        return None if thread.calls else self._small
 
     @cached_property
     def op(self):

@@ -112,11 +112,9 @@ class Multigrid(Krylov):
         use_symmetric = system.symmetric and mirrored
         super().__init__(system, of_symmetric=use_symmetric, maxiter=MAXITER)
         self.symmetric = use_symmetric
-        matrix = system.matrix
-        if use_symmetric:
-            scale = np.broadcast_to(system.sign * system.weights, system.size)
-            matrix = csr_array(matrix * scale[:, None])
-        matrix = matrix if use_symmetric else matrix * system.sign
+        unit = 2.0 ** -int(np.frexp(system.norm(False))[1])  # PyAMG speaks up where sums of entries are below 1e-15
+        scale = unit * system.sign * (system.weights if use_symmetric else 1.0)
+        matrix = csr_array(system.matrix * np.broadcast_to(scale, system.size)[:, None])
         if grid is None:
             built = _ruge_stueben(matrix, strength, levels)
         else:
@@ -124,7 +122,7 @@ class Multigrid(Krylov):
         self.forward = Hierarchy(built, visits, *sweeps)
         self._transposed: Any = None
         self.hierarchy = self.forward.words
-        self._flip = 1 if use_symmetric else system.sign
+        self._flip = unit if use_symmetric else unit * system.sign
 
     def precondition(self, r, transposed):
         """One cycle, or one transposed cycle."""
@@ -196,21 +194,16 @@ def _turned(matrix):
 
 
 def _ruge_stueben(matrix, strength, levels):
-    """The levels that PyAMG builds; NumPy's global random state is left as it was."""
+    """The levels that PyAMG builds; this splitting draws no random numbers."""
     from pyamg import ruge_stuben_solver
 
-    state = np.random.get_state()  # noqa: NPY002
-    np.random.seed(0)  # noqa: NPY002
-    try:
-        built = ruge_stuben_solver(
-            csr_matrix(matrix),  # PyAMG asks for the matrix class, not the array class
-            strength=("classical", {"theta": strength}),
-            CF=("RS", {"second_pass": True}),  # with random jumps the first pass alone does not converge
-            max_levels=levels,
-            max_coarse=COARSEST,
-        )
-    finally:
-        np.random.set_state(state)  # noqa: NPY002
+    built = ruge_stuben_solver(
+        csr_matrix(matrix),  # PyAMG asks for the matrix class, not the array class
+        strength=("classical", {"theta": strength}),
+        CF=("RS", {"second_pass": True}),  # with random jumps the first pass alone does not converge
+        max_levels=levels,
+        max_coarse=COARSEST,
+    )
     return _without_residues([*built.levels])
 
 
@@ -260,9 +253,9 @@ def _coarse_solver(matrix):
         if np.all(np.abs(sums[cells]) <= 1e-9 * sizes[cells]):
             scale = np.max(sizes[cells]) or 1.0
             dense[np.ix_(cells, cells)] += scale / cells.size
-    factors = la.lu_factor(dense, check_finite=False)
-    pivots = np.abs(np.diag(factors[0]))
-    if np.all(pivots > 1e-14 * np.max(np.abs(dense), axis=1)):
-        return lambda b, transposed: la.lu_solve(factors, b, trans=int(transposed), check_finite=False)
+    factors, rows = la.lu_factor(dense, check_finite=False)
+    if np.all(np.abs(np.diag(factors)) > 1e-14 * np.max(np.abs(dense), axis=1)):
+        # A copy, because SciPy changes them while it solves, and another thread may be solving too.
+        return lambda b, transposed: la.lu_solve((factors, rows.copy()), b, trans=int(transposed), check_finite=False)
     inverse = la.pinv(dense, rtol=1e-10)
     return lambda b, transposed: b @ inverse if transposed else inverse @ b

@@ -24,6 +24,7 @@ from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
 from sparsedp.solvers.assembly import Assembly
 from sparsedp.solvers.choose import build, check_settings
+from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.record import SolveLog
 from sparsedp.space import fits
 from sparsedp.structure.base import Structure
@@ -32,8 +33,6 @@ from sparsedp.tape import cast, differentiable, dtype_of, isbox, plain
 from sparsedp.tree import copied
 
 __all__ = ["EllipticSolver", "elliptic_solver"]
-
-KEPT = 2  # set-ups: a forward and a backward pass of one step, or two alternating coefficients
 
 
 def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **options):
@@ -111,7 +110,7 @@ class EllipticSolver:
         self.D, self.G = D, G
         self.info = SolveLog()
         self._settings = settings
-        self._kept: list = []  # (k, shift, Inverse), last used first; plain values only
+        self._kept = Kept()
         self._assembly = Assembly(D, G)
 
     def __reduce__(self):
@@ -183,14 +182,12 @@ class EllipticSolver:
 
     def _inverse(self, k, shift):
         """The set-up for this content, from the last two or new."""
-        for place, (known, known_shift, inv) in enumerate(self._kept):
-            if shift == known_shift and np.array_equal(k, known):
-                self._kept.insert(0, self._kept.pop(place))
-                return inv
-        k = np.array(k, dtype=float)
-        inv = build(self._operator(k, shift), name="elliptic_solver", log=self.info, solves="few", **self._settings)
-        self._kept = [(k, shift, inv), *self._kept[: KEPT - 1]]
-        return inv
+        k = np.asarray(k, dtype=float)
+        known = self._kept.find((k, shift))
+        if known is not None:
+            return known
+        op, settings = self._operator(k.copy(), shift), self._settings
+        return self._kept.put((k, shift), build(op, name="elliptic_solver", log=self.info, solves="few", **settings))
 
     def _operator(self, k, shift):
         name = f"{shift:g} - {self.D.name} @ diag(k) @ {self.G.name}"
@@ -208,9 +205,9 @@ class EllipticSolver:
         return f"<elliptic_solver: shift - {self.D.name} @ diag(k) @ {self.G.name} on {self.G.domain}>"
 
     def __str__(self):
-        if not self._kept:
+        if not len(self._kept):
             return f"{self!r}, not set up yet"
-        return f"{self!r}, {len(self._kept)} of {KEPT} set-ups kept, the last one:\n{self._kept[0][2]}"
+        return f"{self!r}, {len(self._kept)} of {self._kept.most} set-ups kept, the last one:\n{self._kept.last}"
 
 
 def _representable(cotangent):

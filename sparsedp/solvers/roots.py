@@ -19,7 +19,7 @@ from threading import get_ident
 from sparsedp.derivative import pullback
 from sparsedp.direction import push
 from sparsedp.ledger import active as recordings
-from sparsedp.ledger import observers, tell
+from sparsedp.ledger import tell, thread
 from sparsedp.solvers.choose import check_settings
 from sparsedp.solvers.equation import Equation, Layout, vary
 from sparsedp.solvers.jacobian import Jacobians
@@ -174,7 +174,7 @@ class Root:
         known = self._answers.pop(get_ident(), None)
         if known is not None:
             return known.reshape(-1).copy()
-        solved = observers[-1].root if recordings and observers else Root.solved
+        solved = thread.observers[-1].root if recordings and thread.observers else Root.solved
         x = solved(self, equation, guess, leaves)
         if recordings:
             tell(self.name, "method", f"Newton's method, Jacobian {self._jacobians.way or 'not needed'}")

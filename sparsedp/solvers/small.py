@@ -53,7 +53,7 @@ class Small:
         return shifted(self.matrix @ x, self.exponent) if self.exponent else self.matrix @ x
 
     def _solved(self, b, transposed):
-        return GETRS(self._factors[0], self._factors[1], b, trans=int(transposed))[0]
+        return GETRS(self._factors[0], self._factors[1].copy(), b, trans=int(transposed))[0]
 
     def solve(self, b, rtol, transposed=False):
         """(x of A x = b or A^T x = b, SolveInfo), judged by the true residual; None: the general path must do it."""

@@ -139,7 +139,7 @@ class Faces:
     def stencil(self):
         """The stencil, near 1."""
         areas = [np.max(_area(self.grid, axis), initial=0.0) for axis in range(self.grid.dim)]
-        most = self.largest * max(size * area for size, area in zip(self.sizes, areas))
+        most = abs(self.factor) * self.largest * max(size * area for size, area in zip(self.sizes, areas))
         shift = self.shift * np.max(areas) if self.shift else 0.0
         scale = 2.0 ** -int(np.frexp(max(most, shift))[1])
         links = of_lines(self.lines, self.k, self.grid, scale * self.factor)

@@ -134,11 +134,11 @@ class Structured(Engine):
     overwrites = False
 
     def __init__(self, stencil, free, maxiter=None, dtype=np.float32):
-        from sparsedp.kernels import multigrid_cycle, multigrid_pack, multigrid_teams
+        from sparsedp.kernels import multigrid_cycle, multigrid_pack, multigrid_teams, native
         from sparsedp.solvers.stencil_levels import Levels
         from sparsedp.solvers.stencil_spread import Spread
 
-        self.passes, self.cycle = multigrid_teams, multigrid_cycle.cycle
+        self.passes, self.cycle, self.in_team = multigrid_teams, multigrid_cycle.cycle, native.in_team
         self.scale, self.maxiter = stencil.scale, maxiter or MAXITER
         spread = Spread(stencil.grid)
         levels = Levels(spread.natural(stencil, free), spread.widths(), spread.coarsenings, dtype, abs(stencil.scale))
@@ -166,6 +166,10 @@ class Structured(Engine):
         self.first = self.coarse.b[: 2 * first[3] * first[4]].reshape(first[3], 2, first[4])
         self.natural = self.coarse.natural[: first[3] * first[9]].reshape(first[3], first[9])
 
+    def run(self, kernel, *arguments):
+        """A pass, by the team."""
+        return self.in_team(kernel, arguments, self.teams)
+
     def solve(self, b, goal, transposed):
         with self.lock:
             run = _Run(self, b, goal, transposed)
@@ -184,7 +188,7 @@ class _Run:
 
     def __init__(self, engine, b, goal, transposed):
         self.engine, fine = engine, engine.fine
-        self.grid, teams = (fine.shape, fine.periodic, fine.half), engine.teams
+        self.grid = fine.shape, fine.periodic, fine.half
         self.b, self.data, self.transposed = b.reshape(engine.shape), norm(b), transposed
         self.unit = 2.0 ** (np.frexp(self.data)[1] + engine.size.exponent[transposed])
         volumes, ones = (engine.ones, engine.volumes) if transposed else (engine.volumes, engine.ones)
@@ -195,10 +199,11 @@ class _Run:
         self.x, self.r, self.q = engine.wide_vectors
         self.z, self.p, self.old = engine.vectors
         self.x[:] = 0.0
-        self.tail = engine.totals, engine.sums, teams
-        self.field = engine.rings[0], engine.line, teams
+        self.tail = engine.totals, engine.sums
+        self.field = engine.rings[0], engine.line
         self.steps = 0.0, 0.0  # what is still to be added to x, of p and of old
-        engine.passes.load(fine.links, self.r, self.b, fine.scale, self.before, engine.found, *self.grid, *self.field)
+        vectors = fine.links, self.r, self.b
+        engine.run(engine.passes.load, *vectors, fine.scale, self.before, engine.found, *self.grid, *self.field)
 
     def iterate(self):
         """Until the residual is small enough -> (word, number of iterations)."""
@@ -232,9 +237,9 @@ class _Run:
         engine, fine = self.engine, self.engine.fine
         light = *self.grid, engine.rings[1]
         transfer = fine.weights, fine.starts, OVER
-        engine.passes.restrict(fine.light, self.r, engine.first, *transfer, *light, engine.lines, engine.teams)
-        engine.cycle(*engine.coarse, engine.lines, engine.teams)
-        engine.passes.correct(fine.light, self.r, self.z, engine.natural, *transfer, *light, *self.tail)
+        engine.run(engine.passes.restrict, fine.light, self.r, engine.first, *transfer, *light, engine.lines)
+        engine.run(engine.cycle, *engine.coarse, engine.lines)
+        engine.run(engine.passes.correct, fine.light, self.r, self.z, engine.natural, *transfer, *light, *self.tail)
         return float(engine.sums[:, 0].sum())
 
     def direct(self, beta, odd):
@@ -242,13 +247,14 @@ class _Run:
         engine = self.engine
         steps, self.p, self.old = self.steps if odd else (0.0, 0.0), self.old, self.p
         vectors = self.x, self.p, self.old, self.z, self.q
-        engine.passes.direction(engine.fine.links, *vectors, beta, steps, *self.grid, engine.rings[0], *self.tail)
+        links, rings = engine.fine.links, engine.rings[0]
+        engine.run(engine.passes.direction, links, *vectors, beta, steps, *self.grid, rings, *self.tail)
         return float(engine.sums[:, 0].sum())
 
     def step(self, alpha, odd):
         """r -= alpha q -> its size."""
         self.steps = (alpha, 0.0) if odd else (alpha, self.steps[0])
-        self.engine.passes.update(self.r, self.q, self.gauge, alpha, *self.grid, *self.tail)
+        self.engine.run(self.engine.passes.update, self.r, self.q, self.gauge, alpha, *self.grid, *self.tail)
         return float(np.sqrt(self.engine.sums[:, 0].sum()))
 
     def rounding(self):
@@ -268,5 +274,6 @@ class _Run:
         engine, fine = self.engine, self.engine.fine
         out = np.empty(engine.shape)
         vectors = fine.links, self.x, self.steps, self.p, self.old, self.b, out
-        engine.passes.finish(*vectors, fine.scale, self.before + self.after, engine.found, *self.grid, *self.field)
+        widths = self.before + self.after
+        engine.run(engine.passes.finish, *vectors, fine.scale, widths, engine.found, *self.grid, *self.field)
         return out.reshape(-1)

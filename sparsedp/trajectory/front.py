@@ -5,7 +5,7 @@ import numpy as np
 from sparsedp.constants import constant_args
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_function, check_takes, is_whole
-from sparsedp.ledger import loops
+from sparsedp.ledger import thread
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.trajectory.keep import All, Each, Last
 from sparsedp.trajectory.layout import Layout, dense
@@ -118,7 +118,7 @@ def rollout(
     if run.store and (slots is None or slots >= n) and (inputs is not None or not carries(step, *PLAIN)):
         room = None if memory is None else room_within(memory, forms[0].nbytes, n, beside)
         run.tapes = Tapes(room, frozenset(traced), slots is not None)
-    for told in loops:
+    for told in thread.loops:
         told(step, state, params, inputs, n)
     outputs = rollout_rule(run, *args)
     count = len(plain(outputs)) if isinstance(plain(outputs), tuple) else None

@@ -1,0 +1,63 @@
+"""Coefficients times a power of two: the same bits, iterations and words at every size, by every method."""
+
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp import kernels
+
+SHAPES = {1: (40,), 2: (12, 11), 3: (8, 7, 6)}
+METHODS = ["direct", "separable", "multigrid", "structured", "krylov"]
+EXPONENTS = [600, -600, 664, -664, 198, -198, 206, -206, -900]  # 2^-664 is about 1e-200; from 2^+-200 on set-ups scale
+
+
+def scene(dim, coefficients):
+    """(D, G, k on faces, data)."""
+    grid, rng = dp.Grid(SHAPES[dim], size=1.0), np.random.default_rng(dim)
+    k = np.ones(grid.faces.size) if coefficients == "equal" else np.exp(rng.standard_normal(grid.faces.size))
+    return dp.divergence(grid), dp.gradient(grid, dp.dirichlet), k, rng.standard_normal(grid.shape)
+
+
+def inverse(method, D, G, k):
+    K = dp.diagonal(D.domain, k)
+    return dp.inverse(-k[0] * (D @ G) if method == "separable" else -D @ K @ G, method)
+
+
+def elliptic(method, D, G, k):
+    return dp.elliptic_solver(D, G, method)._inverse(k, 0.0)
+
+
+def entries(method, D, G, k):
+    matrix = (
+        (-D @ G).explicit().matrix if method == "separable" else (-D @ dp.diagonal(D.domain, k / k.max()) @ G).matrix
+    )
+    return dp.inverse(dp.from_matrix(matrix * k.max(), G.domain, G.domain), method)
+
+
+def solved(how, method, D, G, k, b):
+    solve = how(method, D, G, k)
+    x, y = solve(b), solve.T(b)
+    return x, y, [(info.iterations, info.status) for info in (solve.info.forward, solve.info.adjoint)]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("dim", SHAPES)
+@pytest.mark.parametrize("how", [inverse, elliptic, entries])
+def test_bits_follow_the_coefficients(how, dim, method, capfd):
+    if method == "separable" and how is entries:
+        pytest.skip("a matrix is no sum of factors")
+    if method == "structured" and (dim == 1 or not kernels.compiled()):
+        pytest.skip("structured is for 2-D and 3-D, with numba")
+    D, G, k, b = scene(dim, "equal" if method == "separable" else "smooth")
+    *wanted, words = solved(how, method, D, G, k, b)
+    dense = (-D @ dp.diagonal(D.domain, k) @ G).matrix.toarray()
+    np.testing.assert_allclose(wanted[0].ravel(), np.linalg.solve(dense, b.ravel()), rtol=1e-7)
+    for exponent in EXPONENTS:
+        *found, told = solved(how, method, D, G, np.ldexp(k, exponent), b)
+        assert told == words, exponent
+        for x, same in zip(found, wanted, strict=True):
+            np.testing.assert_array_equal(np.ldexp(x, exponent), same, err_msg=f"2^{exponent}")
+    for factor in (1e-200, 1e200):  # no power of two: the last digits differ
+        x = solved(how, method, D, G, k * factor, b)[0] * factor
+        np.testing.assert_allclose(x, wanted[0], rtol=1e-7)
+    assert capfd.readouterr() == ("", "")  # PyAMG speaks up where sums of entries are small
