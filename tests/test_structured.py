@@ -243,6 +243,23 @@ def test_gradients_that_overflow_are_refused():
         dp.value_and_grad(lambda k: 1e100 * anp.sum(solve(k, b)))(np.linspace(1.0, 2.0, grid.faces.size))
 
 
+@pytest.mark.parametrize("n", [16, 20, 24])
+def test_cells_without_content_do_not_count_as_weak(n, rng):
+    """An axis of 16 to 32 cells gets one that is linked along it only; nearly all others are held equally."""
+    grid = dp.Grid((n, n, n), size=1.0)
+    D, G, k = dp.divergence(grid), dp.gradient(grid, dp.dirichlet), np.exp(rng.uniform(-1, 1, grid.faces.size))
+    solve, b = dp.elliptic_solver(D, G), rng.standard_normal(grid.shape)
+    x = solve(k, b)
+    assert "multigrid on the grid itself" in str(solve) and solve.info.forward.iterations <= 12
+    residual = b.ravel() + (D @ dp.diagonal(grid.faces, k) @ G).matrix @ x.ravel()
+    assert np.linalg.norm(residual) <= 1e-10 * np.linalg.norm(b)
+    assert dp.inverse(-D @ dp.diagonal(grid.faces, k) @ G, "structured").solver.engine.weak_share < 0.01
+    along = np.concatenate([np.full(n * n * (n + 1), weight) for weight in (1.0, 1.0, 0.01)])
+    flat = dp.elliptic_solver(D, G)  # what is weak along one axis is still left to others
+    flat(k * along, b)
+    assert "held 10 times weaker along one axis" in str(flat)
+
+
 def test_anisotropy_is_refused_honestly_and_left_to_others(rng):
     grid = dp.Grid((64, 64), size=(1.0, 1e4))
     op, b = conductance(grid, 1 + rng.random(grid.shape)), rng.standard_normal(grid.shape)

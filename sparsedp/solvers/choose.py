@@ -43,7 +43,8 @@ DIRECT_UP_TO = {
     "few": {0: 10_000, 1: 10_000_000, 2: 16_384, 3: 2_000},
 }
 
-# The same where structured multigrid is possible.
+# The same where structured multigrid is possible. Measured in 3-D: at 16^3 LU takes 5 times its set-up and a third
+# of its solve, at 24^3 26 times and 1.3 times.
 DIRECT_BELOW_STRUCTURED = {"many": {1: 10_000_000, 2: 16_384, 3: 4_096}, "few": {1: 10_000_000, 2: 4_096, 3: 1_000}}
 
 # In 3-D multigrid takes its levels from pairs of cells where coefficients differ by less than this along an axis,

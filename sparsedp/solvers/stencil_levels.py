@@ -111,7 +111,7 @@ class Levels:
             self.shapes.append(half_shape(self.shapes[-1]))
         self.table, self.parts = self._allocate(finest.periodic)
         self.weak_share = 0.0  # largest share of cells that are held much weaker along one axis than another
-        scale, root = self._scales(finest, False)
+        scale, root = self._scales(finest, False, widths[:: 4 - self.dim])
         self.size = self._size(self._deep(root), widths, unit)
         fine = self._finest(finest, scale)
         level = finest
@@ -210,12 +210,17 @@ class Levels:
 
     # ------------------------------------------------------------ levels
 
-    def _scales(self, level, nine):
-        """One over the root of the diagonal, and the root; 0 where there is no unknown."""
+    def _scales(self, level, nine, widths=()):
+        """One over the root of the diagonal, and the root; 0 where there is no unknown.
+
+        Cells of width 0 (see `Spread`) are linked along that axis only, which slows nothing down: they are not weak.
+        """
         scale, root = padded(level.shape), padded(level.shape)
         arrays = map(self._deep, (level.links, level.extra, scale, root))
         links, *cells = arrays
         weak = diagonal(links, np.array(steps(self.dim, nine)), *cells, WEAK, self.dim - 2)
+        for axis, w in enumerate(widths):
+            weak -= np.count_nonzero(np.compress(w == 0, root[pack.inside(level.shape)], axis))
         if prod(level.shape) >= EXAMINED:
             self.weak_share = max(self.weak_share, weak / prod(level.shape))
         return repeat(scale, level.shape, level.periodic), root
