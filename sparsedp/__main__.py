@@ -52,6 +52,7 @@ def _parser():
         description="Audit a gradient. Exit code: 0 agrees, 1 disagrees, 3 inconclusive, 2 refused.",
     )
     check.add_argument("scene", metavar="SCENE", help=SCENE)
+    check.add_argument("--quick", action="store_true", help="two directions only, for a loss that takes minutes")
     check.set_defaults(run=run_check)
     report = rooms.add_parser(
         "report",
@@ -77,7 +78,7 @@ def run_check(options):
         return refuse(error)
     try:
         with redirect_stdout(sys.stderr):  # what the loss prints is no part of the table
-            audit = gradient(source.loss, source.x)
+            audit = gradient(source.loss, source.x, quick=options.quick)
     except Exception as error:  # the loss is the user's: it may raise anything
         return refuse(f"{options.scene} cannot be audited: {type(error).__name__}: {error}")
     print(audit)

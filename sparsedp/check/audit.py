@@ -8,9 +8,10 @@ import numpy as np
 from sparsedp.check.culprit import culprit_of
 from sparsedp.check.extension import measured
 from sparsedp.check.modes import complex_step, forward_mode, hessian
-from sparsedp.check.noise import noise_of
+from sparsedp.check.noise import POINTS, noise_of
 from sparsedp.check.point import Point
 from sparsedp.check.probes import generator
+from sparsedp.check.progress import shown
 from sparsedp.check.ripple import hidden
 from sparsedp.check.sweep import REFUSALS, Line, Trials, default_steps, dot
 from sparsedp.check.verdict import Audit, decide
@@ -22,10 +23,12 @@ __all__ = ["gradient"]
 FEWEST_STEPS = 8
 BESIDE = 7  # seed of the place where a kinked loss is looked at again
 LOOSE = 1e-8  # a tolerance of solves above this may explain any gap that no call is to blame for
+QUICK = ("random 1", "gradient")  # the directions of a quick audit
+LEFT_OUT = "other directions, single leaves and entries, complex steps and the Hessian product were not looked at"
 UNDERFLOW = 1e-303  # differences of a loss that changes by less are not normal numbers
 
 
-def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None):
+def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None, quick=False):
     """Audit the gradient of a loss at x: does it agree with what the loss does?
 
     Parameters
@@ -45,6 +48,10 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None):
         its largest entry.
     rng : None, int or numpy Generator
         Source of the directions; default a fixed seed of its own.
+    quick : bool
+        One random direction and the gradient itself, for a loss that takes minutes. What was not looked at stands
+        in the reason, also where it agrees: other random directions, single leaves and entries, complex steps, the
+        Hessian product.
 
     Returns
     -------
@@ -83,6 +90,9 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None):
     The Hessian product along the first direction is judged by the third Taylor remainder, of order 2.9 or more:
     `.hessian` and a note say how. It does not touch the verdict, which is about the gradient.
 
+    Cost: two evaluations of the loss for each step and direction (a hundred or two in all, about 60 of a quick
+    audit), and a few gradients. A terminal shows how many are to come on standard error, with a bar if tqdm is there.
+
     Everything is relative: a loss times 1e-200 or 1e200 is judged the same. A loss that refuses a trial
     point (unstable step, no convergence, not finite, a ValueError) makes that step unusable. At a kink
     central differences prove nothing, and the verdict is inconclusive.
@@ -97,28 +107,32 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None):
     'disagrees'
     """
     check_function("check.gradient", loss, "lambda x: np.sum(x**2)")
-    return _audit(loss, x, gradient, steps, directions, rng, beside=False)
-
-
-def _audit(loss, x, gradient, steps, directions, rng, beside):
-    point, trials = Point(x), Trials(loss)
+    point = Point(x)
     chosen = _checked(steps, directions) or default_steps(point.eps)
+    directions = min(directions, 1) if quick else directions
+    ways = sum(1 for _ in _ways(point, point.values, directions, generator(0), quick))
+    with shown(3 + POINTS * min(ways, 2) + 2 * len(chosen) * ways) as told:
+        return _audit(Trials(loss, told), point, gradient, chosen, steps is None, directions, rng, quick)
+
+
+def _audit(trials, point, gradient, steps, extend, directions, rng, quick, beside=False):
+    loss = trials.loss
     base = trials.value(point.tree())
     evaluate = (lambda tree: value_and_grad(loss)(tree)[1]) if gradient is None else gradient
     leaves, doubts = _own_gradient(point, trials, base, evaluate)
     lines, judged, bend = [], [], None
     if math.isfinite(base) and all(np.all(np.isfinite(g)) for g in leaves):
-        lines = _lines(point, leaves, directions, generator(rng), trials, base)
-        judged = [measured(line, chosen, point, trials, extend=steps is None) for line in lines]
+        lines = _lines(point, _ways(point, leaves, directions, generator(rng), quick), leaves, trials, base)
+        judged = [measured(line, steps, point, trials, extend) for line in lines]
         if callable(evaluate):
             judged = [_once_more(*pair, evaluate, trials, point) for pair in zip(lines, judged, strict=True)]
         if _at_kinks(judged) and callable(evaluate) and not beside:
-            judged = _beside(loss, point, gradient, directions, judged)
+            judged = _beside(trials, point, gradient, directions, judged)
         if gradient is None:
             doubts += forward_mode(loss, point, lines[:directions], judged)
-        doubts += complex_step(loss, point, lines[:directions], base)
-        if gradient is None and directions and judged[0].word in ("agrees", "vanishes"):
-            bend = hessian(loss, point, lines[0], judged[0], trials, extend=steps is None)
+        doubts += [] if quick else complex_step(loss, point, lines[:directions], base)
+        if gradient is None and directions and not quick and judged[0].word in ("agrees", "vanishes"):
+            bend = hessian(loss, point, lines[0], judged[0], trials, extend)
             judged[0] = judged[0]._replace(bend=bend.value, rate3=bend.rate)
             doubts.append(("", bend.note))
         if _bits(trials.value(point.tree())) != _bits(base):
@@ -132,13 +146,22 @@ def _audit(loss, x, gradient, steps, directions, rng, beside):
         if culprit is None and trials.tolerance > LOOSE:
             verdict = "inconclusive"
             reason += f"; no call is at fault, but solves stop at rtol {trials.tolerance:g}: tighten them"
+    if quick:
+        names = " and ".join(line.name for line in lines) or "no direction"
+        notes.append(f"quick: looked at along {names}; {LEFT_OUT}")
+        reason = notes[-1] if verdict == "agrees" else reason
     word = bend.word if bend else None
     return Audit(verdict, reason, judged, lines, base, trials.count, point.size, notes, culprit, word)
 
 
-def _lines(point, leaves, directions, rng, trials, base):
+def _ways(point, leaves, directions, rng, quick):
+    """Names and displacements of all directions, or of those of a quick audit."""
+    found = point.directions(leaves, directions, rng)
+    return (way for way in found if way[0] in QUICK) if quick else found
+
+
+def _lines(point, ways, leaves, trials, base):
     """One line for each direction. The noise of the loss is that along the first and the last of them."""
-    ways = point.directions(leaves, directions, rng)
     lines = [Line(name, direction, point, leaves, trials, base) for name, direction in ways]
     noise = noise_of([*lines[:1], *lines[1:][-1:]], point, trials, base)
     for place, line in enumerate(lines):
@@ -165,14 +188,16 @@ def _at_kinks(judged):
     return "outside" in words or {"disagrees", "kink"} <= words
 
 
-def _beside(loss, point, gradient, directions, judged):
+def _beside(trials, point, gradient, directions, judged):
     """At several kinks at once a derivative may lie outside the one-sided ones and follow a convention all the same.
 
     What is wrong beside the kinks as well is wrong.
     """
     moved = point.moved(next(point.directions(point.values, 1, generator(BESIDE)))[1], 2.0**-6)
     with suppress(*REFUSALS):
-        if _audit(loss, point.tree(moved), gradient, None, directions, None, beside=True).verdict != "disagrees":
+        other, again = Point(point.tree(moved)), Trials(trials.loss, trials.told)
+        found = _audit(again, other, gradient, default_steps(other.eps), True, directions, None, False, beside=True)
+        if found.verdict != "disagrees":
             note = "several kinks; beside them nothing speaks against the gradient"
             doubtful = ("outside", "disagrees")
             return [one._replace(word="kink", note=note) if one.word in doubtful else one for one in judged]

@@ -12,7 +12,7 @@ from math import factorial
 
 import numpy as np
 
-__all__ = ["noise_of"]
+__all__ = ["POINTS", "noise_of"]
 
 POINTS = 8  # of a table
 ORDERS = (4, 5, 6)  # of the differences that are read: parabolas leave them alone

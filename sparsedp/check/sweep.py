@@ -17,18 +17,20 @@ SOLVES = ("solve", "adjoint")  # kinds under which the ledger counts solves
 class Trials:
     """A loss with its count of evaluations. Away from x it may refuse; then there is a note and no value.
 
+    `told` is called at each evaluation.
     `solved`: whether the ledger showed a solve of this library in the first evaluation; `tolerance`: the
     loosest relative tolerance of iterative ones.
     """
 
-    def __init__(self, loss):
-        self.loss = loss
+    def __init__(self, loss, told=lambda: None):
+        self.loss, self.told = loss, told
         self.count, self.solved, self.tolerance = 0, False, 0.0
         self.eps = float(np.finfo(float).eps)
 
     def value(self, tree):
         """The loss as a float; the coarsest dtype that it returns is remembered."""
         self.count += 1
+        self.told()
         with np.errstate(all="ignore"):
             value = np.asarray(self.loss(tree) if self.count > 1 else self._first(tree))
         if value.shape != ():
