@@ -1,23 +1,43 @@
 """The command line: ``python -m sparsedp demo``, ``check FILE.py:loss`` and ``report FILE.py --out DIR``.
 
-Exit codes of check and report: 0 agrees, 1 disagrees, 3 inconclusive, 2 the input was refused.
+Exit codes of check and report: 0 agrees, 1 disagrees, 3 inconclusive, 2 the input was refused or a file cannot be
+written, 130 interrupted.
 """
 
 import argparse
+import contextlib
+import os
 import sys
-from contextlib import redirect_stdout
 from pathlib import Path
 
 REFUSED = 2  # exit code of a bad input, the same as argparse's
+INTERRUPTED = 130  # exit code of what Ctrl-C ends, the same as a shell's
+LONGEST = 200  # letters of a name that a sentence shows
 CODES = {"agrees": 0, "disagrees": 1, "inconclusive": 3}
 OUT = "where the results go (default: %(default)s)"
 SCENE = "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"
 
 
 def main(arguments=None):
-    """Command line -> exit code: 0 done or agrees, 1 failed or disagrees, 2 the input was refused, 3 inconclusive."""
-    options = _parser().parse_args(arguments)
-    return options.run(options)
+    """Command line -> exit code.
+
+    0 done or agrees, 1 failed or disagrees, 2 the input was refused or a file cannot be written, 3 inconclusive,
+    130 interrupted.
+    """
+    try:
+        options = _parser().parse_args(arguments)
+        code = options.run(options)
+        print(end="", flush=True)  # what cannot be printed has to be known before the verdict is told
+        return code
+    except KeyboardInterrupt:
+        return refuse("interrupted; there is no result", INTERRUPTED)
+    except FileExistsError as error:
+        return refuse(error)
+    except (OSError, UnicodeEncodeError) as error:
+        place, why = getattr(error, "filename", None), getattr(error, "strerror", None)
+        if place is None:
+            sys.stdout = open(os.devnull, "w")  # or Python tries once more at its end, and changes the exit code
+        return refuse(f"{place or 'the output'} cannot be written: {why or error}; make room, or write elsewhere")
 
 
 class Parser(argparse.ArgumentParser):
@@ -27,10 +47,12 @@ class Parser(argparse.ArgumentParser):
         self.exit(refuse(f"{message}; see {self.prog} --help"))
 
 
-def refuse(reason):
+def refuse(reason, code=REFUSED):
     """Print why on one line of stderr -> exit code."""
-    print("sparsedp:", *str(reason).split(), file=sys.stderr)
-    return REFUSED
+    words = [word if len(word) <= LONGEST else f"{word[: LONGEST // 2]}..." for word in str(reason).split()]
+    with contextlib.suppress(OSError):  # where stderr is broken too, the exit code says it alone
+        print("sparsedp:", *words, file=sys.stderr)
+    return code
 
 
 def _parser():
@@ -49,7 +71,7 @@ def _parser():
     check = rooms.add_parser(
         "check",
         help="audit the gradient of a loss in a file",
-        description="Audit a gradient. Exit code: 0 agrees, 1 disagrees, 3 inconclusive, 2 refused.",
+        description="Audit a gradient. Exit code: 0 agrees, 1 disagrees, 3 inconclusive, 2 refused, 130 interrupted.",
     )
     check.add_argument("scene", metavar="SCENE", help=SCENE)
     check.add_argument("--quick", action="store_true", help="two directions only, for a loss that takes minutes")
@@ -58,7 +80,8 @@ def _parser():
         "report",
         help="audit, plan, certificate, error against run time and stress of a loss in a file, in one folder",
         description="All instruments on one scene. Exit code: 0 agrees, 1 disagrees or a case FAILED, "
-        "3 inconclusive, 2 refused. In the file, workprec_options and stress_options may hold dicts of arguments.",
+        "3 inconclusive, 2 refused, 130 interrupted. In the file, workprec_options and stress_options may hold dicts "
+        "of arguments.",
     )
     report.add_argument("scene", metavar="SCENE", help=SCENE)
     report.add_argument("--out", type=Path, default=Path("sparsedp-report"), metavar="DIR", help=OUT)
@@ -70,17 +93,14 @@ def _parser():
 def run_check(options):
     """Options of the command `check` -> exit code."""
     from sparsedp.check.audit import gradient
-    from sparsedp.report.source import load
+    from sparsedp.report.source import audited, load
 
     try:
         source = load(options.scene)
+        with audited(options.scene):
+            audit = gradient(source.loss, source.x, quick=options.quick)
     except ValueError as error:
         return refuse(error)
-    try:
-        with redirect_stdout(sys.stderr):  # what the loss prints is no part of the table
-            audit = gradient(source.loss, source.x, quick=options.quick)
-    except Exception as error:  # the loss is the user's: it may raise anything
-        return refuse(f"{options.scene} cannot be audited: {type(error).__name__}: {error}")
     print(audit)
     return CODES[audit.verdict]
 

@@ -2,6 +2,8 @@
 
 import csv
 import os
+import re
+import signal
 import subprocess
 import sys
 
@@ -185,3 +187,178 @@ def test_a_folder_that_is_closed(scene, tmp_path, capsys):
     closed.mkdir(mode=0o500)
     assert main(["report", str(scene), "--out", str(closed)]) == 2
     assert "closed cannot be written to; name another with --out" in capsys.readouterr().err
+
+
+# ---- a loss that ends the program ----------------------------------------------------------------------------------
+
+ENDS = {
+    "sys.exit(0)": "SystemExit: 0",
+    "sys.exit()": "SystemExit: ",
+    "sys.exit('all is well')": "SystemExit: all is well",
+    "exit(0)": "SystemExit: 0",
+    "quit()": "SystemExit: None",
+    "raise GeneratorExit": "GeneratorExit: ",
+    "raise asyncio.CancelledError('late')": "CancelledError: late",
+    "raise Odd(0)": "Odd: 0",
+}
+ERRORS = {
+    "raise OSError(28, 'No space left', 'data.npy')": "OSError: [Errno 28] No space left: 'data.npy'",
+    "open('nowhere.npy')": "FileNotFoundError: [Errno 2] No such file or directory: 'nowhere.npy'",
+    "assert False": "AssertionError: ",
+    "nonsense": "NameError: name 'nonsense' is not defined",
+    "raise MemoryError('too large')": "MemoryError: too large",
+    "raise TimeoutError": "TimeoutError: ",
+    "raise StopIteration": "StopIteration",  # a generator on its way turns it into a RuntimeError that names it
+    "raise Exception('odd')": "Exception: odd",
+}
+ENDING = """
+import asyncio, sys
+import autograd.numpy as np
+class Odd(BaseException): pass
+start, calls = np.linspace(0.5, 1.5, 4), []
+{top}
+def loss(u):
+    calls.append(1)
+    if len(calls) > {after}:
+        {end}
+    return np.sum(u**3)
+"""
+
+
+@pytest.fixture
+def ending(tmp_path, monkeypatch):
+    """Write a file with a statement in its loss, from the evaluation after so many on, or at the top."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(end="pass", after=0, top=""):
+        (tmp_path / "ends.py").write_text(ENDING.format(end=end, after=after, top=top), encoding="utf-8")
+
+    return write
+
+
+@pytest.mark.parametrize("after", [0, 7])
+@pytest.mark.parametrize("end", ENDS)
+def test_a_loss_that_ends_the_program_is_no_verdict(ending, capsys, end, after):
+    ending(end, after)
+    for command in (["check", "ends.py"], ["report", "ends.py"]):
+        assert main(command) == 2
+        printed = capsys.readouterr()
+        assert printed.out == "" and re.fullmatch(r"sparsedp: ends(\.py)? cannot be audited: [^\n]*\n", printed.err)
+        assert ENDS[end].strip() in printed.err
+    assert not list(os.scandir("sparsedp-report"))
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_file_that_ends_the_program_is_no_verdict(ending, capsys, end):
+    ending(top=end)
+    for command in ("check", "report"):
+        assert main([command, "ends.py"]) == 2
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        assert printed.err.startswith(f"sparsedp: ends.py does not run: line 6: {ENDS[end]}".strip())
+
+
+@pytest.mark.parametrize("after", [0, 7])
+@pytest.mark.parametrize("end", ERRORS)
+def test_a_loss_that_raises_is_no_verdict(ending, capsys, end, after):
+    """`check` refuses; `report` writes what there is, and is inconclusive, never the 1 of a traceback."""
+    ending(end, after)
+    codes = main(["check", "ends.py"]), main(["report", "ends.py"])
+    printed = capsys.readouterr()
+    assert codes == (2, 3)
+    for text, place in ((printed.err, "ends.py cannot be audited: "), (printed.out, "gradient: not audited, ")):
+        assert place in text and ERRORS[end].strip() in text
+
+
+def test_an_exit_as_a_command(ending, tmp_path):
+    ending("sys.exit(0)")
+    for command in ("check", "report"):
+        arguments = [sys.executable, "-m", "sparsedp", command, "ends.py"]
+        options = {"env": {**os.environ, "PYTHONPATH": str(ROOT)}, "capture_output": True, "text": True, "check": False}
+        done = subprocess.run(arguments, cwd=tmp_path, **options)
+        assert done.returncode == 2 and done.stdout == "" and "cannot be audited: SystemExit: 0" in done.stderr
+
+
+# ---- Ctrl-C, and names that are too long ---------------------------------------------------------------------------
+
+WAITING = """
+import sys, time
+import autograd.numpy as np
+start = np.ones(3)
+def wait():
+    print("now", file=sys.stderr, flush=True)
+    time.sleep(60)
+{top}
+def loss(u):
+    wait()
+    return np.sum(u**3)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("command, top", [("check", ""), ("report", ""), ("check", "wait()"), ("report", "wait()")])
+def test_ctrl_c(tmp_path, command, top):
+    (tmp_path / "waits.py").write_text(WAITING.format(top=top), encoding="utf-8")
+    assert interrupted(tmp_path, "now", command, "waits.py") == (130, "", "sparsedp: interrupted; there is no result\n")
+    assert not list(tmp_path.glob("sparsedp-report/*"))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_ctrl_c_in_the_demo(tmp_path):
+    """While the optimiser runs: it may keep its best point, but the demo ends, and no file is written."""
+    code, _, told = interrupted(tmp_path, "3", "demo", "--size", "24")
+    assert code == 130 and told.splitlines()[-1] == "sparsedp: interrupted; there is no result"
+    assert not list(tmp_path.glob("sparsedp-demo/*"))
+
+
+def interrupted(folder, word, *arguments):
+    """A command that gets the signal of Ctrl-C once a line begins with a word -> (exit code, stdout, stderr)."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, "-m", "sparsedp", *arguments]
+    stream = "stdout" if arguments[0] == "demo" else "stderr"
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=folder, env=environment, **options) as running:
+        for line in getattr(running, stream):
+            if line.split()[:1] == [word]:
+                break
+        running.send_signal(signal.SIGINT)
+        printed, told = running.communicate(timeout=60)
+    return running.returncode, printed, told
+
+
+LONG = "a" * 5000
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (["check", LONG], r"'a+\.\.\. names no scene; write FILE.py:loss, or FILE.py:loss:start"),
+        (["check", f"{LONG}.py"], r"there is no file a+\.\.\. name one that is there"),
+        (["check", f"scene.py:{LONG}"], r"scene.py has no function 'a+\.\.\. write scene.py:NAME of the function to e"),
+        (["check", f"scene.py:loss:{LONG}"], r"scene.py has no 'a+\.\.\. the point; write scene.py:loss:NAME"),
+        (["report", f"{LONG}/{LONG}.py"], r"there is no file a+\.\.\. name one that is there"),
+        (["report", "scene.py", "--out", LONG], r"a+\.\.\. cannot be made a folder: File name too long; name another "),
+        (
+            ["report", f"scene.py:{'b' * 255}"],
+            r".*b+\.\.\. cannot be written: File name too long; make room, or write ",
+        ),
+        (["demo", "--out", LONG], r"a+\.\.\. cannot be made a folder: File name too long; name another with --out"),
+        (["demo", "--input", f"{LONG}.npy"], r"a+\.\.\. is not there or is no plain file; give the path of a .npy, "),
+        (["demo", "--size", LONG], r"argument --size: invalid int value: 'a+\.\.\. see python -m sparsedp demo --help"),
+        ([LONG], r"argument command: invalid choice: 'a+\.\.\. \(choose from .*; see python -m sparsedp --help"),
+    ],
+)
+def test_a_name_of_5000_letters(tmp_path, monkeypatch, capsys, arguments, sentence):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.py").write_text(
+        f"import autograd.numpy as np\nstart = np.ones(3)\nloss = {'b' * 255} = lambda u: np.sum(u**2)\n"
+        f"workprec_options = dict(problem=lambda n: (loss, start), methods={{'a': {{'n': 1}}}}, scene='b' * 255)"
+    )
+    try:
+        code = main(arguments)
+    except SystemExit as ended:
+        code = ended.code
+    printed = capsys.readouterr()
+    assert code == 2 and printed.out == ""
+    assert re.match(f"sparsedp: {sentence}", printed.err) and len(printed.err) < 500
+    assert len(printed.err.splitlines()) == 1

@@ -19,6 +19,7 @@ FLOORS = [
     ("shortcuts", 0),
     ("tree", 0),
     ("ledger", 0),
+    ("files", 0),
     ("traces", 1),
     ("tape", 1),
     ("kernels", 1),

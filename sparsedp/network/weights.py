@@ -5,6 +5,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from sparsedp.files import write_file
 from sparsedp.network.filters import check_widths
 
 __all__ = ["convolution_weights", "dense_weights", "load", "residual_weights", "save"]
@@ -109,6 +110,8 @@ def save(path, parameters):
     ------
     TypeError
         If a leaf is something else, or a key of a dict is not a string.
+    OSError
+        If the file cannot be written; what was saved there before is there still.
 
     Examples
     --------
@@ -120,8 +123,7 @@ def save(path, parameters):
     """
     arrays: list = []
     text = json.dumps({"format": FORMAT, "tree": _words(parameters, arrays)})
-    with open(path, "wb") as file:
-        np.savez(file, np.frombuffer(text.encode(), np.uint8), *arrays)
+    write_file(path, lambda stream: np.savez(stream, np.frombuffer(text.encode(), np.uint8), *arrays))
 
 
 def load(path):

@@ -3,12 +3,12 @@
 import hashlib
 import io
 import json
-import os
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp.files import UNFINISHED, write_file
 from sparsedp.tree import flatten
 
 __all__ = ["Checkpoint", "Found", "digest", "fingerprint"]
@@ -29,8 +29,7 @@ class Found(NamedTuple):
 class Checkpoint:
     """A folder with the last two states, each a .npz without pickle and a JSON manifest with its hash.
 
-    The manifest is written last, and every file under a temporary name that is synced and renamed: a state counts
-    only when its manifest and the hash in it are right.
+    The manifest is written last, and a state counts only when its manifest and the hash in it are right.
 
     Parameters
     ----------
@@ -54,22 +53,9 @@ class Checkpoint:
             "sha256": digest(content), "settings": self._settings, "words": words,
         }  # fmt: skip
         manifest["seal"] = digest(_text(manifest))
-        self._write(name + ".npz", content)
-        self._write(name + ".json", _text(manifest))
+        write_file(self._folder / f"{name}.npz", content)
+        write_file(self._folder / f"{name}.json", _text(manifest))
         self._forget()
-
-    def _write(self, name, content):
-        temporary = self._folder / (name + ".part")
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, self._folder / name)
-        handle = os.open(self._folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
 
     def _forget(self):
         for manifest in self._manifests()[KEPT:]:
@@ -87,7 +73,7 @@ class Checkpoint:
         ValueError
             If a whole state belongs to a run with other settings.
         """
-        skipped = [f"{path.name}: an unfinished write" for path in sorted(self._folder.glob("*.part"))]
+        skipped = [f"{path.name}: an unfinished write" for path in sorted(self._folder.glob(f"*{UNFINISHED}"))]
         for path in self._manifests():
             manifest, leaves, reason = _read(path)
             if reason:

@@ -1,7 +1,5 @@
 """stress: a scene driven through stiff and extreme cases, one word for each."""
 
-import csv
-import io
 import math
 from collections import Counter
 
@@ -9,6 +7,7 @@ from sparsedp.check.findings import table
 from sparsedp.fields import check_function
 from sparsedp.report.hardships import GROUPS, cases
 from sparsedp.report.maps import stability_map
+from sparsedp.report.rows import csv_text
 from sparsedp.report.scene import Scene
 from sparsedp.report.trial import DEGRADED, FAILED, PASSED, REFUSED
 
@@ -151,11 +150,7 @@ class Stress:
 
     def csv(self):
         """The rows as CSV."""
-        stream = io.StringIO()
-        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.rows)
-        return stream.getvalue()
+        return csv_text(self.rows, COLUMNS)
 
     def plot(self, ax=None):
         """Stability map -> picture: growth factor of a step, time step against viscosity.

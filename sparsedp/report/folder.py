@@ -1,22 +1,20 @@
 """All instruments on one scene, in one folder: Markdown, CSV and pictures, and a page that says what they say."""
 
-import contextlib
-import csv
 import os
-import sys
+from functools import partial
 
 from sparsedp.check.audit import gradient
-from sparsedp.errors import SparsedpError
+from sparsedp.files import write_file
 from sparsedp.report.certificate import certify
 from sparsedp.report.extremes import stress
 from sparsedp.report.plan import explain
 from sparsedp.report.precision import workprec
-from sparsedp.report.rows import Rows, cell, settings_of
+from sparsedp.report.rows import Rows, cell, csv_text, settings_of
+from sparsedp.report.source import audited
 
 __all__ = ["write_report"]
 
 PAGE = "report.md"
-TROUBLE = (SparsedpError, ValueError, TypeError, RuntimeError, ArithmeticError, LookupError)
 GOAL = 0.01  # the error that the page recommends a method for, in a sentence
 GOALS = 0.1, GOAL, 1e-3, 1e-4, 1e-6  # and in a table
 LEFT = "left out"  # in every sentence about it
@@ -40,10 +38,12 @@ def write_report(source, folder, force=False):
     Raises
     ------
     ValueError
-        If there is a report already, or the folder cannot be written.
+        If there is a report already, the folder cannot be written, or the loss ends the program.
+    OSError
+        If a file cannot be written.
     """
     _claim(folder, force)
-    with contextlib.redirect_stdout(sys.stderr):  # what the loss prints is no part of the report
+    with audited(source.name):
         audit = _attempt(lambda: gradient(source.loss, source.x))
         trial = _attempt(lambda: stress(source.loss, source.x, **source.stress))
         plan = _attempt(lambda: explain(source.loss, source.x))
@@ -61,7 +61,7 @@ def write_report(source, folder, force=False):
     page = "\n".join(
         [f"# {source.name}: {verdict}", "", MEANING[verdict], *_chapters(chapters, found), *_details(folder)]
     )
-    (folder / PAGE).write_text(page, encoding="utf-8")
+    write_file(folder / PAGE, page)
     return verdict, lines
 
 
@@ -108,7 +108,7 @@ def _attempt(make):
     """What an instrument gives, or the error in words: one that fails does not take the others with it."""
     try:
         return make()
-    except TROUBLE as error:
+    except Exception as error:  # the loss is the user's: it may raise anything
         return " ".join(f"{type(error).__name__}: {error}".split())
 
 
@@ -125,7 +125,7 @@ def _audit(audit, folder):
     if isinstance(audit, str):
         return [f"gradient: not audited, {audit}"]
     _text(folder / "audit.md", "Audit of the gradient", str(audit))
-    _table(folder / "audit.csv", list(audit.rows))
+    write_file(folder / "audit.csv", _table(audit.rows))
     _picture(folder / "audit.png", lambda ax: _drawn(audit, ax))
     proved = f", {audit.digits} digits" if audit.digits is not None else ""
     words = [f"gradient: {audit.verdict}{proved}{': ' if audit.reason else ''}{audit.reason}"]
@@ -141,8 +141,8 @@ def _drawn(audit, ax):
 def _stress(trial, folder):
     if isinstance(trial, str):
         return [f"stress: not run, {trial}"]
-    (folder / "stress.md").write_text(f"# Stiff and extreme cases\n\n{trial.markdown()}", encoding="utf-8")
-    (folder / "stress.csv").write_text(trial.csv(), encoding="utf-8")
+    write_file(folder / "stress.md", f"# Stiff and extreme cases\n\n{trial.markdown()}")
+    write_file(folder / "stress.csv", trial.csv())
     if trial.map is not None:
         _picture(folder / "stress.png", trial.plot)
     failed = [f"FAILED: {row['parameter']} {row['case']}: {row['note']}".replace(":  ", ": ") for row in trial.failures]
@@ -153,7 +153,7 @@ def _plan(plan, folder):
     if isinstance(plan, str):
         return [f"plan: not made, {plan}"]
     _text(folder / "plan.md", "What was computed, and what was left out", str(plan))
-    _table(folder / "plan.csv", plan.rows)
+    write_file(folder / "plan.csv", _table(plan.rows))
     sums = ", ".join(f"{many} {word}" for word, many in plan.totals.items() if many)
     return [f"one gradient: {sums or 'nothing was called'}", *(f"left out: {sentence}" for sentence in plan.left_out)]
 
@@ -162,7 +162,7 @@ def _certificate(found, folder):
     if isinstance(found, str):
         return [f"certificate: not made, {found}"]
     _text(folder / "certificate.md", "Error that solves leave", str(found))
-    _table(folder / "certificate.csv", found.solves)
+    write_file(folder / "certificate.csv", _table(found.solves))
     return [f"error of the gradient from its solves: about {found.gradient_error:.1e}; {found.advice}"]
 
 
@@ -199,14 +199,11 @@ def _details(folder):
 
 
 def _text(path, title, text):
-    path.write_text(f"# {title}\n\n```text\n{text}\n```\n", encoding="utf-8")
+    write_file(path, f"# {title}\n\n```text\n{text}\n```\n")
 
 
-def _table(path, rows):
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]) if rows else ["nothing"], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+def _table(rows):
+    return csv_text(rows, list(rows[0]) if rows else ["nothing"])
 
 
 def _picture(path, draw):
@@ -215,7 +212,6 @@ def _picture(path, draw):
         from sparsedp.report import plots
 
         ax = draw(plots.figure().add_subplot())
-        with path.open("wb") as stream:
-            plots.save(ax.figure, stream)
+        write_file(path, partial(plots.save, ax.figure))
     except ImportError:
         return

@@ -1,10 +1,12 @@
 """Pictures of fields. The only file of the package that imports matplotlib (extra `plot`)."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from sparsedp.errors import ShapeError
+from sparsedp.files import write_file
 from sparsedp.grid import check_grid
 from sparsedp.tape import plain
 
@@ -84,7 +86,7 @@ def animate(grid, frames, path, title=None, limits=None, colours="viridis", rate
     grid : Grid
     frames : sequence of arrays
         Fields that `plot` draws.
-    path : str or Path
+    path : str, Path or binary stream
     title, limits, colours
         As in `plot`; the limits hold for all frames.
     rate : float
@@ -98,6 +100,8 @@ def animate(grid, frames, path, title=None, limits=None, colours="viridis", rate
         If a frame is not a field on the grid.
     ImportError
         If matplotlib is not installed.
+    OSError
+        If the file cannot be written.
 
     Examples
     --------
@@ -120,7 +124,8 @@ def animate(grid, frames, path, title=None, limits=None, colours="viridis", rate
         picture.canvas.draw()
         images.append(_image(np.asarray(picture.canvas.buffer_rgba())))
     first, *rest = images
-    first.save(path, format="GIF", save_all=True, append_images=rest, duration=round(1000 / rate), loop=0)
+    film = partial(first.save, format="GIF", save_all=True, append_images=rest, duration=round(1000 / rate), loop=0)
+    film(path) if hasattr(path, "write") else write_file(path, film)
 
 
 def _drawn(grid, u):

@@ -4,12 +4,14 @@ import csv
 import io
 import json
 import math
+from functools import partial
 from pathlib import Path
 
 from sparsedp.check.findings import table
+from sparsedp.files import write_file
 from sparsedp.report.pareto import unbeaten
 
-__all__ = ["COLUMNS", "Rows", "cell", "kept_rows", "settings_of", "write_row"]
+__all__ = ["COLUMNS", "Rows", "cell", "csv_text", "kept_rows", "settings_of", "write_row"]
 
 COLUMNS = (
     "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
@@ -90,11 +92,7 @@ class Rows:
 
     def csv(self):
         """All columns as CSV."""
-        stream = io.StringIO()
-        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.rows)
-        return stream.getvalue()
+        return csv_text(self.rows, COLUMNS)
 
     def plot(self, ax=None, error="gradient_error"):
         """Log-log picture: run time across, error up, one curve for each method, the Pareto set marked.
@@ -124,20 +122,20 @@ class Rows:
     def save(self, folder):
         """Write scene.md, scene.csv and, where matplotlib is installed, scene.png into a folder -> list of paths.
 
-        A scene may have a name that is no name of a file: "/" becomes "-".
+        A scene may have a name that is no name of a file: "/" becomes "-". A file that cannot be written is an
+        OSError.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / f"{self.stem}.{kind}" for kind in ("md", "csv")]
         for path, text in zip(paths, (self.markdown(), self.csv()), strict=True):
-            path.write_text(text, encoding="utf-8")
+            write_file(path, text)
         try:
             from sparsedp.report import plots
 
             gradient = any(not _empty(row["gradient_error"]) for row in self.rows)
             ax = self.plot(plots.figure().add_subplot(), "gradient_error" if gradient else "forward_error")
-            with (folder / f"{self.stem}.png").open("wb") as stream:
-                plots.save(ax.figure, stream)
+            write_file(folder / f"{self.stem}.png", partial(plots.save, ax.figure))
         except ImportError:
             return paths
         return [*paths, folder / f"{self.stem}.png"]
@@ -153,6 +151,15 @@ class Rows:
 def settings_of(row):
     """The settings of a row in words."""
     return ", ".join(f"{name}={value}" for name, value in json.loads(row["settings"]).items()) or "no settings"
+
+
+def csv_text(rows, columns):
+    """Rows (dicts) -> CSV with a line of names."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
 
 
 def cell(text):
@@ -176,14 +183,10 @@ def _text(value):
 def write_row(file, row):
     """Add a finished row to a CSV file."""
     path = Path(file)
-    fresh = not path.exists() or not path.stat().st_size
-    torn = not fresh and not path.read_bytes().endswith(b"\n")  # a run was cut off while it wrote
-    with path.open("a", encoding="utf-8", newline="") as stream:
-        stream.write("\n" * torn)
-        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
-        if fresh:
-            writer.writeheader()
-        writer.writerow(row)
+    before = path.read_bytes() if path.exists() else b""
+    torn = b"" if before.endswith(b"\n") or not before else b"\n"  # somebody cut its last line off
+    header, line = csv_text([row], COLUMNS).encode().split(b"\n", 1)
+    write_file(path, before + torn + line if before else header + b"\n" + line)
 
 
 def kept_rows(file, versions):

@@ -2,6 +2,7 @@
 
 import contextlib
 import inspect
+import os
 import re
 import runpy
 import sys
@@ -9,7 +10,7 @@ import traceback
 from pathlib import Path
 from typing import Any, NamedTuple
 
-__all__ = ["Source", "load"]
+__all__ = ["Source", "audited", "load"]
 
 STARTS = ("start", "x")  # names of the point, the first that is there
 
@@ -57,6 +58,18 @@ def load(target):
     return Source(name, _of_one(found[loss], found[names[0]]), found[names[0]], *options)
 
 
+@contextlib.contextmanager
+def audited(name):
+    """In it a loss of the user's runs: what it prints goes to stderr, and what it raises, an exit too, is refused."""
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise ValueError(f"{name} cannot be audited: {type(error).__name__}: {error}") from error
+
+
 def _of_one(loss, x):
     """The loss as a function of one point: a point that is a tuple fills a loss of several arguments."""
     if not isinstance(x, tuple) or hasattr(x, "_fields"):
@@ -71,14 +84,16 @@ def _of_one(loss, x):
 
 
 def _run(file):
-    if not file.is_file():
+    if not os.path.isfile(file):  # Path.is_file raises for a name that is too long
         raise ValueError(f"there is no file {file}; name one that is there")
     before = sys.argv, sys.path
     sys.argv, sys.path = [str(file)], [str(file.resolve().parent), *sys.path]
     try:
         with contextlib.redirect_stdout(sys.stderr):
             return runpy.run_path(str(file), run_name=file.stem)
-    except (Exception, SystemExit) as error:  # the file is the user's: it may raise anything
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # the file is the user's: it may raise anything, or end the program
         raise ValueError(f"{file} does not run: {_where(error, file)}{type(error).__name__}: {error}") from error
     finally:
         sys.argv, sys.path = before

@@ -3,6 +3,7 @@
 Nothing is unpickled, and no memory is asked for before the file is known to hold what its header promises.
 """
 
+import os
 import zipfile
 from math import prod
 
@@ -51,7 +52,7 @@ def read_field(path):
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise ValueError(f"{path} is not a .npy, .npz or .png file; save the field with numpy.save")
-    if not path.is_file():
+    if not os.path.isfile(path):  # Path.is_file raises for a name that is too long
         raise FileNotFoundError(f"{path} is not there or is no plain file; give the path of a .npy, .npz or .png file")
     try:
         path.open("rb").close()

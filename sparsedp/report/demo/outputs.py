@@ -1,11 +1,13 @@
 """What the demo leaves behind: pictures, the table, the recovered field. Nothing is overwritten unasked."""
 
-import csv
 import os
+from functools import partial
 
 import numpy as np
 
+from sparsedp.files import write_file
 from sparsedp.report import charts, plots
+from sparsedp.report.rows import csv_text
 
 __all__ = ["PICTURES", "claim", "write_arrays", "write_pictures"]
 
@@ -38,10 +40,11 @@ def claim(folder, force):
         raise ValueError(f"{folder / taken[0]} is there already; name another folder with --out, or write --force")
 
 
-def _opened(path, force, text=False):
-    """A new file for writing. Without `force` also a file that appeared during the run is safe."""
-    mode = "w" if force else "x"
-    return open(path, mode, newline="", encoding="utf-8") if text else open(path, mode + "b")
+def _write(path, force, content):
+    """A file. Without `force` one that appeared during the run is safe too."""
+    if not force and os.path.lexists(path):
+        raise FileExistsError(f"{path} came there during the run; name another folder with --out, or write --force")
+    write_file(path, content)
 
 
 def write_arrays(folder, force, rows, recovered):
@@ -53,13 +56,14 @@ def write_arrays(folder, force, rows, recovered):
     force : bool
     rows : list of dict
     recovered : array
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written, or is there and `force` is not set.
     """
-    with _opened(folder / "table.csv", force, text=True) as stream:
-        writer = csv.DictWriter(stream, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    with _opened(folder / "recovered.npy", force) as stream:
-        np.save(stream, recovered, allow_pickle=False)
+    _write(folder / "table.csv", force, csv_text(rows, list(rows[0])))
+    _write(folder / "recovered.npy", force, lambda stream: np.save(stream, recovered, allow_pickle=False))
 
 
 def write_pictures(folder, force, study, trials):
@@ -76,10 +80,11 @@ def write_pictures(folder, force, study, trials):
     ------
     ImportError
         If matplotlib is not installed.
+    OSError
+        If a file cannot be written, or is there and `force` is not set.
     """
     for name, picture in zip(PICTURES, (*_maps(study, trials[-1]), _convergence(trials)), strict=True):
-        with _opened(folder / name, force) as stream:
-            plots.save(picture, stream)
+        _write(folder / name, force, partial(plots.save, picture))
 
 
 def _maps(study, trial):

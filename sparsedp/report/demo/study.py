@@ -112,6 +112,8 @@ class Trial:
         self.error(start)
         with recording() as calls:
             best = dp.minimise(self.loss, start, maxiter=ITERATIONS, callback=note, memory=20)
+        if best.message.startswith("interrupted"):  # minimise keeps its best point; the demo ends
+            raise KeyboardInterrupt
         if best.history[-1].iteration > len(self.trace):  # the iteration that meets the tolerance is not reported
             note(best.history[-1], best.x)
         self.best = best
