@@ -5,6 +5,7 @@ The message is one sentence: what was given, what is needed, what to write inste
 """
 
 __all__ = [
+    "BudgetWarning",
     "ConvergenceError",
     "DerivativeError",
     "GrowthWarning",
@@ -38,6 +39,10 @@ class DerivativeError(SparsedpError, TypeError):
 
 class GrowthWarning(UserWarning):
     """A gradient through a long run grew so much that it is exact and of little use."""
+
+
+class BudgetWarning(UserWarning):
+    """A memory budget with which a run takes several times as long as with a little more."""
 
 
 class ConvergenceError(SparsedpError, RuntimeError):

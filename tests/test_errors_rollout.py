@@ -121,10 +121,10 @@ TABLE = [
     ),
     (roll(memory=-1), VALUE, 'rollout needs memory as bytes > 0 or a text, got -1; write for example "200 MB"'),
     (
-        roll(memory=167),
+        roll(memory=119),
         VALUE,
-        "rollout cannot work within memory=167: 7 states of 24 bytes and 0 bytes for params and inputs "
-        "are needed; write memory=168",
+        "rollout cannot work within memory=119: 5 states of 24 bytes and 0 bytes for params and inputs "
+        "are needed; write memory=120",
     ),
     (roll(keep="most"), VALUE, 'keep must be "last", "all" or a function of (index, state), got \'most\''),
     (roll(truncate=0), VALUE, "rollout needs truncate >= 1, a whole number of steps, or None, got 0"),
@@ -238,7 +238,7 @@ TABLE = [
         "the step changes the entries of params; make what changes a part of the state",
     ),
     (
-        slope(Forgetful(), memory=7 * 24 + 2 * 8),  # under a budget steps are run again
+        slope(Forgetful(), memory=5 * 24 + 2 * 8),  # under a budget steps are run again
         NONE,
         "the step gives another state when it is run again; it must depend on its arguments only",
     ),

@@ -41,7 +41,7 @@ FEW = pytest.mark.parametrize("few", [False, True])
 def loop(scene, few=False):
     """(field -> field after some steps, shape, dense matrix). `few`: with room for two states beside those at work."""
     step, shape, matrix = SCENES[scene]
-    memory = 64 * int(np.prod(shape)) + 16 if few else None
+    memory = 48 * int(np.prod(shape)) + 16 if few else None
     run = lambda u: dp.rollout(lambda u, _: 0.9 * step(u), u, None, STEPS, memory=memory)
     return run, shape, np.linalg.matrix_power(0.9 * matrix, STEPS)
 
@@ -122,7 +122,7 @@ def test_jumps_within_their_certificate(name, few, rng):
     grid = dp.Grid((16, 14))
     k, D, G = coefficient(name, grid), dp.divergence(grid), dp.gradient(grid, dp.dirichlet)
     u, w = rng.standard_normal((2, *grid.shape))
-    memory = 64 * u.size + 24 * k.size if few else None
+    memory = 48 * u.size + 24 * k.size if few else None
 
     def loss(method, rtol):
         solve = dp.elliptic_solver(D, G, method, rtol=rtol, **OPTIONS.get(method, {}))

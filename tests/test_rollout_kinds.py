@@ -65,7 +65,7 @@ def pairs(i, state):
     return {"mean": anp.mean(state), "pair": (state[1:], np.array([2.0, 2.0])), "i": i} if i % 3 == 1 else None
 
 
-@pytest.mark.parametrize("memory", [None, 184, 208, 304])
+@pytest.mark.parametrize("memory", [None, 136, 160, 256])
 @pytest.mark.parametrize("name", KEEPS)
 def test_every_kind_of_result(name, memory):
     by_rollout, by_loop = KEEPS[name]
@@ -92,13 +92,13 @@ def test_second_order_of_every_kind(name, rng):
 
     wanted = product(KEEPS[name][1], True)
     for reverse in (True, False):
-        close(product(lambda u, p: KEEPS[name][0](u, p, memory=208), reverse), wanted)
+        close(product(lambda u, p: KEEPS[name][0](u, p, memory=160), reverse), wanted)
 
 
 def test_taylor_remainder_of_third_order(rng):
     """f(x + t d) - f - t f' - t^2/2 f'' falls as t^3."""
     x, d = (U, 1.3), (rng.normal(size=3), 0.7)
-    loss = lambda x: KEEPS["last"][0](*x, memory=208)
+    loss = lambda x: KEEPS["last"][0](*x, memory=160)
     slope = lambda x: dp.value_and_grad(loss)(x)[1]
     (value, g), (_, h) = dp.value_and_grad(loss)(x), pushforward(slope, x, d)
     dot = lambda a, b: float(np.sum(a[0] * b[0]) + a[1] * b[1])
@@ -114,7 +114,7 @@ def test_third_derivative():
         return dp.value_and_grad(second)(1.3)[1]
 
     wanted = third(lambda p: anp.sum(loop(U, p, 4)[-1]))
-    assert abs(third(lambda p: anp.sum(dp.rollout(bend, U, p, 4, memory=184))) - wanted) < 1e-13
+    assert abs(third(lambda p: anp.sum(dp.rollout(bend, U, p, 4, memory=136))) - wanted) < 1e-13
 
 
 def test_functions_without_jvp():
@@ -135,7 +135,7 @@ def test_functions_without_jvp():
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 7, 50])
-@pytest.mark.parametrize("memory", [None, 208])
+@pytest.mark.parametrize("memory", [None, 160])
 @pytest.mark.parametrize("losses", [False, True])
 def test_truncation(k, memory, losses):
     """State i is a constant for the steps after it where n - i is a multiple of k."""
@@ -220,7 +220,7 @@ def test_nothing_is_left_behind():
             return u * p
 
     def gradient(step):
-        return dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, 1.1, 5, memory=184)))(U)
+        return dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, 1.1, 5, memory=136)))(U)
 
     step = Step()
     watch = weakref.ref(step)

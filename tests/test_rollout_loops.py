@@ -48,7 +48,7 @@ def test_the_loop_of_a_step_has_the_bits_of_single_steps(name, wanted, monkeypat
     assert value == loss(x)
     monkeypatch.setattr(protocol, "SMALL", 0)
     assert _engine(step, u, v) is protocol.Protocol
-    for options in ({}, {"memory": 9 * u.nbytes + 2 * v.nbytes}):
+    for options in ({}, {"memory": 7 * u.nbytes + 2 * v.nbytes}):
         other, h = dp.value_and_grad(lambda x, options=options: loss(x, **options))(x)
         assert value == other
         assert all(np.array_equal(g[key], h[key]) for key in g)

@@ -69,7 +69,7 @@ class Tree:
 N, CELLS = 40, 12
 U0, C0 = np.sin(np.arange(CELLS)), 0.4 + 0.2 * np.cos(np.arange(CELLS))
 WEIGHTS = np.cos(np.arange(CELLS * (N + 1.0))).reshape(N + 1, CELLS)
-BUDGETS = [CELLS * 8 * k for k in (9, 10, 11, 13, 19, 48)]
+BUDGETS = [CELLS * 8 * k for k in (7, 8, 9, 11, 17, 46)]
 
 
 def loss(step, x, keep="last", n=N, **options):
@@ -164,7 +164,7 @@ def test_binomial_schedule_is_optimal():
 @pytest.mark.parametrize("n", [1, 2, 7, N])
 def test_steps_are_run_again_as_rarely_as_possible(step, slots, n):
     runs: list = []
-    memory = CELLS * 8 * (slots + 8)
+    memory = CELLS * 8 * (slots + 6)
     with recording() as calls:
         dp.value_and_grad(lambda x: loss(step, x, n=n, memory=memory, record=runs.append))((U0, C0))
     told = plan(n, memory, CELLS * 8, 2 * CELLS * 8)
@@ -177,11 +177,11 @@ def test_steps_are_run_again_as_rarely_as_possible(step, slots, n):
 def test_many_steps_without_recursion():
     """10^5 steps of 16^2 cells, 24 states kept."""
     u, c = np.random.default_rng(0).random((16, 16)), np.full((16, 16), 0.3)
-    told = plan(100_000, 33 * 2048, 2048, 2 * 2048)
+    told = plan(100_000, 31 * 2048, 2048, 2 * 2048)
     assert told.kept == 24 and told.factor < 5
     runs: list = []
     step, n = Shift(), 20_000  # the test itself is shorter; the benchmark runs all
-    slope = dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, c, n, memory=33 * 2048, record=runs.append)))(u)[1]
+    slope = dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, c, n, memory=31 * 2048, record=runs.append)))(u)[1]
     assert np.max(np.abs(slope - 1)) < 1e-9 and runs[-1].steps == n
 
 
@@ -214,15 +214,14 @@ def test_peak_is_the_trajectory(step, keep):
 
 
 @pytest.mark.parametrize("step", [Shift(), Plain()], ids=["plain forms", "tape"])
-@pytest.mark.parametrize("states", [9, 12, 24])
+@pytest.mark.parametrize("states", [7, 9, 12, 24])
 def test_peak_under_a_budget(step, states):
     u, n = np.random.default_rng(0).random(20_000), 60
     c = np.full(u.shape, 0.5)
     gradient = lambda: dp.value_and_grad(lambda x: anp.sum(dp.rollout(step, *x, n, memory=states * u.nbytes)))((u, c))
     gradient()
-    # params, their gradient, the result, a cotangent; and what the step needs
-    beside = 7 if isinstance(step, Shift) else 9
-    assert peak(gradient) < (states + beside) * u.nbytes + 200_000
+    beside = 3 if isinstance(step, Shift) else 7  # what the step needs by itself
+    assert peak(gradient) < (states + beside) * u.nbytes + 100_000
     plain = peak(lambda: dp.rollout(step, u, c, n, memory=states * u.nbytes))
     assert plain < 7.2 * u.nbytes  # nothing is kept without a gradient
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from sparsedp.direction import push, zero_like
-from sparsedp.trajectory.keep import Each
+from sparsedp.tape import is_variable
+from sparsedp.trajectory.keep import Each, marked
 from sparsedp.trajectory.layout import Layout
 from sparsedp.tree import leaves
 
@@ -30,7 +31,8 @@ def dual(run, args, moving):
     state = Layout(step.joined(run.state, range(first)), "the dual state")
     params = Layout(step.joined(run.params, step.p), "params")
     inputs = None if run.inputs is None else Layout(step.joined(run.inputs, step.x), "inputs")
-    twin = type(run)(step, state, params, inputs, run.n, _keep(run.keep, state, step), run.slots, run.truncate)
+    twin = type(run)(step, state, params, inputs, run.n, _keep(run.keep, state, step), run.budget, run.truncate)
+    twin.origin = run
     twin.silenced = (*run.silenced, *range(first, 2 * first))
     twin.place_of = {k: k + first * (k >= first) + len(p) * (k >= second) for k in range(len(args))}
 
@@ -93,11 +95,13 @@ class DualStep:
 
     def of_keep(self, function):
         """What keep makes of a state -> the tangents of it."""
-        layout = self.run.state
+        run = self.run
 
         def tangents(i, pair):
             state, directions = pair
-            _, slopes = push(lambda tree: function(i, tree), state, layout.spread(directions))
+            value, slopes = push(lambda tree: function(i, tree), state, run.state.spread(directions))
+            if run.engine.called:
+                run.keep.compare(i, [marked(leaf) for leaf in leaves(value) if is_variable(leaf)])
             return [slope for slope in leaves(slopes) if slope is not None]
 
         return tangents

@@ -1,9 +1,11 @@
 """rollout(): a time loop whose gradient costs one node on the tape."""
 
+import warnings
+
 import numpy as np
 
 from sparsedp.constants import constant_args
-from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.errors import BudgetWarning, DerivativeError, ShapeError
 from sparsedp.fields import check_function, check_takes, is_whole
 from sparsedp.ledger import thread
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
@@ -12,7 +14,7 @@ from sparsedp.trajectory.layout import Layout, dense
 from sparsedp.trajectory.protocol import PLAIN, carries
 from sparsedp.trajectory.rules import rollout_rule
 from sparsedp.trajectory.run import Run
-from sparsedp.trajectory.schedule import room_within, slots_within
+from sparsedp.trajectory.schedule import budget_within_reach, plan, room_within, slots_within
 from sparsedp.trajectory.tapes import Tapes
 from sparsedp.tree import leaves
 
@@ -109,7 +111,8 @@ def rollout(
     traced = [k for k, arg in enumerate(args) if isbox(arg)]
     if traced:  # what is kept on the way forward must be what the way back sees
         args = constant_args(args, traced)
-    beside = 2 * sum(form.nbytes for form in forms[1:] if form is not None)  # a copy and a gradient
+    wanted = [any(map(isbox, leaves(tree))) for tree in (params, inputs)]
+    beside = sum((1 + flag) * form.nbytes for form, flag in zip(forms[1:], wanted) if form)  # a copy, a gradient
     slots = None if memory is None else slots_within(memory, forms[0].nbytes, n, beside)
     if truncate is not None and not is_whole(truncate, 1):
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
@@ -118,6 +121,8 @@ def rollout(
     if run.store and (slots is None or slots >= n) and (inputs is not None or not carries(step, *PLAIN)):
         room = None if memory is None else room_within(memory, forms[0].nbytes, n, beside)
         run.tapes = Tapes(room, frozenset(traced), slots is not None)
+    if run.store and run.slots:
+        _warn_of_repeats(memory, forms[0].nbytes, n, beside)
     for told in thread.loops:
         told(step, state, params, inputs, n)
     outputs = rollout_rule(run, *args)
@@ -144,6 +149,19 @@ def _check_inputs(inputs, n):
             shape = np.shape(plain(leaf))
             if shape[:1] != (n,):
                 raise ShapeError(f"inputs need a first axis of n = {n} entries, got an array of shape {shape}")
+
+
+def _warn_of_repeats(memory, size, n, beside):
+    more = budget_within_reach(memory, size, n, beside)
+    if more is not None:
+        few, many = (plan(n, bytes_, size, beside).factor for bytes_ in (more, memory))
+        warnings.warn(
+            BudgetWarning(
+                f"rollout runs {n} steps {many:.3g} times each within memory={memory!r}, and {few:.3g} times with a "
+                f"little more; write memory={more}"
+            ),
+            stacklevel=3,
+        )
 
 
 def _kind(keep, layout):

@@ -9,12 +9,12 @@ import numpy as np
 from sparsedp.direction import pull_ends
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import frozen
-from sparsedp.tape import dtype_of, is_variable, isbox
+from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.traces import reverse_root, split_box, trace
-from sparsedp.trajectory.layout import owned, refuse_mask
-from sparsedp.tree import flatten
+from sparsedp.trajectory.layout import dense, fingerprint, owned, refuse_mask
+from sparsedp.tree import flatten, leaves
 
-__all__ = ["All", "Each", "Last"]
+__all__ = ["All", "Each", "Last", "marked"]
 
 
 class Last:
@@ -29,11 +29,12 @@ class Last:
 
     along = False  # cotangents enter at the end only
     recycles = True  # nobody sees the states on the way: their arrays may be used again
+    whole = False  # every state is handed out, and thereby kept
 
     def __init__(self, layout, shown=slice(None)):
         self.layout, self.shown = layout, shown
 
-    def collector(self, n):
+    def collector(self, run):
         """Start collecting."""
         return _LastCollector(self)
 
@@ -74,10 +75,11 @@ class All:
 
     def __init__(self, layout, shown=slice(None)):
         self.layout, self.shown = layout, shown
+        self.whole = layout.places[shown] == layout.places
 
-    def collector(self, n):
+    def collector(self, run):
         """Start collecting."""
-        return _AllCollector(self, n)
+        return _AllCollector(self, run.n)
 
     def tree(self, outputs, statics):
         """Outputs of the rule -> what the user gets."""
@@ -101,11 +103,11 @@ class _AllCollector:
         pairs = list(zip(keep.layout.shapes, keep.layout.dtypes, strict=True))[keep.shown]
         self._blocks = [np.empty((n + 1, *shape), dtype) for shape, dtype in pairs]
         self._statics: list = []
-        self._whole = self.shared = len(pairs) == len(keep.layout.shapes)
+        self.shared = keep.whole
 
     def room(self, i):
         """Where state i may be computed: in its place."""
-        self._room = [block[i] for block in self._blocks] if self._whole else None
+        self._room = [block[i] for block in self._blocks] if self.shared else None
         return self._room
 
     def see(self, i, values, statics):
@@ -133,15 +135,25 @@ def _stacked(line):
 class Each:
     """What function(index, state) makes of each state; floating results of one shape are kept in one stack."""
 
-    along, recycles = True, False
+    along, recycles, whole = True, False, False
 
     def __init__(self, layout, function):
         self.layout, self.function = layout, function
         self._groups: dict = {}
+        self._marks: list = []  # of what the function returned, where it will be called again
 
-    def collector(self, n):
+    def collector(self, run):
         """Start collecting."""
-        return _EachCollector(self)
+        return _EachCollector(self, run.store)
+
+    def compare(self, i, marks):
+        """Refuse a function that returns something else for a state than it did before."""
+        if i == len(self._marks):
+            self._marks.append(marks)
+        elif self._marks[i] != marks:
+            raise DerivativeError(
+                "keep returns something else when it is called again; it must depend on its arguments only"
+            )
 
     def tree(self, outputs, statics):
         """Outputs of the rule -> the tuple of what the function returned."""
@@ -164,8 +176,9 @@ class Each:
         state = self.layout.build(values, statics)
         result, number = trace(lambda tree: self.function(i, tree), state, self.layout.spread(roots))
         nodes, slopes = [], []
-        for leaf in reversed([leaf for leaf in flatten(result)[0] if is_variable(leaf)]):
-            value, node = split_box(leaf, number)
+        ends = [split_box(leaf, number) for leaf in leaves(result) if is_variable(leaf)]
+        self.compare(i, [marked(value) for value, _ in ends])
+        for value, node in reversed(ends):
             group = self._groups[_sort(value)]
             counters[group] -= 1
             if node is not None:
@@ -178,11 +191,16 @@ def _sort(value):
     return np.shape(value), dtype_of(value).char
 
 
+def marked(value):
+    """Array or number, plain or traced -> its shape and dtype, and its bits."""
+    return *_sort(value), fingerprint([dense(plain(value))])
+
+
 class _EachCollector:
     shared = False
 
-    def __init__(self, keep):
-        self._keep = keep
+    def __init__(self, keep, stored):
+        self._keep, self._stored = keep, stored
         self._stacks: dict = {}
         self._trees: list = []
 
@@ -196,6 +214,8 @@ class _EachCollector:
         for leaf in found:
             refuse_mask("keep returned a masked array", leaf)
         places = [self._store(leaf) if is_variable(leaf) else None for leaf in found]
+        if self._stored:
+            self._keep.compare(i, [marked(leaf) for leaf, place in zip(found, places, strict=True) if place])
         found = [None if place else leaf for leaf, place in zip(found, places, strict=True)]
         self._trees.append((flatten(rebuild(found))[1], found, places))
         return values

@@ -11,10 +11,11 @@ from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten
 
-__all__ = ["NOTHING", "Layout", "dense", "owned", "refuse_mask", "still"]
+__all__ = ["NOTHING", "Layout", "dense", "fingerprint", "owned", "refuse_mask", "still"]
 
 
 NOTHING = (None,)  # the leaves beside one variable
+FOLD = 509  # words to a line of a fingerprint: a prime, so that a field that was shifted has another one
 
 
 class Layout:
@@ -216,6 +217,27 @@ def refuse_mask(what, leaf):
 def still(statics):
     """Leaves that are no variables -> the same, arrays among them as copies nobody can write into."""
     return statics if statics is NOTHING else constant(statics)
+
+
+def fingerprint(values, statics=NOTHING):
+    """Variables and other leaves of a state -> 64 bits for each variable, and for each whole number and word."""
+    marks = [_bits(value) for value in values]
+    for leaf in () if statics is NOTHING else statics:
+        if isinstance(leaf, (int, str)):
+            marks.append(hash(leaf))
+        elif isinstance(leaf, (np.ndarray, np.generic)) and not leaf.dtype.hasobject:
+            marks.append(_bits(leaf))
+    return marks
+
+
+def _bits(value):
+    """All bits are read once: a large array is cut into lines, which are added up as whole numbers."""
+    if value.nbytes < 8192:
+        return hash(value.tobytes())
+    fold = 521 if any(size % FOLD == 0 for size in value.shape) else FOLD
+    flat = value.reshape(-1).view(np.uint8)
+    end = flat.size - flat.size % (8 * fold)
+    return hash((flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes(), flat[end:].tobytes()))
 
 
 def _labels(tree, name):

@@ -30,7 +30,7 @@ __all__ = ["PLAIN", "Protocol", "carries", "engine_of"]
 SMALL = 2**16  # bytes of a state up to which calling Python for every step would be felt
 PLAIN, WHOLE = ("forward", "backward"), ("march", "retreat")
 FLOAT = np.dtype(float)
-CHUNK = 2**20  # bytes of states that are run at once where none is kept
+CHUNK = 2**20  # bytes of states that are run at once
 
 
 def carries(step, *names):
@@ -65,6 +65,8 @@ def _is_field(form):
 class Protocol(Taped):
     """A step with plain forms. States are arrays of this engine: handed out to the step, taken back, used again."""
 
+    called = False  # rounded otherwise
+
     def __init__(self, run, args, wanted=(), recording=False):
         super().__init__(run, args, wanted, recording)
         self._pool: list = []
@@ -98,6 +100,10 @@ class Protocol(Taped):
         if self._arrays and self._recycles:
             self._pool.append(values)
 
+    def trim(self, many):
+        """Let go of arrays beyond so many."""
+        del self._pool[many:]
+
     def backward(self, i, values, statics, g, want_state):
         """Cotangents of state i + 1 -> those of state i; those of params are added up."""
         layout, step, self._last = self.run.state, self.run.step, (i, values, statics)
@@ -124,16 +130,15 @@ class Whole(Protocol):
 
     def link(self, state, statics):
         """All steps in one piece."""
-        run, left = self.run, self.run.n
-        many = left if run.store else min(left, max(CHUNK // max(run.state.nbytes, 1), 1))
-        states = np.empty((many + 1, *run.state.shapes[0]))
+        run, many = self.run, max(CHUNK // max(self.run.state.nbytes, 1), 1)
+        states = np.empty(((run.n if run.store else min(run.n, many)) + 1, *run.state.shapes[0]))
         states[0], rows = state[0], states[:1]
-        while left:
-            rows = states[: min(many, left) + 1]
-            self._march(run.n - left, rows)
-            left -= len(rows) - 1
-            if left:
+        for done in range(0, run.n, many):  # in pieces, also for Ctrl-C
+            if done and not run.store:
                 states[0] = rows[-1]
+            first = done if run.store else 0
+            rows = states[first : first + min(many, run.n - done) + 1]
+            self._march(done, rows)
         return run.n, [rows[-1]], Rows(states) if run.store else []
 
     def _march(self, first, rows):

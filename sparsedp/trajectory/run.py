@@ -1,12 +1,14 @@
 """A rollout as a value: the step, the form of its arguments, how far, and what is kept."""
 
 from contextlib import nullcontext
+from typing import Any
 
 import numpy as np
 
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.fields import place, surely_finite
 from sparsedp.ledger import active, count
+from sparsedp.trajectory.layout import fingerprint
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.protocol import engine_of
 from sparsedp.trajectory.record import Record
@@ -41,15 +43,19 @@ class Run:
     ):
         self.step, self.state, self.params, self.inputs = step, state, params, inputs
         state.rounds = any(any(form.floats) for form in (state, params, inputs) if form is not None)
-        self.n, self.keep, self.slots, self.truncate, self.store = n, keep, slots, truncate, store
+        self.n, self.keep, self.truncate, self.store = n, keep, truncate, store
+        self.budget, self.slots = slots, None if keep.whole else slots
         self.progress, self.record = progress, record
         self.tapes: Tapes | None = None  # of single steps, kept from the way forward
         self.place_of: dict = {}  # in a dual run: number of an argument of the run -> its number here
         self.silenced: tuple = ()  # variables that are zero for the step after a cut: tangents
-        self.engine: type | None = None  # what runs the steps, once that is known
+        self.origin: Run | None = None  # of a dual run: the one whose states it goes through again
+        self.engine: Any = None  # what runs the steps, once that is known
         self.outcome = None  # what the user's tree holds beside the variables
-        self._kept: list | None = None
+        self._kept: Any = None
         self._final: tuple = ()
+        self._end: list | None = None  # fingerprint of the last state
+        self._before: dict = {}  # number of a kept state -> fingerprint of the state before it, where that is not kept
 
     # ------------------------------------------------------------ arguments
 
@@ -72,12 +78,17 @@ class Run:
         """Run all steps; return the arrays to hand out."""
         tapes = self.tapes if self.store else None
         engine = engine_of(self, args, tapes.wanted if tapes else (), tapes is not None)
-        collector = self.keep.collector(self.n)
+        collector = self.keep.collector(self)
         with engine.guarded(), tapes.fresh() if tapes else nullcontext():
             state, statics, kept = self._advance(engine, collector, args)
         engine.check_params()
         self._check_end(args, state)
+        if self.origin:
+            self.origin.agree(self.n, state, statics)
         if self.store:
+            end = fingerprint(state, statics)
+            self.compare(end, self._end or end)
+            self._end = end
             self._kept, self._final = kept, (state if collector.shared else engine.store(state), statics)
         if active:
             count("rollout.step", "forward", self.n)
@@ -93,13 +104,17 @@ class Run:
         state, along = collector.see(0, state, statics), self.keep.along
         first, state, kept = engine.link(state, statics)
         stop, last = first if self.store else -1, self.n - 1
-        if first == self.n:
+        if 0 < first == self.n:
             state = collector.see(first, state, statics)
         for i in shown_steps(self.progress, range(first, self.n), "forward"):
             stored = i == stop or (stop >= 0 and i == last)
             if stored:
                 kept.append((i, state if collector.shared or i == 0 else engine.store(state), statics))
                 stop = self._next(i, len(kept)) if i == stop else stop
+            elif i + 1 in (stop, last) and stop >= 0:
+                self._before[i + 1] = fingerprint(state, statics)
+            if self.origin and self.origin.keep.whole:
+                self.origin.agree(i, state, statics)
             before = state
             state, statics = engine.forward(i, state, statics, collector.room(i + 1) if along else None)
             if along or i == last:
@@ -134,13 +149,20 @@ class Run:
 
     # ------------------------------------------------------------ backward
 
-    def compare(self, values):
-        """Refuse a last step that gives another state than it gave going forward."""
-        for name, value, known in zip(self.state.names, values, self._final[0], strict=True):
-            if not np.array_equal(value, known):
-                raise DerivativeError(
-                    f"the step gives another {name} when it is run again; it must depend on its arguments only"
-                )
+    def compare(self, marks, known):
+        """Refuse a state that is another one than before; both as fingerprints."""
+        if marks != known:
+            names = [*self.state.names, *[self.state.root] * len(marks)]
+            name = next(name for name, a, b in zip(names, marks, known, strict=False) if a != b)
+            raise DerivativeError(
+                f"the step gives another {name} when it is run again; it must depend on its arguments only"
+            )
+
+    def agree(self, i, values, statics):
+        """Refuse a state that a dual run goes through where it is not the one that was handed out."""
+        if self.engine.called:
+            found = fingerprint(values[: len(self.state.places)], statics[: len(self.state.statics)])
+            self.compare(found, self._end if i == self.n else fingerprint(*self._kept[i][1:]))
 
     def backward(self, args, wanted, g):
         """Cotangents of the outputs -> those of the arguments in `wanted`, in that order."""
@@ -175,11 +197,14 @@ class Run:
         return self.truncate is not None and 0 < i < self.n and (self.n - i) % self.truncate == 0
 
     def take_kept(self):
-        """The kept states. Under a budget they are handed over: freed as they are used, run again if asked again."""
-        kept = self._kept
+        """The kept states, the last one, and `_before`.
+
+        Under a budget they are handed over: freed as they are used, run again if asked again.
+        """
+        found = self._kept, self._final, self._before
         if self.slots is not None:
-            self._kept = None
-        return kept, self._final
+            self._kept, self._final, self._before = None, (), {}
+        return *found, self._end
 
 
 def _at(block, i):

@@ -14,15 +14,17 @@ beta(s-1, r-1) <= n - m <= beta(s-1, r).
 """
 
 import re
+from bisect import bisect_left
 from typing import NamedTuple
 
 from sparsedp.fields import is_number
 
-__all__ = ["Plan", "advances", "plan", "recomputed", "room_within", "slots_within", "stride"]
+__all__ = ["Plan", "advances", "budget_within_reach", "plan", "recomputed", "room_within", "slots_within", "stride"]
 
 UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
-WORKING = 6  # states at work beside the kept ones: the present, the next, the last, a cotangent of two, the result
+WORKING = 4  # states at work beside the kept ones: the present, its cotangent and the one before, the result
 OWN = 5  # states left to what a step needs by itself, where there is room for that
+SLOW = 3  # times as many steps run as with a budget up to twice as large: worth a warning
 
 
 def beta(s, r):
@@ -88,6 +90,20 @@ def slots_within(memory, state_bytes, n, beside=0):
     return min(slots, max(n, 1))
 
 
+def budget_within_reach(memory, state_bytes, n, beside=0):
+    """The least number of bytes with which n steps take a third of the runs, where twice the memory is enough; or None.
+
+    Examples
+    --------
+    >>> budget_within_reach(500, 100, 100), budget_within_reach(5000, 100, 100)
+    (600, None)
+    """
+    runs = advances(n, slots_within(memory, state_bytes, n, beside)) + 1
+    slots = bisect_left(range(n), True, lo=1, key=lambda s: SLOW * (advances(n, s) + 1) <= runs)
+    budget = beside + (slots + min(OWN, slots // 15) + WORKING) * state_bytes
+    return budget if slots < n and budget <= 2 * _bytes(memory) else None
+
+
 def room_within(memory, state_bytes, n, beside=0):
     """Bytes left for other things where all n states and those at work are kept; less than 0 when there are none."""
     return _bytes(memory) - beside - (n + WORKING + OWN) * state_bytes
@@ -131,7 +147,7 @@ def plan(n, memory, state_bytes, beside=0):
     Examples
     --------
     >>> plan(10_000, "100 MB", 256 * 256 * 8)
-    Plan(steps=10000, kept=179, recomputed=9820)
+    Plan(steps=10000, kept=181, recomputed=9818)
     """
     slots = max(n, 1) if memory is None else slots_within(memory, state_bytes, n, beside)
     return Plan(n, slots, recomputed(n, slots))

@@ -9,7 +9,7 @@ from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
 from sparsedp.tape import fit
 from sparsedp.traces import inside, new_box, reverse_root, split_box
-from sparsedp.trajectory.layout import owned, still
+from sparsedp.trajectory.layout import fingerprint, owned, still
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["Taped", "boxed", "fitted"]
@@ -35,6 +35,8 @@ class Taped:
     """
 
     known = None  # going back: variables of the state after this step, where every state is kept
+    after = None  # its fingerprint
+    called = True  # the states are those that the call of the step makes, bit by bit
 
     def __init__(self, run, args, wanted=(), recording=False):
         self.run, self.recording = run, recording
@@ -156,6 +158,9 @@ class Taped:
     def release(self, values):
         """The state is not needed any more."""
 
+    def trim(self, many):
+        """Let go of arrays beyond so many that wait to be used again."""
+
     # ------------------------------------------------------------ backward
 
     def backward(self, i, values, statics, g, want_state):
@@ -166,10 +171,10 @@ class Taped:
         self._last = i, values, statics
         ends = run.tapes and run.tapes.take(i, self.wanted)
         if not ends:
-            pairs, roots, _ = self._taped(i, values, statics, want_state)
-            if i == run.n - 1:
-                run.compare(run.state.check([value for value, _ in pairs], "the step"))
+            pairs, roots, others = self._taped(i, values, statics, want_state)
+            run.compare(fingerprint(run.state.check([value for value, _ in pairs], "the step"), others), self.after)
             ends = [node for _, node in pairs], roots
+            del pairs  # the result itself is not needed any more
         nodes, slopes = [], []
         for node, slope in zip(ends[0], g, strict=True):
             if node is not None and slope is not None:

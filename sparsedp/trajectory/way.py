@@ -1,6 +1,8 @@
 """The way back over all steps of a run."""
 
+from sparsedp.errors import DerivativeError
 from sparsedp.ledger import active, count
+from sparsedp.trajectory.layout import fingerprint
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import LIMIT, Growth
 from sparsedp.trajectory.schedule import stride
@@ -21,7 +23,7 @@ class Way:
 
     def __init__(self, run, engine, want_state):
         self.run, self.engine, self.want_state = run, engine, want_state
-        self.stack, self.final = run.take_kept()
+        self.stack, self.final, self.before, self.after = run.take_kept()
         self.recomputed = 0
 
     def back(self, g):
@@ -30,6 +32,8 @@ class Way:
         growth, many = Growth(run.n, run.truncate), len(self.stack)
         source = run.keep.source(run.n, g)
         total = source(run.n, *self.final)
+        if run.slots is not None:
+            self.final = ()  # not needed any more
         growth.see(run.n, total)
         linked = self.engine.linked()
         for i in shown_steps(run.progress, range(run.n - 1, linked - 1, -1), "backward"):
@@ -51,6 +55,8 @@ class Way:
         """Through the steps of one piece; where that fails, step by step, so that `guarded` can name the step."""
         try:
             return self.engine.unlink(total, self.stack, growth)
+        except DerivativeError:
+            raise
         except Exception:
             for i in range(linked - 1, -1, -1):
                 total = self._step(i, total, source, growth)
@@ -59,9 +65,13 @@ class Way:
     def _step(self, i, total, source, growth):
         run = self.run
         values, statics = self._state_at(i)
+        mark = fingerprint(values, statics) if self.engine.called or i + 1 in self.before else None
+        run.compare(mark, self.before.pop(i + 1, mark))
         wants = not run.is_cut(i) if i else self.want_state
         if total is not None:
-            self.engine.known = self._known(i + 1)
+            self.engine.known, self.engine.after = self._known(i + 1), self.after
+            if run.slots is not None:
+                self.engine.trim(run.slots - len(self.stack))
             total = self.engine.backward(i, values, statics, total, wants)
             if i % growth.every == 0:
                 growth.see(i, total)
@@ -69,6 +79,7 @@ class Way:
             total = _sum(total, source(i, values, statics))
         if run.slots is not None and i:
             self.engine.release(values)
+        self.after = mark
         return total
 
     def _known(self, i):
@@ -100,6 +111,8 @@ class Way:
         self.recomputed += stop - start
         for k in range(start, stop):
             before = values
+            if k == stop - 1 > start:
+                self.before[stop] = fingerprint(values, statics)
             values, statics = self.engine.forward(k, values, statics)
             if k > start:
                 self.engine.release(before)
