@@ -11,7 +11,7 @@ from sparsedp.errors import DerivativeError
 from sparsedp.fields import frozen
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.traces import reverse_root, split_box, trace
-from sparsedp.trajectory.layout import dense, fingerprint, owned, refuse_mask
+from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["All", "Each", "Last", "marked"]
@@ -193,7 +193,8 @@ def _sort(value):
 
 def marked(value):
     """Array or number, plain or traced -> its shape and dtype, and its bits."""
-    return *_sort(value), fingerprint([dense(plain(value))])
+    value = np.asarray(plain(value))
+    return value.shape, value.dtype.char, fingerprint([value])
 
 
 class _EachCollector:

@@ -222,7 +222,9 @@ def still(statics):
 def fingerprint(values, statics=NOTHING):
     """Variables and other leaves of a state -> 64 bits for each variable, and for each whole number and word."""
     marks = [_bits(value) for value in values]
-    for leaf in () if statics is NOTHING else statics:
+    if statics is NOTHING:
+        return marks
+    for leaf in statics:
         if isinstance(leaf, (int, str)):
             marks.append(hash(leaf))
         elif isinstance(leaf, (np.ndarray, np.generic)) and not leaf.dtype.hasobject:

@@ -78,31 +78,41 @@ class Protocol(Taped):
     def forward(self, i, values, statics, room=None):
         """Variables and statics of state i -> those of state i + 1."""
         layout, self._last = self.run.state, (i, values, statics)
-        if room is None and self._arrays and self._recycles:
+        if room is None and self._arrays:
             room = self._pool.pop() if self._pool else self._fresh()
         if layout.bare:
             new = self.run.step.forward(values[0], self.params, None if room is None else room[0])
-            return [new] if layout.is_one(new) else layout.check([new], "the step"), statics
+            return (room if room and new is room[0] else self._settled([new], room)), statics
         out = None if room is None else layout.build(room, statics)
         result = self.run.step.forward(layout.build(values, statics), self.params, out)
         values, statics = layout.take(result, "the step")
-        return layout.check(values, "the step"), statics
+        return self._settled(values, room), statics
+
+    def _settled(self, values, room):
+        """Results in arrays of this engine: a step may return its argument, or an array that it will use again."""
+        values = self.run.state.check(values, "the step")
+        if not self._arrays:
+            return values
+        for value, own in zip(values, room, strict=True):
+            if not np.may_share_memory(value, own):
+                own[...] = value
+        return room
 
     def _fresh(self):
         return [np.empty(s, d) for s, d in zip(self.run.state.shapes, self.run.state.dtypes, strict=True)]
 
     def store(self, values):
-        """Nobody else writes into these arrays: they are kept as they are."""
-        return values
+        """Nobody else writes into arrays of this engine: they are kept as they are."""
+        return values if self._arrays else super().store(values)
 
     def release(self, values):
         """The arrays of a state that is not needed any more."""
         if self._arrays and self._recycles:
             self._pool.append(values)
 
-    def trim(self, many):
-        """Let go of arrays beyond so many."""
-        del self._pool[many:]
+    def trim(self):
+        """Let go of arrays that nothing is in."""
+        self._pool.clear()
 
     def backward(self, i, values, statics, g, want_state):
         """Cotangents of state i + 1 -> those of state i; those of params are added up."""

@@ -104,6 +104,7 @@ class Run:
         state, along = collector.see(0, state, statics), self.keep.along
         first, state, kept = engine.link(state, statics)
         stop, last = first if self.store else -1, self.n - 1
+        origin = self.origin if self.origin and self.origin.keep.whole else None
         if 0 < first == self.n:
             state = collector.see(first, state, statics)
         for i in shown_steps(self.progress, range(first, self.n), "forward"):
@@ -111,10 +112,10 @@ class Run:
             if stored:
                 kept.append((i, state if collector.shared or i == 0 else engine.store(state), statics))
                 stop = self._next(i, len(kept)) if i == stop else stop
-            elif i + 1 in (stop, last) and stop >= 0:
+            elif stop >= 0 and i + 1 in (stop, last):
                 self._before[i + 1] = fingerprint(state, statics)
-            if self.origin and self.origin.keep.whole:
-                self.origin.agree(i, state, statics)
+            if origin:
+                origin.agree(i, state, statics)
             before = state
             state, statics = engine.forward(i, state, statics, collector.room(i + 1) if along else None)
             if along or i == last:

@@ -158,8 +158,8 @@ class Taped:
     def release(self, values):
         """The state is not needed any more."""
 
-    def trim(self, many):
-        """Let go of arrays beyond so many that wait to be used again."""
+    def trim(self):
+        """As many states are kept as may be: let go of arrays that nothing is in."""
 
     # ------------------------------------------------------------ backward
 

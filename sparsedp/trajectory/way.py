@@ -65,13 +65,15 @@ class Way:
     def _step(self, i, total, source, growth):
         run = self.run
         values, statics = self._state_at(i)
-        mark = fingerprint(values, statics) if self.engine.called or i + 1 in self.before else None
-        run.compare(mark, self.before.pop(i + 1, mark))
+        before = self.before.pop(i + 1, None)
+        mark = fingerprint(values, statics) if before or self.engine.called else None
+        if before:
+            run.compare(mark, before)
         wants = not run.is_cut(i) if i else self.want_state
         if total is not None:
             self.engine.known, self.engine.after = self._known(i + 1), self.after
-            if run.slots is not None:
-                self.engine.trim(run.slots - len(self.stack))
+            if run.slots == len(self.stack):
+                self.engine.trim()
             total = self.engine.backward(i, values, statics, total, wants)
             if i % growth.every == 0:
                 growth.see(i, total)

@@ -1,0 +1,255 @@
+"""Steps that are run again: what depends on more than its arguments is refused, or its gradient is that of one loop.
+
+The reference is a loop on the tape of autograd in which every step is called once, in order.
+"""
+
+import autograd
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.derivative import pullback, pushforward
+from sparsedp.errors import DerivativeError
+from sparsedp.trajectory.layout import bits
+
+N, U = 12, np.array([0.3, -0.5, 0.8, 0.1])
+BUDGETS = [None, *(16 + 2 * 8 * N + 32 * (slots + 4) for slots in (1, 2, 3, 4, 6, 9, 12, 200))]
+WEIGHTS = np.cos(np.arange(4.0 * (N + 1))).reshape(N + 1, 4)
+KEEPS = {
+    "last": ("last", lambda out: anp.sum(WEIGHTS[0] * out**2), lambda all_: anp.sum(WEIGHTS[0] * all_[-1] ** 2)),
+    "all": ("all", lambda out: anp.sum(WEIGHTS * out**2), lambda all_: anp.sum(WEIGHTS * anp.stack(all_) ** 2)),
+    "each": (
+        lambda i, u: (anp.sum(WEIGHTS[i] * u**3), i),
+        lambda out: sum(value for value, _ in out),
+        lambda all_: sum(anp.sum(w * u**3) for w, u in zip(WEIGHTS, all_)),
+    ),
+}
+AGAIN = "^the step gives another state when it is run again; it must depend on its arguments only$"
+
+
+def smooth(u, p):
+    return u + 0.1 * anp.sin(p * u) * anp.roll(u, 1)
+
+
+def even(u, p):
+    """The sign of a state is forgotten by the next step."""
+    return smooth(anp.sqrt(u**2), p)
+
+
+STEPS = {  # number of the call, state, params -> state
+    "pure": lambda c, u, p: smooth(u, p),
+    "counter": lambda c, u, p: smooth(u, p) + 0.01 * c,
+    "rounding": lambda c, u, p: smooth(u, p) * (1.0 + 1e-15 * c),
+    "once": lambda c, u, p: smooth(u, p) * (1.5 if c == 5 else 1.0),
+    "once, later": lambda c, u, p: smooth(u, p) * (1.5 if c == N + 1 else 1.0),
+    "once, much later": lambda c, u, p: smooth(u, p) * (1.5 if c == N + 8 else 1.0),
+    "cancels": lambda c, u, p: even(u, p) * (1.0 if c % 3 else -1.0),
+    "cancels, later": lambda c, u, p: even(u, p) * (-1.0 if c == N + 3 else 1.0),
+    "turns": lambda c, u, p: anp.roll(smooth(u, p), 1 if c % 3 else -1),
+}
+
+
+class Counted:
+    """A step that knows how often it was called."""
+
+    def __init__(self, name):
+        self.calls, self.of = 0, STEPS[name]
+
+    def __call__(self, u, p, *inputs):
+        self.calls += 1
+        return self.of(self.calls - 1, u, p) + sum(inputs)
+
+
+def by_loop(name, keep, inputs, truncate, p):
+    step, states = Counted(name), [U]
+    for i in range(N):
+        u = autograd.tracer.getval(states[-1]) if truncate and i and (N - i) % truncate == 0 else states[-1]
+        states.append(step(u, p, *([] if inputs is None else [inputs[i]])))
+    return KEEPS[keep][2](states)
+
+
+@pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
+@pytest.mark.parametrize("keep", KEEPS)
+@pytest.mark.parametrize("name", STEPS)
+def test_refused_or_right(name, keep):
+    refused = 0
+    for inputs, truncate in ((None, None), (0.1 * np.sin(np.arange(N)), None), (None, 5)):
+        value, slope = autograd.value_and_grad(lambda p: by_loop(name, keep, inputs, truncate, p))(1.3)
+        for memory in BUDGETS:
+            step, options = Counted(name), {"inputs": inputs, "memory": memory, "truncate": truncate}
+            loss = lambda p: KEEPS[keep][1](dp.rollout(step, U, p, N, keep=KEEPS[keep][0], **options))
+            try:
+                found = dp.value_and_grad(loss)(1.3)
+            except DerivativeError as error:
+                assert "when it is" in str(error) and step.calls > N
+                refused += 1
+            else:
+                assert found == pytest.approx((value, slope), rel=1e-11)
+    assert refused == 0 if name == "pure" else refused > 5
+
+
+@pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
+@pytest.mark.parametrize("keep", KEEPS)
+@pytest.mark.parametrize("name", ["pure", "counter", "once, much later", "cancels", "cancels, later"])
+def test_tangents_and_second_derivatives_are_refused_or_right(name, keep):
+    """The run that carries the tangents must go through what was handed out."""
+    slope = lambda f: lambda p: dp.value_and_grad(f)(p)[1]
+    ways = {
+        "forward": lambda f: pushforward(f, 1.3, 1.0)[1],
+        "forward over reverse": lambda f: pushforward(slope(f), 1.3, 1.0)[1],
+        "reverse over reverse": lambda f: slope(slope(f))(1.3),
+        "a pullback twice": lambda f: [pull := pullback(f, 1.3)[1], pull(1.0), pull(1.0)][-1],
+    }
+    first = autograd.grad(lambda p: by_loop(name, keep, None, None, p))
+    wanted = {way: autograd.grad(first)(1.3) if "over" in way else first(1.3) for way in ways}
+    refused = 0
+    for memory in BUDGETS[:5]:
+        for way, derivative in ways.items():
+            step = Counted(name)
+            try:
+                found = derivative(
+                    lambda p: KEEPS[keep][1](dp.rollout(step, U, p, N, keep=KEEPS[keep][0], memory=memory))
+                )
+            except DerivativeError:
+                refused += 1
+            else:
+                assert found == pytest.approx(wanted[way], rel=1e-9)
+    assert refused == 0 if name == "pure" else refused > 2
+
+
+@pytest.mark.parametrize("memory", [32 * 5 + 16, 600])
+def test_a_hidden_counter_under_a_budget(memory):
+    with pytest.raises(DerivativeError, match=AGAIN):
+        dp.value_and_grad(lambda p: anp.sum(dp.rollout(Counted("counter"), U, p, 40, memory=memory)))(1.3)
+
+
+def test_a_keep_that_is_called_again():
+    calls = []
+    message = "^keep returns something else when it is called again; it must depend on its arguments only$"
+    for way in (dp.value_and_grad, lambda f: lambda p: pushforward(f, p, 1.0)):
+        with pytest.raises(DerivativeError, match=message):
+            way(lambda p: sum(dp.rollout(smooth, U, p, 3, keep=lambda i, u: calls.append(0) or u[0] * len(calls))))(1.3)
+
+
+@pytest.mark.parametrize("keep", ["last", "all"])
+@pytest.mark.parametrize("changed", ["one array", "all arrays", "a number"])
+def test_what_a_step_uses_is_changed_before_the_way_back(changed, keep):
+    """A list of arrays beside the arguments, and a table that everybody may change."""
+    steps = {
+        "tree": lambda s, p: (s[0] * p * given[s[1]] + table["k"] * s[0] ** 2, s[1] + 1),
+        "kept": lambda s, p: (s[0] * p * anp.cos(given[s[1]]) + table["k"] * s[0] ** 2, s[1] + 1),
+    }
+    for memory in BUDGETS[:1] + BUDGETS[2:]:
+        for step in steps.values():
+            given, table = list(np.linspace(0.5, 1.5, 4 * N).reshape(N, 4)), {"k": 0.1}
+            given = [one.copy() for one in given]
+            loss = lambda p: anp.sum(dp.rollout(step, (U, 0), p, N, memory=memory, keep=keep)[0])
+            wanted, pull = dp.value_and_grad(loss)(0.9)[1], pullback(loss, 0.9)[1]
+            table["k"] = 0.3 if changed == "a number" else 0.1
+            for one in {"one array": given[3:4], "all arrays": given}.get(changed, []):
+                one[:] = 7.0
+            try:
+                assert pull(1.0) == wanted
+            except DerivativeError as error:
+                assert str(error).startswith("the step gives another state[0] when it is run again")
+
+
+class Donor:
+    """A step with plain forms, whose forward is impure in many ways."""
+
+    def __init__(self, name):
+        self.calls, self.name = 0, name
+
+    def __call__(self, u, p):
+        return u + 0.1 * anp.abs(u) * p
+
+    def forward(self, u, p, out=None):
+        self.calls += 1
+        factor = {"counter": 1 + 0.01 * self.calls, "sign": 1.0 if self.calls % 5 else -1.0}.get(self.name, 1.0)
+        if self.name == "identity" and not np.sum(u) % 0.5 < 0.25:
+            return u
+        if self.name == "buffer":
+            self.own = getattr(self, "own", np.empty(u.shape))
+            self.own[:] = self(u, p)
+            return self.own
+        return factor * self(u, p)
+
+    def backward(self, u, p, g, into=None):
+        into = np.zeros_like(p) if into is None else into
+        if self.name == "identity" and not np.sum(u) % 0.5 < 0.25:
+            return g, into
+        into += g * 0.1 * np.abs(u)
+        return g * (1 + 0.1 * np.sign(u) * p), into
+
+
+@pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
+@pytest.mark.parametrize("keep", KEEPS)
+@pytest.mark.parametrize("name", ["identity", "buffer", "pure"])
+def test_plain_forms_may_return_their_argument_or_an_array_of_their_own(name, keep):
+    def loop(x):
+        states = [x[0]]
+        for _ in range(N):
+            u = states[-1]
+            stays = name == "identity" and not np.sum(autograd.tracer.getval(u)) % 0.5 < 0.25
+            states.append(u if stays else u + 0.1 * anp.abs(u) * x[1])
+        return KEEPS[keep][2](states)
+
+    x = (U, np.array([0.3, 0.4, 0.5, 0.6]))
+    value, slopes = autograd.value_and_grad(loop)(x)
+    for memory in (None, *(32 * (slots + 6) for slots in (1, 2, 4, 7, 30))):
+        loss = lambda x: KEEPS[keep][1](dp.rollout(Donor(name), *x, N, keep=KEEPS[keep][0], memory=memory))
+        again, found = dp.value_and_grad(loss)(x)
+        assert again == pytest.approx(value, rel=1e-13)
+        for one, other in zip(found, slopes, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
+@pytest.mark.parametrize("name", ["counter", "sign"])
+def test_plain_forms_are_compared_where_they_are_run_again(name):
+    for slots in (1, 2, 3, 4):
+        step = Donor(name)
+        with pytest.raises(DerivativeError, match=AGAIN):
+            dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, 0.3 * np.ones(4), 20, memory=32 * (slots + 5))))(U)
+        assert step.calls > 20
+
+
+@pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
+@pytest.mark.parametrize("size", [8, 3001])
+def test_nan_and_zeros_of_both_signs_are_no_other_result(size):
+    """NaN in a state on the way, gone at the end; zeros that keep their sign."""
+    u = np.linspace(-1.0, 1.0, size)
+    u[::3] = -0.0
+
+    def step(s, p):
+        bad = np.where(np.arange(size) == 3, np.nan, 0.0) if s[1] == 4 else np.zeros(size)
+        return anp.where(np.arange(size) == 3, 0.5, s[0]) * p * np.tile([1.0, -1.0], size)[:size] + bad, s[1] + 1
+
+    def loop(p):
+        s = (u, 0)
+        for _ in range(N):
+            s = step(s, p)
+        return anp.sum(s[0])
+
+    wanted = autograd.grad(loop)(0.9)
+    for slots in (None, 1, 3, 12, 2000):
+        memory = None if slots is None else 16 + (slots + 4) * u.nbytes
+        found = dp.value_and_grad(lambda p: anp.sum(dp.rollout(step, (u, 0), p, N, memory=memory)[0]))(0.9)[1]
+        assert found == pytest.approx(wanted, rel=1e-12)
+
+
+def test_fingerprints_see_every_bit_and_every_place():
+    rng = np.random.default_rng(0)
+    for shape in ((4,), (1023,), (1025,), (64, 64), (509, 40), (40, 521), (700, 509)):
+        for dtype in ("f4", "f8", "c16"):
+            u = rng.standard_normal(shape).astype(dtype)
+            known = bits(u)
+            assert known == bits(u.copy()) == bits(np.asfortranarray(u))
+            assert all(bits(np.roll(u, 1, axis)) != known for axis in range(u.ndim))
+            for place in rng.integers(0, u.size, 20):
+                other = u.copy()
+                other.flat[place] = np.nextafter(u.flat[place].real, np.inf) + (
+                    u.flat[place].imag * 1j if dtype == "c16" else 0
+                )
+                assert bits(other) != known
