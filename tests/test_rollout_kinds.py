@@ -95,6 +95,77 @@ def test_second_order_of_every_kind(name, rng):
         close(product(lambda u, p: KEEPS[name][0](u, p, memory=160), reverse), wanted)
 
 
+def few(s, p, f=0.0):
+    """Trees with a whole number, an empty branch and nothing at all in them."""
+    u, count, empty = s
+    return u * anp.cos(p["k"] * u) + 0.1 * p["k"] + 0.1 * f, count + 1, empty
+
+
+@pytest.mark.parametrize("options", [{}, {"memory": 200}, {"memory": "1 kB"}, {"truncate": 1}], ids=str)
+@pytest.mark.parametrize("inputs", [False, True])
+@pytest.mark.parametrize("keep", ["last", "all", "function", "nothing"])
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_no_step_one_and_two(n, keep, inputs, options):
+    """Values, and derivatives forward, in reverse and of second order, against the loop written out."""
+    seen = []
+    kept = {
+        "function": lambda i, s: (seen.append(i), anp.sum(s[0] ** 3) * (i + 1 + s[1]))[1],
+        "nothing": lambda i, s: s[2],
+    }
+    force = np.cos(np.arange(float(n))) if inputs else None
+
+    def rolled(u, k, force):
+        out = dp.rollout(few, (u, 3, ()), {"k": k, "none": []}, n, inputs=force, keep=kept.get(keep, keep), **options)
+        if keep in kept:
+            assert len(out) == n + 1
+            return sum(out, 0.0 * k) if keep == "function" else 0.0 * k + len(out) + anp.sum(u)
+        assert out[2] == () and np.array_equal(out[1], np.arange(3, n + 4) if keep == "all" else n + 3)
+        return anp.sum(out[0] ** 2)
+
+    def looped(u, k, force):
+        from sparsedp.tape import plain
+
+        states = [(u, 3, ())]
+        for i in range(n):
+            u = plain(states[-1][0]) if i and "truncate" in options else states[-1][0]
+            states.append(few((u, *states[-1][1:]), {"k": k}, *([] if force is None else [force[i]])))
+        if keep == "function":
+            return sum(kept[keep](i, s) for i, s in enumerate(states))
+        if keep == "nothing":
+            return 0.0 * k + n + 1.0 + anp.sum(states[0][0])
+        return sum(anp.sum(s[0] ** 2) for s in (states if keep == "all" else states[-1:]))
+
+    x, along = (U, 1.3, force), (np.ones(3), 0.5, None if force is None else np.ones(n))
+    slope = lambda f: lambda x: dp.value_and_grad(lambda x: f(*x))(x)[1]
+    for way in (
+        lambda f: f(*x),
+        lambda f: dp.value_and_grad(lambda x: f(*x))(x),
+        lambda f: pushforward(lambda x: f(*x), x, along)[1],
+        lambda f: pushforward(slope(f), x, along)[1],
+        lambda f: dp.value_and_grad(lambda x: anp.sum(slope(f)(x)[0] * U) + slope(f)(x)[1])(x)[1],
+    ):
+        ours, wanted = ([leaf for leaf in leaves(way(f)) if leaf is not None] for f in (rolled, looped))
+        close(ours, wanted)
+    seen.clear()
+    rolled(*x)
+    assert seen == (list(range(n + 1)) if keep == "function" else [])
+
+
+@pytest.mark.parametrize("keep", ["last", "all", lambda i, s: (i, s)], ids=["last", "all", "function"])
+@pytest.mark.parametrize("state", [(), {}, {"n": 1, "word": "a"}], ids=str)
+def test_states_without_numbers(state, keep):
+    step = lambda s, p: {**s, "n": s["n"] + 1} if "n" in s else s
+    for n in (0, 1, 2):
+        out = dp.rollout(step, state, None, n, keep=keep)
+        states = [{**state, "n": 1 + i} if "n" in state else state for i in range(n + 1)]
+        if callable(keep):
+            assert out == tuple(enumerate(states))
+        elif keep == "last" or "n" not in state:
+            assert out == states[-1]
+        else:
+            assert out["word"] == "a" and np.array_equal(out["n"], np.arange(1, n + 2))
+
+
 def test_taylor_remainder_of_third_order(rng):
     """f(x + t d) - f - t f' - t^2/2 f'' falls as t^3."""
     x, d = (U, 1.3), (rng.normal(size=3), 0.7)

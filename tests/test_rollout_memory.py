@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp.errors import BudgetWarning
 from sparsedp.ledger import recording
-from sparsedp.trajectory.schedule import advances, plan, recomputed, stride
+from sparsedp.trajectory.schedule import advances, budget_within_reach, plan, recomputed, stride
 
 
 class Shift:
@@ -224,6 +225,63 @@ def test_peak_under_a_budget(step, states):
     assert peak(gradient) < (states + beside) * u.nbytes + 100_000
     plain = peak(lambda: dp.rollout(step, u, c, n, memory=states * u.nbytes))
     assert plain < 7.2 * u.nbytes  # nothing is kept without a gradient
+
+
+@pytest.mark.parametrize("keep", ["last", "each"])
+@pytest.mark.parametrize("params", [True, False])
+@pytest.mark.parametrize("states", [8, 9, 12, 16, 24, 80])
+def test_the_budget_is_what_a_step_without_needs_of_its_own_takes(states, params, keep):
+    """All of it, the result and its cotangent included; the states that are kept fill it."""
+    n, rng, size = 60, np.random.default_rng(0), 400_000
+    u = rng.random(size // 8)
+    v, weights = rng.random(u.shape), np.cos(u)
+    step, runs = dp.transport(dp.Grid(u.shape, size=1.0, periodic=True), velocity="cells").step(0.4 / u.size), []
+
+    def total(u, v):
+        options = {"keep": lambda i, u: anp.sum(u[:3])} if keep == "each" else {}
+        out = dp.rollout(step, u, v, n, memory=states * size, record=runs.append, **options)
+        return sum(out) if keep == "each" else anp.sum(weights * out)
+
+    gradient = lambda: dp.value_and_grad((lambda x: total(*x)) if params else lambda u: total(u, v))(
+        (u, v) if params else u
+    )
+    gradient()
+    assert runs[1].kept >= min(n, states - 5 - 2 * params - min(5, states // 16))
+    entering = 2 * size * (keep == "each")  # what enters at a state, and the sum
+    assert peak(gradient) < states * size + entering + 100_000
+
+
+def test_a_budget_that_a_little_more_would_help_says_so():
+    """100 steps: the numbers of runs are those of the formula, the least budget is found by trying."""
+    n, size, runs = 100, U0.nbytes, []
+    tight = lambda memory: dp.value_and_grad(
+        lambda u: anp.sum(dp.rollout(Shift(), u, C0, n, memory=memory, record=runs.append))
+    )(U0)
+    message = (
+        "rollout runs 100 steps 49.5 times each within memory=576, and 8.46 times with a little more; write memory=672"
+    )
+    with pytest.warns(BudgetWarning, match=f"^{message}$"):
+        tight(6 * size)
+    assert runs[-1].factor == 49.51
+    tight(7 * size)
+    assert runs[-1].factor == 8.46
+    for slots in range(1, 101):
+        beside, memory = size, (slots + 5 + min(5, slots // 15)) * size
+        told = budget_within_reach(memory, size, n, beside)
+        third = plan(n, memory, size, beside).factor / 3
+        found = [more for more in range(memory, 2 * memory + 1, size) if plan(n, more, size, beside).factor <= third]
+        assert told == (found[0] if found else None)
+
+
+def test_all_states_handed_out_are_states_kept():
+    """Whatever the budget: no step is run again."""
+    for step in (Shift(), Plain()):
+        runs, wanted = [], dp.value_and_grad(lambda x: loss(step, x, "all"))((U0, C0))
+        value, slopes = dp.value_and_grad(lambda x: loss(step, x, "all", memory=7 * U0.nbytes, record=runs.append))(
+            (U0, C0)
+        )
+        assert runs[-1].recomputed == 0 and value == wanted[0]
+        assert all(a.tobytes() == b.tobytes() for a, b in zip(slopes, wanted[1]))
 
 
 @pytest.mark.slow

@@ -1,0 +1,146 @@
+"""Ctrl-C in a time loop: KeyboardInterrupt at once, and everything works as before, to the bit."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from autograd.tracer import trace_stack
+
+import sparsedp as dp
+from sparsedp import ledger, traces
+from sparsedp.derivative import pullback, pushforward
+from sparsedp.tree import leaves
+
+pytestmark = pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
+N, GRID = 9, dp.Grid((6, 5), size=1.0, periodic=True)
+MOVE = dp.transport(GRID, velocity="cells")
+U, V = np.random.default_rng(0).random((6, 5)), 0.1 * np.random.default_rng(1).random((2, 6, 5))
+WIDE = np.array(V[0])
+
+
+class Stops:
+    """A step, with plain forms or without, that is interrupted at one of its calls."""
+
+    def __init__(self, step, at=None):
+        self.step, self.at, self.calls = step, at, 0
+        for name in ("forward", "backward", "march", "retreat", "sparing"):
+            if hasattr(step, name):
+                of = getattr(step, name)
+                setattr(self, name, (lambda *a, of=of, **o: self.counted(of, *a, **o)) if callable(of) else of)
+
+    def counted(self, of, *args, **options):
+        self.calls += 1
+        if self.calls == self.at:
+            raise KeyboardInterrupt
+        return of(*args, **options)
+
+    def __call__(self, u, p):
+        return self.counted(self.step, u, p)
+
+
+def bend(u, p):
+    return u + 0.1 * anp.sin(p * u) * anp.roll(u, 1)
+
+
+LOOPS = {  # step, state, params, options
+    "whole": (MOVE.step(0.02), U, V, {}),
+    "plain forms": (MOVE.step(0.02), U, V, {"memory": (4 + 3) * U.nbytes + 2 * V.nbytes}),
+    "taped": (bend, U, WIDE, {"memory": (4 + 3 + 2) * U.nbytes}),
+    "taped once": (bend, U, WIDE, {"memory": "1 MB"}),
+    "linked": (bend, U, WIDE, {}),
+    "tree": (lambda s, p: (bend(s[0], p), s[1] + 1), (U, 0), WIDE, {}),
+    "all": (bend, U, WIDE, {"keep": "all"}),
+    "each": (bend, U, WIDE, {"keep": lambda i, u: anp.sum(u**2)}),
+}
+
+
+def loss(name, step):
+    _, u, p, options = LOOPS[name]
+    return lambda x: sum(anp.sum(leaf**2) for leaf in leaves(dp.rollout(step, x[0], x[1], N, **options))), (u, p)
+
+
+def gradient(name, step):
+    f, x = loss(name, step)
+    return dp.value_and_grad(f)(x)
+
+
+def product(name, step):
+    f, (u, p) = loss(name, step)
+    return pushforward(lambda p: dp.value_and_grad(lambda p: f((u, p)))(p)[1], p, np.ones_like(p))
+
+
+def twice(name, step):
+    """A pullback that is used again after it was interrupted."""
+    f, x = loss(name, step)
+    value, pull = pullback(f, x)
+    try:
+        return value, pull(1.0)
+    except KeyboardInterrupt:
+        return value, pull(1.0)
+
+
+def told(found):
+    return [np.asarray(leaf).tobytes() for leaf in leaves(found) if leaf is not None]
+
+
+def left_over():
+    kept = len(ledger.active), len(ledger.observers), len(ledger.loops), len(ledger._inner), len(traces.witnesses)
+    return trace_stack.top, *kept, set(traces.untraced)
+
+
+@pytest.mark.parametrize("job", [gradient, product, twice])
+@pytest.mark.parametrize("name", LOOPS)
+def test_interrupted_at_any_call_of_the_step(name, job):
+    step = Stops(LOOPS[name][0])
+    wanted, before, calls = told(job(name, step)), left_over(), step.calls
+    assert calls >= (2 if name == "whole" else N)
+    for at in range(1, calls + 1, 5 if job is product else 1):
+        step.calls, step.at = 0, at
+        try:
+            assert told(job(name, step)) == wanted and job is twice
+        except KeyboardInterrupt:
+            assert step.calls == at
+        assert left_over() == before
+        step.at = None
+        assert told(job(name, step)) == wanted
+
+
+LONG = """
+import sys, time
+import numpy as np, autograd.numpy as anp, sparsedp as dp
+grid = dp.Grid(40, size=1.0, periodic=True)
+move = dp.transport(grid)
+step = {"whole": move.step(1e-3), "linked": lambda u, v: move(u, v, 1e-3)}[sys.argv[1]]
+u, v = np.sin(np.arange(40.0)), np.cos(np.arange(40.0))
+loss = lambda n: lambda u: anp.sum(dp.rollout(step, u, v, n) ** 2)
+wanted = dp.value_and_grad(loss(50))(u)[1].tobytes()
+print("ready", flush=True)
+try:
+    while True:
+        dp.value_and_grad(loss(100_000))(u)
+except KeyboardInterrupt:
+    same = dp.value_and_grad(loss(50))(u)[1].tobytes() == wanted
+    print("the same" if same else "other bits", flush=True)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process")
+@pytest.mark.parametrize("name", ["whole", "linked"])
+def test_a_real_signal(name):
+    child = subprocess.Popen([sys.executable, "-c", LONG, name], stdout=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout.readline() == "ready\n"
+        time.sleep(0.5)
+        start = time.perf_counter()
+        child.send_signal(signal.SIGINT)
+        assert child.stdout.readline() == "the same\n"
+        assert time.perf_counter() - start < 20  # a second at most where nobody else computes
+        assert child.wait(60) == 0
+    finally:
+        child.kill()
+        child.stdout.close()
+        child.wait()
