@@ -1,10 +1,14 @@
 """A simulator without derivatives becomes differentiable: sparse Jacobians by coloured differences."""
 
 import warnings
+from contextlib import contextmanager
+from itertools import product
 from threading import RLock
 from typing import Any
+from zlib import crc32
 
 import numpy as np
+import scipy.sparse as sp
 
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite
@@ -19,11 +23,12 @@ from sparsedp.tree import copied
 
 __all__ = ["Adopted", "adopt"]
 
+STEP, DIFFERENCES = "complex step", "central differences"
 COMPLEX = 1e-30  # step of the complex step: no difference is taken, so nothing cancels
 CENTRAL = np.finfo(float).eps ** (1 / 3)  # step of central differences, relative to x
-AGREES = {"complex step": 1e-6, "central differences": 1e-4}
-ROWS = {"complex step": (1e-9, 0.0), "central differences": (1e-5, 1e-9)}  # of a row, and of the largest: what may miss
-
+SHARES = 1.0, 1e-2  # of the step of central differences: Jacobians and probes
+MOST = {STEP: (1e-9, 1e-12), DIFFERENCES: (1e-4, 1e-4)}  # what a row may lack of a probe: of itself, of the largest row
+GROWS = 1e-5  # what it may lack of a difference if that grows with the step: rounding does not
 TIMES = 2, 5, 11  # steps at which what a row lacks is looked at again
 
 
@@ -37,8 +42,8 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     sparsity : sparse matrix or array, optional
         (y.size, x.size), not 0 where y_i may depend on x_j. Default: what three cells touch, moved over the grid, if at
         3 points each row of the Jacobian agrees with a derivative along a random direction; else found by changing
-        random parts of x at 3 points. An entry that is not 0 on a share s of all points is missed with probability
-        (1 - s)^3; from a stencil also one below 1e-9 (differences: 1e-5) of its row.
+        random parts of x at 3 points. Where a later point takes another branch it is found again, and grows. An entry
+        below 1e-9 (differences: 1e-5) of its row may be missed.
     derivative : "auto", "complex" or "difference"
         complex: f(x + i h v), to rounding, for code that is analytic and takes complex numbers. difference: central
         differences, about ten digits. auto: complex where it is found to agree with differences.
@@ -60,13 +65,17 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     ShapeError
         If the sparsity or a later x has another shape.
     DerivativeError
-        At the first derivative: if f is not deterministic, or the Jacobian misses what a random probe sees; on
-        derivatives of second order.
+        If f is not deterministic, or no Jacobian agrees with a difference along a random direction: a sparsity that
+        lacks entries, a point where f has no derivative; on derivatives of second order.
     NonFiniteError
         If f is NaN or infinite near x.
 
     Notes
     -----
+    Cost: one run for each colour of the pattern (two for central differences), one at x, and two or three that probe
+    the Jacobian row by row along a direction which is another one at each x. Where only a few rows miss something, at
+    a branch of code that takes no complex step there, they are taken by central differences. At a kink the derivative
+    is the mean of both sides, next to it that of its own side.
     Source: A. R. Curtis, M. J. D. Powell, J. K. Reid, IMA J. Appl. Math. 13, 1974 (colouring); W. Squire, G. Trapp,
     SIAM Rev. 40, 1998 (complex step).
 
@@ -93,7 +102,7 @@ class Adopted:
     runs : int
         Runs of the function so far.
     way : str
-        "complex step" or "central differences"; empty before the first derivative.
+        STEP or DIFFERENCES; empty before the first derivative.
     """
 
     def __init__(self, f, sparsity, derivative, name):
@@ -118,7 +127,7 @@ class Adopted:
     def __str__(self):
         if self._coloured is None:
             return f"{self.name}: no derivative asked for yet, {self.runs} runs"
-        each = self._coloured.count * (1 if self.way == "complex step" else 2)
+        each = self._coloured.count * (1 if self.way == STEP else 2)
         rows, columns = self._coloured.pattern.shape
         return (
             f"{self.name}: Jacobian {rows} x {columns} with {self._coloured.pattern.nnz} entries from {each} runs "
@@ -141,7 +150,7 @@ class Adopted:
         return vjp
 
     def _run(self, x):
-        """One run on plain values."""
+        """One run on plain values; a copy, for foreign code may return the array that it will write into next."""
         if active:
             count(f"{self.name}.run", "forward")
         with self._alone:
@@ -182,119 +191,162 @@ class Adopted:
                 f"{self.name} was adopted from {self._shapes[0]} to {self._shapes[1]}, got {x.shape} to {y.shape}; "
                 "adopt it again"
             )
-        first = self._coloured is None
-        if first:
-            self._shapes = x.shape, y.shape
+        if self._coloured is None:
+            self._shapes, self.way = (x.shape, y.shape), self._choose(x)
             self._coloured = self._pattern(x, y)
-            self.way = self._choose(x)
-        matrix = self._by_colours(x, self.way)
-        if first:
-            self._check(matrix, x, y)
+        matrix, wrong = self._probed(self._coloured, x)
+        if wrong.any() and self._sparsity is None:  # a branch was taken that no point before has met
+            self._coloured = self._pattern(x, y, self._coloured.pattern)
+            matrix, wrong = self._probed(self._coloured, x)
+        if wrong.any():
+            raise DerivativeError(
+                f"the Jacobian of {self.name} by {self.way} misses in row {np.argmax(wrong)} what a difference along a "
+                "random direction sees; its sparsity lacks entries, or it has a kink at x: leave sparsity and "
+                "derivative out, or move x a little"
+            )
         return matrix
 
-    def _pattern(self, x, y):
+    # ------------------------------------------------------------ the pattern
+
+    def _pattern(self, x, y, known=None):
+        """The coloured pattern; with the entries `known` from earlier points, those that it has near x and at x."""
         rows, columns = y.size, x.size
+        grid = x.shape if x.shape == y.shape else None
         if self._sparsity is not None:
             given = self._sparsity.tocsr() if hasattr(self._sparsity, "tocsr") else np.asarray(self._sparsity)
             row, column = np.nonzero(given)
             pattern = pattern_of(row, column, given.shape)
             if pattern.shape != (rows, columns):
                 raise ShapeError(f"the sparsity of {self.name} must have shape {(rows, columns)}, got {pattern.shape}")
-            return Coloured(pattern, self._grid(x, y), by_rows=False)
-        if not np.array_equal(self._run(x), y, equal_nan=True):
+            return Coloured(pattern, grid, by_rows=False)
+        if known is None and not np.array_equal(self._run(x), y, equal_nan=True):
             raise DerivativeError(f"{self.name} gives two results for one argument; fix its random state first")
-        near, grid = points_near(self._run, x), self._grid(x, y)
+        near = points_near(self._run, x)
         products = [changes(self._run, point) for point in near]
+        if known is not None:  # of the derivative at x itself: a row that does not depend on a column gives exactly 0
+            step, along = self._steps(x), self._product(x, DIFFERENCES)
+            products.insert(0, lambda v: along(step * v.reshape(x.shape)))
+            near.insert(0, x)
         guess = None if grid is None else translated_pattern(products, grid)
-        if guess is not None and self._holds(Coloured(guess, grid, by_rows=False), x, near):
-            return self._coloured
+        if guess is not None:
+            coloured = Coloured(_united(guess, known), grid, by_rows=False)
+            if self._holds(coloured, near):
+                return coloured
         found = find_pattern(products, rows, columns)
-        return Coloured(dense_pattern(rows, columns) if found is None else found, self._grid(x, y), by_rows=False)
+        return Coloured(dense_pattern(rows, columns) if found is None else _united(found, known), grid, by_rows=False)
 
-    @staticmethod
-    def _grid(x, y):
-        return x.shape if x.shape == y.shape else None
+    def _holds(self, coloured, points):
+        """Whether Jacobians on a guessed pattern are found right."""
+        try:
+            return not any(self._misses(self._by_colours(coloured, x, self.way), x, self.way).any() for x in points)
+        except REFUSED:  # not finite so close to an allowed point
+            return False
 
-    def _holds(self, coloured, x, near):
-        """Whether Jacobians on a guessed pattern give every row of a derivative along a random direction."""
-        self._coloured, rng = coloured, np.random.default_rng(4)
-        way = self._choose(x)
-        share, floor = ROWS[way]
-        for point in near:
-            v, product = self._steps(point) * rng.standard_normal(point.shape), self._product(point, way)
-            try:
-                matrix = self._by_colours(point, way)
-                lacks = product(v) - matrix @ v.reshape(-1)
-                size = share * (abs(matrix) @ np.abs(v).reshape(-1))
-                small = ~(np.abs(lacks) <= size)
-                if not np.all(np.abs(lacks) <= size + floor / share * np.max(size)):
-                    return False
-                if np.any(small) and np.any(small & _grows(lacks, v, product, matrix)):
-                    return False
-            except REFUSED:  # not finite so close to an allowed point
-                return False
-        return True
+    # ------------------------------------------------------------ one Jacobian
 
     def _steps(self, x):
         return CENTRAL * np.maximum(np.abs(x), typical(x))
 
     def _product(self, x, way):
-        if way == "complex step":
+        if way == STEP:
             return lambda v: np.ravel(self._run(x + 1j * COMPLEX * v).imag) / COMPLEX
         return lambda v: np.ravel(self._run(x + v) - self._run(x - v)) / 2
 
-    def _by_colours(self, x, way):
-        steps = np.ones_like(x) if way == "complex step" else self._steps(x)
-        product = self._product(x, way)
-        matrix = self._coloured.matrix(lambda v: product(steps * v.reshape(x.shape)))
+    def _by_colours(self, coloured, x, way, share=1.0):
+        steps = np.ones_like(x) if way == STEP else share * self._steps(x)
+        along = self._product(x, way)
+        matrix = coloured.matrix(lambda v: along(steps * v.reshape(x.shape)))
         matrix.data /= steps.reshape(-1)[matrix.indices]
         if not np.all(np.isfinite(matrix.data)):
             raise NonFiniteError(f"{self.name} is not finite close to x; its Jacobian cannot be taken there")
         return matrix
 
+    def _probed(self, coloured, x):
+        """The Jacobian on a pattern, and the rows in which it misses what probes see.
+
+        Rows that the way in use does not get right are taken by central differences, then by shorter ones: next to a
+        kink these see one side of it, and at a kink the mean of both. What no short probe agrees with, as in code with
+        noise, may agree with a longer one.
+        """
+        ways = [(STEP, 1.0)] if self.way == STEP else []
+        ways += [(DIFFERENCES, share) for share in SHARES] if self._derivative != "complex" else []
+        made: dict = {}
+        matrix, wrong = None, np.ones(coloured.pattern.shape[0], dtype=bool)
+        for share, way in product(reversed(SHARES), ways):
+            try:
+                with _strict():
+                    made[way] = made[way] if way in made else self._by_colours(coloured, x, *way)
+                    matrix = made[way] if matrix is None else _with_rows(matrix, made[way], wrong)
+                    wrong &= self._misses(matrix, x, way[0], share)
+            except Exception as error:  # the code takes no complex numbers here, or nothing so far from x
+                trouble = error
+            if not wrong.any():
+                break
+        if matrix is None:
+            raise trouble
+        return matrix, wrong
+
+    def _misses(self, matrix, x, way, share=SHARES[-1]):
+        """Rows in which a Jacobian misses what its own way and a difference see along a direction of this point."""
+        v = share * self._steps(x) * np.random.default_rng(crc32(x.tobytes())).standard_normal(x.shape)
+        return np.any([_lacks(matrix, v, self._product(x, one), one) for one in {way, DIFFERENCES}], axis=0)
+
     def _choose(self, x):
         if self._derivative == "difference":
-            return "central differences"
+            return DIFFERENCES
         if self._derivative == "complex" or self._is_analytic(x):
-            return "complex step"
-        return "central differences"
+            return STEP
+        return DIFFERENCES
 
     def _is_analytic(self, x):
         """Whether a complex step along one direction agrees with a difference; code that drops it gives 0."""
         v = self._steps(x) * np.random.default_rng(1).uniform(0.5, 1.5, x.shape)
-        difference = self._product(x, "central differences")(v)
+        difference = self._product(x, DIFFERENCES)(v)
         try:
-            with np.errstate(all="ignore"), warnings.catch_warnings():
-                # What is cast to real has lost the derivative.
-                warnings.simplefilter("error", np.exceptions.ComplexWarning)
-                step = self._product(x, "complex step")(v)
+            with _strict():
+                step = self._product(x, STEP)(v)
         except Exception:
             return False
-        return _gap(step, difference) <= 1e-5
-
-    def _check(self, matrix, x, y):
-        """The Jacobian against a difference along a direction of its own."""
-        v = np.random.default_rng(2).standard_normal(x.shape)
-        known = self._product(x, "central differences")(self._steps(x) * v)
-        gap = _gap(matrix @ (self._steps(x) * v).reshape(-1), known)
-        if not gap <= AGREES[self.way]:
-            self._coloured = None
-            raise DerivativeError(
-                f"the Jacobian of {self.name} by {self.way} differs by {gap:.1e} from a difference along a random "
-                "direction; its sparsity lacks entries, or it has a kink at x: give sparsity, or "
-                "derivative='difference'"
-            )
+        size = float(np.linalg.norm(difference))
+        return np.linalg.norm(step - difference) <= 1e-5 * size
 
 
-def _grows(lacks, v, product, matrix):
+@contextmanager
+def _strict():
+    """What is cast to real has lost the derivative."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("error", np.exceptions.ComplexWarning)
+        yield
+
+
+def _united(pattern, known):
+    """A pattern, and the entries of one from before."""
+    if known is None:
+        return pattern
+    both = (pattern + known).tocoo()
+    return pattern_of(both.row, both.col, both.shape)
+
+
+def _with_rows(matrix, other, rows):
+    """A matrix with these rows from another one on the same pattern."""
+    entries = np.repeat(rows, np.diff(matrix.indptr))
+    return sp.csr_array((np.where(entries, other.data, matrix.data), matrix.indices, matrix.indptr), matrix.shape)
+
+
+def _lacks(matrix, v, along, way):
+    """Rows in which a matrix lacks something of the product along v."""
+    lacks = along(v) - matrix @ v.reshape(-1)
+    size = abs(matrix) @ np.abs(v).reshape(-1)
+    share, floor = MOST[way]
+    wrong = ~(np.abs(lacks) <= share * size + floor * np.max(size, initial=0.0))
+    doubtful = ~wrong & (np.abs(lacks) > GROWS * size) if way == DIFFERENCES else wrong
+    return wrong | (doubtful & _grows(lacks, v, along, matrix)) if doubtful.any() else wrong
+
+
+def _grows(lacks, v, along, matrix):
     """Which rows lack something in proportion to the step: entries, however small. What rounding makes does not grow.
 
     A row may be far smaller than the largest, as one of other units is.
     """
-    gaps = [product(times * v) - times * (matrix @ v.reshape(-1)) - times * lacks for times in TIMES]
-    return np.all([np.abs(gap) <= 0.1 * np.abs(lacks) for gap in gaps], axis=0) & (lacks != 0)
-
-
-def _gap(found, known):
-    size = float(np.linalg.norm(known))
-    return float(np.linalg.norm(found - known)) / size if size else float(np.linalg.norm(found) > 0)
+    gaps = [along(times * v) - times * (matrix @ v.reshape(-1)) - times * lacks for times in TIMES]
+    return np.all([~(np.abs(gap) > 0.1 * np.abs(lacks)) for gap in gaps], axis=0) & (lacks != 0)

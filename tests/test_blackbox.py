@@ -43,7 +43,7 @@ def test_a_step_of_foreign_code(rng, f, way, runs, digits):
     assert step.way.startswith(way) and step.jacobian(x).nnz == 6 * 8192
     before = step.runs
     step.jacobian(x + 1)
-    assert step.runs - before <= runs + 1
+    assert step.runs - before <= runs + 4  # itself, and the probes
     assert re.search(r"Jacobian 8192 x 8192 with 49152 entries from \d+ runs instead of 8192, by " + way, str(step))
 
 
