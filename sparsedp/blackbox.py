@@ -18,7 +18,7 @@ from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.probing import REFUSED, changes, points_near, typical
 from sparsedp.solvers.sparsity import dense_pattern, find_pattern, pattern_of
 from sparsedp.solvers.translates import translated_pattern
-from sparsedp.tape import Rule, differentiable, plain
+from sparsedp.tape import Rule, plain
 from sparsedp.tree import copied
 
 __all__ = ["Adopted", "adopt"]
@@ -112,9 +112,9 @@ class Adopted:
         self._coloured: Any = None
         self._points, self._alone = Kept(), RLock()  # foreign code may work in arrays of its own: one thread at a time
         direct: Rule
-        transposed = differentiable(f"{name}.T", self._back, self._only_in_g(lambda h, x: direct(h, x)))
-        direct = differentiable(f"{name}.J", self._along, self._only_in_g(lambda h, x: transposed(h, x)))
-        self._rule = differentiable(
+        transposed = Rule(f"{name}.T", self._back, self._only_in_g(lambda h, x: direct(h, x)))
+        direct = Rule(f"{name}.J", self._along, self._only_in_g(lambda h, x: transposed(h, x)))
+        self._rule = Rule(
             name,
             self._run,
             lambda nums, y, x: lambda g: (transposed(g, x),),

@@ -8,7 +8,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.tape import differentiable, dtype_of, isbox, linear, plain
+from sparsedp.tape import Rule, dtype_of, isbox, linear, plain
 
 __all__ = ["Space", "fits"]
 
@@ -210,4 +210,4 @@ def _join_jvp(nums, tangents, ans, space, *parts):
     return space.join(*(moved.get(num, np.zeros_like(plain(part))) for num, part in enumerate(parts, 1)))
 
 
-_join = differentiable("join", _joined, _join_vjp, _join_jvp)
+_join = Rule("join", _joined, _join_vjp, _join_jvp)

@@ -49,7 +49,8 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     -------
     Rule
         Call it like `forward`. `vjp` and `jvp` use `ans`, `args` and `g` only through other rules, Operators or
-        autograd.numpy: then derivatives of every order follow.
+        autograd.numpy: then derivatives of every order follow. What the three functions return is copied: each may
+        return one array of its own again and again.
 
     Raises
     ------
@@ -69,15 +70,35 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     >>> value_and_grad(cube)(2.0)
     (8.0, 12.0)
     """
-    return Rule(name, forward, vjp, jvp, tuple(keywords))
+    rule = Rule(name, _fresh(forward), vjp and _fresh_pull(vjp), jvp and _fresh(jvp), tuple(keywords))
+    rule._signature = inspect.signature(forward)
+    return rule
+
+
+def _fresh(function):
+    """A function of the user, whose results are copied: it may write into the arrays that it has returned."""
+
+    def act(*args):
+        result = function(*args)
+        return tuple(map(_copied, result)) if isinstance(result, (tuple, list)) else _copied(result)
+
+    return act
+
+
+def _fresh_pull(vjp):
+    return lambda *args: _fresh(vjp(*args))
+
+
+def _copied(value):
+    return value.copy() if isinstance(value, np.ndarray) else value
 
 
 class Rule:
-    """A function with hand-written derivatives. Made by `differentiable`."""
+    """A function with hand-written derivatives whose results are fresh arrays. Users make one with `differentiable`."""
 
     __slots__ = ("_signature", "forward", "jvp", "keywords", "name", "vjp")
 
-    def __init__(self, name, forward, vjp, jvp, keywords):
+    def __init__(self, name, forward, vjp=None, jvp=None, keywords=()):
         self.name = name
         self.forward = forward
         self.vjp = vjp
@@ -216,8 +237,8 @@ def linear(name, forward, transpose):
     >>> double(4.0)
     8.0
     """
-    there = Rule(name, forward, None, None, ())
-    back = Rule(f"{name}.T", transpose, None, None, ())
+    there = Rule(name, forward)
+    back = Rule(f"{name}.T", transpose)
     _set_linear(there, back)
     _set_linear(back, there)
     return there, back

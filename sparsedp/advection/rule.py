@@ -6,7 +6,7 @@ from sparsedp.advection.law import FIELD, INFLOW, Finite
 from sparsedp.advection.values import LETTERS, prepare, raised, result_like, unflatten
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import check_finite, surely_finite
-from sparsedp.tape import differentiable, isbox, linear, plain
+from sparsedp.tape import Rule, isbox, linear, plain
 
 __all__ = ["rule_of"]
 
@@ -39,7 +39,7 @@ def rule_of(law):
         _check_slope(law, "the tangent", found, tangents)
         return unflatten(ans, found)
 
-    return differentiable(name, forward, vjp, jvp)
+    return Rule(name, forward, vjp, jvp)
 
 
 def _check_slope(law, what, slope, given):

@@ -19,7 +19,7 @@ from sparsedp.structure.explicit import Matrix
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Mask
-from sparsedp.tape import differentiable
+from sparsedp.tape import Rule
 
 __all__ = ["convection", "face_laplacian", "face_lift"]
 
@@ -193,7 +193,7 @@ def _bilinear(name, A, B, C):
     def jvp(nums, tangents, ans, v, w):
         return C(sum(A(v) * B(t) if num else A(t) * B(w) for num, t in zip(nums, tangents, strict=True)))
 
-    return differentiable(name, lambda v, w: C(A(v) * B(w)), vjp, jvp)
+    return Rule(name, lambda v, w: C(A(v) * B(w)), vjp, jvp)
 
 
 # ------------------------------------------------------------ the factors

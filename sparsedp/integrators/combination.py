@@ -5,7 +5,7 @@ import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import frozen as frozen_array
-from sparsedp.tape import cast, differentiable, dtype_of, is_variable, isbox, plain
+from sparsedp.tape import Rule, cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["combine", "frozen", "like", "untraced"]
@@ -88,7 +88,7 @@ def _real_as(g, value):
     return anp.real(g) if dtype_of(g).kind == "c" != dtype_of(value).kind else g
 
 
-SUM = differentiable("stages", _total, _total_vjp, _total_jvp)
+SUM = Rule("stages", _total, _total_vjp, _total_jvp)
 
 
 def _words(shapes):

@@ -20,7 +20,7 @@ import numpy as np
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.solvers.separable import spectrum
 from sparsedp.solvers.spectral import SpectralFunction
-from sparsedp.tape import cast, differentiable, dtype_of, isbox
+from sparsedp.tape import Rule, cast, dtype_of, isbox
 
 __all__ = ["Function", "Functions", "phi"]
 
@@ -190,7 +190,7 @@ class Functions:
                 total = total + self._known(chosen, transposed)(z, *(t for _, t in pairs))
             return total
 
-        return differentiable(f"{self.name}.phi.T" if transposed else f"{self.name}.phi", forward, vjp, jvp)
+        return Rule(f"{self.name}.phi.T" if transposed else f"{self.name}.phi", forward, vjp, jvp)
 
 
 def _diagonalised(op, name):

@@ -59,12 +59,14 @@ class Problem:
         return combine(parts[0], (1.0, parts[1])) if len(parts) == 2 else parts[0] if parts else None
 
     def explicit(self, u, params, t):
-        """The rate alone, or None."""
-        return None if self.rate is None else _unchanged(self.rate, u, (params, t) if self.driven else (params,))
+        """The rate alone, or None; a copy: it may write into the array that it returned before."""
+        if self.rate is None:
+            return None
+        return copied(_unchanged(self.rate, u, (params, t) if self.driven else (params,)))
 
     def given(self, params, t):
         """The source alone, or None."""
-        return None if self.source is None else self.source(*((params, t) if self.moving else (params,)))
+        return None if self.source is None else copied(self.source(*((params, t) if self.moving else (params,))))
 
     def __call__(self, u, params, t):
         """The whole right-hand side."""

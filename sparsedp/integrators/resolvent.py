@@ -23,7 +23,7 @@ from sparsedp.solvers.choose import build
 from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.record import SolveLog
 from sparsedp.solvers.system import System
-from sparsedp.tape import cast, differentiable, dtype_of
+from sparsedp.tape import Rule, cast, dtype_of
 
 __all__ = ["Resolvent"]
 
@@ -105,7 +105,7 @@ class Resolvent:
         def forward(z, b):
             return self._solved(z, b, transposed, checked)
 
-        return differentiable(f"{self.name}.solve.T" if transposed else f"{self.name}.solve", forward, vjp, jvp)
+        return Rule(f"{self.name}.solve.T" if transposed else f"{self.name}.solve", forward, vjp, jvp)
 
     def inverse(self, z):
         """The inverse of 1 - z L: kept or set up."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.kernels.correlation import correlate, fold, pad, weigh
-from sparsedp.tape import Rule, differentiable, plain
+from sparsedp.tape import Rule, plain
 
 __all__ = ["check_widths", "convolution"]
 
@@ -127,7 +127,7 @@ def _jvp(nums, tangents, y, x, weight, bias, padding):
     return total
 
 
-_convolution = differentiable("convolution", _forward, _vjp, _jvp)
+_convolution = Rule("convolution", _forward, _vjp, _jvp)
 
 
 def _two(name, forward, first, second):
@@ -142,7 +142,7 @@ def _two(name, forward, first, second):
         parts += [rule(a, given[1], *static)] if 1 in given else []
         return sum(parts[1:], parts[0])
 
-    rule = differentiable(name, forward, vjp, jvp)
+    rule = Rule(name, forward, vjp, jvp)
     return rule
 
 

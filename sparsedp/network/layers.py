@@ -5,7 +5,7 @@ import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.network.filters import convolution, weight_and_bias
-from sparsedp.tape import differentiable, plain
+from sparsedp.tape import Rule, plain
 
 __all__ = ["dense", "relu", "residual_block", "softplus", "tanh"]
 
@@ -73,7 +73,7 @@ def _jvp(nums, tangents, y, x, weight, bias):
     return sum(found[1:], found[0])
 
 
-_dense = differentiable("dense", _forward, _vjp, _jvp)
+_dense = Rule("dense", _forward, _vjp, _jvp)
 
 
 def _activation(name, forward, slope):
@@ -85,7 +85,7 @@ def _activation(name, forward, slope):
     def jvp(nums, tangents, y, x):
         return tangents[0] * slope(x, y)
 
-    return differentiable(name, forward, vjp, jvp)
+    return Rule(name, forward, vjp, jvp)
 
 
 _TANH = _activation("tanh", np.tanh, lambda x, y: 1.0 - y * y)

@@ -17,7 +17,7 @@ from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, cell_beside
 from sparsedp.structure.kronecker import Kronecker
-from sparsedp.tape import differentiable, plain
+from sparsedp.tape import Rule, plain
 
 __all__ = ["harmonic_average"]
 
@@ -106,4 +106,4 @@ def _pair_rule(share):
         both = slopes(low, high)
         return sum(both[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
 
-    return differentiable("harmonic_average", forward, vjp, jvp)
+    return Rule("harmonic_average", forward, vjp, jvp)

@@ -23,7 +23,7 @@ from sparsedp.solvers.choose import build, check_settings
 from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.record import SolveLog
 from sparsedp.space import Space
-from sparsedp.tape import cast, differentiable, dtype_of, isbox, plain
+from sparsedp.tape import Rule, cast, dtype_of, isbox, plain
 from sparsedp.tree import copied
 
 __all__ = ["MatrixSolver", "matrix_solver"]
@@ -178,7 +178,7 @@ class MatrixSolver:
             total = sum(change[num](t) for num, t in zip(nums, tangents, strict=True))
             return (self._adjoint if transposed else self._free)(data, total)
 
-        return differentiable(f"{self.name}.T" if transposed else self.name, forward, vjp, jvp)
+        return Rule(f"{self.name}.T" if transposed else self.name, forward, vjp, jvp)
 
     # ------------------------------------------------------------ set-up
 

@@ -29,7 +29,7 @@ from sparsedp.solvers.record import SolveLog
 from sparsedp.space import fits
 from sparsedp.structure.base import Structure
 from sparsedp.structure.lazy import Chain, Diagonal
-from sparsedp.tape import cast, differentiable, dtype_of, isbox, plain
+from sparsedp.tape import Rule, cast, dtype_of, isbox, plain
 from sparsedp.tree import copied
 
 __all__ = ["EllipticSolver", "elliptic_solver"]
@@ -176,7 +176,7 @@ class EllipticSolver:
             total = sum(change[num](t) for num, t in zip(nums, tangents, strict=True))
             return self._rule(transposed)(k, total, shift)
 
-        return differentiable("elliptic_solver.T" if transposed else "elliptic_solver", forward, vjp, jvp)
+        return Rule("elliptic_solver.T" if transposed else "elliptic_solver", forward, vjp, jvp)
 
     # ------------------------------------------------------------ set-up
 

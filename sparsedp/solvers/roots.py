@@ -25,7 +25,7 @@ from sparsedp.solvers.equation import Equation, Layout, vary
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Newton
 from sparsedp.solvers.record import Run, SolveLog
-from sparsedp.tape import differentiable
+from sparsedp.tape import Rule
 from sparsedp.tree import copied
 
 __all__ = ["Root", "implicit"]
@@ -128,9 +128,9 @@ class Root:
         self._series: dict = {}  # by thread, inside `series`: size -> Jacobian of the last solve
         self._answers: dict = {}  # by thread, inside `answered`: the root
         self._jacobians = Jacobians(self.name, jacobian, sparsity, dict(rtol=rtol, maxiter=None, **settings))
-        self._solution = differentiable(self.name, self._newton, self._vjp, self._jvp)
+        self._solution = Rule(self.name, self._newton, self._vjp, self._jvp)
         self._linear = [
-            differentiable(f"{self.name}{suffix}", *self._linear_rule(transposed))
+            Rule(f"{self.name}{suffix}", *self._linear_rule(transposed))
             for suffix, transposed in ((".tangent", False), (".T", True))
         ]
 

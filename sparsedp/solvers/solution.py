@@ -10,7 +10,7 @@ from sparsedp.fields import field_array
 from sparsedp.operator import Operator
 from sparsedp.solvers.contract import Solver
 from sparsedp.structure.base import Structure, result_dtype
-from sparsedp.tape import differentiable, isbox
+from sparsedp.tape import Rule, isbox
 
 __all__ = ["Inverse"]
 
@@ -142,7 +142,7 @@ class Inverse(Operator):
         def jvp(nums, tangents, ans, b, start):
             return sum(self.tangent(t) if num == 0 else 0.0 * t for num, t in zip(nums, tangents, strict=True))
 
-        return differentiable(self.name, self._solve_from, vjp, jvp)
+        return Rule(self.name, self._solve_from, vjp, jvp)
 
     # ------------------------------------------------------------ words
 

@@ -11,7 +11,7 @@ from sparsedp.errors import DerivativeError
 from sparsedp.fields import frozen
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.traces import reverse_root, split_box, trace
-from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask
+from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, still
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["All", "Each", "Last", "marked"]
@@ -217,7 +217,7 @@ class _EachCollector:
         places = [self._store(leaf) if is_variable(leaf) else None for leaf in found]
         if self._stored:
             self._keep.compare(i, [marked(leaf) for leaf, place in zip(found, places, strict=True) if place])
-        found = [None if place else leaf for leaf, place in zip(found, places, strict=True)]
+        found = still([None if place else leaf for leaf, place in zip(found, places, strict=True)])
         self._trees.append((flatten(rebuild(found))[1], found, places))
         return values
 

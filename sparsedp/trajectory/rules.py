@@ -11,7 +11,7 @@ dual step, which carries a tangent beside every state. Then
 since B is linear in g and <c, B(z, g)> = <g, R'(z) c>.
 """
 
-from sparsedp.tape import differentiable, isbox, plain
+from sparsedp.tape import Rule, isbox, plain
 from sparsedp.trajectory.duality import dual
 from sparsedp.trajectory.layout import dense
 
@@ -119,5 +119,5 @@ def _second(twin, numbers, moved, g):
     return dict(zip(numbers, _list(found, len(numbers)), strict=True))
 
 
-rollout_rule = differentiable("rollout", _forward, _vjp, _jvp)
-pull_rule = differentiable("rollout.T", _pull_forward, _pull_vjp, _pull_jvp)
+rollout_rule = Rule("rollout", _forward, _vjp, _jvp)
+pull_rule = Rule("rollout.T", _pull_forward, _pull_vjp, _pull_jvp)
