@@ -13,6 +13,7 @@ import scipy.sparse as sp
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite
 from sparsedp.ledger import active, count
+from sparsedp.recipe import Remade
 from sparsedp.solvers.colouring import Coloured
 from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.probing import REFUSED, changes, points_near, typical
@@ -94,7 +95,7 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     return Adopted(f, copied(sparsity), derivative, name or getattr(f, "__name__", "simulator"))
 
 
-class Adopted:
+class Adopted(Remade):
     """A foreign function with a sparse Jacobian, kept for the last two points. Made by `adopt`.
 
     Attributes
@@ -105,11 +106,13 @@ class Adopted:
         STEP or DIFFERENCES; empty before the first derivative.
     """
 
-    def __init__(self, f, sparsity, derivative, name):
+    _shapes: Any
+    _coloured: Any
+
+    def __init__(self, f, sparsity, derivative, name, found=(None, "", None)):
         self._f, self._sparsity, self._derivative, self.name = f, sparsity, derivative, name
-        self.runs, self.way = 0, ""
-        self._shapes: Any = None
-        self._coloured: Any = None
+        self._shapes, self.way, self._coloured = found
+        self.runs = 0
         self._points, self._alone = Kept(), RLock()  # foreign code may work in arrays of its own: one thread at a time
         direct: Rule
         transposed = Rule(f"{name}.T", self._back, self._only_in_g(lambda h, x: direct(h, x)))
@@ -120,6 +123,11 @@ class Adopted:
             lambda nums, y, x: lambda g: (transposed(g, x),),
             lambda nums, tangents, y, x: direct(tangents[0], x),
         )
+
+    def recipe(self):
+        # The pattern found so far travels too: it took many runs.
+        found = self._shapes, self.way, self._coloured
+        return Adopted, (self._f, self._sparsity, self._derivative, self.name, found)
 
     def __call__(self, x):
         return self._rule(x)

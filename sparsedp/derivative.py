@@ -8,6 +8,7 @@ import numpy as np
 from sparsedp.constants import is_fixed
 from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.fields import check_function
+from sparsedp.recipe import Made
 from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
 from sparsedp.traces import backward, forward_root, reverse_root, split_box, trace
 from sparsedp.tree import flatten, leaves
@@ -238,4 +239,4 @@ def value_and_grad(loss):
             )
         return value if isbox(value) else float(value), pull(1.0)
 
-    return evaluate
+    return Made(evaluate, value_and_grad, loss)

@@ -16,13 +16,14 @@ from math import prod
 import numpy as np
 
 from sparsedp.errors import ShapeError
+from sparsedp.recipe import Uncached
 from sparsedp.space import Space
 from sparsedp.spacing import AXES, cell_widths, finite_number, flag, lengths, node_axes, per_axis
 
 __all__ = ["Grid", "check_grid"]
 
 
-class Grid:
+class Grid(Uncached):
     """A box of cells in 1-D, 2-D or 3-D, with uniform or stretched spacing. Frozen, equal by value.
 
     Parameters

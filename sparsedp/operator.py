@@ -10,6 +10,7 @@ from sparsedp import kernels
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_out, field_array
 from sparsedp.ledger import active
+from sparsedp.recipe import Remade
 from sparsedp.space import Space, fits
 from sparsedp.structure import algebra
 from sparsedp.structure.base import Structure, result_dtype
@@ -24,7 +25,7 @@ EXPLICIT_BELOW_COMPILED = 4608
 EXPLICIT_BELOW_PLAIN = 262144
 
 
-class Operator:
+class Operator(Remade):
     """A constant linear map from fields on `domain` to fields on `codomain`. Frozen.
 
     Make one with a builder (`gradient`, `from_matrix`, ...), combine with ``@ + - *``, apply with
@@ -72,8 +73,11 @@ class Operator:
     def __setattr__(self, name, value):
         raise AttributeError(f"Operator is frozen; make a new one instead of setting {name}")
 
-    def __reduce__(self):
-        return Operator, (self.structure, self.domain, self.codomain, self.name, self.form)
+    def recipe(self):
+        given = self.structure, self.domain, self.codomain, self.name, self.form
+        if self.form == "matrix-free" or "_origin" not in self.__dict__ or isinstance(self.structure, Matrix):
+            return Operator, given
+        return _with_matrix, (self._matrix_structure, *given)  # turned from that of its origin, which stays behind
 
     # ------------------------------------------------------------ application
 
@@ -284,6 +288,12 @@ class Operator:
 
     def __repr__(self):
         return f"<{self.name}: {self.domain} -> {self.codomain}, {self.form}>"
+
+
+def _with_matrix(matrix, *given):
+    op = Operator(*given)
+    op.__dict__["_matrix_structure"] = matrix
+    return op
 
 
 def _chosen_form(structure):

@@ -8,12 +8,13 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.recipe import Uncached
 from sparsedp.tape import Rule, dtype_of, isbox, linear, plain
 
 __all__ = ["Space", "fits"]
 
 
-class Space:
+class Space(Uncached):
     """The place of a field: the cells, faces, nodes or edges of a grid, or a plain shape.
 
     Parameters
@@ -136,9 +137,6 @@ class Space:
         """The rules of `split`: one for each component."""
         spans = zip(self.offsets, self.offsets[1:], self.parts, strict=False)
         return [_part(self.kind, self.shape, *span) for span in spans]
-
-    def __getstate__(self):
-        return {name: getattr(self, name) for name in ("shape", "kind", "grid", "parts")}  # without what is derived
 
     def __eq__(self, other):
         if not isinstance(other, Space):

@@ -17,6 +17,7 @@ from autograd.tracer import box_types, getval, isbox, new_box
 from sparsedp.constants import constant_args, sparing
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, tell, timed
+from sparsedp.recipe import Remade
 from sparsedp.shortcuts import direct
 from sparsedp.tree import leaves
 
@@ -70,7 +71,10 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     >>> value_and_grad(cube)(2.0)
     (8.0, 12.0)
     """
-    rule = Rule(name, _fresh(forward), vjp and _fresh_pull(vjp), jvp and _fresh(jvp), tuple(keywords))
+    given = name, forward, vjp, jvp, tuple(keywords)
+    rule = Rule(
+        name, _fresh(forward), vjp and _fresh_pull(vjp), jvp and _fresh(jvp), given[-1], (differentiable, given)
+    )
     rule._signature = inspect.signature(forward)
     return rule
 
@@ -93,18 +97,22 @@ def _copied(value):
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
-class Rule:
+class Rule(Remade):
     """A function with hand-written derivatives whose results are fresh arrays. Users make one with `differentiable`."""
 
-    __slots__ = ("_signature", "forward", "jvp", "keywords", "name", "vjp")
+    __slots__ = ("_signature", "forward", "jvp", "keywords", "made", "name", "vjp")
 
-    def __init__(self, name, forward, vjp=None, jvp=None, keywords=()):
+    def __init__(self, name, forward, vjp=None, jvp=None, keywords=(), made=None):
         self.name = name
         self.forward = forward
         self.vjp = vjp
         self.jvp = jvp
         self.keywords = keywords
+        self.made = made or (Rule, (name, forward, vjp, jvp, keywords))  # see recipe.py
         self._signature = _signature(forward)
+
+    def recipe(self):
+        return self.made
 
     def __call__(self, *args, **options):
         if self.keywords or options:

@@ -20,6 +20,7 @@ FLOORS = [
     ("tree", 0),
     ("ledger", 0),
     ("files", 0),
+    ("recipe", 0),
     ("traces", 1),
     ("tape", 1),
     ("kernels", 1),

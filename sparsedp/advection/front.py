@@ -16,6 +16,7 @@ from sparsedp.errors import DerivativeError
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid
+from sparsedp.recipe import Remade
 from sparsedp.structure.explicit import Matrix
 from sparsedp.tape import Rule, isbox
 
@@ -144,7 +145,7 @@ def _sides(grid, boundary):
     return sides
 
 
-class Transport:
+class Transport(Remade):
     """One time step of transport, made by `transport`. Call it: ``move(u, v, dt, inflow=0.0)``. Frozen."""
 
     setting: Setting
@@ -158,7 +159,7 @@ class Transport:
     def __setattr__(self, name, value):
         raise AttributeError(f"Transport is frozen; make a new one instead of setting {name}")
 
-    def __reduce__(self):
+    def recipe(self):
         return Transport, (self.setting,)
 
     def __call__(self, u, v, dt, inflow=0.0):

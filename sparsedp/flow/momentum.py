@@ -5,6 +5,8 @@ hold the wall values; along the other axes it is a field between walls half a ce
 fluid does there is a condition: no_slip and inflow are dirichlet, free_slip and outflow neumann.
 """
 
+from copy import deepcopy
+
 import numpy as np
 import scipy.sparse as sp
 
@@ -177,11 +179,11 @@ def convection(grid, boundary="no_slip", solid=None):
     A = Operator(Kronecker(flux, faces.parts, carried), faces, sites, "carried")
     B = Operator(Kronecker(flux, faces.parts, carrier), faces, sites, "carrier")
     C = Operator(compose(free, Kronecker(faces.parts, flux, gain)), sites, faces, "gain")
-    return _bilinear("convection", A, B, C)
+    return _bilinear("convection", A, B, C, (convection, (grid, deepcopy(boundary), deepcopy(solid))))
 
 
-def _bilinear(name, A, B, C):
-    """The rule of C((A v) (B w))."""
+def _bilinear(name, A, B, C, made):
+    """The rule of C((A v) (B w)), and what makes it again."""
 
     def vjp(nums, ans, v, w):
         def pull(g):
@@ -193,7 +195,7 @@ def _bilinear(name, A, B, C):
     def jvp(nums, tangents, ans, v, w):
         return C(sum(A(v) * B(t) if num else A(t) * B(w) for num, t in zip(nums, tangents, strict=True)))
 
-    return Rule(name, lambda v, w: C(A(v) * B(w)), vjp, jvp)
+    return Rule(name, lambda v, w: C(A(v) * B(w)), vjp, jvp, made=made)
 
 
 # ------------------------------------------------------------ the factors

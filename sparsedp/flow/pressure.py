@@ -88,8 +88,8 @@ class Projection(Operator):
         faces = setup.grid.faces
         super().__init__(Projected(setup), faces, faces, "projection", "matrix-free")
 
-    def __reduce__(self):
-        return _remade, self.structure.setup.recipe
+    def recipe(self):
+        return Projection, (self.structure.setup,)
 
     @property
     def info(self):
@@ -127,7 +127,3 @@ class Projection(Operator):
 
     def __str__(self):
         return str(self.structure.setup.inverse)
-
-
-def _remade(grid, solid, boundary, settings):
-    return Projection(Setup(grid, solid, boundary, settings))

@@ -9,6 +9,7 @@ from sparsedp.flow.walls import CLOSED, flow_sides, pressure_conditions
 from sparsedp.grid import Grid
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.difference import divergence, gradient
+from sparsedp.recipe import Remade
 from sparsedp.solvers.choose import build
 from sparsedp.solvers.facts import magnitude
 from sparsedp.solvers.scaling import largest
@@ -19,7 +20,7 @@ EPS = np.finfo(float).eps
 FEW = 1024  # cells below which transforms are tried even where `inverse` would factor
 
 
-class Setup:
+class Setup(Remade):
     """What a projection needs: the faces that are closed, D, G, and the inverse of A = -D G.
 
     The grid is one of lengths near 1: P does not depend on the unit of length, while squares of
@@ -30,7 +31,7 @@ class Setup:
         self.grid, self.sides = grid, flow_sides(grid, boundary)
         self.solid = None if solid is None else check_solid(grid, solid).copy()
         words = {axis: pair for axis, pair in zip(grid.axes, self.sides, strict=True) if pair}
-        self.recipe = grid, self.solid, words, settings  # nothing that the caller may change
+        self.made = grid, self.solid, words, settings  # nothing that the caller may change
         self.exponent = int(np.frexp(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))[1])
         near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
         self.D = divergence(near)
@@ -48,6 +49,9 @@ class Setup:
         self.reach = tuple(largest(magnitude(first)(np.ones(grid.faces.size))) for first in self.firsts)
         fast = self.solver.engine.method == "separable" and self.grid.cells.size > 0
         self.passes = self._make_passes() if fast else None
+
+    def recipe(self):
+        return Setup, self.made
 
     def _make_passes(self):
         """The forward pair of passes, and the transposed one; None where they are not what the operators do."""

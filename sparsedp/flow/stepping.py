@@ -21,6 +21,7 @@ from sparsedp.flow.pressure import projection
 from sparsedp.flow.walls import flow_sides, pressure_conditions
 from sparsedp.operators.boundary import identity, mask
 from sparsedp.operators.difference import gradient
+from sparsedp.recipe import Remade
 from sparsedp.solvers.choose import inverse
 from sparsedp.tape import isbox, plain
 from sparsedp.tree import copied
@@ -127,12 +128,14 @@ def _check_constant(name, number, least):
         raise NonFiniteError(f"flow_step needs a finite {name}, got {number}; write a number")
 
 
-class FlowStep:
+class FlowStep(Remade):
     """A step of incompressible flow, made by `flow_step`. What the scene does not need is None."""
 
     def __init__(self, grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary):
         self.grid, self.dt, self.viscosity = grid, dt, viscosity
         self.project = projection(grid, solid, boundary)
+        _, solid, boundary, _ = self.project.structure.setup.made  # copies: the caller may change these
+        self.made = grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
         self.pressure = self.project.pressure
         self.slope = gradient(grid, pressure_conditions(flow_sides(grid, boundary)), solid)
         self.kept = mask(grid.faces, self.project.structure.setup.open)
@@ -147,6 +150,9 @@ class FlowStep:
         explicit = viscosity and self.relax is None
         self.viscous: Any = Viscous(self.laplacian, self.walls, viscosity, dt) if explicit else None
         self.acceleration = Acceleration(grid.faces, self.convect, force, self.viscous)
+
+    def recipe(self):
+        return FlowStep, self.made
 
     def start(self, v, params=None):
         """Velocity -> the first state: made incompressible, the pressure still unknown."""

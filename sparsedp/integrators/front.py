@@ -1,5 +1,7 @@
 """stepper(): a rate of change and a method -> a step for time loops."""
 
+from copy import deepcopy
+
 from sparsedp.fields import is_number
 from sparsedp.integrators.adaptive import Adaptive
 from sparsedp.integrators.explicit import EXPLICIT, Explicit
@@ -122,6 +124,11 @@ def stepper(
     check_settings(solver, rtol, maxiter, "raise")
     if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
         raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
+    given = dict(
+        linear=linear, source=source, timed=timed, tolerance=tolerance, floor=deepcopy(floor), unstable=unstable
+    )
+    given |= dict(jacobian=jacobian, solver=solver, rtol=rtol, maxiter=maxiter, **options)
+    made = _remade, (method, rate, dt, given)
     problem = posed(rate, linear, source, timed)
     settings, options = dict(method=solver, rtol=float(rtol), nullspace="raise"), copied(options)
     scheme = _scheme(method, problem, jacobian, settings, maxiter, options, KEPT[tolerance is not None])
@@ -133,7 +140,11 @@ def stepper(
     dt = dt if callable(dt) else positive(dt, "dt")
     bare = problem.whole and source is None and tolerance is None and isinstance(dt, float)
     kind = LinearStep if bare else NonlinearStep if _ends_known(scheme, problem) else Step
-    return kind(method, problem, dt, scheme, limit)
+    return kind(method, problem, dt, scheme, limit, made)
+
+
+def _remade(method, rate, dt, given):
+    return stepper(method, rate, dt, **given)
 
 
 def _ends_known(scheme, problem):

@@ -8,13 +8,14 @@ from sparsedp.errors import NonFiniteError
 from sparsedp.fields import check_finite
 from sparsedp.integrators.combination import like
 from sparsedp.integrators.problem import positive
+from sparsedp.recipe import Remade
 from sparsedp.tape import is_variable, plain
 from sparsedp.tree import leaves
 
 __all__ = ["Step"]
 
 
-class Step:
+class Step(Remade):
     """step(state, params): the state after a time dt. Made by `stepper`.
 
     Parameters
@@ -26,6 +27,8 @@ class Step:
         ``scheme(u, params, t, h)``: the state after a step h.
     limit : Limit or None
         Of explicit steps.
+    made : (function, arguments)
+        What makes the same step again.
 
     Attributes
     ----------
@@ -37,9 +40,12 @@ class Step:
         With error control: the accepted lengths of the last interval, as shares of it.
     """
 
-    def __init__(self, method, problem, dt, scheme, limit):
+    def __init__(self, method, problem, dt, scheme, limit, made):
         self.method, self.problem, self.dt, self.scheme, self.limit = method, problem, dt, scheme, limit
-        self.name = f"stepper({method})"
+        self.name, self.made = f"stepper({method})", made
+
+    def recipe(self):
+        return self.made
 
     @property
     def order(self):

@@ -1,5 +1,7 @@
 """Operators that the user brings: a matrix, a LinearOperator, or two functions."""
 
+from functools import partial
+
 import numpy as np
 import scipy.sparse as sp
 
@@ -113,17 +115,20 @@ def from_linear_operator(linop, domain=None, codomain=None, name="operator"):
         raise TypeError(f"from_linear_operator takes a LinearOperator, got {type(linop).__name__}; write dp.{instead}")
     rows, columns = linop.shape
 
-    def forward(x):
-        return np.asarray(linop.matvec(x.reshape(-1)))
-
-    def backward(g):
-        try:
-            return np.conj(np.asarray(linop.rmatvec(np.conj(g.reshape(-1)))))
-        except (NotImplementedError, TypeError, AttributeError):
-            raise DerivativeError(f"{name} has no transpose: its LinearOperator lacks rmatvec; give it one") from None
-
+    forward, backward = partial(_product, linop), partial(_transposed_product, linop, name)
     structure = Functions(forward, backward, (columns,), (rows,), _kind(getattr(linop, "dtype", None)))
     return Operator(structure, _space(domain, columns), _space(codomain, rows), name)
+
+
+def _product(linop, x):
+    return np.asarray(linop.matvec(x.reshape(-1)))
+
+
+def _transposed_product(linop, name, g):
+    try:
+        return np.conj(np.asarray(linop.rmatvec(np.conj(g.reshape(-1)))))
+    except (NotImplementedError, TypeError, AttributeError):
+        raise DerivativeError(f"{name} has no transpose: its LinearOperator lacks rmatvec; give it one") from None
 
 
 def from_functions(forward, transpose, domain, codomain, name="operator", dtype=float):

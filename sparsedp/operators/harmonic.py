@@ -16,6 +16,7 @@ from sparsedp.fields import check_finite
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, cell_beside
+from sparsedp.recipe import Made
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.tape import Rule, plain
 
@@ -68,7 +69,7 @@ def harmonic_average(grid):
             raise ValueError(f"harmonic_average needs a coefficient >= 0, got {np.min(values):g}")
         return pair(below(k), above(k))
 
-    return average
+    return Made(average, harmonic_average, grid)
 
 
 def _beside(grid, upper):

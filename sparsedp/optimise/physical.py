@@ -73,7 +73,9 @@ def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
 
         return pull
 
-    return differentiable(name, physics, vjp)
+    rule = differentiable(name, physics, vjp)
+    rule.made = physical_gradient, (physics, inverse, rate, name)
+    return rule
 
 
 class PhysicalGradient:

@@ -134,8 +134,8 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
         count(name, "setup")
         count(name, "hierarchy", int(engine.hierarchical))
         spent(name, "setup", log.setup_seconds)
-    recipe = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
-    return Inverse(Solver(system, engine, nullspace, log, name, recipe, reason), reason)
+    made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
+    return Inverse(Solver(system, engine, nullspace, log, name, made, reason), reason)
 
 
 def check_settings(method, rtol, maxiter, nullspace):

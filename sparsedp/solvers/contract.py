@@ -40,6 +40,7 @@ import numpy as np
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
 from sparsedp.fields import check_finite, place
 from sparsedp.ledger import count, thread, timed
+from sparsedp.recipe import Remade
 from sparsedp.solvers.record import Run, merged
 from sparsedp.solvers.scaling import in_range, largest, measured, norm, shifted
 from sparsedp.tape import plain
@@ -71,7 +72,7 @@ class Nothing(Engine):
     hierarchy = "no unknowns"
 
 
-class Solver:
+class Solver(Remade):
     """An engine inside the contract.
 
     Parameters
@@ -81,7 +82,7 @@ class Solver:
     nullspace : "raise" or "project"
     log : SolveLog
     name : str
-    recipe : (function, arguments)
+    made : (function, arguments)
         What makes the same inverse again.
     reason : str
         Why this method, in words.
@@ -89,11 +90,15 @@ class Solver:
 
     observed = True  # whether those who take part in solves are asked
 
-    def __init__(self, system, engine, nullspace, log, name, recipe, reason=""):
-        self.recipe, self.reason = recipe, reason
+    def __init__(self, system, engine, nullspace, log, name, made, reason=""):
+        self.made, self.reason = made, reason
         self.served = not thread.calls  # whether a solve was counted for this set-up
         self.system, self.engine = system, engine
         self.nullspace, self.log, self.name = nullspace, log, name
+
+    def recipe(self):
+        # Factors and hierarchies do not travel: what was asked for does, and is set up again.
+        return _remade, self.made
 
     def solve(self, b, transposed=False, checked=True, start=None):
         """Flat b (float64 or complex128) -> flat x. `checked`: primal data, refused when not compatible."""
@@ -291,3 +296,7 @@ class Solver:
             info=run.info(),
             best=x.reshape(op.domain.shape),
         )
+
+
+def _remade(build, arguments):
+    return build(*arguments).solver

@@ -19,6 +19,7 @@ import scipy.sparse as sp
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import check_plain
 from sparsedp.operators.given import from_matrix
+from sparsedp.recipe import Remade
 from sparsedp.solvers.choose import build, check_settings
 from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.record import SolveLog
@@ -99,7 +100,7 @@ def _canonical(pattern):
     return found
 
 
-class MatrixSolver:
+class MatrixSolver(Remade):
     """solve(data, b), made by `matrix_solver`.
 
     Attributes
@@ -121,6 +122,9 @@ class MatrixSolver:
         self._row_of, self._column_of = (self._picking(place) for place in (self.rows, self.columns))
         self._checked, self._free = self._rule(False, True), self._rule(False, False)
         self._adjoint = self._rule(True, False)
+
+    def recipe(self):
+        return MatrixSolver, (self._pattern, self.domain, self._settings)
 
     def _picking(self, place):
         """Operator: a field -> for each entry the value at its row, or its column."""

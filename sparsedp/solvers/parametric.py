@@ -22,6 +22,7 @@ from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
+from sparsedp.recipe import Remade
 from sparsedp.solvers.assembly import Assembly
 from sparsedp.solvers.choose import build, check_settings
 from sparsedp.solvers.kept import Kept
@@ -97,7 +98,7 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     return EllipticSolver(D, G, settings)
 
 
-class EllipticSolver:
+class EllipticSolver(Remade):
     """solve(k, b, shift=0.0), made by `elliptic_solver`.
 
     Attributes
@@ -113,7 +114,7 @@ class EllipticSolver:
         self._kept = Kept()
         self._assembly = Assembly(D, G)
 
-    def __reduce__(self):
+    def recipe(self):
         return EllipticSolver, (self.D, self.G, self._settings)  # what is kept is set up again
 
     def __call__(self, k, b, shift=0.0):

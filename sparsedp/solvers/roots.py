@@ -20,6 +20,7 @@ from sparsedp.derivative import pullback
 from sparsedp.direction import push
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import tell, thread
+from sparsedp.recipe import Remade
 from sparsedp.solvers.choose import check_settings
 from sparsedp.solvers.equation import Equation, Layout, vary
 from sparsedp.solvers.jacobian import Jacobians
@@ -112,7 +113,7 @@ def implicit(
     return Root(residual, jacobian, sparsity, float(rtol), int(maxiter), settings)
 
 
-class Root:
+class Root(Remade):
     """root(guess, *params), made by `implicit`.
 
     Attributes
@@ -124,7 +125,7 @@ class Root:
     def __init__(self, residual, jacobian, sparsity, rtol, maxiter, settings):
         self.residual, self.rtol, self.maxiter = residual, rtol, maxiter
         self.name = f"implicit({getattr(residual, '__name__', type(residual).__name__)})"
-        self.info = SolveLog()
+        self.info, self._settings = SolveLog(), settings
         self._series: dict = {}  # by thread, inside `series`: size -> Jacobian of the last solve
         self._answers: dict = {}  # by thread, inside `answered`: the root
         self._jacobians = Jacobians(self.name, jacobian, sparsity, dict(rtol=rtol, maxiter=None, **settings))
@@ -133,6 +134,10 @@ class Root:
             Rule(f"{self.name}{suffix}", *self._linear_rule(transposed))
             for suffix, transposed in ((".tangent", False), (".T", True))
         ]
+
+    def recipe(self):
+        given, sparsity = self._jacobians.given, self._jacobians.sparsity
+        return Root, (self.residual, given, sparsity, self.rtol, self.maxiter, self._settings)
 
     @contextmanager
     def series(self):

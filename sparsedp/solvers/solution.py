@@ -78,9 +78,8 @@ class Inverse(Operator):
         self.__dict__["solver"] = solver
         self.__dict__["reason"] = reason
 
-    def __reduce__(self):
-        # Factors and hierarchies do not travel: what was asked for does, and is set up again.
-        return _remade, (*self.solver.recipe, self.structure.transposed, self.structure.checked)
+    def recipe(self):
+        return Inverse, (self.solver, self.reason, self.structure.transposed, self.structure.checked)
 
     @property
     def info(self):
@@ -161,8 +160,3 @@ class Inverse(Operator):
             f"  set-up      {log.setup_seconds:.2g} s; {log.hierarchy}",
         ]
         return "\n".join(lines)
-
-
-def _remade(build, arguments, transposed, checked):
-    inv = build(*arguments)
-    return Inverse(inv.solver, inv.reason, transposed, checked)

@@ -3,12 +3,14 @@
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.recipe import Uncached
+
 __all__ = ["INT32_LIMIT", "Scaled", "Structure", "compact", "result_dtype"]
 
 INT32_LIMIT = 2**31
 
 
-class Structure:
+class Structure(Uncached):
     """A linear map on flat contiguous arrays. Frozen.
 
     Attributes

@@ -7,6 +7,7 @@ import scipy.sparse as sp
 
 from sparsedp.errors import NonFiniteError
 from sparsedp.kernels.layout import Rows, Tridiagonal
+from sparsedp.recipe import Uncached
 
 __all__ = ["Factor"]
 
@@ -14,7 +15,7 @@ MOST_DIAGONALS = 8  # more than this and the row form is at least as fast
 TINY = 2.0**-1000  # products below this would lose digits to underflow
 
 
-class Factor:
+class Factor(Uncached):
     """A 1-D matrix. Frozen; products and sums give new ones.
 
     Parameters

@@ -7,6 +7,7 @@ import scipy.sparse as sp
 
 from sparsedp import kernels
 from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.recipe import Remade
 from sparsedp.structure.base import Structure, compact, result_dtype
 from sparsedp.structure.through import through_faces
 
@@ -134,9 +135,10 @@ class Sum(Structure):
         return self if same else Sum(tangents)
 
 
-class Functions(Structure):
+class Functions(Remade, Structure):
     """A linear map given by two functions on fields: the product and the transposed product."""
 
+    name = "an operator of two functions"
     has_entries = False
 
     def __init__(self, forward, backward, domain, codomain, dtype=float):
@@ -144,6 +146,9 @@ class Functions(Structure):
         self.domain, self.codomain = domain, codomain  # shapes of the fields
         self.shape = (int(np.prod(codomain)), int(np.prod(domain)))
         self.dtype = np.dtype(dtype)
+
+    def recipe(self):
+        return Functions, (self.forward, self.backward, self.domain, self.codomain, self.dtype)
 
     def apply(self, x, out):
         if self.forward is None:

@@ -1,0 +1,78 @@
+"""How objects travel to other processes, and are copied: as the call that makes them again. Caches stay behind."""
+
+import pickle
+from copy import deepcopy
+from functools import cached_property, update_wrapper
+from typing import Any
+
+__all__ = ["Made", "Remade", "Uncached"]
+
+
+class Remade:
+    """An object that is pickled, and copied, as the call that makes it: a subclass has ``recipe()``.
+
+    It returns that function or class of a module, and its arguments.
+    """
+
+    __slots__ = ()
+    recipe: Any
+
+    def __reduce__(self):
+        build, arguments = self.recipe()
+        _check_named(getattr(self, "name", type(self).__name__), arguments)
+        return build, arguments
+
+    def __copy__(self):
+        build, arguments = self.recipe()
+        return build(*arguments)
+
+    def __deepcopy__(self, memo):
+        build, arguments = self.recipe()
+        return build(*deepcopy(arguments, memo))
+
+
+def _check_named(owner, part):
+    """Refuse functions that another process cannot import."""
+    if isinstance(part, (tuple, list, dict)):
+        for one in part.values() if isinstance(part, dict) else part:
+            _check_named(owner, one)
+    elif callable(part) and not isinstance(part, Remade):
+        try:
+            pickle.dumps(part)
+        except Exception as error:
+            raise TypeError(
+                f"{owner} cannot be pickled with {getattr(part, '__qualname__', repr(part))}, which other processes "
+                "cannot import; write it as a def at the top level of a module"
+            ) from error
+
+
+class Made(Remade):
+    """A function that a builder has made; it travels as the call of the builder.
+
+    Parameters
+    ----------
+    function, build : callable
+    *arguments
+        Of `build`.
+    """
+
+    def __init__(self, function, build, *arguments):
+        update_wrapper(self, function)
+        self.name, self._function, self._made = build.__name__, function, (build, arguments)
+
+    def __call__(self, *args, **options):
+        return self._function(*args, **options)
+
+    def recipe(self):
+        return self._made
+
+    def __repr__(self):
+        return f"<function of {self.name}>"
+
+
+class Uncached:
+    """An object whose cached properties do not travel."""
+
+    def __getstate__(self):
+        kept = vars(self).items()
+        return {name: value for name, value in kept if not isinstance(getattr(type(self), name, None), cached_property)}

@@ -1,0 +1,258 @@
+"""Every public object that is called, how to make it of functions with names, and what it gives: for test_pickling.py.
+
+A module of its own: another process imports it, and finds the functions here.
+"""
+
+from copy import deepcopy
+from functools import partial
+
+import autograd.numpy as anp
+import numpy as np
+import scipy.sparse as sp
+from catalogue import CATALOGUE
+from scipy.sparse.linalg import aslinearoperator
+
+import sparsedp as dp
+from sparsedp.derivative import pullback, pushforward
+
+GRID = dp.Grid((6, 5), spacing=[np.linspace(1.0, 1.5, 6), 0.7])
+BOX = dp.Grid((16, 12), size=1.0)
+LINE = dp.Grid(12, size=1.0)
+SOLID = np.zeros((6, 5), dtype=bool)
+SOLID[2:4, 2] = True
+BAND = np.diag(np.full(12, 3.0)) + np.diag(np.linspace(0.5, 1, 11), 1) - np.diag(np.ones(11), -1)
+
+
+def numbers(shape, seed=0):
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+# ------------------------------------------------------------ functions with names
+
+
+def loss(x):
+    return anp.sum(anp.sin(x) ** 2)
+
+
+def burgers(u, params):
+    return -params * u * (u - anp.roll(u, 1))
+
+
+def forced(u, params, t):
+    return anp.cos(t) * u - params * u**2
+
+
+def heating(params, t):
+    return params * anp.cos(t) * np.ones(12)
+
+
+def half(params):
+    return 0.5 * params
+
+
+def cubic(x, p):
+    return x**3 + x - p
+
+
+def slope_of_cubic(x, p):
+    return np.diag(3 * x**2 + 1)
+
+
+def coupled(x, p):
+    return 3 * x + x**3 - 0.5 * anp.roll(x, 1) - 0.2 * anp.roll(x, -1) - p
+
+
+def mix(u):
+    return np.roll(u, 1) - 0.5 * u
+
+
+def unmix(g):
+    return np.roll(g, -1) - 0.5 * g
+
+
+def weigh(r):
+    return 0.25 * r
+
+
+def push(v, params):
+    return -params * v
+
+
+def foreign(x):
+    return np.where(x.real > 0, x * np.roll(x, 1), np.sin(x))
+
+
+def cube(x):
+    return x**3
+
+
+def cube_vjp(nums, y, x):
+    return partial(cube_pull, x)
+
+
+def cube_pull(x, g):
+    return (3 * x**2 * g,)
+
+
+def cube_jvp(nums, tangents, y, x):
+    return 3 * x**2 * tangents[0]
+
+
+def root_of_cube(y, x):
+    return np.sign(y) * np.abs(y) ** (1 / 3)
+
+
+# ------------------------------------------------------------ what an object gives
+
+
+def bits(f, *args):
+    """Value, gradient in all arguments and tangent, as bytes."""
+    floats = tuple(np.asarray(x, float) for x in args)
+    call = lambda x: f(*x)
+    y, pull = pullback(call, floats)
+    back = pull(numbers(np.shape(y), 1))
+    found = [y, *back, pushforward(call, floats, tuple(numbers(np.shape(x), 2) for x in floats))[1]]
+    return [np.asarray(one).tobytes() for one in (*found, f(*args))]
+
+
+def of_operator(op):
+    return bits(op, numbers(op.domain.shape)) + bits(op.T, numbers(op.codomain.shape)) + [op.form, op.name, op.T.form]
+
+
+def of_inverse(inv):
+    b = numbers(inv.domain.shape)
+    return of_operator(inv) + [inv(b, start=0.1 * b).tobytes(), (inv.info.hierarchy, inv.method)]
+
+
+def of_step(step, state, params):
+    """A loop of three steps: its own plain forms, and the tape."""
+    whole = lambda u, p: dp.rollout(step, u, p, 3)
+    leaf = lambda u, p: whole(u, p)[0] if isinstance(state, tuple) else whole(u, p)
+    if isinstance(state, tuple):
+        return bits(lambda u, p: leaf((u, state[1]), p), state[0], params)
+    return bits(leaf, state, params) + bits(step, state, params)
+
+
+def of_flow(step):
+    v = 0.1 * numbers(step.grid.faces.shape)
+    return bits(lambda v, p: dp.rollout(step, step.start(v, p), p, 2)["v"], v, 0.3)
+
+
+def of_certified(tolerance):
+    solve = dp.inverse(-dp.laplacian(BOX, dp.dirichlet), "krylov")
+    start, twin = np.zeros(BOX.shape), deepcopy(tolerance)  # it serves one run
+    best = dp.minimise(lambda b: anp.sum((solve(b) - 1.0) ** 2), start, maxiter=5, tolerance=twin)
+    return [best.x.tobytes()]
+
+
+def of_pair(f):
+    value, slope = f(numbers(7))
+    return [np.float64(value).tobytes(), slope.tobytes()]
+
+
+def of_physical(f):
+    y, pull = pullback(f, numbers(7))
+    return [y.tobytes(), pull(numbers(7, 1)).tobytes()]
+
+
+def of_adopted(f):
+    """Its Jacobian at two points: where branches were met before it has entries that are 0."""
+    return [f.jacobian(x).toarray().tobytes() for x in (numbers(12), numbers(12, 5))] + bits(f, numbers(12))
+
+
+# ------------------------------------------------------------ the objects
+
+STEPS = {
+    "euler": dict(rate=burgers),
+    "heun": dict(rate=burgers, dt=half),
+    "ssprk3": dict(rate=dp.laplacian(LINE), dt=1e-4),
+    "rk4": dict(rate=forced),
+    "backward_euler": dict(rate=dp.laplacian(LINE)),
+    "crank_nicolson": dict(rate=burgers),
+    "tr_bdf2": dict(linear=(dp.laplacian(LINE, dp.dirichlet), half), source=heating),
+    "imex": dict(linear=(dp.laplacian(LINE), 0.1), rate=burgers),
+    "etdrk4": dict(linear=dp.laplacian(LINE), rate=burgers),
+}
+
+
+def stepped(method, tolerance=None):
+    given = dict(STEPS[method])
+    step = dp.stepper(method, given.pop("rate", None), given.pop("dt", 0.01), tolerance=tolerance, **given)
+    state = (numbers(12), 0.2) if step.problem.timed else numbers(12)
+    return step, partial(of_step, state=state, params=0.4)
+
+
+def inverses():
+    """Every method, and what is made of inverses."""
+    poisson = dp.inverse(-dp.laplacian(BOX, dp.dirichlet))
+    neumann = dp.divergence(GRID) @ dp.gradient(GRID, solid=SOLID)
+    yield "auto", poisson
+    for method in ("separable", "direct", "structured", "multigrid", "krylov"):
+        yield method, dp.inverse(-dp.laplacian(BOX, dp.dirichlet), method)
+    yield "singular", dp.inverse(-neumann, nullspace="project")
+    yield "wind", dp.inverse(dp.identity(BOX.cells) - 0.1 * dp.upwind(BOX, 0, 1) - dp.laplacian(BOX), "multigrid")
+    yield "preconditioned", dp.inverse(dp.from_matrix(BAND), "krylov", preconditioner=weigh)
+    yield "transposed", dp.inverse(dp.from_matrix(BAND)).T
+
+
+def operators():
+    for number, entry in enumerate(CATALOGUE):
+        grid = GRID if entry.builder != "from_functions" else LINE
+        if entry.builder != "from_functions":
+            yield f"{entry.builder} {number}", entry.make(grid, entry.conditions([dp.robin(1, 2)])[0])
+    yield "from_functions", dp.from_functions(mix, unmix, 12, 12)
+    yield "from_linear_operator", dp.from_linear_operator(aslinearoperator(sp.csr_array(BAND)))
+    yield "exponential", dp.exponential(dp.laplacian(GRID, dp.dirichlet), 0.1)
+    yield "power", dp.power(-dp.laplacian(BOX, dp.dirichlet), 0.5)
+    yield "projection", dp.projection(GRID, SOLID, {"x": ("no_slip", "outflow")})
+    yield "projection by transforms", dp.projection(BOX)
+    yield "pressure", dp.projection(GRID).pressure
+    yield "composed", dp.gradient(BOX) @ dp.inverse(dp.identity(BOX.cells) - dp.laplacian(BOX)) @ dp.divergence(BOX)
+    yield "move.operator", dp.transport(LINE).operator(np.linspace(-1, 1, 13), 0.01)
+
+
+def travellers():
+    """(name of the public builder, label, object, what it gives): all that a scene may hold and call."""
+    yield from (("inverse", label, inv, of_inverse) for label, inv in inverses())
+    yield from ((label.split()[0], label, op, of_operator) for label, op in operators())
+    yield from (("stepper", method, *stepped(method)) for method in STEPS)
+    yield from (("stepper", f"{method}, tolerance", *stepped(method, 1e-3)) for method in STEPS if method != "ssprk3")
+    solve = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
+    k, b = np.exp(numbers(GRID.faces.size)), numbers(GRID.shape)
+    yield "elliptic_solver", "", solve, lambda solve: bits(solve, k, b, 0.5)
+    pattern = sp.csr_array(BAND)
+    yield "matrix_solver", "", dp.matrix_solver(pattern), lambda s: bits(s, pattern.data, numbers(12))
+    for jacobian in (None, slope_of_cubic):
+        yield "implicit", f"{jacobian}", dp.implicit(cubic, jacobian), lambda s: bits(s, np.zeros(12), numbers(12))
+    yield "implicit", "large", dp.implicit(coupled), lambda s: bits(s, np.zeros(90), numbers(90))
+    for scheme in ("upwind", "van_leer", "semi_lagrangian", "maccormack"):
+        move = dp.transport(GRID, scheme, solid=SOLID)
+        u, v = numbers(GRID.shape), 0.3 * numbers(GRID.faces.size)
+        yield "transport", scheme, move, lambda move, u=u, v=v: bits(move, u, v, 0.1)
+        yield "transport", f"{scheme}, step", move.step(0.1), lambda step, u=u, v=v: of_step(step, u, v)
+    yield "flow_step", "", dp.flow_step(GRID, 0.01, 0.1, push, solid=SOLID), of_flow
+    yield "flow_step", "implicit", dp.flow_step(BOX, 0.01, 0.1, implicit=True, convective=False), of_flow
+    lid = dp.face_lift(GRID)
+    lid = lid(lid.domain.join(0.0, 0.0, 0.0, 1.0))
+    yield "flow_step", "lid", dp.flow_step(GRID, 0.01, half, walls=lid), of_flow
+    v, w = numbers((2, GRID.faces.size))
+    yield "convection", "", dp.convection(GRID, {"x": "free_slip"}, SOLID), lambda c: bits(c, v, w)
+    yield "harmonic_average", "", dp.harmonic_average(GRID), lambda f: bits(f, np.exp(numbers(GRID.shape)))
+    yield "value_and_grad", "", dp.value_and_grad(loss), of_pair
+    yield "differentiable", "", dp.differentiable("cube", cube, cube_vjp, cube_jvp), lambda f: bits(f, numbers(7))
+    yield "physical_gradient", "", dp.physical_gradient(cube, root_of_cube), of_physical
+    yield "adopt", "", dp.adopt(foreign), of_adopted
+    yield "certified", "", dp.certified(0.2), of_certified
+    net = dp.network
+    x, p = numbers((2, 2, 9)), net.residual_weights(np.random.default_rng(0), 2, 3)
+    yield "network", "residual_block", net.residual_block, lambda f: [f(p, x).tobytes()]
+    for layer in (net.tanh, net.relu, net.softplus):
+        yield "network", layer.__name__, layer, lambda f: bits(f, x)
+
+
+# Public names that make nothing which is called later: values, runs, pictures, rooms.
+NOTHING_TO_CALL = {
+    "Grid", "Space", "Operator", "dirichlet", "neumann", "robin", "rollout", "minimise", "update_direction",
+    "set_threads", "convergence", "v_curve", "animate", "plot", "certify", "stress", "workprec", "explain", "check",
+    "errors", "report",
+}  # fmt: skip
