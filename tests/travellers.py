@@ -223,7 +223,7 @@ def travellers():
     pattern = sp.csr_array(BAND)
     yield "matrix_solver", "", dp.matrix_solver(pattern), lambda s: bits(s, pattern.data, numbers(12))
     for jacobian in (None, slope_of_cubic):
-        yield "implicit", f"{jacobian}", dp.implicit(cubic, jacobian), lambda s: bits(s, np.zeros(12), numbers(12))
+        yield "implicit", "jacobian" if jacobian else "", dp.implicit(cubic, jacobian), lambda s: bits(s, np.zeros(12), numbers(12))
     yield "implicit", "large", dp.implicit(coupled), lambda s: bits(s, np.zeros(90), numbers(90))
     for scheme in ("upwind", "van_leer", "semi_lagrangian", "maccormack"):
         move = dp.transport(GRID, scheme, solid=SOLID)
