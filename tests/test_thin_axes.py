@@ -9,6 +9,7 @@ from dense import Dense
 
 import sparsedp as dp
 from sparsedp.conditions import resolve
+from sparsedp.flow import passes
 
 SHAPES = [(1,), (2,), (3,), (1, 4), (4, 1), (1, 1), (2, 1), (3, 2), (1, 1, 4), (3, 1, 3), (1, 2, 1), (2, 2, 3)]
 WORDS = ("no_slip", "free_slip", "inflow", "outflow")
@@ -191,3 +192,23 @@ def test_inverses(shape, rng):
             full = lambda c: 0.7 * np.eye(b.size) + c
             near(solve(k, b.reshape(shape), 0.7).ravel(), np.linalg.solve(full(scaled), b))
             near(solve(1.3, b.reshape(shape), 0.7).ravel(), np.linalg.solve(full(1.3 * A), b))
+
+
+@pytest.mark.parametrize("place", range(5))
+def test_a_planted_mistake_in_the_passes(place, monkeypatch, rng):
+    """Coefficients that are not those of D and G are seen before they are used; the contract solves instead."""
+    grid, right = dp.Grid((1, 4), spacing=0.3), passes._lines
+    boundary = {"x": ("inflow", "inflow"), "y": ("inflow", "outflow")}
+
+    def wrong(D, G, free, transposed):
+        lines = [np.array(line) for line in right(D, G, free, transposed)]
+        lines[place][-1 if place != 4 else 0] *= 0.5
+        return tuple(lines)
+
+    assert dp.projection(grid, boundary=boundary).structure.setup.passes is not None
+    monkeypatch.setattr(passes, "_lines", wrong)
+    P, (matrix, _) = dp.projection(grid, boundary=boundary), Dense(grid, words(grid, boundary)).projection()
+    v = rng.standard_normal(grid.faces.size)
+    assert P.structure.setup.passes is None
+    near(P(v), matrix @ v)
+    near(P.T(v), matrix.T @ v)
