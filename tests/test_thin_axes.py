@@ -194,6 +194,20 @@ def test_inverses(shape, rng):
             near(solve(1.3, b.reshape(shape), 0.7).ravel(), np.linalg.solve(full(1.3 * A), b))
 
 
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer", "semi_lagrangian", "maccormack"])
+@pytest.mark.parametrize("condition", [dp.neumann, dp.dirichlet, None], ids=str)
+def test_transport(scheme, condition, rng):
+    """A further axis of one cell, bounded or periodic, along which nothing flows, changes nothing."""
+    for n, also in product((1, 2, 5), (False, True)):
+        line = dp.Grid(n, spacing=[rng.uniform(0.5, 1.0, n)], periodic=condition is None)
+        wide = dp.Grid((1, n), spacing=[0.7, line.widths[0]], periodic=(also, condition is None))
+        u, v = rng.standard_normal(n), rng.standard_normal(line.faces.size)
+        sides = {} if condition is None else {"y": condition}
+        found = dp.transport(wide, scheme, sides)(u[None], wide.join(0.0, v[None]), 0.05)[0]
+        wanted = dp.transport(line, scheme, condition or dp.neumann)(u, v, 0.05)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("place", range(5))
 def test_a_planted_mistake_in_the_passes(place, monkeypatch, rng):
     """Coefficients that are not those of D and G are seen before they are used; the contract solves instead."""
