@@ -52,7 +52,7 @@ _numbers = count(trace_stack.top + 1)
 
 @contextmanager
 def _new_trace():
-    """A number for a trace: larger than those of the traces it is nested in, and never given twice.
+    """For autograd's own traces: a number larger than those of the traces it is nested in, and never given twice.
 
     autograd counts up and down, for all threads together: of two nested traces the inner one could get the smaller
     number, and its derivative be that of the other.
@@ -65,8 +65,8 @@ trace_stack.new_trace = _new_trace
 
 def inside(fun):
     """Run fun(number) inside a trace of its own; return the result and the number of the trace."""
-    with trace_stack.new_trace() as number:
-        return fun(number), number
+    number = next(_numbers)
+    return fun(number), number
 
 
 def trace(fun, tree, roots):

@@ -356,6 +356,22 @@ def test_networks():
     check(make)
 
 
+def test_updates_and_checks_of_operators():
+    L = dp.laplacian(GRID, dp.dirichlet)
+
+    def make():
+        cube = dp.physical_gradient(lambda x: x**3, lambda y, x: np.sign(y) * np.abs(y) ** (1 / 3))
+
+        def work(number):
+            x = numbers(number, 8, 0.5, 1.5)
+            step = dp.update_direction(lambda x: np.outer(x, x**2).ravel(), x).step
+            return step, slope(lambda x: np.sum((cube(x) - 2.0) ** 2), x), dp.check.operator(L).verdict == "agrees"
+
+        return work
+
+    check(make, 2)
+
+
 def bowl(number):
     """A loss with a small solve in it."""
     solve, b = dp.inverse(-dp.laplacian(dp.Grid(6, size=1.0), dp.dirichlet)), numbers(number, 6)
@@ -396,6 +412,33 @@ def test_instruments():
         return slope(loss, b)
 
     check(lambda: work, 4)
+
+
+FIRST = """
+import sys
+from threading import Barrier, Thread
+sys.setswitchinterval(1e-6)
+begin, found = Barrier(4), []
+
+def act():
+    begin.wait()
+    import autograd.numpy as np
+    import sparsedp as dp
+    grid = dp.Grid((20, 20), size=1.0)
+    k, move, P = np.linspace(1.0, 2.0, grid.faces.size), dp.transport(grid), dp.projection(grid)
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), "multigrid")
+    loss = lambda k: np.sum(solve(k, move(np.ones(grid.shape), P(0.1 * k), 0.01)) ** 2)
+    found.append(dp.value_and_grad(loss)(k)[1].tobytes())
+
+team = [Thread(target=act) for _ in range(4)]
+[one.start() for one in team]
+[one.join() for one in team]
+sys.exit(not len(found) == 4 == found.count(found[0]))
+"""
+
+
+def test_the_first_use_of_the_library_by_four_threads():
+    assert subprocess.run([sys.executable, "-c", FIRST], check=False, timeout=300).returncode == 0
 
 
 # ---------------------------------------------------------------- teams of the compiled kernels

@@ -12,8 +12,8 @@ SHOWN = 6  # lines of the history at each end
 class Record(NamedTuple):
     """One iteration; number 0 is the start.
 
-    `seconds`, `evaluations` and `solves` (forward and adjoint, of every inverse) count from the start of the
-    run; `failed` lists the trial points that the loss refused in this iteration, as (error, message).
+    `seconds`, `evaluations` and `solves` (forward and adjoint, of every inverse, in this thread) count from the start
+    of the run; `failed` lists the trial points that the loss refused in this iteration, as (error, message).
     """
 
     iteration: int

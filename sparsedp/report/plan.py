@@ -61,7 +61,8 @@ def explain(loss, x, gradient=True):
     Kinds: forward, vjp, jvp (applications of operators and rules); solve, adjoint (each solve), iterations,
     setup, reused (solves that found their set-up ready), hierarchy, assembled (matrices that were built),
     skipped (solves with nothing to solve); recomputed (steps of time loops). What was set up before the
-    loss ran is not counted: it is reused. Seconds are without those of the calls inside.
+    loss ran is not counted: it is reused. Seconds are without those of the calls inside. What other threads do
+    meanwhile is not counted either, those that the loss starts included.
     Bytes on the tape: all arrays that its nodes keep between the forward and the backward pass, each once.
 
     Examples

@@ -100,6 +100,7 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     Null space: one vector for each connected component, found from the entries. Data are projected
     with it, and the solution has volume-weighted mean 0 on each singular component; see nullspace.py.
     Transpose: `inv.T` uses the same set-up, is exact to rtol, and never refuses.
+    Threads: several may solve at once, to the same bits; `inv.info` is of the solve that ended last.
 
     Examples
     --------

@@ -112,7 +112,7 @@ class Multigrid(Krylov):
         use_symmetric = system.symmetric and mirrored
         super().__init__(system, of_symmetric=use_symmetric, maxiter=MAXITER)
         self.symmetric = use_symmetric
-        unit = 2.0 ** -int(np.frexp(system.norm(False))[1])  # PyAMG speaks up where sums of entries are below 1e-15
+        unit = 2.0 ** -int(np.frexp(system.norm(False))[1])  # PyAMG prints where entries are far from 1
         scale = unit * system.sign * (system.weights if use_symmetric else 1.0)
         matrix = csr_array(system.matrix * np.broadcast_to(scale, system.size)[:, None])
         if grid is None:

@@ -53,7 +53,7 @@ class SolveInfo:
 
 
 class SolveLog:
-    """The last forward and the last adjoint solve of an inverse, and its set-up.
+    """The last forward and the last adjoint solve of an inverse, by whichever thread, and its set-up.
 
     Attributes
     ----------
