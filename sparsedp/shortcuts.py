@@ -5,9 +5,10 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-__all__ = ["added", "arithmetic", "direct"]
+__all__ = ["added", "along", "arithmetic", "direct"]
 
 FLOAT = np.dtype(float)
+REAL = {np.ndarray, np.float64, float, int}
 
 
 def added(known, back):
@@ -68,6 +69,63 @@ def arithmetic(fun, value, args, nums):
             return None
     back = rule(nums, *args)
     return back and (lambda g: back(g if getattr(g, "dtype", FLOAT) == FLOAT else _real(g)))
+
+
+def along(fun, value, args, nums, tangents):
+    """A call ``value = fun(*args)`` and the tangents of args `nums` -> that of the value; None: autograd knows.
+
+    For float64, without other traces; the formulas are those of autograd.
+    """
+    rule = TANGENTS.get(fun)
+    if rule is None or getattr(value, "dtype", None) != FLOAT or any(type(g) not in REAL for g in tangents):
+        return None
+    return rule(value, nums, tangents, *args)
+
+
+def _add_along(value, nums, tangents, x, y):
+    if len(nums) == 2:
+        return tangents[0] + tangents[1]
+    return tangents[0] if np.shape(tangents[0]) == value.shape else None
+
+
+def _subtract_along(value, nums, tangents, x, y):
+    if len(nums) == 2:
+        return tangents[0] - tangents[1]
+    g = -tangents[0] if nums[0] else tangents[0]
+    return g if np.shape(g) == value.shape else None
+
+
+def _multiply_along(value, nums, tangents, x, y):
+    if type(x) not in REAL or type(y) not in REAL:
+        return None
+    if len(nums) == 2:
+        return tangents[0] * y + x * tangents[1]
+    return x * tangents[0] if nums[0] else tangents[0] * y
+
+
+def _divide_along(value, nums, tangents, x, y):
+    if type(x) not in REAL or type(y) not in REAL:
+        return None
+    if len(nums) == 2:
+        return tangents[0] / y - tangents[1] * x / y**2
+    return -tangents[0] * x / y**2 if nums[0] else tangents[0] / y
+
+
+def _negative_along(value, nums, tangents, x):
+    return -tangents[0]
+
+
+def _item_along(value, nums, tangents, x, index):
+    return tangents[0][index]
+
+
+def _array_along(value, nums, tangents, positional, options, *parts):
+    if positional or options:
+        return None
+    g = np.zeros(value.shape)
+    for num, tangent in zip(nums, tangents):
+        g[num - 2] = tangent
+    return g
 
 
 def _real(g):
@@ -133,4 +191,14 @@ FORMULAS: dict[Any, Any] = {
     anp.power: _power,
     anp.sum: _sum,
     getattr(anp.numpy_wrapper, "_primitive_mean", anp.mean): _mean,  # in newer versions anp.mean only calls it
+}
+TANGENTS: dict[Any, Any] = {
+    anp.add: _add_along,
+    anp.subtract: _subtract_along,
+    anp.multiply: _multiply_along,
+    anp.true_divide: _divide_along,
+    anp.divide: _divide_along,
+    anp.negative: _negative_along,
+    anp.numpy_boxes.ArrayBox.__getitem__: _item_along,
+    anp.numpy_wrapper.array_from_args: _array_along,
 }

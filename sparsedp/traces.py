@@ -11,11 +11,21 @@ from autograd.tracer import isbox, new_box, notrace_primitives, toposort, trace_
 
 from sparsedp.constants import constant, constant_args, sparing
 from sparsedp.ledger import thread
-from sparsedp.shortcuts import added, arithmetic
+from sparsedp.shortcuts import added, along, arithmetic
 from sparsedp.tree import flatten
 
-__all__ = ["ReverseNode", "backward", "forward_root", "inside", "new_box", "reverse_root", "split_box", "trace"]
-__all__ += ["untraced"]
+__all__ = [
+    "ReverseNode",
+    "backward",
+    "forward_root",
+    "in_reverse",
+    "inside",
+    "new_box",
+    "reverse_root",
+    "split_box",
+    "trace",
+    "untraced",
+]
 
 
 class ReverseNode(VJPNode):
@@ -36,10 +46,22 @@ class ReverseNode(VJPNode):
             super().__init__(value, fun, args, options, nums, parents)
 
 
+class ForwardNode(JVPNode):
+    """A call on a forward-mode trace."""
+
+    __slots__ = ()
+    g: Any
+
+    def __init__(self, value, fun, args, options, nums, parents):
+        self.g = None if options else along(fun, value, args, nums, [parent.g for parent in parents])
+        if self.g is None:
+            super().__init__(value, fun, args, options, nums, parents)
+
+
 sparing.update((anp.add, anp.subtract, anp.concatenate_args, anp.array_from_args))  # shapes are all they need
 untraced = notrace_primitives  # by kind of node, functions that leave the tape
-untraced[ReverseNode] = untraced[VJPNode]
-forward_root = JVPNode.new_root  # a fresh start of a forward-mode trace, with its tangent
+untraced[ReverseNode], untraced[ForwardNode] = untraced[VJPNode], untraced[JVPNode]
+forward_root = ForwardNode.new_root  # a fresh start of a forward-mode trace, with its tangent
 
 
 def reverse_root():
@@ -67,6 +89,15 @@ def inside(fun):
     """Run fun(number) inside a trace of its own; return the result and the number of the trace."""
     number = next(_numbers)
     return fun(number), number
+
+
+def in_reverse(value):
+    """Whether a reverse-mode trace leads to a value, under other traces or not."""
+    while isbox(value):
+        if isinstance(value._node, VJPNode):
+            return True
+        value = value._value
+    return False
 
 
 def trace(fun, tree, roots):

@@ -7,6 +7,7 @@ import pytest
 from autograd.extend import defvjp, primitive
 
 import sparsedp as dp
+from sparsedp.derivative import pushforward
 
 RNG = np.random.default_rng(3)
 X, Y = RNG.standard_normal((2, 3, 4))
@@ -51,6 +52,40 @@ def test_second_derivatives_pass_through_the_shortcuts(name):
     ours = dp.value_and_grad(lambda z: slope(z, lambda z: dp.value_and_grad(loss)(z)[1]))((X, Y))[1]
     known = autograd.grad(lambda z: slope(z, autograd.grad(loss)))((X, Y))
     assert all(np.max(np.abs(a - b)) <= 1e-13 * np.max(np.abs(b)) for a, b in zip(ours, known, strict=True))
+
+
+FORWARD = {
+    **FORMULAS,
+    "items": lambda x, y: anp.array([x[0, 0] * y[1, 1], 2.0, x[1, 2] - y[0, 0] / x[2, 3], -y[0, 1]]),
+    "rows": lambda x, y: anp.array([x[0], y[1], np.arange(4.0)]),
+    "kinds": lambda x, y: anp.array([x[0, 0], 3], dtype=float) + anp.array(y[0, :2], ndmin=1),
+    "wider": lambda x, y: (x[0] + np.ones((3, 4))) - (1j * y[0] - x) + y[0] * anp.real(1j * x),
+}
+
+
+@pytest.mark.parametrize("name", FORWARD)
+def test_forward_shortcuts_have_the_bits_of_autograd(name):
+    def ends(z):
+        return anp.sin(FORWARD[name](z[:3], z[3:]))
+
+    z, t = np.concatenate([X, Y]), np.concatenate([Y, X])
+    value, slope = pushforward(ends, z, t)
+    known, along = autograd.make_jvp(ends)(z)(t)
+    assert np.array_equal(value, known) and np.array_equal(slope, along) and slope.dtype == along.dtype
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_second_derivatives_pass_through_the_forward_shortcuts(name):
+    """Reverse over forward and forward over reverse, beside reverse over reverse of autograd."""
+
+    def loss(z):
+        return anp.sum(anp.sin(FORMULAS[name](z[:3], z[3:])))
+
+    z, t = np.concatenate([X, Y]), np.concatenate([Y, X])
+    known = autograd.grad(lambda z: anp.sum(t * autograd.grad(loss)(z)))(z)
+    back = dp.value_and_grad(lambda z: pushforward(loss, z, t)[1])(z)[1]
+    along = pushforward(lambda z: dp.value_and_grad(loss)(z)[1], z, t)[1]
+    assert all(np.max(np.abs(a - known)) <= 1e-13 * np.max(np.abs(known)) for a in (back, along))
 
 
 @pytest.mark.parametrize("kind", ["f", "D"])

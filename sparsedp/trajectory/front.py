@@ -9,6 +9,7 @@ from sparsedp.errors import BudgetWarning, DerivativeError, ShapeError
 from sparsedp.fields import check_function, check_takes, is_whole
 from sparsedp.ledger import thread
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
+from sparsedp.traces import in_reverse
 from sparsedp.trajectory.keep import All, Each, Last
 from sparsedp.trajectory.layout import Layout, dense
 from sparsedp.trajectory.protocol import PLAIN, carries
@@ -118,7 +119,8 @@ def rollout(
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
     run = Run(step, *forms, n, _kind(keep, forms[0]), slots, truncate, bool(traced), progress, record)
     _check_values(run, args)
-    if run.store and (slots is None or slots >= n) and (inputs is not None or not carries(step, *PLAIN)):
+    pulled = any(map(in_reverse, args))  # a forward derivative has no use for tapes
+    if pulled and (slots is None or slots >= n) and (inputs is not None or not carries(step, *PLAIN)):
         room = None if memory is None else room_within(memory, forms[0].nbytes, n, beside)
         run.tapes = Tapes(room, frozenset(traced), slots is not None)
     if run.store and run.slots:
