@@ -234,6 +234,25 @@ def test_a_loss_that_writes_into_what_it_was_given(size):
     assert np.all(dp.value_and_grad(loss)(x)[1] == 12.0)
 
 
+@pytest.mark.parametrize("form", ["array", "row", "part"])
+def test_a_rule_that_writes_into_its_own_result(form):
+    """The normal form of foreign code: one buffer for the results of all calls."""
+    room = np.empty((2, 4))
+    buffer = {"array": room[0].copy(), "row": room[1], "part": room.reshape(-1)[2:6]}[form]
+
+    def forward(x):
+        np.multiply(x, x, out=buffer)
+        return buffer if form == "array" else buffer[:]
+
+    square = dp.differentiable("square", forward, lambda nums, ans, x: lambda g: (2 * x * g,))
+    x = field(4, 1)
+    value, slope = dp.value_and_grad(lambda x: anp.sum(square(square(x)) * square(x)))(x)
+    assert value == pytest.approx(np.sum(x**6), rel=1e-14)
+    assert np.allclose(slope, 6 * x**5, rtol=1e-14)
+    same = dp.differentiable("same", lambda x: x, lambda nums, ans, x: lambda g: (g,))
+    assert same(x) is x
+
+
 def test_tapes_of_autograd_itself():
     """Rules keep their constants on the tape of autograd.grad too."""
     solve, work = dp.matrix_solver(PLACES), entries(1)
