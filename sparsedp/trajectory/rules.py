@@ -70,7 +70,7 @@ def _count(ans):
 
 
 def _pull_forward(pull, *rest):
-    args, g = rest[: pull.many], rest[pull.many :]
+    args, g = tuple(map(dense, rest[: pull.many])), rest[pull.many :]  # numbers as on the way forward
     return _one(pull.run.backward(args, pull.wanted, g))
 
 
