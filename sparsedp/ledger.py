@@ -31,6 +31,8 @@ class Thread(local):
         Kinds of nodes of a tape that see what they stand for; the last one is used.
     solves : int
         Since the thread began, forward and adjoint: counted always, for one addition a solve.
+    grown : int
+        Warnings of cotangents that grew, since the thread began; what warnings do is one for all threads.
     inner : list of float
         For each timed call that is under way, the seconds of the calls inside it.
     """
@@ -41,7 +43,7 @@ class Thread(local):
         self.loops: list[Any] = []
         self.witnesses: list[Any] = []
         self.inner: list[float] = []
-        self.solves = 0
+        self.solves = self.grown = 0
 
 
 thread = Thread()

@@ -251,7 +251,7 @@ TABLE = [
         grad(captured),
         NONE,
         "the step uses a traced value that is not one of its arguments, and its derivative would be lost; "
-        "pass it in params",
+        "pass it in params or make it a part of the state",
     ),
     (
         grad(captured_by_keep),

@@ -221,8 +221,8 @@ def test_a_linked_step_that_keeps_a_traced_value_is_refused():
 
     with pytest.raises(
         DerivativeError,
-        match="the step uses a traced value that it kept from an earlier step, and its derivative would be lost; make "
-        "it a part of the state",
+        match="the step uses a traced value that is not one of its arguments, and its derivative would be lost; pass "
+        "it in params or make it a part of the state",
     ):
         dp.value_and_grad(lambda p: anp.sum(dp.rollout(step, WHERE, p, 12)))(0.3)
 

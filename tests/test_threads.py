@@ -16,6 +16,7 @@ from catalogue import CATALOGUE
 
 import sparsedp as dp
 from sparsedp import kernels, network
+from sparsedp.report.trial import run
 from sparsedp.tree import leaves
 
 FOUR, TIMES = 4, 6
@@ -370,6 +371,31 @@ def test_updates_and_checks_of_operators():
         return work
 
     check(make, 2)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_stress_hears_of_growth_in_its_own_thread():
+    def work(number):
+        factor = 30.0 if number == 0 else 0.9
+        loss = lambda u: np.sum(dp.rollout(lambda u, p: factor * u, u, None, 20) ** 2)
+        return [run(loss, numbers(number, 4)).flagged for _ in range(10)]
+
+    check(lambda: work, 3)
+    assert work(0) == [True] * 10 and work(1) == [False] * 10
+
+
+def test_grids():
+    def make():
+        grid = dp.Grid((5, 4, 3), size=(1.0, 2.0, 3.0), periodic=(False, True, False))
+
+        def work(number):
+            parts = grid.split(numbers(number, grid.faces.size))
+            spaces = [space.volumes for space in (grid.cells, grid.faces, grid.nodes, grid.edges)]
+            return grid.centres(), grid.face_centres(0), grid.volumes, spaces, parts, grid.join(*parts)
+
+        return work
+
+    check(make)
 
 
 def bowl(number):

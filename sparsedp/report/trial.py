@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sparsedp.derivative import value_and_grad
-from sparsedp.errors import GrowthWarning, SparsedpError
+from sparsedp.errors import SparsedpError
+from sparsedp.ledger import thread
 from sparsedp.tape import is_variable
 from sparsedp.tree import flatten, norm
 
@@ -46,14 +47,15 @@ class Outcome(NamedTuple):
 
 def run(loss, x):
     """Value and gradient of a loss at x -> Outcome; whatever it raises is part of it."""
-    with np.errstate(all="ignore"), warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
+    grown = thread.grown
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         try:
             value, gradient = value_and_grad(loss)(x)
         except Exception as error:  # a scene may raise anything: its row shows it
             return Outcome(math.nan, [], error)
     leaves = [np.asarray(g) for g in flatten(gradient)[0] if g is not None]
-    return Outcome(float(value), leaves, None, any(issubclass(one.category, GrowthWarning) for one in told))
+    return Outcome(float(value), leaves, None, thread.grown > grown)
 
 
 def finite(loss, x, strict=True):

@@ -162,7 +162,7 @@ class Layout:
         if isbox(value):
             raise DerivativeError(
                 f"{when} uses a traced value that is not one of its arguments, and its derivative would be lost; "
-                "pass it in params"
+                "pass it in params or make it a part of the state"
             )
         if not isinstance(value, (np.ndarray, np.generic, float, complex)):
             raise ShapeError(_changed(name, "one array", _kind(value), when))

@@ -7,7 +7,6 @@ bits are the same. A piece ends where the cotangent is looked at, and before and
 
 from typing import Any, NamedTuple
 
-from sparsedp.errors import DerivativeError
 from sparsedp.fields import frozen
 from sparsedp.traces import backward, inside, new_box, reverse_root, split_box
 from sparsedp.trajectory.layout import owned
@@ -93,11 +92,6 @@ class Linked(Taped):
                     if (back := found.pop(roots[place], None)) is not None:
                         self._add(place, back)
             back = found.pop(piece.root, None)
-            if found:  # roots of another piece
-                raise DerivativeError(
-                    "the step uses a traced value that it kept from an earlier step, and its derivative would be "
-                    "lost; make it a part of the state"
-                )
             if piece.root is None:
                 return None
             g = [None if back is None else fitted(back, value)]

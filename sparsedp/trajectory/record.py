@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.errors import GrowthWarning
+from sparsedp.ledger import thread
 
 __all__ = ["LIMIT", "Growth", "Record", "looked_at"]
 
@@ -96,6 +97,7 @@ class Growth:
         rate = float(sum(rise for _, rise in pieces) / steps) if steps else float("nan")
         found = Record("backward", self._n, kept, recomputed, tuple(self.norms), rate, float(grown))
         if found.flagged:
+            thread.grown += 1
             warnings.warn(
                 GrowthWarning(
                     f"the cotangent grew by {grown:.0e} over {self._n} steps of rollout, {rate:.2g} a step in the "
