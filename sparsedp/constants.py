@@ -11,7 +11,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-__all__ = ["constant", "constant_args", "is_fixed", "owner", "sparing"]
+__all__ = ["constant", "constant_args", "is_fixed", "sparing"]
 
 SMALL = 2**16  # bytes up to which a copy of its own takes less time than a comparison with an older one
 CHUNK = 2**15  # entries that are compared at once: two pieces of them stay in the cache of a core
@@ -59,11 +59,6 @@ def constant(value):
     if kind is dict:
         return {name: constant(one) for name, one in value.items()}
     return kind(*map(constant, value)) if isinstance(value, tuple) and hasattr(kind, "_fields") else value
-
-
-def owner(value):
-    """The object whose memory an array shows; another value as it is."""
-    return owner(value.base) if isinstance(value, np.ndarray) and value.base is not None else value
 
 
 def is_fixed(array):

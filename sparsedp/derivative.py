@@ -5,7 +5,7 @@ from numbers import Number
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.constants import is_fixed, owner
+from sparsedp.constants import is_fixed
 from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.fields import check_function
 from sparsedp.recipe import Made
@@ -95,17 +95,22 @@ def traced(fun, x, roots):
 
 def _apart(gradients, g):
     """autograd hands one array to both terms of a sum, and g on; a caller may write into the one without the other."""
-    seen = {id(owner(g))}
+    seen = {id(_owner(g))}
     for place, back in enumerate(gradients):
-        if isinstance(back, np.ndarray) and (id(owner(back)) in seen or not back.flags.writeable):
+        if isinstance(back, np.ndarray) and (id(_owner(back)) in seen or not back.flags.writeable):
             gradients[place] = back.copy()
-        seen.add(id(owner(back)))
+        seen.add(id(_owner(back)))
     return gradients
 
 
 def _apart_from_caller(value):
     """An array as it is now: pullbacks need it, and the caller may write into it before they run."""
     return value if not isinstance(value, np.ndarray) or is_fixed(value) else value.copy("K")
+
+
+def _owner(value):
+    """The array whose memory an array shows."""
+    return _owner(value.base) if isinstance(value, np.ndarray) and value.base is not None else value
 
 
 def _gradient(leaf, cotangent):

@@ -8,14 +8,13 @@ Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A
 
 import inspect
 from functools import partial
-from sys import getrefcount
 
 import autograd.numpy as anp
 import numpy as np
 from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
 from autograd.tracer import box_types, getval, isbox, new_box
 
-from sparsedp.constants import constant_args, owner, sparing
+from sparsedp.constants import constant_args, sparing
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, tell, timed
 from sparsedp.recipe import Remade
@@ -62,8 +61,7 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     Notes
     -----
     `vjp` gets read-only copies of the arrays in `args` that are not traced, also of those in tuples, lists and dicts:
-    a caller may write into them before the backward pass. Other objects must stay as they are. A result that
-    `forward` goes on holding, as a buffer for its next call, is copied.
+    a caller may write into them before the backward pass. Other objects must stay as they are.
 
     Examples
     --------
@@ -76,7 +74,7 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     rule = Rule(
         name, _fresh(forward), vjp and _fresh_pull(vjp), jvp and _fresh(jvp), given[-1], (differentiable, given)
     )
-    rule._signature = inspect.signature(forward)
+    rule._signature = _signature(forward)
     return rule
 
 
@@ -146,23 +144,7 @@ def _run(rule, *args):
             raise DerivativeError(
                 f"{rule.name} got a traced value inside a {type(arg).__name__}; pass it as an argument"
             )
-    ans = timed(rule.name, "forward", rule.forward, *args) if active else rule.forward(*args)
-    if type(ans) is np.ndarray and getrefcount(ans if ans.base is None else ans.base) > ALONE and ans.flags.writeable:
-        return _unshared(ans, args)
-    return ans
-
-
-def _alone():
-    ans = np.empty(0)
-    return getrefcount(ans if ans.base is None else ans.base)
-
-
-ALONE = _alone()  # references to a result, or to the array that it is a view of, that nobody else holds
-
-
-def _unshared(ans, args):
-    """A copy of a result in memory that the next call may write into; a view of an argument stays."""
-    return ans if any(owner(ans) is owner(arg) for arg in args) else ans.copy("K")
+    return timed(rule.name, "forward", rule.forward, *args) if active else rule.forward(*args)
 
 
 _primitive = primitive(_run)
