@@ -125,6 +125,7 @@ class Adopted(Remade):
         )
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         # The pattern found so far travels too: it took many runs.
         found = self._shapes, self.way, self._coloured
         return Adopted, (self._f, self._sparsity, self._derivative, self.name, found)

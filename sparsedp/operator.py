@@ -74,6 +74,7 @@ class Operator(Remade):
         raise AttributeError(f"Operator is frozen; make a new one instead of setting {name}")
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         given = self.structure, self.domain, self.codomain, self.name, self.form
         if self.form == "matrix-free" or "_origin" not in self.__dict__ or isinstance(self.structure, Matrix):
             return Operator, given

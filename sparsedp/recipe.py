@@ -64,6 +64,7 @@ class Made(Remade):
         return self._function(*args, **options)
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return self._made
 
     def __repr__(self):

@@ -111,6 +111,7 @@ class Rule(Remade):
         self._signature = _signature(forward)
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return self.made
 
     def __call__(self, *args, **options):

@@ -13,6 +13,7 @@ from catalogue import CATALOGUE
 from scipy.sparse.linalg import aslinearoperator
 
 import sparsedp as dp
+from sparsedp import kernels
 from sparsedp.derivative import pullback, pushforward
 
 GRID = dp.Grid((6, 5), spacing=[np.linspace(1.0, 1.5, 6), 0.7])
@@ -187,7 +188,7 @@ def inverses():
     poisson = dp.inverse(-dp.laplacian(BOX, dp.dirichlet))
     neumann = dp.divergence(GRID) @ dp.gradient(GRID, solid=SOLID)
     yield "auto", poisson
-    for method in ("separable", "direct", "structured", "multigrid", "krylov"):
+    for method in ("separable", "direct", "multigrid", "krylov", *["structured"] * kernels.compiled()):
         yield method, dp.inverse(-dp.laplacian(BOX, dp.dirichlet), method)
     yield "singular", dp.inverse(-neumann, nullspace="project")
     yield "wind", dp.inverse(dp.identity(BOX.cells) - 0.1 * dp.upwind(BOX, 0, 1) - dp.laplacian(BOX), "multigrid")
@@ -223,7 +224,12 @@ def travellers():
     pattern = sp.csr_array(BAND)
     yield "matrix_solver", "", dp.matrix_solver(pattern), lambda s: bits(s, pattern.data, numbers(12))
     for jacobian in (None, slope_of_cubic):
-        yield "implicit", "jacobian" if jacobian else "", dp.implicit(cubic, jacobian), lambda s: bits(s, np.zeros(12), numbers(12))
+        yield (
+            "implicit",
+            "jacobian" if jacobian else "",
+            dp.implicit(cubic, jacobian),
+            lambda s: bits(s, np.zeros(12), numbers(12)),
+        )
     yield "implicit", "large", dp.implicit(coupled), lambda s: bits(s, np.zeros(90), numbers(90))
     for scheme in ("upwind", "van_leer", "semi_lagrangian", "maccormack"):
         move = dp.transport(GRID, scheme, solid=SOLID)

@@ -160,6 +160,7 @@ class Transport(Remade):
         raise AttributeError(f"Transport is frozen; make a new one instead of setting {name}")
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return Transport, (self.setting,)
 
     def __call__(self, u, v, dt, inflow=0.0):

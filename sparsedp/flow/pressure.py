@@ -89,6 +89,7 @@ class Projection(Operator):
         super().__init__(Projected(setup), faces, faces, "projection", "matrix-free")
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return Projection, (self.structure.setup,)
 
     @property

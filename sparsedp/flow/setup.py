@@ -51,6 +51,7 @@ class Setup(Remade):
         self.passes = self._make_passes() if fast else None
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return Setup, self.made
 
     def _make_passes(self):

@@ -152,6 +152,7 @@ class FlowStep(Remade):
         self.acceleration = Acceleration(grid.faces, self.convect, force, self.viscous)
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return FlowStep, self.made
 
     def start(self, v, params=None):

@@ -45,6 +45,7 @@ class Step(Remade):
         self.name, self.made = f"stepper({method})", made
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return self.made
 
     @property

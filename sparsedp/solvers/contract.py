@@ -97,6 +97,7 @@ class Solver(Remade):
         self.nullspace, self.log, self.name = nullspace, log, name
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         # Factors and hierarchies do not travel: what was asked for does, and is set up again.
         return _remade, self.made
 

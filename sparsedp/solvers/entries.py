@@ -124,6 +124,7 @@ class MatrixSolver(Remade):
         self._adjoint = self._rule(True, False)
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return MatrixSolver, (self._pattern, self.domain, self._settings)
 
     def _picking(self, place):

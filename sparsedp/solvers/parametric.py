@@ -115,6 +115,7 @@ class EllipticSolver(Remade):
         self._assembly = Assembly(D, G)
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return EllipticSolver, (self.D, self.G, self._settings)  # what is kept is set up again
 
     def __call__(self, k, b, shift=0.0):

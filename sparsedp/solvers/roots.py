@@ -136,6 +136,7 @@ class Root(Remade):
         ]
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         given, sparsity = self._jacobians.given, self._jacobians.sparsity
         return Root, (self.residual, given, sparsity, self.rtol, self.maxiter, self._settings)
 

@@ -79,6 +79,7 @@ class Inverse(Operator):
         self.__dict__["reason"] = reason
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return Inverse, (self.solver, self.reason, self.structure.transposed, self.structure.checked)
 
     @property

@@ -148,6 +148,7 @@ class Functions(Remade, Structure):
         self.dtype = np.dtype(dtype)
 
     def recipe(self):
+        """The call that makes it again: see recipe.py."""
         return Functions, (self.forward, self.backward, self.domain, self.codomain, self.dtype)
 
     def apply(self, x, out):
