@@ -101,6 +101,12 @@ class Solver(Remade):
         # Factors and hierarchies do not travel: what was asked for does, and is set up again.
         return _remade, self.made
 
+    def __copy__(self):
+        """Another contract around the same engine: who asks for it changes the tolerance or the log."""
+        twin = object.__new__(type(self))
+        twin.__dict__.update(self.__dict__)
+        return twin
+
     def solve(self, b, transposed=False, checked=True, start=None):
         """Flat b (float64 or complex128) -> flat x. `checked`: primal data, refused when not compatible."""
         if b.dtype.kind == "c" and not self.system.complex:
