@@ -43,7 +43,7 @@ def rollout(
         What the rollout may take. None keeps every state. Else as many are kept as fit beside params, inputs
         and their gradients, and the others are run again from those, as rarely as possible. Where all fit, what
         is left goes to the tapes of the steps (4 MB with None): such a step runs once, not twice. Not counted:
-        what one step needs by itself, and all states that `keep` hands out.
+        what one step needs by itself, and what `keep` hands out; with keep="all" no state is run again.
     keep : "last", "all" or callable
         What is handed out: the last state; all n + 1, each array with a new first axis; or the tuple of what
         ``keep(index, state)`` returned for index = 0 ... n, any trees.
@@ -71,7 +71,7 @@ def rollout(
         If state, params or inputs hold NaN or infinity, or a step makes some, or the way back does.
     DerivativeError
         If the step or `keep` uses a traced value that is not an argument; if a derivative is asked of a state
-        without floating numbers; if a step that is run again gives another result.
+        without floating numbers; if a step or `keep` that is run again gives another result.
     ImportError
         If a progress bar is wanted and tqdm is not installed.
 
@@ -79,12 +79,18 @@ def rollout(
     -----
     GrowthWarning
         If the cotangent of the state grew by more than 1e8: a chaotic run. The gradient is exact; nothing is cut.
+    BudgetWarning
+        If a third of the runs of steps would do with at most twice the memory; it says how much is needed.
 
     Notes
     -----
     Cost: n steps forward; backward n steps on a tape of their own, unless it is kept, plus those run again:
     with s states kept and at most r runs over each step, n <= (s + r)! / (s! r!) steps go back. The gradient
     has the same bits for every `memory`. A step that carries plain forms of its own (protocol.py) needs no tape.
+
+    The states gone back through are those of one run that ends, bit by bit, in what was handed out: a step on its
+    tape must give the state after it, and states that are run again must lead to those kept. Large ones are compared
+    by 64 bits that are made of all of theirs.
 
     Source
     ------
