@@ -18,7 +18,7 @@ from sparsedp.tape import isbox
 
 def system(rng, n=30, many=4):
     """A pattern that is not symmetric, entries that make it regular, and data."""
-    pattern = sp.random_array((n, n), density=many / n, rng=rng) + sp.eye_array(n)
+    pattern = sp.csr_array(rng.random((n, n)) < many / n) + sp.eye_array(n)
     solve = matrix_solver(pattern)
     data = rng.uniform(-1, 1, solve.rows.size)
     data[solve.rows == solve.columns] += 4.0

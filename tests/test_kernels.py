@@ -156,7 +156,7 @@ def matrices():
     for n, m in ((1, 1), (2, 3), (7, 7), (40, 41), (131, 130), (300, 300)):
         yield sp.dia_array((np.ones((2, m)) * [[-1], [1]], [0, 1]), shape=(n, m))
         yield sp.dia_array((rng.random((5, m)), [-2, -1, 0, 1, 2]), shape=(n, m))
-        yield sp.random_array((n, m), density=min(1, 2 / m), rng=rng)
+        yield sp.csr_array(np.where(rng.random((n, m)) < 2 / m, rng.random((n, m)), 0.0))
         yield sp.csr_array((n, m))
         ring = sp.lil_array((m, m))
         for shift, value in ((-1, 0.5), (0, -2.0), (1, 0.25)):

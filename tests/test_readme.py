@@ -226,5 +226,24 @@ def test_the_two_commands():
     install = 'python -m pip install -e ".[all]" && '
     assert first.startswith(install + "python -m sparsedp demo")
     assert second.startswith(install + "python -m pytest")
-    shown = subprocess.run([ROOT / ".ci" / "run", "commands"], capture_output=True, text=True, check=True).stdout
-    assert shown.splitlines() == [first, second]
+    assert ci("commands") == [first, second]
+
+
+def ci(word):
+    """What .ci/run says that it runs."""
+    return subprocess.run([ROOT / ".ci" / "run", word], capture_output=True, text=True, check=True).stdout.splitlines()
+
+
+def test_the_virtual_environment_is_the_one_of_the_page():
+    """In the checkout, where tests that look at other people's files would find some; git does not."""
+    [line] = ci("venv")
+    assert f"(`{line}`, Python 3.10 or newer)" in page()
+    folder = re.fullmatch(r"python3 -m venv (\S+) && \. (\S+)/bin/activate", line)[1]
+    assert f"{folder}/" in (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
+
+
+def test_the_oldest_versions_are_those_of_the_requirements():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    named = [*project["dependencies"], *(one for group in project["optional-dependencies"].values() for one in group)]
+    assert ci("oldest") == [one.replace(">=", "==") for one in named if ">=" in one]
+    assert len(ci("oldest")) == len(named) - 1  # all but the extra that is made of extras
