@@ -1,6 +1,8 @@
 """The tape: rules, what they refuse, counts, and derivatives of programs of any order."""
 
 import gc
+import inspect
+import math
 import weakref
 
 import autograd.numpy as anp
@@ -211,3 +213,17 @@ def test_tape_cost_of_one_operator_call():
     slope = value_and_grad(loss)
     slope(u)
     assert min(repeat(lambda: slope(u), number=1, repeat=30)) / 200 <= 40e-6
+
+
+def test_a_function_that_does_not_tell_how_it_is_called():
+    """Functions of C without a signature, as all of NumPy's own were in 1.26: they take their arguments by position."""
+    with pytest.raises(ValueError):
+        inspect.signature(math.hypot)
+    hypot = dp.differentiable(
+        "hypot",
+        math.hypot,
+        lambda nums, ans, x, y: lambda g: tuple(g * (x, y)[num] / ans for num in nums),
+        lambda nums, tangents, ans, x, y: sum(t * (x, y)[num] / ans for num, t in zip(nums, tangents)),
+    )
+    assert dp.value_and_grad(lambda z: hypot(z[0], z[1]))((3.0, 4.0)) == (5.0, (0.6, 0.8))
+    assert "derivative of hypot in args: not asked" in dp.explain(lambda x: hypot(x, 4.0), 3.0).left_out
