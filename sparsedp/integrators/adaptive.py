@@ -62,15 +62,16 @@ class Adaptive:
         """The state after the interval h."""
         self._check_tolerance(u)
         traced = any(map(isbox, leaves((u, params, t, h))))
-        path = [] if traced else None
-        bare = [untraced(tree) for tree in (u, params, t, h)]
-        new = self._cross(*bare, path)
-        return Variation(self, path, *bare, new).follow(u, params, t, h) if traced else new
+        path: list | None = [] if traced else None
+        given = untraced(u), untraced(params), untraced(t), plain(h)
+        new = self._cross(given, path)
+        return Variation(self, path, given, new).follow(u, params, t, h) if traced else new
 
-    def _cross(self, u, params, t, h, path):
+    def _cross(self, given, path):
         """The state after the interval; steps go to `path` as (share, share done, state, state between its halves)."""
+        u, params, t, h = given
         length, done, taken, mark = self._first(u, params, t, h), 0.0, [], 0.0
-        trend = None
+        trend, most = None, LARGEST
         for trial in range(1, MOST + 1):
             left = 1.0 - done
             length = self._allowed(length, left)
@@ -85,7 +86,8 @@ class Adaptive:
             if done >= 1.0:
                 self.taken = taken
                 return u
-            length *= float(np.clip(change, SMALLEST, LARGEST))
+            length *= float(np.clip(change, SMALLEST, most))
+            most = LARGEST if error <= 1 else 1.0  # the step after a refused one is not made longer
             if trial % WINDOW == 0:
                 if (1.0 - done) * WINDOW > FAR * MOST * (done - mark):
                     break
@@ -167,13 +169,12 @@ class Adaptive:
 
     def _first(self, u, params, t, h):
         """A first length from the size of the rate: one that changes the state by a hundredth."""
-        bare, of_params, at = (untraced(tree) for tree in (u, params, t))
-        rate = leaves(self.scheme.problem(bare, of_params, at))
-        if not all(np.all(np.isfinite(plain(leaf))) for leaf in rate if leaf is not None):
+        rate = leaves(self.scheme.problem(u, params, t))
+        if not all(np.all(np.isfinite(leaf)) for leaf in rate if leaf is not None):
             raise NonFiniteError(
                 f"the rate of {self.name} must be finite at the state given; take a state in its domain"
             )
-        size = max((float(np.max(np.abs(leaf), initial=0.0)) for leaf in leaves(bare)), default=0.0)
-        speed = max((float(np.max(np.abs(plain(leaf)), initial=0.0)) for leaf in rate), default=0.0)
-        length = 0.01 * (size or 1.0) / (speed * float(plain(h))) if speed > 0 else 1.0
+        size = max((float(np.max(np.abs(leaf), initial=0.0)) for leaf in leaves(u)), default=0.0)
+        speed = max((float(np.max(np.abs(leaf), initial=0.0)) for leaf in rate), default=0.0)
+        length = 0.01 * (size or 1.0) / (speed * float(h)) if speed > 0 else 1.0
         return min(max(length, 1e3 * LEAST), 1.0) if np.isfinite(length) else 1e-6

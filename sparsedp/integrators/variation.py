@@ -1,21 +1,22 @@
-"""Derivatives over error-controlled steps: time grids that move with the solution, and a shadow that measures their error.
+"""Derivatives over error-controlled steps: lengths that move with the solution, and a shadow that measures the error.
 
 Where something fast happens at a time that depends on the parameters (a jump, an ignition), the derivative of the state
 at a fixed time is its speed there times the derivative of that time: huge for a while, and small again when it is over.
 Steps of fixed lengths lose what is left. So lengths move. With the speed f and the weights of the error norm, a half
-step from the state u gets h + d,
+step of length h from the state u gets h + d,
 
     d = -q <f, u - u*> / <f, f>,     q = a / (a + SLACK),     a = h |f|,
 
-where u* is the same state as data: d is 0 and its derivative takes the state back to the plane through u* across the
+where u* is the same state as data: d is 0, and its derivative takes the state back to the plane through u* across the
 flow. The sum of all d so far is given back, in proportion to the lengths, over a last stretch of the interval that is
 as long as its speed allows. No choice of d changes what the derivative converges to.
 
-The shadow takes the same states with the derivative of f + (w + e) (f - w), a little less extrapolated than the steps
-that count. Tangents start in both and cotangents arrive from both; where they meet, their difference is e times what
-extrapolation took away, the derivative is judged by it, and that of the steps that count goes on. `spread` and `judge`
-are each other's transposes in this sense, so that this holds for every order and mode. The shadow also starts with
-errors of the size of the tolerance: where terms cancel so that those matter, the derivative is refused, too.
+The shadow takes the same states with the derivative of f + (w - e) (f - w), a little less extrapolated than the steps
+that count (f two halves, w whole, see adaptive.py). Tangents start in both, and cotangents arrive from both; where they
+meet, their difference is e times what extrapolation took away. The derivative is judged by it, and that of the steps
+that count goes on. `spread` and `judge` are each other's transposes in this sense, so it holds in every mode and order.
+What enters the shadow also gets errors of the size of the tolerance: where terms cancel so that they matter, the
+derivative is refused, too.
 """
 
 import autograd.numpy as anp
@@ -31,7 +32,7 @@ SLACK = 0.05  # relative change of the state in a half step that has it follow t
 EPSILON = 1e-3  # share of the shadow
 MOST = 4.0  # error of a derivative without extrapolation, in units of tolerance^(p / (p + 1)), that is taken
 TIMES = 10.0  # error of a derivative in units of the tolerance: aim with extrapolation, limit without
-SHARE = 0.1  # of what goes in: derivatives that are smaller are judged by it
+SHARE = 1e-4  # of what goes in: derivatives that are smaller are judged by it
 
 
 class Variation:
@@ -41,21 +42,20 @@ class Variation:
     ----------
     control : Adaptive
     path : list of (share of the interval, share done, state, state between the halves)
-    u, params, t, h, new
-        Plain: what the interval starts with, and its end.
+    given : (u, params, t, h)
+        What the interval starts with, plain.
+    new : tree
+        The state at its end.
     """
 
-    def __init__(self, control, path, u, params, t, h, new):
-        self.control, self.path, self.new = control, path, new
-        self.given = u, params, t, h
+    def __init__(self, control, path, given, new):
+        self.control, self.path, self.given, self.new = control, path, given, new
+        _, _, t, h = given
         spans = [(done * h, 0.5 * share * h) for share, done, _, _ in path]
-        sections = [
-            [
-                self._section(state, None if t is None else t + at, half)
-                for state, at in ((u, start), (mid, start + half))
-            ]
-            for (_, _, u, mid), (start, half) in zip(path, spans, strict=True)
-        ]
+        sections = []
+        for (_, _, *states), (start, half) in zip(path, spans, strict=True):
+            times = (None, None) if t is None else (t + start, t + start + half)
+            sections.append([self._section(state, at, half) for state, at in zip(states, times, strict=True)])
         self.rows = [[row for row, _ in both] for both in sections]
         speeds = np.array([both[0][1] for both in sections])
         rest = h - np.array([start for start, _ in spans])
@@ -86,7 +86,8 @@ class Variation:
         for number in (0, 1):
             for place, part in zip(places, _unpacked(both[number], given), strict=True):
                 found[place] = part
-            new = leaves(self._run(*rebuild(found), EPSILON * number))
+            u, params, t, h = rebuild(found)
+            new = leaves(self._run(u, params, t, h, EPSILON * number))
             arrived.append(_packed([new[place] for place in moving]))
         judged = end(anp.reshape(anp.concatenate(arrived), (2, -1)))
         for place, part in zip(moving, _unpacked(judged, [ends[place] for place in moving]), strict=True):
@@ -168,9 +169,9 @@ class Variation:
 
     def _refuse(self, error, limit):
         raise DerivativeError(
-            f"the derivative of {self.control.name} over {len(self.path)} steps is uncertain by {error:.1e} of its size, "
-            f"at most {limit:.1e} is allowed for the tolerance {self.control.tolerance:g}; give a smaller floor or "
-            "tolerance, and end no interval in the middle of a fast change"
+            f"the derivative of {self.control.name} over {len(self.path)} steps is uncertain by {error:.1e} of its "
+            f"size, more than the {limit:.1e} that its tolerance {self.control.tolerance:g} allows; give a smaller "
+            "floor or tolerance, and end no interval in the middle of a fast change"
         )
 
 

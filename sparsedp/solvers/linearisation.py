@@ -8,6 +8,7 @@ import numpy as np
 from sparsedp.errors import ConvergenceError
 from sparsedp.ledger import thread
 from sparsedp.solvers import facts
+from sparsedp.solvers.contract import norm
 from sparsedp.solvers.record import failure
 
 __all__ = ["Linearisation"]
@@ -60,6 +61,10 @@ class Linearisation:
         if self.small is not None:
             return self.small.seconds, str(self.small)
         return self.inv.info.setup_seconds, self.inv.info.hierarchy
+
+    def terms(self, x):
+        """|J| |x|: how large the terms of J x are; of dense factors entry by entry."""
+        return self.norm * norm(x) if self._small is None else self._small.terms(x)
 
     def step(self, F, forcing):
         """The Newton step -J^-1 F, up to the relative residual `forcing`. Never refused: the next residual judges."""

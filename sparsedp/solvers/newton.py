@@ -5,6 +5,9 @@ for linear systems (see contract.py), x is accepted when
 
     |F| <= rtol |b|,    or    |F| <= 8 eps (|J| |x| + |b|)    (converged_at_roundoff).
 
+Of small systems |J| |x| is taken entry by entry: unknowns of different sizes (species of 1 and 1e-10 with rates of 1e7)
+would else be accepted with errors that add up over many steps.
+
 A Jacobian serves further steps (simplified Newton) while they leave at most a tenth of the residual and the rest
 of the way is short. Such steps gain digits at a fixed rate, where a Newton step doubles them and most often ends
 far below the tolerance; they go on to rtol / 1000, so that roots found either way are as good.
@@ -195,7 +198,7 @@ class Newton:
         with np.errstate(over="ignore", invalid="ignore"):
             if in_range(self.size):
                 data = length(self.J.product(self.x) - self.F)
-                return self.size, data, self.J.norm * length(self.x) + data
+                return self.size, data, self.J.terms(self.x) + data
             unit = -_exponent(self.F)  # so that no square leaves the range of floats
             F = np.ldexp(self.F, unit)
             data = length(np.ldexp(self.J.product(self.x), unit) - F)

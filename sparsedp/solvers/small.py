@@ -52,6 +52,10 @@ class Small:
         """A x."""
         return shifted(self.matrix @ x, self.exponent) if self.exponent else self.matrix @ x
 
+    def terms(self, x):
+        """The 2-norm of |A| |x|, entry by entry."""
+        return float(np.ldexp(size_of(np.abs(self.matrix) @ np.abs(x)), self.exponent))
+
     def _solved(self, b, transposed):
         return GETRS(self._factors[0], self._factors[1].copy(), b, trans=int(transposed))[0]
 
