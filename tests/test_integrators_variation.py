@@ -82,6 +82,17 @@ def test_a_jump_that_moves():
     assert all(isinstance(error, float) for error in judge("van der Pol, 20", [1e-3]))
 
 
+@pytest.mark.parametrize("name, most", [("Robertson", 2e-6), ("HIRES", 1e-2)])
+def test_values_fall_with_the_tolerance(name, most):
+    """Newton's method took errors of 1e-5 in species of 5e-5 for rounding, and they added up."""
+    rate, _, start, params, end, _ = SCENES[name]
+    state, errors = np.array(KNOWN[name][0]), []
+    for tolerance in (1e-3, 1e-4):
+        new = dp.stepper("tr_bdf2", rate, end, tolerance=tolerance)(np.array(start), np.array(params))
+        errors.append(np.max(np.abs(new - state)) / np.max(np.abs(state)))
+    assert errors[1] < errors[0] <= most
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["van der Pol, 20", "van der Pol, 100", "HIRES"])
 def test_right_at_every_tolerance(name):
