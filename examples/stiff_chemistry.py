@@ -35,9 +35,9 @@ for tolerance in (1e-3, 1e-4, 1e-5):
     print(f"{tolerance:9.0e} {len(step.taken):6} {value:10.6f}  {figures} {seconds:8.1f}")
 
 controlled = dict(tolerance=1e-4, floor=1e-6)  # B is 4e-5: what it may be wrong by has to be less
-explicit, implicit = (dp.stepper(method, robertson, end / 500, **controlled) for method in ("rk4", "tr_bdf2"))
+explicit, implicit = (dp.stepper(method, robertson, end / 50, **controlled) for method in ("rk4", "tr_bdf2"))
 explicit(start, RATES), implicit(start, RATES)
-print(f"\nThe first {end / 500:g} s: rk4 takes {len(explicit.taken)} steps, tr_bdf2 {len(implicit.taken)}.")
+print(f"\nThe first {end / 50:g} s: rk4 takes {len(explicit.taken)} steps, tr_bdf2 {len(implicit.taken)}.")
 
 times = end * np.logspace(-3, 0, 10)
 lengths = np.diff(times, prepend=0.0)

@@ -162,8 +162,8 @@ def test_what_cannot_be_trusted_is_refused():
     with pytest.raises(
         DerivativeError,
         match=r"the derivative of stepper\(tr_bdf2\) over \d+ steps is uncertain by \S+ of its size, more than the \S+ "
-        r"that its tolerance 0.01 allows; give a smaller floor or tolerance, and end no interval in the middle of a "
-        "fast change",
+        r"that its tolerance 0.01 allows; give a smaller floor or tolerance, end no interval in the middle of a "
+        "fast change, or take fixed steps",
     ):
         value_and_grad(loss)(20.0)
 

@@ -311,11 +311,12 @@ def test_an_interrupted_run_returns_its_best_point_and_can_go_on(tmp_path):
     out, err, code = pressed(["running"], tmp_path / "parts")
     message, converged, many, value, right = out.split()
     assert (code, err) == (0, "") and (message, converged, right) == ("interrupted", "False", "True")
-    assert 11 <= int(many) < 150 and newest(tmp_path / "parts") == int(many) - 1
+    last = newest(tmp_path / "parts")  # one less where the signal came before an iteration was written down
+    assert 11 <= int(many) < 150 and last in (int(many) - 2, int(many) - 1)
     assert float(value) < valley(np.linspace(-1.2, 1.0, 60))
     again, whole = (dp.minimise(valley, np.linspace(-1.2, 1.0, 60), maxiter=150, tolerance=0, checkpoint=folder)
                     for folder in (tmp_path / "parts", None))  # fmt: skip
-    assert again.resumed.startswith(f"resumed from iteration {int(many) - 1} in") and same(again, whole)
+    assert again.resumed.startswith(f"resumed from iteration {last} in") and same(again, whole)
 
 
 def test_a_second_interrupt_stops_at_once(tmp_path):

@@ -8,7 +8,6 @@ import time
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from autograd.tracer import trace_stack
 
 import sparsedp as dp
 from sparsedp import ledger, traces
@@ -88,8 +87,9 @@ def told(found):
 
 
 def left_over():
-    kept = len(ledger.active), len(ledger.observers), len(ledger.loops), len(ledger._inner), len(traces.witnesses)
-    return trace_stack.top, *kept, set(traces.untraced)
+    mine = ledger.thread
+    kept = len(mine.calls), len(mine.observers), len(mine.loops), len(mine.inner), len(mine.witnesses)
+    return len(ledger.active), *kept, set(traces.untraced)
 
 
 @pytest.mark.parametrize("job", [gradient, product, twice])

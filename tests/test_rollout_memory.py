@@ -253,6 +253,8 @@ def test_the_budget_is_what_a_step_without_needs_of_its_own_takes(states, params
     n, rng, size = 60, np.random.default_rng(0), 400_000
     u = rng.random(size // 8)
     v, weights = rng.random(u.shape), np.cos(u)
+    for given in (u, v, weights):  # nobody writes into them: the tape of the loss keeps no copies beside the rollout
+        given.flags.writeable = False
     step, runs = Scaled(u.size), []
 
     def total(u, v):

@@ -109,7 +109,7 @@ def stepper(
     A coefficient of 0 leaves the state as it is, bit for bit, without set-up or solve.
     With a tolerance each step is extrapolated from two half steps and a whole one (not crank_nicolson), and its length
     follows a jump whose time moves with the params. The derivative is that of these steps; what extrapolation takes
-    away from it, relative to the params and to its largest entry, must stay below 4 tolerance^(p / (p + 1)), p the
+    away from it, relative to the params and to its largest entry, must stay below 6 tolerance^(p / (p + 1)), p the
     order (crank_nicolson: below 10 tolerance). Derivatives that are small because terms cancel may be refused, too.
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
     takes about five times the steps of its value: twice as long as without the judgement.

@@ -23,14 +23,14 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import DerivativeError
-from sparsedp.tape import cast, differentiable, dtype_of, is_variable, isbox, linear, plain
+from sparsedp.tape import Rule, cast, dtype_of, is_variable, isbox, linear, plain
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["Variation"]
 
 SLACK = 0.05  # relative change of the state in a half step that has it follow the flow by half
 EPSILON = 1e-3  # share of the shadow
-MOST = 4.0  # error of a derivative without extrapolation, in units of tolerance^(p / (p + 1)), that is taken
+MOST = 6.0  # error of a derivative without extrapolation, in units of tolerance^(p / (p + 1)), that is taken
 TIMES = 10.0  # error of a derivative in units of the tolerance: aim with extrapolation, limit without
 SHARE = 1e-4  # of what goes in: derivatives that are smaller are judged by it
 
@@ -132,13 +132,13 @@ class Variation:
         enter, leave = self._pair(_packed_sizes(given, map(_size, given)), 1 / _packed_sizes(given, wide), scale)
         split, meet = self._pair(1 / _packed_sizes(ends, far), _packed_sizes(ends, map(_size, ends)), scale)
         name = f"{self.control.name}.variation"
-        start = differentiable(
+        start = Rule(
             name,
             lambda x: np.stack([x, x]),
             lambda nums, ans, x: lambda g: (leave(g),),
             lambda nums, tangents, ans, x: enter(tangents[0]),
         )
-        end = differentiable(
+        end = Rule(
             name,
             lambda both: both[0].copy(),
             lambda nums, ans, both: lambda g: (split(g),),
@@ -171,7 +171,7 @@ class Variation:
         raise DerivativeError(
             f"the derivative of {self.control.name} over {len(self.path)} steps is uncertain by {error:.1e} of its "
             f"size, more than the {limit:.1e} that its tolerance {self.control.tolerance:g} allows; give a smaller "
-            "floor or tolerance, and end no interval in the middle of a fast change"
+            "floor or tolerance, end no interval in the middle of a fast change, or take fixed steps"
         )
 
 
