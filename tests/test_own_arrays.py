@@ -130,6 +130,11 @@ BUILDERS = {
         lambda dt, r: dp.stepper("tr_bdf2", L, dt, solver="krylov", rtol=r),
         stepped,
     ),
+    "stepper, copied": (
+        (np.array(0.01), np.array(1e-3), sp.csr_array(np.eye(12))),
+        lambda dt, r, s: dp.stepper("backward_euler", lambda u, p: -p * u**3, dt, rtol=r, sparsity=s),
+        lambda step: stepped(deepcopy(step)),
+    ),
     "stepper, coefficient": (
         (np.array(0.3),),
         lambda c: dp.stepper("imex", lambda u, p: p * u * u, 0.01, linear=(L, c)),

@@ -1,7 +1,5 @@
 """stepper(): a rate of change and a method -> a step for time loops."""
 
-from copy import deepcopy
-
 from sparsedp.fields import is_number
 from sparsedp.integrators.adaptive import Adaptive
 from sparsedp.integrators.explicit import EXPLICIT, Explicit
@@ -130,20 +128,20 @@ def stepper(
     check_settings(solver, rtol, maxiter, "raise")
     if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
         raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
-    given = dict(
-        linear=linear, source=source, timed=timed, tolerance=tolerance, floor=deepcopy(floor), unstable=unstable
-    )
+    dt = dt if callable(dt) else positive(dt, "dt")
+    # The caller may reuse the arrays.
+    linear, floor, tolerance, rtol, options = copied((linear, floor, tolerance, float(rtol), options))
+    given = dict(linear=linear, source=source, timed=timed, tolerance=tolerance, floor=floor, unstable=unstable)
     given |= dict(jacobian=jacobian, solver=solver, rtol=rtol, maxiter=maxiter, **options)
     made = _remade, (method, rate, dt, given)
     problem = posed(rate, linear, source, timed)
-    settings, options = dict(method=solver, rtol=float(rtol), nullspace="raise"), copied(options)
+    settings = dict(method=solver, rtol=rtol, nullspace="raise")
     scheme = _scheme(method, problem, jacobian, settings, maxiter, options, KEPT[tolerance is not None])
     limit = None
     if tolerance is not None:
-        scheme = Adaptive(scheme, float(tolerance), copied(floor), f"stepper({method})")
+        scheme = Adaptive(scheme, float(tolerance), floor, f"stepper({method})")
     elif method in EXPLICIT and problem.op is not None and unstable == "raise":
         limit = Limit(problem.op, EXPLICIT[method].reach, method)
-    dt = dt if callable(dt) else positive(dt, "dt")
     bare = problem.whole and source is None and tolerance is None and isinstance(dt, float)
     kind = LinearStep if bare else NonlinearStep if _ends_known(scheme, problem) else Step
     return kind(method, problem, dt, scheme, limit, made)

@@ -103,7 +103,7 @@ def _linear(given, whole):
     """(Operator or None, function params -> coefficient)."""
     if given is None:
         return None, None
-    op, coefficient = copied(given) if isinstance(given, tuple) and len(given) == 2 else (given, 1.0)
+    op, coefficient = given if isinstance(given, tuple) and len(given) == 2 else (given, 1.0)
     if not isinstance(op, Operator):
         raise TypeError(f"linear takes an Operator or a pair (Operator, coefficient), got {type(op).__name__}")
     if not fits(op.domain, op.codomain):
