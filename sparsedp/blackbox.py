@@ -281,18 +281,22 @@ class Adopted(Remade):
         ways += [(DIFFERENCES, share) for share in SHARES] if self._derivative != "complex" else []
         made: dict = {}
         matrix, wrong = None, np.ones(coloured.pattern.shape[0], dtype=bool)
+        left, judged = len(SHARES) * len(ways), False
         for share, way in product(reversed(SHARES), ways):
+            left -= 1
             try:
                 with _strict():
                     made[way] = made[way] if way in made else self._by_colours(coloured, x, *way)
                     matrix = made[way] if matrix is None else _with_rows(matrix, made[way], wrong)
                     wrong &= self._misses(matrix, x, way[0], share)
-            except Exception as error:  # the code takes no complex numbers here, or nothing so far from x
-                trouble = error
+                judged = True
+            except MemoryError:
+                raise
+            except Exception:  # the code takes no complex numbers here, or nothing so far from x
+                if not left and not judged:
+                    raise
             if not wrong.any():
                 break
-        if matrix is None:
-            raise trouble
         return matrix, wrong
 
     def _misses(self, matrix, x, way, share=SHARES[-1]):
@@ -314,6 +318,8 @@ class Adopted(Remade):
         try:
             with _strict():
                 step = self._product(x, STEP)(v)
+        except MemoryError:
+            raise
         except Exception:
             return False
         size = float(np.linalg.norm(difference))

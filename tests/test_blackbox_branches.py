@@ -180,6 +180,38 @@ def test_a_sparsity_that_lacks_entries(f, derivative, rng):
         assert rows_agree(found, CODES[f](x), 1e-7)
 
 
+def test_code_that_refuses_every_probe():
+    """What it says is said, not that its sparsity lacks entries."""
+    x = np.array([1.0, 2.0])
+
+    def narrow(z):
+        if np.any(z.real != x):
+            raise ValueError("outside of the table")
+        return z**2
+
+    with pytest.raises(ValueError, match="outside of the table"):
+        dp.adopt(narrow, sparsity=np.eye(2), derivative="complex").jacobian(x)
+
+
+@pytest.mark.parametrize("place", [2, 4, 9])
+def test_no_memory_is_no_branch_of_the_code(place):
+    """It is handed on from wherever the code runs into it, and so is Ctrl-C; the next call is as the first."""
+    x, calls = np.array([1.0, -2.0, 3.0]), []
+
+    def full(z):
+        calls.append(z)
+        if len(calls) == place:
+            raise trouble
+        return z**2
+
+    for trouble in (MemoryError(), KeyboardInterrupt()):
+        calls.clear()
+        adopted = dp.adopt(full)
+        with pytest.raises(type(trouble)):
+            adopted.jacobian(x)
+        assert np.allclose(adopted.jacobian(x).toarray(), np.diag(2 * x), rtol=1e-12)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_never_a_wrong_number(seed):
     """Random programs of branches, at random points: what is handed out agrees with dense differences."""
