@@ -18,9 +18,8 @@ CHUNK = 2**15  # entries that are compared at once: two pieces of them stay in t
 BITS = {1: np.int8, 2: np.int16, 4: np.int32, 8: np.int64}  # by size of an entry: what its bits are compared as
 FIXED = {float, int, bool, str, slice, type(None), type(Ellipsis), np.float64}
 
-sparing: set = (
-    set()
-)  # functions whose pullbacks need no numbers of their constants, and those that call `constant_args`
+# Functions whose pullbacks need no numbers of their constants, and those that call `constant_args`.
+sparing: set = set()
 copies: WeakValueDictionary = WeakValueDictionary()  # (address, shape, strides) of an array -> the last copy of it
 
 

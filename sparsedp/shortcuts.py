@@ -200,5 +200,5 @@ TANGENTS: dict[Any, Any] = {
     anp.divide: _divide_along,
     anp.negative: _negative_along,
     anp.numpy_boxes.ArrayBox.__getitem__: _item_along,
-    anp.numpy_wrapper.array_from_args: _array_along,
+    anp.array_from_args: _array_along,
 }

@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.tape import is_variable
-from sparsedp.tree import flatten, norm
+from sparsedp.tree import copied, flatten, norm
 
 __all__ = ["Point"]
 
@@ -39,7 +39,7 @@ class Point:
 
     def tree(self, values=None, exact=True):
         """The tree with other floating leaves, of the types of the originals if `exact`; always fresh copies."""
-        leaves = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in self._found]
+        leaves = copied(self._found)
         for place, value in zip(self.places, self.values if values is None else values, strict=True):
             leaves[place] = _like(self._found[place], value) if exact else value
         return self._rebuild(leaves)

@@ -5,8 +5,6 @@ hold the wall values; along the other axes it is a field between walls half a ce
 fluid does there is a condition: no_slip and inflow are dirichlet, free_slip and outflow neumann.
 """
 
-from copy import deepcopy
-
 import numpy as np
 import scipy.sparse as sp
 
@@ -22,6 +20,7 @@ from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Mask
 from sparsedp.tape import Rule
+from sparsedp.tree import copied
 
 __all__ = ["convection", "face_laplacian", "face_lift"]
 
@@ -179,7 +178,7 @@ def convection(grid, boundary="no_slip", solid=None):
     A = Operator(Kronecker(flux, faces.parts, carried), faces, sites, "carried")
     B = Operator(Kronecker(flux, faces.parts, carrier), faces, sites, "carrier")
     C = Operator(compose(free, Kronecker(faces.parts, flux, gain)), sites, faces, "gain")
-    return _bilinear("convection", A, B, C, (convection, (grid, deepcopy(boundary), deepcopy(solid))))
+    return _bilinear("convection", A, B, C, (convection, copied((grid, boundary, solid))))
 
 
 def _bilinear(name, A, B, C, made):

@@ -24,7 +24,6 @@ from sparsedp.operators.difference import gradient
 from sparsedp.recipe import Remade
 from sparsedp.solvers.choose import inverse
 from sparsedp.tape import isbox, plain
-from sparsedp.tree import copied
 
 __all__ = ["FlowStep", "flow_step"]
 
@@ -109,10 +108,7 @@ def flow_step(
             f"flow_step takes walls on {grid.faces}, got an array of shape {np.shape(plain(walls))}; write "
             "face_lift(grid, boundary)(values)"
         )
-    viscosity, walls = (
-        viscosity if callable(viscosity) else float(viscosity),
-        copied(walls),
-    )  # the caller may reuse them
+    viscosity = viscosity if callable(viscosity) else float(viscosity)
     return FlowStep(grid, float(dt), viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary)
 
 
@@ -134,7 +130,8 @@ class FlowStep(Remade):
     def __init__(self, grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary):
         self.grid, self.dt, self.viscosity = grid, dt, viscosity
         self.project = projection(grid, solid, boundary)
-        _, solid, boundary, _ = self.project.structure.setup.made  # copies: the caller may change these
+        _, solid, boundary, _ = self.project.structure.setup.made  # copies, as of the walls: the caller may change them
+        walls = constant(walls)
         self.made = grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
         self.pressure = self.project.pressure
         self.slope = gradient(grid, pressure_conditions(flow_sides(grid, boundary)), solid)
@@ -143,7 +140,7 @@ class FlowStep(Remade):
         self.laplacian: Any = None
         if viscosity:
             self.laplacian = face_laplacian(grid, boundary, solid, solid_boundary)
-        self.walls = constant(walls) if viscosity else None
+        self.walls = walls if viscosity else None
         self.relax: Any = None
         if implicit and viscosity:
             self.relax = inverse(identity(grid.faces) - (0.5 * dt * viscosity) * self.laplacian)

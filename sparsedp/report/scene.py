@@ -5,7 +5,7 @@ import numpy as np
 from sparsedp.check.point import Point
 from sparsedp.report.growth import growth_of
 from sparsedp.report.trial import run
-from sparsedp.tree import flatten
+from sparsedp.tree import copied, flatten
 
 __all__ = ["Scene"]
 
@@ -44,7 +44,7 @@ class Scene:
 
     def at(self, other=None):
         """The tree x with other values of some parameters."""
-        leaves = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in self._found]
+        leaves = copied(self._found)
         for name, value in (other or {}).items():
             plain = isinstance(self.leaves[name], float) and np.ndim(value) == 0
             leaves[self._places[name]] = float(value) if plain and np.asarray(value).dtype.kind == "f" else value

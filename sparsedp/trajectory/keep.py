@@ -6,12 +6,13 @@ backward says which cotangent enters at which state (`source`).
 
 import numpy as np
 
+from sparsedp.constants import constant
 from sparsedp.direction import pull_ends
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import frozen
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.traces import reverse_root, split_box, trace
-from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, still
+from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["All", "Each", "Last", "marked"]
@@ -217,7 +218,7 @@ class _EachCollector:
         places = [self._store(leaf) if is_variable(leaf) else None for leaf in found]
         if self._stored:
             self._keep.compare(i, [marked(leaf) for leaf, place in zip(found, places, strict=True) if place])
-        found = still([None if place else leaf for leaf, place in zip(found, places, strict=True)])
+        found = constant([None if place else leaf for leaf, place in zip(found, places, strict=True)])
         self._trees.append((flatten(rebuild(found))[1], found, places))
         return values
 

@@ -11,7 +11,7 @@ from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten
 
-__all__ = ["NOTHING", "Layout", "dense", "fingerprint", "owned", "refuse_mask", "still"]
+__all__ = ["NOTHING", "Layout", "dense", "fingerprint", "owned", "refuse_mask"]
 
 
 NOTHING = (None,)  # the leaves beside one variable
@@ -199,8 +199,7 @@ def _brief(value):
 
 def dense(value):
     """Array or number -> contiguous array, or a NumPy scalar when it has no axes."""
-    value = np.ascontiguousarray(value) if np.ndim(value) else np.asarray(value)[()]
-    return value
+    return np.ascontiguousarray(value) if np.ndim(value) else np.asarray(value)[()]
 
 
 def owned(value):
@@ -212,11 +211,6 @@ def refuse_mask(what, leaf):
     """The mask of an array would be lost on the way."""
     if isinstance(leaf, np.ma.MaskedArray):
         raise TypeError(f"{what}; fill it first, and hand the mask along as an array of its own")
-
-
-def still(statics):
-    """Leaves that are no variables -> the same, arrays among them as copies nobody can write into."""
-    return statics if statics is NOTHING else constant(statics)
 
 
 def fingerprint(values, statics=NOTHING):

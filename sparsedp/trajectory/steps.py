@@ -4,13 +4,14 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from sparsedp.constants import constant
 from sparsedp.direction import pull_ends, zero_like
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
 from sparsedp.tape import fit
 from sparsedp.traces import inside, new_box, reverse_root, split_box
-from sparsedp.trajectory.layout import fingerprint, owned, still
-from sparsedp.tree import flatten, leaves
+from sparsedp.trajectory.layout import fingerprint, owned
+from sparsedp.tree import copied, flatten, leaves
 
 __all__ = ["Taped", "boxed", "fitted"]
 
@@ -80,7 +81,7 @@ class Taped:
             state = run.state.build([frozen(value) for value in values], statics)
             result = self._applied(state, self.params, *run.input_at(i, self.x))
         values, statics = run.state.take(result, "the step")
-        return run.state.check(values, "the step"), still(statics)
+        return run.state.check(values, "the step"), constant(statics)
 
     def _silenced(self, i, values):
         """A dual run has no tangents where the derivative is cut."""
@@ -115,7 +116,7 @@ class Taped:
         layouts = [run.state, run.params, run.inputs][: len(parts)]
         for number, name in enumerate(label for layout in layouts for label in layout.labels):
             if isinstance(found[number], np.ndarray):
-                copies = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in found]
+                copies = copied(found)
                 copies[number].flags.writeable = False
                 try:
                     run.step(*rebuild(copies))
@@ -205,7 +206,7 @@ class Taped:
         run, before = self.run, self.run.tapes.bytes
         pairs, roots, statics = self._taped(i, values, statics, run.wants(i, self.wanted), run.tapes.weighs(i))
         run.tapes.keep(i, ([node for _, node in pairs], roots), before)
-        return run.state.check([value for value, _ in pairs], "the step"), still(statics)
+        return run.state.check([value for value, _ in pairs], "the step"), constant(statics)
 
     def _plan_roots(self, want_state, weighed):
         """A root for each variable that is traced, else None. They hold nothing: every step uses them again."""
