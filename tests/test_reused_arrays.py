@@ -109,7 +109,8 @@ def test_one_array_for_all_calls(name, place, way):
     fresh, reused = (
         answer(WAYS[way], lambda x, r=reused: total(*CASES[name][0](), place, r, x), x, v) for reused in (False, True)
     )
-    assert way not in ("gradient",) or not isinstance(fresh, str)
+    # Only some schemes of transport have no second derivative.
+    assert not isinstance(fresh, str) or (name.startswith("transport_") and way not in ("gradient", "tangent"))
     for one, other in zip(leaves(fresh), leaves(reused), strict=True):
         assert np.array_equal(one, other)
 
