@@ -5,6 +5,7 @@ import inspect
 import math
 import weakref
 
+import autograd
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -175,18 +176,17 @@ def test_rules_and_operators_do_not_leak():
     assert alive() is None
 
 
-def test_an_exception_leaves_the_tracer_as_it_was():
-    from autograd.tracer import trace_stack
-
-    top = trace_stack.top
-
+def test_an_exception_in_an_inner_derivative_leaves_the_outer_one_right():
     def stop(x):
         raise ValueError("no")
 
-    for _ in range(3):
-        with pytest.raises(ValueError, match="no"):
-            value_and_grad(stop)(1.0)
-    assert trace_stack.top == top
+    def loss(x):
+        for _ in range(3):
+            with pytest.raises(ValueError, match="no"):
+                value_and_grad(stop)(x)
+        return x * value_and_grad(lambda y: y**3)(x)[1]
+
+    assert value_and_grad(loss)(2.0) == (24.0, 36.0)
 
 
 def test_linear_rules_are_each_others_derivative():
@@ -227,3 +227,21 @@ def test_a_function_that_does_not_tell_how_it_is_called():
     )
     assert dp.value_and_grad(lambda z: hypot(z[0], z[1]))((3.0, 4.0)) == (5.0, (0.6, 0.8))
     assert "derivative of hypot in args: not asked" in dp.explain(lambda x: hypot(x, 4.0), 3.0).left_out
+
+
+@pytest.mark.parametrize("inner", [autograd.grad, lambda f: lambda x: value_and_grad(f)(x)[1]], ids=["autograd", "own"])
+@pytest.mark.parametrize("outer", [autograd.grad, lambda f: lambda x: value_and_grad(f)(x)[1]], ids=["autograd", "own"])
+def test_no_number_of_a_trace_is_given_twice(outer, inner):
+    """Of two that are nested the inner one has the larger number, and a later one has a larger one than both."""
+    numbers = []
+
+    def cube(x):
+        numbers.append(x._trace)
+        return x**3
+
+    def slope(x):
+        numbers.append(x._trace)
+        return inner(cube)(x)
+
+    assert [outer(slope)(2.0), inner(cube)(2.0), outer(slope)(2.0)] == [12.0, 12.0, 12.0]
+    assert len(numbers) == 5 and all(before < after for before, after in zip(numbers, numbers[1:]))
