@@ -3,6 +3,8 @@
 import pickle
 from copy import deepcopy
 from functools import cached_property, update_wrapper
+from threading import local
+from types import MethodType
 from typing import Any
 
 __all__ = ["Made", "Remade", "Uncached"]
@@ -31,19 +33,32 @@ class Remade:
         return build(*deepcopy(arguments, memo))
 
 
+_busy = local()  # .parts: what this thread is looking at, for objects that hold what holds them
+
+
 def _check_named(owner, part):
-    """Refuse functions that another process cannot import."""
+    """Refuse functions that another process cannot import.
+
+    Of a method only the class is looked at: its object may hold `owner`, and pickle itself follows such circles.
+    """
     if isinstance(part, (tuple, list, dict)):
         for one in part.values() if isinstance(part, dict) else part:
             _check_named(owner, one)
     elif callable(part) and not isinstance(part, Remade):
+        parts = vars(_busy).setdefault("parts", set())
+        if id(part) in parts:
+            return
+        parts.add(id(part))
+        method = isinstance(part, MethodType) and not isinstance(part.__self__, type)
         try:
-            pickle.dumps(part)
+            pickle.dumps(type(part.__self__) if method else part)
         except Exception as error:
             raise TypeError(
                 f"{owner} cannot be pickled with {getattr(part, '__qualname__', repr(part))}, which other processes "
-                "cannot import; write it as a def at the top level of a module"
+                f"cannot import; write {'its class' if method else 'it as a def'} at the top level of a module"
             ) from error
+        finally:
+            parts.discard(id(part))
 
 
 class Made(Remade):

@@ -125,3 +125,50 @@ def test_the_message_whole():
         pickle.dumps(dp.adopt(doubled, name="adopted"))
     with pytest.raises(TypeError, match="cannot be pickled with .*LinearOperator with dtype=float64"):
         pickle.dumps(dp.from_linear_operator(scipys))
+
+
+class Scene:
+    """As users write one: it holds what was made of its own method."""
+
+    def __init__(self):
+        self.factor = 3.0
+        self.gradient = dp.value_and_grad(self.loss)
+        self.step = dp.stepper("euler", self.rate, 0.5)
+
+    def loss(self, x):
+        return self.factor * self.step(x, None) ** 2
+
+    def rate(self, u, params):
+        return -u
+
+
+class Doubles:
+    """A function with a state, that holds what was made of it."""
+
+    def __init__(self):
+        self.gradient = dp.value_and_grad(self)
+
+    def __call__(self, x):
+        return 2 * x
+
+
+def test_objects_made_of_a_method_of_what_holds_them():
+    for scene in (Scene(), Doubles()):
+        for twin in (pickle.loads(pickle.dumps(scene)), copy.deepcopy(scene)):
+            assert twin.gradient(2.0) == scene.gradient(2.0)
+            assert twin is not scene
+    twin = pickle.loads(pickle.dumps(scene.gradient))
+    assert twin(2.0) == scene.gradient(2.0)
+
+
+def test_a_method_of_a_class_without_a_place():
+    class Inner:
+        def rate(self, u, params):
+            return -u
+
+    with pytest.raises(
+        TypeError,
+        match=r"stepper\(euler\) cannot be pickled with .*Inner.rate, which other processes cannot import; write its "
+        "class at the top level of a module",
+    ):
+        pickle.dumps(dp.stepper("euler", Inner().rate, 0.5))
