@@ -176,3 +176,23 @@ def test_complex_and_single_precision():
     single = dp.stepper("heun", lambda u, p: -p * u, 2.0, tolerance=1e-4)
     new, pulled = value_and_grad(lambda u: anp.sum(single(u, 0.5)))(np.ones(3, np.float32))
     assert pulled.dtype == np.float32 and pulled == pytest.approx(np.exp(-1.0), rel=1e-3)
+
+
+def test_without_extrapolation_the_way_out_is_another_method():
+    """Errors of crank_nicolson fall more slowly than its tolerance: a smaller one would be refused, too."""
+
+    def prey(u, p):
+        return anp.array([p[0] * u[0] - p[1] * u[0] * u[1], p[1] * u[0] * u[1] - p[2] * u[1]])
+
+    def slope(method):
+        step = dp.stepper(method, prey, 20.0, tolerance=1e-4)
+        return value_and_grad(lambda p: step(np.array([1.0, 0.5]), p)[0])(np.array([1.0, 0.8, 0.6]))[1]
+
+    with pytest.raises(
+        DerivativeError,
+        match=r"the derivative of stepper\(crank_nicolson\) over \d+ steps is uncertain by \S+ of its size, more than "
+        r"the \S+ that its tolerance 0.0001 allows; take tr_bdf2, which extrapolates, end no interval in the middle of "
+        "a fast change, or take fixed steps",
+    ):
+        slope("crank_nicolson")
+    assert np.allclose(slope("tr_bdf2"), [-7.108311, -6.095685, -16.290818], rtol=0, atol=1e-3 * 16.3)  # by SciPy

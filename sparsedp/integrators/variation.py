@@ -168,10 +168,12 @@ class Variation:
         return linear(f"{control.name}.variation", spread, judge)
 
     def _refuse(self, error, limit):
+        # Without extrapolation errors fall more slowly than the tolerance: a smaller one is refused all the more.
+        cure = "give a smaller floor or tolerance" if self.control.weight else "take tr_bdf2, which extrapolates"
         raise DerivativeError(
             f"the derivative of {self.control.name} over {len(self.path)} steps is uncertain by {error:.1e} of its "
-            f"size, more than the {limit:.1e} that its tolerance {self.control.tolerance:g} allows; give a smaller "
-            "floor or tolerance, end no interval in the middle of a fast change, or take fixed steps"
+            f"size, more than the {limit:.1e} that its tolerance {self.control.tolerance:g} allows; {cure}, end no "
+            "interval in the middle of a fast change, or take fixed steps"
         )
 
 
