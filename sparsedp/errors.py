@@ -42,7 +42,7 @@ class GrowthWarning(UserWarning):
 
 
 class BudgetWarning(UserWarning):
-    """A memory budget with which a run takes several times as long as with a little more."""
+    """A memory budget with which a run takes three times as long as with at most twice as much."""
 
 
 class ConvergenceError(SparsedpError, RuntimeError):

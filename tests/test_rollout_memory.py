@@ -279,8 +279,7 @@ def test_a_budget_that_a_little_more_would_help_says_so():
     )(U0)
     with pytest.warns(
         BudgetWarning,
-        match="rollout runs 100 steps 49.5 times each within memory=576, and 8.46 times with a little more; "
-        "write memory=672",
+        match="rollout runs 100 steps 49.5 times each within memory=576, and 8.46 times with more; write memory=672",
     ):
         tight(6 * size)
     assert runs[-1].factor == 49.51

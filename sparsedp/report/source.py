@@ -67,7 +67,8 @@ def audited(name):
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise ValueError(f"{name} cannot be audited: {type(error).__name__}: {error}") from error
+        cure = "" if isinstance(error, Exception) else "; it ended the program, let it return its value"
+        raise ValueError(f"{name} cannot be audited: {type(error).__name__}: {error}{cure}") from error
 
 
 def _of_one(loss, x):

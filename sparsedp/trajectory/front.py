@@ -165,8 +165,8 @@ def _warn_of_repeats(memory, size, n, beside):
         few, many = (plan(n, bytes_, size, beside).factor for bytes_ in (more, memory))
         warnings.warn(
             BudgetWarning(
-                f"rollout runs {n} steps {many:.3g} times each within memory={memory!r}, and {few:.3g} times with a "
-                f"little more; write memory={more}"
+                f"rollout runs {n} steps {many:.3g} times each within memory={memory!r}, and {few:.3g} times with "
+                f"more; write memory={more}"
             ),
             stacklevel=3,
         )
