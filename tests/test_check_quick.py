@@ -40,6 +40,7 @@ def test_a_quick_audit_takes_a_third_and_says_what_it_did_not_look_at():
     )
     assert quick.reason == limits
     assert str(quick).endswith(f"verdict: agrees to {quick.digits} digits: {limits}")
+    assert str(quick).count(limits) == 1
     assert whole.reason == "" and "quick" not in str(whole)
 
 

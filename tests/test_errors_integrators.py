@@ -31,6 +31,16 @@ TABLE = [
         "tolerance must be between 0 and 1 or None, got 0; write for example 1e-6",
     ),
     (
+        lambda: dp.stepper("rk4", decay, 0.1, tolerance=1e-3, floor=(1e-3, -1.0)),
+        VALUE,
+        "floor must hold numbers >= 0, in the units of u, got (0.001, -1.0); write for example 1e-3",
+    ),
+    (
+        lambda: dp.stepper("rk4", decay, 0.1, tolerance=1e-3, floor="small"),
+        VALUE,
+        "floor must hold numbers >= 0, in the units of u, got 'small'; write for example 1e-3",
+    ),
+    (
         lambda: dp.stepper("imex", decay, 0.1),
         TYPE,
         "imex needs the stiff linear term: write linear=L or linear=(L, coefficient)",
@@ -184,7 +194,7 @@ def test_no_step_meets_the_tolerance():
     step = dp.stepper("rk4", lambda u, p: u**2, 2.0, tolerance=1e-3)
     message = (
         r"stepper\(rk4\) found no step that meets the tolerance 0.001 at 0.5 of its interval after \d+ steps; take a "
-        "larger tolerance or a method for stiff problems"
+        "larger tolerance, a method for stiff problems, or an interval that ends before the solution does"
     )
     with pytest.raises(dp.errors.ConvergenceError, match=message):
         step(np.ones(1))

@@ -140,7 +140,7 @@ class Audit:
         parts = [f"gradient at {self.size} values, loss {self.value:.6g}, {self.evaluations} evaluations"]
         if self.lines:
             parts += [self._curves(), self._summary()]
-        parts += [f"  {note}" for note in self.notes]
+        parts += [f"  {note}" for note in self.notes if note != self.reason]
         proved = f" to {self.digits} digits" if self.digits is not None else ""
         return "\n".join([*parts, f"verdict: {self.verdict}{proved}{': ' if self.reason else ''}{self.reason}"])
 

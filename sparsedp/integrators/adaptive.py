@@ -96,7 +96,8 @@ class Adaptive:
                 break
         raise ConvergenceError(
             f"{self.name} found no step that meets the tolerance {self.tolerance:g} at {done:.3g} of its interval "
-            f"after {len(taken)} steps; take a larger tolerance or a method for stiff problems"
+            f"after {len(taken)} steps; take a larger tolerance, a method for stiff problems, or an interval "
+            "that ends before the solution does"
         )
 
     def _foreseen(self, change, length, error, trend):

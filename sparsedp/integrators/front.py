@@ -1,5 +1,7 @@
 """stepper(): a rate of change and a method -> a step for time loops."""
 
+import numpy as np
+
 from sparsedp.fields import is_number
 from sparsedp.integrators.adaptive import Adaptive
 from sparsedp.integrators.explicit import EXPLICIT, Explicit
@@ -11,7 +13,7 @@ from sparsedp.integrators.split_steps import SPLIT, Exponential, Imex
 from sparsedp.integrators.stability import Limit
 from sparsedp.integrators.steps import Step
 from sparsedp.solvers.choose import check_settings
-from sparsedp.tree import copied
+from sparsedp.tree import copied, leaves
 
 __all__ = ["METHODS", "stepper"]
 
@@ -128,6 +130,8 @@ def stepper(
     check_settings(solver, rtol, maxiter, "raise")
     if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
         raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
+    if not all(map(_is_floor, leaves(floor))):
+        raise ValueError(f"floor must hold numbers >= 0, in the units of u, got {floor!r}; write for example 1e-3")
     dt = dt if callable(dt) else positive(dt, "dt")
     # The caller may reuse the arrays.
     linear, floor, tolerance, rtol, options = copied((linear, floor, tolerance, float(rtol), options))
@@ -145,6 +149,11 @@ def stepper(
     bare = problem.whole and source is None and tolerance is None and isinstance(dt, float)
     kind = LinearStep if bare else NonlinearStep if _ends_known(scheme, problem) else Step
     return kind(method, problem, dt, scheme, limit, made)
+
+
+def _is_floor(leaf):
+    """Whether a leaf of the floor is a number, or numbers, that sizes are added to; None: the default."""
+    return leaf is None or (np.asarray(leaf).dtype.kind in "fiu" and bool(np.all(np.asarray(leaf) >= 0)))
 
 
 def _remade(method, rate, dt, given):
