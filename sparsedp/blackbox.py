@@ -66,8 +66,8 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     ShapeError
         If the sparsity or a later x has another shape.
     DerivativeError
-        If f is not deterministic, or no Jacobian agrees with a difference along a random direction: a sparsity that
-        lacks entries, a point where f has no derivative; on derivatives of second order.
+        If f is not deterministic or has changed since it was run, or no Jacobian agrees with a difference along a
+        random direction: a sparsity that lacks entries, a point where f has no derivative; on derivatives of second order.
     NonFiniteError
         If f is NaN or infinite near x.
 
@@ -120,8 +120,8 @@ class Adopted(Remade):
         self._rule = Rule(
             name,
             self._run,
-            lambda nums, y, x: lambda g: (transposed(g, x),),
-            lambda nums, tangents, y, x: direct(tangents[0], x),
+            lambda nums, y, x: lambda g: (transposed(g, self._same(x, y)),),
+            lambda nums, tangents, y, x: direct(tangents[0], self._same(x, y)),
         )
 
     def recipe(self):
@@ -186,10 +186,23 @@ class Adopted(Remade):
         -------
         csr_array, (y.size, x.size)
         """
+        return self._known(x)[0]
+
+    def _known(self, x):
+        """The Jacobian at a point, and the result there."""
         x = np.asarray(plain(x), dtype=float)
         with self._alone:
             known = self._points.find((x,))
             return self._points.put((x,), self._made(x)) if known is None else known
+
+    def _same(self, x, y):
+        """The argument of a run; refused if its Jacobian is that of another result, as of code with a state."""
+        if plain(x).dtype == float and not np.array_equal(self._known(x)[1], plain(y)):
+            raise DerivativeError(
+                f"{self.name} gives another result for the same argument than before; it must depend on its argument "
+                "only, so what changes from call to call must be a part of it"
+            )
+        return x
 
     def _made(self, x):
         check_finite(f"the argument of {self.name}", x)
@@ -213,7 +226,7 @@ class Adopted(Remade):
                 "random direction sees; its sparsity lacks entries, or it has a kink at x: leave sparsity and "
                 "derivative out, or move x a little"
             )
-        return matrix
+        return matrix, y
 
     # ------------------------------------------------------------ the pattern
 

@@ -7,6 +7,7 @@ A large array that many nodes use is copied once: the last copy of the array at 
 compared bit by bit. That takes as long as a copy and saves the memory. Copies live as long as the tapes that hold them.
 """
 
+from copy import copy
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -57,6 +58,10 @@ def constant(value):
         return kind(map(constant, value))
     if kind is dict:
         return {name: constant(one) for name, one in value.items()}
+    if isinstance(value, dict):  # in an order of its own, or with a default
+        held = copy(value)
+        held.update({name: constant(one) for name, one in value.items()})
+        return held
     return kind(*map(constant, value)) if isinstance(value, tuple) and hasattr(kind, "_fields") else value
 
 

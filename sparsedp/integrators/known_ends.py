@@ -19,13 +19,13 @@ __all__ = ["NonlinearStep"]
 class NonlinearStep(Step):
     """A Step of `Nonlinear` stages with plain forward and backward forms."""
 
-    sparing = True
+    sparing = solves = True
 
     def forward(self, state, params, out=None):
         """The state after a step, of plain values."""
         return self(state, params)
 
-    def backward(self, state, params, g, into=None, new=None, wanted=True):
+    def backward(self, state, params, g, into=None, new=None, wanted=True, met=None):
         """Cotangents (of state, of params) of a step; plain. See LinearStep."""
         found, rebuild = flatten(state)
         roots = [reverse_root() if is_variable(leaf) else None for leaf in found]
@@ -33,6 +33,9 @@ class NonlinearStep(Step):
         others = [reverse_root() if wanted and is_variable(leaf) else None for leaf in given]
         with self.scheme.ending(new):
             result, number = trace(lambda both: self(*both), (state, params), roots + others)
+        if met:
+            ends, rebuild_end = flatten(result)
+            met(rebuild_end([split_box(end, number)[0] for end in ends]))
         pairs = zip([split_box(end, number)[1] for end in leaves(result)], leaves(g), strict=True)
         nodes, slopes = zip(*((node, slope) for node, slope in pairs if node is not None), strict=True)
         backs = iter(pull_ends(list(nodes), list(slopes), [root for root in roots + others if root is not None]))

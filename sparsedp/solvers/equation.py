@@ -103,7 +103,11 @@ class Equation:
     ----------
     statics : list
         The leaves of the parameters, None in place of those that are floating.
+    left : int or None
+        Check sum of the residual at the root, once it is found.
     """
+
+    left = None
 
     def __init__(self, residual, layout, params, name):
         self.residual, self.layout, self.name = residual, layout, name

@@ -63,7 +63,7 @@ class Newton:
         self.equation, self.leaves, self.jacobians = equation, leaves, jacobians
         self.rtol, self.maxiter, self.run = rtol, maxiter, run
         self.x: np.ndarray
-        self.F: np.ndarray
+        self.F: Any = None
         self.size = 0.0  # |F|
         self.steps, self.keeps = steps, steps or equation.size > Small.most
         self.J: Any = None

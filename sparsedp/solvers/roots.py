@@ -15,9 +15,13 @@ derivative of any order takes one linear solve with J or J^T, and derivatives of
 
 from contextlib import contextmanager
 from threading import get_ident
+from zlib import crc32
+
+import numpy as np
 
 from sparsedp.derivative import pullback
 from sparsedp.direction import push
+from sparsedp.errors import DerivativeError
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import tell, thread
 from sparsedp.recipe import Remade
@@ -26,10 +30,14 @@ from sparsedp.solvers.equation import Equation, Layout, vary
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Newton
 from sparsedp.solvers.record import Run, SolveLog
-from sparsedp.tape import Rule
+from sparsedp.tape import Rule, plain
 from sparsedp.tree import copied
 
 __all__ = ["Root", "implicit"]
+
+CHANGED = 1e-4  # relative change of a root by one more Newton step, from which on the residual must be another one
+CANCELS = 1e-12  # residual in units of its terms that is rounding
+LOOSE = 1e4  # the same in units of the tolerance, which is that of the residual
 
 
 def implicit(
@@ -82,7 +90,7 @@ def implicit(
         On use, if the residual does not have as many numbers as x.
     DerivativeError
         On use, if the residual uses a traced value that is not an argument, or if `jacobian` or
-        `sparsity` does not fit the residual at a root whose derivative is asked.
+        `sparsity` does not fit the residual at a root whose derivative is asked, or what else it uses has changed.
 
     Notes
     -----
@@ -198,6 +206,8 @@ class Root(Remade):
         try:
             return newton.solve(guess, (series or {}).get(equation.size))
         finally:
+            if newton.F is not None:
+                equation.left = crc32(newton.F.tobytes())
             if run.status:  # else it is an error of the residual
                 self.info.note(run.info(), False)
             if newton.J is not None:
@@ -214,9 +224,26 @@ class Root(Remade):
 
         def pull(g):
             y = self._linear[True](equation, ans, g, *leaves)
-            return tuple(pullback(varied, chosen)[1](-y))
+            F, back = pullback(varied, chosen)
+            self._check_root(equation, plain(ans), plain(g), plain(y), plain(F), [plain(leaf) for leaf in leaves])
+            return tuple(back(-y))
 
         return pull
+
+    def _check_root(self, equation, x, g, y, F, leaves):
+        """Refuse a derivative where x is no root any more: the residual uses something that has changed since."""
+        changed = max(CHANGED, LOOSE * self.rtol)
+        if equation.left == crc32(F.tobytes()) or not np.abs(y) @ np.abs(F) > changed * (np.abs(g) @ np.abs(x)):
+            return
+        terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1] if leaves else 0.0
+        if np.linalg.norm(F) <= CANCELS * np.linalg.norm(terms):  # a root near 0, where what it is made of cancels
+            return
+        step = self._linear[False].forward(equation, x, F, *leaves)
+        if np.linalg.norm(step) > changed * np.linalg.norm(x):
+            raise DerivativeError(
+                f"{self.name} is not solved any more by what it was: its residual uses something that has changed "
+                "since, such as an array that was written into; make what changes a parameter"
+            )
 
     def _jvp(self, nums, tangents, ans, equation, guess, *leaves):
         varied, chosen = vary(lambda *values: equation(ans, *values), leaves, [num - 2 for num in nums])

@@ -9,7 +9,8 @@ A step may have, beside its call,
 
 both on plain trees. Transport, linear steppers, nonlinear implicit ones of one stage, and flow_step do. Where
 `step.sparing` is true, backward also takes `new`, the result of the step when it is still known, or None, and `wanted`,
-whether params want a cotangent.
+whether params want a cotangent. Where `step.solves` is true, backward finds the result again unless it gets it as
+`new`, and takes `met`: a function that it calls with that result, and that refuses another one than before.
 Where the state is one array, and params another, it may have a time loop of its own as well, for small states:
 
     step.march(states, params)                           fills the rows of `states`, one step from each to the next
@@ -21,7 +22,7 @@ import numpy as np
 from sparsedp.errors import DerivativeError
 from sparsedp.tape import dtype_of
 from sparsedp.trajectory.keep import Last
-from sparsedp.trajectory.layout import NOTHING
+from sparsedp.trajectory.layout import NOTHING, fingerprint
 from sparsedp.trajectory.linked import Linked
 from sparsedp.trajectory.steps import Taped
 
@@ -70,6 +71,7 @@ class Protocol(Taped):
     def __init__(self, run, args, wanted=(), recording=False):
         super().__init__(run, args, wanted, recording)
         self._pool: list = []
+        self.called = getattr(run.step, "solves", False) and not (run.state.bare and run.slots is None)
         self._arrays = bool(run.state.shapes) and all(run.state.shapes)
         self._recycles = run.keep.recycles
         self._sparing = run.state.bare and getattr(run.step, "sparing", False)
@@ -119,13 +121,27 @@ class Protocol(Taped):
         layout, step, self._last = self.run.state, self.run.step, (i, values, statics)
         if layout.bare:
             more = {"new": self.known and self.known[0], "wanted": bool(self._p)} if self._sparing else {}
+            more.update(self._compared(statics))
             back, self._into = step.backward(values[0], self.params, g[0], self._into, **more)
             if not want_state:
                 return None
             return [back] if layout.is_one(back) else layout.check([back], "the backward form of the step")
         g = [np.zeros_like(v) if slope is None else slope for slope, v in zip(g, values, strict=True)]
-        back, self._into = step.backward(layout.build(values, statics), self.params, layout.build(g), self._into)
+        g, more = layout.build(g), self._compared(statics)
+        back, self._into = step.backward(layout.build(values, statics), self.params, g, self._into, **more)
         return layout.check(layout.take(back, "the backward form of the step")[0], "the backward form of the step")
+
+    def _compared(self, statics):
+        """For a step that solves again on the way back: what compares its result with the state after it."""
+        if not (self.called and self.after):
+            return {}
+
+        def met(result):
+            layout = self.run.state
+            values, others = ([result], statics) if layout.bare else layout.take(result, "the step")
+            self.run.compare(fingerprint(layout.check(values, "the step"), others), self.after)
+
+        return {"met": met}
 
     def gradients(self):
         """What has been added up for params."""
