@@ -34,17 +34,16 @@ for tolerance in (1e-3, 1e-4, 1e-5):
     figures += "".join(f"  {np.max(np.abs(error)):10.1e}" for error in errors)
     print(f"{tolerance:9.0e} {len(step.taken):6} {value:10.6f}  {figures} {seconds:8.1f}")
 
-controlled = dict(tolerance=1e-4, floor=1e-6)  # B is 4e-5: what it may be wrong by has to be less
-explicit, implicit = (dp.stepper(method, robertson, end / 50, **controlled) for method in ("rk4", "tr_bdf2"))
+small = dict(tolerance=1e-4, floor=1e-6)  # B is 4e-5: its errors have to be less
+explicit, implicit = (dp.stepper(method, robertson, end / 50, **small) for method in ("rk4", "tr_bdf2"))
 explicit(start, RATES), implicit(start, RATES)
 print(f"\nThe first {end / 50:g} s: rk4 takes {len(explicit.taken)} steps, tr_bdf2 {len(implicit.taken)}.")
 
 times = end * np.logspace(-3, 0, 10)
-lengths = np.diff(times, prepend=0.0)
 reach = dp.stepper("tr_bdf2", lambda u, p: robertson(u, p[0]), lambda p: p[1], tolerance=1e-3)
-run = lambda logs: dp.rollout(reach, start, RATES * np.exp(logs), 10, inputs=lengths, keep="all")
+run = lambda logs: dp.rollout(reach, start, RATES * np.exp(logs), 10, inputs=np.diff(times, prepend=0.0), keep="all")
 moves = [pushforward(run, np.zeros(3), direction) for direction in np.eye(3)]  # forward mode, once for each rate
-(states, _), slopes = moves[0], [move[1:, 2] for _, move in moves]
+states, slopes = moves[0][0], [move[1:, 2] for _, move in moves]
 print(f"C at the end: {states[-1, 2]:.4f}; in log p1, p2, p3: {' '.join(f'{slope[-1]:.4f}' for slope in slopes)}")
 if "--out" in words:
     from matplotlib.figure import Figure

@@ -67,7 +67,8 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
         If the sparsity or a later x has another shape.
     DerivativeError
         If f is not deterministic or has changed since it was run, or no Jacobian agrees with a difference along a
-        random direction: a sparsity that lacks entries, a point where f has no derivative; on derivatives of second order.
+        random direction: a sparsity that lacks entries, a point where f has no derivative; on derivatives of second
+        order.
     NonFiniteError
         If f is NaN or infinite near x.
 
