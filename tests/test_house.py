@@ -256,6 +256,23 @@ def test_every_module_imports(name):
         pytest.skip(f"{cause.name} is not installed")
 
 
+def test_the_tests_import_what_is_there():
+    """A file of tests whose import fails is left out without a word (--doctest-ignore-import-errors)."""
+    wrong = []
+    for path in sorted((ROOT / "tests").glob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if not isinstance(node, ast.ImportFrom) or not within(node.module or "", "sparsedp"):
+                continue
+            try:
+                module = importlib.import_module(node.module)
+                missing = [a.name for a in node.names if f"{node.module}.{a.name}" not in names()]
+                wrong += [f"{path.name}: no {name} in {node.module}" for name in missing if not hasattr(module, name)]
+            except ImportError as error:
+                if (error.name or "").split(".")[0] not in EXTRAS:
+                    wrong.append(f"{path.name}: {error}")
+    none(wrong)
+
+
 def test_stub_and_window_agree():
     stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
     found = {
