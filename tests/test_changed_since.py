@@ -47,8 +47,20 @@ def test_arrays_of_functions_that_change_before_the_way_back(make):
     difference = (loss(START + h * direction, False) - loss(START - h * direction, False)) / (2 * h)
     assert value_and_grad(loss)(START, False)[1] @ direction == pytest.approx(difference, rel=1e-8)
     act = make(work)  # one that keeps no Jacobian of before
-    with pytest.raises(DerivativeError, match="changed since|another result"):
-        value_and_grad(loss)(START, True)
+    if make in (adopted, adopted_with_sparsity):
+        with pytest.raises(
+            DerivativeError,
+            match="<lambda> gives another result for the same argument than before; it must depend on its argument "
+            "only, so what changes from call to call must be a part of it",
+        ):
+            value_and_grad(loss)(START, True)
+    else:
+        with pytest.raises(
+            DerivativeError,
+            match=".* is not solved any more by what it was: its residual uses something that has changed since, such "
+            "as an array that was written into; make what changes a parameter",
+        ):
+            value_and_grad(loss)(START, True)
 
 
 def test_adopted_code_with_a_counter_is_refused():

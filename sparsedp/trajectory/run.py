@@ -153,8 +153,8 @@ class Run:
     def compare(self, marks, known):
         """Refuse a state that is another one than before; both as fingerprints.
 
-        Of a dual run only the states count. Its tangents may differ in their last bit: before 2.3 NumPy squares in
-        x**2 and takes logarithms in power(x, 2), which autograd calls when x is traced.
+        Of a dual run only the states count. Its tangents may differ in their last bit: NumPy 1.26 squares in x**2 and
+        not in power(x, 2), which autograd calls when x is traced.
         """
         most, run = len(marks), self
         while run.origin:
