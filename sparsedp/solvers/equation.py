@@ -1,5 +1,7 @@
 """A residual as a function of flat unknowns: what Newton's method and the derivative rules work on."""
 
+from typing import Any
+
 import autograd.numpy as anp
 import numpy as np
 
@@ -103,11 +105,11 @@ class Equation:
     ----------
     statics : list
         The leaves of the parameters, None in place of those that are floating.
-    left : int or None
-        Check sum of the residual at the root, once it is found.
+    left : (int, float) or None
+        Check sum and norm of the residual at the root, once Newton's method has found it.
     """
 
-    left = None
+    left: Any = None
 
     def __init__(self, residual, layout, params, name):
         self.residual, self.layout, self.name = residual, layout, name

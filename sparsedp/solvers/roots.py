@@ -38,6 +38,7 @@ __all__ = ["Root", "implicit"]
 CHANGED = 1e-4  # relative change of a root by one more Newton step, from which on the residual must be another one
 CANCELS = 1e-12  # residual in units of its terms that is rounding
 LOOSE = 1e4  # the same in units of the tolerance, which is that of the residual
+MORE = 2.0  # times the residual that a solve left: the residual of the same root, with other rounding
 
 
 def implicit(
@@ -187,6 +188,7 @@ class Root(Remade):
     def _newton(self, equation, guess, *leaves):
         known = self._answers.pop(get_ident(), None)
         if known is not None:
+            equation.left = 0, 0.0  # not looked at
             return known.reshape(-1).copy()
         solved = thread.observers[-1].root if recordings and thread.observers else Root.solved
         x = solved(self, equation, guess, leaves)
@@ -207,7 +209,7 @@ class Root(Remade):
             return newton.solve(guess, (series or {}).get(equation.size))
         finally:
             if newton.F is not None:
-                equation.left = crc32(newton.F.tobytes())
+                equation.left = crc32(newton.F.tobytes()), float(np.linalg.norm(newton.F))
             if run.status:  # else it is an error of the residual
                 self.info.note(run.info(), False)
             if newton.J is not None:
@@ -232,8 +234,12 @@ class Root(Remade):
 
     def _check_root(self, equation, x, g, y, F, leaves):
         """Refuse a derivative where x is no root any more: the residual uses something that has changed since."""
-        changed = max(CHANGED, LOOSE * self.rtol)
-        if equation.left == crc32(F.tobytes()) or not np.abs(y) @ np.abs(F) > changed * (np.abs(g) @ np.abs(x)):
+        if equation.left is None:  # somebody else gave the root, and answers for it
+            return
+        changed, (bits, size) = max(CHANGED, LOOSE * self.rtol), equation.left
+        if bits == crc32(F.tobytes()) or np.linalg.norm(F) <= MORE * size:  # as it was left, at a loose tolerance too
+            return
+        if not np.abs(y) @ np.abs(F) > changed * (np.abs(g) @ np.abs(x)):
             return
         terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1] if leaves else 0.0
         if np.linalg.norm(F) <= CANCELS * np.linalg.norm(terms):  # a root near 0, where what it is made of cancels
