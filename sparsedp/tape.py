@@ -7,7 +7,7 @@ Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A
 """
 
 import inspect
-from functools import partial
+from functools import partial, wraps
 
 import autograd.numpy as anp
 import numpy as np
@@ -71,16 +71,14 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     (8.0, 12.0)
     """
     given = name, forward, vjp, jvp, tuple(keywords)
-    rule = Rule(
-        name, _fresh(forward), vjp and _fresh_pull(vjp), jvp and _fresh(jvp), given[-1], (differentiable, given)
-    )
-    rule._signature = _signature(forward)
-    return rule
+    made = differentiable, given
+    return Rule(name, _fresh(forward), vjp and _fresh_pull(vjp), jvp and _fresh(jvp), given[-1], made)
 
 
 def _fresh(function):
     """A function of the user, whose results are copied: it may write into the arrays that it has returned."""
 
+    @wraps(function)  # it has the signature of the function
     def act(*args):
         result = function(*args)
         return tuple(map(_copied, result)) if isinstance(result, (tuple, list)) else _copied(result)
