@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp import kernels
-from sparsedp.kernels import plain
+from sparsedp.kernels import reference
 from sparsedp.kernels.layout import Tridiagonal
 
 __all__ = ["best_times", "triad", "triad_bandwidth"]
@@ -74,10 +74,9 @@ def _line(n, stretched):
     steps = 0.5 * (widths[1:] + widths[:-1])
     lower, upper = np.zeros(n), np.zeros(n)
     lower[1:], upper[:-1] = 1 / (steps * widths[1:]), 1 / (steps * widths[:-1])
-    first, last = (0, 0) if stretched else (1, n - 1)
     centre = -(lower + upper)
     centre[[0, -1]] -= 2
-    return Tridiagonal(lower, centre, upper, first, last)
+    return Tridiagonal(lower, centre, upper)
 
 
 def laplacian_csr(axes):
@@ -107,7 +106,7 @@ def measure(shape, stretched, repeats, csr=True):
     """Times of all ways to apply one Laplacian [s] and of the triad."""
     axes = laplacian_axes(shape, stretched)
     u, out, buffer = np.random.default_rng(0).standard_normal(shape), np.empty(shape), np.empty(shape)
-    tasks = {"triad": triad(shape), "plain": lambda: plain.kronecker_sum(u, out, axes, 0.0)}
+    tasks = {"triad": triad(shape), "plain": lambda: reference.kronecker_sum(u, out, axes, 0.0)}
     if kernels.compiled():
         tasks["compiled"] = lambda: kernels.kronecker_sum(u, out, axes, 0.0)
     if not stretched:

@@ -1,4 +1,4 @@
-"""The kernels against sparse matrices, and the compiled ones against NumPy: all dtypes, sizes and ends."""
+"""The kernels against sparse matrices, compiled and not: all sizes and ends."""
 
 from functools import reduce
 from math import prod
@@ -9,34 +9,19 @@ import pytest
 import scipy.sparse as sp
 
 from sparsedp import kernels
-from sparsedp.kernels import plain
+from sparsedp.kernels import team
 from sparsedp.kernels.layout import Rows, Tridiagonal
 
-DTYPES = [np.float64, np.float32, np.complex128, np.complex64]
 SHAPES = [(1, 1, 1), (1, 1, 2), (1, 1, 3), (1, 1, 700), (1, 2, 1), (1, 31, 37), (1, 64, 130), (2, 1, 3), (2, 2, 2)]
 SHAPES += [(3, 1, 17), (7, 5, 1), (5, 7, 11), (13, 8, 64), (20, 20, 20)]
 NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
-SIDES = ["plain", pytest.param("native", marks=NUMBA)]
 
 
-@pytest.fixture
-def native():
-    """The compiled kernels."""
-    from sparsedp.kernels import native
-
-    return native
-
-
-@pytest.fixture
-def team(native, monkeypatch):
-    """The compiled kernels, with threads for every size."""
-    monkeypatch.setattr(native, "SERIAL", 0)
-    return native
-
-
-def field(rng, shape, dtype):
-    u = rng.standard_normal(shape)
-    return (u + 1j * rng.standard_normal(shape) if np.dtype(dtype).kind == "c" else u).astype(dtype)
+@pytest.fixture(params=[False, pytest.param(True, marks=NUMBA)], ids=["reference", "compiled"])
+def side(request, monkeypatch):
+    """Without numba and with it, there with threads for every size."""
+    monkeypatch.setattr(kernels, "compiled", lambda: request.param)
+    monkeypatch.setattr(team, "SERIAL", 0)
 
 
 def line(rng, n, periodic, stretched):
@@ -47,7 +32,7 @@ def line(rng, n, periodic, stretched):
         band[first:last] = value
     if not periodic or n == 1:
         lower[0] = upper[-1] = 0
-    return Tridiagonal(lower, centre, upper, first, last)
+    return Tridiagonal(lower, centre, upper)
 
 
 def dense(axis, n):
@@ -75,56 +60,45 @@ def cases():
         yield turn, shape, tuple(kind if kind is None else line(rng, n, *kind) for kind, n in zip(kinds, shape))
 
 
-def close(found, expected, dtype, times=10):
+def close(found, expected, times=10):
     scale = 1 + np.max(np.abs(expected), initial=0)
-    return np.all(np.abs(found - expected) <= times * np.finfo(dtype).eps * scale)
+    return np.all(np.abs(found - expected) <= times * np.finfo(float).eps * scale)
 
 
-def along(module, u, rows, scale, start=None):
+def along(u, rows, scale, start=None):
     """The product as a new array; added to `start` if there is one."""
-    out = np.full((len(u), rows.rows, u.shape[2]), np.nan, u.dtype) if start is None else start.copy()
-    module.along_axis(u, out, rows, scale, start is not None, *([2] if module is not plain else []))
+    out = np.full((len(u), rows.rows, u.shape[2]), np.nan) if start is None else start.copy()
+    kernels.along_axis(u, out, rows, scale, start is not None)
     return out
 
 
-def added(module, u, axes, shift, threads=2):
+def added(u, axes, shift):
     out = np.full_like(u, np.nan)
-    module.kronecker_sum(u, out, axes, shift, *([threads] if module is not plain else []))
+    kernels.kronecker_sum(u, out, axes, shift)
     return out
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("side", SIDES)
-def test_sum_of_axes_is_the_sparse_matrix(side, dtype, request, monkeypatch):
-    module = plain if side == "plain" else request.getfixturevalue("native")
+def threads_and_one(make):
+    """What `make` gives with all threads and with one."""
+    found = [make()]
+    kernels.set_threads(1)
+    try:
+        return [*found, make()]
+    finally:
+        kernels.set_threads()
+
+
+def test_sum_of_axes_is_the_sparse_matrix(side):
     rng = np.random.default_rng(1)
-    for turn, shape, axes in cases():
-        monkeypatch.setattr(plain, "WHOLE", 0 if turn % 2 else 10**6)
-        monkeypatch.setattr(plain, "PIECE", (40, 600, 10**5)[turn % 3])
-        u = field(rng, shape, dtype)
-        u.setflags(write=False)
-        expected = (matrix_of(axes, shape, 0.3) @ u.ravel().astype(complex)).reshape(shape)
-        assert close(added(module, u, axes, 0.3), expected, dtype), (shape, axes)
-
-
-@NUMBA
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_compiled_sum_agrees_with_numpy_and_its_bits_depend_on_nothing(dtype, team, monkeypatch):
-    rng = np.random.default_rng(2)
     for _, shape, axes in cases():
-        u = field(rng, shape, dtype)
-        one = added(team, u, axes, -0.5, threads=1)
-        assert close(one, added(plain, u, axes, -0.5), dtype)
-        assert one.tobytes() == added(team, u, axes, -0.5, threads=2).tobytes()
-        with monkeypatch.context() as patch:
-            patch.setattr(team, "PAST_CACHE", 0)
-            patch.setattr(team, "NARROW", 0)
-            assert one.tobytes() == added(team, u, axes, -0.5).tobytes()
+        u = rng.standard_normal(shape)
+        u.setflags(write=False)
+        expected = (matrix_of(axes, shape, 0.3) @ u.ravel()).reshape(shape)
+        many, one = threads_and_one(lambda u=u, axes=axes: added(u, axes, 0.3))
+        assert close(many, expected) and many.tobytes() == one.tobytes(), (shape, axes)
 
 
-@pytest.mark.parametrize("side", SIDES)
-def test_a_missing_neighbour_is_not_read_from_the_far_end(side, request):
-    module = plain if side == "plain" else request.getfixturevalue("native")
+def test_a_missing_neighbour_is_not_read_from_the_far_end(side):
     rng = np.random.default_rng(3)
     shape = (6, 7, 40)
     for axis, n in enumerate(shape):
@@ -132,7 +106,7 @@ def test_a_missing_neighbour_is_not_read_from_the_far_end(side, request):
         for end in (0, n - 1):
             u = np.ones(shape)
             u[tuple(end if k == axis else slice(None) for k in range(3))] = np.nan
-            bad = np.isnan(added(module, u, axes, 1.0)).any(axis=tuple(k for k in range(3) if k != axis))
+            bad = np.isnan(added(u, axes, 1.0)).any(axis=tuple(k for k in range(3) if k != axis))
             assert np.flatnonzero(bad).tolist() == sorted({end, abs(end - 1)})
 
 
@@ -164,38 +138,18 @@ def matrices():
         yield ring
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("side", SIDES)
-def test_matrix_along_an_axis_is_the_sparse_matrix(side, dtype, request, monkeypatch):
-    module = plain if side == "plain" else request.getfixturevalue("native")
+def test_matrix_along_an_axis_is_the_sparse_matrix(side):
     rng = np.random.default_rng(5)
     for turn, matrix in enumerate(matrices()):
-        monkeypatch.setattr(plain, "PIECE", (50, 10**5)[turn % 2])
         rows = record(matrix, turn % 3)
         for before, after in ((1, 1), (3, 1), (2, 2), (2, 5), (1, 90)):
-            u = field(rng, (before, rows.cols, after), dtype)
-            start = field(rng, (before, rows.rows, after), dtype)
-            expected = 0.7 * np.stack([matrix @ plane.astype(complex) for plane in u])
-            once, again = along(module, u, rows, 0.7), along(module, u, rows, 0.7, start)
-            assert close(once, expected, dtype), (turn, u.shape)
-            assert close(again, start + expected, dtype), (turn, u.shape)
-
-
-@NUMBA
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_compiled_product_has_bits_that_depend_on_nothing(dtype, team, monkeypatch):
-    rng = np.random.default_rng(6)
-    for turn, matrix in enumerate(matrices()):
-        rows = record(matrix, turn % 2)
-        for after in (1, 3, 100):
-            u = field(rng, (3, rows.cols, after), dtype)
-            one = np.empty((3, rows.rows, after), dtype)
-            team.along_axis(u, one, rows, -1.5, False, 1)
-            assert one.tobytes() == along(team, u, rows, -1.5).tobytes()
-            with monkeypatch.context() as patch:
-                patch.setattr(team, "PAST_CACHE", 0)
-                patch.setattr(team, "NARROW", 0)
-                assert one.tobytes() == along(team, u, rows, -1.5).tobytes()
+            u = rng.standard_normal((before, rows.cols, after))
+            start = rng.standard_normal((before, rows.rows, after))
+            expected = 0.7 * np.stack([matrix @ plane for plane in u])
+            many, one = threads_and_one(lambda u=u, rows=rows: along(u, rows, 0.7))
+            again = along(u, rows, 0.7, start)
+            assert close(many, expected) and many.tobytes() == one.tobytes(), (turn, u.shape)
+            assert close(again, start + expected), (turn, u.shape)
 
 
 @pytest.mark.parametrize("shape", [(0, 3, 3), (2, 0, 3), (2, 3, 0)])
@@ -213,16 +167,17 @@ def test_rows_without_columns_give_zero():
 
 
 @NUMBA
-def test_python_threads_may_call_at_the_same_time(team):
+def test_python_threads_may_call_at_the_same_time(monkeypatch):
+    monkeypatch.setattr(team, "SERIAL", 0)
     rng = np.random.default_rng(7)
     axes = (None, line(rng, 150, False, True), line(rng, 160, True, True))
-    fields = [field(rng, (1, 150, 160), np.float64) for _ in range(4)]
-    expected = [added(team, u, axes, 0.0) for u in fields]
+    fields = [rng.standard_normal((1, 150, 160)) for _ in range(4)]
+    expected = [added(u, axes, 0.0) for u in fields]
     results, start = [[] for _ in fields], Barrier(len(fields))
 
     def work(k):
         start.wait()
-        results[k].extend(added(team, fields[k], axes, 0.0).tobytes() == expected[k].tobytes() for _ in range(30))
+        results[k].extend(added(fields[k], axes, 0.0).tobytes() == expected[k].tobytes() for _ in range(30))
 
     workers = [Thread(target=work, args=(k,)) for k in range(len(fields))]
     for thread in workers:
@@ -232,31 +187,56 @@ def test_python_threads_may_call_at_the_same_time(team):
     assert [all(result) and len(result) == 30 for result in results] == [True] * len(fields)
 
 
-@NUMBA
-def test_a_kernel_is_compiled_without_a_place_to_keep_it(native):
-    calls = []
+def double(x, start, stop):
+    for i in range(start, stop):
+        x[i] *= 2.0
 
-    def compiler(**options):
-        calls.append(options.pop("cache", False))
-        if calls[-1]:
+
+@NUMBA
+def test_a_loop_is_compiled_without_a_place_to_keep_it(monkeypatch):
+    import numba
+
+    real = numba.njit
+
+    def njit(*args, cache=False, **options):
+        if cache:
             raise RuntimeError("cannot cache function")
-        return lambda function: function
+        return real(*args, **options)
 
-    assert native._kept(compiler, len) is len and calls == [True, False]
+    monkeypatch.setattr(numba, "njit", njit)
+    x = np.ones(5)
+    team.Kernel(double, "write1").run(5, 5, 2, x)
+    assert x.tolist() == [2.0] * 5
 
 
 @NUMBA
-def test_numpy_steps_in_where_nothing_compiles(native, monkeypatch):
+def test_numpy_steps_in_where_nothing_compiles(monkeypatch):
+    import numba
+
+    from sparsedp.kernels import stencil
+
     rng = np.random.default_rng(8)
-    monkeypatch.setattr(native, "njit", lambda *args, **options: 1 / 0)
-    native._kernel.cache_clear()
-    u = field(rng, (3, 4, 5), np.float64)
-    axes, rows = tuple(line(rng, n, True, True) for n in u.shape), record(sp.eye_array(4), True)
-    try:
-        with pytest.warns(RuntimeWarning, match="NumPy is used instead"):
-            found = added(native, u, axes, 1.0)
-        with pytest.warns(RuntimeWarning, match="NumPy is used instead"):
-            product = along(native, u, rows, 2.0)
-    finally:
-        native._kernel.cache_clear()
-    assert np.array_equal(found, added(plain, u, axes, 1.0)) and np.array_equal(product, 2 * u)
+    u = rng.standard_normal((3, 4, 5))
+    axes = tuple(line(rng, n, True, True) for n in u.shape)
+    expected = added(u, axes, 1.0)
+    monkeypatch.setattr(numba, "njit", lambda *args, **options: 1 / 0)
+    monkeypatch.setattr(stencil, "kronecker_sum", team.Kernel(stencil.kronecker_sum.loop, stencil.kronecker_sum.words))
+    with pytest.warns(RuntimeWarning, match="NumPy is used instead"):
+        found = added(u, axes, 1.0)
+    assert close(found, expected)
+
+
+@NUMBA
+def test_an_error_in_a_slab_comes_out_when_all_have_ended(monkeypatch):
+    monkeypatch.setattr(team, "SERIAL", 0)
+    kernel, ended = team.Kernel(double, "write1"), []
+
+    def compiled(x, start, stop):
+        ended.append(start)
+        if start:
+            raise ValueError("this slab")
+
+    kernel.__dict__["compiled"] = compiled
+    with pytest.raises(ValueError, match="this slab"):
+        kernel.run(4, 4, 2, np.ones(4))
+    assert sorted(ended) == [0, 2]

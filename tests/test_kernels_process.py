@@ -43,7 +43,7 @@ import numpy as np
 from sparsedp import kernels
 from sparsedp.kernels.layout import Tridiagonal
 n = 200
-axis = Tridiagonal(np.r_[0, np.ones(n - 1)], -2 * np.ones(n), np.r_[np.ones(n - 1), 0], 1, n - 1)
+axis = Tridiagonal(np.r_[0, np.ones(n - 1)], -2 * np.ones(n), np.r_[np.ones(n - 1), 0])
 u, out = np.ones((1, n, n)), np.zeros((1, n, n))
 kernels.kronecker_sum(u, out, (None, axis, axis), 0.0)
 assert out.sum() == -4 * n

@@ -1,7 +1,7 @@
-"""Compiled loops on plain arrays, with NumPy twins for when numba is not installed.
+"""Compiled loops on plain arrays, and the NumPy formulas (`reference`) that run without numba.
 
-The arrays are not checked: that is the caller's business. numba is
-imported at the first use of a kernel, never before. Setting the environment variable
+The arrays are not checked: that is the caller's business. They are C-contiguous and hold float64; other numbers are
+cast by the caller. numba is imported at the first use of a kernel, never before. Setting the environment variable
 ``SPARSEDP_NUMBA=0`` before the first use switches it off.
 """
 
@@ -12,8 +12,7 @@ import os
 
 import numpy as np
 
-from sparsedp.kernels import plain, plain_measures
-from sparsedp.kernels.layout import LOWERED, REMAINDER, SQUARES, TOTALS
+from sparsedp.kernels import reference
 
 __all__ = [
     "along_axis",
@@ -30,7 +29,6 @@ __all__ = [
 ]
 
 FEW = 16384  # numbers that are not worth a compiled sum, and not the import of numba
-_NONE = np.zeros(0)
 
 
 @functools.cache
@@ -94,25 +92,22 @@ def set_threads(n=None):
     _chosen[:] = [n]
 
 
-@functools.cache
-def _native():
-    """The module of compiled kernels; imports numba."""
-    from sparsedp.kernels import native
-
-    return native
+def _loop(module, name):
+    """A compiled loop of a module of this folder; None where there is no numba, or it does not work here."""
+    if not compiled():
+        return None
+    loop = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    return loop if loop.compiled else None
 
 
 def kronecker_sum(u, out, axes, shift):
-    """Field, three tridiagonal matrices -> out = shift u + sum over a of T_a u, T_a along axis a.
-
-    One pass over memory. Sums are float64 (complex128) and rounded once.
+    """Field, three tridiagonal matrices -> out = shift u + sum over a of T_a u, T_a along axis a, in one pass.
 
     Parameters
     ----------
-    u : ndarray, shape (n0, n1, n2)
-        C-contiguous; float32, float64, complex64 or complex128.
-    out : ndarray, shape (n0, n1, n2)
-        C-contiguous, of the same dtype; must not overlap `u`.
+    u : float64 array, shape (n0, n1, n2)
+    out : float64 array, shape (n0, n1, n2)
+        Must not overlap `u`.
     axes : tuple of three
         `Tridiagonal` of n_a rows, or None where nothing is done along the axis.
     shift : float
@@ -122,29 +117,28 @@ def kronecker_sum(u, out, axes, shift):
     --------
     >>> import numpy as np
     >>> from sparsedp.kernels.layout import Tridiagonal
-    >>> line = Tridiagonal(np.array([0.0, 1, 1]), np.array([-2.0, -2, -2]), np.array([1.0, 1, 0]), 1, 2)
+    >>> line = Tridiagonal(np.array([0.0, 1, 1]), np.array([-2.0, -2, -2]), np.array([1.0, 1, 0]))
     >>> u, out = np.array([[[1.0, 2.0, 4.0]]]), np.zeros((1, 1, 3))
     >>> kronecker_sum(u, out, (None, None, line), 0.0)
     >>> out
     array([[[ 0.,  1., -6.]]])
     """
-    if compiled():
-        _native().kronecker_sum(u, out, axes, shift, threads())
-    else:
-        plain.kronecker_sum(u, out, axes, shift)
+    loop = _loop("stencil", "kronecker_sum") if u.size else None
+    if loop is None:
+        reference.kronecker_sum(u, out, axes, shift)
+        return
+    bands = [np.zeros((3, n)) if axis is None else np.stack(axis) for n, axis in zip(u.shape, axes, strict=True)]
+    loop.run(u.shape[0] * u.shape[1], u.size, threads(), u, out, *bands, shift)
 
 
 def along_axis(u, out, rows, scale, accumulate):
     """Field, sparse 1-D matrix M -> out = scale M u or out += scale M u along the middle axis.
 
-    Sums are float64 (complex128) and rounded once a call.
-
     Parameters
     ----------
-    u : ndarray, shape (L, columns, R)
-        C-contiguous; float32, float64, complex64 or complex128.
-    out : ndarray, shape (L, rows, R)
-        C-contiguous, of the same dtype; must not overlap `u`.
+    u : float64 array, shape (L, columns, R)
+    out : float64 array, shape (L, rows, R)
+        Must not overlap `u`.
     rows : Rows
         The matrix.
     scale : float
@@ -163,10 +157,16 @@ def along_axis(u, out, rows, scale, accumulate):
     >>> out
     array([[[3., 6.]]])
     """
-    if compiled():
-        _native().along_axis(u, out, rows, scale, accumulate, threads())
+    lines = out.shape[2] == 1 and len(rows.offsets) > 0
+    loop = _loop("stencil", "along_rows" if lines else "across_rows") if out.size else None
+    if loop is None:
+        reference.product_along(u, out, rows, scale, accumulate)
+    elif lines:
+        diagonals = rows.offsets, rows.start, rows.stop, rows.values
+        loop.run(out.size, out.size, threads(), u[:, :, 0], out[:, :, 0], *diagonals, scale, accumulate)
     else:
-        plain.along_axis(u, out, rows, scale, accumulate)
+        matrix = rows.indptr, rows.indices, rows.data
+        loop.run(out.shape[0] * out.shape[1], out.size, threads(), u, out, *matrix, scale, accumulate)
 
 
 def sweep(x, lower, upper, inverses, column, row, ends):
@@ -197,16 +197,17 @@ def sweep(x, lower, upper, inverses, column, row, ends):
     array([[-0.33333333],
            [ 1.66666667]])
     """
-    if compiled():
-        _native().sweep(x, lower, upper, inverses, column, row, ends, threads())
+    loop = _loop("elimination", "eliminate") if x.size else None
+    if loop is None:
+        reference.eliminate(x, lower, upper, inverses, column, row, ends)
     else:
-        plain.sweep(x, lower, upper, inverses, column, row, ends)
+        loop.run(x.shape[1], x.size, threads(), x, lower, upper, inverses, column, row, ends)
 
 
 def through_faces(u, k, lines, out, closed):
     """Field, three components on faces, their lines -> out = L diag(k) R u in one pass -> whether it works here.
 
-    Needs `compiled`. See `sparsedp.structure.through` for the lines.
+    See `sparsedp.structure.through` for the lines.
 
     Parameters
     ----------
@@ -214,13 +215,14 @@ def through_faces(u, k, lines, out, closed):
         C-contiguous, without overlap.
     k : three float64 arrays
         One for each axis; empty where the axis has one cell.
-    lines : four float64 arrays for each axis, shape (n_a + 1,), in a row
+    lines : three float64 arrays, shape (4, n_a + 1)
     closed : bool
         Whether faces with k = 0 carry 0, whatever the cells hold.
     """
-    from sparsedp.kernels import conductance
-
-    return conductance.through_faces(u, k, lines, out, np.empty((threads(), u.shape[2] + 1)), closed, threads())
+    loop = _loop("stencil", "through_faces")
+    if loop is not None:
+        loop.run(u.shape[0] * u.shape[1], u.size, threads(), u, *k, *lines, out, closed)
+    return loop is not None
 
 
 def squares(x):
@@ -232,7 +234,7 @@ def squares(x):
     >>> print(squares(np.array([3.0, -4.0])))
     25.0
     """
-    return _measure(SQUARES, _NONE, x, 0.0, _NONE)[1]
+    return _measure(False, None, x, 0.0, None)[1]
 
 
 def totals(x):
@@ -244,7 +246,7 @@ def totals(x):
     >>> print(*totals(np.array([3.0, -4.0])))
     -1.0 25.0
     """
-    return _measure(TOTALS, _NONE, x, 0.0, _NONE)
+    return _measure(False, None, x, 0.0, None)
 
 
 def lowered(x, number, out):
@@ -257,7 +259,9 @@ def lowered(x, number, out):
     >>> print(lowered(np.array([1.0, 3.0]), 2.0, out), out)
     2.0 [-1.  1.]
     """
-    return _measure(LOWERED, _NONE, x, number, out)[1]
+    if out is not x:
+        np.copyto(out, x)
+    return _measure(True, None, out, number, out)[1]
 
 
 def remainder(b, out, x):
@@ -270,10 +274,19 @@ def remainder(b, out, x):
     >>> print(*remainder(np.array([4.0, 6.0]), out, np.array([2.0, 0.0])), out)
     4.0 25.0 [3. 4.]
     """
-    return _measure(REMAINDER, b, x, 0.0, out)
+    return _measure(False, b, x, 0.0, out)
 
 
-def _measure(mode, b, x, number, out):
-    if x.size <= FEW or not compiled() or not x.flags.c_contiguous:
-        return plain_measures.measure(mode, b, x, number, out)
-    return _native().measure(mode, b, x, number, out, threads())
+def _measure(lower, b, x, number, out):
+    """See `sparsedp.kernels.reference.measure`."""
+    loop = _loop("reductions", "measure") if x.size > FEW and x.flags.c_contiguous else None
+    if loop is None:
+        return reference.measure(lower, b, x, number, out)
+    from sparsedp.kernels.reductions import CHUNK, LOWERED, REMAINDER, TOTALS
+
+    mode, none = LOWERED if lower else TOTALS if b is None else REMAINDER, np.zeros(0)
+    chunks = -(-x.size // CHUNK)
+    sums = np.empty((2, chunks))
+    given = none if b is None else b, x, number, none if out is None else out
+    loop.run(chunks, x.size, threads(), mode, *given, sums)
+    return float(sums[0].sum()), float(sums[1].sum())

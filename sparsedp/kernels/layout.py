@@ -4,10 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["CHUNK", "LOWERED", "REMAINDER", "SQUARES", "TOTALS", "Rows", "Tridiagonal"]
-
-CHUNK = 4096  # numbers whose sums are kept apart, so that they do not depend on the number of threads
-SQUARES, TOTALS, LOWERED, REMAINDER = range(4)  # what `measure` does on its way over an array
+__all__ = ["Rows", "Tridiagonal"]
 
 
 class Rows(NamedTuple):
@@ -35,11 +32,8 @@ class Tridiagonal(NamedTuple):
 
     Row i of the product is `lower[i] u[i - 1] + centre[i] u[i] + upper[i] u[i + 1]`, indices modulo n.
     Where `lower[0]` or `upper[-1]` is zero, the far end must not be read: 0 * NaN is NaN.
-    Rows `first <= i < last` have identical coefficients (empty range when the grid is stretched).
     """
 
     lower: np.ndarray  # float64, n
     centre: np.ndarray  # float64, n
     upper: np.ndarray  # float64, n
-    first: int
-    last: int

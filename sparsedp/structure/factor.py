@@ -104,17 +104,4 @@ class Factor(Uncached):
         # With one or two cells the neighbours coincide: what is not centre counts as upper, then lower.
         side = np.select([m.indices == row, m.indices == (row + 1) % max(n, 1)], [1, 2], default=0)
         bands[side, row] = m.data
-        first, last = _uniform_rows(bands)
-        return Tridiagonal(bands[0], bands[1], bands[2], first, last)
-
-
-def _uniform_rows(bands):
-    """Longest run of rows with identical coefficients, looked for around the middle."""
-    n = bands.shape[1]
-    if n == 0:
-        return 0, 0
-    different = np.flatnonzero(np.any(bands != bands[:, n // 2, None], axis=0))
-    below, above = different[different < n // 2], different[different > n // 2]
-    first = int(below[-1]) + 1 if below.size else 0
-    last = int(above[0]) if above.size else n
-    return (first, last) if last - first > n // 2 else (0, 0)
+        return Tridiagonal(*bands)

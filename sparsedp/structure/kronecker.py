@@ -118,13 +118,15 @@ class Kronecker(Structure):
         return compact(sp.block_array(grid, format="csr"))
 
     def apply(self, x, out):
-        if x.dtype.itemsize in (4, 8) and x.dtype.char in "fF" and not self._single_pass:
-            # Several passes would round after each; work in double and round once.
-            wide = np.empty(out.shape, np.result_type(out.dtype, np.float64))
-            self._run(x.astype(wide.dtype), wide)
-            np.copyto(out, wide, casting="same_kind")
-        else:
+        if x.dtype == np.float64:
             self._run(x, out)
+            return
+        # The loops know float64 only: real and imaginary parts apart, and one rounding at the end.
+        pairs = [(x.real, out.real), (x.imag, out.imag)] if x.dtype.kind == "c" else [(x, out)]
+        for part, target in pairs:
+            wide = np.empty(out.shape)
+            self._run(np.array(part, dtype=float), wide)
+            np.copyto(target, wide, casting="same_kind")
 
     def _run(self, x, out):
         inputs = _components(x, self.in_parts)
@@ -134,10 +136,6 @@ class Kronecker(Structure):
                 target[...] = 0
             for number, step in enumerate(steps):
                 step(inputs[step.column], target, number > 0)
-
-    @cached_property
-    def _single_pass(self):
-        return all(len(steps) <= 1 and not any(step.several for step in steps) for steps in self._plan)
 
     @cached_property
     def _plan(self):
@@ -154,8 +152,6 @@ class Kronecker(Structure):
 
 class FusedPass:
     """All three-point terms of a block in one pass over memory."""
-
-    several = False
 
     def __init__(self, column, shape, terms):
         self.column = column
@@ -188,7 +184,6 @@ class TermPass:
             before, after = prod(shape[:axis]), prod(shape[axis + 1 :])
             shape = shape[:axis] + (rows.rows,) + shape[axis + 1 :]
             self.steps.append((rows, (before, rows.cols, after), (before, rows.rows, after)))
-        self.several = len(self.steps) > 1
 
     def __call__(self, u, out, accumulate):
         if not self.steps:

@@ -72,7 +72,8 @@ class ThroughFaces:
         self.shape, self.parts = shape, tuple(parts)
         ends = [side for line in lines for side in line]
         cells = np.repeat(shape, 4)
-        self.lines = tuple(np.append(side, side[0]) if side.size == n else side for n, side in zip(cells, ends))
+        wide = [np.append(side, side[0]) if side.size == n else side for n, side in zip(cells, ends)]
+        self.lines = tuple(np.stack(wide[4 * axis : 4 * axis + 4]) for axis in range(3))
 
     def apply(self, x, out):
         """Write the product into `out` -> whether it could be done."""

@@ -1,0 +1,60 @@
+"""What the compiled loops do, as NumPy formulas of a few lines: their tests, and what runs without numba."""
+
+import numpy as np
+import scipy.sparse as sp
+
+__all__ = ["eliminate", "kronecker_sum", "measure", "product_along"]
+
+
+def kronecker_sum(u, out, axes, shift):
+    """See `sparsedp.kernels.kronecker_sum`."""
+    out[...] = shift * u
+    for axis, line in enumerate(axes):
+        if line is not None:
+            field, total = np.moveaxis(u, axis, 0), np.moveaxis(out, axis, 0)
+            lower, centre, upper = (band.reshape(-1, 1, 1) for band in line)
+            total += centre * field
+            total[1:] += lower[1:] * field[:-1]
+            total[:-1] += upper[:-1] * field[1:]
+            for end, band, other in ((0, lower, -1), (-1, upper, 0)):
+                if band[end] != 0:  # else the far end must not be read: 0 times NaN is NaN
+                    total[end] += band[end] * field[other]
+
+
+def product_along(u, out, rows, scale, add):
+    """See `sparsedp.kernels.along_axis`."""
+    matrix = sp.csr_array((rows.data, rows.indices, rows.indptr), shape=(rows.rows, rows.cols))
+    across = len(u), u.shape[2]
+    flat = np.moveaxis(u, 1, 0).reshape(rows.cols, across[0] * across[1])
+    product = np.moveaxis((scale * (matrix @ flat)).reshape(rows.rows, *across), 0, 1)
+    np.copyto(out, out + product if add else product)
+
+
+def eliminate(x, lower, upper, inverses, column, row, ends):
+    """See `sparsedp.kernels.sweep`."""
+    n, cyclic = len(x), int(row.size > 0)
+    for i in range(n - cyclic):
+        x[i] = (x[i] - lower[i] * x[i - 1] if i else x[i]) * inverses[i]
+        if cyclic:
+            x[-1] -= row[i] * x[i]
+    if cyclic:
+        x[-1] *= inverses[-1]
+    for i in range(n - 2, -1, -1):
+        others = upper[i] * x[i + 1] if i < n - 1 - cyclic else 0.0
+        x[i] -= (others + column[i] * x[-1] if cyclic else others) * inverses[i]
+
+
+def measure(lowered, b, x, number, out):
+    """Two sums: of x, x^2; or, with out -= number, of out^2; or, with out = b - out, of x^2 and out^2."""
+    if lowered:
+        np.subtract(out, number, out=out)
+        return 0.0, _square(out)
+    if b is None:
+        return float(x.sum()), _square(x)
+    np.subtract(b, out, out=out)
+    return _square(x), _square(out)
+
+
+def _square(x):
+    with np.errstate(over="ignore"):  # the caller sees inf, or did not ask for the sum
+        return float(np.einsum("i,i", x, x))  # not by BLAS, whose threads stall those of the kernels
