@@ -6,7 +6,7 @@ from numbers import Number
 
 import numpy as np
 
-from sparsedp import kernels
+from sparsedp import kernels, results
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_out, field_array
 from sparsedp.ledger import active
@@ -111,7 +111,7 @@ class Operator(Remade):
         u = field_array(self, u)
         dtype = u.dtype if self._real else result_dtype(self.structure, u.dtype)
         if out is None:
-            out = np.empty(self.codomain.shape, dtype)
+            out = results.empty(self.codomain.shape, dtype)
         else:
             check_out(self, out, u, dtype)
         self._acting.apply(u.reshape(-1), out.reshape(-1))

@@ -21,6 +21,7 @@ FLOORS = [
     ("ledger", 0),
     ("files", 0),
     ("recipe", 0),
+    ("results", 0),
     ("traces", 1),
     ("tape", 1),
     ("kernels", 1),
