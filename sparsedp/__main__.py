@@ -1,4 +1,4 @@
-"""The command line: ``python -m sparsedp demo``, ``check FILE.py:loss`` and ``report FILE.py --out DIR``.
+"""The command line: ``python -m sparsedp demo``, ``check FILE.py:loss``, ``report FILE.py --out DIR`` and ``compile``.
 
 Exit codes of check and report: 0 agrees, 1 disagrees, 3 inconclusive, 2 the input was refused or a file cannot be
 written, 130 interrupted.
@@ -6,14 +6,17 @@ written, 130 interrupted.
 
 import argparse
 import contextlib
+import importlib
 import os
 import sys
+import time
 from pathlib import Path
 
 REFUSED = 2  # exit code of a bad input, the same as argparse's
 INTERRUPTED = 130  # exit code of what Ctrl-C ends, the same as a shell's
 LONGEST = 200  # letters of a name that a sentence shows
 CODES = {"agrees": 0, "disagrees": 1, "inconclusive": 3}
+LOOPS = [f"sparsedp.kernels.{name}" for name in ("stencil", "elimination", "reductions")]  # where loops are defined
 OUT = "where the results go (default: %(default)s)"
 SCENE = "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"
 
@@ -87,6 +90,12 @@ def _parser():
     report.add_argument("--out", type=Path, default=Path("sparsedp-report"), metavar="DIR", help=OUT)
     report.add_argument("--force", action="store_true", help="overwrite an earlier report")
     report.set_defaults(run=run_report)
+    loops = rooms.add_parser(
+        "compile",
+        help="compile all loops for this machine now, not at their first use",
+        description="Compile all loops and keep them on disk. Without numba there is nothing to compile.",
+    )
+    loops.set_defaults(run=run_compile)
     return parser
 
 
@@ -117,6 +126,32 @@ def run_report(options):
         return refuse(error)
     print(*lines, f"{verdict}; see {options.out / 'report.md'}", sep="\n")
     return CODES[verdict]
+
+
+def run_compile(_):
+    """The command `compile` -> exit code: 1 where a loop does not compile."""
+    from sparsedp import kernels
+    from sparsedp.kernels import team
+
+    if not kernels.compiled():
+        return refuse("there is nothing to compile: numba is not installed or switched off; install sparsedp[fast]")
+    for name in LOOPS:
+        importlib.import_module(name)
+    print(f"compiling {len(team.loops)} loops, those that are not on disk yet", flush=True)
+    start, works = time.perf_counter(), True
+    for loop in _with_bar(team.loops):
+        works = works and loop.compiled is not None
+    print(f"done in {time.perf_counter() - start:.1f} s" if works else "these loops do not work here; NumPy is used")
+    return 0 if works else 1
+
+
+def _with_bar(loops):
+    """Loops -> the same, with a bar where tqdm is installed and someone is watching."""
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        return loops
+    return tqdm(loops, unit="loop", leave=False, disable=None)
 
 
 def run_demo(options):

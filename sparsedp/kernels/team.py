@@ -4,16 +4,42 @@ Threads are Python's own: a loop gives the lock back while it runs, and compiles
 numba takes for its own parallel loops. Which slab a row is in changes nothing in its bits.
 """
 
+import contextlib
 import os
+import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 
-__all__ = ["SERIAL", "Kernel", "kernel"]
+__all__ = ["SERIAL", "Kernel", "kernel", "loops"]
 
 SERIAL = 1 << 19  # numbers: below, a few tenths of a millisecond, a second thread costs more than it brings
 
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}  # by process (a forked child has none of the threads) and size
+
+
+loops: list["Kernel"] = []  # all that the imported modules define
+
+NOTICE = "sparsedp: compiling loops for this machine, once; `python -m sparsedp compile` does all of them\n"
+_noticed: list[bool] = []
+
+
+@contextlib.contextmanager
+def _announced():
+    """Meanwhile, the first function that is not found on disk and has to be compiled is announced on stderr."""
+    from numba.core import event
+
+    class Notice(event.Listener):
+        def on_start(self, _):
+            if not _noticed:
+                _noticed.append(True)
+                sys.stderr.write(NOTICE)
+
+        def on_end(self, _):
+            pass
+
+    with event.install_listener("numba:compile", Notice()):
+        yield
 
 
 def _pool(size):
@@ -56,6 +82,7 @@ class Kernel:
 
     def __init__(self, loop, words, **options):
         self.loop, self.words, self.options, self.__doc__ = loop, words, options, loop.__doc__
+        loops.append(self)
 
     @cached_property
     def compiled(self):
@@ -65,10 +92,11 @@ class Kernel:
 
             options = {"nogil": True, "error_model": "numpy", **self.options}
             signature = tuple(_types(self.words + " int int"))
-            try:
-                return njit([signature], cache=True, **options)(self.loop)
-            except (OSError, RuntimeError):  # there is no place to keep it
-                return njit([signature], **options)(self.loop)
+            with _announced():
+                try:
+                    return njit([signature], cache=True, **options)(self.loop)
+                except (OSError, RuntimeError):  # there is no place to keep it
+                    return njit([signature], **options)(self.loop)
         except Exception as error:  # whatever LLVM or numba object to on this machine
             message = f"The compiled kernels do not work here ({error}); NumPy is used instead."
             warnings.warn(message, RuntimeWarning, stacklevel=4)
