@@ -142,7 +142,8 @@ class Trials:
         """Kept, when it was the last one."""
         if self._last is not None:
             here, vector, number = self._last
-            if number == self.batches.number - 1 and np.array_equal(vector, trial.vector):
+            same_batch = not self.batches.varied or number == self.batches.number - 1
+            if same_batch and np.array_equal(vector, trial.vector):
                 return here
         return self._linearise(trial.vector, self.batches.now(back=1))
 
