@@ -1,16 +1,13 @@
 """Arithmetic on states: an array, or any tree of arrays, plus multiples of others."""
 
-import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import frozen as frozen_array
-from sparsedp.tape import Rule, cast, dtype_of, is_variable, isbox, plain
+from sparsedp.tape import cast, dtype_of, is_variable, plain
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["combine", "frozen", "like", "untraced"]
-
-# u + sum of f_i r_i  has  u_bar = g,  r_i_bar = f_i g  and the tangent  u' + sum of f_i r_i'.
 
 
 def combine(u, *pairs):
@@ -43,7 +40,8 @@ def combine(u, *pairs):
 
 def _matches(leaf, rate):
     """The common case: one array, and a rate of its shape."""
-    return hasattr(rate, "shape") and hasattr(leaf, "shape") and rate.shape == leaf.shape
+    shape = getattr(leaf, "shape", None)
+    return shape is not None and getattr(rate, "shape", None) == shape
 
 
 def _checked(found, tree):
@@ -57,38 +55,12 @@ def _checked(found, tree):
 
 
 def _sum(leaf, factors, rates):
-    """leaf + the sum of factor * rate: on the tape one node, where only arrays are traced."""
+    """leaf + the sum of factor * rate."""
     if leaf is None:
         return None
-    if (isbox(leaf) or any(map(isbox, rates))) and not any(map(isbox, factors)):
-        return SUM(factors, leaf, *rates)
     for factor, rate in zip(factors, rates, strict=True):
         leaf = leaf + factor * rate
     return leaf
-
-
-def _total(factors, leaf, *rates):
-    return _sum(leaf, factors, rates)
-
-
-def _total_vjp(nums, ans, factors, leaf, *rates):
-    def pull(g):
-        return tuple(g if num == 1 else _real_as(factors[num - 2] * g, rates[num - 2]) for num in nums)
-
-    return pull
-
-
-def _total_jvp(nums, tangents, ans, factors, leaf, *rates):
-    total = sum(t if num == 1 else factors[num - 2] * t for num, t in zip(nums, tangents, strict=True))
-    return total if dtype_of(total) == dtype_of(ans) else cast(total, dtype_of(ans))
-
-
-def _real_as(g, value):
-    """What a real rate of a complex state gets is the real part."""
-    return anp.real(g) if dtype_of(g).kind == "c" != dtype_of(value).kind else g
-
-
-SUM = Rule("stages", _total, _total_vjp, _total_jvp)
 
 
 def _words(shapes):
@@ -97,8 +69,8 @@ def _words(shapes):
 
 def like(new, u):
     """The new state in the dtypes of the old one: rates in double precision do not widen a float32 state."""
-    if type(new) is type(u) is np.ndarray and new.dtype == u.dtype:
-        return new
+    if not isinstance(new, (tuple, list, dict)):
+        return new if dtype_of(new) == dtype_of(u) else _rounded(new, u)
     found, rebuild = flatten(new)
     return rebuild(_rounded(leaf, old) for leaf, old in zip(found, leaves(u), strict=True))
 
