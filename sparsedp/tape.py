@@ -184,7 +184,7 @@ def _call_jvp(argnums, tangents, ans, args, kwargs):
         count(rule.name, "jvp")
     tangent = rule.jvp(tuple(num - 1 for num in argnums), tangents, ans, *args[1:])
     # Several results come as a tuple, and the rule itself checks each.
-    return tangent if isinstance(plain(ans), tuple) else _checked(rule.name, [ans], (tangent,), tangents[0])[0]
+    return tangent if isinstance(plain(ans), tuple) else fit(rule.name, ans, tangent, tangents[0])
 
 
 defvjp_argnums(_primitive, _call_vjp)

@@ -6,12 +6,12 @@ from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
-from autograd.core import JVPNode, VJPNode, add_outgrads
-from autograd.tracer import isbox, new_box, notrace_primitives, toposort, trace_stack
+from autograd.core import JVPNode, VJPNode, add_outgrads, primitive_vjps
+from autograd.tracer import box_types, isbox, new_box, notrace_primitives, toposort, trace_stack
 
 from sparsedp.constants import constant, constant_args, sparing
 from sparsedp.ledger import thread
-from sparsedp.shortcuts import added, along, arithmetic
+from sparsedp.shortcuts import ARRAY, COPY, ITEM, NUMBERS, Part, added, along, arithmetic, install
 from sparsedp.tree import flatten
 
 __all__ = [
@@ -58,7 +58,8 @@ class ForwardNode(JVPNode):
             super().__init__(value, fun, args, options, nums, parents)
 
 
-sparing.update((anp.add, anp.subtract, anp.concatenate_args, anp.array_from_args))  # shapes are all they need
+sparing.update((anp.add, anp.subtract, anp.concatenate_args, ARRAY, COPY))  # shapes are all they need
+install(box_types, new_box)
 untraced = notrace_primitives  # by kind of node, functions that leave the tape
 untraced[ReverseNode], untraced[ForwardNode] = untraced[VJPNode], untraced[JVPNode]
 forward_root = ForwardNode.new_root  # a fresh start of a forward-mode trace, with its tangent
@@ -122,8 +123,17 @@ def backward(end, g):
             continue
         for parent, back in zip(node.parents, node.vjp(g), strict=True):
             known = cotangents.get(parent)
-            if known is None and type(back) is np.ndarray:
+            if known is None and type(back) in NUMBERS:
                 cotangents[parent] = back, False
             else:
-                cotangents[parent] = added(known, back) or add_outgrads(known, back)
+                cotangents[parent] = added(known, back) or add_outgrads(known, _sparse(back))
     return found
+
+
+def _sparse(back):
+    """A part of a cotangent that is traced itself: autograd's form of it."""
+    if type(back) is not Part:
+        return back
+    example = np.broadcast_to(0.0, back.shape)
+    (whole,) = primitive_vjps[ITEM]((0,), None, (example, back.index), {})(back.g)
+    return whole
