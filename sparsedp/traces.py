@@ -44,6 +44,8 @@ class ReverseNode(VJPNode):
         self.vjp = None if options else arithmetic(fun, value, args, nums)
         if self.vjp is None:
             super().__init__(value, fun, args, options, nums, parents)
+        if thread.scale is not None:
+            thread.scale.add(value, args, nums)
 
 
 class ForwardNode(JVPNode):

@@ -1,4 +1,4 @@
-"""Steps with a time loop of their own, and steps that share a tape: each against single steps, by bits."""
+"""Steps of transport in a rollout, and steps that share a tape: each against single steps, by bits."""
 
 import autograd
 import autograd.numpy as anp
@@ -8,7 +8,6 @@ import pytest
 import sparsedp as dp
 from sparsedp.derivative import pullback
 from sparsedp.errors import DerivativeError, NonFiniteError, UnstableStepError
-from sparsedp.trajectory import protocol
 
 N = 20
 RNG = np.random.default_rng(3)
@@ -35,7 +34,7 @@ def scene(name):
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("wanted", ["u and v", "u", "v"])
-def test_the_loop_of_a_step_has_the_bits_of_single_steps(name, wanted, monkeypatch):
+def test_steps_of_transport_in_a_rollout_have_the_bits_of_a_budget_and_the_values_of_a_loop(name, wanted):
     step, u, v, weights = scene(name)
 
     def loss(x, **options):
@@ -44,12 +43,9 @@ def test_the_loop_of_a_step_has_the_bits_of_single_steps(name, wanted, monkeypat
         return anp.sum(weights * end * end)  # in NumPy 1.26 the bits of a power are others on a tape
 
     x = {"u": {"u": u}, "v": {"v": v}}.get(wanted, {"u": u, "v": v})
-    assert _engine(step, u, v) is protocol.Whole
     value, g = dp.value_and_grad(loss)(x)
     assert value == loss(x)
-    monkeypatch.setattr(protocol, "SMALL", 0)
-    assert _engine(step, u, v) is protocol.Protocol
-    for options in ({}, {"memory": 7 * u.nbytes + 2 * v.nbytes}):
+    for options in ({"keep": "last"}, {"memory": 7 * u.nbytes + 2 * v.nbytes}):
         other, h = dp.value_and_grad(lambda x, options=options: loss(x, **options))(x)
         assert value == other
         assert all(np.array_equal(g[key], h[key]) for key in g)
@@ -63,33 +59,11 @@ def _by_hand(step, u, v):
     return u
 
 
-def _engine(step, u, v):
-    seen = []
-    real = protocol.engine_of
-
-    def engine_of(run, *args):
-        engine = real(run, *args)
-        seen.append(type(engine))
-        return engine
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sparsedp.trajectory.run.engine_of", engine_of)
-        dp.rollout(step, u, v, 1)
-    return seen[0]
-
-
-def test_many_steps_without_a_way_back_run_in_pieces(monkeypatch):
-    step, u, v, _ = scene("walls")
-    whole = dp.rollout(step, u, v, N)
-    monkeypatch.setattr(protocol, "CHUNK", 3 * u.nbytes)
-    assert np.array_equal(whole, dp.rollout(step, u, v, N))
-    assert np.array_equal(dp.rollout(step, u, v, 0), u)
-
-
-def test_all_other_wishes_take_the_way_by_single_steps():
+def test_records_and_cuts_of_steps_of_transport():
     step, u, v, weights = scene("ring")
     states = dp.rollout(step, u, v, N, keep="all")
     assert np.array_equal(states[-1], dp.rollout(step, u, v, N))
+    assert np.array_equal(dp.rollout(step, u, v, 0), u)
     cut = dp.value_and_grad(lambda u: anp.sum(weights * dp.rollout(step, u, v, N, truncate=N)))(u)[1]
     full = dp.value_and_grad(lambda u: anp.sum(weights * dp.rollout(step, u, v, N)))(u)[1]
     assert np.array_equal(cut, full)
@@ -117,25 +91,6 @@ def test_single_precision_and_other_kinds_take_the_way_by_single_steps():
     value = dp.rollout(step, u.astype("f"), v, N)
     assert value.dtype == np.float32 and np.max(np.abs(value - dp.rollout(step, u, v, N))) < 1e-5
     assert np.max(np.abs(dp.rollout(step, u, v.astype("f"), N) - dp.rollout(step, u, v, N))) < 1e-5
-
-
-def test_a_loop_that_does_not_add_to_what_it_is_given_is_refused():
-    class Forgetful:
-        __call__ = forward = staticmethod(lambda u, p, out=None: u + p)
-        backward = staticmethod(lambda u, p, g, into=None: (g, into))
-
-        def march(self, states, p):
-            states[1:] = states[0] + p * np.arange(1, len(states))[:, None]
-
-        def retreat(self, states, p, g, into=None):
-            return g, (len(states) - 1) * g
-
-    with pytest.raises(
-        DerivativeError,
-        match="the backward form of the step returned another array for params than the one it was given; add to "
-        "`into` and return it",
-    ):
-        dp.value_and_grad(lambda p: anp.sum(dp.rollout(Forgetful(), np.ones(3), p, 20)))(np.ones(3))
 
 
 def test_the_loop_stops_at_the_step_that_goes_wrong():

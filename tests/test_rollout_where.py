@@ -23,10 +23,10 @@ class Doubling:
     def __init__(self, move):
         self.move = move
 
-    def forward(self, state, params, out=None):
+    def forward(self, state, params):
         return self.move(*state, 0.2), 2.0 * state[1]
 
-    def backward(self, state, params, g, into=None):
+    def backward(self, state, params, g):
         raise NonFiniteError("no way")
 
     def __call__(self, state, params):

@@ -6,6 +6,7 @@ from sparsedp.direction import push, zero_like
 from sparsedp.tape import is_variable
 from sparsedp.trajectory.keep import Each, marked
 from sparsedp.trajectory.layout import Layout
+from sparsedp.trajectory.steps import carries
 from sparsedp.tree import leaves
 
 __all__ = ["dual"]
@@ -100,7 +101,7 @@ class DualStep:
         def tangents(i, pair):
             state, directions = pair
             value, slopes = push(lambda tree: function(i, tree), state, run.state.spread(directions))
-            if run.engine.called:
+            if not carries(run.step):
                 run.keep.compare(i, [marked(leaf) for leaf in leaves(value) if is_variable(leaf)])
             return [slope for slope in leaves(slopes) if slope is not None]
 

@@ -12,14 +12,14 @@ from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.traces import in_reverse
 from sparsedp.trajectory.keep import All, Each, Last
 from sparsedp.trajectory.layout import Layout, dense
-from sparsedp.trajectory.protocol import PLAIN, carries
 from sparsedp.trajectory.rules import rollout_rule
 from sparsedp.trajectory.run import Run
 from sparsedp.trajectory.schedule import budget_within_reach, plan, room_within, slots_within
-from sparsedp.trajectory.tapes import Tapes
 from sparsedp.tree import leaves
 
 __all__ = ["rollout"]
+
+SMALL = 2**22  # bytes that tapes of steps may take, beside the states on them, where no budget is given
 
 
 def rollout(
@@ -126,9 +126,9 @@ def rollout(
     run = Run(step, *forms, n, _kind(keep, forms[0]), slots, truncate, bool(traced), progress, record)
     _check_values(run, args)
     pulled = any(map(in_reverse, args))  # a forward derivative has no use for tapes
-    if pulled and (slots is None or slots >= n) and (inputs is not None or not carries(step, *PLAIN)):
-        room = None if memory is None else room_within(memory, forms[0].nbytes, n, beside)
-        run.tapes = Tapes(room, frozenset(traced), slots is not None)
+    if pulled and (slots is None or slots >= n):
+        run.room = SMALL if memory is None else max(room_within(memory, forms[0].nbytes, n, beside), 0)
+        run.traced = frozenset(traced)
     if run.store and run.slots:
         _warn_of_repeats(memory, forms[0].nbytes, n, beside)
     for told in thread.loops:

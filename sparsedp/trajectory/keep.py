@@ -29,7 +29,6 @@ class Last:
     """
 
     along = False  # cotangents enter at the end only
-    recycles = True  # nobody sees the states on the way: their arrays may be used again
     whole = False  # every state is handed out, and thereby kept
 
     def __init__(self, layout, shown=slice(None)):
@@ -57,10 +56,6 @@ class _LastCollector:
     def __init__(self, keep):
         self._keep = keep
 
-    def room(self, i):
-        """Where state i may be computed: nowhere in particular."""
-        return None
-
     def see(self, i, values, statics):
         self._values, self._statics = values, statics
         return values
@@ -72,7 +67,7 @@ class _LastCollector:
 class All:
     """All n + 1 states, stacked along a new first axis."""
 
-    along, recycles = True, False
+    along = True
 
     def __init__(self, layout, shown=slice(None)):
         self.layout, self.shown = layout, shown
@@ -106,20 +101,14 @@ class _AllCollector:
         self._statics: list = []
         self.shared = keep.whole
 
-    def room(self, i):
-        """Where state i may be computed: in its place."""
-        self._room = [block[i] for block in self._blocks] if self.shared else None
-        return self._room
-
     def see(self, i, values, statics):
         self._statics.append(statics)
-        room = self._room if i else self.room(i)
         for block, value in zip(self._blocks, values[self._shown], strict=True):
-            if room is None or not any(value is row for row in room):
-                block[i] = value
-        if not room:
+            block[i] = value
+        if not self.shared:
             return values
-        return [row if type(row) is np.ndarray else value for row, value in zip(room, values, strict=True)]
+        rows = [block[i] for block in self._blocks]
+        return [row if type(row) is np.ndarray else value for row, value in zip(rows, values, strict=True)]
 
     def finish(self, stored):
         if stored:  # the way back uses these very arrays
@@ -205,10 +194,6 @@ class _EachCollector:
         self._keep, self._stored = keep, stored
         self._stacks: dict = {}
         self._trees: list = []
-
-    def room(self, i):
-        """Where state i may be computed: nowhere in particular."""
-        return None
 
     def see(self, i, values, statics):
         layout = self._keep.layout

@@ -1,22 +1,24 @@
 """A rollout as a value: the step, the form of its arguments, how far, and what is kept."""
 
-from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.fields import place, surely_finite
-from sparsedp.ledger import active, count
-from sparsedp.trajectory.layout import fingerprint
+from sparsedp.ledger import active, count, thread
+from sparsedp.trajectory.keep import Last
+from sparsedp.trajectory.layout import fingerprint, owned
+from sparsedp.trajectory.pieces import Scale
 from sparsedp.trajectory.progress import shown_steps
-from sparsedp.trajectory.protocol import engine_of
-from sparsedp.trajectory.record import Record
+from sparsedp.trajectory.record import Record, looked_at
 from sparsedp.trajectory.schedule import stride
-from sparsedp.trajectory.tapes import Tapes
+from sparsedp.trajectory.steps import Steps, carries
 from sparsedp.trajectory.way import Way
 
 __all__ = ["Run"]
+
+HELD = 2**16  # bytes of cotangents of params that may wait until a piece has been gone through
 
 
 class Run:
@@ -46,11 +48,12 @@ class Run:
         self.n, self.keep, self.truncate, self.store = n, keep, truncate, store
         self.budget, self.slots = slots, None if keep.whole else slots
         self.progress, self.record = progress, record
-        self.tapes: Tapes | None = None  # of single steps, kept from the way forward
+        self.room: float = 0  # bytes for tapes that are kept from the way forward
+        self.traced: frozenset = frozenset()  # the arguments that those tapes lead to
+        self.pieces: list = []  # the tapes, from the first step on
         self.place_of: dict = {}  # in a dual run: number of an argument of the run -> its number here
         self.silenced: tuple = ()  # variables that are zero for the step after a cut: tangents
         self.origin: Run | None = None  # of a dual run: the one whose states it goes through again
-        self.engine: Any = None  # what runs the steps, once that is known
         self.outcome = None  # what the user's tree holds beside the variables
         self._kept: Any = None
         self._final: tuple = ()
@@ -76,12 +79,10 @@ class Run:
 
     def forward(self, args):
         """Run all steps; return the arrays to hand out."""
-        tapes = self.tapes if self.store else None
-        engine = engine_of(self, args, tapes.wanted if tapes else (), tapes is not None)
-        collector = self.keep.collector(self)
-        with engine.guarded(), tapes.fresh() if tapes else nullcontext():
-            state, statics, kept = self._advance(engine, collector, args)
-        engine.check_params()
+        steps, collector = Steps(self, args, self.traced), self.keep.collector(self)
+        with steps.guarded():
+            state, statics, kept = self._advance(steps, collector, args)
+        steps.check_params()
         self._check_end(args, state)
         if self.origin:
             self.origin.agree(self.n, state, statics)
@@ -89,7 +90,7 @@ class Run:
             end = fingerprint(state, statics)
             self.compare(end, self._end or end)
             self._end = end
-            self._kept, self._final = kept, (state if collector.shared else engine.store(state), statics)
+            self._kept, self._final = kept, (state if collector.shared else list(map(owned, state)), statics)
         if active:
             count("rollout.step", "forward", self.n)
             count("rollout", "bytes", len(kept) * self.state.nbytes if self.store else 0)
@@ -98,31 +99,61 @@ class Run:
         outputs, self.outcome = collector.finish(self.store)
         return outputs
 
-    def _advance(self, engine, collector, args):
+    def _advance(self, steps, collector, args):
         """(last state, its statics, kept states) after all steps."""
         state, statics = self.split(args)[0], self.state.statics
-        state, along = collector.see(0, state, statics), self.keep.along
-        first, state, kept = engine.link(state, statics)
-        stop, last = first if self.store else -1, self.n - 1
-        origin = self.origin if self.origin and self.origin.keep.whole else None
-        if 0 < first == self.n:
-            state = collector.see(first, state, statics)
-        for i in shown_steps(self.progress, range(first, self.n), "forward"):
-            stored = i == stop or (stop >= 0 and i == last)
-            if stored:
-                kept.append((i, state if collector.shared or i == 0 else engine.store(state), statics))
+        state, shown = collector.see(0, state, statics), iter(shown_steps(self.progress, range(self.n), "forward"))
+        state, statics, kept = self._on_tapes(steps, collector, shown, state, statics)
+        stop, last = len(kept) if self.store else -1, self.n - 1
+        for i in shown:
+            if i == stop or (stop >= 0 and i == last):
+                kept.append((i, state if collector.shared or i == 0 else list(map(owned, state)), statics))
                 stop = self._next(i, len(kept)) if i == stop else stop
             elif stop >= 0 and i + 1 in (stop, last):
                 self._before[i + 1] = fingerprint(state, statics)
-            if origin:
-                origin.agree(i, state, statics)
-            before = state
-            state, statics = engine.forward(i, state, statics, collector.room(i + 1) if along else None)
-            if along or i == last:
-                state = collector.see(i + 1, state, statics)
-            if not stored and i:
-                engine.release(before)
+            self._agree(i, state, statics)
+            state, statics = steps.forward(i, state, statics)
+            state = collector.see(i + 1, state, statics)
         return state, statics, kept
+
+    def _on_tapes(self, steps, collector, shown, state, statics):
+        """As many steps as there is room for, on tapes that are kept: (state, statics, the states before each step)."""
+        kept: list = []
+        self.pieces = []
+        if not (self.store and self.room):
+            return state, statics, kept
+        scale, outer, many, most = Scale(self.room, self.state.nbytes), thread.scale, looked_at(self.n), max(HELD // max(self.params.nbytes, 1), 1)
+        linked = len(state) == 1 and type(self.keep) is Last  # one tape for several steps, to the same bits
+
+        def goes_on(i, values, others, same):
+            scale.step()
+            more = linked and same and 1 < i < self.n and i % many and i - first < most and not self.is_cut(i)
+            if more and scale.has_room:
+                kept.append((i, values, others))
+                return True
+            return False
+
+        steps.recording = True
+        try:
+            while len(kept) < self.n and scale.has_room:
+                first = len(kept)
+                kept.append((first, state, statics))
+                self._agree(first, state, statics)
+                scale.begin()
+                piece, state, statics = steps.taped(first, state, statics, self.wants(first, self.traced), goes_on)
+                if scale.fits:
+                    self.pieces.append(piece)
+                state = collector.see(piece.stop, state, statics)
+                for _ in range(first, piece.stop):
+                    next(shown)
+        finally:
+            thread.scale = outer
+        return state, statics, kept
+
+    def _agree(self, i, state, statics):
+        """A dual run goes through the states of its origin, where those are all at hand."""
+        if self.origin and self.origin.keep.whole:
+            self.origin.agree(i, state, statics)
 
     def _next(self, i, used):
         """Index of the state to be kept after state i."""
@@ -134,10 +165,10 @@ class Run:
         """Refuse a last state that is not finite: NaN stays, so one look tells, and a second run finds the step."""
         if self.state.is_finite(state):
             return
-        engine = engine_of(self, args)
+        steps = Steps(self, args)
         state, statics = self.split(args)[0], self.state.statics
         for i in range(self.n):
-            state, statics = engine.forward(i, state, statics)
+            state, statics = steps.forward(i, state, statics)
             for name, value in zip(self.state.names, state, strict=True):
                 finite = np.isfinite(value)
                 if not np.all(finite):
@@ -169,19 +200,20 @@ class Run:
 
     def agree(self, i, values, statics):
         """Refuse a state that a dual run goes through where it is not the one that was handed out."""
-        if self.engine.called:
-            found = fingerprint(values[: len(self.state.places)], statics[: len(self.state.statics)])
-            self.compare(found, self._end if i == self.n else fingerprint(*self._kept[i][1:]))
+        if carries(self.step):  # the dual run calls the step, whose own form may round otherwise
+            return
+        found = fingerprint(values[: len(self.state.places)], statics[: len(self.state.statics)])
+        self.compare(found, self._end if i == self.n else fingerprint(*self._kept[i][1:]))
 
     def backward(self, args, wanted, g):
         """Cotangents of the outputs -> those of the arguments in `wanted`, in that order."""
         if self._kept is None:
             self.store = True
             self.forward(args)
-        engine = engine_of(self, args, frozenset(wanted))
-        with engine.guarded("on the way back through step"):
-            state = Way(self, engine, self.wants(0, wanted)).back(g)
-        found = [*(state or [None] * len(self.state.places)), *engine.gradients()]
+        steps = Steps(self, args, frozenset(wanted))
+        with steps.guarded("on the way back through step"):
+            state = Way(self, steps, frozenset(wanted)).back(g)
+        found = [*(state or [None] * len(self.state.places)), *steps.gradients()]
         for number in wanted:
             self._check_gradient(number, found[number], g)
         return tuple(_or_zeros(found[number], args[number]) for number in wanted)
@@ -205,15 +237,16 @@ class Run:
         """Whether truncation makes state i a constant for the steps after it."""
         return self.truncate is not None and 0 < i < self.n and (self.n - i) % self.truncate == 0
 
-    def take_kept(self):
-        """The kept states, the last one, and `_before`.
+    def take_kept(self, wanted):
+        """The kept states, the last one, `_before`, the mark of the end, and the tapes to the arguments `wanted`.
 
         Under a budget they are handed over: freed as they are used, run again if asked again.
         """
-        found = self._kept, self._final, self._before
+        pieces = list(self.pieces) if wanted == self.traced else []
+        found = self._kept, self._final, self._before, self._end, pieces
         if self.slots is not None:
-            self._kept, self._final, self._before = None, (), {}
-        return *found, self._end
+            self._kept, self._final, self._before, self.pieces = None, (), {}, []
+        return found
 
 
 def _at(block, i):

@@ -1,4 +1,4 @@
-"""One step, forward on plain values and backward on a tape of its own."""
+"""The steps of a run, forward on plain values or on a tape, and backward along the tape."""
 
 from contextlib import contextmanager
 
@@ -8,12 +8,13 @@ from sparsedp.constants import constant
 from sparsedp.direction import pull_ends, zero_like
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
-from sparsedp.tape import fit
+from sparsedp.tape import Rule, fit, plain
 from sparsedp.traces import inside, new_box, reverse_root, split_box
 from sparsedp.trajectory.layout import fingerprint, owned
+from sparsedp.trajectory.pieces import Piece
 from sparsedp.tree import copied, flatten, leaves
 
-__all__ = ["Taped", "boxed", "fitted"]
+__all__ = ["Steps", "carries"]
 
 
 _REMEDY = {
@@ -23,8 +24,8 @@ _REMEDY = {
 }
 
 
-class Taped:
-    """A step that is a plain function: run as it is going forward, put on a tape of its own going backward.
+class Steps:
+    """The steps of a run: plain going forward, on tapes going backward.
 
     Parameters
     ----------
@@ -35,53 +36,101 @@ class Taped:
         Which of them want a cotangent.
     """
 
-    known = None  # going back: variables of the state after this step, where every state is kept
-    after = None  # its fingerprint
-    called = True  # the states are those that the call of the step makes, bit by bit
-
-    def __init__(self, run, args, wanted=(), recording=False):
-        self.run, self.recording = run, recording
+    def __init__(self, run, args, wanted=()):
+        self.run = run
         _, self.p, self.x = run.split(args)
+        self.plain = run.inputs is None and carries(run.step)
         self._frozen, self._statics = [frozen(value) for value in self.p], run.params.statics
         self.params = run.params.build(self._frozen, self._statics)
         self._given = leaves(self.params)
         self._last: tuple = ()
         self._open = any(layout is not None and layout.open for layout in (run.state, run.params, run.inputs))
-        self.wanted = frozenset(wanted)
         first, second = len(run.state.places), len(run.state.places) + len(self.p)
         self._p = [place for place in range(len(self.p)) if first + place in wanted]
         self._x = [place for place in range(len(self.x)) if second + place in wanted]
+        self.recording = False  # whether tapes are kept
         self.gp: list = [None] * len(self.p)
         self.gx: list = [np.zeros_like(x) if place in self._x else None for place, x in enumerate(self.x)]
-        self._roots: dict = {}
 
     # ------------------------------------------------------------ forward
 
-    def link(self, state, statics):
-        """Steps that are run in one piece: (how many, the state after them, the states before each of them)."""
-        return 0, state, []
-
-    def linked(self):
-        """How many steps, from the first on, `unlink` goes back through in one piece."""
-        return 0
-
-    def forward(self, i, values, statics, room=None):
-        """Variables and statics of state i -> those of state i + 1. `room` is for steps that can use it."""
+    def forward(self, i, values, statics):
+        """Variables and statics of state i -> those of state i + 1."""
         run = self.run
         if run.silenced:
             values = self._silenced(i, values)
         self._last = i, values, statics
-        if self.recording and run.tapes.fit:
-            return self._recorded(i, values, statics)
         if run.state.bare:
-            result = self._applied(frozen(values[0]), self.params, *run.input_at(i, self.x))
+            result = self._moved(frozen(values[0]), *run.input_at(i, self.x))
             if run.state.is_one(result):
                 return [result], statics
         else:
             state = run.state.build([frozen(value) for value in values], statics)
-            result = self._applied(state, self.params, *run.input_at(i, self.x))
+            result = self._moved(state, *run.input_at(i, self.x))
         values, statics = run.state.take(result, "the step")
         return run.state.check(values, "the step"), constant(statics)
+
+    def taped(self, i, values, statics, want_state, goes_on=None):
+        """State i and the steps from there on a tape -> (Piece, variables and statics of the last state).
+
+        `goes_on`: asked with the number, the variables and statics of every new state, and whether its numbers are
+        those on the tape (not rounded, not made contiguous), whether another step follows on the same tape; default:
+        none does.
+        """
+        run = self.run
+        if run.silenced:
+            values = self._silenced(i, values)
+        roots = [reverse_root() if want_state else None for _ in values]
+        piece = Piece(i, roots, statics)
+
+        def steps(number):
+            state, others = boxed([frozen(value) for value in values], roots, number), statics
+            while True:
+                found, others = self._next(piece, state, others, number)
+                pairs = [split_box(value, number) for value in found]
+                new = run.state.check([value for value, _ in pairs], "the step")
+                piece.ends = [node for _, node in pairs]
+                same = all(value is known for (value, _), known in zip(pairs, new, strict=True))
+                if not (goes_on and goes_on(piece.stop, new, others, same)):
+                    return new, others
+                state = [value if node else frozen(owned(known)) for value, (known, node) in zip(found, pairs)]
+
+        (values, statics), _ = inside(steps)
+        return piece, values, statics
+
+    def _next(self, piece, state, statics, number):
+        """One more step of a piece, from traced variables: those of its result, and its statics."""
+        run, i = self.run, piece.stop
+        self._last = i, [plain(value) for value in state], statics
+        p = [reverse_root() if place in self._p else None for place in range(len(self.p))]
+        x = [reverse_root() if place in self._x else None for place in range(len(self.x))]
+        piece.params.append(p)
+        piece.inputs.append(x)
+        params = boxed(self._frozen, p, number)
+        if self.plain:
+            self._others = statics
+            found = plain_step(self, *state, *params)
+            return ([found] if len(state) == 1 else [found[k] for k in range(len(state))]), self._others
+        inputs = run.input_at(i, self.x, lambda rows: boxed(rows, x, number))
+        tree = run.params.build(params, self._statics) if self._p else self.params
+        found, others = run.state.take(self._applied(run.state.build(state, statics), tree, *inputs), "the step")
+        return found, constant(others)
+
+    def _moved(self, state, *inputs):
+        """A step of plain values."""
+        return self.run.step.forward(state, self.params) if self.plain else self._applied(state, self.params, *inputs)
+
+    def moved(self, values):
+        """Variables of a state, whose other leaves stand in `_others` -> those of the next, by the step's own form."""
+        layout, self.before = self.run.state, self._others
+        result = self._moved(layout.build([frozen(value) for value in values], self._others))
+        values, others = layout.take(result, "the step")
+        self._others = constant(others)
+        return layout.check(values, "the step")
+
+    def taken(self, tree):
+        """A state that the step made -> its variables."""
+        return self.run.state.check(self.run.state.take(tree, "the step")[0], "the step")
 
     def _silenced(self, i, values):
         """A dual run has no tangents where the derivative is cut."""
@@ -152,81 +201,26 @@ class Taped:
         if not _same(leaves(self.params), self._given):
             raise ValueError(f"the step changes the entries of params; {_REMEDY['params']}")
 
-    def store(self, values):
-        """A copy that nobody else can write into."""
-        return [owned(value) for value in values]
-
-    def release(self, values):
-        """The state is not needed any more."""
-
-    def trim(self):
-        """As many states are kept as may be: let go of arrays that nothing is in."""
-
     # ------------------------------------------------------------ backward
 
-    def backward(self, i, values, statics, g, want_state):
-        """Cotangents of state i + 1 -> those of state i; those of params and inputs are added up."""
-        run = self.run
-        if run.silenced:
-            values = self._silenced(i, values)
-        self._last = i, values, statics
-        ends = run.tapes and run.tapes.take(i, self.wanted)
-        if not ends:
-            pairs, roots, others = self._taped(i, values, statics, want_state)
-            run.compare(fingerprint(run.state.check([value for value, _ in pairs], "the step"), others), self.after)
-            ends = [node for _, node in pairs], roots
-            del pairs  # the result itself is not needed any more
-        nodes, slopes = [], []
-        for node, slope in zip(ends[0], g, strict=True):
-            if node is not None and slope is not None:
-                nodes.append(node)
-                slopes.append(slope)
-        return self._sorted(i, values, pull_ends(nodes, slopes, ends[1]), want_state)
+    def pull(self, piece, values, g):
+        """Cotangents of the last state of a piece -> those of its first; those of params and inputs are added up.
 
-    def _taped(self, i, values, statics, want_state, weighed=False):
-        """A step on a tape of its own: (value, node) of each variable, the roots, the other leaves."""
-        run = self.run
-        if (want_state, weighed) not in self._roots:
-            self._roots[want_state, weighed] = self._plan_roots(want_state, weighed)
-        state, p, x, roots = self._roots[want_state, weighed]
-
-        def step(number):
-            tree = run.state.build(boxed([frozen(value) for value in values], state, number), statics)
-            params = run.params.build(boxed(self._frozen, p, number), self._statics) if self._p else self.params
-            if run.inputs is None:
-                return self._applied(tree, params)
-            return self._applied(tree, params, *run.input_at(i, self.x, lambda rows: boxed(rows, x, number)))
-
-        result, number = inside(step)
-        ends, others = run.state.take(result, "the step")
-        return [split_box(end, number) for end in ends], roots, others
-
-    def _recorded(self, i, values, statics):
-        """The same as `forward`, on a tape that is kept for the way back."""
-        run, before = self.run, self.run.tapes.bytes
-        pairs, roots, statics = self._taped(i, values, statics, run.wants(i, self.wanted), run.tapes.weighs(i))
-        run.tapes.keep(i, ([node for _, node in pairs], roots), before)
-        return run.state.check([value for value, _ in pairs], "the step"), constant(statics)
-
-    def _plan_roots(self, want_state, weighed):
-        """A root for each variable that is traced, else None. They hold nothing: every step uses them again."""
-        root = self.run.tapes.root if weighed else reverse_root
-        state = [root() if want_state else None for _ in self.run.state.places]
-        p = [root() if place in self._p else None for place in range(len(self.p))]
-        x = [root() if place in self._x else None for place in range(len(self.x))]
-        return state, p, x, [root for root in (*state, *p, *x) if root is not None]
-
-    def _sorted(self, i, values, backs, want_state):
-        split = len(values) if want_state else 0
-        for place, back in zip(self._p, backs[split:], strict=False):
-            if back is not None:
-                self._add(place, back)
-        for place, back in zip(self._x, backs[split + len(self._p) :], strict=True):
-            if back is not None:
-                self.gx[place][i] = back
-        if not want_state:
-            return None
-        return [back if back is None else fitted(back, value) for back, value in zip(backs, values, strict=False)]
+        `values`: the variables of the first state.
+        """
+        self._last = piece.first, values, piece.statics
+        pairs = [(node, slope) for node, slope in zip(piece.ends, g, strict=True) if node and slope is not None]
+        backs = iter(pull_ends([node for node, _ in pairs], [slope for _, slope in pairs], piece.roots))
+        state = [fitted(next(backs), value) if root else None for root, value in zip(piece.state, values, strict=True)]
+        lines = [[[next(backs) if root else None for root in line] for line in pair] for pair in piece.steps]
+        for i, (p, x) in reversed(list(enumerate(lines, piece.first))):
+            for place, back in enumerate(p):
+                if back is not None:
+                    self._add(place, back)
+            for place, back in enumerate(x):
+                if back is not None:
+                    self.gx[place][i] = back
+        return state if any(piece.state) else None
 
     def _add(self, place, back):
         back, total = fitted(back, self.p[place]), self.gp[place]
@@ -240,6 +234,58 @@ class Taped:
     def gradients(self):
         """What has been added up for params and inputs."""
         return [*self.gp, *self.gx]
+
+
+# ---------------------------------------------------------------- steps with a backward form of their own
+
+
+def carries(step):
+    """Whether a step has plain forms of its own: one node on the tape, whatever it is made of.
+
+    It has, beside its call,
+
+        step.forward(state, params) -> state
+        step.backward(state, params, g) -> (g_state, g_params)
+
+    both on plain trees. Linear steppers, nonlinear implicit ones of one stage, and flow_step do. Where `step.sparing` is
+    true, backward also takes `new`, the result of the step when it is one array, and `wanted`, whether params want a
+    cotangent. Where `step.solves` is true, it takes `met`: a function to be called with the result that it finds again,
+    which refuses another one than before.
+    """
+    return callable(getattr(step, "forward", None)) and callable(getattr(step, "backward", None))
+
+
+def _plain_forward(steps, *values):
+    found = steps.moved(values[: len(steps.run.state.places)])
+    if steps.recording:  # the step may use these arrays again
+        found = list(map(owned, found))
+    return found[0] if len(found) == 1 else tuple(found)
+
+
+def _plain_vjp(nums, ans, steps, *values):
+    run, many, wanted = steps.run, len(steps.run.state.places), max(nums) > len(steps.run.state.places)
+    state = run.state.build([frozen(value) for value in values[:many]], steps.before)
+    more = {}  # what is not used is not held
+    if getattr(run.step, "sparing", False):
+        more = {"new": plain(ans) if run.state.bare else None, "wanted": wanted}
+    if getattr(run.step, "solves", False):
+        ends = [plain(ans)] if many == 1 else list(plain(ans))
+        more["met"] = lambda result: run.compare(*(fingerprint(found) for found in (steps.taken(result), ends)))
+
+    def pull(g):
+        slopes = run.state.build([g] if many == 1 else [g[k] for k in range(many)])
+        of_state, of_params = run.step.backward(state, steps.params, slopes, **more)
+        what = "the backward form of the step"
+        backs = run.state.check(run.state.take(of_state, what)[0], what)
+        if wanted:
+            found = [None] * len(steps.p) if of_params is None else run.params.take(of_params, what)[0]
+            backs += [np.zeros_like(p) if back is None else back for back, p in zip(found, steps.p, strict=True)]
+        return tuple(backs[num - 1] for num in nums)
+
+    return pull
+
+
+plain_step = Rule("the step", _plain_forward, _plain_vjp)
 
 
 def _refuses_writing(error):
@@ -256,7 +302,9 @@ def boxed(values, roots, number):
 
 
 def fitted(back, value):
-    """A cotangent in the dtype of its value."""
+    """A cotangent in the dtype of its value; None where there is none."""
+    if back is None:
+        return None
     if type(back) is type(value) and type(back) is not float and (back.dtype, back.shape) == (value.dtype, value.shape):
         return back
     return fit("the step", value, back, back)

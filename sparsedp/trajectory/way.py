@@ -1,8 +1,8 @@
-"""The way back over all steps of a run."""
+"""The backward pass over all steps of a run."""
 
 from sparsedp.errors import DerivativeError
 from sparsedp.ledger import active, count
-from sparsedp.trajectory.layout import fingerprint
+from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import LIMIT, Growth
 from sparsedp.trajectory.schedule import stride
@@ -11,23 +11,23 @@ __all__ = ["Way"]
 
 
 class Way:
-    """One way back over all steps.
+    """One backward pass over all steps.
 
     Parameters
     ----------
     run : Run
-    engine : Taped or Protocol
-    want_state : bool
-        Whether the first state wants a cotangent.
+    steps : Steps
+    wanted : frozenset of int
+        The arguments that want a cotangent.
     """
 
-    def __init__(self, run, engine, want_state):
-        self.run, self.engine, self.want_state = run, engine, want_state
-        self.stack, self.final, self.before, self.after = run.take_kept()
+    def __init__(self, run, steps, wanted):
+        self.run, self.steps, self.want_state = run, steps, run.wants(0, wanted)
+        self.stack, self.final, self.before, self.after, self.pieces = run.take_kept(wanted)
         self.recomputed = 0
 
     def back(self, g):
-        """Cotangents of the outputs -> cotangents of the first state; the rest is added up in the engine."""
+        """Cotangents of the outputs -> cotangents of the first state; the rest is added up in `steps`."""
         run = self.run
         growth, many = Growth(run.n, run.truncate), len(self.stack)
         source = run.keep.source(run.n, g)
@@ -35,13 +35,17 @@ class Way:
         if run.slots is not None:
             self.final = ()  # not needed any more
         growth.see(run.n, total)
-        linked = self.engine.linked()
-        for i in shown_steps(run.progress, range(run.n - 1, linked - 1, -1), "backward"):
+        i = run.n
+        for k in shown_steps(run.progress, range(run.n - 1, -1, -1), "backward"):
+            if k >= i:
+                continue  # part of a piece that has been gone through
             if total is None and not run.keep.along:
                 break  # cut by truncation
-            total = self._step(i, total, source, growth)
-        if linked and total is not None:
-            total = self._unlinked(linked, total, source, growth)
+            i, total = self._through(i, total)
+            if i % growth.every == 0:
+                growth.see(i, total)
+            if run.keep.along and (i > 0 or self.want_state):
+                total = _sum(total, source(i, *self.state[1:]))
         if active:
             count("rollout.step", "vjp", run.n)
             count("rollout.step", "recomputed", self.recomputed)
@@ -51,44 +55,39 @@ class Way:
             growth.record(many, self.recomputed)
         return total
 
-    def _unlinked(self, linked, total, source, growth):
-        """Through the steps of one piece; where that fails, step by step, so that `guarded` can name the step."""
+    def _through(self, i, total):
+        """Back from state i through one piece: the number of the state it starts from, and its cotangents."""
+        run = self.run
+        piece = self.pieces.pop() if self.pieces and self.pieces[-1].stop == i else None
+        first = piece.first if piece else i - 1
+        self.state = first, *self._state_at(first)
+        mark, before = fingerprint(*self.state[1:]), self.before.pop(i, None)
+        if before:
+            run.compare(mark, before)
+        if total is not None:
+            if piece is None:
+                wants = run.wants(first, ()) if first else self.want_state
+                piece, values, statics = self.steps.taped(*self.state, wants)
+                run.compare(fingerprint(values, statics), self.after)
+                del values
+            total = self._pulled(piece, total)
+        self.after = mark
+        return first, total
+
+    def _pulled(self, piece, total):
+        """Through a piece; where that fails, step by step, so that `guarded` can name the step."""
         try:
-            return self.engine.unlink(total, self.stack, growth)
+            return self.steps.pull(piece, self.state[1], total)
         except DerivativeError:
             raise
         except Exception:
-            for i in range(linked - 1, -1, -1):
-                total = self._step(i, total, source, growth)
+            if piece.stop - piece.first == 1:
+                raise
+            for i in range(piece.stop - 1, piece.first - 1, -1):
+                _, values, statics = self.stack[i] if i < len(self.stack) else self.state
+                one, _, _ = self.steps.taped(i, values, statics, True)
+                total = self.steps.pull(one, values, total)
             raise
-
-    def _step(self, i, total, source, growth):
-        run = self.run
-        values, statics = self._state_at(i)
-        before = self.before.pop(i + 1, None)
-        mark = fingerprint(values, statics) if before or self.engine.called else None
-        if before:
-            run.compare(mark, before)
-        wants = not run.is_cut(i) if i else self.want_state
-        if total is not None:
-            self.engine.known, self.engine.after = self._known(i + 1), self.after
-            if run.slots == len(self.stack):
-                self.engine.trim()
-            total = self.engine.backward(i, values, statics, total, wants)
-            if i % growth.every == 0:
-                growth.see(i, total)
-        if run.keep.along and (i > 0 or self.want_state):
-            total = _sum(total, source(i, values, statics))
-        if run.slots is not None and i:
-            self.engine.release(values)
-        self.after = mark
-        return total
-
-    def _known(self, i):
-        """Variables of state i where every state is kept."""
-        if self.run.slots is not None:
-            return None
-        return self.stack[i][1] if i < len(self.stack) else self.final[0]
 
     def _state_at(self, i):
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""
@@ -102,7 +101,6 @@ class Way:
             values, statics = self._again(start, stop, values, statics)
             start = stop
             if start < i:
-                values = self.engine.store(values)
                 stack.append((start, values, statics))
         if stack[-1][0] == i:
             stack.pop()
@@ -112,13 +110,10 @@ class Way:
         """Run from a kept state on."""
         self.recomputed += stop - start
         for k in range(start, stop):
-            before = values
             if k == stop - 1 > start:
                 self.before[stop] = fingerprint(values, statics)
-            values, statics = self.engine.forward(k, values, statics)
-            if k > start:
-                self.engine.release(before)
-        return values, statics
+            values, statics = self.steps.forward(k, values, statics)
+        return list(map(owned, values)), statics  # the last one may be an array that the step uses again
 
 
 def _sum(total, entering):
