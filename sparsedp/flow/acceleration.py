@@ -17,7 +17,7 @@ from sparsedp.solvers.facts import magnitude
 from sparsedp.tape import dtype_of, is_variable, plain
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["Acceleration", "Viscous", "added_to"]
+__all__ = ["Acceleration", "Viscous", "total"]
 
 ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
 
@@ -123,19 +123,10 @@ class Acceleration:
         return back, slopes
 
 
-def added_to(into, trees):
-    """Trees of cotangents, added to those of the tree `into`, in place; without it, their sum, or None."""
-    for tree in trees:
-        if tree is not None:
-            into = tree if into is None else _sum(into, tree)
-    return into
-
-
-def _sum(into, tree):
-    found, rebuild = flatten(into)
-    for number, part in enumerate(leaves(tree)):
-        if isinstance(found[number], np.ndarray):
-            found[number] += part
-        elif part is not None:
-            found[number] = found[number] + part
-    return rebuild(found)
+def total(trees):
+    """The sum of trees of cotangents, leaf by leaf; None is none, and the sum of none."""
+    found = [tree for tree in trees if tree is not None]
+    if len(found) < 2:
+        return found[0] if found else None
+    (one, rebuild), others = flatten(found[0]), leaves(found[1])
+    return rebuild([a if b is None else b if a is None else a + b for a, b in zip(one, others, strict=True)])

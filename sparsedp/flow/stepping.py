@@ -15,7 +15,7 @@ import numpy as np
 from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_function, is_number
-from sparsedp.flow.acceleration import Acceleration, Viscous, added_to
+from sparsedp.flow.acceleration import Acceleration, Viscous, total
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
 from sparsedp.flow.walls import flow_sides, pressure_conditions
@@ -179,7 +179,7 @@ class FlowStep(Remade):
 
     # ------------------------------------------------------------ without the tape, for rollout
 
-    def forward(self, state, params, out=None):
+    def forward(self, state, params):
         """The next state, of plain values: that of a call, to rounding."""
         return self._advanced(state, params, self._parted_plain)
 
@@ -188,8 +188,8 @@ class FlowStep(Remade):
         at_once = not isbox(ahead) and ahead.dtype == np.float64
         return self.project.parts(ahead) if at_once else self._parted(ahead)
 
-    def backward(self, state, params, g, into=None):
-        """Cotangents of a state and of params from that of the next state, plain; those of params are added to `into`.
+    def backward(self, state, params, g):
+        """Cotangents of a state and of params from that of the next state, plain.
 
         The transpose of each line of the step, from the last to the first.
         """
@@ -200,7 +200,7 @@ class FlowStep(Remade):
             v = z + (0.5 * self.dt * self.viscosity) * self.laplacian.T(z)
         of_v, of_params = self.acceleration.backward(state["v"], params, g["a"] + 1.5 * self.dt * z)
         back = {"v": v + of_v, "p": g["p"] - self.dt * self.slope.T(z), "a": -0.5 * self.dt * z}
-        return back, added_to(into, of_params)
+        return back, total(of_params)
 
     def _merged(self, of_v, of_q):
         """The transpose of `_parted`."""

@@ -26,14 +26,14 @@ class LinearStep(Step):
 
     sparing = True
 
-    def forward(self, state, params, out=None):
-        """The state after a step, of plain values; `out` is written into where that saves time."""
+    def forward(self, state, params):
+        """The state after a step, of plain values."""
         if self.method not in EXPLICIT or not isinstance(state, np.ndarray) or state.dtype != np.float64:
             return self(state, params)
         c = self.problem.coefficient(params)
         if self.limit is not None:
             self.limit.check(self.dt, c)
-        new = self._explicit(state, c, np.empty(state.shape) if out is None else out)
+        new = self._explicit(state, c, np.empty(state.shape))
         return self.checked(new, state, params, self.dt)
 
     def _explicit(self, u, c, out):
@@ -52,11 +52,11 @@ class LinearStep(Step):
             kept = self._room = [np.empty(shape) for _ in range(count)]
         return kept[:count]
 
-    def backward(self, state, params, g, into=None, new=None, wanted=True):
+    def backward(self, state, params, g, new=None, wanted=True):
         """Cotangents (of state, of params) of a step; plain.
 
-        `into`: the cotangent of params is added to it. `new`: the result of the step where it is still known;
-        it saves the solve that finds it again. `wanted`: whether params want a cotangent.
+        `new`: the result of the step where it is still known; it saves the solve that finds it again. `wanted`: whether
+        params want a cotangent.
         """
         inner = D * self.dt if self.method in ("tr_bdf2", "imex") else self.dt
         z = inner * self.problem.coefficient(params)  # to the last bit that of the way forward: one set-up
@@ -65,22 +65,13 @@ class LinearStep(Step):
             new = self(state, params)  # the slope is made of it, with the same bits
         back, slope = PULLS[self.method](self.scheme, z, state, g, new, wanted)
         back = back if back.dtype == state.dtype else back.astype(state.dtype)
-        return back, _added(params, into, self.dt * np.real(slope)) if wanted else None
+        return back, np.asarray(params).dtype.type(self.dt * np.real(slope)) if wanted else None
 
     def tangent(self, state, params, dstate, dparams):
         """Tangent of a step along (dstate, dparams); plain."""
         if dparams is None or not is_variable(params):
             return pushforward(lambda u: self(u, params), state, dstate)[1]
         return pushforward(lambda both: self(*both), (state, params), (dstate, dparams))[1]
-
-
-def _added(params, into, slope):
-    if into is None:
-        return np.asarray(params).dtype.type(slope)
-    if isinstance(into, np.ndarray):
-        into += slope
-        return into
-    return into + float(slope)
 
 
 def _ahead(u, h, row, rates, share, out):

@@ -21,11 +21,11 @@ class NonlinearStep(Step):
 
     sparing = solves = True
 
-    def forward(self, state, params, out=None):
+    def forward(self, state, params):
         """The state after a step, of plain values."""
         return self(state, params)
 
-    def backward(self, state, params, g, into=None, new=None, wanted=True, met=None):
+    def backward(self, state, params, g, new=None, wanted=True, met=None):
         """Cotangents (of state, of params) of a step; plain. See LinearStep."""
         found, rebuild = flatten(state)
         roots = [reverse_root() if is_variable(leaf) else None for leaf in found]
@@ -41,18 +41,8 @@ class NonlinearStep(Step):
         backs = iter(pull_ends(list(nodes), list(slopes), [root for root in roots + others if root is not None]))
         of_state = rebuild([_cotangent(next(backs), leaf) if root else leaf for leaf, root in zip(found, roots)])
         of_params = [_cotangent(next(backs), leaf) if root else None for leaf, root in zip(given, others)]
-        return of_state, _added(rebuild_params, of_params, into) if wanted else None
+        return of_state, rebuild_params(of_params) if wanted else None
 
 
 def _cotangent(back, leaf):
     return np.zeros_like(leaf) if back is None else fit("the step", leaf, back, back)
-
-
-def _added(rebuild, found, into):
-    """The cotangents of params, added to the arrays of `into` where it is given."""
-    if into is None:
-        return rebuild(found)
-    for total, back in zip(leaves(into), found, strict=True):
-        if back is not None:
-            total += back
-    return into
