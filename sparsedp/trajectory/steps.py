@@ -10,7 +10,7 @@ from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
 from sparsedp.tape import Rule, fit, plain
 from sparsedp.traces import inside, new_box, reverse_root, split_box
-from sparsedp.trajectory.layout import fingerprint, owned
+from sparsedp.trajectory.layout import NOTHING, fingerprint, owned
 from sparsedp.trajectory.pieces import Piece
 from sparsedp.tree import copied, flatten, leaves
 
@@ -48,6 +48,7 @@ class Steps:
         first, second = len(run.state.places), len(run.state.places) + len(self.p)
         self._p = [place for place in range(len(self.p)) if first + place in wanted]
         self._x = [place for place in range(len(self.x)) if second + place in wanted]
+        self._none, self._no_inputs = [None] * len(self.p), [None] * len(self.x)
         self.recording = False  # whether tapes are kept
         self.gp: list = [None] * len(self.p)
         self.gx: list = [np.zeros_like(x) if place in self._x else None for place, x in enumerate(self.x)]
@@ -100,21 +101,23 @@ class Steps:
 
     def _next(self, piece, state, statics, number):
         """One more step of a piece, from traced variables: those of its result, and its statics."""
-        run, i = self.run, piece.stop
-        self._last = i, [plain(value) for value in state], statics
-        p = [reverse_root() if place in self._p else None for place in range(len(self.p))]
-        x = [reverse_root() if place in self._x else None for place in range(len(self.x))]
+        run, i, params, inputs, x = self.run, piece.stop, self._frozen, (), self._no_inputs
+        self._last = i, state, statics
+        p = [reverse_root() if place in self._p else None for place in range(len(self.p))] if self._p else self._none
+        if run.inputs is not None:
+            x = [reverse_root() if place in self._x else None for place in range(len(self.x))]
+            inputs = run.input_at(i, self.x, lambda rows: boxed(rows, x, number))
         piece.params.append(p)
         piece.inputs.append(x)
-        params = boxed(self._frozen, p, number)
+        if self._p:
+            params = boxed(params, p, number)
         if self.plain:
             self._others = statics
             found = plain_step(self, *state, *params)
             return ([found] if len(state) == 1 else [found[k] for k in range(len(state))]), self._others
-        inputs = run.input_at(i, self.x, lambda rows: boxed(rows, x, number))
         tree = run.params.build(params, self._statics) if self._p else self.params
         found, others = run.state.take(self._applied(run.state.build(state, statics), tree, *inputs), "the step")
-        return found, constant(others)
+        return found, others if others is NOTHING else constant(others)
 
     def _moved(self, state, *inputs):
         """A step of plain values."""
@@ -159,7 +162,7 @@ class Steps:
         if not self._last:
             return "keep changes the state"
         i, values, statics = self._last
-        run = self.run
+        run, values = self.run, [plain(value) for value in values]
         parts = [run.state.build(values, statics), self.params, *run.input_at(i, self.x)]
         found, rebuild = flatten(parts)
         layouts = [run.state, run.params, run.inputs][: len(parts)]
@@ -178,7 +181,7 @@ class Steps:
         if not self._last:
             return False
         i, values, statics = self._last
-        state = self.run.state.build([frozen(value) for value in values], statics)
+        state = self.run.state.build([frozen(plain(value)) for value in values], statics)
         try:
             self.run.step(state, self.params, *self.run.input_at(i, self.x))
         except Exception as error:
@@ -247,10 +250,10 @@ def carries(step):
         step.forward(state, params) -> state
         step.backward(state, params, g) -> (g_state, g_params)
 
-    both on plain trees. Linear steppers, nonlinear implicit ones of one stage, and flow_step do. Where `step.sparing` is
-    true, backward also takes `new`, the result of the step when it is one array, and `wanted`, whether params want a
-    cotangent. Where `step.solves` is true, it takes `met`: a function to be called with the result that it finds again,
-    which refuses another one than before.
+    both on plain trees. Linear steppers, nonlinear implicit ones of one stage, and flow_step do. Where `step.sparing`
+    is true, backward also takes `new`, the result of the step when it is one array, and `wanted`, whether params want
+    a cotangent. Where `step.solves` is true, it takes `met`: a function to be called with the result that it finds
+    again, which refuses another one than before.
     """
     return callable(getattr(step, "forward", None)) and callable(getattr(step, "backward", None))
 
