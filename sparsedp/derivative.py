@@ -10,7 +10,7 @@ from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.fields import check_function
 from sparsedp.recipe import Made
 from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
-from sparsedp.traces import backward, forward_root, reverse_root, split_box, trace
+from sparsedp.traces import backward, forward_root, growing, reverse_root, split_box, trace
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["NO_JVP", "pullback", "pushforward", "traced", "value_and_grad"]
@@ -70,7 +70,8 @@ def pullback(fun, x):
     def pull(g):
         if np.shape(g) != np.shape(value):
             raise ShapeError(f"the cotangent must have the shape {np.shape(value)} of the value, got {np.shape(g)}")
-        cotangents = {} if node is None else backward(node, g)
+        with growing():  # rollouts make tapes on their way back
+            cotangents = {} if node is None else backward(node, g)
         pairs = zip(found, roots, strict=True)
         return rebuild(
             _apart([None if root is None else _gradient(leaf, cotangents.get(root)) for leaf, root in pairs], g)
@@ -82,7 +83,8 @@ def pullback(fun, x):
 def traced(fun, x, roots):
     """`tape.trace`, with a word of advice where NumPy, math or Python refuse a traced value."""
     try:
-        return trace(fun, x, roots)
+        with growing():
+            return trace(fun, x, roots)
     except (TypeError, ValueError, AttributeError) as error:
         said = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
         if isinstance(error, SparsedpError) or not any("ArrayBox" in words for words in said):

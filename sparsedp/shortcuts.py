@@ -132,8 +132,17 @@ def install(boxes, new_box):
         right[raw] = method(primitive, raw, left=False)
         setattr(BOX, f"__{name}__", method(primitive, raw))
         setattr(BOX, f"__r{name}__", right[raw])
-    for name, primitive in zip(MAKERS, (COPY, ARRAY)):
-        setattr(anp.numpy_wrapper, name, direct(primitive, primitive.fun, boxes, new_box))
+    quick = {name: direct(made, made.fun, boxes, new_box) for name, made in zip(MAKERS, (COPY, ARRAY))}
+
+    @wraps(COPY)
+    def copy(args, options, value):
+        """A number needs no copy."""
+        if type(value) in boxes and type(value._value) is np.float64 and not (args or options):
+            return value
+        return quick[MAKERS[0]](args, options, value)
+
+    for name, made in zip(MAKERS, (copy, quick[MAKERS[1]])):
+        setattr(anp.numpy_wrapper, name, made)
 
 
 def arithmetic(fun, value, args, nums):
@@ -142,7 +151,7 @@ def arithmetic(fun, value, args, nums):
     For float64 that is not broadcast, sums, entries and arrays made of numbers; the formulas are those of autograd.
     """
     rule = FORMULAS.get(fun)  # autograd's own: a primitive that a user made of NumPy's has other derivatives
-    if rule is None or value.dtype != FLOAT:
+    if rule is None or value.dtype is not FLOAT:
         return None
     many = rule.__code__.co_argcount - 1
     if many and len(args) != many:
@@ -150,10 +159,10 @@ def arithmetic(fun, value, args, nums):
     shape = None if rule in RESHAPED else value.shape
     for num in nums:
         arg = args[num]
-        if type(arg) not in NUMBERS or arg.dtype != FLOAT or (shape is not None and arg.shape != shape):
+        if type(arg) not in NUMBERS or arg.dtype is not FLOAT or (shape is not None and arg.shape != shape):
             return None
     back = rule(nums, *args)
-    return back and (lambda g: back(g if getattr(g, "dtype", FLOAT) == FLOAT else _real(g)))
+    return back and (lambda g: back(g if getattr(g, "dtype", FLOAT) is FLOAT else _real(g)))
 
 
 def along(fun, value, args, nums, tangents):

@@ -1,5 +1,7 @@
 """Traces: programs run on traced values, and the way back from their results to where they began."""
 
+import gc
+import threading
 from contextlib import contextmanager
 from itertools import count
 from typing import Any
@@ -18,6 +20,7 @@ __all__ = [
     "ReverseNode",
     "backward",
     "forward_root",
+    "growing",
     "in_reverse",
     "inside",
     "new_box",
@@ -86,6 +89,27 @@ def _new_trace():
 
 
 trace_stack.new_trace = _new_trace
+
+
+SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
+_lock, _growing = threading.Lock(), []  # thresholds to go back to, one for each tape that grows
+
+
+@contextmanager
+def growing():
+    """While a tape grows: it has no cycles, and every search for cyclic garbage would walk all of it."""
+    with _lock:
+        before = gc.get_threshold()
+        _growing.append(before if not _growing else _growing[0])
+        if 0 < before[0] < SELDOM:
+            gc.set_threshold(SELDOM, *before[1:])
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _growing.pop()
+            if not _growing:
+                gc.set_threshold(*before)
 
 
 def inside(fun):
