@@ -45,10 +45,10 @@ def flatten(tree):
 
 def copied(tree):
     """Tree -> the same tree with copies of its arrays and sparse matrices: the caller may reuse them."""
-    if type(tree) is np.ndarray:
-        return tree.copy()
-    found, rebuild = flatten(tree)
-    return rebuild(leaf.copy() if isinstance(leaf, np.ndarray) or sp.issparse(leaf) else leaf for leaf in found)
+    if isinstance(tree, (tuple, list, dict)):
+        found, rebuild = flatten(tree)
+        return rebuild(map(copied, found))
+    return tree.copy() if isinstance(tree, np.ndarray) or sp.issparse(tree) else tree
 
 
 def leaves(tree):
