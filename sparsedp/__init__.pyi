@@ -7,7 +7,11 @@ from .blackbox import adopt as adopt
 from .conditions import dirichlet as dirichlet
 from .conditions import neumann as neumann
 from .conditions import robin as robin
+from .derivative import grad as grad
 from .derivative import value_and_grad as value_and_grad
+from .derivative import vjp as vjp
+from .direction import hvp as hvp
+from .direction import jvp as jvp
 from .flow.momentum import convection as convection
 from .flow.momentum import face_laplacian as face_laplacian
 from .flow.momentum import face_lift as face_lift

@@ -7,13 +7,13 @@ import numpy as np
 
 from sparsedp.constants import is_fixed
 from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
-from sparsedp.fields import check_function
+from sparsedp.fields import check_function, is_whole
 from sparsedp.recipe import Made
 from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
 from sparsedp.traces import backward, forward_root, growing, reverse_root, split_box, trace
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["NO_JVP", "pullback", "pushforward", "traced", "value_and_grad"]
+__all__ = ["NO_JVP", "directions", "grad", "pullback", "pushforward", "traced", "value_and_grad", "vjp"]
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
 NO_JVP = (DerivativeError, NotImplementedError)
@@ -147,10 +147,9 @@ def pushforward(fun, x, tangent):
     >>> float(value), float(slope)
     (10.0, 5.0)
     """
-    found, directions = leaves(x), _directions(x, tangent)
     roots = [
         forward_root(direction) if is_variable(leaf) else None
-        for leaf, direction in zip(found, directions, strict=True)
+        for leaf, direction in zip(leaves(x), directions(x, tangent), strict=True)
     ]
     result, number = traced(fun, x, roots)
     ends, rebuild = flatten(result)
@@ -159,7 +158,7 @@ def pushforward(fun, x, tangent):
     return values, rebuild(_no_tangent(value) if node is None else node.g for value, node in pairs)
 
 
-def _directions(x, tangent):
+def directions(x, tangent):
     """Leaves of the tangent in the order of those of `x`; entries of dicts are paired by name."""
     if isinstance(x, dict):
         if not isinstance(tangent, dict) or tangent.keys() != x.keys():
@@ -173,7 +172,7 @@ def _directions(x, tangent):
         if is_variable(x) and (not _is_array(tangent) or np.shape(tangent) != np.shape(x)):
             raise ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
         return [tangent]
-    return [leaf for branch, other in pairs for leaf in _directions(branch, other)]
+    return [leaf for branch, other in pairs for leaf in directions(branch, other)]
 
 
 def _is_array(value):
@@ -193,25 +192,93 @@ def _no_tangent(value):
     return anp.zeros_like(plain(value)) if is_variable(value) else None
 
 
-def value_and_grad(loss):
+def vjp(fun, *x):
+    """Function and its arguments -> its value, and the function from a cotangent to the VJP.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(*x) -> array``.
+    *x : trees of arrays
+        Leaves that are not floating (int, None, str) are passed through and get None.
+
+    Returns
+    -------
+    value : array
+    pull : callable
+        ``pull(g)``, with g of the shape of `value`: a cotangent like x; a tuple where there are several arguments.
+
+    Raises
+    ------
+    TypeError
+        If `fun` is not a function.
+    DerivativeError
+        If no leaf of `x` is a floating array or number, or the value of `fun` is not one array.
+    ShapeError
+        On use of `pull`, if `g` has another shape than the value.
+
+    Examples
+    --------
+    >>> value, pull = vjp(lambda u, v: u * v, 2.0, 5.0)
+    >>> pull(1.0)
+    (5.0, 2.0)
+    """
+    check_function("vjp", fun, "lambda u: ...")
+    value, pull = pullback(lambda parts: fun(*parts), x)
+    return value, (lambda g: pull(g)[0]) if len(x) == 1 else pull
+
+
+def grad(loss, argnum=0):
+    """Scalar loss of a tree -> function that returns the gradient; see `value_and_grad`.
+
+    Parameters
+    ----------
+    loss : callable
+    argnum : int
+        Which of its arguments is `x`.
+
+    Returns
+    -------
+    callable
+        ``f(*args) -> gradient``, with the structure of the argument.
+
+    Raises
+    ------
+    TypeError
+        If `loss` is not a function, or `argnum` no whole number.
+    ShapeError, DerivativeError
+        On use, as `value_and_grad`.
+
+    Examples
+    --------
+    >>> grad(lambda x: x**2)(3.0)
+    6.0
+    """
+    both = value_and_grad(loss, argnum)
+    return Made(lambda *args: both(*args)[1], grad, loss, argnum)
+
+
+def value_and_grad(loss, argnum=0):
     """Scalar loss of a tree -> function that returns the value and the gradient.
 
     Parameters
     ----------
     loss : callable
         ``loss(x, *rest) -> real scalar``; `x` is any nesting of arrays, tuples, lists and dicts.
+    argnum : int
+        Which of its arguments is `x`; default: the first.
 
     Returns
     -------
     callable
-        ``f(x, *rest) -> (value, gradient)``. The gradient has the structure of `x`, each leaf the
+        ``f(*args) -> (value, gradient)``. The gradient has the structure of `x`, each leaf the
         shape and dtype of its twin. Leaves that are not floating (int, bool, None, str) are passed
         to the loss unchanged; their place in the gradient holds None.
 
     Raises
     ------
     TypeError
-        If `loss` is not a function.
+        If `loss` is not a function, or `argnum` no whole number; on use, if there is no such argument.
     ShapeError
         If the loss is not a scalar.
     DerivativeError
@@ -230,9 +297,13 @@ def value_and_grad(loss):
     (18.0, {'a': 12.0, 'n': None})
     """
     check_function("value_and_grad", loss, "lambda x: np.sum(x**2)")
+    if not is_whole(argnum, 0):
+        raise TypeError(f"value_and_grad takes the number of an argument as argnum, got {argnum!r}; write 0, 1, ...")
 
-    def evaluate(x, *rest):
-        value, pull = pullback(lambda tree: loss(tree, *rest), x)
+    def evaluate(*args):
+        if len(args) <= argnum:
+            raise TypeError(f"the gradient in argument {argnum} of the loss needs it, got {len(args)} arguments")
+        value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
         if np.shape(plain(value)) != ():
             raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(plain(value))}; sum it")
         if dtype_of(value).kind == "c":
@@ -241,4 +312,4 @@ def value_and_grad(loss):
             )
         return value if isbox(value) else float(value), pull(1.0)
 
-    return Made(evaluate, value_and_grad, loss)
+    return Made(evaluate, value_and_grad, loss, argnum)

@@ -3,12 +3,79 @@
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import NO_JVP, traced
-from sparsedp.tape import dtype_of, fit, is_variable, plain
+from sparsedp.derivative import NO_JVP, directions, grad, traced
+from sparsedp.fields import check_function
+from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
 from sparsedp.traces import backward, forward_root, reverse_root, split_box
-from sparsedp.tree import flatten
+from sparsedp.tree import flatten, leaves
 
-__all__ = ["pull_ends", "push", "zero_like"]
+__all__ = ["hvp", "jvp", "pull_ends", "push", "zero_like"]
+
+
+def jvp(fun, x, tangent):
+    """Function of a tree -> its value and its directional derivative.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(x)``; its result may be a tree.
+    x, tangent : trees of arrays of the same structure
+        The tangent of a leaf that is not floating is ignored.
+
+    Returns
+    -------
+    (value, tangent of value)
+
+    Raises
+    ------
+    TypeError
+        If `fun` is not a function.
+    ShapeError
+        If the tangent has another structure than `x`, or a leaf of it another shape.
+
+    Notes
+    -----
+    Forward mode; by two reverse passes where a part of `fun` has no forward derivative.
+
+    Examples
+    --------
+    >>> value, slope = jvp(lambda x: x[0] * x[1], (2.0, 5.0), (1.0, 0.0))
+    >>> float(value), float(slope)
+    (10.0, 5.0)
+    """
+    check_function("jvp", fun, "lambda u: ...")
+    moving = [direction if is_variable(leaf) else None for leaf, direction in zip(leaves(x), directions(x, tangent))]
+    return push(fun, x, moving)
+
+
+def hvp(loss, x, tangent):
+    """Scalar loss of a tree, a direction -> the Hessian of the loss times the direction.
+
+    Parameters
+    ----------
+    loss : callable
+        ``loss(x) -> real scalar``.
+    x, tangent : trees of arrays of the same structure
+        The tangent of a leaf that is not floating is ignored.
+
+    Returns
+    -------
+    tree like x
+        None at leaves that are not floating.
+
+    Raises
+    ------
+    TypeError, ShapeError, DerivativeError
+        As `jvp` and `value_and_grad`.
+
+    Examples
+    --------
+    >>> hvp(lambda x: x[0] ** 2 * x[1], (2.0, 5.0), (1.0, 0.0))
+    (10.0, 4.0)
+    """
+    product = jvp(grad(loss), x, tangent)[1]
+    found, rebuild = flatten(product)
+    return rebuild([float(p) if isinstance(u, float) and not isbox(p) else p for p, u in zip(found, leaves(x))])
 
 
 def push(fun, tree, tangents):

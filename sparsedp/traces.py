@@ -92,7 +92,8 @@ trace_stack.new_trace = _new_trace
 
 
 SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
-_lock, _growing = threading.Lock(), []  # thresholds to go back to, one for each tape that grows
+_lock = threading.Lock()
+_growing: list[tuple] = []  # thresholds to go back to, one for each tape that grows
 
 
 @contextmanager

@@ -23,9 +23,10 @@ from sparsedp.tree import flatten, leaves
 # One array and no other, so that nothing beside it is kept; or nothing to differentiate; or tested where it stands.
 ALONE = """
 Operator adopt animate average certified certify check convergence curl diagonal dirichlet divergence embed errors
-explain exponential face_laplacian face_lift from_functions from_linear_operator from_matrix gradient
-harmonic_average identity interior laplacian lift mask minimise neumann part physical_gradient plot power projection
-prolong report restrict robin sample set_threads stress update_direction upwind v_curve value_and_grad workprec
+explain exponential face_laplacian face_lift from_functions from_linear_operator from_matrix grad gradient
+harmonic_average hvp identity interior jvp laplacian lift mask minimise neumann part physical_gradient plot power
+projection prolong report restrict robin sample set_threads stress update_direction upwind v_curve value_and_grad vjp
+workprec
 """.split()
 
 

@@ -245,6 +245,7 @@ def travellers():
     yield "convection", "", dp.convection(GRID, {"x": "free_slip"}, SOLID), lambda c: bits(c, v, w)
     yield "harmonic_average", "", dp.harmonic_average(GRID), lambda f: bits(f, np.exp(numbers(GRID.shape)))
     yield "value_and_grad", "", dp.value_and_grad(loss), of_pair
+    yield "grad", "", dp.grad(loss), lambda f: [f(numbers(7)).tobytes()]
     yield "differentiable", "", dp.differentiable("cube", cube, cube_vjp, cube_jvp), lambda f: bits(f, numbers(7))
     yield "physical_gradient", "", dp.physical_gradient(cube, root_of_cube), of_physical
     yield "adopt", "", dp.adopt(foreign), of_adopted
@@ -260,5 +261,5 @@ def travellers():
 NOTHING_TO_CALL = {
     "Grid", "Space", "Operator", "dirichlet", "neumann", "robin", "rollout", "minimise", "update_direction",
     "set_threads", "convergence", "v_curve", "animate", "plot", "certify", "stress", "workprec", "explain", "check",
-    "errors", "report",
+    "errors", "report", "vjp", "jvp", "hvp",
 }  # fmt: skip
