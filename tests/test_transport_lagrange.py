@@ -8,7 +8,7 @@ import sparsedp as dp
 from sparsedp import kernels
 from sparsedp.derivative import pullback, pushforward
 from sparsedp.errors import DerivativeError
-from sparsedp.kernels import sampling, sampling_plain
+from sparsedp.kernels import departure, team
 
 NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
 SCHEMES = [
@@ -23,7 +23,7 @@ PLACES = [("cells", "faces"), ("faces", "faces"), ("cells", "cells"), ("faces", 
 
 @pytest.fixture
 def without_numba(monkeypatch):
-    monkeypatch.setattr(sampling, "_loop", lambda name, like=(): getattr(sampling_plain, name))
+    monkeypatch.setattr(kernels, "compiled", lambda: False)
 
 
 def setting(shape, periodic, scheme, form, interpolation, of="cells", velocity="faces", solid=None, **options):
@@ -61,11 +61,11 @@ def test_compiled_against_numpy(monkeypatch, shape, interpolation, scheme, form)
         move, point = setting(shape, periodic, scheme, form, interpolation, "faces", boundary=boundary)
         along = tuple(0.3 * np.cos(np.arange(np.size(x))).reshape(np.shape(x)) if np.ndim(x) else 0.3 for x in point)
         results = []
-        for loop in (sampling._loop, lambda name, like=(): getattr(sampling_plain, name)):
-            monkeypatch.setattr(sampling, "_loop", loop)
-            value, pull = pullback(lambda x: move(*x), point)
-            results.append((value, *pull(np.cos(value)), pushforward(lambda x: move(*x), point, along)[1]))
-            monkeypatch.undo()
+        for compiled in (True, False):
+            with monkeypatch.context() as patch:
+                patch.setattr(kernels, "compiled", lambda compiled=compiled: compiled)
+                value, pull = pullback(lambda x: move(*x), point)
+                results.append((value, *pull(np.cos(value)), pushforward(lambda x: move(*x), point, along)[1]))
         for one, other in zip(*results):
             assert one == pytest.approx(other, rel=1e-13, abs=1e-13)
 
@@ -141,22 +141,50 @@ def test_second_derivatives(without_numba):
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-@pytest.mark.parametrize("shape", [(5,), (4, 3), (3, 4, 2)])
-def test_nothing_is_read_beside_the_samples(shape, interpolation):
-    """Places far out on all sides; what lies in front of the samples and behind them is NaN."""
-    move = dp.transport(dp.Grid(shape), "semi_lagrangian", interpolation=interpolation)
-    points, n = move.law.points[0], int(np.prod(shape))
-    around = np.full(points.size + 200, np.nan)
-    samples, scale = around[100:-100], (1.0,) * 3
-    samples[:] = np.cos(np.arange(points.size))
-    for far in (-50.0, -1.0, 0.0, 0.3, 1.0, 50.0):
-        w, speeds = (np.full(n, far),) * 3, tuple(np.zeros((3, n)))
-        sampling.slopes(points, samples, w, scale, np.ones(n), speeds)
-        found = sampling.gather(points, samples, w, scale, np.empty(n))
-        sides = sampling.sides(points, samples, w, scale)
-        more = tuple(np.empty((3, n)))
-        back, rate = sampling.way_back(points, samples, (w, scale), np.ones(n), sides[1:], more, True)
-        here = slice(3 - len(shape), None)
-        assert np.isfinite([*speeds, found, *sides, *more[here]]).all() and np.isfinite([*back, rate]).all()
-        np.testing.assert_allclose(more[here], speeds[here], rtol=1e-13, atol=1e-13)
-        np.testing.assert_array_equal(found, sides[0])
+@pytest.mark.parametrize("shape", [(5,), (4, 3), (3, 4, 2), (1, 300)])
+def test_loops_against_the_matrix_and_nothing_is_read_beside_the_samples(shape, interpolation):
+    """Departure points far out on all sides and at the points; what lies around the samples is NaN."""
+    periodic = (False, True, False)[: len(shape)]
+    points, rng = departure.Points.of(shape, periodic, interpolation), np.random.default_rng(1)
+    n, scale = points.size, np.array([1.0, 0.5, 2.0])[: len(shape)]
+    samples = np.full(points.samples + 200, np.nan)[100:-100]
+    samples[:] = rng.standard_normal(points.samples)
+    g, axes = rng.standard_normal(n), range(len(shape))
+    for w in [np.full((len(shape), n), far) for far in (-50.0, -1.0, 0.0, 0.3, 1.0, 50.0, np.nan, -np.inf)] + [
+        rng.standard_normal((len(shape), n)),
+        np.where(rng.random((len(shape), n)) < 0.5, 0.0, 1.3),
+    ]:
+        found = departure.depart(points, w, scale, np.empty((len(shape) + 1, n)))
+        value, slope = _dense(points, found, -1), [_dense(points, found, axis) for axis in axes]
+        close = dict(rtol=1e-13, atol=1e-13)
+        np.testing.assert_allclose(departure.gather(points, samples, found, np.empty(n)), value @ samples, **close)
+        back = departure.scatter(points, found, g, np.zeros(points.samples))
+        np.testing.assert_allclose(back, value.T @ g, **close)
+        steep = departure.gradient(points, samples, found, scale, g, np.empty(w.shape))
+        for axis in axes:
+            np.testing.assert_allclose(steep[axis], -scale[axis] * g * (slope[axis] @ samples), **close)
+        low, high = np.empty((2, n))
+        departure.extrema(points, samples, found, low, high)
+        assert np.isfinite([low, high]).all() and (low <= high).all()
+
+
+def _dense(points, departures, along):
+    """The matrix of the interpolation, or of its slope."""
+    found = np.zeros((points.size, points.samples))
+    for index, weight in departure.entries(points, departures, along):
+        np.add.at(found, (np.arange(points.size), index), weight)
+    return found
+
+
+@NUMBA
+@pytest.mark.parametrize("scheme", ["semi_lagrangian", "maccormack"])
+@pytest.mark.parametrize("shape", [(2000,), (60, 50), (11, 12, 13)])
+def test_bits_do_not_depend_on_threads(monkeypatch, scheme, shape):
+    monkeypatch.setattr(team, "SERIAL", 0)
+    move, point = setting(shape, False, scheme, None, "linear")
+    found = []
+    for threads in (1, 2, 3):
+        monkeypatch.setattr(kernels, "threads", lambda threads=threads: threads)
+        value, pull = pullback(lambda x: move(*x), point)
+        found.append([np.asarray(x).tobytes() for x in (value, *pull(np.cos(value)))])
+    assert found[0] == found[1] == found[2]

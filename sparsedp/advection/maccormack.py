@@ -2,7 +2,7 @@
 
 With f = W u (looking back along the velocity) and b = V f (looking ahead along it),
 
-    u' = f + (u - b) / 2,     clamped to the least and greatest sample of the cell the content comes from.
+    u' = f + (u - b) / 2,     clamped to the least and greatest sample of the cell around the departure point.
 
     g_f = c g - V^T (c g) / 2,    g_u = c g / 2 + W^T g_f + (cotangents of the bounds),    c = 1 where not clamped.
 
@@ -14,11 +14,12 @@ Source: A. Selle, R. Fedkiw, B. Kim, Y. Liu, J. Rossignac, J. Scientific Computi
 
 import numpy as np
 
-from sparsedp.advection.ruler import three
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
-from sparsedp.kernels import sampling
+from sparsedp.kernels import departure
 
 __all__ = ["MacCormack"]
+
+BLOCK = 1 << 14  # points that NumPy works on at a time: what is made on the way stays in the cache
 
 
 class MacCormack(SemiLagrangian):
@@ -26,83 +27,85 @@ class MacCormack(SemiLagrangian):
 
     forms = ("unclamped midpoint", "clamped midpoint", "unclamped", "clamped")
     linear = False
-    ways = (1, -1)
+    signs = (1, -1)
 
     def __init__(self, setting):
         super().__init__(setting)
         self.clamped = setting.form.startswith("clamped")
 
-    def _both(self, number, u, outside, looks):
-        """Samples of u, those of f, f, and the value before it is clamped."""
-        first = self.samples(number, u, outside)
-        f = self.value(number, first, looks[0])
-        second = self.samples(number, f, outside)
-        return first, second, f + 0.5 * (u - self.value(number, second, looks[1]))
+    def _stages(self, component, u, inflow, trajectories, room):
+        """Samples of u and of f, the value before it is clamped, least and greatest sample (None: not clamped)."""
+        n, (back, ahead) = u.size, trajectories
+        first = component.pad(u, inflow, room)
+        f = component.gather(first, back, room(n))
+        second = component.pad(f, inflow, room)
+        new = component.gather(second, ahead, room(n))
+        for part in _blocks(n):
+            new[part] = f[part] + 0.5 * (u[part] - new[part])
+        bounds = (room(n), room(n)) if self.clamped else None
+        if bounds:
+            departure.extrema(component.points, first, back.departures, *bounds)
+        return first, second, new, bounds
 
-    def carry(self, number, u, outside, looks, out):
+    def advect(self, component, u, inflow, trajectories, room, out):
         """See the base class."""
-        if not all(map(sampling.finite, (u, outside, *looks[0][0]))):
-            return False
-        first, _, new = self._both(number, u, outside, looks)
-        if self.clamped:
-            low, high = sampling.extrema(self.points[number], first, *looks[0])
-            np.minimum(np.maximum(new, low, out=new), high, out=out)
+        *_, new, bounds = self._stages(component, u, inflow, trajectories, room)
+        if bounds:
+            np.clip(new, *bounds, out=out)
         else:
-            out[...] = new
-        return True
+            out[:] = new
 
-    def _bounds(self, number, first, new, look):
-        """Share that is not clamped, and pairs (bound, share that comes from it)."""
-        if not self.clamped:
-            return np.ones(new.size), ()
-        low, high = sampling.extrema(self.points[number], first, *look)
-        at_low, at_high = np.heaviside(low - new, 0.5), np.heaviside(new - high, 0.5)
-        return 1.0 - at_low - at_high, ((low, at_low), (high, at_high))
-
-    def carry_back(self, number, g, u, outside, looks, into, wanted):
+    def advect_vjp(self, component, g, u, inflow, trajectories, room, into, wanted):
         """See the base class."""
-        points, first, inside = self.points[number], self.samples(number, u, outside), wanted and not self.stretched
-        f, *bounds = (
-            sampling.sides(points, first, *looks[0]) if self.clamped else (self.value(number, first, looks[0]),)
-        )
-        second, steep = self.samples(number, f, outside), self._room(g.size if inside else 0)
-        own, back, rate = sampling.miss(points, second, looks[1], f, u, g, bounds, three(steep[1]))
-        of_f, outer = own.copy(), np.zeros(outside.size) if into is None else into[1]
-        self.fold(number, back, of_f, outer)
-        if into is not None or inside:
-            fresh = steep[0] is not steep[1]
-            back, more = sampling.way_back(points, first, looks[0], of_f, bounds, three(steep[0]), fresh)
-            rate += more
+        n, (back, ahead) = u.size, trajectories
+        first, second, of_b, bounds = self._stages(component, u, inflow, trajectories, room)
+        own, of_f, (of_u, of_inflow) = room(n), room(n), into or (None, np.zeros(inflow.size))
+        for part in _blocks(n):
+            share = 1.0
+            if bounds:  # they become the cotangents of the bounds
+                low, high, new = bounds[0][part], bounds[1][part], of_b[part]
+                at_low, at_high = np.heaviside(low - new, 0.5), np.heaviside(new - high, 0.5)
+                low[:], high[:], share = at_low * g[part], at_high * g[part], 1.0 - at_low - at_high
+            own[part] = share * g[part]
+            of_b[part] = -0.5 * own[part]
+        component.pad_vjp(component.scatter(of_b, ahead, room), of_f, of_inflow)
+        of_f += own
         if into is not None:
-            self.fold(number, back, *into)
-            np.add(into[0], 0.5 * own, out=into[0])
-        if not wanted or inside:
-            return steep[: 1 + fresh] if inside else (), rate
-        own *= -0.5
-        steep = self.steepness(number, first, looks[0], of_f), self.steepness(number, second, looks[1], own)
-        return steep, sum(float(np.sum(change * look.speeds)) for change, look in zip(steep, looks, strict=True))
+            of_first = component.scatter(of_f, back, room)
+            for pick, of_bound in zip((np.min, np.max), bounds or (), strict=False):
+                _add_at_bounds(component.points, first, back.departures[-1], pick, of_bound, of_first)
+            component.pad_vjp(of_first, of_u, of_inflow)
+            for part in _blocks(n):
+                of_u[part] += 0.5 * own[part]
+        if not wanted:
+            return []
+        return [component.gradient(first, back, of_f), component.gradient(second, ahead, of_b)]
 
-    def _room(self, size):
-        """Arrays for the cotangents of the velocities of both looks; the same one where these are the same."""
-        first = np.empty((self.setting.grid.dim, size))
-        return first, np.empty_like(first) if self.bent else first
-
-    def carry_tangent(self, number, u, outside, looks, changes, speeds):
+    def advect_jvp(self, component, u, inflow, trajectories, du, dinflow, dm):
         """See the base class."""
-        first, second, new = self._both(number, u, outside, looks)
-        free, bounds = self._bounds(number, first, new, looks[0])
-        du, doutside = changes or (np.zeros(u.size), np.zeros(outside.size))
-        moved = self.samples(number, du, doutside)
-        df = self._moved(number, first, moved, looks[0], speeds and speeds[0])
-        db = self._moved(number, second, self.samples(number, df, doutside), looks[1], speeds and speeds[1])
-        total = free * (df + 0.5 * (du - db))
-        for bound, share in bounds:
-            total += share * sampling.mean_of_equal(self.points[number], first, bound, moved, *looks[0])
+        first, second, new, bounds = self._stages(component, u, inflow, trajectories, np.empty)
+        change = component.pad(du, dinflow)
+        df = component.jvp(first, change, trajectories[0], dm[0])
+        db = component.jvp(second, component.pad(df, dinflow), trajectories[1], dm[1])
+        total = df + 0.5 * (du - db)
+        if bounds is None:
+            return total
+        low, high = (np.heaviside(sign * (bound - new), 0.5) for sign, bound in zip((1, -1), bounds, strict=True))
+        total *= 1.0 - low - high
+        for pick, share in ((np.min, low), (np.max, high)):
+            samples, weights = departure.equal_shares(component.points, first, trajectories[0].departures[-1], pick)
+            total += share * np.sum(weights * change[samples], axis=0)
         return total
 
-    def _moved(self, number, samples, changes, look, speed):
-        """Tangent of one look."""
-        total = self.value(number, changes, look)
-        if speed is not None:
-            total = total + np.sum(self.steepness(number, samples, look, np.ones(total.size)) * speed, axis=0)
-        return total
+
+def _blocks(n):
+    return [slice(start, start + BLOCK) for start in range(0, n, BLOCK)]
+
+
+def _add_at_bounds(points, samples, stencils, pick, of_bound, back):
+    """Cotangent of the least (pick: np.min) or greatest sample of each cell -> added to back at those that equal it."""
+    for part in _blocks(of_bound.size):
+        some = np.flatnonzero(of_bound[part]) + part.start
+        if some.size:
+            index, weights = departure.equal_shares(points, samples, stencils[some], pick)
+            np.add.at(back, index, weights * of_bound[some])
