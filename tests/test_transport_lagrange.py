@@ -154,24 +154,26 @@ def test_loops_against_the_matrix_and_nothing_is_read_beside_the_samples(shape, 
         rng.standard_normal((len(shape), n)),
         np.where(rng.random((len(shape), n)) < 0.5, 0.0, 1.3),
     ]:
-        found = departure.depart(points, w, scale, np.empty((len(shape) + 1, n)))
-        value, slope = _dense(points, found, -1), [_dense(points, found, axis) for axis in axes]
+        value, slope = _dense(points, w, scale), [_dense(points, w, scale, axis) for axis in axes]
         close = dict(rtol=1e-13, atol=1e-13)
-        np.testing.assert_allclose(departure.gather(points, samples, found, np.empty(n)), value @ samples, **close)
-        back = departure.scatter(points, found, g, np.zeros(points.samples))
+        np.testing.assert_allclose(departure.gather(points, samples, w, scale, np.empty(n)), value @ samples, **close)
+        back = departure.scatter(points, w, scale, g, np.zeros(points.samples))
         np.testing.assert_allclose(back, value.T @ g, **close)
-        steep = departure.gradient(points, samples, found, scale, g, np.empty(w.shape))
+        steep = departure.gradient(points, samples, w, scale, g, np.empty(w.shape))
         for axis in axes:
             np.testing.assert_allclose(steep[axis], -scale[axis] * g * (slope[axis] @ samples), **close)
-        low, high = np.empty((2, n))
-        departure.extrema(points, samples, found, low, high)
+        low, high, stencils = np.empty((3, n))
+        departure.extrema(points, samples, w, scale, low, high, stencils)
         assert np.isfinite([low, high]).all() and (low <= high).all()
+        corners, *shares = departure.bound_shares(points, samples, stencils)
+        for share, bound in zip(shares, (low, high)):
+            np.testing.assert_array_equal(np.sum(share * samples[corners], axis=0), bound)
 
 
-def _dense(points, departures, along):
+def _dense(points, w, scale, along=None):
     """The matrix of the interpolation, or of its slope."""
     found = np.zeros((points.size, points.samples))
-    for index, weight in departure.entries(points, departures, along):
+    for index, weight in departure.entries(points, w, scale, along):
         np.add.at(found, (np.arange(points.size), index), weight)
     return found
 

@@ -20,10 +20,9 @@ class Trajectory(NamedTuple):
 
     velocity: Any  # (axis, point), used all along the step
     step: float
-    displacement: Any  # in index coordinates, times
+    displacement: Any  # (axis, point): the departure point is, in index coordinates, point - scale * displacement
     scale: Any  # one number for each axis
     slopes: Any  # derivative of the displacement in the velocity, above and below; None: 1
-    departures: Any  # see kernels.departure
 
 
 def components(setting):
@@ -76,11 +75,9 @@ class Interpolant:
         forward = filling(self.setting.solid, self.setting.grid.periodic)
         return forward, sp.csr_array(forward.T)
 
-    def trajectory(self, velocity, step, room=np.empty):
-        """Velocities (axis, point), signed step -> Trajectory. room: size -> an array."""
-        d, scale, slopes = self.coordinates.displacement(velocity, step)
-        out = room((len(d) + 1) * self.points.size).reshape(len(d) + 1, -1)
-        return Trajectory(velocity, step, d, scale, slopes, departure.depart(self.points, d, scale, out))
+    def trajectory(self, velocity, step):
+        """Velocities (axis, point), signed step -> Trajectory."""
+        return Trajectory(velocity, step, *self.coordinates.displacement(velocity, step))
 
     def pad(self, u, inflow, room=np.empty):
         """Component, inflow values -> samples: the field with its ghost cells."""
@@ -94,19 +91,20 @@ class Interpolant:
 
     def gather(self, samples, trajectory, out):
         """Values at the departure points -> out."""
-        return departure.gather(self.points, samples, trajectory.departures, out)
+        return departure.gather(self.points, samples, trajectory.displacement, trajectory.scale, out)
 
-    def scatter(self, g, trajectory, room=np.empty):
-        """The transpose of `gather` -> samples."""
-        samples = room(self.points.samples)
-        samples[:] = 0.0
-        return departure.scatter(self.points, trajectory.departures, g, samples)
+    def scatter(self, g, trajectory, room=np.empty, out=None):
+        """The transpose of `gather` -> samples, added to `out` if it is given."""
+        if out is None:
+            out = room(self.points.samples)
+            out[:] = 0.0
+        return departure.scatter(self.points, trajectory.displacement, trajectory.scale, g, out)
 
     def gradient(self, samples, trajectory, g, out=None):
         """g times the derivative of `gather` in the velocity of the trajectory -> (axis, point)."""
-        velocity, _, d, scale, slopes, departures = trajectory
+        velocity, _, d, scale, slopes = trajectory
         out = np.empty(velocity.shape) if out is None else out
-        departure.gradient(self.points, samples, departures, scale, g, out)
+        departure.gradient(self.points, samples, d, scale, g, out)
         if slopes is None:
             return out
         above, below = slopes
@@ -114,12 +112,10 @@ class Interpolant:
         if not kinks.any():
             return np.multiply(out, above, out=out)
         nudge = np.where(kinks, 32 * np.finfo(float).eps * max(self.points.shape), 0.0)
-        out[:] = 0.0
-        for sign, slope in ((-1, above), (1, below)):
-            departures = departure.depart(self.points, d + sign * nudge, scale, np.empty_like(departures))
-            side = departure.gradient(self.points, samples, departures, scale, g, np.empty_like(out))
-            out += 0.5 * slope * side
-        return out
+        upper, lower = (
+            departure.gradient(self.points, samples, d + way * nudge, scale, g, np.empty_like(out)) for way in (-1, 1)
+        )
+        return np.multiply(0.5, above * upper + below * lower, out=out)
 
     def jvp(self, samples, change, trajectory, dm):
         """Samples and their tangent, that of the velocity of the trajectory or None -> tangent of `gather`."""
@@ -133,7 +129,7 @@ class Interpolant:
             np.arange(float(n)), np.full(self.ghosts.inflow_end, -1.0), np.empty(self.points.samples)
         )
         found = sp.csr_array((n, n))
-        for index, weight in departure.entries(self.points, trajectory.departures):
+        for index, weight in departure.entries(self.points, trajectory.displacement, trajectory.scale):
             columns = numbers[index].astype(np.int64)
             inside = columns >= 0
             found = found + sp.csr_array((weight[inside], (np.flatnonzero(inside), columns[inside])), (n, n))

@@ -34,7 +34,7 @@ class MacCormack(SemiLagrangian):
         self.clamped = setting.form.startswith("clamped")
 
     def _stages(self, component, u, inflow, trajectories, room):
-        """Samples of u and of f, the value before it is clamped, least and greatest sample (None: not clamped)."""
+        """Samples of u and of f, the value before it is clamped, `extrema` of u or None."""
         n, (back, ahead) = u.size, trajectories
         first = component.pad(u, inflow, room)
         f = component.gather(first, back, room(n))
@@ -42,44 +42,47 @@ class MacCormack(SemiLagrangian):
         new = component.gather(second, ahead, room(n))
         for part in _blocks(n):
             new[part] = f[part] + 0.5 * (u[part] - new[part])
-        bounds = (room(n), room(n)) if self.clamped else None
+        bounds = (room(n), room(n), room(n)) if self.clamped else None
         if bounds:
-            departure.extrema(component.points, first, back.departures, *bounds)
+            departure.extrema(component.points, first, back.displacement, back.scale, *bounds)
         return first, second, new, bounds
 
     def advect(self, component, u, inflow, trajectories, room, out):
         """See the base class."""
         *_, new, bounds = self._stages(component, u, inflow, trajectories, room)
         if bounds:
-            np.clip(new, *bounds, out=out)
+            np.clip(new, *bounds[:2], out=out)
         else:
             out[:] = new
 
-    def advect_vjp(self, component, g, u, inflow, trajectories, room, into, wanted):
+    def advect_vjp(self, component, g, u, inflow, trajectories, room, into, speeds):
         """See the base class."""
-        n, (back, ahead) = u.size, trajectories
-        first, second, of_b, bounds = self._stages(component, u, inflow, trajectories, room)
-        own, of_f, (of_u, of_inflow) = room(n), room(n), into or (None, np.zeros(inflow.size))
+        n, points, (back, ahead) = u.size, component.points, trajectories
+        first, second, new, bounds = self._stages(component, u, inflow, trajectories, room)
+        own, of_f, of_first, (of_u, of_inflow) = room(n), room(n), room(points.samples), into or (None, inflow.copy())
+        of_b = new  # which is used up
+        of_first[:] = 0.0
         for part in _blocks(n):
-            share = 1.0
-            if bounds:  # they become the cotangents of the bounds
-                low, high, new = bounds[0][part], bounds[1][part], of_b[part]
-                at_low, at_high = np.heaviside(low - new, 0.5), np.heaviside(new - high, 0.5)
-                low[:], high[:], share = at_low * g[part], at_high * g[part], 1.0 - at_low - at_high
-            own[part] = share * g[part]
+            free = 1.0
+            if bounds:
+                low, high, stencils = (array[part] for array in bounds)
+                below, above = _step(low, new[part]), _step(new[part], high)
+                free = 1.0 - below - above
+                some = np.flatnonzero(free != 1.0)
+                index, least, greatest = departure.bound_shares(points, first, stencils[some])
+                of_bound = least * below[some] + greatest * above[some]
+                np.add.at(of_first, index, of_bound * g[part][some])
+            own[part] = free * g[part]
             of_b[part] = -0.5 * own[part]
         component.pad_vjp(component.scatter(of_b, ahead, room), of_f, of_inflow)
         of_f += own
         if into is not None:
-            of_first = component.scatter(of_f, back, room)
-            for pick, of_bound in zip((np.min, np.max), bounds or (), strict=False):
-                _add_at_bounds(component.points, first, back.departures[-1], pick, of_bound, of_first)
-            component.pad_vjp(of_first, of_u, of_inflow)
+            component.pad_vjp(component.scatter(of_f, back, out=of_first), of_u, of_inflow)
             for part in _blocks(n):
                 of_u[part] += 0.5 * own[part]
-        if not wanted:
-            return []
-        return [component.gradient(first, back, of_f), component.gradient(second, ahead, of_b)]
+        if speeds is not None:
+            component.gradient(first, back, of_f, speeds[0])
+            component.gradient(second, ahead, of_b, speeds[1])
 
     def advect_jvp(self, component, u, inflow, trajectories, du, dinflow, dm):
         """See the base class."""
@@ -88,24 +91,18 @@ class MacCormack(SemiLagrangian):
         df = component.jvp(first, change, trajectories[0], dm[0])
         db = component.jvp(second, component.pad(df, dinflow), trajectories[1], dm[1])
         total = df + 0.5 * (du - db)
-        if bounds is None:
-            return total
-        low, high = (np.heaviside(sign * (bound - new), 0.5) for sign, bound in zip((1, -1), bounds, strict=True))
-        total *= 1.0 - low - high
-        for pick, share in ((np.min, low), (np.max, high)):
-            samples, weights = departure.equal_shares(component.points, first, trajectories[0].departures[-1], pick)
-            total += share * np.sum(weights * change[samples], axis=0)
+        if bounds is not None:
+            below, above = _step(bounds[0], new), _step(new, bounds[1])
+            index, least, greatest = departure.bound_shares(component.points, first, bounds[2])
+            total *= 1.0 - below - above
+            total += np.sum((least * below + greatest * above) * change[index], axis=0)
         return total
+
+
+def _step(a, b):
+    """1, 1/2, 0 where a > b, a = b, a < b."""
+    return 0.5 * (a > b) + 0.5 * (a >= b)
 
 
 def _blocks(n):
     return [slice(start, start + BLOCK) for start in range(0, n, BLOCK)]
-
-
-def _add_at_bounds(points, samples, stencils, pick, of_bound, back):
-    """Cotangent of the least (pick: np.min) or greatest sample of each cell -> added to back at those that equal it."""
-    for part in _blocks(of_bound.size):
-        some = np.flatnonzero(of_bound[part]) + part.start
-        if some.size:
-            index, weights = departure.equal_shares(points, samples, stencils[some], pick)
-            np.add.at(back, index, weights * of_bound[some])

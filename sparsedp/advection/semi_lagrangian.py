@@ -20,7 +20,7 @@ import scipy.sparse as sp
 from sparsedp.advection.back_trajectory import Euler, Midpoint, velocity_at_points
 from sparsedp.advection.interpolant import components
 from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
-from sparsedp.advection.scratch import Scratch
+from sparsedp.advection.scratch import FEW, Scratch
 from sparsedp.fields import check_finite, surely_finite
 
 __all__ = ["SemiLagrangian"]
@@ -38,7 +38,8 @@ class SemiLagrangian(Law):
         self.components = components(setting)
         self.backtrace = Midpoint(setting) if setting.form.endswith("midpoint") else Euler()
         self.to_points = velocity_at_points(setting)
-        self.scratch = Scratch()
+        self.scratch, dim, ends = Scratch(), setting.grid.dim, [setting.grid.dim * n for n in setting.space.offsets]
+        self.parts = [(slice(*pair), (dim, -1)) for pair in zip(ends, ends[1:], strict=False)]  # of the velocity
 
     # ------------------------------------------------------------ one component, which `maccormack` does in its own way
 
@@ -46,15 +47,15 @@ class SemiLagrangian(Law):
         """The advected component -> out."""
         component.gather(component.pad(u, inflow, room), trajectories[0], out)
 
-    def advect_vjp(self, component, g, u, inflow, trajectories, room, into, wanted):
+    def advect_vjp(self, component, g, u, inflow, trajectories, room, into, speeds):
         """Cotangent of the advected component -> that of u is written, that of inflow added to the pair `into`.
 
-        Returns those of the velocities of the trajectories, if they are wanted.
+        Those of the velocities of the trajectories are written to the arrays `speeds`; None leaves a part out.
         """
         if into is not None:
             component.pad_vjp(component.scatter(g, trajectories[0], room), *into)
-        samples = component.pad(u, inflow, room) if wanted else None
-        return [component.gradient(samples, trajectories[0], g)] if wanted else []
+        if speeds is not None:
+            component.gradient(component.pad(u, inflow, room), trajectories[0], g, speeds[0])
 
     def advect_jvp(self, component, u, inflow, trajectories, du, dinflow, dm):
         """Tangents of u, of inflow and of the velocity of each trajectory (or None) -> tangent."""
@@ -63,17 +64,20 @@ class SemiLagrangian(Law):
 
     # ------------------------------------------------------------ the whole field
 
+    def _room(self, u):
+        """A function from sizes to arrays, and the list of those to give back to the scratch arrays afterwards."""
+        borrowed: list = []
+        return (np.empty if u.size <= FEW else self.scratch.lender(borrowed)), borrowed
+
     def _velocities(self, v, room=np.empty):
         """Velocity as it is given -> for each component an array (axis, point)."""
         if self.to_points is not None:
             v = self.to_points.apply(v, out=room(self.to_points.shape[0]))
-        dim = self.setting.grid.dim
-        ends = np.cumsum([dim * component.points.size for component in self.components])
-        return [part.reshape(dim, -1) for part in np.split(v, ends[:-1])] if len(ends) > 1 else [v.reshape(dim, -1)]
+        return [v[part].reshape(shape) for part, shape in self.parts]
 
-    def _trajectories(self, number, w, dt, room=np.empty):
+    def _trajectories(self, number, w, dt):
         steps, component = [dt * sign for sign in self.signs], self.components[number]
-        return [component.trajectory(self.backtrace.velocity(number, w, step), step, room) for step in steps]
+        return [component.trajectory(self.backtrace.velocity(number, w, step), step) for step in steps]
 
     def _check(self, u, v, inflow):
         """Name the first number that is not finite; the trajectories would hide it."""
@@ -87,11 +91,10 @@ class SemiLagrangian(Law):
     def forward(self, u, v, dt, inflow, out=None):
         """The advected field."""
         self._check(u, v, inflow)
-        out, borrowed = np.empty(u.size) if out is None else out, []
-        room = self.scratch.lender(borrowed)
+        out, (room, borrowed) = np.empty(u.size) if out is None else out, self._room(u)
         for number, (component, w) in enumerate(zip(self.components, self._velocities(v, room), strict=True)):
             span, solid = component.span, component.solid
-            trajectories = self._trajectories(number, w, dt, room)
+            trajectories = self._trajectories(number, w, dt)
             self.advect(component, u[span], inflow, trajectories, room, out[span])
             if solid is not None:
                 np.copyto(out[span], u[span], where=solid)
@@ -100,26 +103,31 @@ class SemiLagrangian(Law):
 
     def pull(self, nums, g, u, v, dt, inflow, into=None):
         """Cotangent of the advected field -> those of the arguments `nums`."""
-        field, speed, borrowed = FIELD in nums or INFLOW in nums, VELOCITY in nums or STEP in nums, []
-        room, g, rate, of_w = self.scratch.lender(borrowed), np.ascontiguousarray(g), 0.0, []
+        field, speed = FIELD in nums or INFLOW in nums, VELOCITY in nums or STEP in nums
+        (room, borrowed), g, rate, of_w = self._room(u), np.ascontiguousarray(g), 0.0, []
         of_u, of_inflow = np.empty(u.size if field else 0), np.zeros(inflow.size)
+        own = np.empty if self.to_points is None else room  # then they are handed out
         for number, (component, w) in enumerate(zip(self.components, self._velocities(v, room), strict=True)):
-            span, solid, trajectories = component.span, component.solid, self._trajectories(number, w, dt, room)
+            span, solid, trajectories = component.span, component.solid, self._trajectories(number, w, dt)
             part = g[span] if solid is None else np.where(solid, 0.0, g[span])
             targets = (of_u[span], of_inflow) if field else None
-            changes = self.advect_vjp(component, part, u[span], inflow, trajectories, room, targets, speed)
+            changes = [own(w.size).reshape(w.shape) for _ in trajectories] if speed else None
+            self.advect_vjp(component, part, u[span], inflow, trajectories, room, targets, changes)
             if field and solid is not None:
                 of_u[span] += np.where(solid, g[span], 0.0)
-            backs = [
-                self.backtrace.vjp(number, w, t.step, change) for t, change in zip(trajectories, changes, strict=False)
-            ]
-            of_w += [sum((back for back, _ in backs[1:]), backs[0][0]).reshape(-1)] if backs else []
-            if STEP in nums:
-                rate += sum(float(np.sum(change * t.velocity)) for t, change in zip(trajectories, changes, strict=True))
-                rate += sum(float(np.sum(bent * w)) for _, bent in backs if bent is not None)
+            for sign, change, trajectory in zip(self.signs, changes or (), trajectories, strict=False):
+                if STEP in nums:
+                    rate += float(np.sum(change * trajectory.velocity))
+                back, bent = self.backtrace.vjp(number, w, trajectory.step, change)
+                if STEP in nums and bent is not None:
+                    rate += float(np.sum(bent * w))
+                if sign == self.signs[0]:
+                    of_w.append(back)
+                else:
+                    of_w[-1] += back
         found = {FIELD: of_u, INFLOW: of_inflow, STEP: rate / dt}
         if VELOCITY in nums:
-            flat = of_w[0] if len(of_w) == 1 else np.concatenate(of_w)
+            flat = of_w[0].reshape(-1) if len(of_w) == 1 else np.concatenate([back.reshape(-1) for back in of_w])
             found[VELOCITY] = flat if self.to_points is None else self.to_points.T.apply(flat)
         self.scratch.give(*borrowed)
         for num in set(into or ()) & set(nums):

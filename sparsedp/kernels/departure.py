@@ -9,6 +9,7 @@ it is their test, what runs without numba, and the matrix of a step. Arrays are 
 NaN among the displacements does no harm.
 """
 
+from functools import cache
 from itertools import product
 from math import prod
 from typing import Any, NamedTuple
@@ -17,9 +18,11 @@ import numpy as np
 
 from sparsedp import kernels
 
-__all__ = ["PAD", "Points", "depart", "entries", "equal_shares", "extrema", "gather", "gradient", "scatter"]
+__all__ = ["PAD", "Points", "bound_shares", "entries", "extrema", "gather", "gradient", "scatter"]
 
 PAD = 3  # what cubic interpolation reads beyond the clamped departure points
+
+NONE, NO_ROWS = np.empty(0), np.empty((0, 0))
 
 # The weights of the four samples from the one before the cell on: coefficients of 1, t, t^2, t^3 in the fraction t of
 # the cell, and the weight at a point (t = 0): for the value and for the slope. A linear slope jumps at the points.
@@ -41,131 +44,109 @@ class Points(NamedTuple):
 
     shape: tuple
     padded: tuple  # the shape with ghost cells
-    axes: Any  # for each axis: points, stride, first point, least and greatest place, last cell, whether periodic
-    weights: Any  # the table of each axis: for the slope along axis 0, 1, ..., and for the value
+    size: int  # number of points
+    samples: int  # number of points and ghost cells
+    axes: (
+        Any  # for each axis: points, stride, samples before the first stencil, ends of the places, last cell, periodic
+    )
+    weights: Any  # a table for each axis: of the value, of the slope
 
     @classmethod
     def of(cls, shape, periodic, interpolation):
         """Shape, whether each axis is periodic, linear or cubic -> Points."""
-        padded = tuple(n + 2 * PAD for n in shape)
+        padded, axes = tuple(n + 2 * PAD for n in shape), []
         beyond = 1.5 if interpolation == "linear" else 2.0
-        axes = [
-            (n, prod(padded[axis + 1 :]), PAD, *((PAD, PAD + n) if wraps else (PAD - beyond, PAD + n - 1 + beyond)))
-            for axis, (n, wraps) in enumerate(zip(shape, periodic, strict=True))
-        ]
-        ends = [(PAD + n, wraps) for n, wraps in zip(shape, periodic, strict=True)]
-        value, slope = WEIGHTS[interpolation]
-        dim = range(len(shape))
-        tables = [np.array([slope if axis == along else value for axis in dim], float) for along in (*dim, -1)]
-        return cls(tuple(shape), padded, np.hstack([np.array(axes, float), np.array(ends, float)]), tables)
-
-    @property
-    def size(self):
-        """Number of points."""
-        return prod(self.shape)
-
-    @property
-    def samples(self):
-        """Number of points and ghost cells."""
-        return prod(self.padded)
+        for axis, (n, wraps) in enumerate(zip(shape, periodic, strict=True)):
+            ends = (0, n) if wraps else (-beyond, n - 1 + beyond)
+            axes.append((n, prod(padded[axis + 1 :]), PAD - 1, *ends, n, wraps))
+        tables = np.array([[table] * len(shape) for table in WEIGHTS[interpolation]], float)
+        return cls(tuple(shape), padded, prod(shape), prod(padded), np.array(axes, float), tables)
 
 
-def _run(loop, points, *args, one_thread=False):
-    from sparsedp.kernels.interpolation import TILE
+@cache
+def _loops():
+    """The module of the compiled loops; it imports numba."""
+    from sparsedp.kernels import interpolation
 
-    work = points.size << len(points.shape)
-    loop.run(-(-points.size // TILE), work, 1 if one_thread else kernels.threads(), *args)
+    return interpolation
 
 
-def depart(points, w, scale, out):
-    """Displacements (axis, point), their scale along each axis -> departure points, written to out (axis + 1, point).
+def _run(name, points, threads, *args):
+    """Run a compiled loop over all points -> whether there is one."""
+    loop = getattr(_loops(), name) if kernels.compiled() else None
+    if loop is None or not loop.compiled:
+        return False
+    loop.run(-(-points.size // _loops().TILE), points.size << len(points.shape), threads, *args)
+    return True
 
-    The last row has the number of the first sample that has a weight, the others the fraction of a cell beyond it.
-    """
-    loop = kernels._loop("interpolation", "depart")
-    if loop is not None:
-        _run(loop, points, w, scale, points.axes, out)
-        return out
-    n, stride, origin, low, high, last, periodic = points.axes.T[:, :, None]
+
+def _depart(points, w, scale):
+    """Departure points -> first samples of their stencils, fractions of a cell (axis, point)."""
+    n, stride, before, low, high, last, periodic = points.axes.T[:, :, None]
     place = np.indices(points.shape, float).reshape(w.shape) - scale[:, None] * w
     with np.errstate(invalid="ignore"):
-        place = np.where(periodic != 0, place - n * np.floor(place / n), place) + origin
+        place = np.where(periodic != 0, place - n * np.floor(place / n), place)
         place = np.minimum(np.where(place >= low, place, low), high)  # NaN goes to the lower end
     cell = np.minimum(np.floor(place), last)
-    np.subtract(place, cell, out=out[:-1])
-    np.sum(stride * (cell - 1), axis=0, out=out[-1])
-    return out
+    return np.sum(stride * (cell + before), axis=0), place - cell
 
 
-def entries(points, departures, along=-1):
-    """Numbers of samples and their weights in the value (along an axis: in the slope), one pair for each column of W."""
-    first, rows = departures[-1].astype(np.int64), []
-    for table, t in zip(points.weights[along], departures, strict=False):
-        a, b, c, d, at_point = table.T[:, :, None]
+def entries(points, w, scale, along=None):
+    """Columns of W, the value (along an axis: the slope), as pairs: for each point a sample and its weight."""
+    (first, fractions), rows = _depart(points, w, scale), []
+    for axis, t in enumerate(fractions):
+        a, b, c, d, at_point = points.weights[int(axis == along), axis].T[:, :, None]
         rows.append(np.where(t != 0, ((d * t + c) * t + b) * t + a, at_point))
-    used = [[m for m, weight in enumerate(row) if weight.any()] for row in rows]
-    for steps in product(*used):
-        index = first + sum(m * int(stride) for m, stride in zip(steps, points.axes[:, 1], strict=True))
-        yield index, prod(row[m] for m, row in zip(steps, rows, strict=True))
+    for steps in product(*([m for m in range(4) if row[m].any()] for row in rows)):
+        weight = prod(row[m] for m, row in zip(steps, rows, strict=True))
+        yield (first + points.axes[:, 1] @ steps).astype(np.int64), weight
 
 
-def _interpolate(points, samples, departures, along, factor, g, out, transpose):
-    loop = kernels._loop("interpolation", "interpolate")
-    if loop is not None:
-        args = samples, departures, points.axes, points.weights[along], factor, g, out, transpose
-        _run(loop, points, *args, one_thread=transpose)
-        return
-    given, pairs = factor * g if g.size else factor, entries(points, departures, along)
-    if transpose:
-        for index, weight in pairs:
-            samples += np.bincount(index, weight * given, samples.size)
-    else:
-        out[:] = given * sum((weight * samples[index] for index, weight in pairs), np.zeros(out.size))
-
-
-def gather(points, samples, departures, out):
-    """Interpolated values at the departure points -> out."""
-    _interpolate(points, samples, departures, -1, 1.0, NONE, out, False)
+def gather(points, samples, w, scale, out):
+    """Interpolated values at the departure points, W samples -> out."""
+    args = samples, w, scale, points.axes, points.weights[:1], NONE, out[None], False
+    if not _run("interpolate", points, kernels.threads(), *args):
+        out[:] = sum(weight * samples[index] for index, weight in entries(points, w, scale))
     return out
 
 
-def scatter(points, departures, g, samples):
-    """The transpose of `gather`, added to the samples."""
-    _interpolate(points, samples, departures, -1, 1.0, g, NONE, True)
+def scatter(points, w, scale, g, samples):
+    """The transpose of `gather`: samples += W^T g. Points share samples, so one thread does it."""
+    if not _run("interpolate", points, 1, samples, w, scale, points.axes, points.weights[:1], g, NO_ROWS, True):
+        for index, weight in entries(points, w, scale):
+            samples += np.bincount(index, weight * g, samples.size)
     return samples
 
 
-def gradient(points, samples, departures, scale, g, out):
-    """g times the derivative of `gather` in the displacements -> out (axis, point)."""
-    for axis, row in enumerate(out):
-        _interpolate(points, samples, departures, axis, -scale[axis], g, row, False)
+def gradient(points, samples, w, scale, g, out):
+    """g times the derivative of `gather` in w -> out (axis, point)."""
+    args = samples, w, scale, points.axes, points.weights, g, out, False
+    if not _run("interpolate", points, kernels.threads(), *args):
+        for axis, row in enumerate(out):
+            slope = sum(weight * samples[index] for index, weight in entries(points, w, scale, axis))
+            row[:] = -scale[axis] * g * slope
     return out
 
 
-def _corners(points, first):
-    """Samples of the cells whose stencils begin at `first`, one row for each corner."""
+def _corners(points, stencils):
+    """First samples of some stencils -> samples of the cells in them, one row for each corner."""
     steps = np.array(list(product((1, 2), repeat=len(points.shape)))) @ points.axes[:, 1]
-    return (steps[:, None] + first).astype(np.int64)
+    return (steps[:, None] + stencils).astype(np.int64)
 
 
-def extrema(points, samples, departures, low, high):
-    """Least and greatest sample of the cell around each departure point -> low, high."""
-    loop = kernels._loop("interpolation", "extrema")
-    if loop is not None:
-        _run(loop, points, samples, departures, points.axes, low, high)
-    else:
-        cells = samples[_corners(points, departures[-1])]
+def extrema(points, samples, w, scale, low, high, stencils):
+    """Least and greatest sample of the cell around each departure point, and the first sample of its stencil."""
+    if not _run("extrema", points, kernels.threads(), samples, w, scale, points.axes, low, high, stencils):
+        stencils[:] = _depart(points, w, scale)[0]
+        cells = samples[_corners(points, stencils)]
         np.min(cells, axis=0, out=low)
         np.max(cells, axis=0, out=high)
 
 
-def equal_shares(points, samples, stencils, pick):
+def bound_shares(points, samples, stencils):
     """First samples of some stencils -> samples of their cells (corner, point), and the weight of each in the mean of
-    those that are the least (pick: np.min) or the greatest (np.max) of the cell."""
+    those that are the least of the cell, and in that of the greatest."""
     corners = _corners(points, stencils)
     cells = samples[corners]
-    equal = cells == pick(cells, axis=0)
-    return corners, equal / equal.sum(axis=0)
-
-
-NONE = np.empty(0)
+    least, greatest = cells == np.min(cells, axis=0), cells == np.max(cells, axis=0)
+    return corners, least / least.sum(axis=0), greatest / greatest.sum(axis=0)

@@ -55,7 +55,7 @@ def _types(words):
     from numba import types
 
     found = {"int": types.int64, "real": types.float64, "flag": types.boolean}
-    for dimensions in (1, 2, 3):
+    for dimensions in (1, 2, 3, 4):
         found[f"read{dimensions}"] = types.Array(types.float64, dimensions, "C", readonly=True)
         found[f"write{dimensions}"] = types.Array(types.float64, dimensions, "C")
     found["index1"] = types.Array(types.int64, 1, "C", readonly=True)
