@@ -19,6 +19,7 @@ from sparsedp.kernels import departure
 
 __all__ = ["MacCormack"]
 
+NONE = np.empty(0)
 BLOCK = 1 << 14  # points that NumPy works on at a time: what is made on the way stays in the cache
 
 
@@ -59,7 +60,7 @@ class MacCormack(SemiLagrangian):
         """See the base class."""
         n, points, (back, ahead) = u.size, component.points, trajectories
         first, second, new, bounds = self._stages(component, u, inflow, trajectories, room)
-        own, of_f, of_first, (of_u, of_inflow) = room(n), room(n), room(points.samples), into or (None, inflow.copy())
+        own, of_f, of_first, (of_u, of_inflow) = room(n), room(n), room(points.samples), into or (NONE, inflow.copy())
         of_b = new  # which is used up
         of_first[:] = 0.0
         for part in _blocks(n):

@@ -6,6 +6,7 @@ last axis, not for each entry of the filter. A field in 1-D is one in 2-D with o
 """
 
 from math import prod
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -13,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 __all__ = ["correlate", "fold", "pad", "weigh"]
 
 BLOCK = 1 << 22  # bytes of the copied matrix that are made at a time: they stay in the cache
-MODES = {"periodic": "wrap", "zero": "constant", "replicate": "edge"}
+MODES: dict[str, Any] = {"periodic": "wrap", "zero": "constant", "replicate": "edge"}
 
 
 def pad(x, widths, padding):

@@ -69,7 +69,7 @@ def _weigh(tables, fractions, many, weights, ends):
             for m in range(4):
                 weight, (a, b, c, d, at_point) = weights[kind, row, m], tables[kind, axis, m]
                 last = used
-                if a == 0.0 and b == 0.0 and c == 0.0 and at_point == 0.0:
+                if not tables[kind, axis, m].any():
                     weight[:many] = 0.0
                     continue
                 for j in range(many):
