@@ -102,7 +102,7 @@ def _parser():
 def run_check(options):
     """Options of the command `check` -> exit code."""
     from sparsedp.check.audit import gradient
-    from sparsedp.report.source import audited, load
+    from sparsedp.report.scene_report import audited, load
 
     try:
         source = load(options.scene)
@@ -116,8 +116,7 @@ def run_check(options):
 
 def run_report(options):
     """Options of the command `report` -> exit code."""
-    from sparsedp.report.folder import write_report
-    from sparsedp.report.source import load
+    from sparsedp.report.scene_report import load, write_report
 
     try:
         source = load(options.scene)
@@ -157,13 +156,14 @@ def _with_bar(loops):
 def run_demo(options):
     """Options of the command `demo` -> exit code."""
     # Here and not at the top: --help and a wrong command line load nothing.
-    from sparsedp.report.demo import outputs, story, study, terrain
+    from sparsedp.report.demo import story, terrain
+    from sparsedp.report.scene_report import claim
 
     try:
         ground = terrain.load(options.input)
-        grids = study.grids_for(ground, options.size)
-        outputs.claim(options.out, options.force)
-        hidden = study.prepare(ground, grids)
+        grids = story.grids_for(ground, options.size)
+        claim(options.out, [*story.PICTURES, *story.ARRAYS], options.force)
+        hidden = story.prepare(ground, grids)
     except (ValueError, OSError, ImportError) as error:
         return refuse(error)
     return 0 if story.tell(hidden, options.out, options.force) else 1

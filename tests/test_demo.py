@@ -13,10 +13,10 @@ from sources import ROOT
 
 import sparsedp as dp
 from sparsedp.__main__ import main
-from sparsedp.report.demo import outputs, scene, study, terrain
+from sparsedp.report.demo import scene, story, terrain
 
 PICTURES = importlib.util.find_spec("matplotlib") is not None
-WRITTEN = (*(outputs.PICTURES if PICTURES else ()), *outputs.ARRAYS)
+WRITTEN = (*(story.PICTURES if PICTURES else ()), *story.ARRAYS)
 
 
 def relief(shape=(28, 24)):
@@ -87,7 +87,7 @@ def test_nothing_is_overwritten_unasked(finished):
 
 
 def test_own_field_and_force(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(study, "ITERATIONS", 3)
+    monkeypatch.setattr(story, "ITERATIONS", 3)
     np.save(tmp_path / "ground.npy", relief())
     arguments = ["demo", "--input", str(tmp_path / "ground.npy"), "--size", "12", "--out", str(tmp_path / "out")]
     assert main(arguments) == 0
@@ -101,9 +101,9 @@ def test_own_field_and_force(tmp_path, monkeypatch, capsys):
 def test_without_matplotlib_and_tqdm(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setitem(sys.modules, "tqdm", None)
-    monkeypatch.setattr(study, "ITERATIONS", 3)
+    monkeypatch.setattr(story, "ITERATIONS", 3)
     assert main(["demo", "--size", "12", "--out", str(tmp_path)]) == 0
-    assert sorted(os.listdir(tmp_path)) == sorted(outputs.ARRAYS)
+    assert sorted(os.listdir(tmp_path)) == sorted(story.ARRAYS)
     printed = capsys.readouterr().out
     assert "a generated terrain" in printed
     assert "No pictures: pictures need matplotlib" in printed
@@ -113,9 +113,9 @@ def test_a_wrong_gradient_is_not_a_success(tmp_path, monkeypatch, capsys):
     class Doubt:
         verdict, lines = "disagrees", ()
 
-    monkeypatch.setattr(study.Trial, "check_gradient", lambda self, directions: Doubt())
-    monkeypatch.setattr(study.Trial, "row", lambda self, check: dict.fromkeys(KEYS, 0))
-    monkeypatch.setattr(study, "ITERATIONS", 1)
+    monkeypatch.setattr(story.Trial, "check_gradient", lambda self, directions: Doubt())
+    monkeypatch.setattr(story.Trial, "row", lambda self, check: dict.fromkeys(KEYS, 0))
+    monkeypatch.setattr(story, "ITERATIONS", 1)
     assert main(["demo", "--size", "12", "--out", str(tmp_path)]) == 1
 
 

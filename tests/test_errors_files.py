@@ -16,7 +16,7 @@ from sources import ROOT, called, modules
 import sparsedp as dp
 from sparsedp.__main__ import main
 from sparsedp.files import write_file
-from sparsedp.report.demo import outputs
+from sparsedp.report.demo import story
 
 resource = pytest.importorskip("resource")  # limits of a process: POSIX only
 
@@ -206,8 +206,8 @@ def test_a_report_without_room(tmp_path, room):
 def test_a_demo_without_room(tmp_path):
     code = LIMITED + (
         "from sparsedp.__main__ import main\n"
-        "from sparsedp.report.demo import study\n"
-        "study.ITERATIONS = 2\n"
+        "from sparsedp.report.demo import story\n"
+        "story.ITERATIONS = 2\n"
         "limit(600)\n"
         "sys.exit(main(['demo', '--size', '12', '--out', sys.argv[1]]))"
     )
@@ -263,9 +263,9 @@ def test_a_file_that_came_during_the_demo_is_not_overwritten(tmp_path):
         FileExistsError,
         match=r".*table\.csv came there during the run; name another folder with --out, or write --force",
     ):
-        outputs.write_arrays(tmp_path, False, [{"a": 1}], np.zeros(3))
+        story.write_arrays(tmp_path, False, [{"a": 1}], np.zeros(3))
     assert contents(tmp_path) == {"table.csv": b"mine"}
-    outputs.write_arrays(tmp_path, True, [{"a": 1}], np.zeros(3))
+    story.write_arrays(tmp_path, True, [{"a": 1}], np.zeros(3))
     assert contents(tmp_path)["table.csv"] == b"a\n1\n"
 
 

@@ -16,7 +16,7 @@ from catalogue import CATALOGUE
 
 import sparsedp as dp
 from sparsedp import kernels, network
-from sparsedp.report.trial import run
+from sparsedp.report.stress_cases import run
 from sparsedp.tree import leaves
 
 FOUR, TIMES = 4, 6

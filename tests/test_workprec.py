@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.report import measurement
-from sparsedp.report.rows import COLUMNS
+from sparsedp.report import work_precision
+from sparsedp.report.work_precision import COLUMNS
 
 FIRST = (
     "scene method unknowns steps tolerance forward_error gradient_error seconds_setup seconds_forward seconds_backward "
@@ -127,9 +127,7 @@ def test_failures_keep_their_row():
     with pytest.raises(
         ValueError, match=r"workprec cannot compare shape \(3,\) with \(4,\); give compare=function\(found, wanted\)"
     ):
-        from sparsedp.report.precision import _distance
-
-        _distance(np.ones(3), np.ones(4))
+        work_precision.relative_distance(np.ones(3), np.ones(4))
     short = lambda found, wanted: abs(np.sum(found) - np.sum(wanted))
     fair = dp.workprec(
         lambda n: (lambda x: anp.sum(x), np.ones(n)),
@@ -143,10 +141,10 @@ def test_failures_keep_their_row():
 
 def test_caches_that_are_not_warm_are_refused(monkeypatch):
     """A run that goes on getting faster has no time; one that settles is warmed first."""
-    clock = iter(2.0**-k for k in range(40))
-    monkeypatch.setattr(measurement, "_seconds", lambda run: (run(), next(clock))[1])
-    monkeypatch.setattr(measurement, "SETTLED", 1.5)
-    monkeypatch.setattr(measurement, "SHORT", 0.0)
+    clock = iter(2.0**-k for k in range(80))
+    monkeypatch.setattr(work_precision, "timed", lambda run: (next(clock), run()))
+    monkeypatch.setattr(work_precision, "SETTLED", 1.5)
+    monkeypatch.setattr(work_precision, "SHORT", 0.0)
     row = table().rows[0]
     assert row["status"] == "not_warm" and math.isnan(row["seconds_forward"]) and row["forward_error"] < 0.1
     monkeypatch.undo()

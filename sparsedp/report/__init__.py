@@ -3,7 +3,6 @@
 It may import every floor; only __main__ and the shop window open it.
 """
 
-from sparsedp.report.charts import convergence, v_curve
-from sparsedp.report.plots import animate, plot
+from sparsedp.report.plots import animate, convergence, plot, v_curve
 
 __all__ = ["animate", "convergence", "plot", "v_curve"]

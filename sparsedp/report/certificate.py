@@ -1,31 +1,156 @@
-"""certify: how wrong are the value and the gradient of a loss because its solves stop early?
+"""The error that solves leave in value and gradient: estimated (`certify`), or as large as allowed (`certified`).
 
-The loss is run once as it is. In a second run each solve, forward and adjoint, starts from its answer and is
-corrected by one loose solve (answers.py). The difference of the two runs is the error, up to the looseness. The
-part of the adjoint solves comes from a run that corrects only them.
+A run of the loss records its solves, forward and adjoint. A second run starts each from its recorded solution x. With
+r = b - A x its residual, A^-1 r is its error; solved to the share s, it takes all but s of that error away. Data b'
+that have changed a little are followed by solving for b' - A x; to follow the data and keep the error, the old
+residual is taken off first: b' - A x - r. The difference of two such runs is the error of the first, up to s.
 
-The corrected value is that of the second run plus the sum of y . r over all solves, with r the forward residual
-that is left and y the adjoint solution: the adjoint says what a residual does to the loss.
+The value of a run is corrected by the sum of y . r over all solves, with r the forward residual that is left and y
+the adjoint solution: the adjoint says what a residual does to the loss.
 
 Source: N. A. Pierce and M. B. Giles, SIAM Review 42, 2000.
 """
 
-from typing import Any
+from collections import Counter
+from copy import copy
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp.check.findings import table
+from sparsedp.derivative import value_and_grad
+from sparsedp.errors import ConvergenceError
 from sparsedp.fields import is_number
-from sparsedp.report.answers import Answers, run, seen
+from sparsedp.ledger import recording, thread
+from sparsedp.report.table import Result, text_table
+from sparsedp.solvers.record import SolveLog
 from sparsedp.tree import leaves, norm
 
-__all__ = ["Certificate", "certify", "distance", "products_of"]
+__all__ = ["Certificate", "Certified", "certified", "certify", "distance"]
 
 TARGET = 0.01  # error of the gradient that the advice is about
-SHARE = 0.01  # of its error that a corrected answer keeps
+SHARE = 0.01  # of its error that a corrected solution keeps
 CONSISTENT = 0.2  # of the terms of the sum of y . r, by which it may differ from the corrected run
-ROUNDING = 1e-13  # relative; smaller errors are not those of solves
-LOOSEST = 0.1
+EXACT = 1e-13  # relative errors below this are those of rounding, not of solves
+LOOSEST = 0.1  # tolerance that is advised
+SHARES = 0.05, 0.5  # least and largest relative tolerance of a correction inside minimise
+CORRECTIONS = 20  # of one evaluation, at most
+ROUNDING = 1e-14  # of the value
+
+
+def distance(one, other):
+    """Euclidean distance of two trees; None counts for nothing."""
+    pairs = zip(leaves(one), leaves(other), strict=True)
+    return norm([np.asarray(a) - np.asarray(b) for a, b in pairs if a is not None])
+
+
+# ---------------------------------------------------------------- recorded solves
+
+
+class RecordedSolve(NamedTuple):
+    """One solve: its solution, residual and right-hand side (flat), and the tolerance it was asked for."""
+
+    x: np.ndarray
+    r: np.ndarray
+    size: float  # of the right-hand side
+    rtol: float
+    iterative: bool
+
+
+class RecordedSolves(dict):
+    """The solves of a run, by (name, "forward" or "adjoint", turn); while it runs, their observer.
+
+    Parameters
+    ----------
+    before : RecordedSolves, optional
+        Of an earlier run: each is the start of the same solve.
+    correct : callable, optional
+        ``correct(key)``: whether the error of the solution is taken away, or kept. Default: always taken away.
+    share : float or None
+        Relative tolerance of each correction. None: the solutions are taken as they are, without a solve.
+    fresh : float, optional
+        Tolerance of solves that were not recorded before. Default: their own.
+    """
+
+    def __init__(self, before=None, correct=lambda key: True, share: float | None = SHARE, fresh=None):
+        super().__init__()
+        self.before, self.correct, self.share, self.fresh = before or {}, correct, share, fresh
+        self.iterations = 0
+        self._turns: Counter = Counter()
+
+    def run(self, function, x):
+        """function(x), with its solves recorded."""
+        thread.observers.append(self)
+        try:
+            with recording() as calls:
+                return function(x)
+        finally:
+            thread.observers.pop()
+            self.iterations = sum(many for (_, kind), many in calls.items() if kind == "iterations")
+
+    def linear(self, solver, b, transposed, checked, start):
+        """The solution of one linear solve, flat. The solver calls this in place of its own `solved`."""
+        product = (solver.system.given.T if transposed else solver.system.given)._flat.apply
+        key, x = self._earlier(solver.name, "adjoint" if transposed else "forward", b.size)
+        if x is None:
+            x = _loosely(solver, b, transposed, self.fresh) if self.fresh else None
+            x = solver.solved(b, transposed, checked, start) if x is None else x
+        elif self.share is not None:
+            x = x + _loosely(solver, b - product(x) - self._left(key), transposed, self.share)
+        rtol, iterative = solver.system.rtol, solver.engine.iterative
+        self[key] = RecordedSolve(x, b - product(x), float(np.linalg.norm(b)), rtol, iterative)
+        return x
+
+    def root(self, root, equation, guess, leaves):
+        """The solution of one nonlinear solve, flat."""
+        key, x = self._earlier(root.name, "forward", guess.size)
+        if x is None:
+            x = root.solved(equation, guess, leaves)
+        elif self.share is not None:
+            x = root.corrected(equation, x, leaves, self.share, -self._left(key))
+        self[key] = RecordedSolve(x, -equation.value(x, leaves), 0.0, root.rtol, True)
+        return x
+
+    def _earlier(self, name, kind, size):
+        """(key of this solve, solution of the same one in the earlier run or None)."""
+        key = name, kind, self._turns[name, kind]
+        self._turns[name, kind] += 1
+        solve = self.before.get(key)
+        return key, solve.x if solve is not None and solve.x.size == size else None
+
+    def _left(self, key):
+        """The residual that is to stay."""
+        return 0.0 if self.correct(key) else self.before[key].r
+
+    def products(self):
+        """y . r for each forward solve, or None when there is one without its adjoint solve.
+
+        They are paired by order: the last solve forward is the first one back.
+        """
+        products = []
+        for (name, kind, turn), solve in self.items():
+            if kind == "forward":
+                other = name if (name, "adjoint", 0) in self else f"{name}.jacobian"
+                adjoint = self.get((other, "adjoint", self._turns[name, kind] - 1 - turn))
+                if adjoint is None or adjoint.x.size != solve.r.size:
+                    return None
+                products.append(float(np.sum(adjoint.x * solve.r).real))
+        return products
+
+
+def _loosely(solver, r, transposed, share):
+    """A^-1 r to the relative residual `share`, beside the log of the solver."""
+    loose = copy(solver)
+    loose.system, loose.log = copy(solver.system), SolveLog()
+    loose.system.rtol = share
+    try:
+        return loose.solved(r, transposed, False)
+    except ConvergenceError as error:
+        if error.best is None:
+            raise
+        return error.best.reshape(-1)  # what it could not take away is still there to be seen
+
+
+# ---------------------------------------------------------------- certify
 
 
 def certify(loss, x, target=TARGET):
@@ -71,40 +196,34 @@ def certify(loss, x, target=TARGET):
     """
     if not (is_number(target) and 0 < target < 1):
         raise ValueError(f"certify needs a target between 0 and 1, got {target!r}; write for example target=0.01")
-    first = Answers()
-    value, gradient = run(loss, x, first)
-    again = Corrections(loss, x, first.found)
-    *corrected, answers = again.run(lambda key: True)
-    adjoint = again.run(lambda key: key[1] == "adjoint")[1]
+    gradient_of, solves = value_and_grad(loss), RecordedSolves()
+    value, gradient = solves.run(gradient_of, x)
     size = norm(gradient) or 1.0
-    total = distance(corrected[1], gradient) / size
-    causes = {
-        "forward solves": distance(corrected[1], adjoint) / size,
-        "adjoint solves": distance(adjoint, gradient) / size,
-    }
-    names = list(dict.fromkeys(_solver(key) for key in first.found))
-    solves = [_row(name, first.found, again, gradient, size, total if len(names) == 1 else None) for name in names]
-    best = _corrected_value(again, value, corrected[0], answers)
-    advice = _advice(total, causes, solves, target)
-    return Certificate(value, gradient, best, corrected[1], total, causes, solves, advice)
 
+    def corrected(correct):
+        again = RecordedSolves(solves, correct)
+        return *again.run(gradient_of, x), again
 
-class Corrections:
-    """Runs of a loss that start from known answers and correct some of them."""
-
-    def __init__(self, loss, x, found):
-        self.loss, self.x, self.found = loss, x, found
-
-    def run(self, correct):
-        """(value, gradient, answers) with the chosen answers corrected."""
-        answers = Answers(self.found, correct, SHARE)
-        return *run(self.loss, self.x, answers), answers.found
-
-
-def distance(one, other):
-    """Euclidean distance of two gradients."""
-    pairs = zip(leaves(one), leaves(other), strict=True)
-    return norm([np.asarray(a) - np.asarray(b) for a, b in pairs if a is not None])
+    best, slope, left = corrected(lambda key: True)
+    half = corrected(lambda key: key[1] == "adjoint")[1]
+    sides = (slope, half), (half, gradient)
+    causes = dict(zip(("forward solves", "adjoint solves"), (distance(*pair) / size for pair in sides), strict=True))
+    total = distance(slope, gradient) / size
+    names = dict.fromkeys(map(_solver, solves))
+    rows = []
+    for name in names:
+        error = total
+        if len(names) > 1:
+            error = distance(corrected(lambda key, name=name: _solver(key) == name)[1], gradient) / size
+        rows.append(_row(name, error, {key: solve for key, solve in solves.items() if _solver(key) == name}))
+    if not _consistent(value, best, solves.products(), left.products()):
+        best = RecordedSolves(left).run(loss, x)
+    else:
+        best += sum(left.products())
+    return Certificate(
+        value=value, gradient=gradient, corrected_value=best, corrected_gradient=slope, gradient_error=total,
+        causes=causes, solves=rows, advice=_advice(total, causes, rows, target),
+    )  # fmt: skip
 
 
 def _solver(key):
@@ -112,46 +231,23 @@ def _solver(key):
     return key[0].removesuffix(".jacobian")
 
 
-def _row(name, found, again, gradient, size, error):
-    """What is known about one solver; its share of the error from a run that corrects only its answers."""
-    mine = {key: answer for key, answer in found.items() if _solver(key) == name}
-    if error is None:
-        error = distance(again.run(lambda key: _solver(key) == name)[1], gradient) / size
-    row = {"solver": name, "rtol": max(a.rtol for a in mine.values()), "error": error}
-    row["iterative"] = any(answer.iterative for answer in mine.values())
+def _row(name, error, solves):
+    """What is known about one solver."""
+    row = {"solver": name, "rtol": max(s.rtol for s in solves.values()), "error": error}
+    row["iterative"] = any(solve.iterative for solve in solves.values())
     for kind in ("forward", "adjoint"):
-        shares = [np.linalg.norm(a.r) / a.size for key, a in mine.items() if key[1] == kind and a.size]
-        row[kind] = sum(key[1] == kind for key in mine)
-        row[f"{kind} residual"] = float(max(shares, default=0.0))
+        own = [solve for key, solve in solves.items() if key[1] == kind]
+        row[kind] = len(own)
+        row[f"{kind} residual"] = float(max((np.linalg.norm(s.r) / s.size for s in own if s.size), default=0.0))
     return row
 
 
-def _corrected_value(again, value, corrected, answers):
-    """The value of the corrected run plus y . r of what is left, or, where they cannot be paired, of a third run.
-
-    They are paired by order: the last solve forward is the first one back. Two runs tell whether that is so.
-    """
-    before, after = products_of(again.found), products_of(answers)
-    if before is not None and after is not None:
-        changed = abs(corrected - value) + sum(map(abs, before))
-        if abs(value + sum(before) - corrected) <= CONSISTENT * changed + ROUNDING * abs(value):
-            return corrected + sum(after)
-    return seen(again.loss, again.x, Answers(answers, share=SHARE))
-
-
-def products_of(found):
-    """y . r for each forward solve, or None when there is one without its adjoint solve."""
-    products = []
-    for (name, kind, turn), answer in found.items():
-        if kind != "forward":
-            continue
-        other = name if (name, "adjoint", 0) in found else f"{name}.jacobian"
-        many = sum(key[:2] == (name, kind) for key in found)
-        adjoint = found.get((other, "adjoint", many - 1 - turn))
-        if adjoint is None or adjoint.x.size != answer.r.size:
-            return None
-        products.append(float(np.sum(adjoint.x * answer.r).real))
-    return products
+def _consistent(value, corrected, before, after):
+    """Whether solves can be paired by order: then y . r of the first run tells what corrections did to the value."""
+    if before is None or after is None:
+        return False
+    allowed = CONSISTENT * (abs(corrected - value) + sum(map(abs, before))) + EXACT * abs(value)
+    return abs(value + sum(before) - corrected) <= allowed
 
 
 def _advice(total, causes, solves, target):
@@ -159,7 +255,7 @@ def _advice(total, causes, solves, target):
     open_to = [row for row in solves if row["iterative"]]
     if not open_to:
         return "all solves are direct: nothing to change"
-    if total <= ROUNDING:
+    if total <= EXACT:
         return "solves are exact to rounding"
     worst = max(open_to, key=lambda row: row["error"])
     side = "adjoint" if causes["adjoint solves"] > causes["forward solves"] else "forward solve"
@@ -172,7 +268,7 @@ def _advice(total, causes, solves, target):
     return f"the tolerances are as they should be {goal}"
 
 
-class Certificate:
+class Certificate(Result):
     """The result of `certify`. Frozen.
 
     Attributes
@@ -198,23 +294,12 @@ class Certificate:
     causes: dict
     solves: list
     advice: str
-
-    def __init__(self, value, gradient, corrected_value, corrected_gradient, error, causes, solves, advice):
-        self.__dict__.update(value=value, gradient=gradient, corrected_value=corrected_value, solves=solves)
-        self.__dict__.update(corrected_gradient=corrected_gradient, gradient_error=error, causes=causes, advice=advice)
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"a certificate is frozen; {name} cannot be set")
+    _plain = ("value", "corrected_value", "value_error", "gradient_error", "causes", "solves", "advice")
 
     @property
     def value_error(self):
         """Estimated error of the value, with its sign."""
         return self.corrected_value - self.value
-
-    def to_dict(self):
-        """The certificate as plain numbers, strings and lists, without the gradients."""
-        names = ("value", "corrected_value", "value_error", "gradient_error", "causes", "solves", "advice")
-        return {name: getattr(self, name) for name in names}
 
     def __str__(self):
         lines = [
@@ -227,9 +312,134 @@ class Certificate:
             [
                 f"value {self.value:.9g}, off by about {self.value_error:.1e}; corrected {self.corrected_value:.12g}",
                 f"gradient off by about {self.gradient_error:.1e} of itself: {causes}",
-                table(lines, head),
+                text_table(lines, head),
                 f"advice: {self.advice}",
             ]
+        )
+
+
+# ---------------------------------------------------------------- adaptive tolerances for minimise
+
+
+def certified(fraction=0.1, tolerance=1e-8):
+    """Fraction of the gradient -> tolerance for `minimise` that also chooses how far solves go.
+
+    Parameters
+    ----------
+    fraction : float
+        Largest error of the gradient relative to itself, and of the value relative to its change
+        since the last step, 0 < fraction < 1.
+    tolerance : float
+        As in `minimise`: converged when the norm of the gradient has fallen by this factor.
+
+    Returns
+    -------
+    Certified
+        For one run: ``minimise(loss, start, tolerance=dp.certified(0.1))``. Afterwards `.saved` is the share of
+        iterations saved, `.iterations`, `.full_iterations` and `.evaluations` are the counts, str() says it all.
+
+    Raises
+    ------
+    ValueError
+        If `fraction` or `tolerance` is out of range, or a gradient is given to `minimise`: its solves are not seen.
+
+    Notes
+    -----
+    The tolerances of the solvers themselves are not used, but for one evaluation at the second point: it counts
+    what an evaluation costs with them. Methods that ask for more than value and gradient are not served.
+
+    Examples
+    --------
+    >>> import autograd.numpy as anp
+    >>> import numpy as np
+    >>> from sparsedp import Grid, dirichlet, inverse, laplacian, minimise
+    >>> solve = inverse(-laplacian(Grid((8, 8)), dirichlet), "krylov")
+    >>> loose = certified(0.1, tolerance=1e-4)
+    >>> best = minimise(lambda b: anp.sum((solve(b) - 1.0) ** 2), np.zeros((8, 8)), tolerance=loose)
+    >>> best.converged, loose.saved > 0
+    (True, True)
+    """
+    if not (is_number(fraction) and 0 < fraction < 1 and is_number(tolerance) and tolerance >= 0):
+        raise ValueError(
+            f"certified needs 0 < fraction < 1 and a tolerance >= 0, got {fraction!r} and {tolerance!r}; "
+            "write for example certified(0.1)"
+        )
+    return Certified(float(fraction), float(tolerance))
+
+
+class Certified:
+    """A tolerance that takes part in the evaluations of `minimise`. Made by `certified`, for one run.
+
+    An evaluation starts from the solutions of the last one and corrects them by loose solves until value and
+    gradient move by less than is asked. What it returns is the last corrected one: its error is about the share that
+    corrections leave, times the last move. The value is corrected by y . r, which leaves an error of second order: a
+    line search compares values that differ by little.
+    """
+
+    def __init__(self, fraction, tolerance):
+        self.fraction, self.tolerance = fraction, tolerance
+        self.share = min(max(fraction, SHARES[0]), SHARES[1])
+        self.evaluations = self.iterations = self.passes = 0
+        self.full_iterations = 0  # of one evaluation with the tolerances of the solvers
+        self._value: Any = None  # of the last step
+        self._gradient, self._solves = None, RecordedSolves()
+
+    def __call__(self, record, first):
+        """Whether the run has converged."""
+        self._value = record.value
+        return record.gradient_norm <= self.tolerance * first.gradient_norm
+
+    def inside(self, loss, gradient):
+        """The loss and the gradient that `minimise` is to use, in this order at every point."""
+        if gradient is not None:
+            raise ValueError("certified sees the solves of the loss, not of a gradient that is given; leave it out")
+
+        def value(x):
+            value, self._gradient = self._settled(value_and_grad(loss), x)
+            return value
+
+        return value, lambda x: self._gradient
+
+    def _settled(self, gradient_of, x):
+        if self.evaluations == 1:  # the start may be a special point: zero, without anything to solve
+            full = RecordedSolves()
+            full.run(gradient_of, x)
+            self.full_iterations = full.iterations
+        # Without a correction first, which takes no solve: what the next one moves tells how far off it was.
+        value, gradient = self._pass(gradient_of, x, RecordedSolves(self._solves, share=None, fresh=self.share))
+        self.evaluations += 1
+        for _ in range(CORRECTIONS if any(solve.iterative for solve in self._solves.values()) else 0):
+            before = value, gradient
+            value, gradient = self._pass(gradient_of, x, RecordedSolves(self._solves, share=self.share))
+            if self._close(*before, value, gradient):
+                break
+        return value, gradient
+
+    def _pass(self, gradient_of, x, solves):
+        value, gradient = solves.run(gradient_of, x)
+        self.passes, self.iterations, self._solves = self.passes + 1, self.iterations + solves.iterations, solves
+        return value + sum(solves.products() or ()), gradient
+
+    def _close(self, value, gradient, new_value, new_gradient):
+        """Whether the error of the new value and gradient, share / (1 - share) times the last move, is allowed."""
+        left = self.share / (1.0 - self.share)
+        change = abs(new_value if self._value is None else self._value - new_value)
+        allowed = max(self.fraction * change, ROUNDING * abs(new_value))
+        exact = left * distance(gradient, new_gradient) <= self.fraction * norm(new_gradient)
+        return exact and left * abs(value - new_value) <= allowed
+
+    @property
+    def saved(self):
+        """Share of the iterations saved, beside the same evaluations with the tolerances of the solvers."""
+        full = self.full_iterations * self.evaluations
+        return 1.0 - self.iterations / full if full else 0.0
+
+    def __str__(self):
+        full = self.full_iterations * self.evaluations
+        return (
+            f"certified to {100 * self.fraction:g} % of the gradient: {self.iterations} iterations in "
+            f"{self.evaluations} evaluations ({self.passes} passes), {full} with the tolerances of the solvers: "
+            f"{100 * self.saved:.0f} % saved"
         )
 
     __repr__ = __str__

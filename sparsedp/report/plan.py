@@ -1,22 +1,22 @@
-"""explain: what one run of a loss and its gradient computed, and what it left out. Counted, not estimated."""
+"""explain: what one run of a loss and its gradient computed, and what it skipped. Counted, not estimated."""
 
 import sys
 from importlib.util import find_spec
 from time import perf_counter
-from typing import Any
 
-from sparsedp.check.findings import table
 from sparsedp.check.visits import bytes_held, witnessed
 from sparsedp.derivative import value_and_grad
 from sparsedp.fields import check_function
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
-from sparsedp.report.omissions import omitted
+from sparsedp.report.table import Result, text_table
+from sparsedp.structure.explicit import Matrix
 from sparsedp.tape import is_variable
 from sparsedp.tree import leaves
 
-__all__ = ["Plan", "explain"]
+__all__ = ["Plan", "explain", "total"]
 
+EXTRAS = {"numba": "compiled kernels", "pyamg": "multigrid", "matplotlib": "pictures", "tqdm": "bars"}
 COLUMNS = ("forward", "vjp", "jvp", "solve", "adjoint", "setup", "reused", "iterations", "assembled")
 TOTALS = {
     "applications": ("forward", "vjp", "jvp"),
@@ -76,25 +76,38 @@ def explain(loss, x, gradient=True):
     (1, 1, 64)
     """
     check_function("explain", loss, "lambda x: np.sum(x**2)")
-    clock = perf_counter()
-    marks: dict[str, Any] = {"before": set(sys.modules), "nodes": 0, "bytes": 0}
+    loaded = set(sys.modules)
     nodes: list = []
+    at_turn: dict = {}
+    clock = perf_counter()
 
     def watched(tree):
         value = loss(tree)
-        marks.update(forward=perf_counter() - clock, nodes=len(nodes), bytes=bytes_held(nodes))
-        marks["names"] = {name for name, _ in calls}
+        at_turn.update(clock=perf_counter(), nodes=len(nodes), bytes=bytes_held(nodes), calls=calls.copy())
         nodes.clear()
-        marks["resumed"] = perf_counter()
+        at_turn["resumed"] = perf_counter()
         return value
 
     with recording() as calls, witnessed(nodes):
         value = value_and_grad(watched)(x)[0] if gradient else float(watched(x))
-        backward = perf_counter() - marks["resumed"]
-    return Plan(calls, value, (marks["forward"], backward), marks, leaves(x), gradient)
+        backward = perf_counter() - at_turn["resumed"]
+    totals = {word: total(calls, *kinds) for word, kinds in TOTALS.items()}
+    steps = sum(calls[name, "forward"] for name, kind in list(calls) if kind == "recomputed")
+    return Plan(
+        value=float(value), counts=calls, totals=totals, rows=_rows(calls), tape_nodes=at_turn["nodes"],
+        left_out=[*_gradient(x, gradient), *_skipped(calls, at_turn["calls"], gradient), *_extras(loaded)],
+        tape_bytes=at_turn["bytes"] + total(calls, "bytes"),
+        recomputation=1.0 + totals["steps recomputed"] / steps if steps else 1.0,
+        seconds=(at_turn["clock"] - clock, backward),
+    )  # fmt: skip
 
 
-class Plan:
+def total(calls, *kinds):
+    """Ledger -> number of calls of these kinds, whoever was called."""
+    return sum(many for (_, kind), many in calls.items() if kind in kinds)
+
+
+class Plan(Result):
     """The result of `explain`. Frozen.
 
     Attributes
@@ -125,56 +138,44 @@ class Plan:
     tape_bytes: int
     recomputation: float
     seconds: tuple
-
-    def __init__(self, calls, value, seconds, marks, inputs, gradient):
-        totals = {word: sum(n for (_, kind), n in calls.items() if kind in kinds) for word, kinds in TOTALS.items()}
-        steps = sum(calls[name, "forward"] for name, kind in list(calls) if kind == "recomputed")
-        factor = 1.0 + totals["steps recomputed"] / steps if steps else 1.0
-        asked = sum(map(is_variable, inputs)) if gradient else 0
-        extra = sum(n for (_, kind), n in calls.items() if kind == "bytes")
-        left_out = omitted(calls, totals, marks["names"], len(inputs) - asked, gradient)
-        left_out += _not_imported(marks["before"])
-        self.__dict__.update(value=float(value), counts=calls, totals=totals, left_out=left_out, seconds=seconds)
-        self.__dict__.update(tape_nodes=marks["nodes"], tape_bytes=marks["bytes"] + extra, recomputation=factor)
-        self.__dict__.update(rows=_rows(calls))
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"a plan is frozen; {name} cannot be set")
+    _plain = ("value", "totals", "left_out", "rows", "tape_nodes", "tape_bytes", "recomputation")
 
     def to_dict(self):
         """The plan as plain numbers, strings, lists and dicts; counts nested by name and kind."""
         counts: dict = {}
         for (name, kind), many in self.counts.items():
             counts.setdefault(name, {})[kind] = many
-        names = ("value", "totals", "left_out", "rows", "tape_nodes", "tape_bytes", "recomputation")
-        return {**{name: getattr(self, name) for name in names}, "counts": counts, "seconds": list(self.seconds)}
+        return super().to_dict() | {"counts": counts, "seconds": list(self.seconds)}
 
     def __str__(self):
         forward, backward = self.seconds
-        head = (
-            f"value {self.value:.6g}: {forward:.2g} s forward, {backward:.2g} s backward; tape: {self.tape_nodes} "
-            f"calls that keep {self.tape_bytes} bytes, recomputation factor {self.recomputation:.2f}"
-        )
         used = [kind for kind in COLUMNS if any(row[kind] for row in self.rows)]
-        names = ("what", *used, "seconds", "how")
         lines = [(r["name"], *(r[k] or "" for k in used), f"{r['seconds']:.1e}", r["how"]) for r in self.rows]
-        sums = ", ".join(f"{many} {word}" for word, many in self.totals.items() if many)
-        left = [f"  - {sentence}" for sentence in self.left_out]
-        return "\n".join([head, table(lines, names), f"totals: {sums or 'nothing was called'}", "left out:", *left])
+        return "\n".join([
+            f"value {self.value:.6g}: {forward:.2g} s forward, {backward:.2g} s backward; tape: {self.tape_nodes} "
+            f"calls that keep {self.tape_bytes} bytes, recomputation factor {self.recomputation:.2f}",
+            text_table(lines, ("what", *used, "seconds", "how")),
+            f"totals: {self.sums}",
+            "left out:",
+            *(f"  - {sentence}" for sentence in self.left_out),
+        ])  # fmt: skip
 
-    __repr__ = __str__
+    @property
+    def sums(self):
+        """The totals that are not 0, in words."""
+        return ", ".join(f"{many} {word}" for word, many in self.totals.items() if many) or "nothing was called"
 
 
 def _rows(calls):
-    """One dict for each name, in the order of first use."""
-    rows = []
-    for name in dict.fromkeys(name for name, _ in calls):
-        kinds = {kind: calls[name, kind] for kind in COLUMNS}
-        if not any(kinds.values()):
-            continue
-        seconds = sum(spent for (other, _), spent in calls.seconds.items() if other == name)
-        rows.append({"name": name, **kinds, "seconds": seconds, "how": _how(calls, name)})
-    return rows
+    """One dict for each name that was called, in the order of first use."""
+    seconds: dict = {}
+    for (name, _), spent in calls.seconds.items():
+        seconds[name] = seconds.get(name, 0.0) + spent
+    rows = [
+        {"name": name, **{kind: calls[name, kind] for kind in COLUMNS}, "seconds": seconds.get(name, 0.0)}
+        for name in dict.fromkeys(name for name, _ in calls)
+    ]
+    return [{**row, "how": _how(calls, row["name"])} for row in rows if any(row[kind] for kind in COLUMNS)]
 
 
 def _how(calls, name):
@@ -186,23 +187,84 @@ def _how(calls, name):
             kind = "iterative" if engine.iterative else "direct"
             method = engine.method if engine.method == kind else f"{engine.method} ({kind})"
             words.append(f"{method}: {actor.reason}")
-        elif isinstance(actor, Operator) and not hasattr(actor, "solver"):
+        elif _applied(actor):
             words.append(actor.form)
     return "; ".join(dict.fromkeys(words)) or "rule"
 
 
-def _not_imported(before):
+def _applied(actor):
+    """Whether it is an operator that is applied and not solved with."""
+    return isinstance(actor, Operator) and not hasattr(actor, "solver")
+
+
+# ---------------------------------------------------------------- skipped work, in sentences
+
+
+def _gradient(x, asked):
+    found = leaves(x)
+    fixed = len(found) - sum(map(is_variable, found))
+    if not asked:
+        yield "the gradient: not asked, nothing taped"
+    elif fixed:
+        yield f"derivatives in {fixed} leaves of x, which are not floating"
+
+
+def _skipped(calls, forward, gradient):
+    """Derivatives, matrices, hierarchies and solves that nobody needed."""
+    for (name, what), facts in calls.told.items():
+        if what == "not asked":
+            yield f"derivative of {name} in {', '.join(map(str, facts))}: not asked"
+    for name, kind in forward if gradient else ():
+        back = calls[name, "vjp"] + calls[name, "jvp"] + calls[f"{name}.T", "forward"]  # the last: without a tape
+        if kind == "forward" and not back:
+            yield f"VJP of {name}: never called, its argument does not depend on x ({calls[name, kind]} calls)"
+    if gradient and not total(calls, "jvp"):
+        yield "JVPs: forward mode was not asked"
+    for name, actors in calls.actors.items():
+        yield from _matrices(calls, name, list(filter(_applied, actors.values())))
+    yield from _solves(calls)
+    for (name, kind), many in calls.items():
+        if kind == "skipped":
+            yield f"{many} solves of {name}: the right-hand side is 0, so is the solution"
+    for (name, what), facts in calls.told.items():
+        if what == "skipped":
+            yield from (f"{name}: {reason} ({many} times)" for reason, many in facts.items())
+    for name, actors in calls.actors.items():
+        if any(isinstance(op, Operator) and op.structure.is_identity for op in actors.values()):
+            yield f"arithmetic of {name}: an identity, {calls[name, 'forward']} copies"
+
+
+def _matrices(calls, name, operators):
+    if not calls[name, "assembled"] and any(op.form == "matrix-free" for op in operators):
+        known = all(op.structure.has_entries for op in operators)
+        yield f"matrix of {name}: not assembled, {'applied' if known else 'known only'} without one"
+    if any(isinstance(op.structure, Matrix) for op in operators):
+        yield f"assembly of {name}: it was given as a matrix"
+
+
+def _solves(calls):
+    """What the solvers did not build or solve."""
+    found = []
+    for name, actors in calls.actors.items():
+        engines = [actor.engine for actor in actors.values() if hasattr(actor, "engine")]
+        for engine in engines:
+            if not engine.hierarchical:
+                found.append(f"multigrid hierarchy for {name}: not built, {engine.method} needs none")
+        if engines and not calls[name, "setup"]:
+            found.append(f"set-up of {name}: made before, {calls[name, 'reused']} solves reuse it")
+        if engines and calls[name, "solve"] and not calls[name, "adjoint"]:
+            found.append(f"adjoint solve of {name}: nothing asks for it")
+    if not any(hasattr(actor, "engine") for actors in calls.actors.values() for actor in actors.values()):
+        yield "solves: none, so no hierarchy, no factors, no set-up"
+    elif not found and not total(calls, "hierarchy"):
+        yield "multigrid hierarchies: none built in this run"
+    yield from dict.fromkeys(found)
+
+
+def _extras(loaded):
     """Extras that this process has not loaded, and those that the run loaded."""
-    sentences = []
-    for name, use in (
-        ("numba", "compiled kernels"),
-        ("pyamg", "multigrid"),
-        ("matplotlib", "pictures"),
-        ("tqdm", "bars"),
-    ):
+    for name, use in EXTRAS.items():
         if name not in sys.modules:
-            missing = "" if find_spec(name) else ", which is not installed"
-            sentences.append(f"not imported: {name} ({use}){missing}")
-        elif name not in before:
-            sentences.append(f"{name} ({use}) was imported by this run, and not before")
-    return sentences
+            yield f"not imported: {name} ({use}){'' if find_spec(name) else ', which is not installed'}"
+        elif name not in loaded:
+            yield f"{name} ({use}) was imported by this run, and not before"

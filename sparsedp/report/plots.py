@@ -1,4 +1,4 @@
-"""Pictures of fields. The only file of the package that imports matplotlib (extra `plot`)."""
+"""Pictures of fields, charts of measurements. The only file of the package that imports matplotlib (extra `plot`)."""
 
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,10 @@ from sparsedp.files import write_file
 from sparsedp.grid import check_grid
 from sparsedp.tape import plain
 
-__all__ = ["animate", "axes_or_current", "figure", "plot", "read_picture", "sample_file", "save"]
+__all__ = [
+    "animate", "convergence", "curves", "figure", "plot", "read_picture", "sample_file", "save", "stability_chart",
+    "unbeaten", "v_curve", "write_picture",
+]  # fmt: skip
 
 ARROWS = 24  # arrows along an axis of a face field, at most
 
@@ -59,21 +62,26 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, colours="viridis
     if np.iscomplexobj(u):
         raise TypeError(f"plot draws real fields, got dtype {u.dtype}; plot its real part or its absolute value")
     kind = _kind(grid, u.shape, at)
-    if ax is None:
-        ax = _matplotlib("pyplot").gca()
+    ax = _current(ax)
     arrows = None
     if kind == "faces" and grid.dim > 1:
         arrows = _at_centres(grid, u)
-        u, kind = np.sqrt(sum(part**2 for part in arrows)), "cells"
+        u, kind = _magnitude(arrows), "cells"
     if title is not None:
         ax.set_title(title)
     if grid.dim == 1:
-        return _line(grid, u, kind, ax, label)
-    shared = {"limits": limits or _range(u), "colours": colours, "label": label}
-    if grid.dim == 3:
-        return _slices(grid, u, kind, ax, shared)
-    _map(grid, u, kind, (0, 1), ax, shared)
-    if arrows is not None:
+        _line(grid, u, kind, ax, label)
+        return ax
+    low, high = limits or _range(u)
+    mesh = partial(_mesh, grid, kind, vmin=low, vmax=high, cmap=colours, shading="auto", rasterized=True)
+    if grid.dim == 2:
+        image = mesh(u, (0, 1), ax)
+        bar = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the map, whatever its shape
+    else:
+        image = _slices(grid, u, kind, ax, mesh)
+        bar = ax.inset_axes((0.93, 0.15, 0.02, 0.7))
+    ax.figure.colorbar(image, cax=bar, label=label or "")
+    if arrows is not None and grid.dim == 2:
         _arrows(grid, arrows, ax)
     return ax
 
@@ -130,9 +138,11 @@ def animate(grid, frames, path, title=None, limits=None, colours="viridis", rate
 
 def _drawn(grid, u):
     """The numbers whose colours a map shows: of a face field its magnitude."""
-    if grid.dim > 1 and _kind(grid, u.shape, None) == "faces":
-        return np.sqrt(sum(part**2 for part in _at_centres(grid, u)))
-    return u
+    return _magnitude(_at_centres(grid, u)) if grid.dim > 1 and _kind(grid, u.shape, None) == "faces" else u
+
+
+def _magnitude(parts):
+    return np.sqrt(sum(part**2 for part in parts))
 
 
 def _image(pixels):
@@ -163,42 +173,29 @@ def _places(grid, axis, kind):
 
 def _line(grid, u, kind, ax, label):
     ax.plot(_places(grid, 0, kind), u, marker="." if u.size <= 64 else None)
-    ax.set_xlim(grid.origin[0], grid.origin[0] + grid.size[0])
-    ax.set_xlabel("x")
-    ax.set_ylabel(label or "")
-    return ax
+    ax.set(xlim=(grid.origin[0], grid.origin[0] + grid.size[0]), xlabel="x", ylabel=label or "")
 
 
-def _map(grid, u, kind, axes, ax, shared, bar=True):
-    """One map of a 2-D array over two axes of the grid."""
+def _mesh(grid, kind, u, axes, ax, **options):
+    """One map of a 2-D array over two axes of the grid -> image."""
     if kind == "cells":  # the mesh of pcolormesh is the corners of the cells
         lines = [np.append(0.0, np.cumsum(grid.widths[a])) + grid.origin[a] for a in axes]
     else:
         lines = [grid.coordinates(a, "nodes") for a in axes]
-    low, high = shared["limits"]
+    ax.set(aspect="equal", xlabel=grid.axes[axes[0]], ylabel=grid.axes[axes[1]])
     # pcolormesh wants rows along y, so the array is turned here and nowhere else.
-    image = ax.pcolormesh(*lines, u.T, vmin=low, vmax=high, cmap=shared["colours"], shading="auto", rasterized=True)
-    ax.set_aspect("equal")
-    ax.set_xlabel(grid.axes[axes[0]])
-    ax.set_ylabel(grid.axes[axes[1]])
-    if bar:
-        beside = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the map, whatever its shape
-        ax.figure.colorbar(image, cax=beside, label=shared["label"] or "")
-    return image
+    return ax.pcolormesh(*lines, u.T, **options)
 
 
-def _slices(grid, u, kind, ax, shared):
-    """The three middle slices of a 3-D field, side by side inside one pair of axes."""
+def _slices(grid, u, kind, ax, mesh):
+    """The three middle slices of a 3-D field, side by side inside one pair of axes -> image."""
     ax.set_axis_off()
     for place, across in enumerate((2, 1, 0)):
         inset = ax.inset_axes((place * 0.33, 0.0, 0.2, 1.0))
-        along = [axis for axis in range(3) if axis != across]
         middle = u.shape[across] // 2
-        image = _map(grid, np.take(u, middle, axis=across), kind, along, inset, shared, bar=False)
+        image = mesh(np.take(u, middle, axis=across), [axis for axis in range(3) if axis != across], inset)
         inset.set_title(f"{grid.axes[across]} = {_places(grid, across, kind)[middle]:.3g}", fontsize="medium")
-    bar = ax.inset_axes((0.93, 0.15, 0.02, 0.7))
-    ax.figure.colorbar(image, cax=bar, label=shared["label"] or "")
-    return ax
+    return image
 
 
 def _at_centres(grid, v):
@@ -215,6 +212,157 @@ def _arrows(grid, arrows, ax):
     ax.quiver(x, y, arrows[0][steps], arrows[1][steps], color="white", pivot="mid")
 
 
+# ---------------------------------------------------------------- charts
+
+
+def unbeaten(points):
+    """Tuples that begin with two costs -> those that no other one beats in both, in the order of the first cost.
+
+    Examples
+    --------
+    >>> unbeaten([(3, 1), (1, 5), (2, 6), (2, 2)])
+    [(1, 5), (2, 2), (3, 1)]
+    """
+    best: list = []
+    for point in sorted(points, key=lambda point: point[:2]):
+        if not best or point[1] < best[-1][1]:
+            best.append(point)
+    return best
+
+
+def curves(lines, ax, xlabel, ylabel, title=None):
+    """Named curves -> one log-log picture; the best points reached at any time are marked.
+
+    Parameters
+    ----------
+    lines : dict
+        Name -> (x, y), two sequences of positive numbers.
+    ax : matplotlib Axes
+    xlabel, ylabel, title : str
+
+    Returns
+    -------
+    matplotlib Axes
+    """
+    best = unbeaten([point for x, y in lines.values() for point in zip(x, y, strict=True)])
+    ax.plot(*np.reshape(best, (-1, 2)).T, color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
+    for name, (x, y) in lines.items():
+        ax.plot(x, y, marker=".", markersize=4, linewidth=1, label=name)
+    return _dressed(ax, xlabel, ylabel, title)
+
+
+def _dressed(ax, xlabel, ylabel, title, xscale="log"):
+    ax.set(xlabel=xlabel, ylabel=ylabel, title=title, xscale=xscale, yscale="log")
+    ax.grid(visible=True, color="0.93")
+    if ax.get_legend_handles_labels()[1]:
+        ax.legend(frameon=False, fontsize="small")
+    return ax
+
+
+def convergence(best, ax=None, against="iteration"):
+    """Result of `minimise` -> picture of the loss and the gradient norm over iterations, seconds or solves.
+
+    Parameters
+    ----------
+    best : Minimum
+        From `minimise`.
+    ax : matplotlib Axes, optional
+        Default: the current axes of pyplot.
+    against : "iteration", "seconds", "evaluations" or "solves"
+        What runs across.
+
+    Returns
+    -------
+    matplotlib Axes
+        Logarithmic upwards; a loss that is not positive everywhere is drawn as its distance from the least one.
+
+    Raises
+    ------
+    ValueError
+        If `against` is another word.
+    ImportError
+        If matplotlib is not installed.
+
+    Examples
+    --------
+    >>> import autograd.numpy as anp
+    >>> from sparsedp import minimise
+    >>> best = minimise(lambda x: anp.sum((x - 1.0) ** 4), np.zeros(2), maxiter=5)
+    >>> convergence(best, figure().add_subplot()).get_xlabel()
+    'iteration'
+    """
+    if against not in ("iteration", "seconds", "evaluations", "solves"):
+        raise ValueError(f"convergence is drawn against iteration, seconds, evaluations or solves, got {against!r}")
+    ax = _current(ax)
+    across = [getattr(record, against) for record in best.history]
+    values = np.array([record.value for record in best.history])
+    label = "loss" if np.all(values > 0) else "loss - least loss"
+    values = values if np.all(values > 0) else values - values.min()
+    for name, heights in ((label, values), ("gradient norm", [record.gradient_norm for record in best.history])):
+        # A height of 0 has no logarithm and leaves a gap.
+        ax.plot(across, np.where(np.asarray(heights) > 0, heights, np.nan), marker=".", linewidth=1, label=name)
+    return _dressed(ax, against, "", f"{best.method}: {best.message.split(':')[0]}", xscale="linear")
+
+
+def v_curve(audit, ax=None):
+    """Audit of a gradient -> picture of |difference - gradient| over the step, one curve for each direction.
+
+    A right gradient gives a V: the error of the differences falls with the step until rounding lifts it. A
+    wrong one gives a plateau.
+
+    Parameters
+    ----------
+    audit : Audit
+        From `check.gradient`.
+    ax : matplotlib Axes, optional
+        Default: the current axes of pyplot.
+
+    Returns
+    -------
+    matplotlib Axes
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+
+    Examples
+    --------
+    >>> from sparsedp import check
+    >>> result = check.gradient(lambda u: np.sum(u**3), np.array([1.0, 2.0]), gradient=lambda u: 3 * u**2)
+    >>> v_curve(result, figure().add_subplot()).get_xlabel()
+    'step'
+    """
+    ax = _current(ax)
+    for name in dict.fromkeys(row["direction"] for row in audit.rows):
+        points = [(row["step"], abs(row["gap"])) for row in audit.rows
+                  if row["direction"] == name and not row["note"] and row["gap"]]  # fmt: skip
+        ax.plot(*np.reshape(points, (-1, 2)).T, marker=".", linewidth=1, label=name)
+    title = f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}"
+    return _dressed(ax, "step", "|difference - gradient| / |derivative|", title)
+
+
+def stability_chart(growth, ax):
+    """Stability map -> picture: growth factor over viscosity (across) and time step (up); refused steps are grey.
+
+    Parameters
+    ----------
+    growth : StabilityMap
+    ax : matplotlib Axes
+
+    Returns
+    -------
+    matplotlib Axes
+    """
+    ax.set_facecolor("0.75")
+    values = np.ma.masked_invalid(np.clip(growth.factors, 0.0, 2.0))
+    axes = growth.viscosities, growth.time_steps
+    image = ax.pcolormesh(*axes, values, vmin=0, vmax=2, cmap="coolwarm", shading="nearest")
+    ax.figure.colorbar(image, ax=ax, label="growth factor of a step (2 and more: red)")
+    ax.plot(*growth.here[::-1], marker="*", color="black", markersize=12)
+    return _dressed(ax, growth.names[1], growth.names[0], "stable: blue; grows: red; refused: grey")
+
+
 # ---------------------------------------------------------------- figures and files
 
 
@@ -223,7 +371,7 @@ def figure(width=5.5, height=4.4):
     return _matplotlib("figure").Figure(figsize=(width, height), layout="constrained")
 
 
-def axes_or_current(ax):
+def _current(ax):
     """The axes given, or the current ones of pyplot."""
     return _matplotlib("pyplot").gca() if ax is None else ax
 
@@ -231,6 +379,16 @@ def axes_or_current(ax):
 def save(picture, stream):
     """Write a figure as PNG to an open binary stream."""
     picture.savefig(stream, format="png", dpi=150, bbox_inches="tight", pad_inches=0.15)
+
+
+def write_picture(path, draw):
+    """``draw(axes) -> axes``, and where it goes -> [path] of the PNG that was written; [] without matplotlib."""
+    try:
+        ax = figure().add_subplot()
+    except ImportError:
+        return []
+    write_file(path, partial(save, draw(ax).figure))
+    return [path]
 
 
 def sample_file(name):

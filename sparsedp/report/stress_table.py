@@ -1,29 +1,17 @@
 """stress: a scene driven through stiff and extreme cases, one word for each."""
 
 import math
-from collections import Counter
+from functools import partial
 
-from sparsedp.check.findings import table
 from sparsedp.fields import check_function
-from sparsedp.report.hardships import GROUPS, cases
-from sparsedp.report.maps import stability_map
-from sparsedp.report.rows import csv_text
-from sparsedp.report.scene import Scene
-from sparsedp.report.trial import DEGRADED, FAILED, PASSED, REFUSED
+from sparsedp.report import plots
+from sparsedp.report.stability import stability_map
+from sparsedp.report.stress_cases import FAILED, GROUPS, WORDS, Scene, cases
+from sparsedp.report.table import csv_text, markdown_table, text_table
 
 __all__ = ["Stress", "stress"]
 
 COLUMNS = ("group", "parameter", "case", "outcome", "figure", "note")
-REASONS = {
-    "scaling": "every parameter is 0, or its range leaves no room",
-    "legal range": "no ranges were given; write ranges={'name': (low, high)}",
-    "zeros and signs": "outside the legal ranges",
-    "jumps": "no array of positive numbers without a range (arrays with a range jump between its ends)",
-    "constant added": "no array that is not 0",
-    "not finite": "the loss depends on no parameter",
-    "kinds of arrays": "no arrays",
-    "time step and viscosity": "no parameter has such a name; write time_step='name', viscosity='name'",
-}
 ELSEWHERE = (
     "isolated regions, solid cells, 1 cell, prime sizes, anisotropic cells: a loss keeps its grid; stress each",
     "10^4 steps: a loss keeps its number of steps",
@@ -85,25 +73,19 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     'grows and changes its sign from step to step: the step is too large'
     """
     check_function("stress", loss, "lambda x: np.sum(x**2)")
-    known = [make.__name__.strip("_").replace("_", " ") for make in GROUPS]
     for group in only or ():
-        if group not in known:
-            raise ValueError(f"stress has no cases {group!r}; write some of {', '.join(known)}")
+        if group not in GROUPS:
+            raise ValueError(f"stress has no cases {group!r}; write some of {', '.join(GROUPS)}")
+    chosen = GROUPS if only is None else only
     scene = Scene(loss, x, ranges, step, time_step, viscosity)
-    rows, left_out = [], []
-    for group, name, case, test in cases(scene):
-        if only is None or group in only:
-            word, figure, note = test()
-            if word is None:
-                left_out.append(f"{case}: {note}")
-            else:
-                rows.append(dict(zip(COLUMNS, (group, name, case, word, float(figure), note), strict=True)))
+    judged = [(*names, *judge()) for *names, judge in cases(scene, chosen)]
+    rows = [dict(zip(COLUMNS, row, strict=True)) for row in judged if row[3]]
+    left_out = [f"{row[2]}: {row[5]}" for row in judged if not row[3]]
     ran = {row["group"] for row in rows}
-    chosen = known if only is None else only
-    left_out += [f"{group}: {REASONS[group]}" for group in chosen if group in REASONS and group not in ran]
-    left_out += [f"{group}: not asked for" for group in known if group not in chosen]
-    drawn = stability_map(scene) if only is None or "time step and viscosity" in only else None
-    return Stress(rows, [*left_out, *ELSEWHERE], drawn)
+    left_out += [f"{group}: {GROUPS[group]}" for group in chosen if group not in ran and GROUPS[group]]
+    left_out += [f"{group}: not asked for" for group in GROUPS if group not in chosen]
+    growth = stability_map(scene) if "time step and viscosity" in chosen else None
+    return Stress(rows, [*left_out, *ELSEWHERE], growth)
 
 
 class Stress:
@@ -118,14 +100,13 @@ class Stress:
     map : StabilityMap or None
     """
 
-    def __init__(self, rows, left_out, drawn):
-        self.rows, self.left_out, self.map = rows, left_out, drawn
+    def __init__(self, rows, left_out, growth):
+        self.rows, self.left_out, self.map = rows, left_out, growth
 
     @property
     def counts(self):
         """Number of rows by outcome."""
-        found = Counter(row["outcome"] for row in self.rows)
-        return {word: found[word] for word in (PASSED, REFUSED, DEGRADED, FAILED)}
+        return {word: sum(row["outcome"] == word for row in self.rows) for word in WORDS}
 
     @property
     def failures(self):
@@ -137,16 +118,14 @@ class Stress:
 
     def to_dict(self):
         """Everything as plain numbers, strings, lists and dicts."""
-        drawn = None if self.map is None else self.map.to_dict()
-        return {"counts": self.counts, "rows": [dict(r) for r in self.rows], "left_out": self.left_out, "map": drawn}
+        rows = [dict(row) for row in self.rows]
+        return {"counts": self.counts, "rows": rows, "left_out": self.left_out, "map": self.map and self.map.to_dict()}
 
     def markdown(self):
         """The table in Markdown, the map and what was left out."""
-        lines = [f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}"]
-        lines += [f"| {' | '.join(cell.replace('|', '/') for cell in _cells(row))} |" for row in self.rows]
-        drawn = [] if self.map is None else ["", "Growth factor of a step:", "", "```text", str(self.map), "```"]
+        growth = ["", "Growth factor of a step:", "", "```text", str(self.map), "```"] if self.map else []
         left = [f"- left out: {sentence}" for sentence in self.left_out]
-        return "\n".join([self.summary, "", *lines, *drawn, "", *left]) + "\n"
+        return "\n".join([self.summary, "", *markdown_table(COLUMNS, map(_cells, self.rows)), *growth, "", *left, ""])
 
     def csv(self):
         """The rows as CSV."""
@@ -168,11 +147,9 @@ class Stress:
         ValueError
             If the scene has no stability map.
         """
-        from sparsedp.report import charts, plots
-
         if self.map is None:
             raise ValueError("this scene has no stability map; it needs a rollout, a time step and a viscosity by name")
-        return charts.stability(self.map, plots.figure().add_subplot() if ax is None else ax)
+        return plots.stability_chart(self.map, plots.figure().add_subplot() if ax is None else ax)
 
     @property
     def summary(self):
@@ -180,15 +157,16 @@ class Stress:
         return "stress: " + ", ".join(f"{many} {word}" for word, many in self.counts.items())
 
     def __str__(self):
-        lines = [_cells(row, 70) for row in self.rows]
-        drawn = [] if self.map is None else ["growth factor of a step:", str(self.map)]
+        growth = ["growth factor of a step:", str(self.map)] if self.map else []
         left = [f"  left out: {sentence}" for sentence in self.left_out]
-        return "\n".join([table(lines, COLUMNS), *drawn, *left, self.summary])
+        lines = map(partial(_cells, most=70), self.rows)
+        return "\n".join([text_table(lines, COLUMNS), *growth, *left, self.summary])
 
     __repr__ = __str__
 
 
-def _cells(row, most=None):
+def _cells(row, most=10_000):
+    """The texts of a row; a note of at most so many letters."""
     figure = "" if math.isnan(row["figure"]) else f"{row['figure']:.2g}"
-    note = row["note"] if most is None or len(row["note"]) <= most else row["note"][: most - 3] + "..."
+    note = row["note"] if len(row["note"]) <= most else row["note"][: most - 3] + "..."
     return row["group"], row["parameter"], row["case"], row["outcome"], figure, note

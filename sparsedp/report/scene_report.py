@@ -1,0 +1,298 @@
+"""A scene in a file, named on the command line, and the report on it: all instruments in one folder.
+
+The folder gets Markdown, CSV and pictures of each instrument, and a page that says what they say.
+"""
+
+import contextlib
+import inspect
+import os
+import re
+import runpy
+import sys
+import traceback
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sparsedp import check
+from sparsedp.files import write_file
+from sparsedp.report import plots
+from sparsedp.report.certificate import certify
+from sparsedp.report.plan import explain
+from sparsedp.report.stress_table import stress
+from sparsedp.report.table import csv_text, markdown_table
+from sparsedp.report.work_precision import Rows, words_of, workprec
+
+__all__ = ["Source", "audited", "claim", "load", "write_report"]
+
+STARTS = ("start", "x")  # names of the point, the first that is there
+OPTIONS = ("workprec_options", "stress_options")  # dicts of arguments in the file
+PAGE = "report.md"
+GOAL = 0.01  # the error that the page recommends a method for, in a sentence
+GOALS = 0.1, GOAL, 1e-3, 1e-4, 1e-6  # and in a table
+LEFT = "left out"  # in every sentence about it
+MEANING = {
+    "agrees": "The gradient is what differences of the loss say, and no stiff or extreme case failed.",
+    "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
+    "inconclusive": "Nothing is proved: the reason stands below. This is no pass.",
+}
+
+
+# ---------------------------------------------------------------- a scene in a file
+
+
+class Source(NamedTuple):
+    """A loss, the point where it is examined, and what else the file tells the instruments."""
+
+    name: str
+    loss: Any
+    x: Any
+    workprec: dict
+    stress: dict
+
+
+def load(target):
+    """Target -> Source. The file is run once, as a module; what it prints goes to stderr.
+
+    Parameters
+    ----------
+    target : str
+        ``FILE.py[:loss[:start]]``. Without a name the loss is called `loss`, and the point `start` or `x`; a point
+        that is a tuple fills a loss of several arguments. Two dicts in the file are handed on: `workprec_options`
+        (problem, methods, ...) and `stress_options` (ranges, step, ...).
+
+    Raises
+    ------
+    ValueError
+        If there is no such file, it does not run, or a name is missing.
+    """
+    parts = re.fullmatch(r"(.+\.py)(?::([^:]+))?(?::([^:]+))?", target)
+    if parts is None:
+        raise ValueError(f"{target!r} names no scene; write FILE.py:loss, or FILE.py:loss:start")
+    file, loss, start = Path(parts[1]), parts[2] or "loss", parts[3]
+    found = _run(file)
+    if not callable(found.get(loss)):
+        raise ValueError(f"{file} has no function {loss!r}; write {file}:NAME of the function to examine")
+    names = [start] if start else [name for name in STARTS if name in found]
+    if not names or names[0] not in found:
+        raise ValueError(f"{file} has no {start or ' or '.join(STARTS)!r}, the point; write {file}:{loss}:NAME")
+    name = file.stem if loss == "loss" else f"{file.stem}-{loss}"
+    options = [found.get(key, {}) for key in OPTIONS]
+    for key, given in zip(OPTIONS, options, strict=True):
+        if not isinstance(given, dict):
+            raise ValueError(f"{key} in {file} must be a dict of arguments, got {type(given).__name__}")
+    return Source(name, _of_one(found[loss], found[names[0]]), found[names[0]], *options)
+
+
+@contextlib.contextmanager
+def audited(name):
+    """In it a loss of the user's runs: what it prints goes to stderr, and what it raises, an exit too, is refused."""
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        cure = "" if isinstance(error, Exception) else "; it ended the program, let it return its value"
+        raise ValueError(f"{name} cannot be audited: {type(error).__name__}: {error}{cure}") from error
+
+
+def _of_one(loss, x):
+    """The loss as a function of one point: a point that is a tuple fills a loss of several arguments."""
+    if not isinstance(x, tuple) or hasattr(x, "_fields"):
+        return loss
+    try:
+        inspect.signature(loss).bind(None)
+    except TypeError:
+        return lambda point: loss(*point)
+    except ValueError:  # a function of C without a signature
+        return loss
+    return loss
+
+
+def _run(file):
+    if not os.path.isfile(file):  # Path.is_file raises for a name that is too long
+        raise ValueError(f"there is no file {file}; name one that is there")
+    before = sys.argv, sys.path
+    sys.argv, sys.path = [str(file)], [str(file.resolve().parent), *sys.path]
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            return runpy.run_path(str(file), run_name=file.stem)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # the file is the user's: it may raise anything, or end the program
+        raise ValueError(f"{file} does not run: {_where(error, file)}{type(error).__name__}: {error}") from error
+    finally:
+        sys.argv, sys.path = before
+
+
+def _where(error, file):
+    """The last line of the file itself that took part, in words."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)]
+    line = error.lineno if isinstance(error, SyntaxError) else frames[-1].lineno if frames else None
+    return "" if line is None else f"line {line}: "
+
+
+# ---------------------------------------------------------------- the report on it
+
+
+def claim(folder, names, force):
+    """Make a folder, and refuse when it holds one of these files and `force` is not set."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{folder} cannot be made a folder: {error.strerror}; name another with --out") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{folder} cannot be written to; name another with --out")
+    for path in (folder / name for name in names):
+        if os.path.lexists(path) and not force:
+            raise ValueError(f"{path} is there already; name another folder with --out, or write --force")
+
+
+def write_report(source, folder, force=False):
+    """Scene and folder -> (verdict, sentences): "agrees", "disagrees" or "inconclusive", and what stands on the page.
+
+    Parameters
+    ----------
+    source : Source
+    folder : pathlib.Path
+    force : bool
+        Whether a report that is there may be replaced.
+
+    Raises
+    ------
+    ValueError
+        If there is a report already, the folder cannot be written, or the loss ends the program.
+    OSError
+        If a file cannot be written.
+    """
+    claim(folder, [PAGE], force)
+    with audited(source.name):
+        results = [_attempt(run, source) for _, _, run, _ in CHAPTERS]
+    chapters = {
+        title: [f"{failed}, {result}"] if isinstance(result, str) else list(tell(result, folder))
+        for (title, failed, _, tell), result in zip(CHAPTERS, results, strict=True)
+    }
+    verdict = _verdict(results[0], results[-1])
+    page = [f"# {source.name}: {verdict}", "", MEANING[verdict]]
+    left = []
+    for (title, sentences), result in zip(chapters.items(), results, strict=True):
+        left += [one for one in sentences if LEFT in one]
+        page += ["", f"## {title}", "", *(f"- {one}" for one in sentences if LEFT not in one)]
+        page += ["", *_goals(result)] if isinstance(result, Rows) else []
+    page += ["", "## What was left out, and why", "", *(f"- {one}" for one in left), "", *_details(folder)]
+    write_file(folder / PAGE, "\n".join(page))
+    return verdict, [one for sentences in chapters.values() for one in sentences]
+
+
+def _attempt(run, source):
+    """What an instrument gives, or the error in words: one that fails does not take the others with it."""
+    try:
+        return run(source)
+    except Exception as error:  # the loss is the user's: it may raise anything
+        return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _verdict(audit, trial):
+    """Wrong beats open: a gradient that disagrees or a case that FAILED, then anything that was not decided."""
+    if getattr(audit, "verdict", None) == "disagrees" or not trial:
+        return "disagrees"
+    return "inconclusive" if isinstance(audit, str) or isinstance(trial, str) else audit.verdict
+
+
+def _write(folder, stem, title, text, rows):
+    """The Markdown and the CSV of an instrument."""
+    write_file(folder / f"{stem}.md", f"# {title}\n\n{text}\n")
+    write_file(folder / f"{stem}.csv", csv_text(rows))
+
+
+def _fenced(result):
+    return f"```text\n{result}\n```"
+
+
+def _audit(audit, folder):
+    _write(folder, "audit", "Audit of the gradient", _fenced(audit), audit.rows)
+    plots.write_picture(folder / "audit.png", lambda ax: plots.v_curve(audit, ax))
+    digits = f", {audit.digits} digits" if audit.digits is not None else ""
+    yield f"gradient: {audit.verdict}{digits}{': ' if audit.reason else ''}{audit.reason}"
+    if audit.culprit:
+        yield f"at fault: {audit.culprit}"
+
+
+def _workprec(table, folder):
+    if table is None:
+        yield "error against run time: left out; the file gives no workprec_options (problem, methods, over, reference)"
+        return
+    table.save(folder)
+    error, words = _judged_by(table)
+    best = table.best(GOAL, error)
+    if best is None:
+        yield f"error against run time: no method reaches a {words} of {GOAL:g}, see {table.stem}.md"
+    else:
+        name, settings, _, seconds = _method(table, best, error)
+        yield f"fastest at a {words} of {100 * GOAL:g} %: {name} ({settings}), {seconds} s"
+    yield from (f"error against run time left out {sentence}" for sentence in table.left_out)
+
+
+def _judged_by(table):
+    """The error that methods are compared by, as a column and in words: that of the gradient, where there is one."""
+    error = "gradient_error" if table.pareto() else "forward_error"
+    return error, error.replace("_", " ")
+
+
+def _method(table, row, error):
+    """A row as texts: method, settings, error, seconds."""
+    return row["method"], words_of(row), f"{100 * row[error]:.2g} %", f"{table.seconds(row, error):.1e}"
+
+
+def _goals(table):
+    """The fastest method for each error, as lines of a Markdown table."""
+    error, words = _judged_by(table)
+    best = [(goal, table.best(goal, error)) for goal in GOALS]
+    lines = [
+        (f"{100 * goal:g} %", *(("none here", "", "", "") if row is None else _method(table, row, error)))
+        for goal, row in best
+    ]
+    return markdown_table((f"{words} at most", "fastest method", "its settings", f"its {words}", "seconds"), lines)
+
+
+def _certificate(certificate, folder):
+    _write(folder, "certificate", "Error that solves leave", _fenced(certificate), certificate.solves)
+    yield f"error of the gradient from its solves: about {certificate.gradient_error:.1e}; {certificate.advice}"
+
+
+def _plan(plan, folder):
+    _write(folder, "plan", "What was computed, and what was left out", _fenced(plan), plan.rows)
+    yield f"one gradient: {plan.sums}"
+    yield from (f"left out: {sentence}" for sentence in plan.left_out)
+
+
+def _stress(trial, folder):
+    _write(folder, "stress", "Stiff and extreme cases", trial.markdown(), trial.rows)
+    if trial.map is not None:
+        plots.write_picture(folder / "stress.png", trial.plot)
+    yield trial.summary
+    for row in trial.failures:
+        yield ": ".join(["FAILED", f"{row['parameter']} {row['case']}".strip(), row["note"]])
+    yield from (f"stress left out {sentence}" for sentence in trial.left_out)
+
+
+# Title, what is said when the instrument fails, the instrument, and what it says (and writes). The audit comes first
+# and the stress cases last: both have a say in the verdict.
+CHAPTERS = (
+    ("Is the gradient right?", "gradient: not audited", lambda s: check.gradient(s.loss, s.x), _audit),
+    ("Which method for which error?", "error against run time: not measured",
+     lambda s: workprec(**s.workprec) if s.workprec else None, _workprec),
+    ("How exact is the gradient, and how exact need the solves be?", "certificate: not made",
+     lambda s: certify(s.loss, s.x), _certificate),
+    ("What one gradient computes", "plan: not made", lambda s: explain(s.loss, s.x), _plan),
+    ("Stiff and extreme cases", "stress: not run", lambda s: stress(s.loss, s.x, **s.stress), _stress),
+)  # fmt: skip
+
+
+def _details(folder):
+    names = sorted(
+        path.name for path in folder.iterdir() if path.suffix in (".md", ".csv", ".png") and path.name != PAGE
+    )
+    links = ", ".join(f"[{name}]({name})" for name in names)
+    pictures = [f"![{name}]({name})" for name in names if name.endswith(".png")]
+    return ["## Details", "", f"Tables and numbers: {links}", "", *pictures, ""]

@@ -1,0 +1,169 @@
+"""The growth factor of a time step: by how much a small change of the state grows in one step; and its map.
+
+A change is carried along the run by the tangent of the step and made small again after each step; what it grows
+by, once the fastest mode has won, is the growth factor (G. Benettin et al., Meccanica 15, 1980). Above 1 is not
+wrong in itself: unstable physics grows. It is the step that is wrong when the fastest mode changes its sign from
+step to step, or when the growth per unit of time falls with the step.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sparsedp.derivative import NO_JVP, pushforward
+from sparsedp.errors import SparsedpError
+from sparsedp.ledger import thread
+from sparsedp.report.table import Result, text_table
+from sparsedp.tape import is_variable
+from sparsedp.tree import flatten, leaves, norm
+
+__all__ = ["SEED", "STEADY", "Growth", "StabilityMap", "growth_of", "stability_map"]
+
+SEED = 20240229  # of random changes, here and in the stress cases
+STEPS, SETTLED = 40, 20  # steps in all, and those that are measured
+STEADY = 1.0 + 1e-3  # growth factors up to here do not count as growth
+SMALL = 1e-6  # change of the state, in units of itself, where a step has no tangent
+POINTS, DECADES = 9, 2.0  # of the map along each axis; on either side of the values of the scene
+
+
+class Growth(NamedTuple):
+    """Growth factor of one step, NaN where there is none; whether the fastest mode flips its sign; the error."""
+
+    factor: float
+    flips: bool = False
+    refusal: str = ""
+
+
+class Loop(Exception):
+    """Carries the first rollout out of a loss before it runs; `args` are one step of it, and where it starts."""
+
+
+def growth_of(loss, x, step=None):
+    """Loss and point -> Growth of the step of its first rollout; None without one.
+
+    ``step(x) -> (advance, state)`` gives another loop.
+    """
+    with np.errstate(all="ignore"):
+        try:
+            loop = _first_rollout(loss, x) if step is None else step(x)
+            return loop and _measured(*loop)
+        except (SparsedpError, ValueError, ArithmeticError, RuntimeError) as error:
+            return Growth(np.nan, refusal=type(error).__name__)
+
+
+def _first_rollout(loss, x):
+    def leave(step, state, params, inputs, n):
+        if n:
+            found, rebuild = flatten(inputs)
+            first = rebuild([leaf[0] if isinstance(leaf, np.ndarray) else leaf for leaf in found])
+            rest = () if inputs is None else (first,)
+            raise Loop(lambda state: step(state, params, *rest), state)
+
+    thread.loops.append(leave)
+    try:
+        loss(x)
+    except Loop as loop:
+        return loop.args
+    finally:
+        thread.loops.remove(leave)
+    return None
+
+
+def _measured(advance, state):
+    rng = np.random.default_rng(SEED)
+    change = [np.asarray(rng.standard_normal(np.shape(leaf))) for leaf in _floating(state)]
+    size = norm(change) or 1.0
+    logarithms, flips = [], []
+    for _ in range(STEPS):
+        change = [part / size for part in change]
+        before = change
+        state, change = _pushed(advance, state, before)
+        size = norm(change)
+        if size == 0 or not np.isfinite(size):
+            return Growth(0.0) if size == 0 else Growth(np.inf, flips=True)
+        logarithms.append(np.log(size))
+        flips.append(sum(float(np.sum(a * b).real) for a, b in zip(before, change, strict=True)) < 0)
+    return Growth(float(np.exp(np.mean(logarithms[-SETTLED:]))), float(np.mean(flips[-SETTLED:])) > 0.5)
+
+
+def _pushed(advance, state, change):
+    """(next state, change of it) for a change of the state."""
+    try:
+        after, moved = pushforward(advance, state, _with(state, change))
+        return after, _floating(moved)
+    except NO_JVP:  # a rule without a JVP
+        here = _floating(state)
+        t = SMALL * (norm(here) or 1.0)
+        after = advance(state)
+        other = advance(_with(state, [a + t * b for a, b in zip(here, change, strict=True)]))
+        return after, [(b - a) / t for a, b in zip(_floating(after), _floating(other), strict=True)]
+
+
+def _floating(state):
+    return [leaf for leaf in leaves(state) if is_variable(leaf)]
+
+
+def _with(state, parts):
+    """The tree of a state with other floating leaves."""
+    found, rebuild = flatten(state)
+    fresh = iter(parts)
+    return rebuild([next(fresh) if is_variable(leaf) else leaf for leaf in found])
+
+
+class StabilityMap(Result):
+    """Growth factors over time step (down) and viscosity (across).
+
+    Attributes
+    ----------
+    names : (str, str)
+    time_steps, viscosities : 1-D arrays
+    factors : 2-D array
+        Growth factor of a step; NaN where the step is refused.
+    here : (float, float)
+        Time step and viscosity of the scene.
+    """
+
+    names: tuple
+    time_steps: np.ndarray
+    viscosities: np.ndarray
+    factors: np.ndarray
+    here: tuple
+
+    def to_dict(self):
+        """The map as plain lists; None where the step is refused."""
+        factors = [[None if np.isnan(f) else float(f) for f in row] for row in self.factors]
+        return {"time_steps": self.time_steps.tolist(), "viscosities": self.viscosities.tolist(), "factors": factors}
+
+    def __str__(self):
+        rows = [(f"{dt:.1e}", *map(_cell, row)) for dt, row in zip(self.time_steps, self.factors, strict=True)]
+        return text_table(rows, (" \\ ".join(self.names), *(f"{nu:.1e}" for nu in self.viscosities)))
+
+
+def _cell(factor):
+    return "refused" if np.isnan(factor) else f"{factor:.3g}"
+
+
+def stability_map(scene):
+    """Scene -> StabilityMap, or None where it has no loop, or no named time step and viscosity of one number each."""
+    names = tuple(scene.named.values())
+    if None in names or scene.growth is None or scene.growth.refusal:
+        return None
+    here = [scene.leaves[name] for name in names]
+    if any(np.size(value) != 1 or np.min(value) <= 0 for value in here):
+        return None
+    dts, nus = (_values(float(np.max(value)), scene.ranges.get(name)) for name, value in zip(names, here, strict=True))
+
+    def factor(*pair):
+        other = {name: a * np.ones_like(b) for name, a, b in zip(names, pair, here, strict=True)}
+        growth = growth_of(scene.loss, scene.at(other), scene.step)
+        return np.nan if growth is None else growth.factor
+
+    factors = np.array([[factor(dt, nu) for nu in nus] for dt in dts])
+    place = tuple(float(np.max(value)) for value in here)
+    return StabilityMap(names=names, time_steps=dts, viscosities=nus, factors=factors, here=place)
+
+
+def _values(value, limits):
+    if limits is not None and limits[0] > 0:
+        return np.geomspace(limits[0], limits[1], POINTS)
+    return value * 10.0 ** np.linspace(-DECADES, DECADES, POINTS)

@@ -1,0 +1,454 @@
+"""workprec: error against run time, of values and of gradients, one row for each run."""
+
+import csv
+import itertools
+import json
+import math
+import platform
+import statistics
+import tracemalloc
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from sparsedp.derivative import value_and_grad
+from sparsedp.errors import SparsedpError
+from sparsedp.fields import check_function, is_whole
+from sparsedp.files import write_file
+from sparsedp.ledger import recording
+from sparsedp.report import plots
+from sparsedp.report.certificate import distance
+from sparsedp.report.table import csv_text, markdown_table, text_table
+from sparsedp.tree import leaves, norm
+
+__all__ = ["COLUMNS", "Rows", "measured_row", "relative_distance", "timed", "versions", "words_of", "workprec"]
+
+COLUMNS = (
+    "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
+    "seconds_forward", "seconds_backward", "peak_bytes", "solves_forward", "solves_adjoint", "iterations", "status",
+    "seed", "versions", "settings", "reference_error", "seconds_forward_median", "seconds_forward_max",
+    "seconds_backward_median", "seconds_backward_max",
+)  # fmt: skip
+TEXTS = ("scene", "method", "status", "seed", "versions", "settings")
+KEY = ("scene", "method", "settings", "seed")  # what a row of an earlier run is found by
+SHOWN = COLUMNS[1:15]
+SETTLED = 2.0  # a run that is not faster than the last one by more is warm
+MOST_WARM_UPS = 7
+SHORT = 2e-3  # [s]: below, times differ for other reasons
+FAILURES = (SparsedpError, ArithmeticError, ValueError, MemoryError, np.linalg.LinAlgError)
+
+
+def workprec(
+    problem, methods, over=None, reference=None, compare=None, repeats=3, file=None, scene=None, skip=None, seed=0
+):
+    """Problem and methods -> error against run time: a table, one row for each method and setting.
+
+    Parameters
+    ----------
+    problem : callable
+        ``problem(**settings)`` -> (loss, x) or (loss, x, facts). Facts are columns (unknowns, steps, tolerance);
+        facts["output"], a function of x, gives the array that the forward error is about in place of the loss.
+        With x None, loss() is the run itself (an optimiser, say) and its result the answer; it has no gradient.
+    methods : dict
+        Name of a method -> dict of its settings.
+    over : dict, optional
+        Name of a setting -> list of values: every method is run with every combination.
+    reference : (value, gradient), callable, dict, or list of two dicts
+        The exact answer and gradient; a function of the settings in `over` that gives them; or settings that
+        replace those of the row: of two the second is used, and its distance from the first is the error of
+        the reference. Default: the errors are NaN.
+    compare : callable, optional
+        ``compare(found, wanted)`` -> error of a gradient or an answer. Default: Euclidean, relative.
+    repeats : int
+        Timed runs after the warm ones; the least counts.
+    file : path, optional
+        CSV file: rows are added as they finish, and those in it are not run again.
+    scene : str, optional
+        Default: the name of `problem`.
+    skip : callable, optional
+        ``skip(method, settings)`` -> the reason why a run is left out, or None.
+    seed : int
+        Noted in every row; handed to the problem by the caller.
+
+    Returns
+    -------
+    Rows
+        `.rows` (dicts), `.markdown()`, `.csv()`, `.plot(ax)`, `.pareto()`, `.save(folder)`, `.left_out`; str() is
+        the table.
+
+    Raises
+    ------
+    ValueError
+        If `repeats` is not a whole number >= 1, there is no method, or the file is not such a table.
+    TypeError
+        If the problem does not give (loss, x).
+
+    Notes
+    -----
+    Every run is warm: it is repeated until its time has settled, and one that does not settle has the status
+    not_warm and no time. Set-up: the time of problem(...) and of the first set-ups of solvers. Backward: the time
+    of value and gradient less that of the value. Peak bytes: what Python's allocator saw in one run. A run that
+    fails keeps its row, with the status of its solve or the name of its error.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid, dirichlet, inverse, laplacian
+    >>> def poisson(cells, method):
+    ...     solve = inverse(-laplacian(Grid(cells, size=1.0), dirichlet), method)
+    ...     return lambda s: solve(s * np.ones(cells)).mean(), 1.0
+    >>> table = workprec(poisson, {"direct": {"method": "direct"}}, {"cells": [8, 16, 32]}, reference=(1 / 12, 1 / 12))
+    >>> [f"{row['gradient_error']:.4f}" for row in table.rows]
+    ['0.0313', '0.0078', '0.0020']
+    """
+    check_function("workprec", problem, "lambda cells: (loss, x)")
+    if not is_whole(repeats, 1):
+        raise ValueError(f"workprec needs repeats >= 1, a whole number, got {repeats!r}; the default is 3")
+    if not methods or not isinstance(methods, dict):
+        raise ValueError("workprec needs at least one method; write {'name': {settings}}")
+    scene, over = scene or getattr(problem, "__name__", "scene"), over or {}
+    finished, left_out = _finished(Path(file)) if file else ({}, [])
+    errors = partial(_errors, problem, reference, compare or relative_distance, {})
+    rows = []
+    for (method, own), *values in itertools.product(methods.items(), *over.values()):
+        shared = dict(zip(over, values, strict=True))
+        settings = shared | own
+        reason = skip and skip(str(method), settings)
+        if reason:
+            left_out.append(f"{method} with {_words(settings)}: {reason}")
+            continue
+        key = scene, str(method), _text_of(settings), str(seed)
+        row = finished.get(key)
+        if row is None:
+            figures, *result = measured_row(problem, settings, repeats)
+            figures |= errors({name: settings[name] for name in over}, *result)
+            row = dict.fromkeys(COLUMNS, np.nan) | {name: figures[name] for name in figures if name in COLUMNS}
+            row |= {**dict(zip(KEY, key, strict=True)), "versions": versions()}
+            if file:
+                _append(Path(file), row)
+        rows.append(row)
+    return Rows(scene, rows, left_out)
+
+
+def words_of(row):
+    """The settings of a row in words."""
+    return _words(json.loads(row["settings"]))
+
+
+def _words(settings):
+    return ", ".join(f"{name}={value}" for name, value in settings.items()) or "no settings"
+
+
+def _text_of(settings):
+    return json.dumps(settings, sort_keys=True, default=str)
+
+
+def versions():
+    """Python and the libraries that figures depend on, in words."""
+    found = [f"python {platform.python_version()}"]
+    for name in ("sparsedp", "numpy", "scipy", "autograd", "pyamg", "numba"):
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            found.append(f"{name} -")
+    return " ".join(found)
+
+
+# ---------------------------------------------------------------- one run: timed, weighed, counted
+
+
+def measured_row(problem, settings, repeats):
+    """Settings of one run -> (row of figures, answer, gradient). What fails keeps a row with its status."""
+    try:
+        setup, given = timed(partial(problem, **settings))
+        loss, x, facts = _task(given)
+        run = _runs(loss, x)[-1]
+        calls, status, first = _warm(run)
+        row = {"status": status, "seconds_setup": setup + sum(s for (_, kind), s in first.items() if kind == "setup")}
+        for column, kind in (("solves_forward", "solve"), ("solves_adjoint", "adjoint"), ("iterations", "iterations")):
+            row[column] = sum(many for (_, other), many in calls.items() if other == kind)
+        value, gradient = _times(_runs(loss, x), row, repeats)
+        row["peak_bytes"] = _peak(run)
+        answer = _answer(value, x, facts)
+    except FAILURES as error:
+        return {"status": _failure(error)}, None, None
+    if not np.all(np.isfinite(answer)):
+        row["status"] = "nonfinite"
+    size = sum(map(np.size, leaves(answer if x is None else x)))
+    return {"unknowns": size, **facts, **row}, answer, gradient
+
+
+def _task(given):
+    """(loss, x) or (loss, x, facts) -> all three."""
+    if not isinstance(given, tuple) or len(given) not in (2, 3):
+        raise TypeError(
+            f"a problem gives (loss, x) or (loss, x, facts), got {type(given).__name__}; write return loss, x"
+        )
+    return (*given, {})[:3]
+
+
+def _runs(loss, x):
+    """[function that gives the value or answer, function that gives it with the gradient where there is one]."""
+    return [loss] if x is None else [partial(loss, x), partial(value_and_grad(loss), x)]
+
+
+def _answer(value, x, facts):
+    """What the forward error is about: the output if the facts name one, else the value."""
+    output = facts.get("output")
+    return np.asarray(value if output is None else output(x), float)
+
+
+def timed(run):
+    clock = perf_counter()
+    result = run()
+    return perf_counter() - clock, result
+
+
+def _warm(run):
+    """Run until the time has settled: compiled code, caches of set-ups, imports.
+
+    Gives the calls of the last run, whether it is warm, and the seconds of the calls of the first.
+    """
+    before, first = math.inf, None
+    for _ in range(MOST_WARM_UPS):
+        with recording() as calls:
+            now, _ = timed(run)
+        first = calls.seconds if first is None else first
+        if before <= SETTLED * now + SHORT:  # it does not fall any more
+            return calls, "ok", first
+        before = now
+    return calls, "not_warm", first
+
+
+def _times(runs, row, repeats):
+    """Run times into the row: the least, the median and the largest of the repeats -> (value, gradient).
+
+    NaN when the caches never got warm. The time of the gradient is that of both less the least of the value.
+    """
+    least, result = 0.0, (None, None)
+    for name, run in zip(("seconds_forward", "seconds_backward"), runs, strict=False):
+        pairs = [timed(run) for _ in range(repeats)]
+        seconds = [max(spent - least, 0.0) if row["status"] == "ok" else math.nan for spent, _ in pairs]
+        least, result = min(seconds), pairs[-1][1]
+        row |= {name: least, f"{name}_median": statistics.median(seconds), f"{name}_max": max(seconds)}
+    return result if len(runs) > 1 else (result, None)
+
+
+def _peak(run):
+    """Bytes that a run holds at most, beyond what there was before, as Python's allocator sees it."""
+    running = tracemalloc.is_tracing()
+    if not running:
+        tracemalloc.start()
+    try:
+        tracemalloc.reset_peak()
+        before = tracemalloc.get_traced_memory()[0]
+        run()
+        return tracemalloc.get_traced_memory()[1] - before
+    finally:
+        if not running:
+            tracemalloc.stop()
+
+
+def _failure(error):
+    """Status of a run that failed: the word of the solve, or the name of the error."""
+    return getattr(getattr(error, "info", None), "status", None) or type(error).__name__
+
+
+# ---------------------------------------------------------------- exact answers
+
+
+def _errors(problem, given, compare, cache, shared, answer, gradient):
+    """The columns of errors of one run; a reference is found once for the settings that the methods share."""
+    if given is None or answer is None:
+        return {}
+    try:
+        key = _text_of(shared)
+        if key not in cache:
+            cache[key] = _reference(problem, given, compare, shared)
+        value, slope, error = cache[key]
+        gaps = {"forward_error": compare(answer, value), "reference_error": error}
+        return gaps if gradient is None or slope is None else {**gaps, "gradient_error": compare(gradient, slope)}
+    except FAILURES as trouble:
+        return {"status": f"reference: {_failure(trouble)}"}
+
+
+def _reference(problem, given, compare, shared):
+    """(answer, gradient, error of the reference)."""
+    if callable(given) or isinstance(given, tuple):
+        return *(given(**shared) if callable(given) else given), 0.0
+    results = []
+    for settings in [given] if isinstance(given, dict) else given:
+        loss, x, facts = _task(problem(**{**shared, **settings}))
+        value, gradient = (loss(), None) if x is None else value_and_grad(loss)(x)
+        results.append((_answer(value, x, facts), gradient))
+    pairs = [(a, b) for a, b in zip(*results[-2:], strict=True) if a is not None] if len(results) > 1 else []
+    return *results[-1], max((compare(a, b) for a, b in pairs), default=math.nan)
+
+
+def relative_distance(one, other):
+    """Euclidean distance relative to the second."""
+    for a, b in zip(leaves(one), leaves(other), strict=True):
+        if np.shape(a) != np.shape(b):
+            raise ValueError(
+                f"workprec cannot compare shape {np.shape(a)} with {np.shape(b)}; give compare=function(found, wanted)"
+            )
+    return distance(one, other) / (norm(other) or 1.0)
+
+
+# ---------------------------------------------------------------- the table
+
+
+class Rows:
+    """Error against run time. Made by `workprec`.
+
+    Attributes
+    ----------
+    scene : str
+    rows : list of dict
+        Keys are COLUMNS; NaN where a figure does not exist.
+    left_out : list of str
+        Runs that were not made, with the reason.
+    """
+
+    def __init__(self, scene, rows, left_out):
+        self.scene, self.rows, self.left_out = scene, rows, left_out
+
+    @property
+    def stem(self):
+        """What the files of `save` are called."""
+        return self.scene.replace("/", "-")
+
+    def seconds(self, row, error="gradient_error"):
+        """The run time that belongs to an error: of the value, or of value and gradient."""
+        return row["seconds_forward"] + (row["seconds_backward"] if error == "gradient_error" else 0.0)
+
+    def _points(self, error):
+        """(seconds, error, row) of the runs that have both."""
+        points = [(self.seconds(row, error), row[error], row) for row in self.rows if row["status"] == "ok"]
+        return [point for point in points if math.isfinite(point[0] + point[1])]
+
+    def pareto(self, error="gradient_error"):
+        """Rows that no other row beats in both time and error, the fastest first."""
+        return [row for *_, row in plots.unbeaten(self._points(error))]
+
+    def best(self, error, which="gradient_error"):
+        """The fastest row whose error is at most `error`, or None."""
+        return next((row for row in self.pareto(which) if row[which] <= error), None)
+
+    def markdown(self):
+        """The table in Markdown, with what was left out; a star marks the Pareto set of the gradient."""
+        best = [id(row) for row in [*self.pareto(), *self.pareto("forward_error")]]
+        head, lines = self._shown()
+        lines = [(*line, "*" if id(row) in best else "") for line, row in zip(lines, self.rows, strict=True)]
+        errors = [row["reference_error"] for row in self.rows if not math.isnan(row["reference_error"])]
+        stated = [f"\nError of the reference: {max(errors):.1e}."] if errors else []
+        left = [f"- left out: {sentence}" for sentence in self.left_out]
+        star = "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."
+        table = markdown_table((*head, "best"), lines)
+        return "\n".join([f"### {self.scene}", "", *table, "", star, *stated, *([""] if left else []), *left, ""])
+
+    def _shown(self):
+        """(names of the columns for readers, texts): settings that tell the rows of a method apart are among them."""
+        settings: list[dict] = [json.loads(row["settings"]) for row in self.rows]
+        first: dict = {}
+        for row, own in zip(self.rows, settings, strict=True):
+            first.setdefault(row["method"], own)
+        apart = dict.fromkeys(
+            name for row, own in zip(self.rows, settings, strict=True) for name, value in own.items()
+            if name not in SHOWN and value != first[row["method"]].get(name)
+        )  # fmt: skip
+        used = [name for name in SHOWN[1:] if any(map(_text, (row[name] for row in self.rows)))]
+        lines = [
+            (row["method"], *(str(own.get(name, "")) for name in apart), *(_text(row[name]) for name in used))
+            for row, own in zip(self.rows, settings, strict=True)
+        ]
+        return ("method", *apart, *used), lines
+
+    def csv(self):
+        """All columns as CSV."""
+        return csv_text(self.rows, COLUMNS)
+
+    def plot(self, ax=None, error="gradient_error"):
+        """Log-log picture: run time across, error up, one curve for each method, the Pareto set marked.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+        error : "gradient_error" or "forward_error"
+
+        Returns
+        -------
+        matplotlib Axes
+        """
+        ax = plots.figure().add_subplot() if ax is None else ax
+        curves: dict = {}
+        for seconds, gap, row in self._points(error):
+            if gap > 0:
+                curves.setdefault(row["method"], []).append((seconds, gap))
+        if curves:
+            lines = {name: tuple(zip(*sorted(points), strict=True)) for name, points in curves.items()}
+            plots.curves(lines, ax, "run time [s]", error.replace("_", " "))
+        ax.set_title(self.scene)
+        return ax
+
+    def save(self, folder):
+        """Write scene.md, scene.csv and, where matplotlib is installed, scene.png into a folder -> list of paths.
+
+        A scene may have a name that is no name of a file: "/" becomes "-". A file that cannot be written is an
+        OSError.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = [folder / f"{self.stem}.{kind}" for kind in ("md", "csv", "png")]
+        write_file(paths[0], self.markdown())
+        write_file(paths[1], self.csv())
+        error = "gradient_error" if self.pareto() else "forward_error"
+        return [*paths[:2], *plots.write_picture(paths[2], partial(self.plot, error=error))]
+
+    def __str__(self):
+        head, lines = self._shown()
+        left = [f"  left out: {sentence}" for sentence in self.left_out]
+        return "\n".join([f"{self.scene}: error against run time", text_table(lines, head), *left])
+
+    __repr__ = __str__
+
+
+def _text(value):
+    if not isinstance(value, float):
+        return str(value)
+    return "" if math.isnan(value) else f"{value:.2g}"
+
+
+# ---------------------------------------------------------------- a file that can be continued
+
+
+def _append(path, row):
+    """Add a finished row to a CSV file."""
+    before = path.read_bytes() if path.exists() else b""
+    torn = b"" if before.endswith(b"\n") or not before else b"\n"  # somebody cut its last line off
+    header, line = csv_text([row], COLUMNS).encode().split(b"\n", 1)
+    write_file(path, before + torn + line if before else header + b"\n" + line)
+
+
+def _finished(path):
+    """CSV file -> (finished rows of these versions by key, what is left out)."""
+    if not path.exists() or not path.stat().st_size:
+        return {}, []
+    with path.open(encoding="utf-8", newline="") as stream:
+        reader = csv.DictReader(stream)
+        if tuple(reader.fieldnames or ()) != COLUMNS:
+            raise ValueError(f"{path.name} is no table of workprec; give another file name")
+        rows = [row for row in reader if row["versions"] and row["seconds_backward_max"] is not None]
+    same = [row for row in rows if row["versions"] == versions()]
+    other = len(rows) - len(same)
+    left = [f"{other} rows of {path.name} from other versions: run again"] if other else []
+    typed: list[Any] = [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in same]
+    return {tuple(row[name] for name in KEY): row for row in typed}, left
+
+
+def _number(text):
+    value = float(text or "nan")
+    return int(value) if value.is_integer() and "." not in text and "e" not in text else value
