@@ -21,6 +21,7 @@ from sparsedp.derivative import value_and_grad
 from sparsedp.errors import ConvergenceError
 from sparsedp.fields import is_number
 from sparsedp.ledger import recording, thread
+from sparsedp.report.plan import total
 from sparsedp.report.table import Result, text_table
 from sparsedp.solvers.record import SolveLog
 from sparsedp.tree import leaves, norm
@@ -32,6 +33,7 @@ SHARE = 0.01  # of its error that a corrected solution keeps
 CONSISTENT = 0.2  # of the terms of the sum of y . r, by which it may differ from the corrected run
 EXACT = 1e-13  # relative errors below this are those of rounding, not of solves
 LOOSEST = 0.1  # tolerance that is advised
+SHOWN = ("solver", "rtol", "forward", "forward residual", "adjoint", "adjoint residual", "error")
 SHARES = 0.05, 0.5  # least and largest relative tolerance of a correction inside minimise
 CORRECTIONS = 20  # of one evaluation, at most
 ROUNDING = 1e-14  # of the value
@@ -85,7 +87,7 @@ class RecordedSolves(dict):
                 return function(x)
         finally:
             thread.observers.pop()
-            self.iterations = sum(many for (_, kind), many in calls.items() if kind == "iterations")
+            self.iterations = total(calls, "iterations")
 
     def linear(self, solver, b, transposed, checked, start):
         """The solution of one linear solve, flat. The solver calls this in place of its own `solved`."""
@@ -206,23 +208,20 @@ def certify(loss, x, target=TARGET):
 
     best, slope, left = corrected(lambda key: True)
     half = corrected(lambda key: key[1] == "adjoint")[1]
-    sides = (slope, half), (half, gradient)
-    causes = dict(zip(("forward solves", "adjoint solves"), (distance(*pair) / size for pair in sides), strict=True))
-    total = distance(slope, gradient) / size
+    causes = {"forward solves": distance(slope, half) / size, "adjoint solves": distance(half, gradient) / size}
+    error, rows = distance(slope, gradient) / size, []
     names = dict.fromkeys(map(_solver, solves))
-    rows = []
     for name in names:
-        error = total
-        if len(names) > 1:
-            error = distance(corrected(lambda key, name=name: _solver(key) == name)[1], gradient) / size
-        rows.append(_row(name, error, {key: solve for key, solve in solves.items() if _solver(key) == name}))
-    if not _consistent(value, best, solves.products(), left.products()):
-        best = RecordedSolves(left).run(loss, x)
-    else:
+        own = slope if len(names) == 1 else corrected(lambda key, name=name: _solver(key) == name)[1]
+        mine = {key: solve for key, solve in solves.items() if _solver(key) == name}
+        rows.append(_row(name, distance(own, gradient) / size, mine))
+    if _consistent(value, best, solves.products(), left.products()):
         best += sum(left.products())
+    else:
+        best = RecordedSolves(left).run(loss, x)
     return Certificate(
-        value=value, gradient=gradient, corrected_value=best, corrected_gradient=slope, gradient_error=total,
-        causes=causes, solves=rows, advice=_advice(total, causes, rows, target),
+        value=value, gradient=gradient, corrected_value=best, corrected_gradient=slope, gradient_error=error,
+        causes=causes, solves=rows, advice=_advice(error, causes, rows, target),
     )  # fmt: skip
 
 
@@ -302,19 +301,11 @@ class Certificate(Result):
         return self.corrected_value - self.value
 
     def __str__(self):
-        lines = [
-            (s["solver"], f"{s['rtol']:.0e}", s["forward"], f"{s['forward residual']:.1e}", s["adjoint"],
-             f"{s['adjoint residual']:.1e}", f"{s['error']:.1e}") for s in self.solves
-        ]  # fmt: skip
-        head = ("solver", "rtol", "forward", "residual", "adjoint", "residual", "error of the gradient")
         causes = ", ".join(f"{error:.1e} from {name}" for name, error in self.causes.items())
-        return "\n".join(
-            [
-                f"value {self.value:.9g}, off by about {self.value_error:.1e}; corrected {self.corrected_value:.12g}",
-                f"gradient off by about {self.gradient_error:.1e} of itself: {causes}",
-                text_table(lines, head),
-                f"advice: {self.advice}",
-            ]
+        return (
+            f"value {self.value:.9g}, off by about {self.value_error:.1e}; corrected {self.corrected_value:.12g}\n"
+            f"gradient off by about {self.gradient_error:.1e} of itself: {causes}\n"
+            f"{text_table(self.solves, SHOWN)}\nadvice: {self.advice}"
         )
 
 

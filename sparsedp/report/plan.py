@@ -103,7 +103,7 @@ def explain(loss, x, gradient=True):
 
 
 def total(calls, *kinds):
-    """Ledger -> number of calls of these kinds, whoever was called."""
+    """Calls (or their seconds) by (name, kind) -> the sum of these kinds, whoever was called."""
     return sum(many for (_, kind), many in calls.items() if kind in kinds)
 
 
@@ -150,11 +150,11 @@ class Plan(Result):
     def __str__(self):
         forward, backward = self.seconds
         used = [kind for kind in COLUMNS if any(row[kind] for row in self.rows)]
-        lines = [(r["name"], *(r[k] or "" for k in used), f"{r['seconds']:.1e}", r["how"]) for r in self.rows]
+        rows = [{name: value or "" for name, value in row.items()} for row in self.rows]
         return "\n".join([
             f"value {self.value:.6g}: {forward:.2g} s forward, {backward:.2g} s backward; tape: {self.tape_nodes} "
             f"calls that keep {self.tape_bytes} bytes, recomputation factor {self.recomputation:.2f}",
-            text_table(lines, ("what", *used, "seconds", "how")),
+            text_table(rows, ("name", *used, "seconds", "how")),
             f"totals: {self.sums}",
             "left out:",
             *(f"  - {sentence}" for sentence in self.left_out),

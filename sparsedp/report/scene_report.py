@@ -10,6 +10,7 @@ import re
 import runpy
 import sys
 import traceback
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from sparsedp.report import plots
 from sparsedp.report.certificate import certify
 from sparsedp.report.plan import explain
 from sparsedp.report.stress_table import stress
-from sparsedp.report.table import csv_text, markdown_table
+from sparsedp.report.table import csv_text, markdown_table, write_table
 from sparsedp.report.work_precision import Rows, words_of, workprec
 
 __all__ = ["Source", "audited", "claim", "load", "write_report"]
@@ -199,19 +200,12 @@ def _verdict(audit, trial):
     return "inconclusive" if isinstance(audit, str) or isinstance(trial, str) else audit.verdict
 
 
-def _write(folder, stem, title, text, rows):
-    """The Markdown and the CSV of an instrument."""
-    write_file(folder / f"{stem}.md", f"# {title}\n\n{text}\n")
-    write_file(folder / f"{stem}.csv", csv_text(rows))
-
-
-def _fenced(result):
-    return f"```text\n{result}\n```"
+def _write(folder, stem, title, result, rows, draw=None):
+    write_table(folder, stem, f"# {title}\n\n```text\n{result}\n```\n", csv_text(rows), draw)
 
 
 def _audit(audit, folder):
-    _write(folder, "audit", "Audit of the gradient", _fenced(audit), audit.rows)
-    plots.write_picture(folder / "audit.png", lambda ax: plots.v_curve(audit, ax))
+    _write(folder, "audit", "Audit of the gradient", audit, audit.rows, partial(plots.v_curve, audit))
     digits = f", {audit.digits} digits" if audit.digits is not None else ""
     yield f"gradient: {audit.verdict}{digits}{': ' if audit.reason else ''}{audit.reason}"
     if audit.culprit:
@@ -247,29 +241,27 @@ def _method(table, row, error):
 def _goals(table):
     """The fastest method for each error, as lines of a Markdown table."""
     error, words = _judged_by(table)
-    best = [(goal, table.best(goal, error)) for goal in GOALS]
-    lines = [
-        (f"{100 * goal:g} %", *(("none here", "", "", "") if row is None else _method(table, row, error)))
-        for goal, row in best
-    ]
-    return markdown_table((f"{words} at most", "fastest method", "its settings", f"its {words}", "seconds"), lines)
+    names = f"{words} at most", "fastest method", "its settings", f"its {words}", "seconds"
+    best = [table.best(goal, error) for goal in GOALS]
+    lines = [_method(table, row, error) if row else ["none here"] for row in best]
+    lines = [(f"{100 * goal:g} %", *line) for goal, line in zip(GOALS, lines, strict=True)]
+    return markdown_table([dict(zip(names, line, strict=False)) for line in lines], names)
 
 
 def _certificate(certificate, folder):
-    _write(folder, "certificate", "Error that solves leave", _fenced(certificate), certificate.solves)
+    _write(folder, "certificate", "Error that solves leave", certificate, certificate.solves)
     yield f"error of the gradient from its solves: about {certificate.gradient_error:.1e}; {certificate.advice}"
 
 
 def _plan(plan, folder):
-    _write(folder, "plan", "What was computed, and what was left out", _fenced(plan), plan.rows)
+    _write(folder, "plan", "What was computed, and what was left out", plan, plan.rows)
     yield f"one gradient: {plan.sums}"
     yield from (f"left out: {sentence}" for sentence in plan.left_out)
 
 
 def _stress(trial, folder):
-    _write(folder, "stress", "Stiff and extreme cases", trial.markdown(), trial.rows)
-    if trial.map is not None:
-        plots.write_picture(folder / "stress.png", trial.plot)
+    text = f"# Stiff and extreme cases\n\n{trial.markdown()}"
+    write_table(folder, "stress", text, trial.csv(), trial.map and trial.plot)
     yield trial.summary
     for row in trial.failures:
         yield ": ".join(["FAILED", f"{row['parameter']} {row['case']}".strip(), row["note"]])

@@ -13,7 +13,7 @@ import numpy as np
 from sparsedp.derivative import NO_JVP, pushforward
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
-from sparsedp.report.table import Result, text_table
+from sparsedp.report.table import Result, aligned
 from sparsedp.tape import is_variable
 from sparsedp.tree import flatten, leaves, norm
 
@@ -136,7 +136,7 @@ class StabilityMap(Result):
 
     def __str__(self):
         rows = [(f"{dt:.1e}", *map(_cell, row)) for dt, row in zip(self.time_steps, self.factors, strict=True)]
-        return text_table(rows, (" \\ ".join(self.names), *(f"{nu:.1e}" for nu in self.viscosities)))
+        return aligned(rows, (" \\ ".join(self.names), *(f"{nu:.1e}" for nu in self.viscosities)))
 
 
 def _cell(factor):
@@ -146,21 +146,20 @@ def _cell(factor):
 def stability_map(scene):
     """Scene -> StabilityMap, or None where it has no loop, or no named time step and viscosity of one number each."""
     names = tuple(scene.named.values())
-    if None in names or scene.growth is None or scene.growth.refusal:
+    here = [scene.leaves.get(name, 0.0) for name in names]
+    alone = all(np.size(value) == 1 and np.min(value) > 0 for value in here)
+    if not alone or scene.growth is None or scene.growth.refusal:
         return None
-    here = [scene.leaves[name] for name in names]
-    if any(np.size(value) != 1 or np.min(value) <= 0 for value in here):
-        return None
-    dts, nus = (_values(float(np.max(value)), scene.ranges.get(name)) for name, value in zip(names, here, strict=True))
+    here = [float(np.max(value)) for value in here]
+    dts, nus = (_values(value, scene.ranges.get(name)) for name, value in zip(names, here, strict=True))
 
     def factor(*pair):
-        other = {name: a * np.ones_like(b) for name, a, b in zip(names, pair, here, strict=True)}
-        growth = growth_of(scene.loss, scene.at(other), scene.step)
+        other = {name: np.full_like(scene.leaves[name], value) for name, value in zip(names, pair, strict=True)}
+        growth = scene.growth_at(other)
         return np.nan if growth is None else growth.factor
 
     factors = np.array([[factor(dt, nu) for nu in nus] for dt in dts])
-    place = tuple(float(np.max(value)) for value in here)
-    return StabilityMap(names=names, time_steps=dts, viscosities=nus, factors=factors, here=place)
+    return StabilityMap(names=names, time_steps=dts, viscosities=nus, factors=factors, here=tuple(here))
 
 
 def _values(value, limits):

@@ -1,7 +1,6 @@
 """The stress cases of a scene: extreme values of its parameters, and what has to come out of each.
 
 CASES is the table: for each group the parameters it applies to, the values to try, and the judge of what comes out.
-A judge gives (word, figure, note); the words are PASSED, REFUSED, DEGRADED and FAILED.
 """
 
 import math
@@ -48,7 +47,7 @@ GROUPS = {
 }
 
 
-# ---------------------------------------------------------------- a scene and its parameters
+# ---------------------------------------------------------------- a scene, and a run of it
 
 
 class Scene:
@@ -74,92 +73,65 @@ class Scene:
         names = [re.sub(r"^\['?([^\[\]']*)'?\]$", r"\1", name.removeprefix("x") or "x") for name in point.names]
         self._places = dict(zip(names, point.places, strict=True))
         self.leaves = {name: self._found[place] for name, place in self._places.items()}
-        if isinstance(ranges, (tuple, list)) and len(names) == 1:
-            ranges = {names[0]: ranges}
-        self.ranges = {name: self._limits(name, limits) for name, limits in (ranges or {}).items()}
+        ranges = {names[0]: ranges} if isinstance(ranges, (tuple, list)) and len(names) == 1 else ranges or {}
+        for name in (*ranges, time_step, viscosity):
+            if name is not None and name not in names:
+                raise ValueError(f"stress knows the parameters {', '.join(names)}, got {name!r}; write one of them")
+        for name, limits in ranges.items():
+            if np.size(limits) != 2 or not np.all(np.isfinite(limits)) or limits[0] >= limits[1]:
+                raise ValueError(f"stress needs ranges of two finite numbers, low < high, got {limits!r} for {name}")
+        self.ranges = {name: tuple(map(float, limits)) for name, limits in ranges.items()}
         self.named = {
-            kind: self._known(name) if name else next((word for word in words if word in names), None)
-            for (kind, words), name in zip(NAMES.items(), (time_step, viscosity), strict=True)
+            kind: given or next((word for word in words if word in names), None)
+            for (kind, words), given in zip(NAMES.items(), (time_step, viscosity), strict=True)
         }
-        self.base = run(loss, self.at())
-        self.growth = growth_of(loss, self.at(), step)
+        self.base = self.run({})
+        self.growth = self.growth_at({})
 
-    def at(self, other=None):
+    def at(self, other):
         """The tree x with other values of some parameters; always fresh copies."""
         leaves = copied(self._found)
-        for name, value in (other or {}).items():
+        for name, value in other.items():
             plain = isinstance(self.leaves[name], float) and np.asarray(value).dtype.kind == "f"
             leaves[self._places[name]] = float(value) if plain else value
         return self._rebuild(leaves)
 
-    def _limits(self, name, limits):
-        self._known(name)
-        low, high = map(float, limits) if np.size(limits) == 2 else (math.nan, math.nan)
-        if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise ValueError(f"stress needs ranges of two finite numbers, low < high, got {limits!r} for {name}")
-        return low, high
+    def run(self, other):
+        """What the loss gives there."""
+        return run(self.loss, self.at(other))
 
-    def _known(self, name):
-        if name not in self.leaves:
-            raise ValueError(f"stress knows the parameters {', '.join(self.leaves)}, got {name!r}; write one of them")
-        return name
+    def growth_at(self, other):
+        """How a step grows there."""
+        return growth_of(self.loss, self.at(other), self.step)
 
+    def legal(self, name, value):
+        """Whether a value lies in the range of a parameter; without a range everything does."""
+        low, high = self.ranges.get(name, (-math.inf, math.inf))
+        return bool(np.all(value >= low) and np.all(value <= high))
 
-class Parameter:
-    """One parameter of a scene; without a name all of them, whose value is a dict."""
-
-    def __init__(self, scene, name="", leaf=None):
-        self.scene, self.name, self.leaf = scene, name, leaf
-        self.low, self.high = scene.ranges.get(name, (-math.inf, math.inf))
-        self.ranged, self.many = name in scene.ranges, np.size(leaf) > 1
-        self.kind = next((kind for kind, other in scene.named.items() if other == name), None)
-
-    def point(self, value):
-        """The point of the scene with another value of this parameter."""
-        return self.scene.at({self.name: value} if self.name else value)
-
-    def run(self, value):
-        """What the loss gives at that point."""
-        return run(self.scene.loss, self.point(value))
-
-    def legal(self, value):
-        """Whether a value lies in the range of the parameter; without a range everything does."""
-        return bool(np.all(value >= self.low) and np.all(value <= self.high))
-
-    def fault(self, value):
-        """The word for a wrong number: FAILED as given, in a stated range, and without viscosity."""
-        inviscid = self.kind == "viscosity" and not np.any(value)
-        return FAILED if not self.name or inviscid or (self.ranged and self.legal(value)) else DEGRADED
-
-    def filled(self, value):
-        """The same number everywhere."""
-        return np.full_like(self.leaf, value) if np.ndim(self.leaf) else float(value)
-
-    @cached_property
-    def size(self):
-        """Root mean square of an array; 0 for a single number."""
-        return float(np.sqrt(np.mean(np.square(self.leaf)))) if self.many else 0.0
+    def fault(self, other):
+        """The word for a wrong number: FAILED as given, in stated ranges, and without viscosity."""
+        stated = all(name in self.ranges and self.legal(name, value) for name, value in other.items())
+        inviscid = not np.any(other.get(self.named["viscosity"], 1.0))
+        return FAILED if stated or inviscid else DEGRADED
 
     @cached_property
     def steepest(self):
-        """Index of the entry with the largest derivative; None where the loss does not depend on the parameter."""
-        if not self.name or not self.scene.base.gradient:
-            return None
-        g = np.abs(self.scene.base.gradient[list(self.scene.leaves).index(self.name)])
-        return np.unravel_index(int(np.argmax(g)), g.shape) if np.max(g, initial=0.0) > 0 else None
+        """Name -> index of the entry with the largest derivative, of what the loss depends on."""
+        pairs = zip(self.leaves, map(np.abs, self.base.gradient), strict=False)  # no gradient where it is refused
+        return {name: np.unravel_index(np.argmax(g), g.shape) for name, g in pairs if np.max(g, initial=0.0) > 0}
 
     @cached_property
-    def degree(self):
-        """d, where the loss is a monomial s^d in the scale s of the parameter; None where it is not."""
-        outcomes = [self.run(s * self.leaf) for s in (0.5, 1.0, 2.0)]
-        if not all(out.finite and out.value for out in outcomes):
-            return None
-        half, one, two = (math.log2(abs(out.value)) for out in outcomes)
-        degree = round(two - one)
-        return degree if degree and abs(two - one - degree) + abs(one - half - degree) < 1e-12 else None
-
-
-# ---------------------------------------------------------------- runs
+    def degrees(self):
+        """Name -> d, where the loss is a monomial s^d in the scale s of a parameter."""
+        degrees = {}
+        for name, leaf in self.leaves.items():
+            outcomes = [self.run({name: s * leaf}) for s in (0.5, 1.0, 2.0)]
+            if all(out.finite and out.value for out in outcomes):
+                powers = np.diff([math.log2(abs(out.value)) for out in outcomes])
+                if np.sum(np.abs(powers - np.rint(powers[0]))) < 1e-12:
+                    degrees[name] = round(powers[0])
+        return degrees
 
 
 class Outcome(NamedTuple):
@@ -203,35 +175,35 @@ def _attempt(function, x):
             return error
 
 
-# ---------------------------------------------------------------- judges: (parameter, value) -> (word, figure, note)
+# ---------------------------------------------------------------- judges: (scene, other values) -> (word, figure, note)
 
 
-def finite(p, value):
+def finite(scene, other):
     """The run ends with finite numbers, and the gradient agrees with differences. As given, it may not be refused."""
-    out = p.run(value)
+    out = scene.run(other)
     if out.error is not None:
         word, *rest = out.refusal
-        return FAILED if word == REFUSED and not p.name else word, *rest
+        return FAILED if word == REFUSED and not other else word, *rest
     if not out.finite:
         what = f"value {out.value:g}" if not math.isfinite(out.value) else "the gradient is not finite"
-        return p.fault(value), math.nan, f"{what}, and no error"
-    return _against_differences(p.scene.loss, p.point(value), out)
+        return scene.fault(other), math.nan, f"{what}, and no error"
+    return _against_differences(scene.loss, scene.at(other), out)
 
 
-def steady(p, value):
+def steady(scene, other):
     """As `finite`, and the step at that point does not grow by the fault of the scheme."""
-    verdict = finite(p, value)
-    growth = verdict[0] == PASSED and p.scene.growth and growth_of(p.scene.loss, p.point(value), p.scene.step)
+    verdict = finite(scene, other)
+    growth = verdict[0] == PASSED and scene.growth and scene.growth_at(other)
     if growth and growth.factor > STEADY and growth.flips:
-        return p.fault(value), growth.factor, "growth factor of a step: unstable, and no error"
+        return scene.fault(other), growth.factor, "growth factor of a step: unstable, and no error"
     return verdict
 
 
-def near(p, value, good=0.0, bad=1e-10, note="differs from the plain case", unit=1.0):
+def near(scene, other, good=0.0, bad=1e-10, note="differs from the plain case", unit=1.0):
     """Value and gradient are those of the plain case to `good` (0: to the last bit), or to `bad`, which is degraded."""
-    x, base = p.point(value), p.scene.base
+    x, base = scene.at(other), scene.base
     before = _bits(x)
-    out = run(p.scene.loss, x)
+    out = run(scene.loss, x)
     if out.error is not None or base.error is not None:
         word, *rest = (base if out.error is None else out).refusal
         return word if good else FAILED, *rest
@@ -250,37 +222,30 @@ def _graded(gap, good, bad, note, unit=1.0):
     return word, gap, "" if word == PASSED else note.format(gap / unit)
 
 
-def shifted(p, value, share):
-    """Incompatible data of a singular system: projected or refused, never amplified."""
-    if share == 1:
-        return finite(p, value)
-    note = "amplified by {:.0e}: is a null space left in?"
-    return near(p, value, max(1e4 * share, WEAK), max(1e6 * share, LOST), note, share)
-
-
-def scaled(p, value, exponent):
+def scaled(scene, other, exponent):
     """A monomial scales exactly; another loss is judged at the new point as it is."""
-    if p.degree is None:
-        return steady(p, value)
-    out, power = p.run(value), p.degree * exponent
+    (name,) = other
+    if not scene.degrees.get(name):
+        return steady(scene, other)
+    out, power = scene.run(other), scene.degrees[name] * exponent
     if out.error is not None:
         return out.refusal
-    if abs(math.log2(abs(p.scene.base.value)) + power) > LARGEST:
+    if abs(math.log2(abs(scene.base.value)) + power) > LARGEST:
         return DEGRADED, math.nan, f"the value is {out.value:g}: not representable"
-    gap = abs(out.value / math.ldexp(p.scene.base.value, power) - 1.0)
+    gap = abs(out.value / math.ldexp(scene.base.value, power) - 1.0)
     return _graded(gap, 1e-12, 1e-3, f"is not 2^{power} times the plain value")
 
 
-def refused(p, value, located=False):
+def refused(scene, other, located=False):
     """The run ends with a typed error.
 
     located: it has to say which number is wrong, or where the first one stands (a loss may have moved it on the
     way), or to name the parameter.
     """
-    out = p.run(value)
+    out = scene.run(other)
     if out.error is not None:
         word, figure, words = out.refusal
-        place = rf"the first at|got -?(nan|inf)\b|\b{re.escape(p.name)}\b"
+        place = rf"the first at|got -?(nan|inf)\b|\b{re.escape(next(iter(other)))}\b"
         if word == REFUSED and located and not re.search(place, words):
             return DEGRADED, figure, f"refused without a name or a place: {words}"
         return word, figure, words
@@ -289,9 +254,9 @@ def refused(p, value, located=False):
     return DEGRADED, math.nan, f"taken without an error; value {out.value:g}"
 
 
-def growing(p, _):
+def growing(scene, _):
     """The growth factor of a step: above 1 is right only if the physics grows."""
-    scene, growth, dt = p.scene, p.scene.growth, p.scene.named["time step"]
+    growth, dt = scene.growth, scene.named["time step"]
     if growth is None:
         return None, math.nan, "no rollout in the loss; give step=lambda x: (advance, state)"
     if growth.refusal:
@@ -302,7 +267,7 @@ def growing(p, _):
         return FAILED, growth.factor, "grows and changes its sign from step to step: the step is too large"
     if dt is None:
         return DEGRADED, growth.factor, "grows; name the time step, so that physics and step can be told apart"
-    finer = growth_of(scene.loss, scene.at({dt: scene.leaves[dt] / FINER}), scene.step).factor
+    finer = scene.growth_at({dt: scene.leaves[dt] / FINER}).factor
     if finer > 1 and math.log(growth.factor) <= 4 * FINER * math.log(finer):
         return PASSED, growth.factor, "grows as the physics does"
     return FAILED, growth.factor, "grows, and does not with a smaller step"
@@ -311,7 +276,7 @@ def growing(p, _):
 def _against_differences(loss, x, out):
     """The gradient against central differences along itself, in units of each leaf: its root mean square."""
     found, rebuild = flatten(x)
-    units = [norm(leaf) / math.sqrt(max(np.size(leaf), 1)) or 1.0 for leaf in found if is_variable(leaf)]
+    units = [_rms(leaf) or 1.0 for leaf in found if is_variable(leaf)]
     slopes = [unit * g for unit, g in zip(units, out.gradient, strict=True)]
     size = norm(slopes)
     if size == 0:
@@ -346,130 +311,130 @@ def _against_differences(loss, x, out):
     return DEGRADED, best, "the differences do not settle: a kink, noise or a steep change"
 
 
+def _rms(leaf):
+    return norm(leaf) / math.sqrt(max(np.size(leaf), 1))
+
+
 # ---------------------------------------------------------------- the table
 
 
-class Group(NamedTuple):
-    """Cases of one kind: whom they apply to, and for each judge the values it sees, by the name of the case."""
-
-    name: str
-    applies: Any  # (parameter) -> bool
-    rows: tuple  # of pairs: (parameter) -> {case: value}, judge(parameter, value)
-    legal: bool = False  # values outside the range of a parameter are left out
+def _random(x, low, high):
+    return np.random.default_rng(SEED).uniform(low, high, np.shape(x))
 
 
-def _random():
-    return np.random.default_rng(SEED)
-
-
-def _points(p):
-    spread = np.geomspace if p.low > 0 and p.high > 10 * p.low else np.linspace
-    return {f"all {value:.3g}": p.filled(value) for value in spread(p.low, p.high, 5)}
-
-
-def _within(p):
-    odd = np.arange(np.size(p.leaf)).reshape(np.shape(p.leaf)) % 2
-    spread = p.low + (p.high - p.low) * _random().random(np.shape(p.leaf))
-    jump = {f"jumps {p.low:.3g} to {p.high:.3g}": np.where(odd, p.high, p.low)}
-    return jump | {"random in its range": spread} if p.many else {}
-
-
-def _outside(p):
-    ends = {"below its range": 2 * p.low - p.high, "above its range": 2 * p.high - p.low}
-    return {case: p.filled(value) for case, value in ends.items() if math.isfinite(value)}
-
-
-def _jumps(p):
-    half = np.where(np.arange(p.leaf.size) < p.leaf.size // 2, 1e-4, 1e4)
-    sizes = {"jump of 1e8": half, "random over 8 decades": 10.0 ** _random().uniform(-4, 4, p.leaf.size)}
-    return {case: p.leaf * size.reshape(p.leaf.shape) for case, size in sizes.items()}
-
-
-def _spoilt(p):
-    hole = np.zeros(np.shape(p.leaf))
-    hole[p.steepest] = 1.0
-    return {f"one {bad}": np.where(hole, bad, p.leaf) if np.ndim(p.leaf) else bad for bad in (math.nan, math.inf)}
-
-
-def _copies(p):
-    fixed = p.leaf.copy()
-    fixed.flags.writeable = False
-    wide = np.repeat(p.leaf, 2, axis=-1)
-    kinds = {
-        "Fortran order": np.asfortranarray(p.leaf),
-        "strided": wide[..., ::2],
-        "reversed": p.leaf[::-1].copy()[::-1],
-    }
-    return {"read-only": fixed, **kinds}
-
-
-def _longer(p):
-    shape = (len(p.leaf) + 1, *p.leaf.shape[1:])
-    return {f"shape {shape}": np.resize(p.leaf, shape), "complex": p.leaf + 1j * p.leaf}
-
-
-def _last_digits(p):
-    rng = _random()
+def _last_digits(scene):
+    rng = np.random.default_rng(SEED)
     return {"last digits of x changed": {
-        name: leaf * (1 + ROUNDING * rng.choice([-1.0, 1.0], np.shape(leaf))) for name, leaf in p.scene.leaves.items()
+        name: x * (1 + ROUNDING * rng.choice([-1.0, 1.0], np.shape(x))) for name, x in scene.leaves.items()
     }}  # fmt: skip
 
 
-def _integers(p):
-    return {"all integers": {name: np.asarray(leaf).astype(int) for name, leaf in p.scene.leaves.items()}}
+def _within(scene, name, x):
+    low, high = scene.ranges[name]
+    spread = np.geomspace if low > 0 and high > 10 * low else np.linspace
+    cases = {f"all {value:.3g}": np.full_like(x, value) for value in spread(low, high, 5)}
+    odd = np.arange(np.size(x)).reshape(np.shape(x)) % 2
+    mixed = {f"jumps {low:.3g} to {high:.3g}": np.where(odd, high, low), "random in its range": _random(x, low, high)}
+    return cases | mixed if np.size(x) > 1 else cases
 
 
-def _wrong_signs(p):
-    values = (0.0 * p.leaf, -p.leaf) if p.kind == "time step" else (-p.leaf,)
+def _outside(scene, name, x):
+    low, high = scene.ranges[name]
+    ends = {"below its range": 2 * low - high, "above its range": 2 * high - low}
+    return {case: np.full_like(x, value) for case, value in ends.items() if math.isfinite(value)}
+
+
+def _jumps(scene, name, x):
+    half = np.arange(x.size).reshape(x.shape) < x.size // 2
+    return {"jump of 1e8": x * np.where(half, 1e-4, 1e4), "random over 8 decades": x * 10.0 ** _random(x, -4, 4)}
+
+
+def _spoilt(scene, name, x):
+    hole = np.zeros(np.shape(x), bool)
+    hole[scene.steepest[name]] = True
+    return {f"one {bad}": np.where(hole, bad, x) for bad in (math.nan, math.inf)}
+
+
+def _copies(scene, name, x):
+    fixed, wide = x.copy(), np.repeat(x, 2, axis=-1)
+    fixed.flags.writeable = False
+    back = x[::-1].copy()[::-1]
+    return {"read-only": fixed, "Fortran order": np.asfortranarray(x), "strided": wide[..., ::2], "reversed": back}
+
+
+def _not_fields(scene, name, x):
+    shape = (len(x) + 1, *x.shape[1:])
+    return {f"shape {shape}": np.resize(x, shape), "complex": x + 1j * x}
+
+
+def _wrong_signs(scene, name, x):
+    values = (0.0 * x, -x) if name == scene.named["time step"] else (-x,)
     return {f"{np.min(value):g}": value for value in values}
 
 
-def _all(p):
-    return not p.name
+class Group(NamedTuple):
+    """Cases of one kind. Those of the scene as a whole take it alone, the others one parameter: its name and value."""
+
+    name: str
+    applies: Any  # (scene, name, x) -> bool; None: the scene as a whole
+    rows: tuple  # of pairs: (scene, name, x) -> {case: value}, and judge
+    legal: bool = False  # values outside the range of a parameter are left out
 
 
-ROUNDED = partial(near, good=WEAK, bad=LOST, note="rounding is amplified by {:.0e}", unit=ROUNDING)
+LOST_DIGITS = partial(near, good=WEAK, bad=LOST, note="rounding is amplified by {:.0e}", unit=ROUNDING)
+# Incompatible data of a singular system are projected or refused, never amplified.
+AMPLIFIED = "amplified by {:.0e}: is a null space left in?"
+TINY_SHIFT = partial(near, good=WEAK, bad=LOST, note=AMPLIFIED, unit=1e-14)
+SMALL_SHIFT = partial(near, good=1e-3, bad=0.1, note=AMPLIFIED, unit=1e-7)
+
 CASES = (
-    Group("as given", _all, (
-        (lambda p: {"value and gradient": {}}, finite),
-        (lambda p: {"two runs": {}}, near),
-        (_last_digits, ROUNDED),
-        (lambda p: {"growth in one step": {}}, growing),
+    Group("as given", None, (
+        (lambda s: {"value and gradient": {}}, finite),
+        (lambda s: {"two runs": {}}, near),
+        (_last_digits, LOST_DIGITS),
+        (lambda s: {"growth in one step": {}}, growing),
     )),
-    Group("scaling", lambda p: p.name and np.any(p.leaf), tuple(
-        (lambda p, e=e: {f"times 2^{e}": p.leaf * 2.0**e}, partial(scaled, exponent=e))
+    Group("scaling", lambda s, name, x: np.any(x), tuple(
+        (lambda s, name, x, e=e: {f"times 2^{e}": x * 2.0**e}, partial(scaled, exponent=e))
         for e in (1, -1, 10, -10, 100, -100, 900, -900)
     ), legal=True),
-    Group("legal range", lambda p: p.ranged, ((_points, steady), (_within, steady), (_outside, steady))),
-    Group("zeros and signs", lambda p: p.name and not p.kind, (
-        (lambda p: {"all 0": 0.0 * p.leaf, "sign changed": -1.0 * p.leaf}, finite),
+    Group("legal range", lambda s, name, x: name in s.ranges, ((_within, steady), (_outside, steady))),
+    Group("zeros and signs", lambda s, name, x: name not in s.named.values(), (
+        (lambda s, name, x: {"all 0": 0.0 * x, "sign changed": -1.0 * x}, finite),
     ), legal=True),
-    Group("jumps", lambda p: p.many and np.all(p.leaf > 0) and not p.ranged, ((_jumps, finite),)),
-    Group("constant added", lambda p: p.size, tuple(
-        (lambda p, s=s: {f"plus {s:g} of itself": p.leaf + s * p.size}, partial(shifted, share=s))
-        for s in (1e-14, 1e-7, 1.0)
+    Group("jumps", lambda s, name, x: np.size(x) > 1 and np.all(x > 0) and name not in s.ranges, ((_jumps, finite),)),
+    Group("constant added", lambda s, name, x: np.size(x) > 1 and np.any(x), (
+        (lambda s, name, x: {"plus 1e-14 of itself": x + 1e-14 * _rms(x)}, TINY_SHIFT),
+        (lambda s, name, x: {"plus 1e-07 of itself": x + 1e-7 * _rms(x)}, SMALL_SHIFT),
+        (lambda s, name, x: {"plus 1 of itself": x + _rms(x)}, finite),
     ), legal=True),
-    Group("not finite", lambda p: p.steepest is not None, ((_spoilt, partial(refused, located=True)),)),
-    Group("kinds of arrays", lambda p: isinstance(p.leaf, np.ndarray) and p.leaf.ndim, (
+    Group("not finite", lambda s, name, x: name in s.steepest, ((_spoilt, partial(refused, located=True)),)),
+    Group("kinds of arrays", lambda s, name, x: isinstance(x, np.ndarray) and x.ndim, (
         (_copies, near),
-        (lambda p: {"float32": p.leaf.astype(np.float32)}, partial(near, good=1e-4, bad=1e-2)),
-        (_longer, refused),
+        (lambda s, name, x: {"float32": x.astype(np.float32)}, partial(near, good=1e-4, bad=1e-2)),
+        (_not_fields, refused),
     )),
-    Group("kinds of arrays", _all, ((_integers, refused),)),
-    Group("time step and viscosity", lambda p: p.kind, (
-        (lambda p: {f"times {f:g}": p.leaf * f for f in (1e-8, 1e-4, 1e-2, 1e-1, 1e1, 1e2, 1e4, 1e8)}, steady),
-        (lambda p: {"0": 0.0 * p.leaf} if p.kind == "viscosity" else {}, finite),
+    Group("kinds of arrays", None, (
+        (lambda s: {"all integers": {name: np.asarray(x).astype(int) for name, x in s.leaves.items()}}, refused),
+    )),
+    Group("time step and viscosity", lambda s, name, x: name in s.named.values(), (
+        (lambda s, name, x: {f"times {f:g}": x * f for f in (1e-8, 1e-4, 1e-2, 1e-1, 1e1, 1e2, 1e4, 1e8)}, steady),
+        (lambda s, name, x: {"0": 0.0 * x} if name == s.named["viscosity"] else {}, finite),
     ), legal=True),
-    Group("time step and viscosity", lambda p: p.kind, ((_wrong_signs, refused),)),
+    Group("time step and viscosity", lambda s, name, x: name in s.named.values(), ((_wrong_signs, refused),)),
 )  # fmt: skip
 
 
 def cases(scene, groups):
     """Scene and names of groups -> (group, parameter, case, function that gives (word, figure, note))."""
-    parameters = [Parameter(scene), *(Parameter(scene, name, leaf) for name, leaf in scene.leaves.items())]
-    for group in CASES:
-        for p in filter(group.applies, parameters if group.name in groups else ()):
+    for group in (group for group in CASES if group.name in groups):
+        if group.applies is None:
             for values, judge in group.rows:
-                for case, value in values(p).items():
-                    if not group.legal or p.legal(value):
-                        yield group.name, p.name, case, partial(judge, p, value)
+                for case, other in values(scene).items():
+                    yield group.name, "", case, partial(judge, scene, other)
+            continue
+        for name, x in scene.leaves.items():
+            for values, judge in group.rows if group.applies(scene, name, x) else ():
+                for case, value in values(scene, name, x).items():
+                    if not group.legal or scene.legal(name, value):
+                        yield group.name, name, case, partial(judge, scene, {name: value})

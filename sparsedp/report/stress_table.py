@@ -1,17 +1,18 @@
 """stress: a scene driven through stiff and extreme cases, one word for each."""
 
-import math
-from functools import partial
+import textwrap
+from typing import Any
 
 from sparsedp.fields import check_function
 from sparsedp.report import plots
 from sparsedp.report.stability import stability_map
 from sparsedp.report.stress_cases import FAILED, GROUPS, WORDS, Scene, cases
-from sparsedp.report.table import csv_text, markdown_table, text_table
+from sparsedp.report.table import Result, csv_text, left_out, markdown_table, text_table
 
 __all__ = ["Stress", "stress"]
 
 COLUMNS = ("group", "parameter", "case", "outcome", "figure", "note")
+WIDEST = 70  # letters of a note in a text
 ELSEWHERE = (
     "isolated regions, solid cells, 1 cell, prime sizes, anisotropic cells: a loss keeps its grid; stress each",
     "10^4 steps: a loss keeps its number of steps",
@@ -80,15 +81,15 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     scene = Scene(loss, x, ranges, step, time_step, viscosity)
     judged = [(*names, *judge()) for *names, judge in cases(scene, chosen)]
     rows = [dict(zip(COLUMNS, row, strict=True)) for row in judged if row[3]]
-    left_out = [f"{row[2]}: {row[5]}" for row in judged if not row[3]]
+    skipped = [f"{row[2]}: {row[5]}" for row in judged if not row[3]]
     ran = {row["group"] for row in rows}
-    left_out += [f"{group}: {GROUPS[group]}" for group in chosen if group not in ran and GROUPS[group]]
-    left_out += [f"{group}: not asked for" for group in GROUPS if group not in chosen]
+    skipped += [f"{group}: {GROUPS[group]}" for group in chosen if group not in ran and GROUPS[group]]
+    skipped += [f"{group}: not asked for" for group in GROUPS if group not in chosen]
     growth = stability_map(scene) if "time step and viscosity" in chosen else None
-    return Stress(rows, [*left_out, *ELSEWHERE], growth)
+    return Stress(rows=rows, left_out=[*skipped, *ELSEWHERE], map=growth)
 
 
-class Stress:
+class Stress(Result):
     """The result of `stress`.
 
     Attributes
@@ -100,8 +101,9 @@ class Stress:
     map : StabilityMap or None
     """
 
-    def __init__(self, rows, left_out, growth):
-        self.rows, self.left_out, self.map = rows, left_out, growth
+    rows: list
+    left_out: list
+    map: Any
 
     @property
     def counts(self):
@@ -124,8 +126,8 @@ class Stress:
     def markdown(self):
         """The table in Markdown, the map and what was left out."""
         growth = ["", "Growth factor of a step:", "", "```text", str(self.map), "```"] if self.map else []
-        left = [f"- left out: {sentence}" for sentence in self.left_out]
-        return "\n".join([self.summary, "", *markdown_table(COLUMNS, map(_cells, self.rows)), *growth, "", *left, ""])
+        table = markdown_table(self.rows, COLUMNS)
+        return "\n".join([self.summary, "", *table, *growth, "", *left_out(self.left_out), ""])
 
     def csv(self):
         """The rows as CSV."""
@@ -158,15 +160,5 @@ class Stress:
 
     def __str__(self):
         growth = ["growth factor of a step:", str(self.map)] if self.map else []
-        left = [f"  left out: {sentence}" for sentence in self.left_out]
-        lines = map(partial(_cells, most=70), self.rows)
-        return "\n".join([text_table(lines, COLUMNS), *growth, *left, self.summary])
-
-    __repr__ = __str__
-
-
-def _cells(row, most=10_000):
-    """The texts of a row; a note of at most so many letters."""
-    figure = "" if math.isnan(row["figure"]) else f"{row['figure']:.2g}"
-    note = row["note"] if len(row["note"]) <= most else row["note"][: most - 3] + "..."
-    return row["group"], row["parameter"], row["case"], row["outcome"], figure, note
+        rows = [{**row, "note": textwrap.shorten(row["note"], WIDEST, placeholder=" ...")} for row in self.rows]
+        return "\n".join([text_table(rows, COLUMNS), *growth, *left_out(self.left_out, "  "), self.summary])

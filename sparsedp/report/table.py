@@ -1,11 +1,17 @@
-"""What all instruments give: a value that prints itself, and one table as three texts (columns, Markdown, CSV)."""
+"""What all instruments give: a value that prints itself, and one table as text, Markdown, CSV and files.
+
+A table is a list of rows (dicts) and the names of the columns that are shown.
+"""
 
 import csv
 import io
+import math
 
-from sparsedp.check.findings import table as text_table
+from sparsedp.check.findings import table as aligned
+from sparsedp.files import write_file
+from sparsedp.report import plots
 
-__all__ = ["Result", "csv_text", "markdown_cell", "markdown_table", "text_table"]
+__all__ = ["Result", "aligned", "csv_text", "left_out", "markdown_table", "text_of", "text_table", "write_table"]
 
 
 class Result:
@@ -27,21 +33,43 @@ class Result:
         return str(self)
 
 
-def csv_text(rows, columns=None):
-    """Rows (dicts) -> CSV with a line of names; default: the keys of the first row."""
+def text_of(value):
+    """A cell: two digits of a float, nothing for NaN."""
+    if not isinstance(value, float):
+        return str(value)
+    return "" if math.isnan(value) else f"{value:.2g}"
+
+
+def text_table(rows, names):
+    """Table -> text in columns."""
+    return aligned([[text_of(row.get(name, "")) for name in names] for row in rows], names)
+
+
+def markdown_table(rows, names):
+    """Table -> lines of Markdown."""
+    lines = [[text_of(row.get(name, "")) for name in names] for row in rows]
+    cells = [[" ".join(text.split()).replace("|", "\\|") for text in line] for line in (names, *lines)]
+    head, *body = [f"| {' | '.join(line)} |" for line in cells]
+    return [head, f"|{'---|' * len(names)}", *body]
+
+
+def left_out(sentences, indent="- "):
+    """What an instrument left out, and why -> lines."""
+    return [f"{indent}left out: {sentence}" for sentence in sentences]
+
+
+def csv_text(rows, names=None):
+    """Table -> CSV with a line of names; default: the keys of the first row."""
     stream = io.StringIO()
-    writer = csv.DictWriter(stream, columns or list(rows[0] if rows else ["nothing"]), lineterminator="\n")
+    writer = csv.DictWriter(stream, names or list(rows[0] if rows else ["nothing"]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return stream.getvalue()
 
 
-def markdown_table(head, lines):
-    """Names of the columns, and rows of texts -> lines of Markdown."""
-    rows = [f"| {' | '.join(map(markdown_cell, line))} |" for line in (head, *lines)]
-    return [rows[0], f"|{'---|' * len(head)}", *rows[1:]]
-
-
-def markdown_cell(text):
-    """A text as it may stand in a table of Markdown."""
-    return " ".join(text.split()).replace("|", "\\|")
+def write_table(folder, stem, markdown, csv, draw=None):
+    """Texts of a table, and ``draw(axes) -> axes`` -> paths of stem.md, stem.csv and, with matplotlib, stem.png."""
+    paths = [folder / f"{stem}.{kind}" for kind in ("md", "csv", "png")]
+    write_file(paths[0], markdown)
+    write_file(paths[1], csv)
+    return [*paths[:2], *(plots.write_picture(paths[2], draw) if draw else ())]

@@ -5,7 +5,6 @@ import itertools
 import json
 import math
 import platform
-import statistics
 import tracemalloc
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -22,7 +21,8 @@ from sparsedp.files import write_file
 from sparsedp.ledger import recording
 from sparsedp.report import plots
 from sparsedp.report.certificate import distance
-from sparsedp.report.table import csv_text, markdown_table, text_table
+from sparsedp.report.plan import total
+from sparsedp.report.table import Result, csv_text, left_out, markdown_table, text_of, text_table, write_table
 from sparsedp.tree import leaves, norm
 
 __all__ = ["COLUMNS", "Rows", "measured_row", "relative_distance", "timed", "versions", "words_of", "workprec"]
@@ -36,6 +36,7 @@ COLUMNS = (
 TEXTS = ("scene", "method", "status", "seed", "versions", "settings")
 KEY = ("scene", "method", "settings", "seed")  # what a row of an earlier run is found by
 SHOWN = COLUMNS[1:15]
+COUNTS = {"solves_forward": "solve", "solves_adjoint": "adjoint", "iterations": "iterations"}  # in the ledger
 SETTLED = 2.0  # a run that is not faster than the last one by more is warm
 MOST_WARM_UPS = 7
 SHORT = 2e-3  # [s]: below, times differ for other reasons
@@ -110,7 +111,7 @@ def workprec(
     if not methods or not isinstance(methods, dict):
         raise ValueError("workprec needs at least one method; write {'name': {settings}}")
     scene, over = scene or getattr(problem, "__name__", "scene"), over or {}
-    finished, left_out = _finished(Path(file)) if file else ({}, [])
+    finished, skipped = _finished(Path(file)) if file else ({}, [])
     errors = partial(_errors, problem, reference, compare or relative_distance, {})
     rows = []
     for (method, own), *values in itertools.product(methods.items(), *over.values()):
@@ -118,19 +119,19 @@ def workprec(
         settings = shared | own
         reason = skip and skip(str(method), settings)
         if reason:
-            left_out.append(f"{method} with {_words(settings)}: {reason}")
+            skipped.append(f"{method} with {_words(settings)}: {reason}")
             continue
         key = scene, str(method), _text_of(settings), str(seed)
         row = finished.get(key)
         if row is None:
             figures, *result = measured_row(problem, settings, repeats)
             figures |= errors({name: settings[name] for name in over}, *result)
-            row = dict.fromkeys(COLUMNS, np.nan) | {name: figures[name] for name in figures if name in COLUMNS}
-            row |= {**dict(zip(KEY, key, strict=True)), "versions": versions()}
+            figures |= {**dict(zip(KEY, key, strict=True)), "versions": versions()}
+            row = {name: figures.get(name, np.nan) for name in COLUMNS}
             if file:
                 _append(Path(file), row)
         rows.append(row)
-    return Rows(scene, rows, left_out)
+    return Rows(scene=scene, rows=rows, left_out=skipped)
 
 
 def words_of(row):
@@ -167,9 +168,8 @@ def measured_row(problem, settings, repeats):
         loss, x, facts = _task(given)
         run = _runs(loss, x)[-1]
         calls, status, first = _warm(run)
-        row = {"status": status, "seconds_setup": setup + sum(s for (_, kind), s in first.items() if kind == "setup")}
-        for column, kind in (("solves_forward", "solve"), ("solves_adjoint", "adjoint"), ("iterations", "iterations")):
-            row[column] = sum(many for (_, other), many in calls.items() if other == kind)
+        row = {"status": status, "seconds_setup": setup + total(first, "setup")}
+        row |= {name: total(calls, kind) for name, kind in COUNTS.items()}
         value, gradient = _times(_runs(loss, x), row, repeats)
         row["peak_bytes"] = _peak(run)
         answer = _answer(value, x, facts)
@@ -233,7 +233,7 @@ def _times(runs, row, repeats):
         pairs = [timed(run) for _ in range(repeats)]
         seconds = [max(spent - least, 0.0) if row["status"] == "ok" else math.nan for spent, _ in pairs]
         least, result = min(seconds), pairs[-1][1]
-        row |= {name: least, f"{name}_median": statistics.median(seconds), f"{name}_max": max(seconds)}
+        row |= {name: least, f"{name}_median": float(np.median(seconds)), f"{name}_max": max(seconds)}
     return result if len(runs) > 1 else (result, None)
 
 
@@ -301,7 +301,7 @@ def relative_distance(one, other):
 # ---------------------------------------------------------------- the table
 
 
-class Rows:
+class Rows(Result):
     """Error against run time. Made by `workprec`.
 
     Attributes
@@ -313,8 +313,9 @@ class Rows:
         Runs that were not made, with the reason.
     """
 
-    def __init__(self, scene, rows, left_out):
-        self.scene, self.rows, self.left_out = scene, rows, left_out
+    scene: str
+    rows: list
+    left_out: list
 
     @property
     def stem(self):
@@ -341,31 +342,24 @@ class Rows:
     def markdown(self):
         """The table in Markdown, with what was left out; a star marks the Pareto set of the gradient."""
         best = [id(row) for row in [*self.pareto(), *self.pareto("forward_error")]]
-        head, lines = self._shown()
-        lines = [(*line, "*" if id(row) in best else "") for line, row in zip(lines, self.rows, strict=True)]
+        rows, names = self._shown()
+        stars = ["*" if id(row) in best else "" for row in self.rows]
+        table = markdown_table([{**row, "best": star} for row, star in zip(rows, stars, strict=True)], [*names, "best"])
+        star = "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."
         errors = [row["reference_error"] for row in self.rows if not math.isnan(row["reference_error"])]
         stated = [f"\nError of the reference: {max(errors):.1e}."] if errors else []
-        left = [f"- left out: {sentence}" for sentence in self.left_out]
-        star = "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."
-        table = markdown_table((*head, "best"), lines)
-        return "\n".join([f"### {self.scene}", "", *table, "", star, *stated, *([""] if left else []), *left, ""])
+        return "\n".join([f"### {self.scene}", "", *table, "", star, *stated, "", *left_out(self.left_out), ""])
 
     def _shown(self):
-        """(names of the columns for readers, texts): settings that tell the rows of a method apart are among them."""
-        settings: list[dict] = [json.loads(row["settings"]) for row in self.rows]
+        """The table for readers: what is known of the runs, and the settings that tell those of a method apart."""
+        rows = [json.loads(row["settings"]) | row for row in self.rows]
         first: dict = {}
-        for row, own in zip(self.rows, settings, strict=True):
-            first.setdefault(row["method"], own)
         apart = dict.fromkeys(
-            name for row, own in zip(self.rows, settings, strict=True) for name, value in own.items()
-            if name not in SHOWN and value != first[row["method"]].get(name)
+            name for row in rows for name in row
+            if name not in COLUMNS and row[name] != first.setdefault(row["method"], row)[name]
         )  # fmt: skip
-        used = [name for name in SHOWN[1:] if any(map(_text, (row[name] for row in self.rows)))]
-        lines = [
-            (row["method"], *(str(own.get(name, "")) for name in apart), *(_text(row[name]) for name in used))
-            for row, own in zip(self.rows, settings, strict=True)
-        ]
-        return ("method", *apart, *used), lines
+        used = [name for name in SHOWN if any(text_of(row[name]) for row in rows)]
+        return rows, [*used[:1], *apart, *used[1:]]
 
     def csv(self):
         """All columns as CSV."""
@@ -388,8 +382,8 @@ class Rows:
         for seconds, gap, row in self._points(error):
             if gap > 0:
                 curves.setdefault(row["method"], []).append((seconds, gap))
-        if curves:
-            lines = {name: tuple(zip(*sorted(points), strict=True)) for name, points in curves.items()}
+        lines = {name: np.transpose(sorted(points)) for name, points in curves.items()}
+        if lines:  # nothing has no logarithm
             plots.curves(lines, ax, "run time [s]", error.replace("_", " "))
         ax.set_title(self.scene)
         return ax
@@ -402,24 +396,12 @@ class Rows:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        paths = [folder / f"{self.stem}.{kind}" for kind in ("md", "csv", "png")]
-        write_file(paths[0], self.markdown())
-        write_file(paths[1], self.csv())
         error = "gradient_error" if self.pareto() else "forward_error"
-        return [*paths[:2], *plots.write_picture(paths[2], partial(self.plot, error=error))]
+        return write_table(folder, self.stem, self.markdown(), self.csv(), partial(self.plot, error=error))
 
     def __str__(self):
-        head, lines = self._shown()
-        left = [f"  left out: {sentence}" for sentence in self.left_out]
-        return "\n".join([f"{self.scene}: error against run time", text_table(lines, head), *left])
-
-    __repr__ = __str__
-
-
-def _text(value):
-    if not isinstance(value, float):
-        return str(value)
-    return "" if math.isnan(value) else f"{value:.2g}"
+        table = text_table(*self._shown())
+        return "\n".join([f"{self.scene}: error against run time", table, *left_out(self.left_out, "  ")])
 
 
 # ---------------------------------------------------------------- a file that can be continued

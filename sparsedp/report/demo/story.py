@@ -4,8 +4,6 @@ What the reader sees is printed; pictures, the table and the recovered field are
 """
 
 import os
-import sys
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,7 +16,7 @@ from sparsedp.report import plots
 from sparsedp.report.demo.scene import NOISE, RTOL, Ground, Survey, objective, regulariser, survey
 from sparsedp.report.demo.terrain import Terrain, hidden_ground, remap
 from sparsedp.report.plan import total
-from sparsedp.report.table import csv_text
+from sparsedp.report.table import csv_text, text_table
 from sparsedp.report.work_precision import measured_row, versions
 
 __all__ = ["ARRAYS", "PICTURES", "Study", "Trial", "grids_for", "prepare", "tell"]
@@ -29,7 +27,7 @@ ITERATIONS = 80
 SEED = 0
 PICTURES = ("truth.png", "recovery.png", "error.png", "convergence.png")
 ARRAYS = ("table.csv", "recovered.npy")
-TABLE = "  {:>10}  {:>8}  {:>10}  {:>7}  {:>7}  {:>7}  {:>12}  {:>5}"
+SHOWN = ("grid", "unknowns", "iterations", "solves_forward", "solves_adjoint", "seconds", "misfit", "error")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,59 +81,55 @@ def prepare(terrain, grids):
 class Trial:
     """The recovery on one grid, and its row in the table of error against run time.
 
-    Parameters
+    Attributes
     ----------
-    study : Study
-    grid : Grid
+    loss, x : callable, array
+        And a ground that is nowhere special.
+    trace : list of (seconds, misfit, error)
+        After each iteration. Misfit: root mean square of (computed - read) / noise, 1 is a fit within the noise.
+        Error: distance from the truth, relative, 1 for the flat start.
     """
 
     def __init__(self, study, grid):
-        self.study, self.grid = study, grid
-        self.loss = self.problem()[0]
-        self.roughness = regulariser(grid)
-        self.to_finest = remap(grid, study.grids[-1]).explicit()
-        self.trace = []  # (seconds, misfit, error) after each iteration
-        self.name = " x ".join(map(str, grid.shape))
+        self.study, self.grid, self.name = study, grid, " x ".join(map(str, grid.shape))
+        self.loss, self.x = self.problem()
+        self.trace: list = []
 
     def problem(self):
-        """A loss that has not been used before, and the ground where it is looked at: nowhere special."""
+        """A loss that has not been used before, and where it is looked at."""
         x, y = self.grid.centres()
         ground = Ground(self.grid, self.study.data.wells, self.study.data.sensors)
         return objective(ground, self.study.data), 0.5 * np.sin(5 * x + 1) * np.cos(4 * y)
 
-    def check_gradient(self, directions):
-        """The gradient against finite differences."""
-        loss, x = self.problem()
-        return dp.check.gradient(loss, x, directions=directions)
-
-    def recover(self, watch):
-        """L-BFGS from the flat start. ``watch(seconds, misfit, error)`` is called after each iteration."""
-        truth = self.study.truth
+    def recover(self):
+        """L-BFGS from the flat start; prints a line for each iteration."""
+        truth, roughness, start = self.study.truth, regulariser(self.grid), np.zeros(self.grid.shape)
+        to_finest = remap(self.grid, self.study.grids[-1]).explicit()
 
         def note(record, logk):
-            # Root mean square of (computed - read) / noise: 1 is a fit within the noise.
-            misfit = float(np.sqrt(max(0.0, 2 * (record.value - self.roughness(logk)))))
-            error = float(np.linalg.norm(self.to_finest(logk) - truth) / np.linalg.norm(truth))
+            misfit = float(np.sqrt(max(0.0, 2 * (record.value - roughness(logk)))))
+            error = float(np.linalg.norm(to_finest(logk) - truth) / np.linalg.norm(truth))
             self.trace.append((record.seconds, misfit, error))
-            watch(*self.trace[-1])
+            print(f"  {len(self.trace):9d}   {misfit:12.3f}   {error:5.3f}   {record.seconds:7.2f}", flush=True)
 
-        start = np.zeros(self.grid.shape)
+        print(f"Recovery on {self.grid}\n  iteration   misfit/noise   error   seconds")
         dp.value_and_grad(self.loss)(start + 1e-12)  # the first call of a kernel is not the price of a run
-        self.to_finest(start)
         with recording() as calls:
-            best = dp.minimise(self.loss, start, maxiter=ITERATIONS, callback=note, memory=20)
+            self.best = best = dp.minimise(self.loss, start, maxiter=ITERATIONS, callback=note, memory=20)
         if best.message.startswith("interrupted"):  # minimise keeps its best point; the demo ends
             raise KeyboardInterrupt
         if best.history[-1].iteration > len(self.trace):  # the iteration that meets the tolerance is not reported
             note(best.history[-1], best.x)
-        self.best = best
         kinds = {"solves_forward": "solve", "solves_adjoint": "adjoint", "setups": "setup"}
         self.solves = {name: total(calls, kind) for name, kind in kinds.items()}
+        forward, adjoint, setups = self.solves.values()
+        print(f"  {forward} forward and {adjoint} adjoint solves, {setups} set-ups\n")
 
     def row(self, check):
         """The figures of the run and of its gradient check, in the order of the columns of the table."""
         _, misfit, error = self.trace[-1]
         cost = measured_row(self.problem, {}, repeats=3)[0]
+        gaps = (abs(line.gap) / line.scale for line in check.lines if line.scale > 0)
         return {
             "scene": "demo",
             "method": "lbfgs, adjoint",
@@ -144,9 +138,7 @@ class Trial:
             "tolerance": RTOL,
             "misfit": misfit,
             "error": error,
-            "gradient_error": max(
-                (abs(line.gap) / line.scale for line in check.lines if line.scale > 0), default=np.nan
-            ),
+            "gradient_error": max(gaps, default=np.nan),
             "seconds": self.best.history[-1].seconds,
             **{name: cost[name] for name in ("seconds_setup", "seconds_forward", "seconds_backward", "peak_bytes")},
             **self.solves,
@@ -183,13 +175,14 @@ def tell(study, folder, force):
     """
     _introduce(study)
     trials = [Trial(study, grid) for grid in study.grids]
-    checks = [trial.check_gradient(directions=3 if trial is trials[-1] else 1) for trial in trials]
+    checks = [dp.check.gradient(t.loss, t.x, directions=3 if t is trials[-1] else 1) for t in trials]
     print(f"Is the gradient right? On {trials[-1].grid}:", checks[-1], sep="\n")
     print(f"On the coarser grids: {', '.join(check.verdict for check in checks[:-1])}\n")
     for trial in trials:
-        _recover(trial)
+        trial.recover()
     rows = [trial.row(check) for trial, check in zip(trials, checks, strict=True)]
-    _show_table(rows)
+    print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
+    print(text_table([{"grid": "flat start", "error": 1.0}, *rows], SHOWN), end="\n\n")
     write_arrays(folder, force, rows, trials[-1].best.x)
     written = list(ARRAYS)
     try:
@@ -206,50 +199,15 @@ def _introduce(study):
     terrain, data = study.terrain, study.data
     low, high = np.exp([study.truth.min(), study.truth.max()])
     wells, sensors = data.readings.shape
-    print(f"The ground   {terrain.source}, {' x '.join(map(str, terrain.field.shape))} values,")
-    print(f"             taken as log-conductivity: {low:.2g} to {high:.2g} times the mean")
-    print(f"The survey   {wells} wells pumped in turn, {sensors} pressure sensors, {100 * NOISE:g} % noise,")
-    print(f"             computed on {study.source_grid}")
-    print("The law      -div(k grad p) = b, rivers at both ends in x, no flow through the other sides")
     print(
+        f"The ground   {terrain.source}, {' x '.join(map(str, terrain.field.shape))} values,",
+        f"             taken as log-conductivity: {low:.2g} to {high:.2g} times the mean",
+        f"The survey   {wells} wells pumped in turn, {sensors} pressure sensors, {100 * NOISE:g} % noise,",
+        f"             computed on {study.source_grid}",
+        "The law      -div(k grad p) = b, rivers at both ends in x, no flow through the other sides",
         "The task     find log k in every cell from the readings: L-BFGS through the adjoint, from a flat start\n",
-        flush=True,
-    )
-
-
-def _recover(trial):
-    print(f"Recovery on {trial.grid}")
-    print("  iteration   misfit/noise   error   seconds")
-    with _progress() as (say, step):
-
-        def watch(seconds, misfit, error):
-            say(f"  {len(trial.trace):9d}   {misfit:12.3f}   {error:5.3f}   {seconds:7.2f}")
-            step()
-
-        trial.recover(watch)
-    print("  {solves_forward} forward and {solves_adjoint} adjoint solves, {setups} set-ups\n".format(**trial.solves))
-
-
-@contextmanager
-def _progress():
-    """A bar below the lines when tqdm is installed and someone is watching; the lines alone otherwise."""
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        yield partial(print, flush=True), lambda: None
-        return
-    with tqdm(total=ITERATIONS, unit="iteration", leave=False, disable=not sys.stderr.isatty()) as bar:
-        yield (partial(print, flush=True) if bar.disable else bar.write), bar.update
-
-
-def _show_table(rows):
-    print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
-    print(TABLE.format("grid", "unknowns", "iterations", "forward", "adjoint", "seconds", "misfit/noise", "error"))
-    print(TABLE.format("flat start", "", "", "", "", "", "", "1.000"))
-    for row in rows:
-        counts = (row[name] for name in ("grid", "unknowns", "iterations", "solves_forward", "solves_adjoint"))
-        print(TABLE.format(*counts, *(f"{row[name]:.3f}" for name in ("seconds", "misfit", "error"))))
-    print()
+        sep="\n", flush=True,
+    )  # fmt: skip
 
 
 # ---------------------------------------------------------------- what is left behind
@@ -270,26 +228,22 @@ def write_arrays(folder, force, rows, recovered):
 
 def _maps(study, trial):
     """Truth and recovery with the same colours, and their difference."""
-    grid, truth, found = trial.grid, study.truth, trial.best.x
-    limits = float(truth.min()), float(truth.max())
-    label = "log of conductivity / mean conductivity"
-    for title, field in (("Hidden ground", truth), ("Recovered from the readings", found)):
-        yield _map(grid, field, study.data, title, label=label, limits=limits)
-    gap = found - truth
-    title = f"Recovered - hidden: relative error {trial.trace[-1][2]:.2f}"
-    yield _map(grid, gap, None, title, label=label, limits=(-limits[1], limits[1]), colours="RdBu_r")
-
-
-def _map(grid, field, data, title, **options):
-    picture = plots.figure()
-    ax = plots.plot(grid, field, ax=picture.add_subplot(), title=title, **options)
-    ax.set_xlabel("x [longest side]")
-    ax.set_ylabel("y [longest side]")
-    if data is not None:
+    truth, recovery, data = study.truth, trial.best.x, study.data
+    low, high = float(truth.min()), float(truth.max())
+    for title, field, options in (
+        ("Hidden ground", truth, {"limits": (low, high)}),
+        ("Recovered from the readings", recovery, {"limits": (low, high)}),
+        (f"Recovered - hidden: relative error {trial.trace[-1][2]:.2f}", recovery - truth,
+         {"limits": (-high, high), "colours": "RdBu_r"}),
+    ):  # fmt: skip
+        picture = plots.figure()
+        ax = picture.add_subplot()
+        plots.plot(trial.grid, field, ax, title, "log of conductivity / mean conductivity", **options)
+        ax.set(xlabel="x [longest side]", ylabel="y [longest side]")
         ax.plot(*data.sensors.T, ".", color="black", markersize=1, alpha=0.6)
         ax.plot(*data.wells.T, "o", color="white", markeredgecolor="black", markersize=6)
         picture.supxlabel("circles: wells, pumped in turn; dots: pressure sensors", fontsize="small", color="0.3")
-    return picture
+        yield picture
 
 
 def _convergence(trials):
@@ -300,9 +254,7 @@ def _convergence(trials):
         (left, 1, "misfit / noise", "How well the readings are met (1: to the noise)"),
         (right, 2, "relative error of log conductivity", "How well the ground is found (flat start: 1)"),
     ):
-        traces = {f"{trial.name} cells": np.transpose(trial.trace) for trial in trials}
-        plots.curves(
-            {label: (trace[0], trace[column]) for label, trace in traces.items()}, ax, "run time [s]", name, title
-        )
+        traces = {f"{trial.name} cells": np.transpose(trial.trace)[[0, column]] for trial in trials}
+        plots.curves(traces, ax, "run time [s]", name, title)
     left.axhline(1.0, color="0.5", linestyle=":", linewidth=1)
     return picture

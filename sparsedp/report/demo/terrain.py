@@ -11,6 +11,7 @@ from math import prod
 import numpy as np
 
 import sparsedp as dp
+from sparsedp.fields import check_finite
 from sparsedp.report import plots
 
 __all__ = ["Terrain", "hidden_ground", "load", "read_array", "read_field", "remap"]
@@ -253,10 +254,7 @@ def _checked(path, field):
         raise ValueError(f"{path} needs at least {LEAST} values along each axis, got shape {field.shape}")
     with np.errstate(over="ignore"):
         field = field.astype(float)
-    bad = np.argwhere(~np.isfinite(field))
-    if len(bad):
-        first = tuple(bad[0].tolist())
-        raise ValueError(f"{path} needs finite values, got {len(bad)} that are NaN or infinite, the first at {first}")
+    check_finite(path, field, "needs finite values")
     largest = np.abs(field).max()
     if largest > 0:
         field = np.ldexp(field, -np.frexp(largest)[1])  # by a power of two: nothing is rounded, nothing overflows
