@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp.report.stress_cases import CASES, GROUPS
 
 GRID = dp.Grid(24, size=1.0)
 L = dp.laplacian(GRID, dp.dirichlet)
@@ -190,6 +191,41 @@ def test_the_picture():
     plots = pytest.importorskip("matplotlib") and __import__("sparsedp.report.plots", fromlist=["figure"])
     result = dp.stress(explicit, number(0.4), only=["time step and viscosity"])
     assert result.plot(plots.figure().add_subplot()).get_ylabel() == "dt"
+
+
+# ---- the table of cases ---------------------------------------------------------------------------------------------
+
+
+def test_every_group_has_cases_and_a_reason_to_have_none():
+    assert list(dict.fromkeys(group.name for group in CASES)) == list(GROUPS)
+    assert all(reason for group, reason in GROUPS.items() if group != "as given")
+    x = {"field": START, "dt": 0.1, "nu": 0.5}
+    loss = lambda p: p["nu"] * anp.sum(p["field"] ** 2) * (1 + p["dt"])
+    result = dp.stress(loss, x, ranges={"dt": (0.01, 0.2)})
+    jumps = dp.stress(lambda u: anp.sum(u**2), START**2 + 1, only=["jumps"])
+    assert {row["group"] for row in [*result.rows, *jumps.rows]} == set(GROUPS)
+    assert not any(sentence.startswith("kinds of arrays") for sentence in result.left_out)
+
+
+def test_values_outside_a_stated_range_are_not_failures():
+    """A number that is not finite is a failure inside a range, and shown as degraded outside and without one."""
+    loss = lambda p: p["a"] / anp.where(p["a"] < 2.0, 1.0, 0.0)
+    words = {}
+    for high in (1.9, 3.0):
+        rows = dp.stress(loss, {"a": 1.0}, ranges={"a": (0.5, high)}, only=["legal range"]).rows
+        words[high] = {row["case"]: row["outcome"] for row in rows}
+    assert words[1.9]["all 1.9"] == "passed" and words[1.9]["above its range"] == "degraded"
+    assert words[3.0]["all 3"] == "FAILED"
+    free = dp.stress(loss, {"a": 1.0}, only=["scaling"]).rows
+    assert {row["outcome"] for row in free if row["case"] == "times 2^10"} == {"degraded"}
+
+
+def test_an_absolute_tolerance_does_not_scale():
+    """A monomial has to scale exactly: what is lost at 2^-100 is found."""
+    blunt = lambda u: anp.where(anp.abs(u) > 1e-12, u, 0.0)
+    failed = dp.stress(lambda u: anp.sum(blunt(u) ** 2), START, only=["scaling"]).failures
+    assert {row["case"] for row in failed} >= {"times 2^-100"}
+    assert any("is not 2^-200 times the plain value" in row["note"] for row in failed)
 
 
 def test_refusals():

@@ -61,12 +61,8 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, colours="viridis
     u = np.asarray(plain(u))
     if np.iscomplexobj(u):
         raise TypeError(f"plot draws real fields, got dtype {u.dtype}; plot its real part or its absolute value")
-    kind = _kind(grid, u.shape, at)
+    u, kind, arrows = _scalar(grid, u, at)
     ax = _current(ax)
-    arrows = None
-    if kind == "faces" and grid.dim > 1:
-        arrows = _at_centres(grid, u)
-        u, kind = _magnitude(arrows), "cells"
     if title is not None:
         ax.set_title(title)
     if grid.dim == 1:
@@ -81,7 +77,7 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, colours="viridis
         image = _slices(grid, u, kind, ax, mesh)
         bar = ax.inset_axes((0.93, 0.15, 0.02, 0.7))
     ax.figure.colorbar(image, cax=bar, label=label or "")
-    if arrows is not None and grid.dim == 2:
+    if arrows and grid.dim == 2:
         _arrows(grid, arrows, ax)
     return ax
 
@@ -123,7 +119,7 @@ def animate(grid, frames, path, title=None, limits=None, colours="viridis", rate
     frames = [np.asarray(plain(frame)) for frame in frames]
     if not frames:
         raise ValueError("animate needs at least one frame, got none; run with keep='all'")
-    limits = limits or _range(np.concatenate([_drawn(grid, frame).ravel() for frame in frames]))
+    limits = limits or _range(np.concatenate([_scalar(grid, frame)[0].ravel() for frame in frames]))
     picture, images = figure(), []
     _matplotlib("backends.backend_agg").FigureCanvasAgg(picture)
     for frame in frames:
@@ -136,13 +132,21 @@ def animate(grid, frames, path, title=None, limits=None, colours="viridis", rate
     film(path) if hasattr(path, "write") else write_file(path, film)
 
 
-def _drawn(grid, u):
-    """The numbers whose colours a map shows: of a face field its magnitude."""
-    return _magnitude(_at_centres(grid, u)) if grid.dim > 1 and _kind(grid, u.shape, None) == "faces" else u
-
-
-def _magnitude(parts):
-    return np.sqrt(sum(part**2 for part in parts))
+def _scalar(grid, u, at=None):
+    """(the numbers that a map shows, where they live, components): of a face field its magnitude, at the centres."""
+    fitting = [
+        kind for kind in ("cells", "faces", "nodes") if u.shape == getattr(grid, kind).shape and at in (None, kind)
+    ]
+    if not fitting:
+        where = at or "cells, faces or nodes"
+        raise ShapeError(f"plot takes a field on the {where} of {grid}, got an array of shape {u.shape}")
+    if fitting[0] != "faces" or grid.dim == 1:
+        return u, fitting[0], []
+    parts = []
+    for a, part in enumerate(grid.split(u)):
+        whole = np.concatenate([part, part.take([0], a)], a) if grid.periodic[a] else part
+        parts.append(0.5 * (np.delete(whole, -1, a) + np.delete(whole, 0, a)))
+    return np.sqrt(sum(part**2 for part in parts)), "cells", parts
 
 
 def _image(pixels):
@@ -150,16 +154,6 @@ def _image(pixels):
     from PIL import Image
 
     return Image.fromarray(pixels[..., :3].copy()).quantize(256)
-
-
-def _kind(grid, shape, at):
-    fitting = [kind for kind in ("cells", "faces", "nodes") if shape == getattr(grid, kind).shape]
-    if at is None and fitting:
-        return fitting[0]
-    if at in fitting:
-        return at
-    places = at or "cells, faces or nodes"
-    raise ShapeError(f"plot takes a field on the {places} of {grid}, got an array of shape {shape}")
 
 
 def _range(u):
@@ -196,14 +190,6 @@ def _slices(grid, u, kind, ax, mesh):
         image = mesh(np.take(u, middle, axis=across), [axis for axis in range(3) if axis != across], inset)
         inset.set_title(f"{grid.axes[across]} = {_places(grid, across, kind)[middle]:.3g}", fontsize="medium")
     return image
-
-
-def _at_centres(grid, v):
-    """Components of a face field, each averaged from the two faces of a cell to its centre."""
-    parts = grid.split(v)
-    above = [np.roll(p, -1, a) if grid.periodic[a] else np.delete(p, 0, a) for a, p in enumerate(parts)]
-    below = [p if grid.periodic[a] else np.delete(p, -1, a) for a, p in enumerate(parts)]
-    return [0.5 * (low + high) for low, high in zip(below, above, strict=True)]
 
 
 def _arrows(grid, arrows, ax):
@@ -294,13 +280,13 @@ def convergence(best, ax=None, against="iteration"):
     if against not in ("iteration", "seconds", "evaluations", "solves"):
         raise ValueError(f"convergence is drawn against iteration, seconds, evaluations or solves, got {against!r}")
     ax = _current(ax)
-    across = [getattr(record, against) for record in best.history]
-    values = np.array([record.value for record in best.history])
-    label = "loss" if np.all(values > 0) else "loss - least loss"
-    values = values if np.all(values > 0) else values - values.min()
-    for name, heights in ((label, values), ("gradient norm", [record.gradient_norm for record in best.history])):
+    records = [(getattr(record, against), record.value, record.gradient_norm) for record in best.history]
+    across, values, norms = np.array(records, float).T
+    least = values.min()
+    loss = ("loss", values) if least > 0 else ("loss - least loss", values - least)
+    for name, heights in (loss, ("gradient norm", norms)):
         # A height of 0 has no logarithm and leaves a gap.
-        ax.plot(across, np.where(np.asarray(heights) > 0, heights, np.nan), marker=".", linewidth=1, label=name)
+        ax.plot(across, np.where(heights > 0, heights, np.nan), marker=".", linewidth=1, label=name)
     return _dressed(ax, against, "", f"{best.method}: {best.message.split(':')[0]}", xscale="linear")
 
 

@@ -20,7 +20,7 @@ from sparsedp.report.stability import SEED, STEADY, growth_of
 from sparsedp.tape import is_variable
 from sparsedp.tree import copied, flatten, norm
 
-__all__ = ["FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
+__all__ = ["CASES", "FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 
 WORDS = PASSED, REFUSED, DEGRADED, FAILED = "passed", "refused correctly", "degraded", "FAILED"
 NAMES = {"time step": ("dt", "time_step", "tau"), "viscosity": ("nu", "viscosity", "diffusivity", "kappa", "mu")}
@@ -322,7 +322,7 @@ def _random(x, low, high):
     return np.random.default_rng(SEED).uniform(low, high, np.shape(x))
 
 
-def _last_digits(scene):
+def _last_digits(scene, *_):
     rng = np.random.default_rng(SEED)
     return {"last digits of x changed": {
         name: x * (1 + ROUNDING * rng.choice([-1.0, 1.0], np.shape(x))) for name, x in scene.leaves.items()
@@ -356,10 +356,11 @@ def _spoilt(scene, name, x):
 
 
 def _copies(scene, name, x):
-    fixed, wide = x.copy(), np.repeat(x, 2, axis=-1)
+    fixed, wide = x.copy(), np.full((*x.shape, 2), np.nan, x.dtype)
     fixed.flags.writeable = False
+    wide[..., 0] = x
     back = x[::-1].copy()[::-1]
-    return {"read-only": fixed, "Fortran order": np.asfortranarray(x), "strided": wide[..., ::2], "reversed": back}
+    return {"read-only": fixed, "Fortran order": np.asfortranarray(x), "strided": wide[..., 0], "reversed": back}
 
 
 def _not_fields(scene, name, x):
@@ -373,7 +374,7 @@ def _wrong_signs(scene, name, x):
 
 
 class Group(NamedTuple):
-    """Cases of one kind. Those of the scene as a whole take it alone, the others one parameter: its name and value."""
+    """Cases of one kind, of one parameter (its name and value), or of the scene as a whole (then values are dicts)."""
 
     name: str
     applies: Any  # (scene, name, x) -> bool; None: the scene as a whole
@@ -389,10 +390,10 @@ SMALL_SHIFT = partial(near, good=1e-3, bad=0.1, note=AMPLIFIED, unit=1e-7)
 
 CASES = (
     Group("as given", None, (
-        (lambda s: {"value and gradient": {}}, finite),
-        (lambda s: {"two runs": {}}, near),
+        (lambda *_: {"value and gradient": {}}, finite),
+        (lambda *_: {"two runs": {}}, near),
         (_last_digits, LOST_DIGITS),
-        (lambda s: {"growth in one step": {}}, growing),
+        (lambda *_: {"growth in one step": {}}, growing),
     )),
     Group("scaling", lambda s, name, x: np.any(x), tuple(
         (lambda s, name, x, e=e: {f"times 2^{e}": x * 2.0**e}, partial(scaled, exponent=e))
@@ -415,7 +416,7 @@ CASES = (
         (_not_fields, refused),
     )),
     Group("kinds of arrays", None, (
-        (lambda s: {"all integers": {name: np.asarray(x).astype(int) for name, x in s.leaves.items()}}, refused),
+        (lambda s, *_: {"all integers": {name: np.asarray(x).astype(int) for name, x in s.leaves.items()}}, refused),
     )),
     Group("time step and viscosity", lambda s, name, x: name in s.named.values(), (
         (lambda s, name, x: {f"times {f:g}": x * f for f in (1e-8, 1e-4, 1e-2, 1e-1, 1e1, 1e2, 1e4, 1e8)}, steady),
@@ -428,13 +429,10 @@ CASES = (
 def cases(scene, groups):
     """Scene and names of groups -> (group, parameter, case, function that gives (word, figure, note))."""
     for group in (group for group in CASES if group.name in groups):
-        if group.applies is None:
+        for name, x in scene.leaves.items() if group.applies else [("", None)]:
+            if group.applies and not group.applies(scene, name, x):
+                continue
             for values, judge in group.rows:
-                for case, other in values(scene).items():
-                    yield group.name, "", case, partial(judge, scene, other)
-            continue
-        for name, x in scene.leaves.items():
-            for values, judge in group.rows if group.applies(scene, name, x) else ():
                 for case, value in values(scene, name, x).items():
                     if not group.legal or scene.legal(name, value):
-                        yield group.name, name, case, partial(judge, scene, {name: value})
+                        yield group.name, name, case, partial(judge, scene, {name: value} if name else value)
