@@ -1,6 +1,7 @@
 """Certificates: the estimated errors are the true ones; and tolerances as loose as a gradient allows."""
 
 import json
+import pickle
 
 import autograd.numpy as anp
 import numpy as np
@@ -149,6 +150,7 @@ def test_certified_control(method):
     assert loose.iterations <= 0.7 * iterations
     assert loose.evaluations == found.evaluations and loose.passes >= 2 * found.evaluations
     assert f"{loose.iterations} iterations in" in str(loose) and "% saved" in repr(loose)
+    assert str(pickle.loads(pickle.dumps(loose))) == str(loose)  # also after a run
 
 
 class Sweeps(Engine):

@@ -373,7 +373,8 @@ class Certified:
         self.evaluations = self.iterations = self.passes = 0
         self.full_iterations = 0  # of one evaluation with the tolerances of the solvers
         self._value: Any = None  # of the last step
-        self._gradient, self._solves = None, RecordedSolves()
+        self._gradient: Any = None
+        self._solves: dict = {}  # of the last evaluation
 
     def __call__(self, record, first):
         """Whether the run has converged."""
@@ -408,7 +409,9 @@ class Certified:
 
     def _pass(self, gradient_of, x, solves):
         value, gradient = solves.run(gradient_of, x)
-        self.passes, self.iterations, self._solves = self.passes + 1, self.iterations + solves.iterations, solves
+        self._solves = dict(solves)
+        self.passes += 1
+        self.iterations += solves.iterations
         return value + sum(solves.products() or ()), gradient
 
     def _close(self, value, gradient, new_value, new_gradient):
