@@ -239,8 +239,8 @@ def curves(lines, ax, xlabel, ylabel, title=None):
 
 def _dressed(ax, xlabel, ylabel, title, xscale="log"):
     ax.set(xlabel=xlabel, ylabel=ylabel, title=title, xscale=xscale, yscale="log")
-    ax.grid(visible=True, color="0.93")
-    if ax.get_legend_handles_labels()[1]:
+    if ax.get_legend_handles_labels()[1]:  # curves; a map has none
+        ax.grid(visible=True, color="0.93")
         ax.legend(frameon=False, fontsize="small")
     return ax
 
