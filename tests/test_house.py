@@ -55,8 +55,8 @@ DOORS = [
     ("autograd.numpy.numpy_boxes", r"tape\.py", ()),
     ("autograd.numpy.numpy_vspaces", r"tape\.py", ()),
     ("autograd.numpy.numpy_wrapper", r"tape\.py", ()),
-    ("pyamg", r"solvers/multigrid\.py", ()),
-    ("numba", r"kernels/.*", ()),
+    ("pyamg", r"solvers/amg\.py", ()),
+    ("numba", r"kernels/.*|solvers/multigrid/loops\.py", ()),
     ("matplotlib", r"report/plots\.py", ()),
     ("tqdm", r"report/.*|__main__\.py|(.*/)?progress\.py", ()),
 ]

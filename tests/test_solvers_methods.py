@@ -9,7 +9,7 @@ import sparsedp as dp
 from sparsedp.derivative import value_and_grad
 from sparsedp.kernels import compiled
 from sparsedp.ledger import recording
-from sparsedp.solvers.multigrid import CoarseSolve
+from sparsedp.solvers.amg import CoarseSolve
 
 SWEEPS = {
     "forward, backward": (("forward",), ("backward",)),

@@ -50,15 +50,17 @@ def _pool(size):
     return _pools[key]
 
 
-def _types(words):
-    """Words such as "read3 write1 real int flag" -> types of numba. What is read may be written to, or read-only."""
+def _types(words, narrow):
+    """Words such as "read3 write1 real int flag" -> types of numba; see `Kernel`."""
     from numba import types
 
     found = {"int": types.int64, "real": types.float64, "flag": types.boolean}
+    kinds = {"": types.float64, "~": types.float32 if narrow else types.float64}
     for dimensions in (1, 2, 3, 4):
-        found[f"read{dimensions}"] = types.Array(types.float64, dimensions, "C", readonly=True)
-        found[f"write{dimensions}"] = types.Array(types.float64, dimensions, "C")
-    found["index1"] = types.Array(types.int64, 1, "C", readonly=True)
+        for mark, kind in kinds.items():
+            found[f"{mark}read{dimensions}"] = types.Array(kind, dimensions, "C", readonly=True)
+            found[f"{mark}write{dimensions}"] = types.Array(kind, dimensions, "C")
+        found[f"index{dimensions}"] = types.Array(types.int64, dimensions, "C", readonly=True)
     return [found[word] for word in words.split()]
 
 
@@ -75,13 +77,23 @@ class Kernel:
     loop : function
         Its last two arguments are the rows it works on, `start` and `stop`.
     words : str
-        The types of its other arguments: read1 to read3, write1 to write3 (float64), index1 (int64), real, int, flag.
+        The types of its other arguments: read1 to read3 (may be read-only), write1 to write3 (float64), index1 to
+        index3 (int64), real, int, flag. With ~ before it an array is of float32 in `single`.
+    narrow : bool
+        Whether such arrays are of float32 here.
     **options
         Of numba's ``njit``.
+
+    Attributes
+    ----------
+    single : Kernel
+        The same loop for arrays of float32, where its words have a ~.
     """
 
-    def __init__(self, loop, words, **options):
+    def __init__(self, loop, words, narrow=False, **options):
         self.loop, self.words, self.options, self.__doc__ = loop, words, options, loop.__doc__
+        self.narrow = narrow
+        self.single = Kernel(loop, words, True, **options) if "~" in words and not narrow else self
         loops.append(self)
 
     @cached_property
@@ -91,7 +103,7 @@ class Kernel:
             from numba import njit
 
             options = {"nogil": True, "error_model": "numpy", **self.options}
-            signature = tuple(_types(self.words + " int int"))
+            signature = tuple(_types(self.words + " int int", self.narrow))
             with _announced():
                 try:
                     return njit([signature], cache=True, **options)(self.loop)

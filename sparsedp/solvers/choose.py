@@ -8,14 +8,14 @@ from sparsedp.fields import is_number, is_whole
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, spent
 from sparsedp.operators.given import check_operator
+from sparsedp.solvers.amg import multigrid_engine
 from sparsedp.solvers.contract import Nothing, Solver
 from sparsedp.solvers.direct import direct_engine
 from sparsedp.solvers.krylov import krylov_engine
-from sparsedp.solvers.multigrid import multigrid_engine
+from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
 from sparsedp.solvers.record import SolveLog, failure
 from sparsedp.solvers.separable import separable_engine, spectrum
 from sparsedp.solvers.solution import Inverse
-from sparsedp.solvers.structured import structured_engine, structured_if_suited
 from sparsedp.solvers.system import System
 from sparsedp.space import fits
 from sparsedp.tree import copied

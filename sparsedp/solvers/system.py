@@ -89,7 +89,7 @@ class System:
         """The coefficients of the faces, where the operator is made of them and no probing is needed; else None."""
         if self.grid is None or self.grid.dim == 1:
             return None
-        from sparsedp.solvers.stencil_lines import faces_of
+        from sparsedp.solvers.multigrid.lines import faces_of
 
         return faces_of(self.op.structure, self.grid)
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from sparsedp.solvers import facts
-from sparsedp.solvers.stencil import Stencil, Unfit, cleaned
-from sparsedp.solvers.stencil_lines import of_lines, read_lines
+from sparsedp.solvers.multigrid.lines import of_lines, read_lines
+from sparsedp.solvers.multigrid.stencil import Stencil, Unfit, cleaned
 from sparsedp.structure.base import Scaled
 from sparsedp.structure.explicit import Matrix
 from sparsedp.structure.kronecker import Kronecker

@@ -1,7 +1,7 @@
 """structured: multigrid on the grid itself, compiled, for 5- and 7-point operators that no transform solves.
 
 S = scale V A, V the cell volumes, is symmetric. So A x = b is S x = scale V b, and A^T y = g is S z = scale g
-with y = V z: one set-up serves both. Conjugate gradients run on the red cells (see `kernels.multigrid`)
+with y = V z: one set-up serves both. Conjugate gradients run on the red cells (see `loops`)
 with one V-cycle as preconditioner, which is its own transpose. The cycle computes in single precision, and
 so are the directions kept; the equations, the solution and the residual are double.
 """
@@ -13,15 +13,14 @@ import numpy as np
 
 from sparsedp import kernels
 from sparsedp.solvers.contract import Engine, norm
+from sparsedp.solvers.multigrid.cycle import OVER
 
 __all__ = ["Structured", "structured_engine", "structured_if_suited"]
 
 PRECISIONS = {"auto": None, "single": np.float32, "double": np.float64}  # words -> types of the cycle
 
-CHUNK = 16384  # cells for which one sum is kept
 SERIAL = 100_000  # cells below which a team of threads is not worth it
 MAXITER = 200
-OVER = 1.2  # of a sweep on the finest level; 1 takes up to one iteration more
 SLOW = 0.3  # a step that leaves more than this share of the residual may have met rounding
 WEAK_SHARE = 0.1  # of cells: beyond it a cycle with point smoothing takes more than about 30 iterations
 SURE = 1 - 1e-6  # sizes are measured with weights in single precision
@@ -56,7 +55,7 @@ def structured_engine(system, *, precision="auto"):
     -----
     Source: J. E. Dendy, Black box multigrid, J. Comput. Phys. 48 (1982) 366-386.
     """
-    from sparsedp.solvers.stencil import Unfit
+    from sparsedp.solvers.multigrid.stencil import Unfit
 
     if precision not in tuple(PRECISIONS):
         raise ValueError(f"precision must be 'auto', 'single' or 'double', got {precision!r}")
@@ -71,7 +70,7 @@ def structured_engine(system, *, precision="auto"):
 
 def structured_if_suited(system):
     """System -> (engine, "") if structured multigrid is a good choice, else (None, why not)."""
-    from sparsedp.solvers.stencil import Unfit
+    from sparsedp.solvers.multigrid.stencil import Unfit
 
     grid = system.op.domain.grid
     if grid is None or grid.dim == 1:
@@ -90,8 +89,8 @@ def structured_if_suited(system):
 
 def _built(system, dtype=None):
     """The engine; raises Unfit. The type of its cycle, where it is not given, is found from the coefficients."""
-    from sparsedp.solvers.stencil_facts import components_of_stencil, null_space_of_stencil
-    from sparsedp.solvers.stencil_reading import stencil_of
+    from sparsedp.solvers.multigrid.facts import components_of_stencil, null_space_of_stencil
+    from sparsedp.solvers.multigrid.reading import stencil_of
 
     stencil, faces = stencil_of(system), system.faces
     if faces is not None and faces.connected:
@@ -102,7 +101,7 @@ def _built(system, dtype=None):
     free = system.null_space.right > 0 if system.null_space.count else np.zeros(system.size, bool)
     engine = Structured(stencil, free, system.maxiter, dtype or _precision(stencil, faces))
     if system.grid.cells.size and all(system.grid.uniform):
-        system.norms = engine.size.norm, engine.size.norm
+        system.norms = engine.norm, engine.norm
     return engine
 
 
@@ -134,49 +133,44 @@ class Structured(Engine):
     overwrites = False
 
     def __init__(self, stencil, free, maxiter=None, dtype=np.float32):
-        from sparsedp.kernels import multigrid_cycle, multigrid_pack, multigrid_teams, native
-        from sparsedp.solvers.stencil_levels import Levels
-        from sparsedp.solvers.stencil_spread import Spread
+        from sparsedp.solvers.multigrid import loops
+        from sparsedp.solvers.multigrid.levels import Level, hierarchy
+        from sparsedp.solvers.multigrid.spread import Spread
 
-        self.passes, self.cycle, self.in_team = multigrid_teams, multigrid_cycle.cycle, native.in_team
-        self.scale, self.maxiter = stencil.scale, maxiter or MAXITER
-        spread = Spread(stencil.grid)
-        levels = Levels(spread.natural(stencil, free), spread.widths(), spread.coarsenings, dtype, abs(stencil.scale))
-        self.fine, self.coarse, self.hierarchy = levels.fine, levels.coarse, levels.words
+        self.scale, self.maxiter, self.loops = stencil.scale, maxiter or MAXITER, loops
+        self.spread = spread = Spread(stencil.grid)
+        threads = kernels.threads() if prod(stencil.grid.shape) >= SERIAL else 1
+        level = Level(spread.natural(stencil, free), finest=True)
+        scale, root = level.in_order(level.scale), level.in_order(level.root)
+        level.weak -= spread.between(root)
+        self.fine, self.weak_share, self.hierarchy = hierarchy(level, spread.coarsenings, dtype, threads)
         self.hierarchy += ", cycle in double precision" if dtype == np.float64 else ""
-        self.found, self.volumes, self.ones = spread.found, spread.widths(), spread.widths(of_grid=False)
-        self.shape = stencil.grid.shape if spread.dim == 3 else (stencil.grid.shape[0], 1, stencil.grid.shape[1])
-        self.size, self.weak_share = levels.size, levels.weak_share
-        self._scratch(multigrid_pack.packed, multigrid_pack.width, dtype)
+        volumes, filled = spread.volumes()
+        self.factors = scale * volumes, scale  # what a right-hand side of A, and of its transpose, is multiplied with
+        gauges = root / filled, root  # how a scaled residual measures in the user's cells, but for a number
+        self.tops = tuple(float(gauge.max(initial=0.0)) or 1.0 for gauge in gauges)
+        self.norm = 2.0 * float(np.max(gauges[0] * root, initial=0.0)) / abs(self.scale)
+        layout, red = self.fine.layout, self.fine.red
+        self.gauges = layout.zeros(2, len(red), dtype=dtype)
+        for rows, gauge, top in zip(self.gauges, gauges, self.tops):
+            layout.split(gauge / top, rows, red)
+        self.tops = tuple(top / abs(self.scale) for top in self.tops)
+        self.vectors = layout.zeros(4, len(red))  # x, r, q, and the right-hand side of the black cells
+        self.light = layout.zeros(3, len(red), dtype=dtype)  # z and two directions
+        self.sums, self.field = np.zeros(layout.halves[0]), np.zeros(spread.shape)
         self.lock = threading.Lock()
 
-    def _scratch(self, packed, width, dtype):
-        """Vectors and what the members of a team work on."""
-        fine, shape = self.fine, self.fine.shape
-        wide, rows = fine.links.shape[-1], fine.links.shape[1:]
-        self.teams = teams = kernels.threads() if prod(shape) >= SERIAL else 1
-        self.wide_vectors = [packed(*rows) for _ in range(3)]
-        self.vectors = [packed(*rows, dtype=dtype) for _ in range(3)]
-        self.sums = np.zeros((max(1, min(shape[0], prod(shape) // CHUNK)), 2))
-        self.totals, self.line = packed(teams, 2, wide), packed(teams, width(shape[2], split=False))
-        self.rings = packed(teams, 2, 3, shape[1], wide), packed(teams, 2, 3, shape[1], wide, dtype=dtype)
-        natural = width((shape[2] + 1) // 2, split=False)
-        self.lines = packed(teams, 2 * ((shape[1] + 1) // 2) + 1, natural, dtype=dtype)
-        first = self.coarse.levels[0]
-        self.first = self.coarse.b[: 2 * first[3] * first[4]].reshape(first[3], 2, first[4])
-        self.natural = self.coarse.natural[: first[3] * first[9]].reshape(first[3], first[9])
-
-    def run(self, kernel, *arguments):
-        """A pass, by the team."""
-        return self.in_team(kernel, arguments, self.teams)
+    def couple(self, x, out, tables):
+        """out += c x."""
+        rows = tables.shape[1]
+        ends = np.arange(len(tables))[:, None] * rows + np.array([0, rows])
+        self.fine.run(self.loops.couple, self.fine.double, x, out, tables.reshape(-1, 4), ends, self.fine.layout.sizes)
 
     def solve(self, b, goal, transposed):
         with self.lock:
             run = _Run(self, b, goal, transposed)
             word, used = run.iterate()
             solution = run.solution()
-            for vector in self.vectors if word else ():  # the next solve multiplies them by 0
-                vector[:] = 0.0
             return solution, used, word
 
 
@@ -187,33 +181,33 @@ class _Run:
     """
 
     def __init__(self, engine, b, goal, transposed):
-        self.engine, fine = engine, engine.fine
-        self.grid = fine.shape, fine.periodic, fine.half
-        self.b, self.data, self.transposed = b.reshape(engine.shape), norm(b), transposed
-        self.unit = 2.0 ** (np.frexp(self.data)[1] + engine.size.exponent[transposed])
-        volumes, ones = (engine.ones, engine.volumes) if transposed else (engine.volumes, engine.ones)
-        self.before = (volumes[0] * (engine.scale / self.unit), *volumes[1:])
-        self.after = (ones[0] * self.unit, *ones[1:])
-        self.goal = SURE * goal / (self.unit * engine.size.factor[transposed])
-        self.gauge = engine.size.gauge[transposed]
-        self.x, self.r, self.q = engine.wide_vectors
-        self.z, self.p, self.old = engine.vectors
-        self.x[:] = 0.0
-        self.tail = engine.totals, engine.sums
-        self.field = engine.rings[0], engine.line
-        self.steps = 0.0, 0.0  # what is still to be added to x, of p and of old
-        vectors = fine.links, self.r, self.b
-        engine.run(engine.passes.load, *vectors, fine.scale, self.before, engine.found, *self.grid, *self.field)
+        self.engine, self.fine, self.transposed = engine, engine.fine, transposed
+        self.data, self.gauge, self.top = norm(b), engine.gauges[int(transposed)], engine.tops[transposed]
+        self.unit = 2.0 ** (np.frexp(self.data)[1] - np.frexp(self.top)[1])
+        self.goal = SURE * goal / (self.unit * self.top)
+        self.x, self.r, self.q, self.black = engine.vectors
+        self.z, self.p, self.old = engine.light
+        for vector in (self.x, self.q, self.p, self.old):
+            vector[...] = 0.0
+        fine, layout, field = self.fine, self.fine.layout, engine.field
+        engine.spread.put(b.reshape(engine.spread.grid.shape), field)
+        field *= engine.factors[transposed]
+        field *= engine.scale / self.unit
+        layout.split(field, self.black, fine.black)
+        layout.split(field, self.r, fine.red)
+        engine.couple(layout.wrap(self.black), self.r, fine.to_red)
+        layout.wrap(self.r)
+        self.step(0.0)
 
     def iterate(self):
         """Until the residual is small enough -> (word, number of iterations)."""
         rho, best, since, last = 1.0, np.inf, 0, np.inf
         for used in range(1, self.engine.maxiter + 1):
             rho, old = self.precondition(), rho
-            curvature = self.direct(rho / old if used > 1 else 0.0, odd=used % 2 == 1)
+            curvature = self.direct(rho / old if used > 1 else 0.0)
             if not (rho > 0.0 and 0.0 < curvature < np.inf):
                 return self.stuck(rho, curvature, last), used
-            residual = self.step(rho / curvature, odd=used % 2 == 1)
+            residual = self.step(rho / curvature)
             if residual <= self.goal:
                 return "", used
             if not residual < SLOW * last and residual <= self.rounding():
@@ -234,46 +228,41 @@ class _Run:
 
     def precondition(self):
         """z = M r -> r . z."""
-        engine, fine = self.engine, self.engine.fine
-        light = *self.grid, engine.rings[1]
-        transfer = fine.weights, fine.starts, OVER
-        engine.run(engine.passes.restrict, fine.light, self.r, engine.first, *transfer, *light, engine.lines)
-        engine.run(engine.cycle, *engine.coarse, engine.lines)
-        engine.run(engine.passes.correct, fine.light, self.r, self.z, engine.natural, *transfer, *light, *self.tail)
-        return float(engine.sums[:, 0].sum())
+        self.fine.precondition(self.r, self.z, self.engine.sums)
+        return float(self.engine.sums.sum())
 
-    def direct(self, beta, odd):
-        """The next direction and its image -> p . q. Every other time x catches up."""
-        engine = self.engine
-        steps, self.p, self.old = self.steps if odd else (0.0, 0.0), self.old, self.p
-        vectors = self.x, self.p, self.old, self.z, self.q
-        links, rings = engine.fine.links, engine.rings[0]
-        engine.run(engine.passes.direction, links, *vectors, beta, steps, *self.grid, rings, *self.tail)
-        return float(engine.sums[:, 0].sum())
+    def direct(self, beta):
+        """The next direction p and its image q -> p . q. x catches up with the last step."""
+        fine, loops, sums = self.fine, self.engine.loops, self.engine.sums
+        sizes = fine.layout.sizes
+        self.p, self.old = self.old, self.p
+        fine.run(loops.advance, self.x, self.p, self.old, self.z, sizes, self.alpha, beta)
+        tables = fine.to_black, fine.to_red
+        fine.run(loops.image, fine.double, self.p, self.p, self.q, *tables, sizes, sums, 1.0, -1.0, 0.0)
+        return float(sums.sum())
 
-    def step(self, alpha, odd):
+    def step(self, alpha):
         """r -= alpha q -> its size."""
-        self.steps = (alpha, 0.0) if odd else (alpha, self.steps[0])
-        self.engine.run(self.engine.passes.update, self.r, self.q, self.gauge, alpha, *self.grid, *self.tail)
-        return float(np.sqrt(self.engine.sums[:, 0].sum()))
+        self.alpha, fine, sums = alpha, self.fine, self.engine.sums
+        fine.run(self.engine.loops.update, self.r, self.q, fine.x, self.gauge, fine.layout.sizes, sums, alpha, OVER)
+        return float(np.sqrt(sums.sum()))
 
     def rounding(self):
         """Size of a residual that rounding explains, as the contract will see it."""
-        size, gauge = self.engine.size, self.engine.size.gauge[not self.transposed]
-        x = self.x + self.steps[0] * self.p + self.steps[1] * self.old
+        engine, gauge = self.engine, self.engine.gauges[int(not self.transposed)]
+        x = self.x + self.alpha * self.p
         x = np.divide(x, gauge, out=np.zeros_like(x), where=gauge > 0)
-        solution = norm(x.reshape(-1)) * self.unit / size.factor[not self.transposed]
-        return ROUNDING * (size.norm * solution + self.data) * self.goal_unit
-
-    @property
-    def goal_unit(self):
-        return 1.0 / (self.unit * self.engine.size.factor[self.transposed])
+        solution = norm(x.reshape(-1)) * self.unit / engine.tops[not self.transposed]
+        return ROUNDING * (engine.norm * solution + self.data) / (self.unit * self.top)
 
     def solution(self):
         """x as a flat field."""
-        engine, fine = self.engine, self.engine.fine
-        out = np.empty(engine.shape)
-        vectors = fine.links, self.x, self.steps, self.p, self.old, self.b, out
-        widths = self.before + self.after
-        engine.run(engine.passes.finish, *vectors, fine.scale, widths, engine.found, *self.grid, *self.field)
+        engine, fine, layout, field = self.engine, self.fine, self.fine.layout, self.engine.field
+        self.x += self.alpha * self.p
+        engine.couple(layout.wrap(self.x), self.black, fine.to_black)
+        layout.merge(self.x, fine.red, field)
+        layout.merge(self.black, fine.black, field)
+        field *= engine.factors[not self.transposed]
+        out = engine.spread.taken(field) * self.unit
+        field[...] = 0.0
         return out.reshape(-1)

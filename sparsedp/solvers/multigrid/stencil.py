@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["Stencil", "Unfit", "cleaned", "elliptic_stencil"]
+__all__ = ["Stencil", "Unfit", "cleaned"]
 
 EPS = np.finfo(float).eps
 CLEAN = 16 * EPS  # what is left of a diagonal is 0 below this share of the links at it
@@ -72,48 +72,6 @@ class Stencil(NamedTuple):
         for axis, flag in enumerate(self.grid.periodic):
             whole[axis][axis] = slice(None) if flag else slice(1, -1)
         return tuple(c[tuple(part)] for c, part in zip(self.links, whole))
-
-
-def elliptic_stencil(grid, k, walls=None, shift=0.0):
-    """Stencil of shift - divergence diag(k) gradient, written down without an operator.
-
-    Parameters
-    ----------
-    grid : Grid
-    k : array, a field on the faces
-        0 on faces that are closed; on walls it multiplies `walls`.
-    walls : sequence of pairs, one for each axis, optional
-        Slope per unit of the cell's value on the lower and the upper wall: a / (a h / 2 + b) for
-        a u + b du/dn = 0. Default 0 (neumann). Periodic axes: None.
-    shift : float
-
-    Returns
-    -------
-    Stencil
-
-    Examples
-    --------
-    >>> from sparsedp.grid import Grid
-    >>> stencil = elliptic_stencil(Grid((3, 1)), np.ones(10))
-    >>> stencil.links[0].ravel() / stencil.scale
-    array([0., 1., 1., 0.])
-    """
-    extra = shift * grid.volumes
-    links = []
-    for axis, part in enumerate(grid.split(np.asarray(k, dtype=float))):
-        area = np.expand_dims(np.take(grid.volumes, 0, axis) / grid.widths[axis][0], axis)
-        line = [1] * grid.dim
-        line[axis] = -1
-        conductance = part * area
-        c = conductance / grid.spacings(axis).reshape(line)
-        if not grid.periodic[axis]:
-            c, ends = np.moveaxis(c, axis, 0), np.moveaxis(conductance, axis, 0)
-            c[0] = c[-1] = 0.0
-            for side, place in enumerate((0, -1) if walls else ()):
-                np.moveaxis(extra, axis, 0)[place] += walls[axis][side] * ends[place]
-            c = np.moveaxis(c, 0, axis)
-        links.append(c)
-    return Stencil(grid, tuple(links), extra).checked()
 
 
 def cleaned(extra, total):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.solvers.stencil import CLEAN, Stencil, cleaned
+from sparsedp.solvers.multigrid.stencil import CLEAN, Stencil, cleaned
 from sparsedp.structure.base import Scaled
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Chain, Diagonal
