@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.check.findings import table
+from sparsedp.check.summary import table
 
 AUDIT = dp.check.gradient
 X = np.linspace(1.0, 2.0, 20)

@@ -184,13 +184,13 @@ def test_real_functions_may_refuse_complex_fields():
 
 
 def test_norms_from_products_are_bounds_from_below():
-    from sparsedp.check.probes import generator, size_of
+    from sparsedp.check.operators import Probe
 
     op = dp.laplacian(GRID, dp.dirichlet)
     free = given(op.apply, op.T.apply)
-    exact, bound = size_of(op, generator(None)), size_of(free, generator(None))
+    exact, bound = Probe(op).size, Probe(free).size
     assert 0.3 * exact <= bound <= exact * (1 + 1e-12)
-    assert size_of(given(op.apply, None), generator(None)) <= exact * (1 + 1e-12)
+    assert Probe(given(op.apply, None)).size <= exact * (1 + 1e-12)
 
 
 def test_a_check_draws_from_its_own_generator():

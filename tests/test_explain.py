@@ -287,7 +287,7 @@ def test_held_arrays_are_found_in_any_container():
     from functools import partial
     from types import SimpleNamespace
 
-    from sparsedp.check.visits import bytes_held
+    from sparsedp.check.nodes import bytes_held
 
     late = lambda g: unset + g  # a cell that is never filled
     if False:

@@ -158,9 +158,9 @@ def test_floors_rule_sees_a_wrong_import():
     assert not may_import("sparsedp.solvers.choose", "sparsedp.advection")
     assert not may_import("sparsedp.operator", "sparsedp")
     assert not may_import("sparsedp.solvers.choose", "sparsedp.check")
-    assert not may_import("sparsedp.check.twins", "sparsedp.report.plots")
+    assert not may_import("sparsedp.check.operators", "sparsedp.report.plots")
     assert may_import("sparsedp.solvers.choose", "sparsedp.solvers.direct")
-    assert may_import("sparsedp.report.explain", "sparsedp.check.adjointness")
+    assert may_import("sparsedp.report.explain", "sparsedp.check.operators")
 
 
 # ---- files, names and lengths --------------------------------------------------------------------------------------

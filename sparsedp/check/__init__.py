@@ -4,10 +4,8 @@ Nothing else in the package imports it. Every check returns a value with `.verdi
 inconclusive), is true only when it agrees, and prints its table.
 """
 
-from sparsedp.check.adjointness import transpose
 from sparsedp.check.audit import gradient
-from sparsedp.check.cards import operator
+from sparsedp.check.operators import operator, transpose, twin
 from sparsedp.check.refinement import order
-from sparsedp.check.twins import twin
 
 __all__ = ["gradient", "operator", "order", "transpose", "twin"]

@@ -1,31 +1,32 @@
 """The audit of a gradient: differences over many step sizes, Taylor rates, determinism, forward against reverse."""
 
 import math
+import warnings
 from contextlib import suppress
 
+import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.check.culprit import culprit_of
-from sparsedp.check.extension import measured
-from sparsedp.check.modes import complex_step, forward_mode, hessian
-from sparsedp.check.noise import POINTS, noise_of
-from sparsedp.check.point import Point
-from sparsedp.check.probes import generator
+from sparsedp.check.judge import FIELDS, Judgement, at_kinks, curvature, examined, explained, forward_mode, verdict
 from sparsedp.check.progress import shown
-from sparsedp.check.ripple import hidden
-from sparsedp.check.sweep import REFUSALS, Line, Trials, default_steps, dot
-from sparsedp.check.verdict import Audit, decide
-from sparsedp.derivative import value_and_grad
+from sparsedp.check.summary import Result, table
+from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, default_steps, generator
+from sparsedp.derivative import pullback, value_and_grad
 from sparsedp.fields import check_function, is_whole
+from sparsedp.tree import flatten
 
-__all__ = ["gradient"]
+__all__ = ["Audit", "gradient"]
 
 FEWEST_STEPS = 8
-BESIDE = 7  # seed of the place where a kinked loss is looked at again
+SHIFT = 7, 2.0**-6  # seed and length of the step to the point where a kinked loss is looked at again
 LOOSE = 1e-8  # a tolerance of solves above this may explain any gap that no call is to blame for
 QUICK = ("random 1", "gradient")  # the directions of a quick audit
 LEFT_OUT = "other directions, single leaves and entries, complex steps and the Hessian product were not looked at"
 UNDERFLOW = 1e-303  # differences of a loss that changes by less are not normal numbers
+FORGIVEN = 1e3  # tolerances of the solves inside that the modes may differ by; beyond, no solve is to blame
+APART = 1e-10  # of the derivative: what rounding leaves of a complex step
+TINY_STEP = 2.0**-100  # of a complex step, in units of x: its square is lost beside x
 
 
 def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None, quick=False):
@@ -107,143 +108,271 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None, quick=F
     'disagrees'
     """
     check_function("check.gradient", loss, "lambda x: np.sum(x**2)")
-    point = Point(x)
-    chosen = _checked(steps, directions) or default_steps(point.eps)
-    directions = min(directions, 1) if quick else directions
-    ways = sum(1 for _ in _ways(point, point.values, directions, generator(0), quick))
-    with shown(3 + POINTS * min(ways, 2) + 2 * len(chosen) * ways) as told:
-        return _audit(Trials(loss, told), point, gradient, chosen, steps is None, directions, rng, quick)
+    if not is_whole(directions, 0):
+        raise ValueError(f"a sweep needs directions >= 0, a whole number, got {directions!r}; the default is 3")
+    chosen = tuple(map(float, () if steps is None else steps))
+    if steps is not None and (len(set(chosen)) < FEWEST_STEPS or not all(0 < step < math.inf for step in chosen)):
+        raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {chosen}")
+    point, count = Point(x), min(directions, 1) if quick else directions
+    chosen = chosen or default_steps(point.eps)
+    lines = len(_directions(point, point.vector, count, generator(0), quick))
+    with shown(3 + POINTS * min(lines, 2) + 2 * len(chosen) * lines) as told:
+        return _audit(Trials(loss, told), point, gradient, chosen, steps is None, count, generator(rng), quick)
 
 
-def _audit(trials, point, gradient, steps, extend, directions, rng, quick, beside=False):
-    loss = trials.loss
+def _directions(point, gradient, count, rng, quick):
+    pairs = point.directions(gradient, count, rng)
+    return [pair for pair in pairs if pair[0] in QUICK or not quick]
+
+
+def _audit(trials, point, gradient, steps, extend, count, rng, quick, beside=False):
+    """The audit at one point; `beside`: it is the one beside kinks, which looks no further."""
+    loss, taped, judged, hessian = trials.loss, gradient is None, [], None
+    slope = (lambda tree: value_and_grad(loss)(tree)[1]) if taped else gradient
     base = trials.value(point.tree())
-    evaluate = (lambda tree: value_and_grad(loss)(tree)[1]) if gradient is None else gradient
-    leaves, doubts = _own_gradient(point, trials, base, evaluate)
-    lines, judged, bend = [], [], None
-    if math.isfinite(base) and all(np.all(np.isfinite(g)) for g in leaves):
-        lines = _lines(point, _ways(point, leaves, directions, generator(rng), quick), leaves, trials, base)
-        judged = [measured(line, steps, point, trials, extend) for line in lines]
-        if callable(evaluate):
-            judged = [_once_more(*pair, evaluate, trials, point) for pair in zip(lines, judged, strict=True)]
-        if _at_kinks(judged) and callable(evaluate) and not beside:
-            judged = _beside(trials, point, gradient, directions, judged)
-        if gradient is None:
-            doubts += forward_mode(loss, point, lines[:directions], judged)
-        doubts += [] if quick else complex_step(loss, point, lines[:directions], base)
-        if gradient is None and directions and not quick and judged[0].word in ("agrees", "vanishes"):
-            bend = hessian(loss, point, lines[0], judged[0], trials, extend)
-            judged[0] = judged[0]._replace(bend=bend.value, rate3=bend.rate)
-            doubts.append(("", bend.note))
-        if _bits(trials.value(point.tree())) != _bits(base):
-            doubts.append(("inconclusive", "the loss gives another value after the audit: it keeps a state"))
-    verdict, reason = decide(judged, doubts)
-    notes = [reason for word, reason in doubts if not word]
+    vector, doubts = _own_gradient(point, trials, base, slope)
+    notes = []
+    if math.isfinite(base) and np.all(np.isfinite(vector)):
+        directions = _directions(point, vector, count, rng, quick)
+        judged = examined(trials, point, base, vector, directions, steps, extend)
+        random = judged[:count]
+        if callable(slope):
+            for one in judged:
+                explained(one, slope)
+            if not beside and at_kinks(judged):
+                _look_beside(trials, point, gradient, count, judged)
+        if taped and random:
+            doubts.append(_modes(forward_mode(loss, random), trials.tolerance))
+        if not quick:
+            doubts += _complex_step(loss, point, random, base)
+        if taped and random and not quick and judged[0].word in ("agrees", "vanishes"):
+            hessian, note = _hessian(loss, point, judged[0], extend)
+            notes.append(note)
+        if not _same(trials.value(point.tree()), base):
+            doubts.append(("unsound", "the loss gives another value after the audit: it keeps a state"))
+    outcome, reason = verdict(judged, doubts)
+    notes = [reason for word, reason in doubts if word == "note"] + notes
     culprit = None
-    if verdict == "disagrees" and gradient is None:
-        culprit, why = _culprit(loss, point)
-        notes.append(why)
+    if outcome == "disagrees" and taped:
+        culprit, why = culprit_of(loss, point)
+        notes.append(f"culprit: {why}")
         if culprit is None and trials.tolerance > LOOSE:
-            verdict = "inconclusive"
+            outcome = "inconclusive"
             reason += f"; no call is at fault, but solves stop at rtol {trials.tolerance:g}: tighten them"
     if quick:
-        names = " and ".join(line.name for line in lines) or "no direction"
+        names = " and ".join(one.direction for one in judged) or "no direction"
         notes.append(f"quick: looked at along {names}; {LEFT_OUT}")
-        reason = notes[-1] if verdict == "agrees" else reason
-    word = bend.word if bend else None
-    return Audit(verdict, reason, judged, lines, base, trials.count, point.size, notes, culprit, word)
+        reason = notes[-1] if outcome == "agrees" else reason
+    return Audit(outcome, reason, judged, notes, culprit, hessian, base, trials.count, point.size)
 
 
-def _ways(point, leaves, directions, rng, quick):
-    """Names and displacements of all directions, or of those of a quick audit."""
-    found = point.directions(leaves, directions, rng)
-    return (way for way in found if way[0] in QUICK) if quick else found
+def _same(a, b):
+    return a == b or (math.isnan(a) and math.isnan(b))
 
 
-def _lines(point, ways, leaves, trials, base):
-    """One line for each direction. The noise of the loss is that along the first and the last of them."""
-    lines = [Line(name, direction, point, leaves, trials, base) for name, direction in ways]
-    noise = noise_of([*lines[:1], *lines[1:][-1:]], point, trials, base)
-    for place, line in enumerate(lines):
-        line.noise, line.close = noise, place == 0
-    return lines
-
-
-def _once_more(line, found, evaluate, trials, point):
-    """A gap that a ripple of the gradient may explain is none that differences prove."""
-
-    def slope_at(tree):
-        try:
-            return dot(point.leaves_of(evaluate(tree)), line.direction)
-        except REFUSALS:
-            return line.slope
-
+def _own_gradient(point, trials, base, slope):
+    """Vector of the gradient, and the doubts that come before any difference."""
+    doubts = []
+    if not math.isfinite(base):
+        doubts.append(("unsound", f"the loss is {base} at x"))
+    elif trials.value(point.tree()) != base:
+        doubts.append(("unsound", "two evaluations of the loss differ: it is not deterministic"))
+    if not callable(slope):
+        return point.gradient(slope), doubts
     with np.errstate(all="ignore"):
-        return hidden(line, found, slope_at, trials.eps, point)
+        vector, again = (point.gradient(slope(point.tree())) for _ in range(2))
+    if not np.array_equal(vector, again, equal_nan=True):
+        doubts.append(("unsound", "two evaluations of the gradient differ: it is not deterministic"))
+    if 0 < np.max(np.abs(vector * point.units), initial=0.0) < UNDERFLOW:
+        doubts.append(("unsound", f"the loss changes by less than {UNDERFLOW:g}: it underflows, scale it"))
+    for name, values in zip(point.names, point.arrays(vector), strict=True):
+        if not np.all(np.isfinite(values)):
+            doubts.append(("broken", f"the gradient of {name} holds NaN or infinity"))
+    return vector, doubts
 
 
-def _at_kinks(judged):
-    """Whether kinks may explain what speaks against a gradient; one that is far in one direction is seen in others."""
-    words = {one.word for one in judged}
-    return "outside" in words or {"disagrees", "kink"} <= words
-
-
-def _beside(trials, point, gradient, directions, judged):
+def _look_beside(trials, point, gradient, count, judged):
     """At several kinks at once a derivative may lie outside the one-sided ones and follow a convention all the same.
 
     What is wrong beside the kinks as well is wrong.
     """
-    moved = point.moved(next(point.directions(point.values, 1, generator(BESIDE)))[1], 2.0**-6)
+    away = next(point.directions(point.vector, 1, generator(SHIFT[0])))[1]
     with suppress(*REFUSALS):
-        other, again = Point(point.tree(moved)), Trials(trials.loss, trials.told)
-        found = _audit(again, other, gradient, default_steps(other.eps), True, directions, None, False, beside=True)
-        if found.verdict != "disagrees":
-            note = "several kinks; beside them nothing speaks against the gradient"
-            doubtful = ("outside", "disagrees")
-            return [one._replace(word="kink", note=note) if one.word in doubtful else one for one in judged]
-    return judged
+        other, again = Point(point.tree(point.vector + SHIFT[1] * away)), Trials(trials.loss, trials.told)
+        steps = default_steps(other.eps)
+        if _audit(again, other, gradient, steps, True, count, generator(None), False, True).verdict != "disagrees":
+            for one in judged:
+                if one.word in ("outside", "disagrees"):
+                    one.word, one.note = "kink", "several kinks; beside them nothing speaks against the gradient"
 
 
-def _culprit(loss, point):
-    """(name, sentence) of the first call at fault."""
-    fault = culprit_of(loss, point)
-    if fault is None:
-        return None, "culprit: every call on the tape is right at the values it met; a value may bypass the tape"
-    return fault.name, f"culprit: {fault.name}, {fault.reason}"
+# ------------------------------------------------------------ other ways to a derivative
 
 
-def _checked(steps, directions):
-    if not is_whole(directions, 0):
-        raise ValueError(f"a sweep needs directions >= 0, a whole number, got {directions!r}; the default is 3")
-    if steps is None:
-        return None
-    steps = tuple(float(step) for step in steps)
-    if len(set(steps)) < FEWEST_STEPS or not all(0 < step < math.inf for step in steps):
-        raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {steps}")
-    return steps
+def _modes(found, tolerance):
+    """Gap of forward and reverse mode -> doubt, or a note."""
+    if found is None:
+        return "note", "forward mode: not available, a rule has no JVP"
+    gap, allowed = found
+    if gap <= allowed:
+        return "note", f"forward mode: agrees with reverse mode to {gap:.0e}"
+    reason = f"forward and reverse mode differ by {gap:.1e}"
+    if gap <= FORGIVEN * tolerance:
+        return "open", f"{reason}, which solves to rtol {tolerance:g} may leave; tighten them"
+    return "broken", f"{reason}: the JVP or the VJP of a rule is wrong"
 
 
-def _own_gradient(point, trials, base, evaluate):
-    """Leaves of the gradient, and the doubts that come before any difference."""
-    doubts = []
-    if not math.isfinite(base):
-        doubts.append(("inconclusive", f"the loss is {base} at x"))
-    elif _bits(trials.value(point.tree())) != _bits(base):
-        doubts.append(("inconclusive", "two evaluations of the loss differ: it is not deterministic"))
-    if not callable(evaluate):
-        return point.leaves_of(evaluate), doubts
-    with np.errstate(all="ignore"):
-        first, second = (point.leaves_of(evaluate(point.tree())) for _ in range(2))
-    if any(a.tobytes() != b.tobytes() for a, b in zip(first, second, strict=True)):
-        doubts.append(("inconclusive", "two evaluations of the gradient differ: it is not deterministic"))
-    largest = max(np.max(np.abs(g), initial=0.0) * unit for g, unit in zip(first, point.units, strict=True))
-    if 0 < largest < UNDERFLOW:
-        doubts.append(("inconclusive", f"the loss changes by less than {UNDERFLOW:g}: it underflows, scale it"))
-    for name, g in zip(point.names, first, strict=True):
-        if not np.all(np.isfinite(g)):
-            doubts.append(("disagrees", f"the gradient of {name} holds NaN or infinity"))
-    return first, doubts
+@np.errstate(all="ignore")
+def _complex_step(loss, point, judged, base):
+    """Im f(x + i t d) / t beside g . d: exact to rounding where the code is analytic, and else no note.
+
+    Source: W. Squire and G. Trapp, SIAM Review 40, 1998.
+    """
+    gaps = []
+    for one in [] if point.complex else judged:
+        arrays = zip(point.arrays(point.vector), point.arrays(one.line.direction), strict=True)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a discarded imaginary part shows in the figure
+                value = complex(loss(point.tree([x + 1j * TINY_STEP * d for x, d in arrays])))
+        except Exception:  # a loss of real numbers may refuse complex ones in any way
+            return []
+        if value.imag == 0 or not abs(value.real - base) <= 1e-9 * abs(base):
+            return []
+        gaps.append(abs(value.imag / TINY_STEP - one.slope) / one.scale)
+    return [("note", f"complex step: agrees to {max(gaps):.0e}")] if gaps and max(gaps) <= APART else []
 
 
-def _bits(value):
-    return np.float64(value).tobytes()
+def _hessian(loss, point, one, extend):
+    """d . H d by reverse mode over reverse mode -> (word or None, note).
+
+    The gradient has its verdict without it: a pullback that uses a value it captured has a right gradient and a
+    wrong Hessian.
+    """
+    if point.complex:
+        return None, "Hessian product: not looked at, x is complex"
+    direction = point.arrays(one.line.direction)
+
+    def slope(tree):
+        leaves = flatten(value_and_grad(loss)(tree)[1])[0]
+        return sum(anp.sum(leaves[place] * d) for place, d in zip(point.places, direction, strict=True))
+
+    try:
+        with np.errstate(all="ignore"):
+            product = point.gradient(pullback(slope, point.tree())[1](1.0)) @ one.line.direction
+    except Exception as error:  # a rule, ours or not, may lack a second derivative and say so in any way
+        return None, f"Hessian product: not available ({type(error).__name__})"
+    word, reason = curvature(one, float(product), extend)
+    return word, f"Hessian product: {word}, {reason}"
+
+
+# ------------------------------------------------------------ the result
+
+
+class Audit(Result):
+    """The result of `check.gradient`. Frozen; true only when the gradient agrees.
+
+    Attributes
+    ----------
+    verdict : "agrees", "disagrees" or "inconclusive"
+    reason : str
+        Why, when it does not simply agree.
+    digits : int or None
+        Digits that are proved, in the worst direction; None unless it agrees.
+    culprit : str or None
+        Name of the first operator, rule or function of autograd on the tape whose own VJP or JVP is at
+        fault, when the verdict is "disagrees"; a note says what is wrong with it. None when each is right:
+        then a value bypasses the tape, or the gradient was given.
+    hessian : "agrees", "disagrees", "inconclusive" or None
+        What the third Taylor remainder says of a Hessian product along the first direction; it does not touch the
+        verdict on the gradient. None where there is no product: no second derivatives, or a gradient that was given.
+    lines : tuple of Judgement
+        One for each direction: word, difference, slope, gap, bar, scale, step, rates, digits, note, bend.
+    value : float
+        The loss at x.
+    evaluations : int
+        How often the loss was evaluated.
+    """
+
+    verdict: str
+    reason: str
+    digits: int | None
+    culprit: str | None
+    hessian: str | None
+    lines: tuple[Judgement, ...]
+    value: float
+    evaluations: int
+    size: int
+    notes: tuple[str, ...]
+    _word = "an audit"
+
+    def __init__(self, verdict, reason, judged, notes, culprit, hessian, value, evaluations, size):
+        proved = [one.digits for one in judged if one.word in ("agrees", "vanishes")]
+        digits = int(min(proved)) if verdict == "agrees" else None
+        super().__init__(verdict=verdict, reason=reason, digits=digits, culprit=culprit, hessian=hessian, value=value)
+        self.__dict__.update(evaluations=evaluations, size=size, lines=tuple(judged), notes=tuple(notes))
+
+    @property
+    def rows(self):
+        """One dict for each direction and step: the numbers of the table and of the V-curve."""
+        return tuple(
+            {
+                "direction": one.direction,
+                "step": level.step,
+                "plus": level.plus,
+                "minus": level.minus,
+                "difference": level.difference,
+                "slope": level.slope,
+                "gap": _share(level.difference - level.slope, one.scale),
+                "one_sided": _share((level.plus + level.minus - 2 * one.line.base) / level.step, one.scale),
+                "note": level.note,
+            }
+            for one in self.lines
+            for level in one.line.levels
+        )
+
+    def to_dict(self):
+        """The audit as plain numbers, strings and lists."""
+        names = ("verdict", "reason", "digits", "culprit", "hessian", "value", "evaluations", "size")
+        lines = [{name: getattr(one, name) for name in FIELDS} for one in self.lines]
+        data = {name: getattr(self, name) for name in names}
+        return {**data, "notes": list(self.notes), "lines": lines, "rows": list(self.rows)}
+
+    def __str__(self):
+        parts = [f"gradient at {self.size} values, loss {self.value:.6g}, {self.evaluations} evaluations"]
+        if self.lines:
+            parts += [self._curves(), self._table()]
+        parts += [f"  {note}" for note in self.notes if note != self.reason]
+        proved = f" to {self.digits} digits" if self.digits is not None else ""
+        return "\n".join([*parts, f"verdict: {self.verdict}{proved}{': ' if self.reason else ''}{self.reason}"])
+
+    def __repr__(self):
+        """One line, which is what pytest shows of an assertion that fails."""
+        words = [self.reason, *(note for note in self.notes if note.startswith("culprit"))]
+        return f"<gradient {self.verdict}: {'; '.join(filter(None, words)) or f'{self.digits} digits'}>"
+
+    def _curves(self):
+        """|difference - g . d| relative to the derivative, over the steps (down) and directions (across)."""
+        cells = {(r["step"], r["direction"]): "-" if r["note"] else f"{abs(r['gap']):.0e}" for r in self.rows}
+        names = [one.direction for one in self.lines]
+        steps = sorted({step for step, _ in cells}, reverse=True)
+        lines = [(f"{step:.1e}", *(cells.get((step, name), "") for name in names)) for step in steps]
+        return table(lines, ("step", *names))
+
+    def _table(self):
+        """One line for each direction."""
+        lines = [
+            (one.direction, f"{one.slope:.9g}", f"{one.difference:.9g}", f"{_share(abs(one.gap), one.scale):.0e}",
+             f"{one.resolution:.0e}", *map(_order, (one.rate1, one.rate2, one.rate3)), one.word, one.note)
+            for one in self.lines
+        ]  # fmt: skip
+        head = ("direction", "g . d", "differences", "gap", "bar", "order 1", "order 2", "order 3", "", "")
+        return table(lines, head)
+
+
+def _order(rate):
+    return "-" if math.isnan(rate) else "exact" if math.isinf(rate) else f"{rate:.2f}"
+
+
+def _share(value, scale):
+    return value / scale if scale > 0 else (0.0 if value == 0 else math.inf)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from sparsedp.check.findings import table
+from sparsedp.check.summary import Result, table
 from sparsedp.fields import check_function
 
 __all__ = ["Refinement", "order"]
@@ -51,84 +51,53 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
     return Refinement(sizes, tuple(float(error_at(n)) for n in sizes), expected)
 
 
-class Refinement:
+class Refinement(Result):
     """Errors over sizes, and the order they show. Frozen.
 
     Attributes
     ----------
     sizes, errors : tuples
     expected : (low, high) or None
+    orders : tuple of float
+        Observed order between neighbouring sizes; NaN where it cannot be told.
+    order : float
+        Least-squares slope through the last three sizes.
+    verdict : "agrees", "disagrees" or "inconclusive"
+    reason : str
+        Why the verdict is what it is.
     """
 
     sizes: tuple[int, ...]
     errors: tuple[float, ...]
-    expected: tuple[float, float] | None
+    orders: tuple[float, ...]
+    order: float
+    reason: str
+    _word = "a refinement"
 
     def __init__(self, sizes, errors, expected=None):
-        interval = None if expected is None else (float(expected[0]), float(expected[1]))
-        self.__dict__.update(sizes=sizes, errors=errors, expected=interval)
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"a refinement is frozen; {name} cannot be set")
-
-    @property
-    def orders(self):
-        """Observed order between neighbouring sizes; NaN where it cannot be told."""
-        pairs = zip(self.sizes, self.sizes[1:], self.errors, self.errors[1:], strict=False)
-        return tuple(_slope((n, m), (e, f)) for n, m, e, f in pairs)
-
-    @property
-    def order(self):
-        """Least-squares slope through the last three sizes."""
-        return _slope(self.sizes[-3:], self.errors[-3:])
-
-    @property
-    def reason(self):
-        """Why the verdict is what it is."""
-        if math.isnan(self.order):
-            return "an error is 0 or not finite: no slope"
-        if self.expected is None:
-            return "no order was expected"
-        low, high = self.expected
-        return f"expected {low:g} to {high:g}"
-
-    @property
-    def verdict(self):
-        """agrees, disagrees or inconclusive."""
-        if self.expected is None or math.isnan(self.order):
-            return "inconclusive"
-        return "agrees" if self.expected[0] <= self.order <= self.expected[1] else "disagrees"
-
-    @property
-    def ok(self):
-        """Whether the verdict is "agrees"."""
-        return self.verdict == "agrees"
-
-    def __bool__(self):
-        return self.ok
+        orders = tuple(_slope(sizes[i : i + 2], errors[i : i + 2]) for i in range(len(sizes) - 1))
+        order, interval = _slope(sizes[-3:], errors[-3:]), expected and tuple(map(float, expected))
+        verdict, reason = "inconclusive", "no order was expected"
+        if math.isnan(order):
+            reason = "an error is 0 or not finite: no slope"
+        elif interval:
+            verdict = "agrees" if interval[0] <= order <= interval[1] else "disagrees"
+            reason = f"expected {interval[0]:g} to {interval[1]:g}"
+        super().__init__(sizes=sizes, errors=errors, orders=orders, order=order)
+        super().__init__(expected=interval, verdict=verdict, reason=reason)
 
     def __float__(self):
         return self.order
 
     def to_dict(self):
         """The refinement as plain numbers, strings and lists."""
-        return {
-            "sizes": list(self.sizes),
-            "errors": list(self.errors),
-            "orders": list(self.orders),
-            "order": self.order,
-            "expected": None if self.expected is None else list(self.expected),
-            "verdict": self.verdict,
-            "reason": self.reason,
-        }
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
 
     def __str__(self):
         orders = ["", *(f"{slope:.2f}" for slope in self.orders)]
         lines = [(n, f"{error:.3e}", slope) for n, error, slope in zip(self.sizes, self.errors, orders, strict=True)]
         head = f"order {self.order:.2f} over the last three sizes: {self.verdict} ({self.reason})"
         return head + "\n" + table(lines, ("n", "error", "order"))
-
-    __repr__ = __str__
 
 
 def _slope(sizes, errors):

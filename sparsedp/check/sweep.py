@@ -1,34 +1,182 @@
-"""Differences of a loss along one direction, over a sweep of step sizes."""
+"""The numbers of an audit: a point, directions to leave it, and losses over a sweep of step sizes on both sides.
 
+A point is one vector of real numbers, complex leaves as pairs, and so are gradients and directions: the derivative
+along a direction is a plain dot product. The noise of the loss comes from a table of differences of neighbouring
+values. The loss itself only ever sees fresh copies of its own tree.
+"""
+
+from math import factorial
 from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
 from sparsedp.ledger import recording
-from sparsedp.tree import norm
+from sparsedp.tape import is_variable
+from sparsedp.tree import copied, flatten, norm
 
-__all__ = ["Level", "Line", "Trials", "default_steps", "dot"]
+__all__ = ["POINTS", "REFUSALS", "Line", "Point", "Trials", "default_steps", "generator", "joined", "noise_of"]
 
 REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # what a loss may raise away from x
 SOLVES = ("solve", "adjoint")  # kinds under which the ledger counts solves
+MOST_LEAVES = 8  # with more leaves than this, none gets a direction of its own
+SAME = "the loss does not change"
+
+
+def generator(rng):
+    """None, a seed or a Generator -> a Generator that nobody else draws from."""
+    return np.random.default_rng(20240229 if rng is None else rng)
+
+
+def default_steps(eps):
+    """Step sizes in units of x, over at least eight decades, from coarse to fine.
+
+    Powers of two, so that x + step * d loses as few digits as it can. Single precision leaves fewer
+    decades, so they lie closer.
+    """
+    return tuple(2.0**-k for k in range(2, 31, 3)) if eps < 1e-10 else tuple(2.0**-k for k in range(-2, 27, 2))
+
+
+# ------------------------------------------------------------ points and directions
+
+
+class Point:
+    """Where a loss is examined, as a vector.
+
+    Each leaf has a unit: the root mean square of its values (1 if they are all 0). A step of size t
+    moves every leaf by t times its unit, so that leaves of different physical size are all examined.
+
+    Parameters
+    ----------
+    x : tree of arrays
+    """
+
+    def __init__(self, x):
+        self._leaves, self._rebuild = flatten(x)
+        self.places = [place for place, leaf in enumerate(self._leaves) if is_variable(leaf)]
+        if not self.places:
+            raise DerivativeError("a gradient is checked at floating values, and x holds none; write x.astype(float)")
+        self.values = [np.array(self._leaves[place]) for place in self.places]
+        paths = list(_paths(x))
+        self.names = [paths[place] or "x" for place in self.places]
+        for name, values in zip(self.names, self.values, strict=True):
+            if not np.all(np.isfinite(values)):
+                raise NonFiniteError(f"a gradient is checked at finite values, and {name} holds NaN or infinity")
+        self.vector = joined(self.values)
+        self.complex = any(values.dtype.kind == "c" for values in self.values)
+        counts = [joined([values]).size for values in self.values]
+        self._ends = np.cumsum(counts)[:-1]
+        self.units = np.repeat([_rms(part) or 1.0 for part in np.split(self.vector, self._ends)], counts)
+        self.size = sum(values.size for values in self.values)
+        self.eps = max(float(np.finfo(values.dtype).eps) for values in self.values)
+
+    def arrays(self, vector):
+        """Arrays of the shapes and dtypes of the floating leaves; this rounds."""
+        return [
+            part.view(_wide(x)).astype(x.dtype).reshape(x.shape)
+            for part, x in zip(np.split(vector, self._ends), self.values, strict=True)
+        ]
+
+    def tree(self, other=None):
+        """The tree with other floating leaves, arrays or a vector; always fresh copies."""
+        arrays = self.values if other is None else self.arrays(other) if isinstance(other, np.ndarray) else other
+        leaves = copied(self._leaves)
+        for place, value in zip(self.places, arrays, strict=True):
+            leaf = leaves[place]
+            number = isinstance(leaf, (float, complex)) and not isinstance(leaf, np.generic)
+            kind = type(leaf) if number and value.dtype.kind != "c" else value.dtype.type
+            leaves[place] = np.array(value) if isinstance(leaf, np.ndarray) else kind(value)
+        return self._rebuild(leaves)
+
+    def gradient(self, tree):
+        """Vector of a gradient, a tree like x: dL/dRe - i dL/dIm of complex leaves becomes (dL/dRe, dL/dIm)."""
+        leaves = flatten(tree)[0]
+        if len(leaves) != len(self._leaves):
+            raise DerivativeError(f"the gradient has {len(leaves)} leaves where x has {len(self._leaves)}")
+        arrays = [np.conj(leaves[place]) for place in self.places]
+        for name, x, g in zip(self.names, self.values, arrays, strict=True):
+            if g.shape != x.shape:
+                raise DerivativeError(f"the gradient of {name} has shape {g.shape} where {x.shape} is needed")
+        return joined([g.astype(np.result_type(g, _wide(x))) for g, x in zip(arrays, self.values, strict=True)])
+
+    def directions(self, gradient, count, rng):
+        """Names and displacements: random ones, and structured ones that see what random ones average away."""
+        if self.size == 0:
+            return
+        for number in range(count):
+            yield f"random {number + 1}", self._random(rng)
+        for chosen, name in enumerate(self.names if 1 < len(self.names) <= MOST_LEAVES else ()):
+            alone = self._random(rng)
+            for part in np.delete(np.arange(len(self.names)), chosen):
+                np.split(alone, self._ends)[part][...] = 0.0
+            if np.any(alone):
+                yield f"random in {name}", alone
+        if self.size == 1:
+            return
+        yield "constant", self.units
+        slopes = self.units * np.where(np.isfinite(gradient), gradient, 0.0)
+        largest = np.max(np.abs(slopes))
+        if largest > 0:  # along the gradient, as the units measure it, no entry moves more than 4 units
+            yield "gradient", self.units * (slopes / largest) / max(_rms(slopes / largest), 0.25)
+            yield "largest entry", self.units * (np.arange(slopes.size) == np.argmax(np.abs(slopes)))
+
+    def _random(self, rng):
+        """Random displacement, of root mean square 1 in each leaf."""
+        values = rng.standard_normal(self.vector.size)
+        for part in np.split(values, self._ends):
+            part /= _rms(part) or 1.0
+        return self.units * values
+
+
+def joined(arrays):
+    """Arrays -> one vector of doubles, complex numbers as pairs."""
+    return np.concatenate([np.ravel(values).astype(_wide(values)).view(float) for values in arrays])
+
+
+def _rms(vector):
+    return norm(vector) / np.sqrt(max(vector.size, 1))
+
+
+def _wide(values):
+    return np.complex128 if values.dtype.kind == "c" else np.float64
+
+
+def _paths(tree, prefix=""):
+    """How each leaf is reached, in the order of flatten."""
+    if isinstance(tree, dict):
+        for key, branch in tree.items():
+            yield from _paths(branch, f"{prefix}[{key!r}]")
+    elif isinstance(tree, (tuple, list)):
+        names = getattr(tree, "_fields", None)
+        for place, branch in enumerate(tree):
+            yield from _paths(branch, f"{prefix}.{names[place]}" if names else f"{prefix}[{place}]")
+    else:
+        yield f"x{prefix}" if prefix else ""
+
+
+# ------------------------------------------------------------ losses
 
 
 class Trials:
     """A loss with its count of evaluations. Away from x it may refuse; then there is a note and no value.
 
-    `told` is called at each evaluation.
-    `solved`: whether the ledger showed a solve of this library in the first evaluation; `tolerance`: the
-    loosest relative tolerance of iterative ones.
+    Attributes
+    ----------
+    solved : bool
+        Whether the ledger showed a solve of this library in the first evaluation.
+    tolerance : float
+        The loosest relative tolerance of iterative ones.
+    eps : float
+        Rounding of the coarsest dtype that the loss has returned.
     """
 
     def __init__(self, loss, told=lambda: None):
-        self.loss, self.told = loss, told
+        self.loss, self.told = loss, told  # `told` is called at each evaluation
         self.count, self.solved, self.tolerance = 0, False, 0.0
         self.eps = float(np.finfo(float).eps)
 
     def value(self, tree):
-        """The loss as a float; the coarsest dtype that it returns is remembered."""
+        """The loss as a float."""
         self.count += 1
         self.told()
         with np.errstate(all="ignore"):
@@ -81,25 +229,16 @@ class Level(NamedTuple):
         return (self.ahead - self.behind) / (2 * self.step)
 
 
-def default_steps(eps):
-    """Step sizes in units of x, over at least eight decades, from coarse to fine.
-
-    Powers of two, so that x + step * d loses as few digits as it can. Single precision leaves fewer
-    decades, so they lie closer.
-    """
-    return tuple(2.0**-k for k in range(2, 31, 3)) if eps < 1e-10 else tuple(2.0**-k for k in range(-2, 27, 2))
-
-
 class Line:
     """A sweep along one direction, which can be extended.
 
     Parameters
     ----------
     name : str
-    direction : list of arrays
-        Displacement of each leaf for step 1.
+    direction : vector
+        Displacement for step 1.
     point : Point
-    gradient : list of arrays
+    gradient : vector
     trials : Trials
     base : float
         The loss at the point.
@@ -108,40 +247,32 @@ class Line:
     ----------
     noise : float
         Noise of the loss in units of its rounding, where a table of differences has shown it; else 0.
-    close : bool
-        Whether steps far below the plateau are looked at as well, where there is noise.
     """
 
     def __init__(self, name, direction, point, gradient, trials, base):
         self.name, self.direction, self.base = name, direction, base
-        self.gradient, self.solved, self.tolerance = gradient, trials.solved, trials.tolerance
-        self._point, self._trials = point, trials
-        self._length = norm(direction)
-        self.slope = dot(gradient, direction)
-        self.typical = norm([g * d for g, d in zip(gradient, direction, strict=True)])
-        self.levels = []
-        self.noise, self.close = 0.0, False
+        self.point, self.gradient, self.trials = point, gradient, trials
+        self.slope, self.typical = float(gradient @ direction), norm(gradient * direction)
+        self.levels, self.noise = [], 0.0
 
-    def expected(self, displacement):
-        """What the gradient says that the loss changes by."""
-        return dot(self.gradient, displacement)
+    def end(self, step):
+        """(loss at x + step d, what the gradient expects it to change by, why there is no loss)."""
+        arrays = self.point.arrays(self.point.vector + step * self.direction)
+        away = joined(arrays) - self.point.vector  # what the rounding of x left of the step
+        change = float(self.gradient @ away)
+        if not abs(norm(away) / (abs(step) * norm(self.direction)) - 1) < 0.1:
+            return np.nan, change, "the step is lost in the rounding of x"
+        value, note = self.trials.attempt(self.point.tree(arrays))
+        return value, change, note
 
     def sweep(self, steps):
-        """Evaluate the loss at x + t d and x - t d for every t of `steps`."""
-        self.levels = sorted([*self.levels, *map(self._level, steps)], key=lambda level: -level.step)
+        """Evaluate the loss at x + t d and x - t d for every new t of `steps`."""
+        new = [self._level(step) for step in steps if step not in {level.step for level in self.levels}]
+        self.levels = sorted([*self.levels, *new], key=lambda level: -level.step)
 
     def _level(self, step):
-        ends = [self._point.moved(self.direction, sign * step) for sign in (1, -1)]
-        there, back = map(self._point.away, ends)
-        length = norm([a - b for a, b in zip(there, back, strict=True)]) / (2 * step)
-        ahead, behind = self.expected(there), self.expected(back)
-        if not abs(length / self._length - 1) < 0.1:
-            return Level(step, np.nan, np.nan, ahead, behind, "the step is lost in the rounding of x")
-        plus, note = self._trials.attempt(self._point.tree(ends[0]))
-        minus, other = self._trials.attempt(self._point.tree(ends[1]))
-        if plus == minus == self.base:
-            note = "the loss does not change"
-        return Level(step, plus, minus, ahead, behind, note or other)
+        (plus, ahead, note), (minus, behind, other) = self.end(step), self.end(-step)
+        return Level(step, plus, minus, ahead, behind, SAME if plus == minus == self.base else note or other)
 
     @property
     def usable(self):
@@ -150,10 +281,46 @@ class Line:
 
     @property
     def silent(self):
-        """Whether the loss never changed: constant along this direction, to rounding."""
-        return not self.usable and any(level.note == "the loss does not change" for level in self.levels)
+        """Steps that left the loss the same, if all did: it is constant along this direction, to rounding."""
+        return [] if self.usable else [level.step for level in self.levels if level.note == SAME]
 
 
-def dot(gradient, direction):
-    """g . d, for complex leaves the real part of the plain product, as the tape defines the gradient."""
-    return float(sum(np.sum((g * d).real) for g, d in zip(gradient, direction, strict=True)))
+# ------------------------------------------------------------ noise
+
+POINTS = 8  # of a table of differences
+ORDERS = (4, 5, 6)  # of the differences that are read: parabolas leave them alone
+FIRST = 0.7320508 * 2.0**-28  # least distance, in units of x, of double precision; no power of two times a step
+GROWTH = 2.0**6  # of the distance, while the loss stands still
+MOST = 4  # distances tried
+
+
+def noise_of(line):
+    """Line -> how much the loss varies where it should not, in units of its rounding; 0 where nothing varies.
+
+    Values at equal distances, so close that a smooth loss is a straight line there. The k-th differences of a line
+    are 0; those of independent errors of standard deviation s have the variance s^2 (2k)! / (k!)^2. The distance is
+    no power of two times a step of the sweep, and it grows until the loss changes from point to point: else the
+    steps of a loss that was rounded (to single precision, by a table) fall on the points of the sweep and hide.
+
+    Source: the table is that of J. J. Moré and S. M. Wild, SIAM J. Sci. Comput. 33, 2011.
+    """
+    distance = FIRST * max(1.0, line.point.eps / np.finfo(float).eps) ** 0.5
+    for _ in range(MOST):
+        ends = [line.end(place * distance) for place in range(1, POINTS + 1)]  # on one side: a kink at x is no noise
+        if any(note for _, _, note in ends):
+            return 0.0
+        values, changes = np.array([end[:2] for end in ends]).T
+        if np.count_nonzero(np.diff(values)) > POINTS // 2:
+            size = max(np.max(np.abs(values)), abs(line.base), np.finfo(float).tiny)
+            return _deviation(values - line.base - changes) / (line.trials.eps * size)
+        distance *= GROWTH
+    return 0.0
+
+
+def _deviation(rests):
+    """Standard deviation of independent errors, by the differences of each order; the least is nearest to noise."""
+    largest = float(np.max(np.abs(rests)))
+    if not largest > 0:
+        return 0.0
+    shares = [np.mean(np.diff(rests / largest, order) ** 2) * factorial(order) ** 2 for order in ORDERS]
+    return largest * min(np.sqrt(share / factorial(2 * order)) for share, order in zip(shares, ORDERS, strict=True))

@@ -4,7 +4,7 @@ import sys
 from importlib.util import find_spec
 from time import perf_counter
 
-from sparsedp.check.visits import bytes_held, witnessed
+from sparsedp.check.nodes import bytes_held, witnessed
 from sparsedp.derivative import value_and_grad
 from sparsedp.fields import check_function
 from sparsedp.ledger import recording

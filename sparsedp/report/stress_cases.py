@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp.check.point import Point
+from sparsedp.check.sweep import Point
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread

@@ -7,7 +7,7 @@ import csv
 import io
 import math
 
-from sparsedp.check.findings import table as aligned
+from sparsedp.check.summary import table as aligned
 from sparsedp.files import write_file
 from sparsedp.report import plots
 

@@ -10,53 +10,44 @@ from sparsedp.ledger import thread
 from sparsedp.tape import called, isbox
 from sparsedp.traces import ReverseNode, untraced
 
-__all__ = ["Visit", "bytes_held", "witnessed"]
+__all__ = ["Node", "bytes_held", "bytes_of", "witnessed"]
 
 EMPTY = CellType()
 DEEPEST = 12  # levels of containers inside each other; deeper ones are not the tape's
 
 
-class Visit:
+class Node:
     """One call that the tape holds.
 
     Attributes
     ----------
     subject : Rule, Operator, or a function of autograd
-    fun : callable
-        ``fun(*args, **options)`` is the call.
-    nums : tuple of int
-        Places of the arguments that are differentiated.
-    inside : Visit or None
+    value
+        Its result.
+    values : list
+        The arguments that are differentiated.
+    plain : bool
+        Whether no argument belongs to an outer trace.
+    inside : Node or None
         The call whose derivative made this one, as a time loop does that runs its steps again.
+    again : callable
+        ``again(values)`` is the same call with other values of these arguments.
     """
 
-    __slots__ = ("args", "fun", "inside", "nums", "options", "subject", "value")
-
     def __init__(self, fun, value, args, options, nums, inside):
-        self.fun, self.value, self.args, self.options, self.nums = fun, value, args, options, nums
-        self.inside, self.subject = inside, called(fun, args)
+        self.subject, self.value, self.inside = called(fun, args), value, inside
+        self.values, self.plain = [args[num] for num in nums], not any(map(isbox, args))
+
+        def again(values):
+            given = dict(zip(nums, values, strict=True))
+            return fun(*(given.get(num, arg) for num, arg in enumerate(args)), **options)
+
+        self.again = again
 
     @property
     def name(self):
         """How the user knows it."""
         return getattr(self.subject, "name", None) or getattr(self.subject, "__name__", type(self.subject).__name__)
-
-    @property
-    def values(self):
-        """The arguments that are differentiated."""
-        return [self.args[num] for num in self.nums]
-
-    @property
-    def plain(self):
-        """Whether no argument belongs to an outer trace."""
-        return not any(map(isbox, self.args))
-
-    def again(self, values):
-        """The same call with other values of these arguments."""
-        args = list(self.args)
-        for num, value in zip(self.nums, values, strict=True):
-            args[num] = value
-        return self.fun(*args, **self.options)
 
 
 @contextmanager
@@ -66,15 +57,15 @@ def witnessed(nodes=None):
     Parameters
     ----------
     nodes : list, optional
-        Gets the nodes themselves; then no values are kept, and nothing is yielded.
+        Gets the nodes of the tape themselves; then no values are kept, and nothing is yielded.
 
     Yields
     ------
-    list of Visit
+    list of Node
         In the order of the calls.
     """
-    found: list[Visit] = []
-    running: list[Visit] = []  # calls whose derivative is under way, the innermost last
+    found: list[Node] = []
+    running: list[Node] = []  # calls whose derivative is under way, the innermost last
 
     class Witness(ReverseNode):
         """A node that reports itself."""
@@ -87,12 +78,12 @@ def witnessed(nodes=None):
             if nodes is not None:
                 nodes.append(self)
                 return
-            visit = Visit(fun, value, args, options, nums, running[-1] if running else None)
-            found.append(visit)
+            node = Node(fun, value, args, options, nums, running[-1] if running else None)
+            found.append(node)
             pull = self.vjp
 
             def watched(g):
-                running.append(visit)
+                running.append(node)
                 try:
                     return pull(g)
                 finally:
@@ -111,34 +102,35 @@ def witnessed(nodes=None):
 
 def bytes_held(nodes):
     """Bytes of all arrays that nodes of a tape keep alive, each buffer once."""
+    return bytes_of([node.vjp for node in nodes])
+
+
+def bytes_of(thing, opened=()):
+    """Bytes of all arrays below functions (what they close over, their defaults), containers and `opened` types."""
     buffers: dict[int, int] = {}
     seen: set[int] = set()
-    for node in nodes:
-        _collect(node.vjp, buffers, seen, 0)
+    waiting = [(thing, 0)]
+    while waiting:
+        thing, depth = waiting.pop()
+        if isinstance(thing, np.ndarray):
+            while isinstance(thing.base, np.ndarray):
+                thing = thing.base
+            buffers[id(thing)] = thing.nbytes
+        elif depth <= DEEPEST and id(thing) not in seen:
+            seen.add(id(thing))
+            waiting += [(part, depth + 1) for part in _parts(thing, opened)]
     return sum(buffers.values())
 
 
-def _collect(thing, buffers, seen, depth):
-    """Arrays below functions (what they close over, their defaults), containers and boxes."""
-    if isinstance(thing, np.ndarray):
-        while isinstance(thing.base, np.ndarray):
-            thing = thing.base
-        buffers[id(thing)] = thing.nbytes
-        return
-    if depth > DEEPEST or id(thing) in seen:
-        return
-    seen.add(id(thing))
-    for part in _parts(thing):
-        _collect(part, buffers, seen, depth + 1)
-
-
-def _parts(thing):
+def _parts(thing, opened):
     if isinstance(thing, (tuple, list, set)):
         return thing
     if isinstance(thing, dict):
         return thing.values()
     if isbox(thing):
         return (thing._value,)
+    if isinstance(thing, opened):
+        return vars(thing).values()
     if hasattr(thing, "func") and hasattr(thing, "keywords"):  # functools.partial
         return (thing.func, thing.args, thing.keywords)
     held = [cell.cell_contents for cell in getattr(thing, "__closure__", None) or () if cell != EMPTY]

@@ -1,0 +1,481 @@
+"""What the numbers of a sweep prove: one table from the evidence along a line to a word and its reason, one from the
+words of all lines to the verdict.
+
+Everything is judged on the gap m(t) = (f(x + t d) - f(x - t d)) / 2t - g . d, with the displacement that
+rounding left of t d. For a right gradient m(t) = c t^2 + noise / t; for a wrong one it has a plateau.
+
+Estimates of the plateau: each m(t) and each Richardson extrapolation of two neighbours. The error bar of
+an estimate is its largest distance from the two estimates beside it, plus the noise of the loss divided by
+the step. The estimate with the smallest bar counts.
+
+Taylor: R1(t), the size of f(x +- t d) - f without the gradient, must fall like t; R2(t), that of
+f(x +- t d) - f -+ t g . d, like t^2 or faster. Each is the root mean square over both signs, so that
+the t^2 and t^3 parts of a smooth loss cannot cancel.
+
+Source: the extrapolation is that of C. J. F. Ridders, Advances in Engineering Software 4, 1982.
+"""
+
+import math
+from contextlib import suppress
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from sparsedp.check.sweep import REFUSALS, Line, joined, noise_of
+from sparsedp.derivative import NO_JVP, pushforward
+
+__all__ = ["FIELDS", "Judgement", "at_kinks", "curvature", "examined", "explained", "forward_mode", "verdict"]
+
+RESOLVED = 1e-3  # an error bar above this share of the derivative proves nothing
+AGREED = 1e-8  # a gap below this share is agreement, whatever the bar
+NOISY = 1e-6  # the same behind a solve that the ledger shows, or in noise: what a solve leaves may be smooth
+LEFT = 1e-9  # a gap below this share of the loss may be what a solve leaves: not wrong, but not right either
+LOOSE = 10.0  # the same in units of the tolerance of the solves, where that is looser
+PER_NOISE = 1e4  # between the two: this multiple of the measured noise of the loss
+VANISHED = 1e-6  # a derivative and bar below this share of the curvature are 0
+FAR, NEAR = 10.0, 3.0  # gap over bar: beyond FAR it is wrong, below NEAR it is right
+FINEST = 5  # levels that tell the noise of the loss
+LEVELS = 4  # usable steps without which nothing is judged
+TINY = np.finfo(float).tiny
+ROUNDING = 1e3  # noise above this many roundings has another cause: a solver, chaos, a staircase
+NEGLIGIBLE = 1e-6  # of the largest derivative: an open direction below it does not matter
+SMALL = 1e-3  # the same for a direction that is resolved to a digit at least
+
+MODES = 1e-10  # forward and reverse mode differ by rounding
+SOLVED = 1e-6  # by more, when there are solves inside: each mode ends at its own residual
+
+# Taylor orders.
+FIRST = 0.05  # order 1 is 1 to within this
+SECOND = 1.95  # the least order with the gradient
+THIRD = 2.9  # the least order with gradient and Hessian
+WRONG = 2.1  # up to here the third order is that of a wrong Hessian, above that of a loss without third derivatives
+ODD = 0.1  # share of a remainder that changes its sign with the step: then the Hessian jumps at x
+FEWEST = 3  # usable levels
+CLEAR = 100.0  # a usable remainder stands this far above the noise: the noise then moves an order by 0.03 at most
+LINEAR = 5.0  # a level serves for order 1 where t |g . d| is this often the even part: it moves it by 0.03 at most
+NEARBY = 70.0  # levels up to this multiple of the step of the plateau: coarser ones are no limit t -> 0
+APART = 4.0  # least ratio of the two steps of a pair
+MOST = 5  # usable levels that are read, the finest ones
+
+# Steps beyond those of the sweep, where it leaves the derivative open.
+GOAL = 1e-5  # error bar, relative, above which a sweep is extended
+COARSER = tuple(2.0**k for k in range(1, 38, 3))
+BETWEEN = 2.0 ** np.arange(-9, 7)  # around the step of the plateau
+FINER = tuple(2.0**-k for k in range(33, 46, 3))
+HALVES = 2.0 ** np.arange(-1, -21, -1)  # for a third order that the sweep leaves open
+
+# Ripples: a small part of the loss with a derivative that is not small.
+RIPPLED = 2.0 ** -np.arange(27, 46)  # steps that may see one
+SMOOTH = 30.0  # roundings that the loss of a smooth function varies by at most
+RUN = 3  # neighbouring fine levels that agree with each other
+SEES = 0.1  # to this share; and the rounding of the loss, as a share of the gap, up to which a level tells
+WITHIN = (1.0, 10.0, 100.0)  # multiples of the step over which a gap moves the loss by its noise
+NEARER = 0.01  # steps of the plateau: within this a smooth gradient does not bend
+
+# What a judgement tells as plain data.
+FIELDS = "direction word difference slope gap bar scale step rate1 rate2 digits jitter note bend rate3".split()
+
+
+# Evidence -> word and reason: the first row that holds. Where few levels are usable, only the first four can.
+WORDS: tuple[tuple[str, Any, str], ...] = (
+    ("constant", lambda e: e.silent and e.slope == 0, "the loss does not change along this direction"),
+    (
+        "disagrees",
+        lambda e: e.silent and abs(e.slope) * e.silent > 2 * FAR * e.line.trials.eps * abs(e.line.base),
+        "the loss does not change along this direction, the gradient says it does",
+    ),
+    ("noise", lambda e: e.silent, "the rounding of the loss hides the derivative"),
+    ("few", lambda e: e.used < LEVELS, "{e.used} usable steps, at least 4 are needed ({e.refusals})"),
+    # Between two one-sided derivatives every value is a matter of convention.
+    (
+        "outside",
+        lambda e: e.beyond > FAR * (e.bar + e.uncertain) and e.beyond > RESOLVED * e.scale,
+        "outside the one-sided derivatives, off by {e.share:.1e}",
+    ),
+    ("kink", lambda e: e.split, "a kink: the one-sided derivatives differ by {e.split:.1e}, of {e.scale:.1e}"),
+    (
+        "noise",
+        lambda e: e.wrong and e.size <= e.left,
+        "off by {e.share:.1e}: solves may leave this in such a loss, tighten their rtol",
+    ),
+    # Noise that swallows the whole difference may be a chaotic loss with a right gradient.
+    (
+        "disagrees",
+        lambda e: e.wrong and (e.jitter < ROUNDING or abs(e.difference) > FAR * e.bar),
+        "off by {e.share:.1e}, with error bars of {e.resolution:.1e}",
+    ),
+    ("noise", lambda e: e.wrong, "the loss is noisy or chaotic: differences see no derivative at all"),
+    (
+        "noise",
+        lambda e: e.resolved and not e.close,
+        "off by {e.share:.1e}, with error bars of {e.resolution:.1e}: not enough to tell",
+    ),
+    (
+        "masked",
+        lambda e: e.close and e.jitter > ROUNDING and e.bar > NOISY * e.scale,
+        "noise of {e.loudness:.0e} of the loss leaves {e.digits:.0f} digits, 6 are needed",
+    ),
+    (
+        "rough",
+        lambda e: (e.close or e.zero) and e.used2 >= FEWEST and not e.rate2 >= SECOND,
+        "the second Taylor remainder is of order {e.rate2:.2f}: not twice differentiable here",
+    ),
+    (
+        "rough",
+        lambda e: (e.close or e.zero) and e.used1 >= FEWEST and not abs(e.rate1 - 1) <= FIRST,
+        "the loss changes with order {e.rate1:.2f} in the step, not 1",
+    ),
+    (
+        "few",
+        lambda e: e.close and 0 < e.used2 < FEWEST,
+        "the second Taylor remainder stands out of the noise on {e.used2} steps, 3 are needed",
+    ),
+    (
+        "few",
+        lambda e: e.close and e.used1 < FEWEST and not e.flat,
+        "the change of the loss stands out of the noise on {e.used1} steps, 3 are needed",
+    ),
+    ("agrees", lambda e: e.close and e.used1 < FEWEST, "flat: there is no climb to judge order 1 by"),
+    ("agrees", lambda e: e.close, ""),
+    ("vanishes", lambda e: e.zero, "the derivative is 0 to rounding, beside the curvature"),
+    ("noise", lambda e: True, "noise of {e.resolution:.1e} of the derivative hides it"),
+)
+
+# What is known at the end -> verdict: the first group with a member decides, by the member that counts most.
+VERDICTS = (
+    (("unsound",), "inconclusive"),
+    (("broken",), "disagrees"),
+    (("ripple",), "inconclusive"),
+    (("disagrees", "outside"), "disagrees"),
+    (("open", "kink", "rough", "noise", "masked", "few"), "inconclusive"),
+)
+
+
+def verdict(judged, doubts):
+    """Judgements of all directions and doubts, pairs of word and reason -> (verdict, reason in words)."""
+    largest = max((one.scale for one in judged), default=0.0)
+    known = [(word, reason, np.inf) for word, reason in doubts]
+    for one in judged:
+        if not (one.word in ("noise", "masked", "few") and _negligible(one, largest)):
+            weight = abs(one.gap) / one.scale if one.wrong else 0.0
+            known.append((one.word, f"along {one.direction}: {one.note}", weight))
+    for words, outcome in VERDICTS:
+        members = [(weight, reason) for word, reason, weight in known if word in words]
+        if members:
+            return outcome, max(members, key=lambda pair: pair[0])[1]
+    proved = {one.word for one in judged} & {"agrees", "vanishes"}
+    if not proved:
+        return "inconclusive", "the loss is constant to rounding"
+    return "agrees", "" if "agrees" in proved else "the gradient is 0 to rounding, beside the curvature"
+
+
+def _negligible(one, largest):
+    """An open direction whose derivative, by gradient and by differences, is little beside the others."""
+    if abs(one.gap) > NEAR * one.bar:
+        return False
+    small = one.word == "noise" and one.resolution <= 0.1 and one.bar <= SMALL * largest
+    return small or one.scale + one.bar <= NEGLIGIBLE * largest
+
+
+# ------------------------------------------------------------ evidence
+
+
+class Judgement:
+    """What is proved along one direction, in a word, and the evidence for it.
+
+    Attributes
+    ----------
+    direction : str
+    word : str
+        agrees, disagrees; vanishes: both derivatives are 0 to rounding; kink: the one-sided derivatives differ;
+        outside: they differ, and the gradient is beyond both; rough: a Taylor remainder has the wrong order;
+        noise, few: nothing is proved, by noise or for want of usable steps;
+        masked: gap and bar are small, but noise that is no rounding leaves too few digits;
+        constant: the loss does not change, as the gradient says; ripple: coarse and fine steps see two derivatives.
+    difference, slope : float
+        Best estimate of the derivative, from differences; and g . d.
+    gap, bar, scale : float
+        Difference less slope, its error bar, and what both are compared with.
+    step : float
+        Where the plateau is.
+    rate1, rate2, rate3 : float
+        Orders of f(x + t d) - f, the one farthest from 1, NaN when there is none; the lowest with t g . d taken off,
+        infinite when that is noise on all levels; and with t^2/2 d . H d too, where a Hessian product was looked at.
+    bend : float
+        d . H d.
+    digits : float
+    jitter : float
+        Noise of the loss, in units of its rounding.
+    note : str
+    line : Line
+    """
+
+    gap = size = jitter = step = rate1 = rate2 = bend = rate3 = math.nan
+    bar, digits = math.inf, 0.0
+    close: Any = False
+    wrong: Any = False
+    zero: Any = False
+
+    @np.errstate(all="ignore")  # losses near the limits of the floating point numbers are judged like others
+    def __init__(self, line):
+        self.line, self.direction, self.slope, self.used = line, line.name, line.slope, len(line.usable)
+        self.scale, self.silent = np.float64(max(abs(line.slope), line.typical)), max(line.silent, default=0.0)
+        self.refusals = "; ".join(sorted({level.note for level in line.levels} - {""})) or "the sweep has too few steps"
+        if self.used >= LEVELS:
+            self._read(line)
+            self._measure()
+            self._compare()
+            self._order()
+        self.difference, self.resolution = self.slope + self.gap, self.bar / self.scale
+        self.word, self.note = first(WORDS, self)
+
+    def _read(self, line):
+        """Gaps, remainders and noise on all levels, from coarse to fine."""
+        eps, base = line.trials.eps, abs(line.base)
+        levels = np.array([level[:5] for level in line.usable]).T
+        self.t, sides = levels[0], levels[1:3]
+        self.changes = sides - line.base
+        self.rests = self.changes - levels[3:]  # without the gradient, on both sides
+        self.m = (self.rests[0] - self.rests[1]) / (2 * self.t)
+        # The gap of the one-sided differences, with the part that comes from unequal displacements taken out.
+        self.kinks = (self.rests[0] + self.rests[1]) / self.t
+        self.rounding = eps * np.maximum(np.max(np.abs(sides), axis=0), max(base, TINY))
+        # What the finest levels vary by, in roundings of the loss. Rounding does that, or a solver inside.
+        varied = np.abs(np.diff(self.m)) * self.t[1:] / self.rounding[1:]
+        self.jitter = max(float(np.max(varied[1 - FINEST :])), 2 * line.noise)
+        self.noise = max(2.0, self.jitter) * self.rounding
+        self.curvature = float(np.median(np.abs(self.kinks / self.t)[:3]))
+
+    def _measure(self):
+        """The estimate with the smallest bar that no finer level contradicts, away from kinks if there is one."""
+        trials, spread = self.line.trials, self.line.point.eps
+        least = NOISY if trials.solved else AGREED
+        self.agreed = max(float(np.clip(PER_NOISE * trials.eps * self.jitter, least, NOISY)), 300 * spread)
+        ranked = self._estimates(self.m, 2, self.noise)
+        bends = self._estimates(self.kinks, 1, 2 * self.noise)
+        found: list[Any] = []
+        for gap, bar, index in ranked:
+            # A derivative is a limit, not a passing plateau: all finer levels agree with it.
+            passing = np.any((np.abs(self.m - gap) > bar + 6 * self.noise / self.t)[index + 1 :])
+            # The jump of the one-sided derivatives around the level, and its bar; 0 if it goes to 0.
+            jump, error = next((pair[:2] for pair in bends if abs(pair[2] - index) <= 1), (0.0, 0.0))
+            scale = max(self.scale, abs(self.slope + gap))
+            split = abs(jump) * (abs(jump) > max(FAR * error, self.agreed * scale))
+            found.append((passing, bool(split) or bar > RESOLVED * scale, gap, bar, index, scale, split, error))
+        # Of equal ones the first, with the smallest bar; of passing ones the last.
+        lasting = [one for one in found if not one[0]] or found[-1:]
+        best = next((one for one in lasting if not one[1]), lasting[0])
+        self.gap, bar, index, self.scale, self.split, self.uncertain = best[2:]
+        floor = 8 * spread * self.curvature + 4 * spread * self.line.typical
+        self.bar, self.step, self.size, self.floor = bar + floor, float(self.t[index]), abs(self.gap), floor
+
+    def _estimates(self, values, power, noise):
+        """Estimates of v0 in values(t) = v0 + c t^power, best first: (estimate, bar, index of its finest level)."""
+        ratio = (self.t[:-1] / self.t[1:]) ** power
+        found: list[Any] = []
+        for series in (values, (ratio * values[1:] - values[:-1]) / (ratio - 1)):
+            jumps, start = np.abs(np.diff(series)), values.size - series.size + 1
+            bars = np.maximum(jumps[:-1], jumps[1:]) + 2 * (noise / self.t)[start:-1]
+            found += zip(series[1:-1], bars, range(start, values.size - 1), strict=True)
+        return sorted(found, key=lambda estimate: estimate[1])
+
+    def _compare(self):
+        """How gap, bar, scale and noise compare."""
+        size, bar, scale, trials = self.size, self.bar, self.scale, self.line.trials
+        self.share, self.beyond = size / scale, (size - self.split / 2) * (self.split > 0)
+        far = bar * (FAR if self.jitter < ROUNDING else 3 * FAR)
+        self.wrong = size > max(far, self.agreed * scale, self.agreed * 1e-4 * self.curvature)
+        base = abs(self.line.base)
+        self.left = max(LEFT * base, LOOSE * trials.tolerance * max(base, scale)) * trials.solved
+        self.resolved = bar <= RESOLVED * scale
+        self.close = self.resolved and size <= max(min(NEAR * bar, RESOLVED * scale - bar), self.agreed * scale)
+        vanished = scale + bar <= max(VANISHED, self.agreed) * self.curvature
+        self.zero = not self.resolved and size <= NEAR * bar and vanished
+        self.loudness = self.jitter * trials.eps
+        share = max(size, bar) / (self.curvature if self.zero else scale)
+        self.digits = float(np.clip(-np.log10(share), 0, 16))
+
+    def _order(self):
+        """Orders of the Taylor remainders, on levels near the plateau.
+
+        Usable for order 2: R2 >= CLEAR (noise + t |gap|). Where they are fewer than FEWEST, the even part of R2 is
+        judged, which no gap can hide, then the same on all levels; with no usable level at all the loss is linear to
+        its noise, and there is no order to judge. Usable for order 1: R1 >= CLEAR noise, and t |g . d| >= LINEAR
+        times the even part (f(x + t d) + f(x - t d)) / 2 - f. Where the slope is so small that f bends before it
+        climbs (near a minimum), order 1 cannot be 1: the direction is flat and order 1 is not judged. So it is where
+        neither the loss nor t g . d ever leaves the noise (the kernel of a Laplacian), if gap and bar are far below
+        the terms of g . d.
+        """
+        t, clear, gap = self.t, CLEAR * self.noise, self.size * (self.close or self.zero)
+        near, even, climb = t <= NEARBY * self.step, np.abs(self.kinks * t) / 2, abs(self.slope) * t
+        change, rest = both(self.changes), both(self.rests)
+        usable = (rest, rest >= clear + CLEAR * t * gap), (even, even >= clear)
+        found = [orders(t, size, some & place) for place in (near, t > 0) for size, some in usable]
+        self.used2, rates = next((one for one in found if one[0] >= FEWEST), max(found, key=lambda one: one[0]))
+        self.rate2 = min(rates, default=np.nan) if self.used2 else np.inf
+        seen, climbs = near & (change >= clear), climb >= LINEAR * even
+        self.used1, rates = orders(t, change, seen & climbs)
+        self.rate1 = max(rates, key=lambda rate: abs(rate - 1), default=np.nan)
+        still = self.bar + self.size <= VANISHED * self.scale and not np.any(seen | (climb >= clear))
+        self.flat = bool(still or np.any(seen & ~climbs))
+
+
+def first(rows, evidence):
+    """Word and reason of the first row of a table that holds."""
+    return next((word, text.format(e=evidence)) for word, holds, text in rows if holds(evidence))
+
+
+def both(sides):
+    """Root mean square over both signs of a step."""
+    return np.hypot(*sides) / np.sqrt(2)
+
+
+def orders(t, remainder, usable, most=MOST):
+    """(number, orders) of the finest usable levels; the two levels of a pair are at least a factor APART."""
+    levels, found = np.flatnonzero(usable)[-most:], []
+    for coarse in levels:
+        for fine in levels[t[levels] * APART <= t[coarse]][:1]:
+            found.append(float(np.log(remainder[coarse] / remainder[fine]) / np.log(t[coarse] / t[fine])))
+    return len(levels), found
+
+
+# ------------------------------------------------------------ all directions
+
+
+def examined(trials, point, base, gradient, directions, steps, extend):
+    """Point, gradient and directions, pairs of name and displacement -> one Judgement for each.
+
+    The noise belongs to the loss, not to a direction: the larger one along the first and the last counts for all.
+    """
+    lines = [Line(name, direction, point, gradient, trials, base) for name, direction in directions]
+    noise = max(map(noise_of, [*lines[:1], *lines[1:][-1:]]), default=0.0)
+    for line in lines:
+        line.noise = noise
+    return [measured(line, steps, extend, line is lines[0]) for line in lines]
+
+
+def at_kinks(judged):
+    """Whether kinks may explain what speaks against a gradient; one that is far in one direction is seen in others."""
+    words = {one.word for one in judged}
+    return "outside" in words or {"disagrees", "kink"} <= words
+
+
+def forward_mode(loss, judged):
+    """How far forward mode is from reverse mode along some directions -> (gap, allowed); None where a rule has no JVP.
+
+    They may differ by rounding, by SOLVED where the ledger shows a solve or the loss is noisy.
+    """
+    gaps, allowed = [0.0], MODES
+    for one in judged:
+        line, point = one.line, one.line.point
+        tangent = point.arrays(line.direction)
+        try:
+            with np.errstate(all="ignore"):
+                slope = float(pushforward(loss, point.tree(), point.tree(tangent))[1])
+        except NO_JVP:
+            return None
+        wanted = float(line.gradient @ joined(tangent))
+        gaps.append(0.0 if slope == wanted else abs(slope - wanted) / max(one.scale, abs(wanted), line.typical))
+        allowed = max(allowed, 300 * point.eps, SOLVED * (one.jitter > ROUNDING or line.trials.solved))
+    return float(np.max(gaps)), allowed
+
+
+# ------------------------------------------------------------ more steps where the first leave it open
+
+
+def measured(line, steps, extend, close=False):
+    """Sweep, judge, and where the derivative stays open go on: finer if there may be finer features.
+
+    Noise at the level of rounding asks for coarser steps: x may be small beside the scale of the loss.
+
+    Parameters
+    ----------
+    line : Line
+    steps : sequence of float
+    extend : bool
+        Whether other steps may be taken too.
+    close : bool
+        Whether steps far below the plateau are looked at, where there is noise, though all agrees.
+    """
+    line.sweep(steps)
+    found = Judgement(line)
+    if extend and found.word in ("few", "rough") and found.step > 0:  # more levels between those there are
+        line.sweep(found.step * BETWEEN)
+        found = Judgement(line)
+    if extend and found.word != "vanishes" and found.resolution > max(GOAL, 1e4 * line.point.eps):
+        line.sweep(FINER * (not found.jitter <= ROUNDING) + COARSER * (not found.jitter > ROUNDING))
+        found = min(Judgement(line), found, key=lambda one: one.resolution)
+    if extend and close and found.close and found.jitter > SMOOTH:
+        line.sweep(RIPPLED)
+        _see_ripple(found, Judgement(line))
+    return found
+
+
+def _see_ripple(found, finer):
+    """A plateau of coarse steps is no proof where fine ones, that rounding does not hide, agree on another derivative.
+
+    Then the loss has a ripple: its derivative at x is one thing, the slope of the whole another.
+    """
+    for start in range(np.flatnonzero(finer.t < found.step)[0], finer.t.size - RUN + 1):
+        run = slice(start, start + RUN)
+        gap, rounding = float(np.median(finer.m[run])), np.max(4 * finer.rounding[run] / finer.t[run])
+        visible = max(NOISY * found.scale, FAR * found.bar, rounding / SEES)
+        if abs(gap) > visible and np.max(np.abs(finer.m[run] - gap)) <= SEES * abs(gap):
+            found.word = "ripple"
+            found.note = f"a ripple: steps below {found.step:.0e} are off by {abs(gap) / found.scale:.1e}, others agree"
+
+
+@np.errstate(all="ignore")
+def explained(found, gradient):
+    """Whether a ripple below the noise of the loss, that the gradient shows, may explain a gap; then -> ripple.
+
+    A gradient that bends by as much as the gap, within steps over which the gap does not move the loss beyond its
+    noise, belongs to a loss whose ripple no difference can see.
+    """
+    line, noise = found.line, max(2.0, found.jitter) * found.line.trials.eps * abs(found.line.base)
+
+    def slope(step):
+        there = line.point.tree(line.point.vector + step * line.direction)
+        return line.point.gradient(gradient(there)) @ line.direction
+
+    for step in [times * noise / found.size for times in WITHIN] if found.word == "disagrees" else []:
+        with suppress(*REFUSALS):
+            bend = abs(slope(step) + slope(-step) - 2 * line.slope) if step < NEARER * found.step else 0.0
+            if bend > SEES * found.size:
+                found.word = "ripple"
+                found.note = f"the gradient bends by {bend / found.scale:.1e} of itself within a step of {step:.0e}: "
+                found.note += "a ripple below the noise of the loss may explain the gap"
+                return
+
+
+# ------------------------------------------------------------ Hessian products
+
+HESSIANS: tuple[tuple[str, Any, str], ...] = (
+    ("agrees", lambda e: not e.used, "is noise"),
+    ("inconclusive", lambda e: e.used < FEWEST, "stands out of the noise on {e.used} steps, 3 are needed"),
+    ("agrees", lambda e: e.rate >= THIRD, "of order {e.rate:.2f}"),
+    ("inconclusive", lambda e: e.rate > WRONG or e.jumps, "of order {e.rate:.2f}: not three times differentiable"),
+    ("disagrees", lambda e: True, "of order {e.rate:.2f}: it is off by {e.off:.1e}"),
+)
+
+
+@np.errstate(all="ignore")
+def curvature(found, bend, extend):
+    """Judgement of a gradient and a Hessian product d . H d -> word and reason, by the third Taylor remainder.
+
+    The order is read on the finest usable levels, those that stand out of noise, gap and the rounding of x.
+    """
+    e = Judgement(found.line)
+    rests = e.rests - e.t**2 / 2 * bend
+    usable = both(rests) >= CLEAR * (e.noise + e.t * (found.size + e.floor))
+    used, rates = orders(e.t, both(rests), usable, FEWEST)  # coarse ones are no limit t -> 0
+    if extend and 0 < used < FEWEST:
+        found.line.sweep(HALVES)
+        return curvature(found, bend, False)
+    found.bend, found.rate3 = bend, min(rates, default=np.nan) if used else np.inf
+    last = np.max(np.flatnonzero(usable), initial=0)
+    odd, even = abs(rests[0, last] - rests[1, last]), abs(rests[0, last] + rests[1, last])
+    off = even / e.t[last] ** 2 / np.float64(abs(bend))
+    word, text = first(HESSIANS, SimpleNamespace(used=used, rate=found.rate3, jumps=odd > ODD * even, off=off))
+    return word, f"d.Hd = {bend:.9g} along {found.direction}, third Taylor remainder {text}"

@@ -1,0 +1,552 @@
+"""Checks of operators: is the transpose the transpose, are two forms one operator, are its derivatives right?
+
+Figures are in units of rounding times the size of the operator; each check is a function of random fields, and a row.
+"""
+
+from contextlib import suppress
+from functools import cached_property, reduce
+from math import inf, sqrt
+from operator import add, matmul
+from typing import Any
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.check.properties import facts_of
+from sparsedp.check.summary import Row, Summary
+from sparsedp.check.sweep import generator
+from sparsedp.derivative import pullback, pushforward, value_and_grad
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.operators.given import check_operator
+from sparsedp.structure.base import Scaled, result_dtype
+from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.lazy import Chain, Sum
+from sparsedp.tree import norm
+
+__all__ = ["OperatorSummary", "fault_of", "field", "operator", "transpose", "twin"]
+
+LIMIT = 10.0
+DTYPES = ("float64", "complex128", "float32", "complex64")
+LARGEST = 2**21  # unknowns above which no matrix is built for a check
+MOST_COLUMNS = 512  # columns that are found one application at a time
+POWERS = 8  # products of a power iteration
+PLAIN = 1e-100, 1e100  # sizes of operators whose square can be held
+ORDINARY = 1e-30, 1e30  # sizes of operators that take fields near the ends of the range of floats
+
+
+def field(rng, shape, dtype):
+    """Random normal field of a dtype."""
+    values = rng.standard_normal(shape)
+    if np.dtype(dtype).kind == "c":
+        values = values + 1j * rng.standard_normal(shape)
+    return np.asarray(values, dtype)
+
+
+def row(name, measure, optional=False):
+    """Row of what ``measure()`` returns: a figure, a list of mistakes, or the reason why the property does not apply.
+
+    An error fails, or skips a row that is optional: operators from outside may raise anything.
+    """
+    try:
+        found = measure()
+    except Exception as error:
+        note = f"{type(error).__name__}: {error}"
+        return Row(name, None, None, None, f"refused, {note}") if optional else Row(name, None, LIMIT, False, note)
+    if isinstance(found, str):
+        return Row(name, None, None, None, found)
+    if isinstance(found, list):
+        return Row(name, float(len(found)), 0.0, not found, "; ".join(found))
+    return Row(name, float(found), LIMIT, bool(found <= LIMIT))
+
+
+class Probe:
+    """An operator under test: random fields for it, and what its rounding errors are measured against.
+
+    Parameters
+    ----------
+    op : Operator
+        Its tangent is tested: an inverse without its check of primal data.
+    seeds : int
+        Random fields of each test and dtype.
+    rng : None, int or numpy Generator
+
+    Attributes
+    ----------
+    sizes : sparse matrix or None
+        Sizes of the entries, where they can be listed at a fair price.
+    size : float
+        sqrt(|A|_1 |A|_inf): from the entries, or a lower bound from products. A bound from below makes the tests
+        stricter, never laxer.
+    """
+
+    def __init__(self, op, seeds=1, rng=None):
+        self.op, self.rng, self.seeds = op.tangent, generator(rng), max(seeds, 1)
+        self.real = op.dtype.kind != "c"
+        cheap = max(op.shape) <= (LARGEST if op.structure.has_entries else MOST_COLUMNS)
+        self.sizes = magnitude(self.op.structure) if cheap else None
+        self.size = _size(self.sizes) if cheap else self._bound()
+
+    def domain(self, dtype=float):
+        """Random field of the domain."""
+        return field(self.rng, self.op.domain.shape, dtype)
+
+    def codomain(self, dtype=float):
+        """Random field of the codomain, complex where the operator is."""
+        return field(self.rng, self.op.codomain.shape, dtype if self.real else np.result_type(dtype, np.complex64))
+
+    def rows(self, name, dtypes):
+        """A row for each dtype: how far the two sides of an identity are apart, at worst over the seeds."""
+        rows: list[Row] = []
+        for dtype in map(np.dtype, dtypes):
+            low, high = (1e-25, 1e25) if np.finfo(dtype).eps > 1e-10 else (1e-290, 1e290)  # squares fit, too
+            unfit = ""
+            if 0 < self.size <= low or self.size >= high:
+                unfit = f"entries of size {self.size:.1e} do not fit into {dtype}"
+            worst = lambda dtype=dtype, unfit=unfit: unfit or np.max([self.gap(name, dtype) for _ in range(self.seeds)])
+            # A clean refusal of complex fields is fine where real fields work.
+            optional = dtype.kind == "c" and self.real and rows[0].ok is True
+            rows.append(row(f"{name}, {dtype}", worst, optional))
+        return rows
+
+    def gap(self, name, dtype):
+        """Distance of the two sides of an identity, entry by entry, in units of rounding; 0 where they are the same."""
+        left, right, bound = IDENTITIES[name](self, self.domain(dtype), self.domain(dtype), self.codomain(dtype))
+        gaps = np.abs(left - right).reshape(-1)
+        with np.errstate(all="ignore"):
+            shares = gaps / (bound * unit(self.op.structure, result_dtype(self.op.structure, dtype)))
+        return float(np.max(np.where(gaps == 0, 0.0, shares), initial=0.0))
+
+    def bound(self, u, transposed=False):
+        """What rounding is relative to in A u: |A| |u|, entry by entry.
+
+        Functions round relative to the whole result (transforms, solves): |A| |u| in norms.
+        """
+        whole = 0.0 if self.sizes is not None and self.op.structure.has_entries else self.size * norm(u)
+        sizes = self.sizes.T if transposed and self.sizes is not None else self.sizes
+        return whole if sizes is None else whole + sizes @ np.abs(u).reshape(-1).astype(float)
+
+    def transposed(self, g, real):
+        """A^T g by the transposed matrix, or by `.T` when no matrix can be listed; its real part, of real fields."""
+        op = self.op
+        listed = self.sizes is not None
+        back = (op.explicit().matrix.T @ g.reshape(-1)).reshape(op.domain.shape) if listed else op.T.apply(g)
+        return back.real if real else back
+
+    def _bound(self):
+        """The 2-norm, from below, by power iteration; only products of A itself count."""
+        bound, x = 0.0, self.domain()
+        for _ in range(POWERS):
+            y = self.op.apply(x)
+            bound = max(bound, float(norm(y) / norm(x)))
+            try:
+                x = self.op.T.apply(y)
+            except DerivativeError:  # it has no transpose
+                x = self.domain()
+            if not norm(x) > 0:
+                break
+        return bound
+
+
+def _hessian_product(op, u, v):
+    """That of Re sum(op(u)^2) / 2 along v, reverse over reverse."""
+    gradient = value_and_grad(lambda x: anp.sum(anp.real(op(x) ** 2)) / 2)
+    return pullback(lambda x: anp.sum(gradient(x)[1] * v), u)[1](1.0)
+
+
+def _dot(a, b):
+    """Summed in double precision: the sums are not what is tested."""
+    return np.sum(a * b.astype(np.result_type(b, float)))
+
+
+def _other_form(op, u):
+    """A u without the listed matrix; where only that is there, by SciPy."""
+    if not isinstance(op.structure, Matrix):
+        return op.matrix_free().apply(u)
+    product = op.explicit().matrix @ u.reshape(-1).astype(np.result_type(u, float))
+    return product.reshape(op.codomain.shape).astype(result_dtype(op.structure, u.dtype))
+
+
+# Identities of a right operator: left side, right side, and what their rounding is relative to.
+IDENTITIES: dict[str, Any] = {
+    "linearity": lambda p, u, v, g: (
+        p.op.apply(0.75 * u - v),
+        0.75 * p.op.apply(u) - p.op.apply(v),
+        p.bound(u) + p.bound(v),
+    ),
+    "JVP": lambda p, u, v, g: (pushforward(p.op, u, v)[1], p.op.apply(v), p.bound(v)),
+    "VJP": lambda p, u, v, g: (pullback(p.op, u)[1](g), p.transposed(g, u.dtype.kind != "c"), p.bound(g, True)),
+    "transpose": lambda p, u, v, g: (_dot(p.op.apply(u), g), _dot(u, p.op.T.apply(g)), p.size * norm(u) * norm(g)),
+    "second order": lambda p, u, v, g: (
+        _hessian_product(p.op, u, v),
+        p.transposed(p.op.apply(v), True),
+        p.size * p.size * norm(v),
+    ),
+    "forward": lambda p, u, v, g: (p.op.explicit().apply(u), _other_form(p.op, u), p.bound(u)),
+    "transposed": lambda p, u, v, g: (p.op.T.explicit().apply(g), _other_form(p.op.T, g), p.bound(g, True)),
+}
+
+
+def unit(structure, dtype):
+    """Size of one rounding: eps of the dtype, or the tolerance of a structure that solves, if it is larger.
+
+    An inverse has it in `solver.system.rtol`: its residual is accepted there, whatever the method.
+    """
+    members = getattr(structure, "members", None) or [getattr(structure, "inner", None)]
+    inner = max((unit(member, dtype) for member in members if member is not None), default=0.0)
+    system = getattr(getattr(structure, "solver", None), "system", structure)
+    return max(float(np.finfo(dtype).eps), float(getattr(system, "rtol", 0.0)), inner)
+
+
+def magnitude(structure):
+    """Structure -> sparse matrix of sizes: |A| entry by entry, |A| |B| for a product, |A| + |B| for a sum.
+
+    The rounding error of an application is at most a few units times this matrix times |u|, also
+    where entries of the product cancel.
+    """
+    if isinstance(structure, Scaled):
+        return magnitude(structure.inner) * abs(structure.factor)
+    if isinstance(structure, (Chain, Sum)):
+        combine = matmul if isinstance(structure, Chain) else add
+        return reduce(combine, map(magnitude, structure.members))
+    return abs(structure.explicit())
+
+
+def _size(sizes):
+    """sqrt(|A|_1 |A|_inf) of a matrix of sizes."""
+    one, infinite = (np.max(sizes.sum(axis=axis), initial=0.0) for axis in (0, 1))
+    return sqrt(one) * sqrt(infinite)
+
+
+# ------------------------------------------------------------ transpose
+
+
+def transpose(op, seeds=5, rng=None):
+    """Operator -> summary of the scaled dot test, |<A u, v> - <u, A^T v>| / (eps sqrt(|A|_1 |A|_inf) |u| |v|).
+
+    Parameters
+    ----------
+    op : Operator
+    seeds : int
+        Pairs of random fields for each dtype.
+    rng : None, int or numpy Generator
+        Source of the fields; default a fixed seed of its own.
+
+    Returns
+    -------
+    Summary
+        One row for float64, complex128, float32 and complex64, each <= 10. `.verdict`, `.ok`,
+        `.worst`, `.rows`; str() is the table.
+
+    Notes
+    -----
+    The products are plain, without conjugation, as `.T` is. The norms come from the entries; without
+    entries they are lower bounds from products with A, which makes the test stricter. An operator
+    that contains a solve is judged by the tolerance of the solve in place of eps.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid, from_functions, gradient
+    >>> transpose(gradient(Grid((4, 3)))).verdict
+    'agrees'
+    >>> transpose(from_functions(np.cumsum, np.cumsum, 5, 5)).verdict
+    'disagrees'
+    """
+    check_operator("check.transpose", op)
+    rows = Probe(op, seeds, rng).rows("transpose", DTYPES)
+    return Summary(f"transpose of {op.name}, {op.domain} -> {op.codomain}", rows)
+
+
+# ------------------------------------------------------------ agreement of forms
+
+
+def twin(op, seeds=3, rng=None):
+    """Operator -> summary: its matrix against its matrix-free form, forward and transposed.
+
+    Parameters
+    ----------
+    op : Operator
+    seeds : int
+        Random fields for each dtype.
+    rng : None, int or numpy Generator
+        Source of the fields; default a fixed seed of its own.
+
+    Returns
+    -------
+    Summary
+        The difference of the two products, entry by entry, in units of eps |A| |u| (for products of
+        operators |A| |B| |u|), and the difference of the matrix of the transpose from the transposed
+        matrix. Each <= 10.
+
+    Notes
+    -----
+    Some operators have one form only, and the first row says so. One that was given as a matrix is
+    compared with the product of that matrix by SciPy. One that was given by functions is compared
+    with its columns, found one application at a time, up to 512 unknowns; above, only the functions
+    are known, nothing can be compared, and the verdict is inconclusive.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid, divergence
+    >>> twin(divergence(Grid((4, 3)))).verdict
+    'agrees'
+    """
+    return Summary(f"twin of {op.name}, explicit against matrix-free", _form_rows(Probe(op, seeds, rng)))
+
+
+def _form_rows(probe):
+    """Rows: both products in three dtypes, entry by entry, and the entries of the transpose."""
+    op, listed = probe.op, probe.sizes is not None
+    rows = [row("forms", lambda: _forms(op.structure, listed))]
+    rows += probe.rows("forward", DTYPES[:3]) if listed else []
+    transposed = row("transposed", lambda: op.T.apply(np.zeros(op.codomain.shape)) is None)
+    if listed and transposed.ok:
+        rows += probe.rows("transposed", DTYPES[:3])
+        rows.append(row("transpose, entry by entry", lambda: _entries(probe)))
+    return rows if transposed.ok or not listed else [*rows, transposed]  # what a foreign function raises has its row
+
+
+def _forms(structure, listed):
+    if isinstance(structure, Matrix):
+        return "one form: given as a matrix; compared with the product by SciPy"
+    if structure.has_entries:
+        return "both" if listed else "too large: the matrix was not built for this test"
+    return f"one form: given by functions{'; compared with' if listed else ', and too large to list'} its columns"
+
+
+def _entries(probe):
+    """The matrix of the transpose, from its own definition, against the transposed matrix."""
+    structure, rounding = probe.op.structure, unit(probe.op.structure, float)
+    gap = abs(structure.transpose().explicit() - structure.explicit().T).tocsr()
+    gap.eliminate_zeros()
+    if not gap.nnz or not structure.has_entries:  # functions round relative to the whole
+        return gap.max() / (probe.size * rounding) if gap.nnz else 0.0
+    shares = gap.multiply(probe.sizes.T.tocsr().power(-1)).tocsr()
+    return shares.max() / rounding if shares.nnz == gap.nnz else inf  # an entry where there should be none
+
+
+def fault_of(op, rng):
+    """Operator -> what is wrong with its linearity or its transpose, in words; "" if nothing."""
+    probe = Probe(op, 1, rng)
+    kinds = DTYPES[:1] if probe.real else DTYPES[1:2]
+    rows = probe.rows("linearity", kinds) + probe.rows("transpose", kinds)
+    failed = [(inf if one.figure is None else one.figure, one) for one in rows if one.ok is False]
+    if not failed:
+        return ""
+    figure, worst = max(failed, key=lambda pair: pair[0])
+    how = worst.note or f"is off by about {figure * unit(probe.op.structure, float):.0e}"
+    return f"its {worst.name.split(',')[0]} {how}"
+
+
+# ------------------------------------------------------------ arguments: each test gives a list of mistakes
+
+
+def _shapes(probe):
+    """Fields that hold as many numbers in another shape, or one number too many."""
+    shape, size, mistakes = probe.op.domain.shape, probe.op.domain.size, []
+    for other in {(*shape, 1), (size + 1,), (1, size), (size,)} - {shape}:
+        try:
+            probe.op(np.zeros(other))
+            mistakes.append(f"takes shape {other} for {shape}")
+        except ShapeError:
+            pass
+        except Exception as error:  # anything but a ShapeError is the wrong answer
+            mistakes.append(f"shape {other} raises {type(error).__name__}")
+    return mistakes
+
+
+def _dtypes(probe):
+    """The result has the dtype of the field; bool and int become float64, and have no gradient."""
+    op, mistakes = probe.op, []
+    for dtype in map(np.dtype, DTYPES):
+        try:
+            found = op(probe.domain(dtype)).dtype
+        except (TypeError, DerivativeError):
+            if dtype.kind == "c" and probe.real:
+                continue  # a clean refusal of complex fields
+            raise
+        if found != result_dtype(op.structure, dtype):
+            mistakes.append(f"{dtype} gives {found}")
+    for kind in ("int64", "bool"):
+        u = probe.rng.integers(0, 2, op.domain.shape).astype(kind)
+        if not _equal(op(u), op(u.astype(float))):
+            mistakes.append(f"{kind} gives other numbers than float64")
+        with suppress(DerivativeError):
+            pullback(op, u)
+            mistakes.append(f"a gradient in {kind} is not refused")
+    return mistakes
+
+
+def _layouts(probe):
+    """Fortran order, strides, a reversed and a read-only array: the bits of the contiguous copy."""
+    u = probe.domain()
+    layouts = {"Fortran order": np.asfortranarray(u), "strided": np.stack([u, np.nan * u], axis=-1)[..., 0]}
+    layouts["read-only"] = np.broadcast_to(u.copy(), u.shape)
+    layouts["reversed"] = np.flip(np.flip(u).copy())
+    return [name for name, other in layouts.items() if not _equal(probe.op(other), probe.op(u))]
+
+
+def _freshness(probe):
+    op, u = probe.op, probe.domain()
+    before, first = u.copy(), op(u)
+    kept, second, given = first.copy(), op(-2.0 * u), np.full_like(first, np.nan)
+    shared = np.may_share_memory(first, u) or np.may_share_memory(first, second)
+    mistakes = {
+        "the input is modified": not _equal(u, before),
+        "the result is not a fresh array": shared or not _equal(first, kept),
+        "apply(u, out) differs from apply(u)": op.apply(u, out=given) is not given or not _equal(given, kept),
+    }
+    return [name for name, found in mistakes.items() if found]
+
+
+def _repeats(probe):
+    pairs = {"applications": (probe.op, probe.domain()), "transposed applications": (probe.op.T, probe.codomain())}
+    return [f"two {name} differ" for name, (op, u) in pairs.items() if not _equal(op(u), op(u))]
+
+
+def _equal(a, b):
+    return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=True)
+
+
+def _scaling(size, op, u):
+    """A field times 2^900 or 2^-900 gives the same digits: largest difference, relative, in roundings."""
+    if not ORDINARY[0] < size < ORDINARY[1]:
+        return f"entries of size {size:.1e} leave the range of floats then"
+    wanted = op.apply(u)
+    gaps = [np.max(np.abs(op.apply(u * 2.0**p) * 2.0**-p - wanted), initial=0.0) for p in (900, -900)]
+    return max(gaps) and max(gaps) / (np.finfo(float).eps * np.max(np.abs(wanted)))
+
+
+# ------------------------------------------------------------ the summary
+
+
+def operator(op, seeds=3, rng=None):
+    """Operator -> its summary: spaces, form, entries, and one row for each property of a right operator.
+
+    Parameters
+    ----------
+    op : Operator
+        From the catalogue, or from outside: `from_matrix`, `from_functions`, `from_linear_operator`.
+    seeds : int
+        Random fields for each test and dtype.
+    rng : None, int or numpy Generator
+        Source of the fields; default a fixed seed of its own.
+
+    Returns
+    -------
+    OperatorSummary
+        `.verdict` and `.ok`; `.rows` with name, figure, limit, ok, note; `.failed` names what failed;
+        print(summary) shows it all.
+
+    Notes
+    -----
+    Rows: linearity, transpose (scaled dot test in four dtypes), twin (explicit against matrix-free,
+    forward, transposed and entry by entry), JVP, VJP, second order, wrong shapes refused, dtypes, memory
+    layouts, fresh results, same bits twice, the same digits for a
+    field times 2^+-900. Beside them stand facts without a verdict (`facts`): cost and bytes, row sums, spectrum,
+    the largest stable step, what the operator is adjoint to, the derivative that it stands for and its order.
+    Figures are in units of rounding; an inverse is judged by
+    the tolerance of its solve, without its check of primal data.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp import from_functions
+    >>> blur = from_functions(lambda u: u + np.roll(u, 1), lambda g: g + np.roll(g, -1), 6, 6, name="blur")
+    >>> operator(blur).verdict
+    'agrees'
+    >>> wrong = from_functions(lambda u: u + np.roll(u, 1), lambda g: g + np.roll(g, 1), 6, 6, name="wrong")
+    >>> "transpose, float64" in operator(wrong).failed
+    True
+    """
+    check_operator("check.operator", op)
+    with np.errstate(all="ignore"):  # what overflows shows in the figures
+        try:
+            probe = Probe(op, seeds, rng)
+        except Exception as error:  # a foreign function may raise anything
+            row = Row("application", None, LIMIT, False, f"{type(error).__name__}: {error}")
+            return OperatorSummary(op, None, [row])
+        return OperatorSummary(op, probe, _rows(probe))
+
+
+def _rows(probe):
+    kinds = DTYPES[: 1 if probe.real else 2]
+    rows = [one for name in ("linearity", "JVP", "VJP") for one in probe.rows(name, kinds)]
+    if PLAIN[0] < probe.size < PLAIN[1]:
+        rows.append(row("second order", lambda: probe.gap("second order", np.dtype(float))))
+    rows += probe.rows("transpose", DTYPES)
+    rows += [one._replace(name=f"twin, {one.name}") for one in _form_rows(probe)]
+    return rows + [row(name, lambda test=test: test(probe)) for name, test in ARGUMENTS.items()]
+
+
+ARGUMENTS: dict[str, Any] = {
+    "wrong shapes refused": _shapes,
+    "dtypes": _dtypes,
+    "memory layouts": _layouts,
+    "input unmodified, result fresh": _freshness,
+    "same bits twice": _repeats,
+    "scaling by 2^+-900": lambda probe: _scaling(probe.size, probe.op, probe.domain()),
+    "scaling by 2^+-900, transposed": lambda probe: _scaling(probe.size, probe.op.T, probe.codomain()),
+}
+
+
+class OperatorSummary(Summary):
+    """What was found out about one operator. Prints itself.
+
+    Attributes
+    ----------
+    op : Operator
+    size : float or None
+        sqrt(|A|_1 |A|_inf), from below when the entries are not known.
+    nnz : int or None
+        Number of stored entries, where listing them costs no application.
+    facts : dict
+        What the operator is: domain, codomain, form, dtype, nnz, bytes, size; seconds of one application
+        in each form; row sums, symmetry, M-matrix; integration by parts in the volumes of its grid, the derivative
+        that a row inside stands for and its order, or why they are not known; of a square one
+        spectral radius, definiteness, null space
+        and the largest stable step of u' = A u by explicit Euler. Found when they are asked for; what cannot
+        be found at a fair price is left out.
+    """
+
+    op: Any
+    size: float | None
+    nnz: int | None
+
+    def __init__(self, op, probe, rows):
+        listed = isinstance(op.structure, Matrix) or (probe and probe.sizes is not None and op.structure.has_entries)
+        nnz = int(op.explicit().matrix.nnz) if listed else None
+        super().__init__(f"{op.name}: {op.domain} -> {op.codomain}", rows, op=op, size=probe and probe.size, nnz=nnz)
+
+    @cached_property
+    def facts(self):
+        """Dict of what the operator is."""
+        op = self.op
+        basic = {"domain": str(op.domain), "codomain": str(op.codomain), "form": op.form, "dtype": str(op.dtype)}
+        basic |= {"nnz": self.nnz, "size": self.size}
+        # One that cannot even be applied has no facts.
+        return basic | (facts_of(op, self.nnz is not None, not self.failed) if self.size is not None else {})
+
+    def to_dict(self):
+        """The summary as plain numbers, strings and lists."""
+        return {**super().to_dict(), **self.facts}
+
+    def _head(self):
+        op, facts = self.op, self.facts
+        parts = [op.form, str(op.dtype), "entries not listed" if self.nnz is None else f"{self.nnz} entries"]
+        parts += [f"{facts['bytes']} bytes"] if "bytes" in facts else []
+        parts += [] if self.size is None else [f"sqrt(|A|_1 |A|_inf) = {self.size:.3g}"]
+        times = [f"{1e6 * seconds:.3g} us {form}" for form, seconds in facts.get("seconds", {}).items()]
+        short = [f"{name} {_word(facts[name])}" for name in SHORT if name in facts]
+        lines = [", ".join(parts), ", ".join(times) and f"one application: {', '.join(times)}", ", ".join(short)]
+        lines += [f"{name}: {facts[name]}" for name in LONG if name in facts]
+        return [*super()._head(), *(f"  {line}" for line in lines if line)]
+
+
+SHORT = ("row sums", "symmetric", "definite", "M-matrix", "null space", "spectral radius", "stable step")
+LONG = "integration by parts", "order", "acts as"
+
+
+def _word(value):
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return value if isinstance(value, str) else f"{value:.4g}"

@@ -1,0 +1,277 @@
+"""What an operator is: its cost in each form, its signs and spectrum, what it is adjoint to, which derivative it is.
+
+Facts for the summary of an operator, not verdicts.
+"""
+
+from functools import partial
+from itertools import product
+from math import factorial
+from timeit import repeat
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import ArpackError, eigs, eigsh
+
+from sparsedp.check.nodes import bytes_of
+from sparsedp.errors import DerivativeError
+from sparsedp.operators.boundary import interior
+from sparsedp.operators.difference import divergence, gradient
+from sparsedp.space import fits
+from sparsedp.spacing import node_axes
+from sparsedp.structure.base import Structure
+
+__all__ = ["facts_of"]
+
+DENSE_UP_TO = 256  # rows up to which all eigenvalues are found
+LARGEST_SPECTRUM = 100_000  # rows above which no eigenvalue is sought
+ZERO = 1e-10  # of the largest: a smaller eigenvalue, row sum or entry is 0
+OUTER = 1e-4  # the same where only the ends of the spectrum are found
+SYMMETRIC = 1e-13
+REPEATS = 5  # of a measurement of time
+OPENED = Structure, sp.sparray  # types whose attributes an operator stores
+HOLDS = 1e-12  # gap of a rule of integration by parts, of the sizes of both sides
+MOST = 400  # entries of a row that is still a stencil
+INSIDE = 0.5, 0.3, 0.7  # shares of the way along an axis where a row is looked at, the first that is not 0
+FEWEST = 5  # cells along an axis: fewer, and no row is inside
+DEGREES = 7  # of the polynomials that a row is tried on
+MOMENT = 1e-8  # of the sum of sizes: a moment below it is rounding
+
+
+@np.errstate(all="ignore")
+def facts_of(op, listed, right):
+    """Operator -> dict of what it is.
+
+    Parameters
+    ----------
+    op : Operator
+    listed : bool
+        Whether its entries are known.
+    right : bool
+        Whether nothing is wrong with it: else its spectrum is left out.
+    """
+    facts: dict[str, Any] = {}
+    if not hasattr(op, "solver"):  # factors and hierarchies of a solver are not the operator's
+        facts["bytes"] = bytes_of(op._matrix_structure if op.form == "explicit" else op.structure, OPENED)
+    facts["seconds"] = _seconds(op.tangent, listed)
+    square = fits(op.domain, op.codomain)
+    facts |= _signs(op.explicit().matrix, square) if listed else {}
+    facts["integration by parts"] = _by_parts(op.tangent)
+    try:
+        facts |= _stencil(op.tangent)
+    except _UnknownError as reason:
+        facts["order"] = f"not known: {reason}"
+    size = op.shape[0] if right and square and op.dtype.kind != "c" else 0
+    if 0 < size <= (LARGEST_SPECTRUM if listed else DENSE_UP_TO):
+        facts |= _spectrum(op.tangent, facts.get("symmetric", False))
+    return facts
+
+
+def _seconds(op, listed):
+    """Seconds of one application in each form that exists: dict, the least of several."""
+    u, seconds = np.random.default_rng(0).standard_normal(op.domain.shape), {}
+    for one in (op.explicit(), op.matrix_free()) if listed else (op,):
+        again = partial(one.apply, u, one.apply(u))  # the first application may compile
+        seconds[one.form] = min(repeat(again, number=1, repeat=REPEATS))
+    return seconds
+
+
+# ------------------------------------------------------------ entries and eigenvalues
+
+
+def _signs(A, square):
+    """Row sums, symmetry and M-matrix, from the entries."""
+    sums, size = np.asarray(A.sum(axis=1)).reshape(-1), np.max(abs(A).sum(axis=1), initial=0.0)
+    still = np.all(np.abs(sums) <= ZERO * size)
+    facts: dict[str, Any] = {"row sums": "0" if still else f"{sums.real.min():.3g} to {sums.real.max():.3g}"}
+    if square:
+        facts["symmetric"] = bool(abs(A - A.T).max() <= SYMMETRIC * abs(A).max()) if A.nnz else True
+        facts["M-matrix"] = _m_matrix(A, sums, size) if A.dtype.kind != "c" else "no: complex"
+    return facts
+
+
+def _m_matrix(A, sums, size):
+    """Off-diagonal entries of one sign, diagonal of the other and weakly dominant: then A, or -A, has A^-1 >= 0."""
+    diagonal = A.diagonal()
+    sign = 1.0 if np.sum(diagonal) >= 0 else -1.0
+    wrong = int(np.sum((sign * (A - sp.diags_array(diagonal))).tocsr().data > ZERO * size))
+    if wrong:
+        return f"no: {wrong} entries beside the diagonal have its sign"
+    if np.any(sign * sums < -ZERO * size) or np.any(sign * diagonal < 0):
+        return "no: the diagonal is not dominant"
+    return "yes" if sign > 0 else "yes, of -A"
+
+
+def _spectrum(op, symmetric):
+    """Spectral radius, definiteness, null space and the largest stable step of u' = A u.
+
+    All eigenvalues of a small operator; of a large one the ends only, by Lanczos or Arnoldi from a fixed start.
+    Explicit Euler is stable when |1 + dt e| <= 1 for every eigenvalue e: dt <= -2 Re(e) / |e|^2.
+    """
+    whole = op.shape[0] <= DENSE_UP_TO
+    if whole:
+        entries = op.explicit().matrix.toarray()
+        values = np.linalg.eigvalsh(entries) if symmetric else np.linalg.eigvals(entries)
+    else:
+        options = {"v0": np.random.default_rng(0).standard_normal(op.shape[0]), "tol": 1e-6}
+        search, ends = (eigsh, {"k": 2, "which": "BE"}) if symmetric else (eigs, {"k": 1, "which": "LM"})
+        try:
+            values = search(op.to_scipy(), **ends, **options, return_eigenvectors=False)
+        except ArpackError:
+            return {}
+    radius = np.max(np.abs(values))
+    kept = values[np.abs(values) > (ZERO if whole else OUTER) * radius]
+    facts: dict[str, Any] = {"spectral radius": float(radius)}
+    if whole:
+        facts["null space"] = int(values.size - kept.size)
+    if symmetric:
+        kind = "semidefinite" if kept.size < values.size else "definite" if whole else "definite or semidefinite"
+        side = "positive" if np.all(kept > 0) else "negative" if np.all(kept < 0) else ""
+        facts["definite"] = f"{side} {kind}" if side else "indefinite"
+    if whole or symmetric:
+        step = float(np.min(-2 * np.minimum(kept.real, 0.0) / np.abs(kept) ** 2, initial=np.inf))
+        facts["stable step"] = 0.0 if step * radius <= ZERO else step
+    return facts
+
+
+# ------------------------------------------------------------ integration by parts
+
+
+def _by_parts(op):
+    """Operator -> what it is adjoint to in the volumes of its grid, in words.
+
+    With V and W the volumes of cells and faces and I the inner faces: a gradient has <W I G u, v> = -<V u, D I v>
+    with the divergence of its grid, a divergence the same with the gradient; an operator of one space may be
+    self-adjoint, <V A u, v> = <V u, A v>. Tried on random fields.
+    """
+    one, other, rng = op.domain, op.codomain, np.random.default_rng(1)
+    if one.grid is None or one.grid != other.grid or op.dtype.kind == "c":
+        return "not known: it is between no two real fields of one grid"
+    rule, partner = PARTNERS.get((one.kind, other.kind), ("", None))
+    if one == other and node_axes(one.kind, 0, one.grid.dim) is not None:
+        rule, partner = "self-adjoint in the volumes of its grid", lambda grid: -op
+    if partner is None:
+        return f"not known: no rule for {one.kind} -> {other.kind}"
+    u, v = (rng.standard_normal(space.shape) * _open(space) for space in (one, other))
+    value = op.apply(u)
+    v = v * (value != 0)
+    left, right = other.volumes * value * v, -one.volumes * u * partner(one.grid).apply(v)
+    scale = np.linalg.norm(left) * np.sqrt(left.size)
+    gap = abs(left.sum() - right.sum()) / scale if scale > 0 else 0.0
+    return f"{rule}, to {gap:.0e}" if gap <= HOLDS else f"not {rule} (off by {gap:.0e})"
+
+
+# Spaces of an operator -> the rule, and what stands on the other side of it, with its sign turned.
+PARTNERS: dict[tuple, tuple] = {
+    ("cells", "faces"): ("with the divergence of its grid", divergence),
+    ("faces", "cells"): ("with the gradient of its grid", gradient),
+}
+
+
+def _open(space):
+    """1 where a value takes part: not on walls."""
+    return interior(space.grid).apply(np.ones(space.shape)) if space.kind == "faces" else 1.0
+
+
+# ------------------------------------------------------------ the derivative that a row stands for
+
+
+class _UnknownError(Exception):
+    """Why an operator has no order."""
+
+
+def _stencil(op):
+    """Operator -> dict: the derivative that a row in the middle of the grid stands for, and how exactly.
+
+    A row with weights w at distances s is w_1 u(x + s_1) + ... = sum over a of M_a d^a u, M_a = sum w s^a / a!.
+    The lowest degree with a moment is the derivative; the next one, p higher, the error: order p. On a stretched
+    grid that is the order of one row; what errors of neighbouring rows take from each other is not seen.
+    """
+    for space in (op.domain, op.codomain):
+        if space.grid is None:
+            raise _UnknownError("it is no operator between fields of a grid")
+        if node_axes(space.kind, 0, space.grid.dim) is None:
+            raise _UnknownError(f"values on {space.kind} have no places")
+        if min(space.grid.shape) < FEWEST:
+            raise _UnknownError(f"it needs {FEWEST} cells along each axis")
+    if op.dtype.kind == "c":
+        raise _UnknownError("it is complex")
+    rows = [_row(op, component) for component in range(len(op.codomain.parts))]
+    order = min(row[0] for row in rows)
+    return {
+        "order": int(order) if order < np.inf else "exact on polynomials",
+        "acts as": "; ".join(row[1] for row in rows),
+    }
+
+
+def _row(op, component):
+    """(order, words) of the row in the middle of one component."""
+    moments = _moments(op, *_weights(op, component))
+    low, *more = sorted(moments) or [0]
+    if not moments:
+        raise _UnknownError("its row in the middle is 0 on polynomials")
+    words = _terms(moments[low], op)
+    if not more:
+        return np.inf, words
+    h = max(np.max(widths) for widths in op.domain.grid.widths)
+    size, error = (max(map(abs, moments[degree].values())) for degree in (low, more[0]))
+    if error > size * h ** (more[0] - low):
+        raise _UnknownError(f"it mixes {words} with {_terms(moments[more[0]], op)}")
+    return more[0] - low, words
+
+
+def _weights(op, component):
+    """(place, weights) of the row in the middle of one component."""
+    part = op.codomain.parts[component]
+    before = sum(int(np.prod(other)) for other in op.codomain.parts[:component])
+    for share in INSIDE:  # a row may be closed by a solid
+        place = before + np.ravel_multi_index([int(share * n) for n in part], part)
+        unit = (np.arange(op.codomain.size) == place).astype(float)
+        try:
+            weights = op.T.apply(unit.reshape(op.codomain.shape)).reshape(-1)
+        except DerivativeError as error:
+            raise _UnknownError("it has no transpose") from error
+        used = np.count_nonzero(weights)
+        if used > min(MOST, weights.size / 2):
+            raise _UnknownError("a row is no stencil of neighbours")
+        if used:
+            return place, weights
+    raise _UnknownError("its rows in the middle are 0")
+
+
+def _positions(space):
+    """Positions of all values and the component of each, shape (size, dim + 1)."""
+    grid, lines = space.grid, []
+    for component in range(len(space.parts)):
+        on_nodes = node_axes(space.kind, component, grid.dim)
+        at = [grid.coordinates(a, "nodes" if a in on_nodes else "cells") for a in range(grid.dim)]
+        lines.append(np.stack(np.meshgrid(*at, component, indexing="ij"), axis=-1).reshape(-1, grid.dim + 1))
+    return np.concatenate(lines)
+
+
+def _moments(op, place, weights):
+    """Degree -> {(component, powers): moment}, where it is more than rounding; powers of x first."""
+    grid, used = op.domain.grid, weights != 0
+    found: dict[int, dict] = {}
+    at = _positions(op.domain)[used]
+    away, weights = at[:, :-1] - _positions(op.codomain)[place, :-1], weights[used]
+    away -= np.where(grid.periodic, grid.size * np.round(away / grid.size), 0.0)  # the short way round
+    powers = [power for power in product(range(DEGREES), repeat=grid.dim) if sum(power) < DEGREES]
+    for component, power in product(np.unique(at[:, -1]), sorted(powers, reverse=True)):
+        degree, scale = sum(power), np.prod([factorial(p) for p in power])
+        moment = float(np.sum((weights * np.prod(away**power, axis=1))[at[:, -1] == component]) / scale)
+        reach = np.sum(np.abs(weights) * np.max(np.abs(away), axis=1) ** degree) / factorial(degree)
+        if abs(moment) > MOMENT * reach:
+            found.setdefault(degree, {})[component, power] = moment
+    return found
+
+
+def _terms(moments, op):
+    """The moments of one degree as a sum of derivatives, such as 2 u_xx + u_yy."""
+    text = ""
+    for (component, power), moment in moments.items():
+        name = f"u{component + 1:.0f}" if len(op.domain.parts) > 1 else "u"
+        slopes = "".join(axis * p for axis, p in zip(op.domain.grid.axes, power, strict=True))
+        size = "" if abs(abs(moment) - 1) < MOMENT else f"{abs(moment):.4g} "
+        text += f" {'-' if moment < 0 else '+'} {size}{name}{'_' * bool(slopes)}{slopes}"
+    return text[3:] if text.startswith(" +") else f"-{text[3:]}"

@@ -1,0 +1,133 @@
+"""Results of checks: values with a verdict that print their table."""
+
+import math
+from typing import Any, NamedTuple
+
+__all__ = ["Result", "Row", "Summary", "table"]
+
+
+class Result:
+    """What a check gives back: frozen, and true only when its verdict is "agrees"."""
+
+    verdict: str
+    _word = "a result"
+
+    def __init__(self, **values):
+        self.__dict__.update(values)
+
+    def __setattr__(self, name, value):
+        raise AttributeError(f"{self._word} is frozen; {name} cannot be set")
+
+    @property
+    def ok(self):
+        """Whether the verdict is "agrees"."""
+        return self.verdict == "agrees"
+
+    def __bool__(self):
+        return self.ok
+
+    def __repr__(self):
+        return str(self)
+
+
+class Row(NamedTuple):
+    """One property: its name, the measured figure, the largest figure allowed, and whether it holds.
+
+    `ok` is None when the property does not apply; `note` says why, or what went wrong.
+    """
+
+    name: str
+    figure: float | None
+    limit: float | None
+    ok: bool | None
+    note: str = ""
+
+
+class Summary(Result):
+    """The rows of a check of an operator. Frozen; true when nothing failed and something was tested.
+
+    Attributes
+    ----------
+    title : str
+    rows : tuple of Row
+    limit : float
+        Largest figure allowed, in units of rounding.
+    failed : tuple of str
+        Names of the rows that failed.
+    verdict : "agrees", "disagrees" or "inconclusive"
+        Inconclusive where nothing could be tested.
+    """
+
+    title: str
+    rows: tuple[Row, ...]
+    limit: float
+    failed: tuple[str, ...]
+    _word = "a finding"
+
+    def __init__(self, title, rows, limit=10.0, **values):
+        failed = tuple(row.name for row in rows if row.ok is False)
+        verdict = "disagrees" if failed else "agrees" if any(row.ok for row in rows) else "inconclusive"
+        super().__init__(title=title, rows=tuple(rows), limit=limit, failed=failed, verdict=verdict, **values)
+
+    @property
+    def worst(self):
+        """Largest figure of the tested rows (NaN counts as infinite); 0 without any."""
+        figures = [row.figure for row in self.rows if row.figure is not None]
+        return max((math.inf if math.isnan(figure) else figure for figure in figures), default=0.0)
+
+    def to_dict(self):
+        """The summary as plain numbers, strings and lists."""
+        rows = [row._asdict() for row in self.rows]
+        return {"title": self.title, "verdict": self.verdict, "limit": self.limit, "worst": self.worst, "rows": rows}
+
+    def _head(self):
+        """Lines above the rows."""
+        return [f"{self.title}: {self.verdict}"]
+
+    def __str__(self):
+        words = {True: "ok", False: "FAILS", None: "-"}
+        cells = [
+            (
+                row.name,
+                "" if row.figure is None else f"{row.figure:.3g}",
+                "" if row.limit is None else f"<= {row.limit:g}",
+                words[row.ok],
+                row.note,
+            )
+            for row in self.rows
+        ]
+        return "\n".join([*self._head(), table(cells)])
+
+
+def table(lines: Any, head=None, indent="  "):
+    """Rows of strings -> text in columns: the first column to the left, numbers to the right.
+
+    Parameters
+    ----------
+    lines : sequence of equally long tuples of str
+    head : tuple of str, optional
+    indent : str
+
+    Returns
+    -------
+    str
+    """
+    lines = [tuple(map(str, line)) for line in lines]
+    columns = list(zip(*([head] if head else []), *lines, strict=True))
+    if not columns:
+        return indent + "nothing to show"
+    numeric = [all(map(_number, column[bool(head) :])) for column in columns]
+    aligned = [
+        [cell.rjust(width) if right else cell.ljust(width) for cell in column]
+        for column, right in zip(columns, numeric, strict=True)
+        for width in [max(map(len, column))]
+    ]
+    return "\n".join((indent + "  ".join(cells)).rstrip() for cells in zip(*aligned, strict=True))
+
+
+def _number(text):
+    try:
+        float(text or "0")
+    except ValueError:
+        return text in ("-", "exact")
+    return True
