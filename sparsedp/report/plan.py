@@ -78,27 +78,27 @@ def explain(loss, x, gradient=True):
     check_function("explain", loss, "lambda x: np.sum(x**2)")
     loaded = set(sys.modules)
     nodes: list = []
-    at_turn: dict = {}
+    turn: list = []  # what is known when the forward pass ends
     clock = perf_counter()
 
     def watched(tree):
         value = loss(tree)
-        at_turn.update(clock=perf_counter(), nodes=len(nodes), bytes=bytes_held(nodes), calls=calls.copy())
+        turn[:] = perf_counter() - clock, len(nodes), bytes_held(nodes), calls.copy()
         nodes.clear()
-        at_turn["resumed"] = perf_counter()
+        turn.append(perf_counter())
         return value
 
     with recording() as calls, witnessed(nodes):
         value = value_and_grad(watched)(x)[0] if gradient else float(watched(x))
-        backward = perf_counter() - at_turn["resumed"]
+        end = perf_counter()
+    seconds, many, size, forward, resumed = turn
     totals = {word: total(calls, *kinds) for word, kinds in TOTALS.items()}
     steps = sum(calls[name, "forward"] for name, kind in list(calls) if kind == "recomputed")
     return Plan(
-        value=float(value), counts=calls, totals=totals, rows=_rows(calls), tape_nodes=at_turn["nodes"],
-        left_out=[*_gradient(x, gradient), *_skipped(calls, at_turn["calls"], gradient), *_extras(loaded)],
-        tape_bytes=at_turn["bytes"] + total(calls, "bytes"),
+        value=float(value), counts=calls, totals=totals, rows=_rows(calls), tape_nodes=many,
+        left_out=[*_gradient(x, gradient), *_skipped(calls, forward, gradient), *_extras(loaded)],
+        tape_bytes=size + total(calls, "bytes"), seconds=(seconds, end - resumed),
         recomputation=1.0 + totals["steps recomputed"] / steps if steps else 1.0,
-        seconds=(at_turn["clock"] - clock, backward),
     )  # fmt: skip
 
 
@@ -168,14 +168,13 @@ class Plan(Result):
 
 def _rows(calls):
     """One dict for each name that was called, in the order of first use."""
-    seconds: dict = {}
-    for (name, _), spent in calls.seconds.items():
-        seconds[name] = seconds.get(name, 0.0) + spent
-    rows = [
-        {"name": name, **{kind: calls[name, kind] for kind in COLUMNS}, "seconds": seconds.get(name, 0.0)}
-        for name in dict.fromkeys(name for name, _ in calls)
-    ]
-    return [{**row, "how": _how(calls, row["name"])} for row in rows if any(row[kind] for kind in COLUMNS)]
+    rows = []
+    for name in dict.fromkeys(name for name, _ in calls):
+        kinds = {kind: calls[name, kind] for kind in COLUMNS}
+        if any(kinds.values()):
+            seconds = sum(spent for (other, _), spent in calls.seconds.items() if other == name)
+            rows.append({"name": name, **kinds, "seconds": seconds, "how": _how(calls, name)})
+    return rows
 
 
 def _how(calls, name):
@@ -214,6 +213,8 @@ def _skipped(calls, forward, gradient):
     for (name, what), facts in calls.told.items():
         if what == "not asked":
             yield f"derivative of {name} in {', '.join(map(str, facts))}: not asked"
+        if what == "skipped":
+            yield from (f"{name}: {reason} ({many} times)" for reason, many in facts.items())
     for name, kind in forward if gradient else ():
         back = calls[name, "vjp"] + calls[name, "jvp"] + calls[f"{name}.T", "forward"]  # the last: without a tape
         if kind == "forward" and not back:
@@ -226,12 +227,6 @@ def _skipped(calls, forward, gradient):
     for (name, kind), many in calls.items():
         if kind == "skipped":
             yield f"{many} solves of {name}: the right-hand side is 0, so is the solution"
-    for (name, what), facts in calls.told.items():
-        if what == "skipped":
-            yield from (f"{name}: {reason} ({many} times)" for reason, many in facts.items())
-    for name, actors in calls.actors.items():
-        if any(isinstance(op, Operator) and op.structure.is_identity for op in actors.values()):
-            yield f"arithmetic of {name}: an identity, {calls[name, 'forward']} copies"
 
 
 def _matrices(calls, name, operators):
@@ -240,6 +235,8 @@ def _matrices(calls, name, operators):
         yield f"matrix of {name}: not assembled, {'applied' if known else 'known only'} without one"
     if any(isinstance(op.structure, Matrix) for op in operators):
         yield f"assembly of {name}: it was given as a matrix"
+    if any(op.structure.is_identity for op in operators):
+        yield f"arithmetic of {name}: an identity, {calls[name, 'forward']} copies"
 
 
 def _solves(calls):

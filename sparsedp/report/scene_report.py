@@ -169,20 +169,17 @@ def write_report(source, folder, force=False):
     claim(folder, [PAGE], force)
     with audited(source.name):
         results = [_attempt(run, source) for _, _, run, _ in CHAPTERS]
-    chapters = {
-        title: [f"{failed}, {result}"] if isinstance(result, str) else list(tell(result, folder))
-        for (title, failed, _, tell), result in zip(CHAPTERS, results, strict=True)
-    }
     verdict = _verdict(results[0], results[-1])
-    page = [f"# {source.name}: {verdict}", "", MEANING[verdict]]
-    left = []
-    for (title, sentences), result in zip(chapters.items(), results, strict=True):
-        left += [one for one in sentences if LEFT in one]
+    page, left, lines = [f"# {source.name}: {verdict}", "", MEANING[verdict]], [], []
+    for (title, failed, _, tell), result in zip(CHAPTERS, results, strict=True):
+        sentences = [f"{failed}, {result}"] if isinstance(result, str) else list(tell(result, folder))
+        lines += sentences
+        left += [f"- {one}" for one in sentences if LEFT in one]
         page += ["", f"## {title}", "", *(f"- {one}" for one in sentences if LEFT not in one)]
         page += ["", *_goals(result)] if isinstance(result, Rows) else []
-    page += ["", "## What was left out, and why", "", *(f"- {one}" for one in left), "", *_details(folder)]
+    page += ["", "## What was left out, and why", "", *left, "", *_details(folder)]
     write_file(folder / PAGE, "\n".join(page))
-    return verdict, [one for sentences in chapters.values() for one in sentences]
+    return verdict, lines
 
 
 def _attempt(run, source):

@@ -42,15 +42,18 @@ def text_of(value):
 
 def text_table(rows, names):
     """Table -> text in columns."""
-    return aligned([[text_of(row.get(name, "")) for name in names] for row in rows], names)
+    return aligned(_cells(rows, names), names)
 
 
 def markdown_table(rows, names):
     """Table -> lines of Markdown."""
-    lines = [[text_of(row.get(name, "")) for name in names] for row in rows]
-    cells = [[" ".join(text.split()).replace("|", "\\|") for text in line] for line in (names, *lines)]
+    cells = [[" ".join(text.split()).replace("|", "\\|") for text in line] for line in (names, *_cells(rows, names))]
     head, *body = [f"| {' | '.join(line)} |" for line in cells]
     return [head, f"|{'---|' * len(names)}", *body]
+
+
+def _cells(rows, names):
+    return [[text_of(row.get(name, "")) for name in names] for row in rows]
 
 
 def left_out(sentences, indent="- "):
