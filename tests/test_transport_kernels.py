@@ -1,4 +1,4 @@
-"""The fused loops of transport: compiled against NumPy, and bits that do not depend on the number of threads."""
+"""The loops of Eulerian transport against sparse matrices, and bits that do not depend on the number of threads."""
 
 from itertools import product
 
@@ -9,8 +9,8 @@ import sparsedp as dp
 from sparsedp import kernels
 from sparsedp.advection.scratch import FEW, MOST, Scratch
 from sparsedp.derivative import pullback
-from sparsedp.kernels import streams_plain
-from sparsedp.kernels.streams import TILE
+from sparsedp.kernels import fluxes, team
+from sparsedp.kernels.fluxes import TILE
 
 NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
 SHAPES = [(1,), (3,), (2 * TILE + 5,), (1, 9), (9, 1), (3, TILE + 20), (11, 13), (4, 5, 6), (2, 1, 19)]
@@ -41,7 +41,7 @@ def results(move, u, v, q):
 
 
 @NUMBA
-def test_compiled_is_numpy(monkeypatch):
+def test_compiled_is_the_reference(monkeypatch):
     for scene in scenes():
         compiled = results(*scene)
         with monkeypatch.context() as patch:
@@ -53,32 +53,56 @@ def test_compiled_is_numpy(monkeypatch):
 
 @NUMBA
 def test_bits_do_not_depend_on_threads(monkeypatch):
-    from sparsedp.kernels import native
-
-    monkeypatch.setattr(native, "SERIAL", 0)
+    monkeypatch.setattr(team, "SERIAL", 0)
     for scene in scenes():
         found = []
-        for threads in (1, 2):
+        for threads in (1, 2, 3):
             monkeypatch.setattr(kernels, "threads", lambda: threads)
             found.append([x.tobytes() for x in results(*scene)])
-        assert found[0] == found[1]
+        assert found[0] == found[1] == found[2]
 
 
 @NUMBA
-def test_numpy_takes_over_where_nothing_can_be_compiled(monkeypatch):
-    from sparsedp.kernels import native, streams_native
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
+@pytest.mark.parametrize("velocity, form", FORMS)
+def test_many_steps_at_once(scheme, velocity, form):
+    """The time loop of the step: the states and cotangents of single steps."""
+    rng = np.random.default_rng(4)
+    grid = dp.Grid((5, 4), spacing=[rng.uniform(0.5, 1.5, 5), 0.7])
+    move = dp.transport(grid, scheme, dp.dirichlet, velocity, form=form)
+    v, q, g = (
+        rng.normal(size=move.setting.velocity_shapes[0]),
+        rng.normal(size=move.walls.size),
+        rng.normal(size=(5, 4)),
+    )
+    step, states = move.step(0.02, q), np.zeros((4, 5, 4))
+    states[0] = rng.normal(size=(5, 4))
+    step.march(states, v)
+    for u, new in zip(states, states[1:]):
+        np.testing.assert_array_equal(step.forward(u, v), new)
+    back, into = step.retreat(states, v, g, np.ones_like(v))
+    for_field, total = g, np.ones_like(v)
+    for u in states[-2::-1]:
+        for_field, total = step.backward(u, v, for_field, total)
+    np.testing.assert_allclose(back, for_field, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(into, total, rtol=1e-13, atol=1e-14)
+    np.testing.assert_array_equal(step.retreat(states, v, g)[0], back)
 
-    def refuse(*args, **options):
+
+@NUMBA
+def test_the_reference_takes_over_where_nothing_can_be_compiled(monkeypatch):
+    def refuse(words):
         raise TypeError("no such target")
 
     move, u, v, q = next(scenes())
-    streams_native._loops.cache_clear()
+    wanted = move(u, v, 0.01, q)
+    broken = team.Kernel(fluxes.stage.loop, fluxes.stage.words)
+    monkeypatch.setattr(fluxes, "stage", broken)
     with monkeypatch.context() as patch:
-        patch.setattr(native, "_kept", refuse)
+        patch.setattr(team, "_types", refuse)
         with pytest.warns(RuntimeWarning, match="The compiled kernels do not work here .no such target"):
             new = move(u, v, 0.01, q)
-    streams_native._loops.cache_clear()
-    np.testing.assert_array_equal(new, move(u, v, 0.01, q))
+    np.testing.assert_allclose(new, wanted, rtol=1e-14)
 
 
 def test_parts_that_are_asked_alone_are_the_same():
@@ -98,16 +122,47 @@ def test_lines_that_are_short_everywhere():
     np.testing.assert_allclose(move(u, v, 1e-5), move.operator(v, 1e-5)(u), rtol=1e-13)
 
 
-def test_numbers_of_the_numpy_twin():
-    x = streams_plain.Numbers(np.array([-1.0, 0.0, 2.0, np.nan, np.inf]))
-    y = streams_plain.Numbers(np.array([-1.0, 0.0, 2.0]))
-    np.testing.assert_array_equal(x.step().value, [0.0, 0.5, 1.0, 0.0, 1.0])
-    np.testing.assert_array_equal(x.short_of(0.0).value, [1.0, 0.0, 0.0, 1.0, 0.0])
-    np.testing.assert_array_equal(x.infinite().value, [0.0, 0.0, 0.0, 1.0, 1.0])
-    np.testing.assert_array_equal(y.alike(streams_plain.Numbers(np.array([-3.0, 1.0, -1.0]))).value, [1.0, 0.0, 0.0])
-    np.testing.assert_array_equal((y / 2.0 + y * y - y * 0.5).value, [1.0, 0.0, 4.0])
+def minmod(a, b, c, e):
+    """The difference to the nearer neighbour in value, halved; for equal cells."""
+    low, same = np.abs(a) <= np.abs(b), a * b > 0
+    slope = 0.5 * (low * a + (1.0 - low) * b) * same
+    return slope, slope, 0.5 * low * same, 0.5 * (1.0 - low) * same, 0.5 * low * same, 0.5 * (1.0 - low) * same
 
 
+def parabola(a, b, c, e):
+    """Third-order upwind on equal cells: the sides of a cell differ, and so do the slopes."""
+    one = 0.0 * a + 1.0
+    return (a + 2 * b) / 6, (2 * a + b) / 6, one / 6, one / 3, one / 3, one / 6
+
+
+@pytest.mark.parametrize("limiter", [minmod, parabola])
+@pytest.mark.parametrize("velocity, form", FORMS)
+def test_other_limiters(limiter, velocity, form, monkeypatch):
+    """A scheme is a function and a line: its loops, its tangent and its cotangents are there."""
+    scheme = fluxes.Scheme(limiter, (0.0, 0.75, 1 / 3), 1.0, limiter is minmod)
+    monkeypatch.setitem(fluxes.SCHEMES, "van_leer", scheme)
+    monkeypatch.setitem(fluxes.slopes, "van_leer", fluxes.slopes_of("other", limiter, cache=False))
+    rng = np.random.default_rng(5)
+    solid = np.zeros((7, 6), bool)
+    solid[3, 3] = True
+    for grid, obstacle in ((dp.Grid((7, 6), size=2.0, periodic=(True, False)), solid), (dp.Grid(9, spacing=0.3), None)):
+        move = dp.transport(grid, "van_leer", dp.dirichlet, velocity, form=form, solid=obstacle)
+        v = rng.normal(size=move.setting.velocity_shapes[0])
+        scene = move, rng.normal(size=move.space.shape), v, rng.normal(size=move.walls.shape)
+        found, law = results(*scene), move.law
+        with monkeypatch.context() as patch:
+            patch.setattr(kernels, "compiled", lambda: False)
+            for one, other in zip(found, results(*scene)):
+                np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)
+        u, v, q = (x.ravel() for x in scene[1:])
+        along = {0: rng.normal(size=u.size), 1: rng.normal(size=v.size), 2: 0.3, 3: rng.normal(size=q.size)}
+        g = rng.normal(size=u.size)
+        back = law.pull((0, 1, 2, 3), g, u, v, 0.01, q)
+        ahead = law.push(along, u, v, 0.01, q)
+        np.testing.assert_allclose(g @ ahead, sum(np.sum(along[n] * back[n]) for n in along), rtol=1e-12)
+
+
+@NUMBA
 def test_arrays_kept_between_calls_change_nothing():
     grid = dp.Grid((150, 130), size=1.0)
     move, rng = dp.transport(grid, "van_leer"), np.random.default_rng(2)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.advection.upwind import Upwind
+from sparsedp.advection.eulerian import Eulerian
 from sparsedp.derivative import pullback, pushforward, value_and_grad
 from sparsedp.errors import DerivativeError
 from sparsedp.ledger import recording
@@ -122,9 +122,9 @@ def test_operator_is_the_step_and_refused_where_there_is_none():
 def test_only_what_is_asked_is_computed(monkeypatch):
     move, args, loss = scene("upwind", GRIDS["2-D"], "faces", "flux")
     asked = []
-    pull = Upwind.pull
+    pull = Eulerian.pull
     spy = lambda self, nums, *rest, **more: asked.append(nums) or pull(self, nums, *rest, **more)
-    monkeypatch.setattr(Upwind, "pull", spy)
+    monkeypatch.setattr(Eulerian, "pull", spy)
     for name, number in (("u", (0,)), ("v", (1,)), ("dt", (2,)), ("inflow", (3,))):
         asked.clear()
         value_and_grad(lambda x: squares(move, {**args, name: x}))(args[name])

@@ -1,63 +1,164 @@
-"""What donor cell and van Leer share: the bilinear form, its fused loops, and the checks after a pass."""
+"""The schemes that look at the sides of cells: donor cell, van Leer and others of `sparsedp.kernels.fluxes.SCHEMES`.
+
+Donor cell, first order: the value at a side is that of the cell it comes from.
+Van Leer, second order where the field is smooth: with A and B the differences of u to the point below and above, of the
+same sign, q = A / (A + B), widths h, distances d, c = 2 d_below / h and e = 2 d_above / h, the value at a side differs
+from that at its point by
+
+    s = (A + B) R(q),   R = q (1 - q) (q e^2 + (1 - q) c^2) / (q^2 e^2 + (c + e - 2) c e q (1 - q) + (1 - q)^2 c^2)
+
+(equal cells: A B / (A + B), the harmonic mean), and s = 0 where A and B differ in sign. A step is the mean of the field
+and of what two steps of Euler make of it. The sum of the Courant numbers of all sides of a point must not exceed 1/2:
+then no new extrema appear (TVD in 1-D). Where one of A, B is 0 the derivative is the mean of both sides, as it is at
+rest; where both are 0 it is 0.
+
+Sources: R. Courant, E. Isaacson, M. Rees, Comm. Pure Appl. Math. 5 (1952) 243-255. B. van Leer, J. Comput. Phys. 32
+(1979) 101-136; stretched grids: A. Mignone, J. Comput. Phys. 270 (2014) 784-814; stages: S. Gottlieb, C.-W. Shu, Math.
+Comp. 67 (1998) 73-85.
+"""
 
 from functools import cached_property
+from itertools import pairwise
 from math import isfinite
+from typing import Any
 
-from sparsedp.advection.bilinear import Bilinear
-from sparsedp.advection.law import STEP, VELOCITY, Finite, Law
-from sparsedp.advection.loops import Loops
+import numpy as np
+
+from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Finite, Law
+from sparsedp.advection.loops import Loops, able
+from sparsedp.advection.reference import Reference
+from sparsedp.advection.scratch import Scratch
 from sparsedp.advection.stability import check_numbers, check_result, check_weights
 from sparsedp.fields import surely_finite
+from sparsedp.tape import isbox
 
 __all__ = ["Eulerian"]
 
+NOTHING: Any = None
+
 
 class Eulerian(Law):
-    """Base of the schemes whose formulas run point by point over the matrices of `lattice`."""
-
-    limited = False
+    """See the head of the file: compiled loops, and `Reference` where they do not work or a value is traced."""
 
     def __init__(self, setting):
         super().__init__(setting)
-        self.bilinear = Bilinear(setting, self.walls)
-
-    @property
-    def matrices(self):
-        return self.bilinear.matrices
+        self.reference, self.scratch = Reference(setting, self.walls), Scratch()
+        self.scheme = self.reference.scheme
+        self.linear = self.twice = self.scheme.limiter is None
 
     @cached_property
-    def _loops(self):
-        return Loops(self.matrices, limited=self.limited)
+    def loops(self):
+        return Loops(self.reference, self.scratch)
 
-    def _needed(self, v):
-        """The velocity where the scheme needs it."""
-        between = self.bilinear.between
-        return v if between is None else between[0] @ v
+    def forward(self, u, v, dt, inflow, out=None):
+        if able():
+            return self._forward(u, v, self.loops.speeds(v), dt, inflow, out)
+        with np.errstate(all="ignore"):
+            found = self.reference.step(u, v, dt, inflow)
+        self._check(u, v, dt, inflow, found)
+        if out is None:
+            return found
+        out[:] = found
+        return out
 
-    def _check(self, wrong, u, v, dt, inflow, out, share=1.0):
-        """Name what a pass has found wrong, and what it has not met."""
+    def _forward(self, u, v, speeds, dt, inflow, out=None):
+        out, wrong, spare = np.empty(u.size) if out is None else out, 0.0, list[Any]()
+        x, lend = u, self.scratch.lender(spare)
+        for number, keep in enumerate(self.scheme.stages, 1):
+            new = lend(u.size) if number < len(self.scheme.stages) else out
+            slopes = self.loops.slopes(x, inflow, False, spare)
+            wrong += self.loops.stage(x, slopes, speeds, dt, inflow, u, keep, new)
+            x = new
+        self.scratch.give(*spare)
         if wrong or not isfinite(self._unseen(v, inflow)):
-            check_numbers(self.setting, u, v, inflow)
-            check_weights(self, dt, self.bilinear.rate(v), share)
-            check_result(self.setting, out)
+            self._check(u, v, dt, inflow, out)
+        return out
+
+    def _check(self, u, v, dt, inflow, out):
+        """Name what a step has found wrong, and what it has not met."""
+        check_numbers(self.setting, u, v, inflow)
+        check_weights(self.setting, dt, self.reference.rate(v), self.scheme.most)
+        check_result(self.setting, out)
 
     def _unseen(self, v, inflow):
-        """Sum over what a pass may leave out: inflow values at closed walls, velocities inside solids."""
+        """Sum over what a step may leave out: inflow values at closed walls, velocities inside solids."""
         unseen = inflow.sum() if inflow.size else 0.0
         return unseen if self.setting.solid is None else unseen + v.sum()
 
-    def _cotangents(self, nums, found, good):
-        """Those of the arguments `nums`; good: what the loops have written is finite."""
-        if good and VELOCITY in nums and self.bilinear.between is not None:
-            good = surely_finite(found[VELOCITY])
+    def pull(self, nums, g, u, v, dt, inflow, into=None):
+        if not able() or any(map(isbox, (g, u, v, dt, inflow))):
+            found = self.reference.pull(nums, g, u, v, dt, inflow)
+            for place, num in enumerate(nums):
+                if into is not None and num in into:
+                    into[num] += found[place]
+            return tuple((into or {}).get(num, back) for num, back in zip(nums, found, strict=True))
+        kept, wanted = (into or {}).get(VELOCITY), VELOCITY in nums or STEP in nums
+        gspeeds, added = self.loops.blank(kept) if wanted else (NOTHING, False)
+        field = FIELD in nums or INFLOW in nums
+        args = np.ascontiguousarray(g), u, self.loops.speeds(v), dt, inflow, gspeeds, added
+        of_field, of_inflow, good = self._pull(*args, field)
+        found = {FIELD: of_field, INFLOW: of_inflow}
+        if wanted:
+            found[VELOCITY] = gspeeds[0] if added else self.loops.of_velocity(*gspeeds)
+            good &= found[VELOCITY] is gspeeds[0] or surely_finite(found[VELOCITY])
+        if STEP in nums:  # a step is homogeneous in the velocity times dt
+            found[STEP] = float(np.vdot(v, found[VELOCITY])) / dt
+            good &= isfinite(found[STEP])
+        if wanted:
+            if kept is not None and not added:
+                kept += found[VELOCITY]
+                found[VELOCITY] = kept
         backs = tuple(found[num] for num in nums)
-        return Finite(backs) if good and isfinite(found[STEP]) else backs
+        return Finite(backs) if good else backs
 
-    def _of_velocity(self, gw, kept, added):
-        """Cotangent of the velocity as given, from that where it is needed; added to `kept` where there is one."""
-        between = self.bilinear.between
-        found = gw if between is None else between[1] @ gw
-        if kept is None or added:
-            return found
-        kept += found
-        return kept
+    def _pull(self, g, u, speeds, dt, inflow, gspeeds, added, field=True):
+        """Cotangents of u (field: where it is wanted) and inflow, those of the velocity into gspeeds; all finite?"""
+        spare: list = []
+        known: list = []
+        lend = self.scratch.lender(spare)
+        for keep in self.scheme.stages:
+            x = u
+            if known:
+                x = lend(u.size)
+                self.loops.stage(*known[-1][:2], speeds, dt, inflow, u, known[-1][2], x)
+            known.append((x, self.loops.slopes(x, inflow, True, spare), keep))
+        ginflow, rest, wrong = np.zeros(inflow.size), None, 0.0
+        while known:
+            x, slopes, keep = known.pop()
+            if keep:  # a share of the cotangent goes to the first field
+                rest, g = (keep * g if rest is None else rest + keep * g), (1.0 - keep) * g
+            gu = (lend(u.size) if known else np.empty(u.size)) if field or known else None
+            wrong += self.loops.pull(g, x, slopes, speeds, dt, inflow, gu, ginflow, gspeeds, added)
+            g, added = gu, True
+        self.scratch.give(*spare)
+        if g is not None and rest is not None:
+            g += rest
+        return g, ginflow, wrong == 0.0 and isfinite(ginflow.sum())
+
+    def march(self, states, v, dt, inflow):
+        if not able():
+            return super().march(states, v, dt, inflow)
+        speeds = self.loops.speeds(v)
+        for u, new in pairwise(states):
+            self._forward(u, v, speeds, dt, inflow, new)
+        return None
+
+    def retreat(self, states, g, v, dt, inflow, into=None):
+        if not able():
+            return super().retreat(states, g, v, dt, inflow, into)
+        speeds, (gspeeds, added) = self.loops.speeds(v), (NOTHING, False) if into is None else self.loops.blank(into)
+        direct = added
+        for u in states[-2::-1]:
+            g, added = self._pull(g, u, speeds, dt, inflow, gspeeds, added)[0], True
+        if into is not None and not direct and len(states) > 1:
+            into += self.loops.of_velocity(*gspeeds)
+        return g
+
+    def push(self, tangents, u, v, dt, inflow):
+        return self.reference.push(tangents, u, v, dt, inflow)
+
+    def matrix(self, v, dt):
+        nothing = np.zeros(self.setting.space.size), v, np.zeros(self.walls.size)
+        check_numbers(self.setting, *nothing)
+        check_weights(self.setting, dt, self.reference.rate(v), self.scheme.most)
+        return self.reference.matrix(v, dt)

@@ -2,18 +2,18 @@
 
 import numpy as np
 
+from sparsedp.advection.eulerian import Eulerian
 from sparsedp.advection.law import Law, Setting
 from sparsedp.advection.maccormack import MacCormack
 from sparsedp.advection.rule import rule_of
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.advection.step import Step
 from sparsedp.advection.still import Still
-from sparsedp.advection.upwind import Upwind
 from sparsedp.advection.values import check_step, flat_numbers
-from sparsedp.advection.van_leer import VanLeer
 from sparsedp.conditions import dirichlet, neumann, resolve
 from sparsedp.errors import DerivativeError
 from sparsedp.grid import Grid
+from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid
 from sparsedp.recipe import Remade
@@ -22,7 +22,7 @@ from sparsedp.tape import Rule, isbox
 
 __all__ = ["Transport", "transport"]
 
-LAWS = {"upwind": Upwind, "van_leer": VanLeer, "semi_lagrangian": SemiLagrangian, "maccormack": MacCormack}
+LAWS = {**dict.fromkeys(SCHEMES, Eulerian), "semi_lagrangian": SemiLagrangian, "maccormack": MacCormack}
 CHOICES = {
     "velocity": ("faces", "cells"),
     "of": ("cells", "faces"),

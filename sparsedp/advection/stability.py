@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sparsedp.advection.lattice import place_words
 from sparsedp.errors import UnstableStepError
 from sparsedp.fields import check_finite, rounded_down
 
@@ -18,15 +19,15 @@ def check_numbers(setting, u, v, inflow):
     check_finite(name, inflow, "needs finite inflow values")
 
 
-def check_weights(law, dt, rate, share=1.0):
+def check_weights(setting, dt, rate, share):
     """Refuse a step in which share - dt * rate, the weight that a point keeps, is negative somewhere."""
     bad = ~(share - dt * rate >= -ROUNDING)
-    if law.setting.unstable == "raise" and np.any(bad):
+    if setting.unstable == "raise" and np.any(bad):
         worst = int(np.argmax(rate))
         largest = rounded_down(share / rate[worst])
         raise UnstableStepError(
-            f"transport {law.setting.scheme}: dt = {dt:.12g} is too large at {np.count_nonzero(bad)} of {rate.size} "
-            f"points, most at {law.matrices.place(worst)}; the largest stable dt is {largest}, "
+            f"transport {setting.scheme}: dt = {dt:.12g} is too large at {np.count_nonzero(bad)} of {rate.size} "
+            f"points, most at {place_words(setting, worst)}; the largest stable dt is {largest}, "
             "or write unstable='allow'"
         )
 

@@ -10,6 +10,7 @@ import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
+from types import FunctionType
 
 __all__ = ["SERIAL", "Kernel", "kernel", "loops"]
 
@@ -61,6 +62,7 @@ def _types(words, narrow):
             found[f"{mark}read{dimensions}"] = types.Array(kind, dimensions, "C", readonly=True)
             found[f"{mark}write{dimensions}"] = types.Array(kind, dimensions, "C")
         found[f"index{dimensions}"] = types.Array(types.int64, dimensions, "C", readonly=True)
+    found["mask1"] = types.Array(types.boolean, 1, "C", readonly=True)
     return [found[word] for word in words.split()]
 
 
@@ -77,10 +79,15 @@ class Kernel:
     loop : function
         Its last two arguments are the rows it works on, `start` and `stop`.
     words : str
-        The types of its other arguments: read1 to read3 (may be read-only), write1 to write3 (float64), index1 to
-        index3 (int64), real, int, flag. With ~ before it an array is of float32 in `single`.
+        The types of its other arguments: read1 to read4 (may be read-only), write1 to write4 (float64), index1 to
+        index4 (int64), mask1 (bool), real, int, flag. With ~ before it an array is of float32 in `single`.
+    uses : dict, optional
+        {name: function} that the loop, and these functions themselves, call by that name. They are compiled with it,
+        and stand in the same file: that is where numba looks whether what it has kept is still good.
+    name : str, optional
+        Tells loops of the same code that use other functions apart.
     narrow : bool
-        Whether such arrays are of float32 here.
+        Whether arrays with a ~ are of float32 here.
     **options
         Of numba's ``njit``.
 
@@ -90,10 +97,10 @@ class Kernel:
         The same loop for arrays of float32, where its words have a ~.
     """
 
-    def __init__(self, loop, words, narrow=False, **options):
-        self.loop, self.words, self.options, self.__doc__ = loop, words, options, loop.__doc__
-        self.narrow = narrow
-        self.single = Kernel(loop, words, True, **options) if "~" in words and not narrow else self
+    def __init__(self, loop, words, uses=None, name=None, narrow=False, **options):
+        self.loop, self.words, self.uses, self.options = loop, words, uses or {}, options
+        self.name, self.__doc__, self.narrow = name or loop.__name__, loop.__doc__, narrow
+        self.single = Kernel(loop, words, uses, name, True, **options) if "~" in words and not narrow else self
         loops.append(self)
 
     @cached_property
@@ -103,12 +110,17 @@ class Kernel:
             from numba import njit
 
             options = {"nogil": True, "error_model": "numpy", **self.options}
-            signature = tuple(_types(self.words + " int int", self.narrow))
+            keep = options.pop("cache", True)
+            signature, names = tuple(_types(self.words + " int int", self.narrow)), dict(self.loop.__globals__)
+            loop = FunctionType(self.loop.__code__, names, self.name)
+            loop.__qualname__ = self.name  # the kept code goes by it
+            for name, function in self.uses.items():
+                names[name] = njit(**options)(FunctionType(function.__code__, names, name))
             with _announced():
                 try:
-                    return njit([signature], cache=True, **options)(self.loop)
+                    return njit([signature], cache=keep, **options)(loop)
                 except (OSError, RuntimeError):  # there is no place to keep it
-                    return njit([signature], **options)(self.loop)
+                    return njit([signature], **options)(loop)
         except Exception as error:  # whatever LLVM or numba object to on this machine
             message = f"The compiled kernels do not work here ({error}); NumPy is used instead."
             warnings.warn(message, RuntimeWarning, stacklevel=4)
