@@ -115,25 +115,29 @@ class SemiLagrangian(Law):
             self.advect_vjp(component, part, u[span], inflow, trajectories, room, targets, changes)
             if field and solid is not None:
                 of_u[span] += np.where(solid, g[span], 0.0)
-            for sign, change, trajectory in zip(self.signs, changes or (), trajectories, strict=False):
-                if STEP in nums:
-                    rate += float(np.sum(change * trajectory.velocity))
-                back, bent = self.backtrace.vjp(number, w, trajectory.step, change)
-                if STEP in nums and bent is not None:
-                    rate += float(np.sum(bent * w))
-                if sign == self.signs[0]:
-                    of_w.append(back)
-                else:
-                    of_w[-1] += back
+            if changes is not None:
+                back, gain = self._of_velocity(number, w, trajectories, changes, STEP in nums)
+                of_w.append(back.reshape(-1))
+                rate += gain
         found = {FIELD: of_u, INFLOW: of_inflow, STEP: rate / dt}
         if VELOCITY in nums:
-            flat = of_w[0].reshape(-1) if len(of_w) == 1 else np.concatenate([back.reshape(-1) for back in of_w])
+            flat = of_w[0] if len(of_w) == 1 else np.concatenate(of_w)
             found[VELOCITY] = flat if self.to_points is None else self.to_points.T.apply(flat)
         self.scratch.give(*borrowed)
         for num in set(into or ()) & set(nums):
             into[num] += found[num]
             found[num] = into[num]
         return tuple(found[num] for num in nums)
+
+    def _of_velocity(self, number, w, trajectories, changes, timed):
+        """Cotangents of the velocities of the trajectories -> that of w, and dt times that of dt if it is asked for."""
+        total, rate = None, 0.0
+        for change, trajectory in zip(changes, trajectories, strict=True):
+            rate += _dot(change, trajectory.velocity) if timed else 0.0
+            back, bent = self.backtrace.vjp(number, w, trajectory.step, change)
+            rate += _dot(bent, w) if timed and bent is not None else 0.0
+            total = back if total is None else np.add(total, back, out=total)
+        return total, rate
 
     def push(self, tangents, u, v, dt, inflow):
         """{argument: tangent} -> tangent of the advected field."""
@@ -158,3 +162,8 @@ class SemiLagrangian(Law):
                 block = sp.diags_array(1.0 - solid) @ block + sp.diags_array(1.0 * solid)
             blocks.append(block)
         return sp.csr_array(sp.block_diag(blocks, format="csr"))
+
+
+def _dot(a, b):
+    with np.errstate(over="ignore", invalid="ignore"):  # the rule refuses what is not finite
+        return float(np.einsum("ij,ij", a, b))
