@@ -102,11 +102,9 @@ def test_the_cycle_is_symmetric_and_positive(shape, periodic, rng):
     r, z = layout.zeros(2, len(fine.red))
 
     def cycle(field):
-        from sparsedp.solvers.multigrid.cycle import OVER
-
         layout.split(field, r, fine.red)
         layout.wrap(r)
-        fine.x[...] = OVER * r
+        fine.x[...] = fine.over * r
         fine.precondition(r, z, engine.sums)
         out = np.zeros(layout.shape)
         layout.merge(z, fine.red, out)

@@ -12,7 +12,6 @@ from sparsedp.solvers.multigrid.smoother import chess_board
 
 __all__ = ["Coarse", "Coarsest", "Finest"]
 
-OVER = 1.2  # of a sweep on the finest level; 1 takes up to one iteration more
 TWICE = {2: 2, 3: 0}  # in 2-D a second visit to a sixteenth of the cells takes a fifth of the iterations off
 
 
@@ -66,8 +65,10 @@ class Finest(Visited):
     Attributes
     ----------
     x : array
-        What the cycle starts from: OVER r, with ghost cells.
+        What the cycle starts from: `over` r, with ghost cells.
     """
+
+    over = 1.2  # of a sweep; 1 takes up to one iteration more
 
     def __init__(self, level, dtype, threads):
         self.red, self.black = chess_board(level.layout)
@@ -95,12 +96,12 @@ class Finest(Visited):
     def precondition(self, r, z, sums):
         """z = what the cycle makes of r; r . z to sums."""
         tables, sizes = (self.to_black, self.to_red), self.layout.sizes
-        left = 1.0 / OVER - 1.0
-        self.run(loops.smooth, self.links, self.x, r, self.r, *tables, sizes, sums, left, 1.0, 0.0)
+        over = self.over
+        self.run(loops.smooth, self.links, self.x, r, self.r, *tables, sizes, sums, 1.0 / over - 1.0, 1.0, 0.0)
         self.visit(self.collect)
         self.below.cycle(TWICE[self.layout.dim])
         self.visit(self.prolong)
-        self.run(loops.smooth, self.links, self.x, r, z, *tables, sizes, sums, 1.0 - OVER, OVER, OVER)
+        self.run(loops.smooth, self.links, self.x, r, z, *tables, sizes, sums, 1.0 - over, over, over)
 
 
 class Coarse(Visited):
@@ -151,14 +152,14 @@ class Coarsest:
     def __init__(self, natural, above, dtype):
         self.layout = layout = Layout(natural.shape, natural.periodic)
         self.above, self.natural, self.scale = above, above.zeros(1, dtype=dtype), above.zeros()
-        self.b = layout.zeros(len(layout.colours), dtype=dtype)
+        self.b, self.places = layout.zeros(len(layout.colours), dtype=dtype), np.empty(natural.shape, int)
+        layout.merge(np.arange(self.b.size).reshape(self.b.shape), range(len(self.b)), self.places)
+        self.order = above.cells(np.arange(above.size), 0).reshape(-1)
         self.matrix, above.cells(self.scale, 0)[...] = dense_inverse(natural)
         above.wrap(self.scale)
-        self.vector = np.zeros(natural.shape)
 
     def cycle(self, twice):
         """b -> the solution, in natural order."""
-        self.layout.merge(self.b, range(len(self.b)), self.vector)
-        found = (self.matrix * self.vector.reshape(-1)).sum(axis=1)
-        self.above.cells(self.natural[0], 0)[...] = found.reshape(self.vector.shape)
+        vector = self.b.reshape(-1)[self.places.reshape(-1)]
+        self.natural[0, self.order] = (self.matrix * vector).sum(axis=1)
         self.above.wrap(self.natural)

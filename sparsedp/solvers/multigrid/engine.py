@@ -13,7 +13,8 @@ import numpy as np
 
 from sparsedp import kernels
 from sparsedp.solvers.contract import Engine, norm
-from sparsedp.solvers.multigrid.cycle import OVER
+from sparsedp.solvers.multigrid.reading import stencil_of
+from sparsedp.solvers.multigrid.stencil import Unfit
 
 __all__ = ["Structured", "structured_engine", "structured_if_suited"]
 
@@ -55,8 +56,6 @@ def structured_engine(system, *, precision="auto"):
     -----
     Source: J. E. Dendy, Black box multigrid, J. Comput. Phys. 48 (1982) 366-386.
     """
-    from sparsedp.solvers.multigrid.stencil import Unfit
-
     if precision not in tuple(PRECISIONS):
         raise ValueError(f"precision must be 'auto', 'single' or 'double', got {precision!r}")
     if not kernels.compiled():
@@ -70,8 +69,6 @@ def structured_engine(system, *, precision="auto"):
 
 def structured_if_suited(system):
     """System -> (engine, "") if structured multigrid is a good choice, else (None, why not)."""
-    from sparsedp.solvers.multigrid.stencil import Unfit
-
     grid = system.op.domain.grid
     if grid is None or grid.dim == 1:
         return None, "structured multigrid is for grids in 2-D and 3-D"
@@ -90,7 +87,6 @@ def structured_if_suited(system):
 def _built(system, dtype=None):
     """The engine; raises Unfit. The type of its cycle, where it is not given, is found from the coefficients."""
     from sparsedp.solvers.multigrid.facts import components_of_stencil, null_space_of_stencil
-    from sparsedp.solvers.multigrid.reading import stencil_of
 
     stencil, faces = stencil_of(system), system.faces
     if faces is not None and faces.connected:
@@ -148,13 +144,12 @@ class Structured(Engine):
         volumes, filled = spread.volumes()
         self.factors = scale * volumes, scale  # what a right-hand side of A, and of its transpose, is multiplied with
         gauges = root / filled, root  # how a scaled residual measures in the user's cells, but for a number
-        self.tops = tuple(float(gauge.max(initial=0.0)) or 1.0 for gauge in gauges)
+        self.tops = tuple((float(gauge.max(initial=0.0)) or 1.0) / abs(self.scale) for gauge in gauges)
         self.norm = 2.0 * float(np.max(gauges[0] * root, initial=0.0)) / abs(self.scale)
         layout, red = self.fine.layout, self.fine.red
         self.gauges = layout.zeros(2, len(red), dtype=dtype)
         for rows, gauge, top in zip(self.gauges, gauges, self.tops):
-            layout.split(gauge / top, rows, red)
-        self.tops = tuple(top / abs(self.scale) for top in self.tops)
+            layout.split(gauge / (top * abs(self.scale)), rows, red)
         self.vectors = layout.zeros(4, len(red))  # x, r, q, and the right-hand side of the black cells
         self.light = layout.zeros(3, len(red), dtype=dtype)  # z and two directions
         self.sums, self.field = np.zeros(layout.halves[0]), np.zeros(spread.shape)
@@ -244,7 +239,9 @@ class _Run:
     def step(self, alpha):
         """r -= alpha q -> its size."""
         self.alpha, fine, sums = alpha, self.fine, self.engine.sums
-        fine.run(self.engine.loops.update, self.r, self.q, fine.x, self.gauge, fine.layout.sizes, sums, alpha, OVER)
+        fine.run(
+            self.engine.loops.update, self.r, self.q, fine.x, self.gauge, fine.layout.sizes, sums, alpha, fine.over
+        )
         return float(np.sqrt(sums.sum()))
 
     def rounding(self):

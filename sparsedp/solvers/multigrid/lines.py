@@ -63,7 +63,8 @@ def of_lines(lines, k, grid, unit=1.0):
     for axis, part in enumerate(grid.split(k)):
         line, faces = lines[axis], np.moveaxis(part, axis, 0)
         area = unit * _area(grid, axis)
-        links.append(np.moveaxis(_along(line.link, faces, area), 0, axis))
+        factor = line.link.reshape((-1,) + (1,) * (grid.dim - 1)) * area
+        links.append(np.moveaxis(faces * factor, 0, axis))
         cells = np.moveaxis(extra, axis, 0)
         for values, shift in ((line.below, -1), (line.above, 0)):
             for f in np.flatnonzero(values):
@@ -77,15 +78,6 @@ def _area(grid, axis):
     if grid.cells.size and all(np.all(h == h[0]) for h in others):
         return float(np.prod([h[0] for h in others]))
     return others[0][:, None] * others[1] if len(others) > 1 else others[0]
-
-
-def _along(line, faces, area):
-    """line[f] * faces[f, ...] * area."""
-    if line.size > 2 and np.isscalar(area) and np.all(line[1:-1] == line[1]):  # equal cells: one number, and two ends
-        out = faces * (line[1] * area)
-        out[0], out[-1] = faces[0] * (line[0] * area), faces[-1] * (line[-1] * area)
-        return out
-    return faces * (line.reshape((-1,) + (1,) * (faces.ndim - 1)) * area)
 
 
 class Faces:

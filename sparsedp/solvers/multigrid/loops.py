@@ -123,17 +123,19 @@ def chess(c, red, given, out, to_black, to_red, sizes, sums, own, share, rest, s
         sum_around(black, to_black, c, red, at, at, there, (last + 1 - begin) * plane)
         for q in range(black.shape[0]):
             ghosts(black[q], there, last + 1 - begin, sizes, True)
-        at = (GHOST + first) * plane
-        sum_around(out, to_red, c, black, at, 2 * plane, at, (last - first) * plane)
+        at, n = (GHOST + first) * plane, (last - first) * plane
+        sum_around(out, to_red, c, black, at, 2 * plane, at, n)
+        for q in range(red.shape[0]):
+            row, x, y = out[q, at : at + n], red[q, at : at + n], given[q, at : at + n]
+            for k in range(n):
+                row[k] = f * x[k] + g * row[k] + h * kind(y[k])
+            ghosts(out[q], at, last - first, sizes, False)
         for p in range(first, last):
             at, sums[p] = (GHOST + p) * plane, 0.0
             for q in range(red.shape[0]):
-                row, x, y = out[q, at : at + plane], red[q, at : at + plane], given[q, at : at + plane]
-                for k in range(plane):
-                    row[k] = f * x[k] + g * row[k] + h * kind(y[k])
-                ghosts(out[q], at, 1, sizes, False)
-                sums[p] += product(row, y)
-                ghosts(out[q], at, 1, sizes, True)
+                sums[p] += product(out[q, at : at + plane], given[q, at : at + plane])
+        for q in range(red.shape[0]):
+            ghosts(out[q], (GHOST + first) * plane, last - first, sizes, True)
     for q in range(red.shape[0]):
         ghost_planes(out[q], start, stop, sizes)
 
