@@ -16,7 +16,10 @@ REFUSED = 2  # exit code of a bad input, the same as argparse's
 INTERRUPTED = 130  # exit code of what Ctrl-C ends, the same as a shell's
 LONGEST = 200  # letters of a name that a sentence shows
 CODES = {"agrees": 0, "disagrees": 1, "inconclusive": 3}
-LOOPS = [f"sparsedp.kernels.{name}" for name in ("stencil", "elimination", "reductions")]  # where loops are defined
+LOOPS = [  # where loops are defined
+    *(f"sparsedp.kernels.{name}" for name in "elimination fluxes interpolation projection reductions stencil".split()),
+    "sparsedp.solvers.multigrid.loops",
+]
 OUT = "where the results go (default: %(default)s)"
 SCENE = "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"
 

@@ -56,6 +56,7 @@ DOORS = [
     ("autograd.numpy.numpy_vspaces", r"tape\.py", ()),
     ("autograd.numpy.numpy_wrapper", r"tape\.py", ()),
     ("pyamg", r"solvers/amg\.py", ()),
+    ("llvmlite", r"nowhere", ()),
     ("numba", r"kernels/.*|solvers/multigrid/loops\.py", ()),
     ("matplotlib", r"report/plots\.py", ()),
     ("tqdm", r"report/.*|__main__\.py|(.*/)?progress\.py", ()),
@@ -64,7 +65,7 @@ TALKS = r"report/.*|__main__\.py"  # may print
 NOWHERE = {"utils.py", "util.py", "helpers.py", "helper.py", "misc.py", "common.py"}
 LENGTHS = {"sparsedp": 600, "tests": 600, "benchmarks": 300, "examples": 60}
 LONGER = {"solver_in_the_loop.py": 125}  # two solvers, a network and a study
-EXTRAS = ("numba", "llvmlite", "matplotlib", "tqdm")  # foreign libraries that need not be there
+EXTRAS = ("numba", "matplotlib", "tqdm")  # foreign libraries that need not be there
 LAZY = ("pyamg", "numba", "matplotlib", "tqdm", "scipy", "autograd", "numpy")  # not touched by `import sparsedp`
 UNFINISHED = r"\b(?:TO" + r"DO|FIX" + r"ME|X" + r"XX|NotImplemented" + r"Error)\b"
 
