@@ -146,12 +146,13 @@ class Eulerian(Law):
     def retreat(self, states, g, v, dt, inflow, into=None):
         if not able():
             return super().retreat(states, g, v, dt, inflow, into)
-        speeds, (gspeeds, added) = self.loops.speeds(v), (NOTHING, False) if into is None else self.loops.blank(into)
-        direct = added
+        speeds, gspeeds, added = self.loops.speeds(v), NOTHING, False
         for u in states[-2::-1]:
-            g, added = self._pull(g, u, speeds, dt, inflow, gspeeds, added)[0], True
-        if into is not None and not direct and len(states) > 1:
-            into += self.loops.of_velocity(*gspeeds)
+            if into is not None:
+                gspeeds, added = self.loops.blank(into)
+            g = self._pull(g, u, speeds, dt, inflow, gspeeds, added)[0]
+            if into is not None and not added:
+                into += self.loops.of_velocity(*gspeeds)
         return g
 
     def push(self, tangents, u, v, dt, inflow):
