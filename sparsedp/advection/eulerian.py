@@ -18,12 +18,12 @@ Comp. 67 (1998) 73-85.
 """
 
 from functools import cached_property
-from itertools import pairwise
 from math import isfinite
 from typing import Any
 
 import numpy as np
 
+from sparsedp import results
 from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Finite, Law
 from sparsedp.advection.loops import Loops, able
 from sparsedp.advection.reference import Reference
@@ -50,19 +50,16 @@ class Eulerian(Law):
     def loops(self):
         return Loops(self.reference, self.scratch)
 
-    def forward(self, u, v, dt, inflow, out=None):
+    def forward(self, u, v, dt, inflow):
         if able():
-            return self._forward(u, v, self.loops.speeds(v), dt, inflow, out)
+            return self._forward(u, v, dt, inflow)
         with np.errstate(all="ignore"):
             found = self.reference.step(u, v, dt, inflow)
         self._check(u, v, dt, inflow, found)
-        if out is None:
-            return found
-        out[:] = found
-        return out
+        return found
 
-    def _forward(self, u, v, speeds, dt, inflow, out=None):
-        out, wrong, spare = np.empty(u.size) if out is None else out, 0.0, list[Any]()
+    def _forward(self, u, v, dt, inflow):
+        speeds, out, wrong, spare = self.loops.speeds(v), results.empty(u.shape, float), 0.0, list[Any]()
         x, lend = u, self.scratch.lender(spare)
         for number, keep in enumerate(self.scheme.stages, 1):
             new = lend(u.size) if number < len(self.scheme.stages) else out
@@ -85,33 +82,24 @@ class Eulerian(Law):
         unseen = inflow.sum() if inflow.size else 0.0
         return unseen if self.setting.solid is None else unseen + v.sum()
 
-    def pull(self, nums, g, u, v, dt, inflow, into=None):
+    def pull(self, nums, g, u, v, dt, inflow):
         if not able() or any(map(isbox, (g, u, v, dt, inflow))):
-            found = self.reference.pull(nums, g, u, v, dt, inflow)
-            for place, num in enumerate(nums):
-                if into is not None and num in into:
-                    into[num] += found[place]
-            return tuple((into or {}).get(num, back) for num, back in zip(nums, found, strict=True))
-        kept, wanted = (into or {}).get(VELOCITY), VELOCITY in nums or STEP in nums
-        gspeeds, added = self.loops.blank(kept) if wanted else (NOTHING, False)
-        field = FIELD in nums or INFLOW in nums
-        args = np.ascontiguousarray(g), u, self.loops.speeds(v), dt, inflow, gspeeds, added
+            return self.reference.pull(nums, g, u, v, dt, inflow)
+        wanted, field = VELOCITY in nums or STEP in nums, FIELD in nums or INFLOW in nums
+        gspeeds = self.loops.blank() if wanted else NOTHING
+        args = np.ascontiguousarray(g), u, self.loops.speeds(v), dt, inflow, gspeeds
         of_field, of_inflow, good = self._pull(*args, field)
         found = {FIELD: of_field, INFLOW: of_inflow}
         if wanted:
-            found[VELOCITY] = gspeeds[0] if added else self.loops.of_velocity(*gspeeds)
+            found[VELOCITY] = self.loops.of_velocity(*gspeeds)
             good &= found[VELOCITY] is gspeeds[0] or surely_finite(found[VELOCITY])
         if STEP in nums:  # a step is homogeneous in the velocity times dt
             found[STEP] = float(np.vdot(v, found[VELOCITY])) / dt
             good &= isfinite(found[STEP])
-        if wanted:
-            if kept is not None and not added:
-                kept += found[VELOCITY]
-                found[VELOCITY] = kept
         backs = tuple(found[num] for num in nums)
         return Finite(backs) if good else backs
 
-    def _pull(self, g, u, speeds, dt, inflow, gspeeds, added, field=True):
+    def _pull(self, g, u, speeds, dt, inflow, gspeeds, field):
         """Cotangents of u (field: where it is wanted) and inflow, those of the velocity into gspeeds; all finite?"""
         spare: list = []
         known: list = []
@@ -122,38 +110,18 @@ class Eulerian(Law):
                 x = lend(u.size)
                 self.loops.stage(*known[-1][:2], speeds, dt, inflow, u, known[-1][2], x)
             known.append((x, self.loops.slopes(x, inflow, True, spare), keep))
-        ginflow, rest, wrong = np.zeros(inflow.size), None, 0.0
+        ginflow, rest, wrong, added = np.zeros(inflow.size), None, 0.0, False
         while known:
             x, slopes, keep = known.pop()
             if keep:  # a share of the cotangent goes to the first field
                 rest, g = (keep * g if rest is None else rest + keep * g), (1.0 - keep) * g
-            gu = (lend(u.size) if known else np.empty(u.size)) if field or known else None
+            gu = (lend(u.size) if known else results.empty(u.shape, float)) if field or known else None
             wrong += self.loops.pull(g, x, slopes, speeds, dt, inflow, gu, ginflow, gspeeds, added)
             g, added = gu, True
         self.scratch.give(*spare)
         if g is not None and rest is not None:
             g += rest
         return g, ginflow, wrong == 0.0 and isfinite(ginflow.sum())
-
-    def march(self, states, v, dt, inflow):
-        if not able():
-            return super().march(states, v, dt, inflow)
-        speeds = self.loops.speeds(v)
-        for u, new in pairwise(states):
-            self._forward(u, v, speeds, dt, inflow, new)
-        return None
-
-    def retreat(self, states, g, v, dt, inflow, into=None):
-        if not able():
-            return super().retreat(states, g, v, dt, inflow, into)
-        speeds, gspeeds, added = self.loops.speeds(v), NOTHING, False
-        for u in states[-2::-1]:
-            if into is not None:
-                gspeeds, added = self.loops.blank(into)
-            g = self._pull(g, u, speeds, dt, inflow, gspeeds, added)[0]
-            if into is not None and not added:
-                into += self.loops.of_velocity(*gspeeds)
-        return g
 
     def push(self, tangents, u, v, dt, inflow):
         return self.reference.push(tangents, u, v, dt, inflow)

@@ -5,7 +5,6 @@ but for what it finds on the way: `u` of `space.size` numbers, `v` of the veloci
 `dt` a float > 0, `inflow` of `walls.size` numbers. Arguments are numbered 0 to 3 in that order.
 """
 
-from itertools import pairwise
 from math import prod
 from typing import Any, NamedTuple
 
@@ -57,12 +56,11 @@ class Finite(tuple):
 class Law:
     """Base of the schemes. A subclass sets the flags and has these methods:
 
-    ``forward(u, v, dt, inflow, out=None)``
-        The moved field, into `out` when it is given.
-    ``pull(nums, g, u, v, dt, inflow, into=None)``
+    ``forward(u, v, dt, inflow)``
+        The moved field.
+    ``pull(nums, g, u, v, dt, inflow)``
         Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed;
         `Finite` when that is known.
-        `into` maps the number of an argument to an array: its cotangent is added there and returned.
     ``push(tangents, u, v, dt, inflow)``
         {number of an argument: tangent} -> tangent of the result.
     ``matrix(v, dt)``
@@ -94,18 +92,6 @@ class Law:
         self.name = f"transport {setting.scheme}"
         self.field_shapes, self.velocity_shapes = (setting.space.shape,), setting.velocity_shapes
         self.walls = wall_space(setting)
-
-    def march(self, states, v, dt, inflow):
-        """Fill the rows of `states` from the first: step by step, all with the same velocity."""
-        for u, new in pairwise(states):
-            self.forward(u, v, dt, inflow, out=new)
-
-    def retreat(self, states, g, v, dt, inflow, into=None):
-        """Cotangent of the last row -> that of the first; that of v is added to the array `into` when it is given."""
-        nums, own = ((FIELD,), None) if into is None else ((FIELD, VELOCITY), {VELOCITY: into})
-        for u in states[-2::-1]:
-            g = self.pull(nums, g, u, v, dt, inflow, into=own)[0]
-        return g
 
 
 def component_shapes(setting):

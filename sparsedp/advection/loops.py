@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp import kernels
+from sparsedp import kernels, results
 from sparsedp.advection.lattice import lattices, opened
 from sparsedp.kernels import fluxes
 
@@ -96,13 +96,11 @@ class Loops:
         w = w if self._open is None else w * self._open
         return w, w
 
-    def blank(self, into=None):
-        """Arrays for the cotangents of `speeds`, and whether they are to be added to."""
-        if self.even and into is not None and self.reference.between is None and self._open is None:
-            return (into, into), True
+    def blank(self):
+        """Arrays for the cotangents of `speeds`."""
         size = self.components[-1].speed.stop
-        low = np.empty(size)
-        return (low, low if self.even else np.empty(size)), False
+        low = results.empty((size,), float)
+        return low, low if self.even else results.empty((size,), float)
 
     def of_velocity(self, low, high):
         """Cotangents of `speeds` -> that of the velocity as given."""
@@ -168,7 +166,7 @@ class Loops:
         derivatives in `slopes` are overwritten. Returns how many values are not finite.
         """
         if self._limiter is not None and gspeeds is None:
-            gspeeds, added = self.blank()[0], False
+            gspeeds, added = self.blank(), False
         wrong, modes = 0.0, (not self.even, not added)
         for number, (field, q, w, rows, axes, lengths, parts) in enumerate(self.components):
             found, work = np.zeros((3, parts)), (parts, field.stop - field.start, kernels.threads())

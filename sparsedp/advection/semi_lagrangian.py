@@ -17,6 +17,7 @@ R. Keys, IEEE Trans. Acoustics, Speech and Signal Processing 29 (1981) 1153-1160
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp import results
 from sparsedp.advection.back_trajectory import Euler, Midpoint, velocity_at_points
 from sparsedp.advection.interpolant import components
 from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
@@ -88,10 +89,10 @@ class SemiLagrangian(Law):
         if inflow.size:
             check_finite(self.name, inflow, "needs finite inflow values")
 
-    def forward(self, u, v, dt, inflow, out=None):
+    def forward(self, u, v, dt, inflow):
         """The advected field."""
         self._check(u, v, inflow)
-        out, (room, borrowed) = np.empty(u.size) if out is None else out, self._room(u)
+        out, (room, borrowed) = results.empty(u.shape, float), self._room(u)
         for number, (component, w) in enumerate(zip(self.components, self._velocities(v, room), strict=True)):
             span, solid = component.span, component.solid
             trajectories = self._trajectories(number, w, dt)
@@ -101,7 +102,7 @@ class SemiLagrangian(Law):
         self.scratch.give(*borrowed)
         return out
 
-    def pull(self, nums, g, u, v, dt, inflow, into=None):
+    def pull(self, nums, g, u, v, dt, inflow):
         """Cotangent of the advected field -> those of the arguments `nums`."""
         field, speed = FIELD in nums or INFLOW in nums, VELOCITY in nums or STEP in nums
         (room, borrowed), g, rate, of_w = self._room(u), np.ascontiguousarray(g), 0.0, []
@@ -124,9 +125,6 @@ class SemiLagrangian(Law):
             flat = of_w[0] if len(of_w) == 1 else np.concatenate(of_w)
             found[VELOCITY] = flat if self.to_points is None else self.to_points.T.apply(flat)
         self.scratch.give(*borrowed)
-        for num in set(into or ()) & set(nums):
-            into[num] += found[num]
-            found[num] = into[num]
         return tuple(found[num] for num in nums)
 
     def _of_velocity(self, number, w, trajectories, changes, timed):
