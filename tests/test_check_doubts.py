@@ -70,6 +70,12 @@ def test_a_ripple_decides_nothing(size, frequency):
     assert blind.verdict == "inconclusive" or size * frequency < 1e-2
 
 
+@pytest.mark.parametrize("size, frequency", [(1e-12, 1e6), (1e-13, 1e7), (1e-15, 1e8), (1e-10, 1e5)])
+def test_a_right_gradient_is_not_accused_for_a_ripple_that_its_curvature_hides(size, frequency):
+    """Within a step that shows the ripple the gradient changes more by its curvature; both sides tell them apart."""
+    assert AUDIT(lambda u: anp.sum(u**2) + size * anp.sum(anp.sin(frequency * u)), X).verdict == "inconclusive"
+
+
 def test_a_constant_far_above_the_rest_makes_no_ripple():
     """Steps of 1e11 see no curvature at all, and are no measure of the usual one."""
     x, off = np.random.default_rng(0).uniform(0.5, 1.0, 7), lambda factor: lambda u: factor * np.cos(u)

@@ -7,6 +7,7 @@ import pytest
 import scipy.sparse as sp
 
 import sparsedp as dp
+from sparsedp.ledger import recording
 from sparsedp.operator import Operator
 from sparsedp.structure.base import Structure
 
@@ -160,6 +161,18 @@ def test_twins_that_differ():
     assert result.verdict == "disagrees"
     assert "forward, float64" in result.failed
     assert not dp.check.transpose(op)
+
+
+def test_a_small_row_beside_a_large_one_counts_as_much():
+    op = Operator(Torn(np.diag([1e9, 1.0, 1.0, 2.0]), 1 + 1e-10), dp.Space(4), dp.Space(4), "torn", "matrix-free")
+    assert "twin, forward, float64" in dp.check.operator(op).failed
+
+
+def test_a_check_of_a_solve_applies_it_a_few_times_more_than_it_has_columns():
+    inv = dp.inverse(-dp.laplacian(GRID, dp.dirichlet), "direct")
+    with recording() as calls:
+        assert dp.check.operator(inv)
+    assert calls[inv.name, "solve"] + calls[inv.name, "adjoint"] <= 8 * inv.shape[0]
 
 
 def test_operators_with_one_form_say_so():

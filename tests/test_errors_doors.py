@@ -127,6 +127,11 @@ TABLE = [
     ),
     (lambda: dp.check.order(2), TYPE, "check.order takes a function, got int; write lambda n: error on n cells"),
     (
+        lambda: dp.check.twin(np.eye(3)),
+        TYPE,
+        "check.twin takes an Operator, got ndarray; write dp.from_matrix(...) first",
+    ),
+    (
         lambda: dp.check.transpose(np.eye(3)),
         TYPE,
         "check.transpose takes an Operator, got ndarray; write dp.from_matrix(...) first",

@@ -8,7 +8,17 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.check.culprit import culprit_of
-from sparsedp.check.judge import FIELDS, Judgement, at_kinks, curvature, examined, explained, forward_mode, verdict
+from sparsedp.check.judge import (
+    FIELDS,
+    PROVED,
+    Judgement,
+    at_kinks,
+    curvature,
+    examined,
+    explained,
+    forward_mode,
+    verdict,
+)
 from sparsedp.check.progress import shown
 from sparsedp.check.summary import Result, table
 from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, default_steps, generator
@@ -114,27 +124,21 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None, quick=F
     if steps is not None and (len(set(chosen)) < FEWEST_STEPS or not all(0 < step < math.inf for step in chosen)):
         raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {chosen}")
     point, count = Point(x), min(directions, 1) if quick else directions
-    chosen = chosen or default_steps(point.eps)
-    lines = len(_directions(point, point.vector, count, generator(0), quick))
-    with shown(3 + POINTS * min(lines, 2) + 2 * len(chosen) * lines) as told:
-        return _audit(Trials(loss, told), point, gradient, chosen, steps is None, count, generator(rng), quick)
-
-
-def _directions(point, gradient, count, rng, quick):
-    pairs = point.directions(gradient, count, rng)
-    return [pair for pair in pairs if pair[0] in QUICK or not quick]
+    chosen, names = chosen or default_steps(point.eps), QUICK if quick else None
+    lines = len(point.directions(point.vector, count, generator(0), names))
+    with shown(3 + POINTS * min(lines, 2) + 2 * len(chosen) * lines) as tick:
+        return _audit(Trials(loss, tick), point, gradient, chosen, steps is None, count, generator(rng), names)
 
 
 def _audit(trials, point, gradient, steps, extend, count, rng, quick, beside=False):
-    """The audit at one point; `beside`: it is the one beside kinks, which looks no further."""
+    """The audit at one point; `quick`: names of its directions, or None for all; `beside`: that beside kinks."""
     loss, taped, judged, hessian = trials.loss, gradient is None, [], None
     slope = (lambda tree: value_and_grad(loss)(tree)[1]) if taped else gradient
     base = trials.value(point.tree())
     vector, doubts = _own_gradient(point, trials, base, slope)
     notes = []
     if math.isfinite(base) and np.all(np.isfinite(vector)):
-        directions = _directions(point, vector, count, rng, quick)
-        judged = examined(trials, point, base, vector, directions, steps, extend)
+        judged = examined(trials, point, base, vector, point.directions(vector, count, rng, quick), steps, extend)
         random = judged[:count]
         if callable(slope):
             for one in judged:
@@ -145,10 +149,10 @@ def _audit(trials, point, gradient, steps, extend, count, rng, quick, beside=Fal
             doubts.append(_modes(forward_mode(loss, random), trials.tolerance))
         if not quick:
             doubts += _complex_step(loss, point, random, base)
-        if taped and random and not quick and judged[0].word in ("agrees", "vanishes"):
+        if taped and random and not quick and judged[0].word in PROVED:
             hessian, note = _hessian(loss, point, judged[0], extend)
             notes.append(note)
-        if not _same(trials.value(point.tree()), base):
+        if trials.value(point.tree()) != base:
             doubts.append(("unsound", "the loss gives another value after the audit: it keeps a state"))
     outcome, reason = verdict(judged, doubts)
     notes = [reason for word, reason in doubts if word == "note"] + notes
@@ -163,11 +167,19 @@ def _audit(trials, point, gradient, steps, extend, count, rng, quick, beside=Fal
         names = " and ".join(one.direction for one in judged) or "no direction"
         notes.append(f"quick: looked at along {names}; {LEFT_OUT}")
         reason = notes[-1] if outcome == "agrees" else reason
-    return Audit(outcome, reason, judged, notes, culprit, hessian, base, trials.count, point.size)
-
-
-def _same(a, b):
-    return a == b or (math.isnan(a) and math.isnan(b))
+    digits = [int(one.digits) for one in judged if outcome == "agrees" and one.word in PROVED]
+    return Audit(
+        verdict=outcome,
+        reason=reason,
+        digits=min(digits, default=None),
+        culprit=culprit,
+        hessian=hessian,
+        value=base,
+        evaluations=trials.count,
+        size=point.size,
+        notes=tuple(notes),
+        lines=tuple(judged),
+    )
 
 
 def _own_gradient(point, trials, base, slope):
@@ -196,11 +208,11 @@ def _look_beside(trials, point, gradient, count, judged):
 
     What is wrong beside the kinks as well is wrong.
     """
-    away = next(point.directions(point.vector, 1, generator(SHIFT[0])))[1]
+    away = point.directions(point.vector, 1, generator(SHIFT[0]))[0][1]
     with suppress(*REFUSALS):
-        other, again = Point(point.tree(point.vector + SHIFT[1] * away)), Trials(trials.loss, trials.told)
+        other, again = Point(point.tree(point.vector + SHIFT[1] * away)), Trials(trials.loss, trials.tick)
         steps = default_steps(other.eps)
-        if _audit(again, other, gradient, steps, True, count, generator(None), False, True).verdict != "disagrees":
+        if _audit(again, other, gradient, steps, True, count, generator(None), None, True).verdict != "disagrees":
             for one in judged:
                 if one.word in ("outside", "disagrees"):
                     one.word, one.note = "kink", "several kinks; beside them nothing speaks against the gradient"
@@ -306,12 +318,6 @@ class Audit(Result):
     notes: tuple[str, ...]
     _word = "an audit"
 
-    def __init__(self, verdict, reason, judged, notes, culprit, hessian, value, evaluations, size):
-        proved = [one.digits for one in judged if one.word in ("agrees", "vanishes")]
-        digits = int(min(proved)) if verdict == "agrees" else None
-        super().__init__(verdict=verdict, reason=reason, digits=digits, culprit=culprit, hessian=hessian, value=value)
-        self.__dict__.update(evaluations=evaluations, size=size, lines=tuple(judged), notes=tuple(notes))
-
     @property
     def rows(self):
         """One dict for each direction and step: the numbers of the table and of the V-curve."""
@@ -333,10 +339,8 @@ class Audit(Result):
 
     def to_dict(self):
         """The audit as plain numbers, strings and lists."""
-        names = ("verdict", "reason", "digits", "culprit", "hessian", "value", "evaluations", "size")
         lines = [{name: getattr(one, name) for name in FIELDS} for one in self.lines]
-        data = {name: getattr(self, name) for name in names}
-        return {**data, "notes": list(self.notes), "lines": lines, "rows": list(self.rows)}
+        return {**vars(self), "notes": list(self.notes), "lines": lines, "rows": list(self.rows)}
 
     def __str__(self):
         parts = [f"gradient at {self.size} values, loss {self.value:.6g}, {self.evaluations} evaluations"]

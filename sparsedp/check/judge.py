@@ -25,7 +25,7 @@ import numpy as np
 from sparsedp.check.sweep import REFUSALS, Line, joined, noise_of
 from sparsedp.derivative import NO_JVP, pushforward
 
-__all__ = ["FIELDS", "Judgement", "at_kinks", "curvature", "examined", "explained", "forward_mode", "verdict"]
+__all__ = ["FIELDS", "PROVED", "Judgement", "at_kinks", "curvature", "examined", "explained", "forward_mode", "verdict"]
 
 RESOLVED = 1e-3  # an error bar above this share of the derivative proves nothing
 AGREED = 1e-8  # a gap below this share is agreement, whatever the bar
@@ -70,9 +70,11 @@ RIPPLED = 2.0 ** -np.arange(27, 46)  # steps that may see one
 SMOOTH = 30.0  # roundings that the loss of a smooth function varies by at most
 RUN = 3  # neighbouring fine levels that agree with each other
 SEES = 0.1  # to this share; and the rounding of the loss, as a share of the gap, up to which a level tells
-WITHIN = (1.0, 10.0, 100.0)  # multiples of the step over which a gap moves the loss by its noise
+WITHIN = (1.0, 20.0)  # multiples of the step over which a gap moves the loss by its noise
+JUMP = 1e-4  # of such a step: within it a ripple is smooth
 NEARER = 0.01  # steps of the plateau: within this a smooth gradient does not bend
 
+PROVED = "agrees", "vanishes"
 # What a judgement tells as plain data.
 FIELDS = "direction word difference slope gap bar scale step rate1 rate2 digits jitter note bend rate3".split()
 
@@ -164,7 +166,7 @@ def verdict(judged, doubts):
         members = [(weight, reason) for word, reason, weight in known if word in words]
         if members:
             return outcome, max(members, key=lambda pair: pair[0])[1]
-    proved = {one.word for one in judged} & {"agrees", "vanishes"}
+    proved = {one.word for one in judged} & set(PROVED)
     if not proved:
         return "inconclusive", "the loss is constant to rounding"
     return "agrees", "" if "agrees" in proved else "the gradient is 0 to rounding, beside the curvature"
@@ -435,16 +437,17 @@ def explained(found, gradient):
     """
     line, noise = found.line, max(2.0, found.jitter) * found.line.trials.eps * abs(found.line.base)
 
-    def slope(step):
-        there = line.point.tree(line.point.vector + step * line.direction)
-        return line.point.gradient(gradient(there)) @ line.direction
+    def bend(step):
+        ends = [line.point.tree(line.point.vector + side * line.direction) for side in (step, -step)]
+        slopes = [line.point.gradient(gradient(end)) @ line.direction for end in ends]
+        return abs(slopes[0] + slopes[1] - 2 * line.slope)
 
     for step in [times * noise / found.size for times in WITHIN] if found.word == "disagrees" else []:
         with suppress(*REFUSALS):
-            bend = abs(slope(step) + slope(-step) - 2 * line.slope) if step < NEARER * found.step else 0.0
-            if bend > SEES * found.size:
+            size = bend(step) if step < NEARER * found.step else 0.0
+            if size > SEES * found.size and size > 2 * bend(JUMP * step):  # at a kink it jumps, however near
                 found.word = "ripple"
-                found.note = f"the gradient bends by {bend / found.scale:.1e} of itself within a step of {step:.0e}: "
+                found.note = f"the gradient bends by {size / found.scale:.1e} of itself within a step of {step:.0e}: "
                 found.note += "a ripple below the noise of the loss may explain the gap"
                 return
 

@@ -72,19 +72,30 @@ class Probe:
 
     Attributes
     ----------
-    sizes : sparse matrix or None
-        Sizes of the entries, where they can be listed at a fair price.
+    forms : tuple of Operator
+        Explicit and matrix-free, where the entries can be listed at a fair price.
+    matrix, sizes : sparse matrix or None
+        The entries, and what their rounding errors are relative to.
     size : float
         sqrt(|A|_1 |A|_inf): from the entries, or a lower bound from products. A bound from below makes the tests
         stricter, never laxer.
     """
 
+    forms: tuple
+    matrix: Any
+    sizes: Any
+
     def __init__(self, op, seeds=1, rng=None):
         self.op, self.rng, self.seeds = op.tangent, generator(rng), max(seeds, 1)
         self.real = op.dtype.kind != "c"
-        cheap = max(op.shape) <= (LARGEST if op.structure.has_entries else MOST_COLUMNS)
-        self.sizes = magnitude(self.op.structure) if cheap else None
-        self.size = _size(self.sizes) if cheap else self._bound()
+        structure = self.op.structure
+        self.forms, self.matrix, self.sizes = (), None, None
+        if max(op.shape) <= (LARGEST if structure.has_entries else MOST_COLUMNS):
+            self.forms = self.op.explicit(), self.op.matrix_free()
+            self.matrix = self.forms[0].matrix
+            composed = isinstance(structure, (Chain, Sum, Scaled))
+            self.sizes = magnitude(structure) if composed else abs(self.matrix)
+        self.size = self._norm() if self.sizes is None else _size(self.sizes)
 
     def domain(self, dtype=float):
         """Random field of the domain."""
@@ -111,7 +122,7 @@ class Probe:
     def gap(self, name, dtype):
         """Distance of the two sides of an identity, entry by entry, in units of rounding; 0 where they are the same."""
         left, right, bound = IDENTITIES[name](self, self.domain(dtype), self.domain(dtype), self.codomain(dtype))
-        gaps = np.abs(left - right).reshape(-1)
+        gaps = np.abs(left - right).reshape(-1, max(np.size(bound), 1))
         with np.errstate(all="ignore"):
             shares = gaps / (bound * unit(self.op.structure, result_dtype(self.op.structure, dtype)))
         return float(np.max(np.where(gaps == 0, 0.0, shares), initial=0.0))
@@ -121,30 +132,34 @@ class Probe:
 
         Functions round relative to the whole result (transforms, solves): |A| |u| in norms.
         """
-        whole = 0.0 if self.sizes is not None and self.op.structure.has_entries else self.size * norm(u)
-        sizes = self.sizes.T if transposed and self.sizes is not None else self.sizes
-        return whole if sizes is None else whole + sizes @ np.abs(u).reshape(-1).astype(float)
+        if self.matrix is None:
+            return self.size * norm(u)
+        sizes = self.sizes.T if transposed else self.sizes
+        whole = 0.0 if self.op.structure.has_entries else self.size * norm(u)
+        return whole + sizes @ np.abs(u).reshape(-1).astype(float)
 
     def transposed(self, g, real):
         """A^T g by the transposed matrix, or by `.T` when no matrix can be listed; its real part, of real fields."""
-        op = self.op
-        listed = self.sizes is not None
-        back = (op.explicit().matrix.T @ g.reshape(-1)).reshape(op.domain.shape) if listed else op.T.apply(g)
+        if self.matrix is None:
+            back = self.op.T.apply(g)
+        else:
+            back = (self.matrix.T @ g.reshape(-1)).reshape(self.op.domain.shape)
         return back.real if real else back
 
-    def _bound(self):
+    def _norm(self):
         """The 2-norm, from below, by power iteration; only products of A itself count."""
-        bound, x = 0.0, self.domain()
+        op, size, x = self.op, 0.0, self.domain()
         for _ in range(POWERS):
-            y = self.op.apply(x)
-            bound = max(bound, float(norm(y) / norm(x)))
+            length = norm(x)
+            if not length > 0:
+                break
+            y = op.apply(x / length)
+            size = max(size, float(norm(y)))
             try:
-                x = self.op.T.apply(y)
+                x = op.T.apply(y)
             except DerivativeError:  # it has no transpose
                 x = self.domain()
-            if not norm(x) > 0:
-                break
-        return bound
+        return size
 
 
 def _hessian_product(op, u, v):
@@ -156,14 +171,6 @@ def _hessian_product(op, u, v):
 def _dot(a, b):
     """Summed in double precision: the sums are not what is tested."""
     return np.sum(a * b.astype(np.result_type(b, float)))
-
-
-def _other_form(op, u):
-    """A u without the listed matrix; where only that is there, by SciPy."""
-    if not isinstance(op.structure, Matrix):
-        return op.matrix_free().apply(u)
-    product = op.explicit().matrix @ u.reshape(-1).astype(np.result_type(u, float))
-    return product.reshape(op.codomain.shape).astype(result_dtype(op.structure, u.dtype))
 
 
 # Identities of a right operator: left side, right side, and what their rounding is relative to.
@@ -181,8 +188,16 @@ IDENTITIES: dict[str, Any] = {
         p.transposed(p.op.apply(v), True),
         p.size * p.size * norm(v),
     ),
-    "forward": lambda p, u, v, g: (p.op.explicit().apply(u), _other_form(p.op, u), p.bound(u)),
-    "transposed": lambda p, u, v, g: (p.op.T.explicit().apply(g), _other_form(p.op.T, g), p.bound(g, True)),
+    "forward": lambda p, u, v, g: (
+        p.matrix @ u.reshape(-1),
+        np.stack([form.apply(u).reshape(-1) for form in p.forms]),
+        p.bound(u),
+    ),
+    "transposed": lambda p, u, v, g: (
+        p.matrix.T @ g.reshape(-1),
+        np.stack([form.T.apply(g).reshape(-1) for form in p.forms]),
+        p.bound(g, True),
+    ),
 }
 
 
@@ -290,12 +305,13 @@ def twin(op, seeds=3, rng=None):
     >>> twin(divergence(Grid((4, 3)))).verdict
     'agrees'
     """
+    check_operator("check.twin", op)
     return Summary(f"twin of {op.name}, explicit against matrix-free", _form_rows(Probe(op, seeds, rng)))
 
 
 def _form_rows(probe):
     """Rows: both products in three dtypes, entry by entry, and the entries of the transpose."""
-    op, listed = probe.op, probe.sizes is not None
+    op, listed = probe.op, probe.matrix is not None
     rows = [row("forms", lambda: _forms(op.structure, listed))]
     rows += probe.rows("forward", DTYPES[:3]) if listed else []
     transposed = row("transposed", lambda: op.T.apply(np.zeros(op.codomain.shape)) is None)
@@ -316,7 +332,7 @@ def _forms(structure, listed):
 def _entries(probe):
     """The matrix of the transpose, from its own definition, against the transposed matrix."""
     structure, rounding = probe.op.structure, unit(probe.op.structure, float)
-    gap = abs(structure.transpose().explicit() - structure.explicit().T).tocsr()
+    gap = abs(structure.transpose().explicit() - probe.matrix.T).tocsr()
     gap.eliminate_zeros()
     if not gap.nnz or not structure.has_entries:  # functions round relative to the whole
         return gap.max() / (probe.size * rounding) if gap.nnz else 0.0
@@ -513,7 +529,7 @@ class OperatorSummary(Summary):
     nnz: int | None
 
     def __init__(self, op, probe, rows):
-        listed = isinstance(op.structure, Matrix) or (probe and probe.sizes is not None and op.structure.has_entries)
+        listed = isinstance(op.structure, Matrix) or (probe and probe.matrix is not None and op.structure.has_entries)
         nnz = int(op.explicit().matrix.nnz) if listed else None
         super().__init__(f"{op.name}: {op.domain} -> {op.codomain}", rows, op=op, size=probe and probe.size, nnz=nnz)
 

@@ -5,7 +5,6 @@ along a direction is a plain dot product. The noise of the loss comes from a tab
 values. The loss itself only ever sees fresh copies of its own tree.
 """
 
-from math import factorial
 from typing import NamedTuple
 
 import numpy as np
@@ -64,28 +63,26 @@ class Point:
                 raise NonFiniteError(f"a gradient is checked at finite values, and {name} holds NaN or infinity")
         self.vector = joined(self.values)
         self.complex = any(values.dtype.kind == "c" for values in self.values)
-        counts = [joined([values]).size for values in self.values]
-        self._ends = np.cumsum(counts)[:-1]
-        self.units = np.repeat([_rms(part) or 1.0 for part in np.split(self.vector, self._ends)], counts)
+        self._ends = np.cumsum([values.size * (1 + (values.dtype.kind == "c")) for values in self.values])[:-1]
+        self.units = np.concatenate([np.full(part.size, _rms(part) or 1.0) for part in self._parts(self.vector)])
         self.size = sum(values.size for values in self.values)
         self.eps = max(float(np.finfo(values.dtype).eps) for values in self.values)
 
+    def _parts(self, vector):
+        """Views of what belongs to each leaf."""
+        return np.split(vector, self._ends)
+
     def arrays(self, vector):
         """Arrays of the shapes and dtypes of the floating leaves; this rounds."""
-        return [
-            part.view(_wide(x)).astype(x.dtype).reshape(x.shape)
-            for part, x in zip(np.split(vector, self._ends), self.values, strict=True)
-        ]
+        parts = zip(self._parts(vector), self.values, strict=True)
+        return [part.view(_wide(x)).astype(x.dtype).reshape(x.shape) for part, x in parts]
 
     def tree(self, other=None):
         """The tree with other floating leaves, arrays or a vector; always fresh copies."""
         arrays = self.values if other is None else self.arrays(other) if isinstance(other, np.ndarray) else other
         leaves = copied(self._leaves)
-        for place, value in zip(self.places, arrays, strict=True):
-            leaf = leaves[place]
-            number = isinstance(leaf, (float, complex)) and not isinstance(leaf, np.generic)
-            kind = type(leaf) if number and value.dtype.kind != "c" else value.dtype.type
-            leaves[place] = np.array(value) if isinstance(leaf, np.ndarray) else kind(value)
+        for place, value in zip(self.places, arrays, strict=True):  # numbers stay numbers
+            leaves[place] = np.array(value) if isinstance(leaves[place], np.ndarray) else value[()]
         return self._rebuild(leaves)
 
     def gradient(self, tree):
@@ -97,33 +94,37 @@ class Point:
         for name, x, g in zip(self.names, self.values, arrays, strict=True):
             if g.shape != x.shape:
                 raise DerivativeError(f"the gradient of {name} has shape {g.shape} where {x.shape} is needed")
-        return joined([g.astype(np.result_type(g, _wide(x))) for g, x in zip(arrays, self.values, strict=True)])
+        return joined([g.astype(_wide(x)) for g, x in zip(arrays, self.values, strict=True)])
 
-    def directions(self, gradient, count, rng):
-        """Names and displacements: random ones, and structured ones that see what random ones average away."""
+    def directions(self, gradient, count, rng, wanted=None):
+        """Names and displacements: random ones, and structured ones that see what random ones average away.
+
+        Each leaf alone, all by the same, along the gradient, its largest entry; `wanted`: only those of these names.
+        """
         if self.size == 0:
-            return
-        for number in range(count):
-            yield f"random {number + 1}", self._random(rng)
+            return []
+        found = {f"random {number + 1}": self._random(rng) for number in range(count)}
         for chosen, name in enumerate(self.names if 1 < len(self.names) <= MOST_LEAVES else ()):
             alone = self._random(rng)
-            for part in np.delete(np.arange(len(self.names)), chosen):
-                np.split(alone, self._ends)[part][...] = 0.0
+            for other, part in enumerate(self._parts(alone)):
+                part *= other == chosen
             if np.any(alone):
-                yield f"random in {name}", alone
-        if self.size == 1:
-            return
-        yield "constant", self.units
+                found[f"random in {name}"] = alone
         slopes = self.units * np.where(np.isfinite(gradient), gradient, 0.0)
         largest = np.max(np.abs(slopes))
-        if largest > 0:  # along the gradient, as the units measure it, no entry moves more than 4 units
-            yield "gradient", self.units * (slopes / largest) / max(_rms(slopes / largest), 0.25)
-            yield "largest entry", self.units * (np.arange(slopes.size) == np.argmax(np.abs(slopes)))
+        if self.size > 1:
+            found["constant"] = self.units
+        if (
+            self.size > 1 and largest > 0
+        ):  # along the gradient, as the units measure it, no entry moves more than 4 units
+            found["gradient"] = self.units * (slopes / largest) / max(_rms(slopes / largest), 0.25)
+            found["largest entry"] = self.units * (np.arange(slopes.size) == np.argmax(np.abs(slopes)))
+        return [pair for pair in found.items() if wanted is None or pair[0] in wanted]
 
     def _random(self, rng):
         """Random displacement, of root mean square 1 in each leaf."""
         values = rng.standard_normal(self.vector.size)
-        for part in np.split(values, self._ends):
+        for part in self._parts(values):
             part /= _rms(part) or 1.0
         return self.units * values
 
@@ -170,15 +171,15 @@ class Trials:
         Rounding of the coarsest dtype that the loss has returned.
     """
 
-    def __init__(self, loss, told=lambda: None):
-        self.loss, self.told = loss, told  # `told` is called at each evaluation
+    def __init__(self, loss, tick=lambda: None):
+        self.loss, self.tick = loss, tick  # `tick` is called at each evaluation
         self.count, self.solved, self.tolerance = 0, False, 0.0
         self.eps = float(np.finfo(float).eps)
 
     def value(self, tree):
         """The loss as a float."""
         self.count += 1
-        self.told()
+        self.tick()
         with np.errstate(all="ignore"):
             value = np.asarray(self.loss(tree) if self.count > 1 else self._first(tree))
         if value.shape != ():
@@ -288,7 +289,7 @@ class Line:
 # ------------------------------------------------------------ noise
 
 POINTS = 8  # of a table of differences
-ORDERS = (4, 5, 6)  # of the differences that are read: parabolas leave them alone
+ORDER, VARIANCE = 4, 70.0  # of the differences that are read: parabolas leave them alone; (2k)! / (k!)^2
 FIRST = 0.7320508 * 2.0**-28  # least distance, in units of x, of double precision; no power of two times a step
 GROWTH = 2.0**6  # of the distance, while the loss stands still
 MOST = 4  # distances tried
@@ -318,9 +319,6 @@ def noise_of(line):
 
 
 def _deviation(rests):
-    """Standard deviation of independent errors, by the differences of each order; the least is nearest to noise."""
+    """Standard deviation of independent errors, by their fourth differences."""
     largest = float(np.max(np.abs(rests)))
-    if not largest > 0:
-        return 0.0
-    shares = [np.mean(np.diff(rests / largest, order) ** 2) * factorial(order) ** 2 for order in ORDERS]
-    return largest * min(np.sqrt(share / factorial(2 * order)) for share, order in zip(shares, ORDERS, strict=True))
+    return largest * float(np.sqrt(np.mean(np.diff(rests / largest, ORDER) ** 2) / VARIANCE)) if largest > 0 else 0.0
