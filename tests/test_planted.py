@@ -83,8 +83,8 @@ BUGS = {
     ),
     "off by one in the last step": Bug(
         "trajectory/way.py",
-        "range(run.n - 1, linked - 1, -1)",
-        "range(run.n - 2, linked - 1, -1)",
+        "range(run.n - 1, -1, -1)",
+        "range(run.n - 2, -1, -1)",
         "tests/test_rollout.py",
     ),
     "a cotangent of the wrong dtype": Bug(

@@ -86,7 +86,7 @@ def rollout(
     -----
     Cost: n steps forward; backward n steps on a tape of their own, unless it is kept, plus those run again:
     with s states kept and at most r runs over each step, n <= (s + r)! / (s! r!) steps go back. The gradient
-    has the same bits for every `memory`. A step that carries plain forms of its own (protocol.py) needs no tape.
+    has the same bits for every `memory`. A step with a backward form of its own is one node on the tape.
 
     The states gone back through are those of one run that ends, bit by bit, in what was handed out: a step on its
     tape must give the state after it, and states that are run again must lead to those kept. Large ones are compared
