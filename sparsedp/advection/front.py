@@ -220,7 +220,7 @@ class Transport(Remade):
         return Operator(Matrix(self.law.matrix(flat, float(dt))), self.space, self.space, name)
 
     def step(self, dt, inflow=0.0):
-        """Time step, inflow -> ``step(u, v)``, the form that rollout takes, with plain forms that it runs faster.
+        """Time step, inflow -> ``step(u, v)``, the form that rollout takes.
 
         Parameters
         ----------
