@@ -12,6 +12,8 @@ from functools import cache
 
 from sources import ROOT
 
+from sparsedp.kernels.team import NOTICE
+
 EXAMPLES = sorted(path.name for path in (ROOT / "examples").glob("*.py"))
 SMALL = {
     "poisson_adjoint.py": "32",
@@ -66,5 +68,5 @@ def run(name, *options):
     """What an example prints when it runs small."""
     found = ended(name, *options)
     assert found.returncode == 0, found.stderr
-    assert found.stderr == ""
+    assert found.stderr.replace(NOTICE, "") == ""  # the first one to use a loop says that it is compiled
     return found.stdout

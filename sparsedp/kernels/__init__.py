@@ -234,7 +234,7 @@ def squares(x):
     >>> print(squares(np.array([3.0, -4.0])))
     25.0
     """
-    return _measure(False, None, x, 0.0, None)[1]
+    return _measure(False, None, x, 0.0, None)[1] if x.size > FEW else reference.square(x)
 
 
 def totals(x):

@@ -3,7 +3,9 @@
 import numpy as np
 import scipy.sparse as sp
 
-__all__ = ["eliminate", "kronecker_sum", "measure", "product_along"]
+__all__ = ["eliminate", "kronecker_sum", "measure", "product_along", "square"]
+
+SHORT = 8192  # numbers that BLAS sums up on one thread
 
 
 def kronecker_sum(u, out, axes, shift):
@@ -48,13 +50,16 @@ def measure(lowered, b, x, number, out):
     """Two sums: of x, x^2; or, with out -= number, of out^2; or, with out = b - out, of x^2 and out^2."""
     if lowered:
         np.subtract(out, number, out=out)
-        return 0.0, _square(out)
+        return 0.0, square(out)
     if b is None:
-        return float(x.sum()), _square(x)
+        return float(x.sum()), square(x)
     np.subtract(b, out, out=out)
-    return _square(x), _square(out)
+    return square(x), square(out)
 
 
-def _square(x):
+def square(x):
+    """The sum of squares of a flat array."""
     with np.errstate(over="ignore"):  # the caller sees inf, or did not ask for the sum
+        if x.size <= SHORT and x.flags.c_contiguous:
+            return float(x.dot(x))
         return float(np.einsum("i,i", x, x))  # not by BLAS, whose threads stall those of the kernels
