@@ -11,6 +11,7 @@ import scipy.sparse as sp
 
 from sparsedp import kernels
 from sparsedp.kernels import projection
+from sparsedp.solvers.scaling import norm
 from sparsedp.structure.factor import Factor
 
 __all__ = ["Passes"]
@@ -62,7 +63,7 @@ class Passes:
             return sqrt(sums[0]), sqrt(sums[1])
         for number, (part, faces, cells, inward, *_) in enumerate(self.axes):
             kernels.along_axis(x[part].reshape(faces), b.reshape(cells), inward.rows, 1.0, number > 0)
-        return sqrt(kernels.squares(b)), sqrt(kernels.squares(x))
+        return norm(b), norm(x)
 
     def push(self, x, p, out):
         """out = K x + G p."""

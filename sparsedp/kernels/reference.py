@@ -48,18 +48,18 @@ def eliminate(x, lower, upper, inverses, column, row, ends):
 
 def measure(lowered, b, x, number, out):
     """Two sums: of x, x^2; or, with out -= number, of out^2; or, with out = b - out, of x^2 and out^2."""
-    if lowered:
-        np.subtract(out, number, out=out)
-        return 0.0, square(out)
-    if b is None:
-        return float(x.sum()), square(x)
-    np.subtract(b, out, out=out)
-    return square(x), square(out)
+    with np.errstate(over="ignore"):  # the caller sees inf, or did not ask for the sum
+        if lowered:
+            np.subtract(out, number, out=out)
+            return 0.0, square(out)
+        if b is None:
+            return float(x.sum()), square(x)
+        np.subtract(b, out, out=out)
+        return square(x), square(out)
 
 
 def square(x):
     """The sum of squares of a flat array."""
-    with np.errstate(over="ignore"):  # the caller sees inf, or did not ask for the sum
-        if x.size <= SHORT and x.flags.c_contiguous:
-            return float(x.dot(x))
-        return float(np.einsum("i,i", x, x))  # not by BLAS, whose threads stall those of the kernels
+    if x.size <= SHORT and x.flags.c_contiguous:
+        return float(x.dot(x))
+    return float(np.einsum("i,i", x, x))  # not by BLAS, whose threads stall those of the kernels

@@ -5,16 +5,14 @@ Both keep the best iterate, and name what went wrong with a status word ("" when
 
 import numpy as np
 
-from sparsedp.kernels.reference import SHORT
-
 __all__ = ["conjugate_gradients", "dot", "gmres"]
 
 DIVERGED = 1e8  # growth of the residual over the first one
 
 
 def dot(x, y):
-    """Inner product; of long arrays without BLAS: its threads would stall compiled kernels."""
-    return float(x.dot(y) if x.size <= SHORT else np.einsum("i,i->", x, y))
+    """Inner product without BLAS: its threads would stall compiled kernels."""
+    return float(np.einsum("i,i->", x, y))
 
 
 class Best:
