@@ -122,12 +122,8 @@ class Run:
         self.pieces = []
         if not (self.store and self.room):
             return state, statics, kept
-        scale, outer, many, most = (
-            Scale(self.room, self.state.nbytes),
-            thread.scale,
-            looked_at(self.n),
-            max(HELD // max(self.params.nbytes, 1), 1),
-        )
+        scale, outer = Scale(self.room, self.state.nbytes), thread.scale
+        many, most = looked_at(self.n), max(HELD // max(self.params.nbytes, 1), 1)
         linked = len(state) == 1 and type(self.keep) is Last  # one tape for several steps, to the same bits
 
         def goes_on(i, values, others, same):

@@ -61,7 +61,8 @@ class Way:
         piece = self.pieces.pop() if self.pieces and self.pieces[-1].stop == i else None
         first = piece.first if piece else i - 1
         self.state = first, *self._state_at(first)
-        mark, before = fingerprint(*self.state[1:]), self.before.pop(i, None)
+        before, kept = self.before.pop(i, None), bool(self.pieces) and self.pieces[-1].stop == first
+        mark = fingerprint(*self.state[1:]) if before or not kept else None  # what is on a tape is not run again
         if before:
             run.compare(mark, before)
         if total is not None:
@@ -83,8 +84,12 @@ class Way:
         except Exception:
             if piece.stop - piece.first == 1:
                 raise
+            states = [self.state[1:]]
+            for i in range(piece.first, piece.stop - 1):
+                values, statics = self.steps.forward(i, *states[-1])
+                states.append((list(map(owned, values)), statics))
             for i in range(piece.stop - 1, piece.first - 1, -1):
-                _, values, statics = self.stack[i] if i < len(self.stack) else self.state
+                values, statics = states.pop()
                 one, _, _ = self.steps.taped(i, values, statics, True)
                 total = self.steps.pull(one, values, total)
             raise
@@ -94,6 +99,8 @@ class Way:
         run, stack = self.run, self.stack
         if run.slots is None:
             return stack[i][1:]
+        while stack[-1][0] > i:  # those of a piece are gone through at once
+            stack.pop()
         start, values, statics = stack[-1]
         while start < i:
             free = run.slots - len(stack) + 1
