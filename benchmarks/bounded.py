@@ -158,7 +158,7 @@ def compared(problem, seed=0):
     counted, options = Counted(loss, start.shape), {"maxiter": 2000, "maxfun": 20000, "ftol": 1e-14, "gtol": 1e-12}
     known = minimize(counted, start.ravel(), jac=True, bounds=pairs, method="L-BFGS-B", options=options)
     goal = known.fun + SAME * abs(known.fun)
-    best = dp.minimise(
+    best = dp.minimize(
         loss, start, bounds=(lower, upper), maxiter=2000, tolerance=lambda record, first: record.value <= goal
     )
     ours = best.evaluations if best.value <= goal else np.inf

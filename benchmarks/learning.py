@@ -14,9 +14,9 @@ import numpy as np
 import sparsedp as dp
 from benchmarks.triad import best_times
 from sparsedp import network
-from sparsedp.optimise.directions import Family
-from sparsedp.optimise.flat import Packing
-from sparsedp.optimise.linearised import Linearised
+from sparsedp.optimize.directions import Family
+from sparsedp.optimize.flat import Packing
+from sparsedp.optimize.linearised import Linearised
 
 SIZES = (64, 64), (64, 128), (128, 64), (64, 64)  # 24896 weights
 

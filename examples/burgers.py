@@ -42,7 +42,7 @@ for descents in range(1, 201):
     found |= {f"{descents} gradient descents": u} if descents in (49, 50, 200) else {}
 print("loss before descent 1 to 6, 11, 16, 21 ... 46:", *(f"{losses[k]:.6f}" for k in [*range(6), *range(10, 46, 5)]))
 # Many starts end like that. L-BFGS looks for the least steep one.
-found["L-BFGS"] = dp.minimise(lambda u: loss(u) + 1e-5 * np.mean(G(u) ** 2), np.zeros(n), "lbfgs", maxiter=200).x
+found["L-BFGS"] = dp.minimize(lambda u: loss(u) + 1e-5 * np.mean(G(u) ** 2), np.zeros(n), "lbfgs", maxiter=200).x
 print("the start, found by           loss  mean error  at the start  33 frames over 32")
 for name, u in found.items():
     off = np.abs(dp.rollout(step, u, nu, 32, keep="all") - truth)

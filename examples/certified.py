@@ -34,7 +34,7 @@ print("\nL-BFGS to a gradient 1e-6 times as large, with solves to 1e-10, and as 
 for method in ("krylov", "multigrid"):
     counts = {}
     for name, tolerance in (("exact", 1e-6), ("certified", dp.certified(0.1, 1e-6))):
-        spent = dp.explain(lambda u: dp.minimise(control(method), u, tolerance=tolerance).value, 0 * x, gradient=False)
+        spent = dp.explain(lambda u: dp.minimize(control(method), u, tolerance=tolerance).value, 0 * x, gradient=False)
         counts[name] = sum(many for (_, kind), many in spent.counts.items() if kind == "iterations")
         print(f"{method:10} {name:10} loss {spent.value:.9e} {counts[name]:6d} iterations in solves")
     print(tolerance)

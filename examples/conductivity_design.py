@@ -15,14 +15,14 @@ def design(label, grid, G, volumes, heat):
     """The k on the faces with the least integral of f T, where -div(k grad T) = f; returns k and T."""
     solve = dp.elliptic_solver(dp.divergence(grid), G)
 
-    def conductivity(share):  # positive, and of integral V, whatever the optimiser tries
+    def conductivity(share):  # positive, and of integral V, whatever the optimizer tries
         return V * share**2 / np.sum(volumes * share**2)
 
     def content(share):
         return np.sum(grid.volumes * heat * solve(conductivity(share), heat))
 
     even = np.ones(grid.faces.shape)
-    best = dp.minimise(content, even, maxiter=100, tolerance=1e-4)
+    best = dp.minimize(content, even, maxiter=100, tolerance=1e-4)
     k = conductivity(best.x)
     T = solve(k, heat)
     steep = np.abs(G(T))[k > 1e-2 * np.max(k)]  # at the optimum conductor lies only where T is steepest

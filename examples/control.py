@@ -36,7 +36,7 @@ def tell(label, number, f):
 print(f"{scenes:3} scenes           number  seconds  ms each |f|/truth     worst   largest error at the end")
 for eps, weight in zip((0.1, 0.1, 0.1, 0.05, 0.03, 0.03, 0.03), (1e2, 1e2, 1e3, 1e3, 1e4, 1e5, 1e6)):
     penalty = lambda miss, price=price, weight=weight: np.sum(price * miss + 0.5 * weight * miss**2)
-    best = dp.minimise(lambda f: np.sum(size(f, eps)) + penalty(run(f) - wanted), f, maxiter=min(100, 10 * scenes))
+    best = dp.minimize(lambda f: np.sum(size(f, eps)) + penalty(run(f) - wanted), f, maxiter=min(100, 10 * scenes))
     f, count, price = best.x, count + best.evaluations, price + weight * (run(best.x) - wanted)
     tell("adjoint, gradients", count, f)
 # Cross-entropy: 32 forces on 8 x 8 blocks; mean and deviation of the 8 best draw the next ones, scene by scene.

@@ -53,5 +53,5 @@ for n in (finest // 2, finest):
 print(" known  {:7.4f}  {:6.3f}  {:6.3f}".format(*KNOWN))
 if "--out" in sys.argv:
     Path(sys.argv[-1]).mkdir(exist_ok=True)
-    ax = dp.plot(grid, heat, title="temperature", colours="inferno")
+    ax = dp.plot(grid, heat, title="temperature", cmap="inferno")
     ax.figure.savefig(Path(sys.argv[-1]) / "convection.png", dpi=120)

@@ -37,7 +37,7 @@ def train(label, f, method, maxiter, every, budget=np.inf, published="", **optio
             print(told, *published.split()[len(curves[label]) - 1 :][:1])
         return record.seconds > budget
 
-    return dp.minimise(f, start, method, maxiter, 0, watch, **options)
+    return dp.minimize(f, start, method, maxiter, 0, watch, **options)
 
 
 print("method                 gradients  seconds       loss     unseen published")

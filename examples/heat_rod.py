@@ -44,5 +44,5 @@ def loss(u):
 
 print(f"gradient of the loss after {steps} steps, against finite differences:")
 print(dp.check.gradient(loss, bump))
-best = dp.minimise(loss, bump, maxiter=20)
+best = dp.minimize(loss, bump, maxiter=20)
 print(f"\nloss {loss(bump):.2e} -> {best.value:.2e} in {len(best.history)} entries of history")

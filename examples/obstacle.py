@@ -48,7 +48,7 @@ def loss(profile):
 flat = np.ones(n)
 print(f"{np.count_nonzero(cylinder)} solid cells, {measured.size} readings, {n} unknowns, {steps} steps")
 print("gradient against finite differences:", dp.check.gradient(loss, flat).verdict)
-best = dp.minimise(loss, flat, maxiter=30)
+best = dp.minimize(loss, flat, maxiter=30)
 print(f"loss {loss(flat):.3f} -> {best.value:.5f} in {best.evaluations} gradients")
 error = lambda profile: np.linalg.norm(profile - hidden) / np.linalg.norm(hidden)
 print(f"error of the profile {error(flat):.3f} -> {error(best.x):.4f}")

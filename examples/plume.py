@@ -51,4 +51,4 @@ print("\ngradient of that in the source, against finite differences:", dp.check.
 if "--out" in sys.argv:
     smoke, _ = dp.rollout(step, still, source, 40, keep="all")
     Path(sys.argv[-1]).mkdir(exist_ok=True)
-    dp.animate(grid, smoke, Path(sys.argv[-1]) / "plume.gif", title="smoke", colours="magma")
+    dp.animate(grid, smoke, Path(sys.argv[-1]) / "plume.gif", title="smoke", cmap="magma")

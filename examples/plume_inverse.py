@@ -56,4 +56,4 @@ if "--out" in sys.argv:
     Path(sys.argv[-1]).mkdir(exist_ok=True)
     both = dp.Grid((64, 40))
     frames = [np.concatenate(pair) for pair in zip(run(winds[0], sources[0], "all"), run(still[0], wanted, "all"))]
-    dp.animate(both, frames, Path(sys.argv[-1]) / "plume_inverse.gif", title="ours, and the wanted", colours="magma")
+    dp.animate(both, frames, Path(sys.argv[-1]) / "plume_inverse.gif", title="ours, and the wanted", cmap="magma")

@@ -34,6 +34,6 @@ print("cells   alpha  J found          J exact          gap     iterations  grad
 for alpha in (1e-2, 1e-4):
     for n in (finest // 4, finest // 2, finest):
         loss, exact, start = problem(n, alpha)
-        best = dp.minimise(loss, start, maxiter=60)
+        best = dp.minimize(loss, start, maxiter=60)
         gap, steps = abs(best.value / exact - 1), best.history[-1].iteration
         print(f"{n:4}^2  {alpha:6.0e}  {best.value:.9e}  {exact:.9e}  {gap:.0e}  {steps:10}  {best.evaluations:9}")

@@ -45,7 +45,7 @@ for label, loss, start, frames in (
     ("network for the start, adjoint", lambda w: through(first(w)), weights, lambda w: run(first(w))),
     ("the start itself, adjoint", through, np.zeros(n), run),
 ):
-    best = dp.minimise(loss, start, "lbfgs", count if start is weights else 200, 0)
+    best = dp.minimize(loss, start, "lbfgs", count if start is weights else 200, 0)
     u, spent, calls = frames(best.x), best.history[-1].seconds, best.evaluations
     off, told = np.mean(np.abs(u - truth), 1), f"{label:30} {calls:8} {1e3 * spent / calls:8.1f} {spent:8.1f}"
     print(f"{told} {seen(u[16]):8.1e} {np.mean(off):7.4f} {off[0]:9.4f} {np.sqrt(scheme(u)):17.1e}", flush=True)

@@ -50,7 +50,7 @@ for r, place, s in ((0.08, 0.5, 0.0), (0.12, 0.5, 0.0), (0.16, 0.5, 0.0), (0.12,
 
 # How slender must an obstacle of this area be, to be pushed three quarters as much?
 share = lambda s: drag({"r": 0.12, "y": 0.5, "s": s}) / drag({"r": 0.12, "y": 0.5, "s": 0.0})
-best = dp.minimise(lambda s: (share(s) - 0.75) ** 2, 0.0, maxiter=10)
+best = dp.minimize(lambda s: (share(s) - 0.75) ** 2, 0.0, maxiter=10)
 print(f"\n{share(best.x):.4f} of the drag of the disc at axes 1 : {np.exp(2 * best.x):.3f}")
 if "--out" in sys.argv:
     Path(sys.argv[-1]).mkdir(exist_ok=True)

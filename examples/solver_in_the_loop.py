@@ -17,8 +17,8 @@ runs, dt, nu = 16, 0.1, 0.01
 def solver(cells, dt):
     """u_t + (u^2 / 2 - nu u_x + network)_x = f on a ring, explicit and upwind: where cells are coarse, it smears."""
     sheet = dp.Grid((runs, cells), spacing=(1e9, 2 * np.pi / cells), periodic=True)  # a row is a run, far from others
-    A, G = (dp.part(sheet, 1) @ op for op in (dp.average(sheet), dp.gradient(sheet)))
-    D = dp.divergence(sheet) @ dp.embed(sheet, 1)
+    A, G = (dp.component(sheet, 1) @ op for op in (dp.average(sheet), dp.gradient(sheet)))
+    D = dp.divergence(sheet) @ dp.component(sheet, 1).T
 
     def step(u, weights, f):
         flux = 0.5 * A(u**2) - (nu + np.pi / cells * abs(A(u))) * G(u) + network(weights, u)
@@ -74,7 +74,7 @@ def train(unrolled, truncate=None, fresh=True):
         # Every 150 gradients a new record, made when it is asked for; or the frames of the first one, always.
         draw = lambda i, k=k, done=done: window((done + i) // 150 if fresh else 0, 20 + 37 * i % 120, k)
         loss = lambda weights, seen: np.mean(miss(weights, seen, truncate=truncate) ** 2)
-        weights, done = dp.minimise(loss, weights, "adam", count // 3, 0, batches=draw, rate=rate).x, done + count // 3
+        weights, done = dp.minimize(loss, weights, "adam", count // 3, 0, batches=draw, rate=rate).x, done + count // 3
     return weights
 
 

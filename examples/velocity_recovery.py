@@ -37,7 +37,7 @@ found = {}
 for label, first in (("rest", np.zeros(n)), (f"constant {guess:+.2f}", np.full(n, guess))):
     for method in ("gd", "lbfgs"):
         options = {"rate": 0.01} if method == "gd" else {}
-        best = dp.minimise(loss, first, method, maxiter=200, **options)
+        best = dp.minimize(loss, first, method, maxiter=200, **options)
         error = np.max(np.abs(best.x - hidden)[passed])
         found[label, method] = best.x
         print(f"{label:24} {method:12} {loss(first):10.2f} {best.value:12.1e} {len(best.history):8} {error:16.3f}")

@@ -19,7 +19,7 @@ def smoke_divergence():
         np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * r**2))
         for cx, cy, r in zip(rng.uniform(0.2, 0.8, 4) * n, rng.uniform(0.1, 0.5, 4) * n, rng.uniform(2, 6, 4))
     )
-    lift = grid.join(0.0, dp.part(grid, 1)(dp.average(grid)(smoke)))
+    lift = grid.join(0.0, dp.component(grid, 1)(dp.average(grid)(smoke)))
     return dp.divergence(grid)(dp.interior(grid)(lift))
 
 

@@ -22,7 +22,7 @@ def smoke_divergence():
     x, y = grid.centres()
     places = zip(rng.uniform(0.2, 0.8, 4) * n, rng.uniform(0.1, 0.5, 4) * n, rng.uniform(0.03, 0.1, 4) * n)
     smoke = sum(np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * r**2)) for cx, cy, r in places)
-    b = dp.divergence(grid)(dp.interior(grid)(grid.join(0.0, dp.part(grid, 1)(dp.average(grid)(smoke)))))
+    b = dp.divergence(grid)(dp.interior(grid)(grid.join(0.0, dp.component(grid, 1)(dp.average(grid)(smoke)))))
     return b / np.sqrt(np.mean(b**2))
 
 
@@ -46,7 +46,7 @@ found, parts = {"": w}, [seen[i : i + 2] for i in range(0, 64, 2)]
 print(f"after {k} iterations of CG, from     trained [s]  residual    error  CG to 1e-3  multigrid")
 for label, old in (("zero", ""), ("guess", "zero"), ("guess, trained again", "guess"), (CG, "guess")):
     f, steps = (lambda w, b, on=label == CG: loss(w, b, on)), 10 * n if old else 0
-    best = dp.minimise(f, found[old], "adam", steps, 0, rate=0.01 if old == "guess" else 0.03, batches=parts)
+    best = dp.minimize(f, found[old], "adam", steps, 0, rate=0.01 if old == "guess" else 0.03, batches=parts)
     found[label] = best.x
     cases = [(b, x, solve(b, start=x), direct(b)) for b, x in zip(unseen, guess(best.x, unseen))]
     left = np.mean([np.linalg.norm(b - box(end)) / n for b, _, end, _ in cases])

@@ -1,4 +1,4 @@
-"""Physics that can be differentiated, on grids: operators, solvers, time steps, optimisers, checks of gradients.
+"""Physics that can be differentiated, on grids: operators, solvers, time steps, optimizers, checks of gradients.
 
     import autograd.numpy as np  # NumPy that the library can look through
     import sparsedp as dp
@@ -22,7 +22,7 @@ _WINDOW = {
     "operator": "Operator",
     "operators.given": "from_functions from_linear_operator from_matrix",
     "operators.difference": "curl divergence gradient laplacian upwind",
-    "operators.transfer": "average embed part prolong restrict sample",
+    "operators.transfer": "average component prolong restrict sample",
     "operators.harmonic": "harmonic_average",
     "operators.boundary": "diagonal identity interior lift mask",
     "solvers.choose": "inverse",
@@ -36,9 +36,9 @@ _WINDOW = {
     "flow.stepping": "flow_step",
     "integrators.front": "stepper",
     "trajectory.front": "rollout",
-    "optimise.directions": "update_direction",
-    "optimise.loop": "minimise",
-    "optimise.physical": "physical_gradient",
+    "optimize.directions": "update_direction",
+    "optimize.loop": "minimize",
+    "optimize.physical": "physical_gradient",
     "kernels": "set_threads",
     "report.plots": "animate convergence plot v_curve",
     "report.certificate": "certified certify",
@@ -46,6 +46,11 @@ _WINDOW = {
     "report.work_precision": "workprec",
     "report.plan": "explain",
     "blackbox": "adopt",
+}
+_RENAMED = {  # names of the first edition -> what to write
+    "minimise": "dp.minimize",
+    "part": "dp.component(grid, axis)",
+    "embed": "dp.component(grid, axis).T",
 }
 _ROOMS = ("check", "errors", "network", "report")
 _HOME = {name: module for module, names in _WINDOW.items() for name in names.split()}
@@ -65,10 +70,11 @@ def __getattr__(name):
         except metadata.PackageNotFoundError:
             value = "0+unknown"  # run from a tree that was never installed
     else:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        hint = f"; write {_RENAMED[name]}" if name in _RENAMED else ""
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
     globals()[name] = value  # the next look-up does not come here
     return value
 
 
 def __dir__():
-    return sorted({*globals(), *__all__, "__version__"})
+    return [*__all__, "__version__"]

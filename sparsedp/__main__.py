@@ -67,7 +67,7 @@ def _parser():
     demo = rooms.add_parser(
         "demo",
         help="find the hidden ground under a real terrain from well readings",
-        description="Recover a hidden field from sensor readings by adjoint optimisation, and check the gradient.",
+        description="Recover a hidden field from sensor readings by adjoint optimization, and check the gradient.",
     )
     demo.add_argument("--input", type=Path, metavar="FILE", help="a 2-D field as .npy, .npz or .png (default: terrain)")
     demo.add_argument("--size", type=int, default=64, metavar="N", help="cells along the longest side (default: 64)")

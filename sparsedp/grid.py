@@ -64,7 +64,7 @@ class Grid(Uncached):
     origin: tuple[float, ...]
     widths: tuple[np.ndarray, ...]
 
-    def __init__(self, shape, size=None, spacing=None, origin=0.0, periodic=False):
+    def __init__(self, shape, *, size=None, spacing=None, origin=0.0, periodic=False):
         shape = lengths(shape)
         if size is not None and spacing is not None:
             raise ValueError("a grid takes size or spacing, not both; leave one out")

@@ -128,7 +128,7 @@ def test_text_data_and_state():
     assert not thread.observers
 
 
-# ---- tolerances for an optimiser -----------------------------------------------------------------------------------
+# ---- tolerances for an optimizer -----------------------------------------------------------------------------------
 
 
 def control(method, rtol=1e-10):
@@ -139,12 +139,12 @@ def control(method, rtol=1e-10):
 
 @pytest.mark.parametrize("method", ["krylov", "multigrid"])
 def test_certified_control(method):
-    best = dp.minimise(control("direct"), 0 * X, tolerance=1e-12)
+    best = dp.minimize(control("direct"), 0 * X, tolerance=1e-12)
     with recording() as calls:
-        full = dp.minimise(control(method), 0 * X, tolerance=1e-6)
+        full = dp.minimize(control(method), 0 * X, tolerance=1e-6)
     iterations = sum(n for (_, kind), n in calls.items() if kind == "iterations")
     loose = dp.certified(0.1, 1e-6)
-    found = dp.minimise(control(method), 0 * X, tolerance=loose)
+    found = dp.minimize(control(method), 0 * X, tolerance=loose)
     assert found.converged and found.evaluations <= full.evaluations + 1
     assert control("direct")(found.x) / best.value - 1 <= 1e-10
     assert loose.iterations <= 0.7 * iterations
@@ -179,14 +179,14 @@ def test_case_b7():
     swept = Inverse(Solver(system, Sweeps(system), "raise", SolveLog(), "sweeps", (None, ())), "a test")
     loose = dp.certified(0.5, 0.0)
     options = dict(method="gd", maxiter=125, rate=275.0, tolerance=loose)
-    best = dp.minimise(lambda theta: anp.sum((swept(theta * load) - wanted) ** 2) / (2 * n), 5.0, **options)
+    best = dp.minimize(lambda theta: anp.sum((swept(theta * load) - wanted) ** 2) / (2 * n), 5.0, **options)
     assert abs(best.x / 2 - 1) <= 1.30e-5
     assert loose.iterations <= 0.2 * 75000
 
 
 def test_direct_solves_and_refusals():
     loose = dp.certified(0.1)
-    assert dp.minimise(control("direct"), 0 * X, tolerance=loose).converged
+    assert dp.minimize(control("direct"), 0 * X, tolerance=loose).converged
     assert loose.passes == loose.evaluations and loose.saved == 0.0
     with pytest.raises(
         ValueError,
@@ -196,4 +196,4 @@ def test_direct_solves_and_refusals():
     with pytest.raises(
         ValueError, match="certified sees the solves of the loss, not of a gradient that is given; leave it out"
     ):
-        dp.minimise(lambda u: anp.sum(u**2), X, gradient=lambda u: 2 * u, tolerance=dp.certified())
+        dp.minimize(lambda u: anp.sum(u**2), X, gradient=lambda u: 2 * u, tolerance=dp.certified())

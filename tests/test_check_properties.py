@@ -161,7 +161,7 @@ def test_the_order_that_refinement_shows():
 def test_one_component_of_faces_has_its_places_and_volumes():
     """x-faces sit on nodes along x: a difference between the centres beside them is of second order."""
     for axis, slope in enumerate(("u_x", "u_y")):
-        one = dp.part(GRID, axis)
+        one = dp.component(GRID, axis)
         assert np.array_equal(one.codomain.volumes, GRID.split(GRID.faces.volumes)[axis])
         facts = CARD(one @ dp.gradient(GRID)).facts
         assert (facts["acts as"], facts["order"]) == (slope, 2)

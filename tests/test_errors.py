@@ -258,7 +258,7 @@ REFUSE = (
 
 @pytest.mark.parametrize("loss", [lambda u: float(anp.sum(u)), lambda u: math.sin(u[0]), lambda u: u[0].item(), filled])
 def test_a_loss_that_leaves_the_tape(loss):
-    for run in (dp.value_and_grad(loss), lambda x: dp.check.gradient(loss, x), lambda x: dp.minimise(loss, x)):
+    for run in (dp.value_and_grad(loss), lambda x: dp.check.gradient(loss, x), lambda x: dp.minimize(loss, x)):
         with pytest.raises(DERIVATIVE) as caught:
             run(np.ones(3))
         said = str(caught.value)

@@ -80,7 +80,7 @@ def test_check_at_another_point(scene, capsys):
 
 STRANGERS = {
     "without a guard": ("grid = dp.Grid(9, size=1.0)\nstart = np.ones(9)\nL = dp.laplacian(grid, dp.dirichlet)\n"
-                        "loss = lambda u: np.sum(L(u) ** 2)\nprint(dp.minimise(loss, start, maxiter=2))",
+                        "loss = lambda u: np.sum(L(u) ** 2)\nprint(dp.minimize(loss, start, maxiter=2))",
                         "", 0, "agrees"),
     "a tuple as the point": ("start = (np.ones(3), 2.0)\nloss = lambda p: np.sum(p[0] ** 3) * p[1]", "", 0, "agrees"),
     "two arguments": ("x = (np.ones(3), 2.0)\ndef energy(u, k):\n    return k * np.sum(u**3)", ":energy", 0, "agrees"),
@@ -305,7 +305,7 @@ def test_ctrl_c(tmp_path, command, top):
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_ctrl_c_in_the_demo(tmp_path):
-    """While the optimiser runs: it may keep its best point, but the demo ends, and no file is written."""
+    """While the optimizer runs: it may keep its best point, but the demo ends, and no file is written."""
     code, _, told = interrupted(tmp_path, "3", "demo", "--size", "24")
     assert code == 130 and told.splitlines()[-1] == "sparsedp: interrupted; there is no result"
     assert not list(tmp_path.glob("sparsedp-demo/*"))

@@ -1,5 +1,7 @@
 """What is no grid, no operator, no function, or no plain array is named at the door."""
 
+import re
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -21,8 +23,7 @@ BUILDERS = {
     "sample": lambda grid: dp.sample(grid, [[0.5, 0.5]]),
     "restrict": lambda grid: dp.restrict(grid, 2),
     "prolong": lambda grid: dp.prolong(grid, 2),
-    "embed": lambda grid: dp.embed(grid, "x"),
-    "part": lambda grid: dp.part(grid, "x"),
+    "component": lambda grid: dp.component(grid, "x"),
     "harmonic_average": dp.harmonic_average,
     "projection": dp.projection,
     "transport": dp.transport,
@@ -106,11 +107,11 @@ TABLE = [
         TYPE,
         "rollout takes a function, got NoneType; write lambda state, params: ...",
     ),
-    (lambda: dp.minimise(None, U), TYPE, "minimise takes a function, got NoneType; write lambda x: np.sum(x**2)"),
+    (lambda: dp.minimize(None, U), TYPE, "minimize takes a function, got NoneType; write lambda x: np.sum(x**2)"),
     (
-        lambda: dp.minimise(np.sum, U, callback=1),
+        lambda: dp.minimize(np.sum, U, callback=1),
         TYPE,
-        "callback of minimise takes a function, got int; write lambda record, x: False",
+        "callback of minimize takes a function, got int; write lambda record, x: False",
     ),
     (lambda: dp.explain(1.0, U), TYPE, "explain takes a function, got float; write lambda x: np.sum(x**2)"),
     (lambda: dp.stress(1.0, U), TYPE, "stress takes a function, got float; write lambda x: np.sum(x**2)"),
@@ -172,3 +173,11 @@ def test_what_solves_take(kind):
         assert LAP(x) == pytest.approx(b.astype(wanted), abs=1e-5)
     value, slope = dp.value_and_grad(lambda k: anp.sum(anp.real(SOLVE(k, b))))(V)
     assert slope.dtype == float and np.all(slope <= 1e-12) and value > 0
+
+
+@pytest.mark.parametrize(
+    "name, now", [("minimise", "dp.minimize"), ("embed", "component(grid, axis).T"), ("part", "component")]
+)
+def test_a_name_of_the_first_edition_tells_the_new_one(name, now):
+    with pytest.raises(AttributeError, match=re.escape(now) + "$"):
+        getattr(dp, name)

@@ -148,7 +148,7 @@ WRITERS = {
                   " scene='path').save(folder)",
     "workprec(file)": "dp.workprec(lambda n: (lambda s: s**n, 1.0), {'a' * (size // 8): {}}, {'n': [2, 3, 4]},"
                       " repeats=1, file=path)",
-    "checkpoint": "dp.minimise(lambda x: (x**2).sum(), np.linspace(-1, 1, size), 'gd', maxiter=3, rate=0.1,"
+    "checkpoint": "dp.minimize(lambda x: (x**2).sum(), np.linspace(-1, 1, size), 'gd', maxiter=3, rate=0.1,"
                   " tolerance=0, checkpoint=folder)",
     "animate": "dp.animate(dp.Grid((size // 20, 9)), [np.eye(size // 20, 9)] * 3, path)",
 }  # fmt: skip
@@ -271,9 +271,9 @@ def test_a_file_that_came_during_the_demo_is_not_overwritten(tmp_path):
 
 def test_a_run_goes_on_from_the_state_before_the_disk_was_full(tmp_path, monkeypatch):
     """The state that found no room is not there, and the one before it takes the run to the same bits."""
-    monkeypatch.setattr("sparsedp.optimise.resume.SHARE", np.inf)
+    monkeypatch.setattr("sparsedp.optimize.resume.SHARE", np.inf)
     loss, start = lambda x: ((x - 1) ** 4).sum(), np.linspace(-1, 1, 9)
-    whole = dp.minimise(loss, start, maxiter=8, tolerance=0)
+    whole = dp.minimize(loss, start, maxiter=8, tolerance=0)
     fsync, room = os.fsync, [11]
 
     def full(handle):
@@ -284,9 +284,9 @@ def test_a_run_goes_on_from_the_state_before_the_disk_was_full(tmp_path, monkeyp
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left on device: .*state-"):
-        dp.minimise(loss, start, maxiter=8, tolerance=0, checkpoint=tmp_path)
+        dp.minimize(loss, start, maxiter=8, tolerance=0, checkpoint=tmp_path)
     monkeypatch.setattr(os, "fsync", fsync)
     assert not list(tmp_path.glob("*.part"))
-    best = dp.minimise(loss, start, maxiter=8, tolerance=0, checkpoint=tmp_path)
+    best = dp.minimize(loss, start, maxiter=8, tolerance=0, checkpoint=tmp_path)
     assert best.resumed.startswith("resumed from iteration ") and "skipped" not in best.resumed
     assert np.array_equal(best.x, whole.x) and best.evaluations == whole.evaluations

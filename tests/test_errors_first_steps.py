@@ -47,7 +47,7 @@ WRONG = [
         "weights are drawn from a numpy Generator, got 0; write np.random.default_rng(0)",
     ),
     (
-        lambda: dp.minimise(lambda x: anp.sum(x**2), np.ones(4), bounds=(np.zeros(3), None)), ShapeError,
+        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(4), bounds=(np.zeros(3), None)), ShapeError,
         "a bound of shape (3,) does not fit start, of shape (4,)",
     ),
     (

@@ -40,7 +40,7 @@ FLOORS = [
     ("flow", 7),
     ("integrators", 7),
     ("trajectory", 8),
-    ("optimise", 9),
+    ("optimize", 9),
     ("network", 9),
     ("blackbox", 9),
 ]

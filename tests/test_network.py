@@ -124,7 +124,7 @@ def test_a_residual_network_and_its_updates(rng):
         return nn.convolution(q[2], hidden) - anp.roll(x, 1, axis=-1) ** 2
 
     assert dp.check.gradient(lambda q: anp.sum(net(q) ** 2), p).verdict == "agrees"
-    best = dp.minimise(net, p, "levenberg_marquardt", maxiter=15, apart=True)
+    best = dp.minimize(net, p, "levenberg_marquardt", maxiter=15, apart=True)
     assert best.value < 0.2 * best.history[0].value
 
 

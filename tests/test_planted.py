@@ -117,8 +117,8 @@ BUGS = {
         "anp.concatenate([u, plain(inflow)])",
         "tests/test_transport_rules.py",
     ),
-    "a checkpoint that misses a vector of the optimiser": Bug(
-        "optimise/resume.py",
+    "a checkpoint that misses a vector of the optimizer": Bug(
+        "optimize/resume.py",
         "        (state, best), history = _restored(template, found.leaves)",
         "        (state, best), history = _restored(template, found.leaves)\n"
         "        state = state._replace(**{state._fields[1]: template[1]})",

@@ -89,7 +89,7 @@ def test_openings(shape, stretched):
     v = velocity(grid)
     result = P(v)
     np.testing.assert_allclose(dp.divergence(grid)(result)[~solid], 0, atol=1e-8)
-    assert np.array_equal(dp.part(grid, 0)(result)[0], dp.part(grid, 0)(v)[0])
+    assert np.array_equal(dp.component(grid, 0)(result)[0], dp.component(grid, 0)(v)[0])
     np.testing.assert_allclose(P(result), result, atol=1e-9)
     if grid.cells.size < 200:
         matrix = dense(grid, solid, OPEN)

@@ -48,47 +48,47 @@ def same(a, b):
 
 @pytest.mark.parametrize("method, loss, options", RUNS)
 def test_a_run_in_pieces_is_the_run(tmp_path, monkeypatch, method, loss, options):
-    monkeypatch.setattr("sparsedp.optimise.resume.SHARE", np.inf)  # every state is written
-    whole = dp.minimise(loss, START, method, maxiter=12, tolerance=0, **options)
+    monkeypatch.setattr("sparsedp.optimize.resume.SHARE", np.inf)  # every state is written
+    whole = dp.minimize(loss, START, method, maxiter=12, tolerance=0, **options)
     for stop in (3, 4, 9, 12):
-        part = dp.minimise(loss, START, method, maxiter=stop, tolerance=0, checkpoint=tmp_path, **options)
+        part = dp.minimize(loss, START, method, maxiter=stop, tolerance=0, checkpoint=tmp_path, **options)
     assert same(part, whole)
     assert part.resumed.startswith("resumed from iteration ")
     assert len(list(tmp_path.iterdir())) == 4  # two states of two files
-    again = dp.minimise(loss, START, method, maxiter=12, tolerance=0, checkpoint=tmp_path, **options)
+    again = dp.minimize(loss, START, method, maxiter=12, tolerance=0, checkpoint=tmp_path, **options)
     assert same(again, whole)
 
 
 def test_what_a_finished_run_says_when_called_again(tmp_path):
-    first = dp.minimise(valley, START, checkpoint=tmp_path)
+    first = dp.minimize(valley, START, checkpoint=tmp_path)
     assert first.converged and first.resumed == f"nothing to resume in {tmp_path}"
-    again = dp.minimise(valley, START, checkpoint=tmp_path)
+    again = dp.minimize(valley, START, checkpoint=tmp_path)
     assert same(again, first) and again.resumed in str(again)
 
 
 def test_what_stopped_a_run_does_not_stop_the_next(tmp_path):
     """A callback stops one run; more iterations and a smaller tolerance go on from there, to the same bits."""
     options = {"maxiter": 30, "tolerance": 1e-6}
-    whole = dp.minimise(valley, START, **options)
-    stopped = dp.minimise(
+    whole = dp.minimize(valley, START, **options)
+    stopped = dp.minimize(
         valley, START, checkpoint=tmp_path, callback=lambda record, x: record.iteration == 5, **options
     )
     assert stopped.message == "stopped by the callback" and len(stopped.history) == 6
-    assert same(dp.minimise(valley, START, checkpoint=tmp_path, **options), whole)
+    assert same(dp.minimize(valley, START, checkpoint=tmp_path, **options), whole)
     finer = {"maxiter": 200, "tolerance": 1e-12}
-    assert same(dp.minimise(valley, START, checkpoint=tmp_path, **finer), dp.minimise(valley, START, **finer))
+    assert same(dp.minimize(valley, START, checkpoint=tmp_path, **finer), dp.minimize(valley, START, **finer))
 
 
 def test_truncated_and_foreign_files_are_named_and_skipped(tmp_path, monkeypatch):
-    monkeypatch.setattr("sparsedp.optimise.resume.SHARE", np.inf)
-    whole = dp.minimise(valley, START, maxiter=8, tolerance=0)
-    dp.minimise(valley, START, maxiter=6, tolerance=0, checkpoint=tmp_path)
+    monkeypatch.setattr("sparsedp.optimize.resume.SHARE", np.inf)
+    whole = dp.minimize(valley, START, maxiter=8, tolerance=0)
+    dp.minimize(valley, START, maxiter=6, tolerance=0, checkpoint=tmp_path)
     last = tmp_path / "state-000000006.npz"
     last.write_bytes(last.read_bytes()[:-7])
     (tmp_path / "state-000000009.json").write_text("{}")
     (tmp_path / "state-000000008.json").write_text(json.dumps({"format": "another", "seal": ""}))
     (tmp_path / "state-000000007.npz.part").write_bytes(b"half")
-    best = dp.minimise(valley, START, maxiter=8, tolerance=0, checkpoint=tmp_path)
+    best = dp.minimize(valley, START, maxiter=8, tolerance=0, checkpoint=tmp_path)
     assert same(best, whole)
     assert "resumed from iteration 5" in best.resumed
     assert "state-000000006.json: state-000000006.npz is truncated or changed" in best.resumed
@@ -98,12 +98,12 @@ def test_truncated_and_foreign_files_are_named_and_skipped(tmp_path, monkeypatch
 
 
 def test_a_missing_file_and_a_manifest_that_was_changed(tmp_path, monkeypatch):
-    monkeypatch.setattr("sparsedp.optimise.resume.SHARE", np.inf)
-    dp.minimise(valley, START, maxiter=3, tolerance=0, checkpoint=tmp_path)
+    monkeypatch.setattr("sparsedp.optimize.resume.SHARE", np.inf)
+    dp.minimize(valley, START, maxiter=3, tolerance=0, checkpoint=tmp_path)
     (tmp_path / "state-000000003.npz").unlink()
     changed = tmp_path / "state-000000002.json"
     changed.write_text(changed.read_text().replace('"iteration": 2', '"iteration": 1'))
-    best = dp.minimise(valley, START, maxiter=0, checkpoint=tmp_path)
+    best = dp.minimize(valley, START, maxiter=0, checkpoint=tmp_path)
     assert "state-000000003.npz is missing" in best.resumed and "nothing to resume" in best.resumed
     assert "state-000000002.json: not a manifest of sparsedp" in best.resumed
 
@@ -121,24 +121,24 @@ def test_a_missing_file_and_a_manifest_that_was_changed(tmp_path, monkeypatch):
 )
 def test_another_run_is_refused(tmp_path, change, name):
     run = {"loss": valley, "start": START, "maxiter": 2, "checkpoint": tmp_path}
-    dp.minimise(**run)
+    dp.minimize(**run)
     with pytest.raises(
         ValueError,
         match=".* holds a run with another .* than the one given; give what it was begun with, or write another "
         "checkpoint folder",
     ) as refused:
-        dp.minimise(**{**run, **change})
+        dp.minimize(**{**run, **change})
     assert f"another {name} than" in str(refused.value)
 
 
 def refused(tmp_path, name, begun, given, **both):
     """Whether a run is refused that was begun with other arguments, and goes on with its own."""
     both = {"maxiter": 6, "tolerance": 0, "checkpoint": tmp_path, **both}
-    dp.minimise(**begun, **{**both, "maxiter": 3})
+    dp.minimize(**begun, **{**both, "maxiter": 3})
     with pytest.raises(ValueError, match=f"another {name} than the one given; give what it was begun with, or write"):
-        dp.minimise(**given, **both)
-    whole = dp.minimise(**begun, **{**both, "checkpoint": None})
-    assert same(dp.minimise(**begun, **both), whole)
+        dp.minimize(**given, **both)
+    whole = dp.minimize(**begun, **{**both, "checkpoint": None})
+    assert same(dp.minimize(**begun, **both), whole)
 
 
 TREE = {"x": START, "n": 2, "word": "a", "none": None, "flag": True, "pair": (1.0, np.arange(3))}
@@ -176,16 +176,16 @@ def test_other_batches_are_refused(tmp_path, begun, given):
 
 def test_batches_that_were_not_seen_yet_may_be_others(tmp_path):
     run = {"loss": residuals, "start": START, "method": "half_inverse", "rate": 0.1, "tolerance": 0}
-    dp.minimise(**run, batches=BATCHES, maxiter=2, checkpoint=tmp_path)
+    dp.minimize(**run, batches=BATCHES, maxiter=2, checkpoint=tmp_path)
     other = [*BATCHES[:3], BATCHES[0]]
-    again = dp.minimise(**run, batches=other, maxiter=6, checkpoint=tmp_path)
-    assert again.resumed.startswith("resumed") and same(again, dp.minimise(**run, batches=other, maxiter=6))
+    again = dp.minimize(**run, batches=other, maxiter=6, checkpoint=tmp_path)
+    assert again.resumed.startswith("resumed") and same(again, dp.minimize(**run, batches=other, maxiter=6))
 
 
 def test_each_batch_is_asked_for_once():
     asked = []
     run = {"loss": residuals, "start": START, "method": "half_inverse", "rate": 0.1, "tolerance": 0, "maxiter": 4}
-    dp.minimise(**run, batches=lambda i: asked.append(i) or BATCHES[i])
+    dp.minimize(**run, batches=lambda i: asked.append(i) or BATCHES[i])
     assert asked == [0, 1, 2, 3, 4]
 
 
@@ -210,7 +210,7 @@ def test_a_loss_that_is_another_one_away_from_the_start(tmp_path):
 
 def test_functions_among_the_options_do_not_hinder_the_next_process(tmp_path):
     """They have no address in the folder."""
-    run = lambda maxiter, **more: dp.minimise(
+    run = lambda maxiter, **more: dp.minimize(
         lambda y: anp.sum((y - 2.0) ** 2), START, "physical_gradient", maxiter, 0, rate=0.3,
         physics=lambda x: 2 * x, inverse=lambda y, x: y / 2, **more,
     )  # fmt: skip
@@ -224,7 +224,7 @@ def test_a_tolerance_with_a_memory_takes_no_checkpoint(tmp_path):
         match="certified keeps answers that a checkpoint does not hold; leave checkpoint out, or give tolerance a "
         "number",
     ):
-        dp.minimise(valley, START, tolerance=dp.certified(), checkpoint=tmp_path)
+        dp.minimize(valley, START, tolerance=dp.certified(), checkpoint=tmp_path)
 
 
 SCRIPT = """
@@ -232,14 +232,14 @@ import sys
 import autograd.numpy as anp, numpy as np, time
 import sparsedp as dp
 from sparsedp.tree import leaves
-import sparsedp.optimise.resume as resume
+import sparsedp.optimize.resume as resume
 resume.SHARE = np.inf
 def valley(x):
     time.sleep(1e-3)
     return anp.sum(100 * (x[1:] - x[:-1] ** 2) ** 2 + (1 - x[:-1]) ** 2)
 bounds = (-2.0, np.where(np.arange(60) % 7, 2.0, 0.9)) if sys.argv[3:] else None
 start = np.linspace(-1.2, 1.0, 60)
-best = dp.minimise(valley, start, maxiter=150, tolerance=0, bounds=bounds, checkpoint=sys.argv[1])
+best = dp.minimize(valley, start, maxiter=150, tolerance=0, bounds=bounds, checkpoint=sys.argv[1])
 np.save(sys.argv[2], best.x)
 np.save(sys.argv[2] + ".values", [record.value for record in best.history])
 """
@@ -291,7 +291,7 @@ def slow_end(x):
     return x
 seen = lambda record, x: record.iteration == 10 and print("running", flush=True)
 start = np.linspace(-1.2, 1.0, 60)
-best = dp.minimise(valley, start, maxiter=150, tolerance=0, callback=seen, project=slow_end, checkpoint=sys.argv[1])
+best = dp.minimize(valley, start, maxiter=150, tolerance=0, callback=seen, project=slow_end, checkpoint=sys.argv[1])
 print(best.message, best.converged, len(best.history), best.value, valley(best.x) == best.value)
 """
 
@@ -314,7 +314,7 @@ def test_an_interrupted_run_returns_its_best_point_and_can_go_on(tmp_path):
     last = newest(tmp_path / "parts")  # one less where the signal came before an iteration was written down
     assert 11 <= int(many) < 150 and last in (int(many) - 2, int(many) - 1)
     assert float(value) < valley(np.linspace(-1.2, 1.0, 60))
-    again, whole = (dp.minimise(valley, np.linspace(-1.2, 1.0, 60), maxiter=150, tolerance=0, checkpoint=folder)
+    again, whole = (dp.minimize(valley, np.linspace(-1.2, 1.0, 60), maxiter=150, tolerance=0, checkpoint=folder)
                     for folder in (tmp_path / "parts", None))  # fmt: skip
     assert again.resumed.startswith(f"resumed from iteration {last} in") and same(again, whole)
 
@@ -330,7 +330,7 @@ def test_a_second_interrupt_stops_at_once(tmp_path):
 @pytest.mark.parametrize("at", [1, 8, 12])
 def test_interrupted_inside_an_evaluation(tmp_path, monkeypatch, method, loss, at):
     """The evaluation that was cut short is made again: the resumed run has the bits and counts of the whole one."""
-    monkeypatch.setattr("sparsedp.optimise.resume.SHARE", 0.0)  # no state is written before the end
+    monkeypatch.setattr("sparsedp.optimize.resume.SHARE", 0.0)  # no state is written before the end
     calls = []
 
     def cut(x):
@@ -342,13 +342,13 @@ def test_interrupted_inside_an_evaluation(tmp_path, monkeypatch, method, loss, a
     run = {"start": START, "method": method, "maxiter": 12, "tolerance": 0}
     if at == 1:
         with pytest.raises(KeyboardInterrupt):
-            dp.minimise(cut, **run, checkpoint=tmp_path)
+            dp.minimize(cut, **run, checkpoint=tmp_path)
         return
-    best = dp.minimise(cut, **run, checkpoint=tmp_path)
+    best = dp.minimize(cut, **run, checkpoint=tmp_path)
     assert best.message == "interrupted" and not best.converged and best.covariance is None
-    whole = dp.minimise(loss, **run)
+    whole = dp.minimize(loss, **run)
     assert [record.value for record in best.history] == [r.value for r in whole.history[: len(best.history)]]
-    assert same(dp.minimise(loss, **run, checkpoint=tmp_path), whole)
+    assert same(dp.minimize(loss, **run, checkpoint=tmp_path), whole)
 
 
 def test_interrupted_in_the_callback():
@@ -356,5 +356,5 @@ def test_interrupted_in_the_callback():
         if record.iteration == 4:
             raise KeyboardInterrupt
 
-    best = dp.minimise(valley, START, callback=callback)
+    best = dp.minimize(valley, START, callback=callback)
     assert best.message == "interrupted" and len(best.history) == 5 and str(best).endswith("interrupted")

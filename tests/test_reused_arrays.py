@@ -22,9 +22,9 @@ from sparsedp.tree import flatten, leaves
 
 # One array and no other, so that nothing beside it is kept; or nothing to differentiate; or tested where it stands.
 ALONE = """
-Operator adopt animate average certified certify check convergence curl diagonal dirichlet divergence embed errors
+Operator adopt animate average certified certify check convergence curl diagonal dirichlet divergence errors
 explain exponential face_laplacian face_lift from_functions from_linear_operator from_matrix grad gradient
-harmonic_average hvp identity interior jvp laplacian lift mask minimise neumann part physical_gradient plot power
+harmonic_average hvp identity interior component jvp laplacian lift mask minimize neumann physical_gradient plot power
 projection prolong report restrict robin sample set_threads stress update_direction upwind v_curve value_and_grad vjp
 workprec
 """.split()
@@ -349,14 +349,14 @@ def test_set_ups_own_their_coefficients():
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "gd", "adam", "newton_cg"])
-def test_minimise_hands_out_copies(method):
+def test_minimize_hands_out_copies(method):
     options = {"rate": 0.1} if method in ("gd", "adam") else {}
     start, lower = np.full(3, 2.0), np.full(3, 0.5)
     options["bounds"] = lower, None
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         known, seen = [], []
-        best = dp.minimise(
+        best = dp.minimize(
             lambda x: anp.sum((x - 0.3) ** 4), start, method, 4, callback=lambda r, x: known.append(x.copy()), **options
         )
 
@@ -365,5 +365,5 @@ def test_minimise_hands_out_copies(method):
             x[:] = np.nan
             start[:] = lower[:] = np.nan
 
-        again = dp.minimise(lambda x: anp.sum((x - 0.3) ** 4), start, method, 4, callback=spoil, **options)
+        again = dp.minimize(lambda x: anp.sum((x - 0.3) ** 4), start, method, 4, callback=spoil, **options)
     assert np.array_equal(best.x, again.x) and np.array_equal(known, seen)

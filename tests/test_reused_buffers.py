@@ -262,15 +262,15 @@ def rosenbrock_slope(x):
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "gd", "adam"])
-def test_gradients_for_minimise(method):
+def test_gradients_for_minimize(method):
     start, options = np.full(4, 0.5), dict(method=method, maxiter=30)
-    wanted = dp.minimise(rosenbrock, start, gradient=rosenbrock_slope, **options)
-    found = dp.minimise(reusing(rosenbrock), start, gradient=reusing(rosenbrock_slope), **options)
+    wanted = dp.minimize(rosenbrock, start, gradient=rosenbrock_slope, **options)
+    found = dp.minimize(reusing(rosenbrock), start, gradient=reusing(rosenbrock_slope), **options)
     assert np.array_equal(found.x, wanted.x) and found.value == wanted.value
     assert [one.value for one in found.history] == [one.value for one in wanted.history]
 
 
-def test_batches_for_minimise():
+def test_batches_for_minimize():
     data = np.arange(12.0).reshape(4, 3)
     loss, room = lambda x, batch: anp.sum((x - batch) ** 2), np.empty(3)
 
@@ -279,11 +279,11 @@ def test_batches_for_minimise():
         return room
 
     options = dict(method="adam", maxiter=9)
-    wanted, found = (dp.minimise(loss, np.zeros(3), batches=b, **options) for b in (list(data), batches))
+    wanted, found = (dp.minimize(loss, np.zeros(3), batches=b, **options) for b in (list(data), batches))
     assert np.array_equal(wanted.x, found.x)
     linear = lambda x, batch: x - batch
     options = dict(method="half_inverse", maxiter=9)
-    wanted, found = (dp.minimise(linear, np.zeros(3), batches=b, **options) for b in (list(data), batches))
+    wanted, found = (dp.minimize(linear, np.zeros(3), batches=b, **options) for b in (list(data), batches))
     assert np.array_equal(wanted.x, found.x)
 
 

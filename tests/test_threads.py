@@ -287,7 +287,7 @@ def test_rollouts(memory):
     check(make, 3)
 
 
-# ---------------------------------------------------------------- derivatives, instruments, optimisers
+# ---------------------------------------------------------------- derivatives, instruments, optimizers
 
 
 def nested(d):
@@ -405,9 +405,9 @@ def bowl(number):
 
 
 @pytest.mark.parametrize("method", ["gd", "adam", "lbfgs", "newton_cg"])
-def test_minimise(method):
+def test_minimize(method):
     def work(number):
-        best = dp.minimise(bowl(number), np.ones(6), method, maxiter=5)
+        best = dp.minimize(bowl(number), np.ones(6), method, maxiter=5)
         return best.x, best.value, [(r.value, r.gradient_norm, r.evaluations, r.solves) for r in best.history]
 
     check(lambda: work, 2)
@@ -433,7 +433,7 @@ def test_instruments():
             return [result.verdict == "agrees"]
         if number == 2:
             found = dp.certify(loss, b)
-            best = dp.minimise(loss, b, tolerance=dp.certified(0.1), maxiter=2)
+            best = dp.minimize(loss, b, tolerance=dp.certified(0.1), maxiter=2)
             return found.gradient, found.gradient_error, best.x
         return slope(loss, b)
 

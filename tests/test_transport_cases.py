@@ -67,7 +67,7 @@ def test_a1_gradient_is_the_central_difference():
 
 def test_a1_from_rest():
     case = Recovery()
-    best = dp.minimise(case.loss, np.zeros(64), maxiter=60)
+    best = dp.minimize(case.loss, np.zeros(64), maxiter=60)
     assert best.value <= 2.5
 
 

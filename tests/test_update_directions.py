@@ -1,4 +1,4 @@
-"""Gradient, half-inverse, Gauss-Newton: one family of directions, and the methods of minimise built on it."""
+"""Gradient, half-inverse, Gauss-Newton: one family of directions, and the methods of minimize built on it."""
 
 import autograd.numpy as anp
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.errors import NonFiniteError
-from sparsedp.optimise.singular_values import singular
+from sparsedp.optimize.singular_values import singular
 from sparsedp.tape import linear
 
 SHAPES = [(12, 30), (30, 12), (9, 9), (1, 5), (5, 1)]
@@ -144,7 +144,7 @@ def test_memory_of_the_bidiagonalisation(rng):
     assert gap(found.step, np.sqrt(weights) * x) < 1e-8
 
 
-# ---- the methods of minimise ---------------------------------------------------------------------------------------
+# ---- the methods of minimize ---------------------------------------------------------------------------------------
 
 
 def valley(x):
@@ -162,7 +162,7 @@ SQUARES = [
 
 @pytest.mark.parametrize("method, options", SQUARES)
 def test_least_squares(method, options):
-    best = dp.minimise(valley, np.array([-1.2, 1.0] * 3), method, maxiter=60, **options)
+    best = dp.minimize(valley, np.array([-1.2, 1.0] * 3), method, maxiter=60, **options)
     assert best.converged and np.allclose(best.x, 1, atol=1e-6)
     assert best.value == pytest.approx(0.5 * np.sum(valley(best.x) ** 2))
 
@@ -170,13 +170,13 @@ def test_least_squares(method, options):
 @pytest.mark.parametrize("method, options", SQUARES)
 def test_a_linear_problem_takes_one_step_and_none_at_rounding(rng, method, options):
     matrix, data = rng.standard_normal((9, 4)), rng.standard_normal(9)
-    best = dp.minimise(lambda x: matrix @ x - data, np.zeros(4), method, tolerance=0, maxiter=40, **options)
+    best = dp.minimize(lambda x: matrix @ x - data, np.zeros(4), method, tolerance=0, maxiter=40, **options)
     assert np.allclose(best.x, np.linalg.lstsq(matrix, data, rcond=None)[0], atol=1e-6)
     assert best.converged
 
 
 def test_a_singular_jacobian_takes_the_shortest_step():
-    best = dp.minimise(lambda x: anp.array([1.0, 1.0]) * (x[0] + x[1] - 2.0), np.zeros(2), "gauss_newton")
+    best = dp.minimize(lambda x: anp.array([1.0, 1.0]) * (x[0] + x[1] - 2.0), np.zeros(2), "gauss_newton")
     assert np.allclose(best.x, 1.0)
 
 
@@ -185,25 +185,25 @@ def test_the_two_variables_of_the_literature():
     start, y = np.array([3.0, 3.0]), lambda x: anp.stack([x[0], x[1] ** 2])
     square = lambda v: anp.sum(v**2)
     fixed = {"maxiter": 10, "tolerance": 0}
-    descent = dp.minimise(lambda x: square(y(x)), start, "gd", rate=0.01, **fixed)
+    descent = dp.minimize(lambda x: square(y(x)), start, "gd", rate=0.01, **fixed)
     assert np.allclose(descent.x, (2.4512184, 0.96171147), rtol=1e-6)
     options = {"physics": y, "inverse": lambda v, x: np.stack([v[0], np.sqrt(v[1])])}
-    slow = dp.minimise(square, start, "physical_gradient", rate=0.15, **options, **fixed)
+    slow = dp.minimize(square, start, "physical_gradient", rate=0.15, **options, **fixed)
     assert np.allclose(slow.x, (0.08474258, 0.50421), rtol=1e-6)
-    assert np.array_equal(dp.minimise(square, start, "physical_gradient", rate=0.5, **options, maxiter=1).x, [0, 0])
+    assert np.array_equal(dp.minimize(square, start, "physical_gradient", rate=0.5, **options, maxiter=1).x, [0, 0])
 
 
 def test_half_inverse_equalises_the_directions():
     scales = np.array([1.0, 1e-4])
-    best = dp.minimise(lambda x: scales * (x - 1.0), np.zeros(2), "half_inverse", maxiter=60, tolerance=0)
-    descent = dp.minimise(lambda x: anp.sum((scales * (x - 1.0)) ** 2), np.zeros(2), "gd", maxiter=60)
+    best = dp.minimize(lambda x: scales * (x - 1.0), np.zeros(2), "half_inverse", maxiter=60, tolerance=0)
+    descent = dp.minimize(lambda x: anp.sum((scales * (x - 1.0)) ** 2), np.zeros(2), "gd", maxiter=60)
     assert abs(best.x[1] - 1) < 0.6 < 0.99 < abs(descent.x[1] - 1)
 
 
 def test_batches():
     data = [np.full(3, value) for value in (1.0, 2.0, 3.0)]
     for batches in (data, lambda i: data[i % 3]):
-        best = dp.minimise(lambda x, b: x - b, np.zeros(3), "half_inverse", maxiter=30, batches=batches, rate=0.5)
+        best = dp.minimize(lambda x, b: x - b, np.zeros(3), "half_inverse", maxiter=30, batches=batches, rate=0.5)
         assert np.all(best.x > 1.5) and np.all(best.x < 3) and best.value == best.history[-1].value
     seen = []
 
@@ -211,12 +211,12 @@ def test_batches():
         seen.append(batch)
         return anp.sum((x - batch) ** 2)
 
-    dp.minimise(loss, np.zeros(1), "adam", maxiter=4, batches=[0, 1, 2], tolerance=0)
+    dp.minimize(loss, np.zeros(1), "adam", maxiter=4, batches=[0, 1, 2], tolerance=0)
     assert seen == [0, 1, 2, 0, 1]
 
 
 def test_a_minimum_that_is_not_a_solution():
-    best = dp.minimise(lambda x: anp.abs(x) + 1.0, np.full(2, 0.5), "gauss_newton")
+    best = dp.minimize(lambda x: anp.abs(x) + 1.0, np.full(2, 0.5), "gauss_newton")
     assert not best.converged and "no lower point along the Gauss-Newton step" in best.message
 
 
@@ -235,7 +235,7 @@ def test_half_inverse_losses_as_with_a_dense_svd(rng):
         hidden = anp.tanh(anp.sum(states[:, :, None] * w[0], axis=-2))
         return anp.sum(hidden[:, :, None] * w[1], axis=-2) @ physics - target
 
-    best = dp.minimise(misses, (first, second), "half_inverse", 6, 0, rate=0.1, apart=True)
+    best = dp.minimize(misses, (first, second), "half_inverse", 6, 0, rate=0.1, apart=True)
     x, losses = np.concatenate([first.ravel(), second.ravel()]), []
     for _ in range(7):
         tree = x[:80].reshape(4, 20), x[80:].reshape(20, 24)

@@ -158,11 +158,11 @@ def test_caches_that_are_not_warm_are_refused(monkeypatch):
 
 
 def test_a_run_without_gradient_and_an_output():
-    """An optimiser: the run is its own answer. An output: the field, not the loss, is compared."""
+    """An optimizer: the run is its own answer. An output: the field, not the loss, is compared."""
 
     def fit(method):
         loss = lambda x: anp.sum((x - 3.0) ** 2)
-        return lambda: dp.minimise(loss, np.zeros(2), method=method, maxiter=50).x, None
+        return lambda: dp.minimize(loss, np.zeros(2), method=method, maxiter=50).x, None
 
     found = dp.workprec(fit, {"lbfgs": {"method": "lbfgs"}}, reference=(np.full(2, 3.0), None), repeats=1)
     assert found.rows[0]["forward_error"] < 1e-6 and math.isnan(found.rows[0]["gradient_error"])

@@ -142,7 +142,7 @@ def of_flow(step):
 def of_certified(tolerance):
     solve = dp.inverse(-dp.laplacian(BOX, dp.dirichlet), "krylov")
     start, twin = np.zeros(BOX.shape), deepcopy(tolerance)  # it serves one run
-    best = dp.minimise(lambda b: anp.sum((solve(b) - 1.0) ** 2), start, maxiter=5, tolerance=twin)
+    best = dp.minimize(lambda b: anp.sum((solve(b) - 1.0) ** 2), start, maxiter=5, tolerance=twin)
     return [best.x.tobytes()]
 
 
@@ -259,7 +259,7 @@ def travellers():
 
 # Public names that make nothing which is called later: values, runs, pictures, rooms.
 NOTHING_TO_CALL = {
-    "Grid", "Space", "Operator", "dirichlet", "neumann", "robin", "rollout", "minimise", "update_direction",
+    "Grid", "Space", "Operator", "dirichlet", "neumann", "robin", "rollout", "minimize", "update_direction",
     "set_threads", "convergence", "v_curve", "animate", "plot", "certify", "stress", "workprec", "explain", "check",
     "errors", "report", "vjp", "jvp", "hvp",
 }  # fmt: skip

@@ -1,7 +1,7 @@
 """Small networks as plain functions of a parameter tree: dense and convolution layers, nothing more.
 
 A layer is ``layer(p, x)`` with p a dict of arrays; a network is a Python function that calls layers; its parameters
-are any nesting of such dicts, and minimise takes them as they are.
+are any nesting of such dicts, and minimize takes them as they are.
 """
 
 from sparsedp.network.filters import convolution

@@ -1,4 +1,4 @@
-"""From one place to another: average, sample, restrict, prolong, embed, part."""
+"""From one place to another: average, sample, restrict, prolong, component."""
 
 from itertools import product
 
@@ -18,7 +18,7 @@ from sparsedp.structure.explicit import Matrix
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker
 
-__all__ = ["average", "embed", "part", "prolong", "restrict", "sample"]
+__all__ = ["average", "component", "prolong", "restrict", "sample"]
 
 
 def average(grid, boundary=neumann):
@@ -191,8 +191,8 @@ def _coarse(grid, factor):
     return Grid(shape, spacing=spacing, origin=grid.origin, periodic=grid.periodic), factors
 
 
-def embed(grid, axis):
-    """One component of a face field -> faces, zero in the other components.
+def component(grid, axis):
+    """Faces -> one component of the face field, in its own shape. Its transpose puts it back among zeros.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def embed(grid, axis):
     Returns
     -------
     Operator
-        in: shape `grid.face_shape(axis)` [unit]; out: faces [unit]. Its transpose is `part`.
+        in: faces [unit]; out: shape `grid.face_shape(axis)` [unit].
 
     Raises
     ------
@@ -211,39 +211,13 @@ def embed(grid, axis):
 
     Examples
     --------
-    >>> embed(Grid((1, 1)), "x")(np.array([[1.0], [2.0]]))
+    >>> component(Grid((1, 1)), "y")(np.array([1.0, 2.0, 3.0, 4.0]))
+    array([[3., 4.]])
+    >>> component(Grid((1, 1)), "x").T(np.array([[1.0], [2.0]]))
     array([1., 2., 0., 0.])
     """
-    check_grid("embed", grid)
+    check_grid("component", grid)
     axis = grid.axis(axis)
-    component = Space(grid.face_shape(axis), f"{grid.axes[axis]}-faces", grid)
-    blocks = {(axis, 0): along(axis, grid.dim, None)}
-    return Operator(Kronecker(grid.faces.parts, component.parts, blocks), component, grid.faces, "embed")
-
-
-def part(grid, axis):
-    """Faces -> one component of the face field, in its own shape.
-
-    Parameters
-    ----------
-    grid : Grid
-    axis : int or "x", "y", "z"
-
-    Returns
-    -------
-    Operator
-        in: faces [unit]; out: shape `grid.face_shape(axis)` [unit]. Its transpose is `embed`.
-
-    Raises
-    ------
-    ValueError
-        If the grid has no such axis.
-
-    Examples
-    --------
-    >>> part(Grid((1, 1)), "y")(np.array([1.0, 2.0, 3.0, 4.0]))
-    array([[3., 4.]])
-    """
-    check_grid("part", grid)
-    turned = embed(grid, axis)
-    return Operator(turned.structure.transpose(), turned.codomain, turned.domain, "part")
+    own = Space(grid.face_shape(axis), f"{grid.axes[axis]}-faces", grid)
+    blocks = {(0, axis): along(axis, grid.dim, None)}
+    return Operator(Kronecker(own.parts, grid.faces.parts, blocks), grid.faces, own, "component")

@@ -34,7 +34,7 @@ CONSISTENT = 0.2  # of the terms of the sum of y . r, by which it may differ fro
 EXACT = 1e-13  # relative errors below this are those of rounding, not of solves
 LOOSEST = 0.1  # tolerance that is advised
 SHOWN = ("solver", "rtol", "forward", "forward residual", "adjoint", "adjoint residual", "error")
-SHARES = 0.05, 0.5  # least and largest relative tolerance of a correction inside minimise
+SHARES = 0.05, 0.5  # least and largest relative tolerance of a correction inside minimize
 CORRECTIONS = 20  # of one evaluation, at most
 ROUNDING = 1e-14  # of the value
 
@@ -309,11 +309,11 @@ class Certificate(Result):
         )
 
 
-# ---------------------------------------------------------------- adaptive tolerances for minimise
+# ---------------------------------------------------------------- adaptive tolerances for minimize
 
 
 def certified(fraction=0.1, tolerance=1e-8):
-    """Fraction of the gradient -> tolerance for `minimise` that also chooses how far solves go.
+    """Fraction of the gradient -> tolerance for `minimize` that also chooses how far solves go.
 
     Parameters
     ----------
@@ -321,18 +321,18 @@ def certified(fraction=0.1, tolerance=1e-8):
         Largest error of the gradient relative to itself, and of the value relative to its change
         since the last step, 0 < fraction < 1.
     tolerance : float
-        As in `minimise`: converged when the norm of the gradient has fallen by this factor.
+        As in `minimize`: converged when the norm of the gradient has fallen by this factor.
 
     Returns
     -------
     Certified
-        For one run: ``minimise(loss, start, tolerance=dp.certified(0.1))``. Afterwards `.saved` is the share of
+        For one run: ``minimize(loss, start, tolerance=dp.certified(0.1))``. Afterwards `.saved` is the share of
         iterations saved, `.iterations`, `.full_iterations` and `.evaluations` are the counts, str() says it all.
 
     Raises
     ------
     ValueError
-        If `fraction` or `tolerance` is out of range, or a gradient is given to `minimise`: its solves are not seen.
+        If `fraction` or `tolerance` is out of range, or a gradient is given to `minimize`: its solves are not seen.
 
     Notes
     -----
@@ -343,10 +343,10 @@ def certified(fraction=0.1, tolerance=1e-8):
     --------
     >>> import autograd.numpy as anp
     >>> import numpy as np
-    >>> from sparsedp import Grid, dirichlet, inverse, laplacian, minimise
+    >>> from sparsedp import Grid, dirichlet, inverse, laplacian, minimize
     >>> solve = inverse(-laplacian(Grid((8, 8)), dirichlet), "krylov")
     >>> loose = certified(0.1, tolerance=1e-4)
-    >>> best = minimise(lambda b: anp.sum((solve(b) - 1.0) ** 2), np.zeros((8, 8)), tolerance=loose)
+    >>> best = minimize(lambda b: anp.sum((solve(b) - 1.0) ** 2), np.zeros((8, 8)), tolerance=loose)
     >>> best.converged, loose.saved > 0
     (True, True)
     """
@@ -359,7 +359,7 @@ def certified(fraction=0.1, tolerance=1e-8):
 
 
 class Certified:
-    """A tolerance that takes part in the evaluations of `minimise`. Made by `certified`, for one run.
+    """A tolerance that takes part in the evaluations of `minimize`. Made by `certified`, for one run.
 
     An evaluation starts from the solutions of the last one and corrects them by loose solves until value and
     gradient move by less than is asked. What it returns is the last corrected one: its error is about the share that
@@ -382,7 +382,7 @@ class Certified:
         return record.gradient_norm <= self.tolerance * first.gradient_norm
 
     def inside(self, loss, gradient):
-        """The loss and the gradient that `minimise` is to use, in this order at every point."""
+        """The loss and the gradient that `minimize` is to use, in this order at every point."""
         if gradient is not None:
             raise ValueError("certified sees the solves of the loss, not of a gradient that is given; leave it out")
 

@@ -18,7 +18,7 @@ __all__ = [
 ARROWS = 24  # arrows along an axis of a face field, at most
 
 
-def plot(grid, u, ax=None, title=None, label=None, limits=None, colours="viridis", at=None):
+def plot(grid, u, ax=None, title=None, label=None, limits=None, cmap="viridis", at=None):
     """Field on a grid -> picture in which axis 0 is x, axis 1 is y, lengths are to scale.
 
     Parameters
@@ -32,7 +32,7 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, colours="viridis
         Above the picture; beside the colour bar (in 1-D: the vertical axis).
     limits : (float, float), optional
         The values at the ends of the colour bar. Give two pictures the same limits to compare them.
-    colours : str
+    cmap : str
         Name of a matplotlib colour map.
     at : "cells", "faces" or "nodes", optional
         Where the numbers live, when the shape alone does not tell (cells before faces before nodes).
@@ -69,7 +69,7 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, colours="viridis
         _line(grid, u, kind, ax, label)
         return ax
     low, high = limits or _range(u)
-    mesh = partial(_mesh, grid, kind, vmin=low, vmax=high, cmap=colours, shading="auto", rasterized=True)
+    mesh = partial(_mesh, grid, kind, vmin=low, vmax=high, cmap=cmap, shading="auto", rasterized=True)
     if grid.dim == 2:
         image = mesh(u, (0, 1), ax)
         bar = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the map, whatever its shape
@@ -82,7 +82,7 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, colours="viridis
     return ax
 
 
-def animate(grid, frames, path, title=None, limits=None, colours="viridis", rate=12):
+def animate(grid, frames, path, title=None, limits=None, cmap="viridis", rate=12):
     """Frames of a field -> animated GIF.
 
     Parameters
@@ -91,7 +91,7 @@ def animate(grid, frames, path, title=None, limits=None, colours="viridis", rate
     frames : sequence of arrays
         Fields that `plot` draws.
     path : str, Path or binary stream
-    title, limits, colours
+    title, limits, cmap
         As in `plot`; the limits hold for all frames.
     rate : float
         Frames a second.
@@ -124,7 +124,7 @@ def animate(grid, frames, path, title=None, limits=None, colours="viridis", rate
     _matplotlib("backends.backend_agg").FigureCanvasAgg(picture)
     for frame in frames:
         picture.clear()
-        plot(grid, frame, ax=picture.add_subplot(), title=title, limits=limits, colours=colours)
+        plot(grid, frame, ax=picture.add_subplot(), title=title, limits=limits, cmap=cmap)
         picture.canvas.draw()
         images.append(_image(np.asarray(picture.canvas.buffer_rgba())))
     first, *rest = images
@@ -246,12 +246,12 @@ def _dressed(ax, xlabel, ylabel, title, xscale="log"):
 
 
 def convergence(best, ax=None, against="iteration"):
-    """Result of `minimise` -> picture of the loss and the gradient norm over iterations, seconds or solves.
+    """Result of `minimize` -> picture of the loss and the gradient norm over iterations, seconds or solves.
 
     Parameters
     ----------
     best : Minimum
-        From `minimise`.
+        From `minimize`.
     ax : matplotlib Axes, optional
         Default: the current axes of pyplot.
     against : "iteration", "seconds", "evaluations" or "solves"
@@ -272,8 +272,8 @@ def convergence(best, ax=None, against="iteration"):
     Examples
     --------
     >>> import autograd.numpy as anp
-    >>> from sparsedp import minimise
-    >>> best = minimise(lambda x: anp.sum((x - 1.0) ** 4), np.zeros(2), maxiter=5)
+    >>> from sparsedp import minimize
+    >>> best = minimize(lambda x: anp.sum((x - 1.0) ** 4), np.zeros(2), maxiter=5)
     >>> convergence(best, figure().add_subplot()).get_xlabel()
     'iteration'
     """

@@ -53,7 +53,7 @@ def workprec(
     problem : callable
         ``problem(**settings)`` -> (loss, x) or (loss, x, facts). Facts are columns (unknowns, steps, tolerance);
         facts["output"], a function of x, gives the array that the forward error is about in place of the loss.
-        With x None, loss() is the run itself (an optimiser, say) and its result the answer; it has no gradient.
+        With x None, loss() is the run itself (an optimizer, say) and its result the answer; it has no gradient.
     methods : dict
         Name of a method -> dict of its settings.
     over : dict, optional

@@ -115,8 +115,8 @@ class Trial:
         print(f"Recovery on {self.grid}\n  iteration   misfit/noise   error   seconds")
         dp.value_and_grad(self.loss)(start + 1e-12)  # the first call of a kernel is not the price of a run
         with recording() as calls:
-            self.best = best = dp.minimise(self.loss, start, maxiter=ITERATIONS, callback=note, memory=20)
-        if best.message.startswith("interrupted"):  # minimise keeps its best point; the demo ends
+            self.best = best = dp.minimize(self.loss, start, maxiter=ITERATIONS, callback=note, memory=20)
+        if best.message.startswith("interrupted"):  # minimize keeps its best point; the demo ends
             raise KeyboardInterrupt
         if best.history[-1].iteration > len(self.trace):  # the iteration that meets the tolerance is not reported
             note(best.history[-1], best.x)
@@ -234,7 +234,7 @@ def _maps(study, trial):
         ("Hidden ground", truth, {"limits": (low, high)}),
         ("Recovered from the readings", recovery, {"limits": (low, high)}),
         (f"Recovered - hidden: relative error {trial.trace[-1][2]:.2f}", recovery - truth,
-         {"limits": (-high, high), "colours": "RdBu_r"}),
+         {"limits": (-high, high), "cmap": "RdBu_r"}),
     ):  # fmt: skip
         picture = plots.figure()
         ax = picture.add_subplot()

@@ -3,7 +3,7 @@
 import time
 
 from sparsedp.ledger import thread
-from sparsedp.optimise.result import Record
+from sparsedp.optimize.result import Record
 from sparsedp.tree import norm
 
 __all__ = ["Watch"]

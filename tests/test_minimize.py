@@ -1,4 +1,4 @@
-"""minimise(): every method, any nesting, any scale; trial points that the loss refuses; what it says about it."""
+"""minimize(): every method, any nesting, any scale; trial points that the loss refuses; what it says about it."""
 
 import sys
 from collections import namedtuple
@@ -9,9 +9,9 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
-from sparsedp.optimise.first_order import Adam, Descent
-from sparsedp.optimise.flat import Packing
-from sparsedp.optimise.trials import Trials
+from sparsedp.optimize.first_order import Adam, Descent
+from sparsedp.optimize.flat import Packing
+from sparsedp.optimize.trials import Trials
 from sparsedp.tape import plain
 
 Rest = namedtuple("Rest", "b nothing")
@@ -56,7 +56,7 @@ def refused(result):
 
 def test_nested_leaves_keep_their_kinds():
     given = start()
-    best = dp.minimise(nested, given)
+    best = dp.minimize(nested, given)
     assert best.converged and best.method == "lbfgs"
     assert np.allclose(best.x["a"], 1, atol=1e-4)
     assert best.x["n"] == 3 and best.x["word"] == "x" and best.x["rest"].nothing is None
@@ -78,16 +78,16 @@ METHODS = [
 
 @pytest.mark.parametrize("method, options, reached", METHODS)
 def test_methods(method, options, reached):
-    best = dp.minimise(valley, np.array([-1.2, 1.0]), method, maxiter=500, **options)
+    best = dp.minimize(valley, np.array([-1.2, 1.0]), method, maxiter=500, **options)
     assert best.value < reached
     assert best.value == min(record.value for record in best.history)
 
 
 def test_plain_gradient_descent_and_adam_are_what_the_books_say():
     x = np.array([1.0, 2.0])
-    best = dp.minimise(bowl, x, "gd", maxiter=1, rate=0.1, tolerance=0)
+    best = dp.minimize(bowl, x, "gd", maxiter=1, rate=0.1, tolerance=0)
     assert np.array_equal(best.x, x - 0.1 * (2 * (x - 3.0)))
-    best = dp.minimise(bowl, x, "adam", maxiter=1, rate=0.1)
+    best = dp.minimize(bowl, x, "adam", maxiter=1, rate=0.1)
     assert np.allclose(best.x, x + 0.1, rtol=1e-7)
 
 
@@ -95,48 +95,48 @@ def test_plain_gradient_descent_and_adam_are_what_the_books_say():
 @pytest.mark.parametrize("method, options", [("lbfgs", {}), ("gd", {}), ("adam", {"rate": 0.1})])
 def test_the_size_of_the_loss_does_not_matter(scale, method, options):
     x = np.array([-1.2, 1.0, 0.5])
-    plain_run = dp.minimise(valley, x, method, maxiter=20, **options)
-    scaled = dp.minimise(lambda u: scale * valley(u), x, method, maxiter=20, **options)
+    plain_run = dp.minimize(valley, x, method, maxiter=20, **options)
+    scaled = dp.minimize(lambda u: scale * valley(u), x, method, maxiter=20, **options)
     same = np.log2(scale) % 1 == 0
     assert np.array_equal(scaled.x, plain_run.x) if same else np.allclose(scaled.x, plain_run.x, rtol=1e-4)
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-3, 1e6])
 def test_the_size_of_x_does_not_matter(scale):
-    best = dp.minimise(lambda u: valley(u / scale), scale * np.array([-1.2, 1.0, 0.5]))
+    best = dp.minimize(lambda u: valley(u / scale), scale * np.array([-1.2, 1.0, 0.5]))
     assert best.converged and np.allclose(best.x / scale, 1, atol=1e-5)
 
 
 def test_single_precision_and_complex_leaves():
-    best = dp.minimise(bowl, np.ones(5, np.float32))
+    best = dp.minimize(bowl, np.ones(5, np.float32))
     assert best.x.dtype == np.float32 and np.array_equal(best.x, np.full(5, 3, np.float32))
-    assert dp.minimise(valley, np.array([-1.2, 1.0], np.float32)).value < 1e-6
+    assert dp.minimize(valley, np.array([-1.2, 1.0], np.float32)).value < 1e-6
     target = np.array([3 + 4j, -1j])
-    best = dp.minimise(lambda z: anp.sum(anp.abs(z - target) ** 2), np.array([1 + 1j, 2 - 1j]))
+    best = dp.minimize(lambda z: anp.sum(anp.abs(z - target) ** 2), np.array([1 + 1j, 2 - 1j]))
     assert np.allclose(best.x, target)
-    assert dp.minimise(lambda z: anp.abs(z - 1j) ** 2, 0.5 + 0j).x == pytest.approx(1j)
-    own = dp.minimise(lambda z: np.sum(np.abs(z - target) ** 2), 0 * target, gradient=lambda z: 2 * np.conj(z - target))
+    assert dp.minimize(lambda z: anp.abs(z - 1j) ** 2, 0.5 + 0j).x == pytest.approx(1j)
+    own = dp.minimize(lambda z: np.sum(np.abs(z - target) ** 2), 0 * target, gradient=lambda z: 2 * np.conj(z - target))
     assert np.allclose(own.x, target)
 
 
 def test_a_foreign_loss_with_its_own_gradient():
-    best = dp.minimise(lambda x: float(np.sum((x - 3.0) ** 2)), np.ones(4), gradient=lambda x: 2 * (x - 3.0))
+    best = dp.minimize(lambda x: float(np.sum((x - 3.0) ** 2)), np.ones(4), gradient=lambda x: 2 * (x - 3.0))
     assert best.converged and np.allclose(best.x, 3)
 
 
 def test_start_at_the_minimum_and_no_iterations():
-    best = dp.minimise(bowl, np.full(3, 3.0))
+    best = dp.minimize(bowl, np.full(3, 3.0))
     assert best.converged and best.message == "converged: the gradient is 0" and best.evaluations == 1
-    best = dp.minimise(bowl, np.ones(3), maxiter=0)
+    best = dp.minimize(bowl, np.ones(3), maxiter=0)
     assert best.value == 12 and len(best.history) == 1 and not best.converged
     assert best.message == "stopped after 0 iterations, as maxiter asks"
 
 
 def test_a_large_offset_ends_in_rounding():
-    best = dp.minimise(lambda x: 1e8 + valley(x), np.array([-1.2, 1.0]), tolerance=0)
+    best = dp.minimize(lambda x: 1e8 + valley(x), np.array([-1.2, 1.0]), tolerance=0)
     assert best.converged and "cannot fall further" in best.message
     assert np.allclose(best.x, 1, atol=1e-3)
-    descent = dp.minimise(lambda x: 1e8 + bowl(x), np.ones(2), "gd", rate=0.4, line_search="backtracking", tolerance=0)
+    descent = dp.minimize(lambda x: 1e8 + bowl(x), np.ones(2), "gd", rate=0.4, line_search="backtracking", tolerance=0)
     assert descent.converged and np.allclose(descent.x, 3, atol=1e-3)
 
 
@@ -145,7 +145,7 @@ def test_a_large_offset_ends_in_rounding():
 
 @pytest.mark.parametrize("error", [UnstableStepError, ConvergenceError, NonFiniteError])
 def test_the_search_goes_past_refused_points(error):
-    best = dp.minimise(walled(valley, 1.0005, error), np.zeros(5))
+    best = dp.minimize(walled(valley, 1.0005, error), np.zeros(5))
     assert best.converged and np.allclose(best.x, 1, atol=1e-4)
     assert refused(best) and set(refused(best)) == {(error.__name__, "beyond 1.0005")}
     assert "refused: " + error.__name__ in str(best) or len(best.history) > 13
@@ -154,13 +154,13 @@ def test_the_search_goes_past_refused_points(error):
 def test_many_walls(rng):
     for _ in range(5):
         reach = 1 + 10 ** rng.uniform(-3, -0.5)
-        best = dp.minimise(walled(valley, reach), rng.uniform(-0.9, 0.9, 6), maxiter=300)
+        best = dp.minimize(walled(valley, reach), rng.uniform(-0.9, 0.9, 6), maxiter=300)
         assert best.converged and np.max(np.abs(best.x)) <= reach
 
 
 @pytest.mark.parametrize("method, options", [("lbfgs", {}), ("gd", {}), ("gd", {"rate": 0.3}), ("adam", {"rate": 0.1})])
 def test_a_minimum_behind_the_wall(method, options):
-    best = dp.minimise(walled(bowl, 1.0), np.zeros(3), method, maxiter=60, **options)
+    best = dp.minimize(walled(bowl, 1.0), np.zeros(3), method, maxiter=60, **options)
     assert np.all(best.x <= 1.0) and np.allclose(best.x, 1, atol=1e-3)
     assert not best.converged and refused(best)
     assert all(np.isfinite(record.value) for record in best.history)
@@ -168,14 +168,14 @@ def test_a_minimum_behind_the_wall(method, options):
 
 def test_nan_without_an_error_is_refused_too():
     with np.errstate(all="ignore"):
-        best = dp.minimise(lambda x: anp.sum(x) - 1e-3 * anp.sum(anp.log(x)), np.ones(5))
+        best = dp.minimize(lambda x: anp.sum(x) - 1e-3 * anp.sum(anp.log(x)), np.ones(5))
     assert np.allclose(best.x, 1e-3, rtol=1e-4)
     assert {failure.error for failure in refused(best)} == {"NonFiniteError"}
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "gd"])
 def test_a_wrong_gradient_is_hinted_at(method):
-    best = dp.minimise(bowl, np.ones(5), method, gradient=lambda x: -2 * (x - 3.0))
+    best = dp.minimize(bowl, np.ones(5), method, gradient=lambda x: -2 * (x - 3.0))
     assert not best.converged and np.array_equal(best.x, np.ones(5))
     assert "dp.check.gradient(loss, x) tells whether the gradient is right" in best.message
 
@@ -184,7 +184,7 @@ def test_a_wrong_gradient_is_hinted_at(method):
 
 
 def test_history_and_text():
-    best = dp.minimise(valley, np.array([-1.2, 1.0]))
+    best = dp.minimize(valley, np.array([-1.2, 1.0]))
     assert [record.iteration for record in best.history] == list(range(len(best.history)))
     assert best.history[0].value == valley(np.array([-1.2, 1.0]))
     assert best.history[-1].evaluations == best.evaluations
@@ -196,9 +196,9 @@ def test_history_and_text():
 
 
 def test_tolerance_as_number_and_as_rule():
-    loose, tight = (dp.minimise(valley, np.array([-1.2, 1.0]), tolerance=t) for t in (1e-2, 1e-10))
+    loose, tight = (dp.minimize(valley, np.array([-1.2, 1.0]), tolerance=t) for t in (1e-2, 1e-10))
     assert loose.converged and tight.converged and loose.evaluations < tight.evaluations
-    rule = dp.minimise(valley, np.array([-1.2, 1.0]), tolerance=lambda record, first: record.value < 0.1 * first.value)
+    rule = dp.minimize(valley, np.array([-1.2, 1.0]), tolerance=lambda record, first: record.value < 0.1 * first.value)
     assert rule.converged and len(rule.history) < len(tight.history)
 
 
@@ -209,21 +209,21 @@ def test_callback_stops():
         seen.append((record.iteration, valley(x) == record.value))
         return record.iteration == 3
 
-    best = dp.minimise(valley, np.array([-1.2, 1.0]), callback=callback)
+    best = dp.minimize(valley, np.array([-1.2, 1.0]), callback=callback)
     assert seen == [(1, True), (2, True), (3, True)]
     assert best.message == "stopped by the callback" and not best.converged
 
 
 def test_progress_bar(capsys, monkeypatch):
     pytest.importorskip("tqdm")
-    dp.minimise(walled(valley, 1.3), np.array([-1.2, 1.0]), maxiter=3, progress="fit")
+    dp.minimize(walled(valley, 1.3), np.array([-1.2, 1.0]), maxiter=3, progress="fit")
     shown = capsys.readouterr()
     assert "fit" in shown.err and "loss" in shown.err and shown.out == ""
     monkeypatch.setitem(sys.modules, "tqdm", None)
     with pytest.raises(
         ImportError, match=r"a progress bar needs tqdm; install sparsedp\[plot\], or leave progress out"
     ):
-        dp.minimise(bowl, np.ones(2), progress=True)
+        dp.minimize(bowl, np.ones(2), progress=True)
 
 
 def test_states_are_values_that_can_be_resumed():

@@ -17,7 +17,7 @@ def progress_bar(wanted, total):
         from tqdm import tqdm
     except ImportError as error:
         raise ImportError("a progress bar needs tqdm; install sparsedp[plot], or leave progress out") from error
-    return Bar(tqdm(total=total, desc=wanted if isinstance(wanted, str) else "minimise", leave=True))
+    return Bar(tqdm(total=total, desc=wanted if isinstance(wanted, str) else "minimize", leave=True))
 
 
 class Silence:

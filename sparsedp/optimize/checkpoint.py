@@ -1,4 +1,4 @@
-"""States of an optimisation on disk: written whole or not at all, checked when read."""
+"""States of an optimization on disk: written whole or not at all, checked when read."""
 
 import hashlib
 import io
@@ -13,7 +13,7 @@ from sparsedp.tree import flatten
 
 __all__ = ["Checkpoint", "Found", "digest", "fingerprint"]
 
-FORMAT = "sparsedp optimisation 1"
+FORMAT = "sparsedp optimization 1"
 KEPT = 2
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import is_whole
-from sparsedp.optimise.trials import Stuck, Trial, power_of_two
+from sparsedp.optimize.trials import Stuck, Trial, power_of_two
 from sparsedp.tree import norm
 
 __all__ = ["NewtonCG", "NewtonState"]
@@ -90,7 +90,7 @@ class _Model:
         return self._masked(self._product(d) / self._height)
 
     def step(self, radius):
-        """Minimiser of the model within the radius -> step, predicted fall of the loss, whether it is on the edge."""
+        """Minimizer of the model within the radius -> step, predicted fall of the loss, whether it is on the edge."""
         p, bent, edge = self._steihaug(radius)
         return p, -float(np.dot(self._slope, p) + 0.5 * np.dot(p, bent)) * self._height, edge
 

@@ -79,7 +79,7 @@ def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
 
 
 class PhysicalGradient:
-    """The method of minimise: gradient descent with rate 1 on x, through the inverse simulator.
+    """The method of minimize: gradient descent with rate 1 on x, through the inverse simulator.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class PhysicalGradient:
     def __init__(self, physics=None, inverse=None, rate=1.0):
         if physics is None or inverse is None:
             raise TypeError(
-                "physical_gradient needs physics and inverse; write minimise(loss_of_y, x, 'physical_gradient', "
+                "physical_gradient needs physics and inverse; write minimize(loss_of_y, x, 'physical_gradient', "
                 "physics=f, inverse=f_inverse)"
             )
         self.rule = physical_gradient(physics, inverse, rate)

@@ -1,25 +1,25 @@
-"""minimise(): the loop around every method."""
+"""minimize(): the loop around every method."""
 
 import inspect
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_function, is_number, is_whole
-from sparsedp.optimise.batches import Batches
-from sparsedp.optimise.box import Box
-from sparsedp.optimise.first_order import Adam, Descent
-from sparsedp.optimise.flat import Packing
-from sparsedp.optimise.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
-from sparsedp.optimise.newton import NewtonCG
-from sparsedp.optimise.physical import PhysicalGradient
-from sparsedp.optimise.progress import progress_bar
-from sparsedp.optimise.quasi_newton import Quasi
-from sparsedp.optimise.result import Minimum
-from sparsedp.optimise.resume import Journal
-from sparsedp.optimise.trials import Stuck, Trials
-from sparsedp.optimise.watch import Watch
+from sparsedp.optimize.batches import Batches
+from sparsedp.optimize.box import Box
+from sparsedp.optimize.first_order import Adam, Descent
+from sparsedp.optimize.flat import Packing
+from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
+from sparsedp.optimize.newton import NewtonCG
+from sparsedp.optimize.physical import PhysicalGradient
+from sparsedp.optimize.progress import progress_bar
+from sparsedp.optimize.quasi_newton import Quasi
+from sparsedp.optimize.result import Minimum
+from sparsedp.optimize.resume import Journal
+from sparsedp.optimize.trials import Stuck, Trials
+from sparsedp.optimize.watch import Watch
 from sparsedp.tree import leaves
 
-__all__ = ["minimise"]
+__all__ = ["minimize"]
 
 METHODS = {
     "lbfgs": Quasi,
@@ -33,7 +33,7 @@ METHODS = {
 }
 
 
-def minimise(
+def minimize(
     loss,
     start,
     method="lbfgs",
@@ -54,7 +54,7 @@ def minimise(
     ----------
     loss : callable
         ``loss(x) -> real scalar``; with batches ``loss(x, batch)``. For gauss_newton, levenberg_marquardt and
-        half_inverse it returns residuals, an array, and half the sum of their squares is minimised. For
+        half_inverse it returns residuals, an array, and half the sum of their squares is minimized. For
         physical_gradient it is a function of the end state ``physics(x)``.
     start : array, number, or any nesting of them in tuples, lists and dicts
         Not modified. Leaves that are not floating stay as they are.
@@ -120,20 +120,20 @@ def minimise(
     --------
     >>> import autograd.numpy as anp
     >>> import numpy as np
-    >>> best = minimise(lambda x: anp.sum((x["a"] - 3.0) ** 2), {"a": np.zeros(2), "n": 7})
+    >>> best = minimize(lambda x: anp.sum((x["a"] - 3.0) ** 2), {"a": np.zeros(2), "n": 7})
     >>> best.x
     {'a': array([3., 3.]), 'n': 7}
     >>> best.converged
     True
     """
-    check_function("minimise", loss, "lambda x: np.sum(x**2)")
+    check_function("minimize", loss, "lambda x: np.sum(x**2)")
     if callback is not None:
-        check_function("callback of minimise", callback, "lambda record, x: False")
+        check_function("callback of minimize", callback, "lambda record, x: False")
     stepper = _stepper(method, options)
     if not is_whole(maxiter, 0):
-        raise ValueError(f"minimise needs maxiter >= 0, a whole number, got {maxiter!r}; the default is 100")
+        raise ValueError(f"minimize needs maxiter >= 0, a whole number, got {maxiter!r}; the default is 100")
     if not callable(tolerance) and not (is_number(tolerance) and tolerance >= 0):
-        raise ValueError(f"minimise needs a tolerance >= 0, got {tolerance!r}; the default is 1e-8")
+        raise ValueError(f"minimize needs a tolerance >= 0, got {tolerance!r}; the default is 1e-8")
     if hasattr(tolerance, "inside"):  # it takes part in the evaluations
         if checkpoint is not None:
             raise ValueError(

@@ -37,18 +37,18 @@ TIMES = np.linspace(0, 2, 30)
 def test_few_unknowns_go_forward_and_few_residuals_in_reverse(rng, method):
     tall = Counted()
     data = 3 * np.exp(-1.3 * TIMES) + 0.1 * rng.standard_normal(30)
-    best = dp.minimise(lambda x: x[0] * tall.rule(-x[1] * TIMES) - data, np.ones(2), method)
+    best = dp.minimize(lambda x: x[0] * tall.rule(-x[1] * TIMES) - data, np.ones(2), method)
     assert best.converged and tall.reverse <= 1  # the gradient at the start, before the shape is known
     assert tall.forward <= 2 * len(best.history)  # the covariance takes the last Jacobian
     wide, matrix = Counted(), rng.standard_normal((3, 20))
-    best = dp.minimise(lambda x: anp.dot(matrix, wide.rule(x)) - 1.0, np.zeros(20), method)
+    best = dp.minimize(lambda x: anp.dot(matrix, wide.rule(x)) - 1.0, np.zeros(20), method)
     assert best.value < 1e-12 and wide.forward == 0 and wide.reverse >= 3 * (len(best.history) - 1)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_rule_without_a_forward_derivative(rng, method):
     data = 3 * np.exp(-1.3 * TIMES) + 0.1 * rng.standard_normal(30)
-    fit = lambda rule: dp.minimise(lambda x: x[0] * rule(-x[1] * TIMES) - data, np.ones(2), method)
+    fit = lambda rule: dp.minimize(lambda x: x[0] * rule(-x[1] * TIMES) - data, np.ones(2), method)
     with_it, without = fit(Counted().rule), fit(Counted(jvp=False).rule)
     assert np.allclose(with_it.x, without.x, rtol=1e-9) and np.allclose(with_it.covariance, without.covariance)
 
@@ -63,7 +63,7 @@ def test_lotka_volterra(rng):
     path = lambda p: dp.rollout(step, np.array([1.0, 0.5]), p, 200, keep="all")[::10].ravel()
     data = path(np.array([1.0, 0.8, 0.6])) + 0.02 * rng.standard_normal(42)
     start, passes = np.array([0.9, 0.9, 0.7]), []
-    best = dp.minimise(lambda p: passes.append(p) or path(p) - data, start, "levenberg_marquardt")
+    best = dp.minimize(lambda p: passes.append(p) or path(p) - data, start, "levenberg_marquardt")
     known, spread = curve_fit(lambda _, *p: path(np.array(p)), np.arange(42.0), data, start, xtol=1e-12, ftol=1e-12)
     assert best.converged and np.allclose(best.x, known, rtol=1e-6)
     assert np.allclose(best.covariance, spread, rtol=1e-4)
@@ -74,7 +74,7 @@ def test_lotka_volterra(rng):
 def test_rejected_points_take_no_derivative():
     rule = Counted()
     loss = lambda x: rule.rule(x * TIMES) - np.exp(TIMES)
-    best = dp.minimise(loss, np.array([-2.0]), "levenberg_marquardt")  # the first steps are far too long
+    best = dp.minimize(loss, np.array([-2.0]), "levenberg_marquardt")  # the first steps are far too long
     assert best.converged and np.allclose(best.x, 1)
     assert best.evaluations > len(best.history) >= rule.forward - 1
 
@@ -90,7 +90,7 @@ def test_covariance_by_hand_and_as_curve_fit_has_it(rng, method, scale):
     data = model(TIMES, *(np.array([3.0, 1.3, 0.5]) * sizes)) + 0.1 * rng.standard_normal(30)
     loss = lambda x: x["a"] / sizes[0] * anp.exp(-x["b"][0] / sizes[1] * TIMES) + x["b"][1] / sizes[2] - data
     start = {"a": 2.5, "n": 7, "b": np.array([1.0, 0.4]) * sizes[1:]}
-    best = dp.minimise(loss, start, method, maxiter=300, tolerance=1e-10)
+    best = dp.minimize(loss, start, method, maxiter=300, tolerance=1e-10)
     a, (b, _) = best.x["a"], best.x["b"]
     jacobian = np.stack([np.exp(-b / sizes[1] * TIMES), -a * TIMES * np.exp(-b / sizes[1] * TIMES), np.ones(30)], 1)
     by_hand = np.linalg.inv(jacobian.T @ jacobian) * 2 * best.value / 27 * np.outer(sizes, sizes)
@@ -102,14 +102,14 @@ def test_covariance_by_hand_and_as_curve_fit_has_it(rng, method, scale):
 
 def test_covariance_where_it_is_not_known(rng):
     data, matrix = rng.standard_normal(10), rng.standard_normal((10, 3))
-    run = lambda columns, loss=None, **options: dp.minimise(
+    run = lambda columns, loss=None, **options: dp.minimize(
         loss or (lambda x: anp.dot(columns, x) - data), np.zeros(columns.shape[1]), "levenberg_marquardt", **options
     )
     assert np.all(np.isinf(run(matrix[:, [0, 1, 1]]).covariance))
     assert np.all(np.isinf(run(matrix * [1.0, 1.0, 0.0]).covariance))
     assert run(rng.standard_normal((10, 10))).covariance is None  # no residual is left over
     assert run(matrix, dense=False).covariance is None
-    assert dp.minimise(lambda x: anp.sum(x**2), np.ones(2)).covariance is None
+    assert dp.minimize(lambda x: anp.sum(x**2), np.ones(2)).covariance is None
     known = run(matrix).covariance
     assert np.allclose(known, np.linalg.inv(matrix.T @ matrix) * least_squares(
         lambda x: matrix @ x - data, np.zeros(3)).cost * 2 / 7)  # fmt: skip

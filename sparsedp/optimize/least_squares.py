@@ -10,10 +10,10 @@ import scipy.linalg
 from scipy.sparse.linalg import LinearOperator, lsmr
 
 from sparsedp.fields import is_number
-from sparsedp.optimise.directions import DENSE, Family
-from sparsedp.optimise.first_order import HALVINGS, admissible, backtracked
-from sparsedp.optimise.singular_values import decomposed
-from sparsedp.optimise.trials import Stuck, Trial
+from sparsedp.optimize.directions import DENSE, Family
+from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked
+from sparsedp.optimize.singular_values import decomposed
+from sparsedp.optimize.trials import Stuck, Trial
 from sparsedp.tree import norm
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]

@@ -1,8 +1,8 @@
-"""What an optimisation gives back: the best point, the history, and the reason it stopped."""
+"""What an optimization gives back: the best point, the history, and the reason it stopped."""
 
 from typing import Any, NamedTuple
 
-from sparsedp.optimise.trials import Failure
+from sparsedp.optimize.trials import Failure
 
 __all__ = ["Minimum", "Record"]
 
@@ -26,7 +26,7 @@ class Record(NamedTuple):
 
 
 class Minimum:
-    """The result of `minimise`. Frozen.
+    """The result of `minimize`. Frozen.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Minimum:
         self.__dict__.update(resumed=resumed, covariance=covariance)
 
     def __setattr__(self, name, value):
-        raise AttributeError(f"the result of minimise is frozen; {name} cannot be set")
+        raise AttributeError(f"the result of minimize is frozen; {name} cannot be set")
 
     def __str__(self):
         last = self.history[-1]

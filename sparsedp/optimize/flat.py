@@ -41,7 +41,7 @@ class Packing:
         self._found, self._rebuild = flatten(tree)
         self._places = [place for place, leaf in enumerate(self._found) if is_variable(leaf)]
         if not self._places:
-            raise DerivativeError("minimise needs floating values in start, and found none; write start.astype(float)")
+            raise DerivativeError("minimize needs floating values in start, and found none; write start.astype(float)")
         leaves = [np.asarray(self._found[place]) for place in self._places]
         self.size = sum(map(self._width, leaves))
         self.complex = any(map(np.iscomplexobj, leaves))

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.optimise.trials import Trial
+from sparsedp.optimize.trials import Trial
 
 __all__ = ["line_search"]
 

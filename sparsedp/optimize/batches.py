@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from sparsedp.optimise.checkpoint import fingerprint
+from sparsedp.optimize.checkpoint import fingerprint
 
 __all__ = ["Batches"]
 

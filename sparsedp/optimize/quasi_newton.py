@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import is_whole
-from sparsedp.optimise.quadratic import Quadratic
-from sparsedp.optimise.trials import Stuck, Trial, power_of_two
-from sparsedp.optimise.wolfe import line_search
+from sparsedp.optimize.quadratic import Quadratic
+from sparsedp.optimize.trials import Stuck, Trial, power_of_two
+from sparsedp.optimize.wolfe import line_search
 from sparsedp.tree import norm
 
 __all__ = ["Quasi", "QuasiState"]

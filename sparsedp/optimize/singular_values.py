@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg.lapack import dsyevd
 
 from sparsedp.errors import NonFiniteError
-from sparsedp.optimise.trials import power_of_two
+from sparsedp.optimize.trials import power_of_two
 
 __all__ = ["Singular", "decomposed", "singular"]
 

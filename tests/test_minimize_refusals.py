@@ -1,4 +1,4 @@
-"""What minimise() refuses, and what it says."""
+"""What minimize() refuses, and what it says."""
 
 import autograd.numpy as anp
 import numpy as np
@@ -14,7 +14,7 @@ def bowl(x):
 
 def foreign(value, gradient):
     """A run on a loss that is not traced."""
-    return dp.minimise(lambda x: value(x), np.ones(2), gradient=gradient)
+    return dp.minimize(lambda x: value(x), np.ones(2), gradient=gradient)
 
 
 def test_errors_at_the_start_are_not_hidden():
@@ -22,9 +22,9 @@ def test_errors_at_the_start_are_not_hidden():
         raise UnstableStepError("beyond 0.5")
 
     with pytest.raises(UnstableStepError, match="beyond 0.5"):
-        dp.minimise(refuse, np.ones(2))
+        dp.minimize(refuse, np.ones(2))
     with pytest.raises(KeyError):
-        dp.minimise(lambda x: {}["no such"], np.ones(2))
+        dp.minimize(lambda x: {}["no such"], np.ones(2))
     with pytest.raises(
         NonFiniteError, match="the loss is nan; it must be finite at the start, and elsewhere it is avoided"
     ):
@@ -36,58 +36,58 @@ def test_errors_at_the_start_are_not_hidden():
         foreign(lambda x: 1.0, lambda x: x * np.nan)
     with pytest.raises(NonFiniteError, match=r"^leaf 1 of the gradient must be finite .*, the first at \(0, 1\)$"):
         start = {"a": 1.0, "b": np.ones((2, 2))}
-        dp.minimise(lambda x: 1.0, start, gradient=lambda x: {"a": 1.0, "b": np.array([[1, np.nan], [1, 1]])})
+        dp.minimize(lambda x: 1.0, start, gradient=lambda x: {"a": 1.0, "b": np.array([[1, np.nan], [1, 1]])})
 
 
 def test_methods_and_options():
     with pytest.raises(
         ValueError, match="method must be one of lbfgs, gd, adam, newton_cg, .*, physical_gradient, got 'newton'"
     ):
-        dp.minimise(bowl, np.ones(2), "newton")
+        dp.minimize(bowl, np.ones(2), "newton")
     with pytest.raises(TypeError, match="lbfgs has no option 'rate'; it has memory, line_search"):
-        dp.minimise(bowl, np.ones(2), rate=1.0)
-    with pytest.raises(ValueError, match="minimise needs maxiter >= 0, a whole number, got -1; the default is 100"):
-        dp.minimise(bowl, np.ones(2), maxiter=-1)
-    with pytest.raises(ValueError, match="minimise needs maxiter >= 0, a whole number, got True; the default is 100"):
-        dp.minimise(bowl, np.ones(2), maxiter=True)
-    with pytest.raises(ValueError, match="minimise needs maxiter >= 0, a whole number, got None; the default is 100"):
-        dp.minimise(bowl, np.ones(2), maxiter=None)
-    with pytest.raises(ValueError, match="minimise needs a tolerance >= 0, got nan; the default is 1e-8"):
-        dp.minimise(bowl, np.ones(2), tolerance=np.nan)
-    with pytest.raises(ValueError, match="minimise needs a tolerance >= 0, got 'a'; the default is 1e-8"):
-        dp.minimise(bowl, np.ones(2), tolerance="a")
+        dp.minimize(bowl, np.ones(2), rate=1.0)
+    with pytest.raises(ValueError, match="minimize needs maxiter >= 0, a whole number, got -1; the default is 100"):
+        dp.minimize(bowl, np.ones(2), maxiter=-1)
+    with pytest.raises(ValueError, match="minimize needs maxiter >= 0, a whole number, got True; the default is 100"):
+        dp.minimize(bowl, np.ones(2), maxiter=True)
+    with pytest.raises(ValueError, match="minimize needs maxiter >= 0, a whole number, got None; the default is 100"):
+        dp.minimize(bowl, np.ones(2), maxiter=None)
+    with pytest.raises(ValueError, match="minimize needs a tolerance >= 0, got nan; the default is 1e-8"):
+        dp.minimize(bowl, np.ones(2), tolerance=np.nan)
+    with pytest.raises(ValueError, match="minimize needs a tolerance >= 0, got 'a'; the default is 1e-8"):
+        dp.minimize(bowl, np.ones(2), tolerance="a")
 
 
 def test_ranges_of_options():
     with pytest.raises(
         ValueError, match="lbfgs needs memory >= 1 and line_search >= 2, got 0 and 20; write whole numbers"
     ):
-        dp.minimise(bowl, np.ones(2), memory=0)
+        dp.minimize(bowl, np.ones(2), memory=0)
     with pytest.raises(ValueError, match="gd needs a positive rate, got -1; leave it out and it is searched for"):
-        dp.minimise(bowl, np.ones(2), "gd", rate=-1)
+        dp.minimize(bowl, np.ones(2), "gd", rate=-1)
     with pytest.raises(ValueError, match="gd needs a momentum from 0 to below 1, got 1; leave it out for none"):
-        dp.minimise(bowl, np.ones(2), "gd", momentum=1)
+        dp.minimize(bowl, np.ones(2), "gd", momentum=1)
     with pytest.raises(
         ValueError, match="gd has no line search 'wolfe'; write line_search='backtracking' or leave it out"
     ):
-        dp.minimise(bowl, np.ones(2), "gd", line_search="wolfe")
+        dp.minimize(bowl, np.ones(2), "gd", line_search="wolfe")
     with pytest.raises(ValueError, match="adam needs a positive rate, got 0; the default is 1e-3"):
-        dp.minimise(bowl, np.ones(2), "adam", rate=0)
+        dp.minimize(bowl, np.ones(2), "adam", rate=0)
     with pytest.raises(ValueError, match="adam needs a positive rate, got None; the default is 1e-3"):
-        dp.minimise(bowl, np.ones(2), "adam", rate=None)
+        dp.minimize(bowl, np.ones(2), "adam", rate=None)
     with pytest.raises(ValueError, match="adam needs a positive epsilon, got 0; the default is 1e-8"):
-        dp.minimise(bowl, np.ones(2), "adam", epsilon=0)
+        dp.minimize(bowl, np.ones(2), "adam", epsilon=0)
     with pytest.raises(
         ValueError, match=r"adam needs two betas from 0 to below 1, got \(1, 2\); the default is \(0.9, 0.999\)"
     ):
-        dp.minimise(bowl, np.ones(2), "adam", betas=(1, 2))
+        dp.minimize(bowl, np.ones(2), "adam", betas=(1, 2))
 
 
 def test_losses_and_gradients():
     with pytest.raises(
-        DerivativeError, match=r"minimise needs floating values in start, and found none; write start.astype\(float\)"
+        DerivativeError, match=r"minimize needs floating values in start, and found none; write start.astype\(float\)"
     ):
-        dp.minimise(bowl, np.arange(3))
+        dp.minimize(bowl, np.arange(3))
     with pytest.raises(ShapeError, match=r"the loss must be a scalar, got an array of shape \(2,\); sum it"):
         foreign(lambda x: x, lambda x: x)
     with pytest.raises(DerivativeError, match="the gradient has 2 leaves where start has 1; return a tree like start"):
@@ -102,7 +102,7 @@ def test_losses_and_gradients():
 def test_the_result_is_frozen_and_shares_nothing():
     x = np.ones(3)
     x.flags.writeable = False
-    best = dp.minimise(bowl, x)
+    best = dp.minimize(bowl, x)
     assert not np.may_share_memory(best.x, x) and best.x.flags.writeable
-    with pytest.raises(AttributeError, match="the result of minimise is frozen; x cannot be set"):
+    with pytest.raises(AttributeError, match="the result of minimize is frozen; x cannot be set"):
         best.x = 1

@@ -1,4 +1,4 @@
-"""What the optimisers refuse: each message, whole."""
+"""What the optimizers refuse: each message, whole."""
 
 import re
 
@@ -11,7 +11,7 @@ from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 
 
 def run(loss=lambda x: anp.sum(x**2), start=(0.5, 0.5), method="lbfgs", **options):
-    return lambda: dp.minimise(loss, np.array(start), method, **options)
+    return lambda: dp.minimize(loss, np.array(start), method, **options)
 
 
 def direction(outputs=lambda u: u, x=(1.0, 1.0), g=None, **options):
@@ -87,7 +87,7 @@ WRONG = [
     (run(method="half_inverse", rate=0), ValueError, "half_inverse needs a positive rate, got 0; the default is 1"),
     (
         run(method="physical_gradient"), TypeError,
-        "physical_gradient needs physics and inverse; write minimise(loss_of_y, x, 'physical_gradient', physics=f, "
+        "physical_gradient needs physics and inverse; write minimize(loss_of_y, x, 'physical_gradient', physics=f, "
         "inverse=f_inverse)",
     ),
     (

@@ -6,9 +6,9 @@ import numpy as np
 
 from sparsedp.derivative import pullback, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.optimise.batches import Batches
-from sparsedp.optimise.box import Box
-from sparsedp.optimise.linearised import Linearised, Restricted
+from sparsedp.optimize.batches import Batches
+from sparsedp.optimize.box import Box
+from sparsedp.optimize.linearised import Linearised, Restricted
 from sparsedp.tape import isbox
 
 __all__ = ["Failure", "Stuck", "Trial", "Trials", "power_of_two"]

@@ -1,13 +1,13 @@
-"""A run of minimise written down as it goes, and taken up again."""
+"""A run of minimize written down as it goes, and taken up again."""
 
 import time
 from typing import Any
 
 import numpy as np
 
-from sparsedp.optimise.checkpoint import Checkpoint, digest, fingerprint
-from sparsedp.optimise.result import Record
-from sparsedp.optimise.trials import Failure
+from sparsedp.optimize.checkpoint import Checkpoint, digest, fingerprint
+from sparsedp.optimize.result import Record
+from sparsedp.optimize.trials import Failure
 from sparsedp.tree import flatten
 
 __all__ = ["Journal"]

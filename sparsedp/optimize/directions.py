@@ -11,9 +11,9 @@ import numpy as np
 import scipy.linalg
 
 from sparsedp.fields import check_function, is_number
-from sparsedp.optimise.flat import Packing
-from sparsedp.optimise.linearised import Linearised
-from sparsedp.optimise.singular_values import decomposed
+from sparsedp.optimize.flat import Packing
+from sparsedp.optimize.linearised import Linearised
+from sparsedp.optimize.singular_values import decomposed
 
 __all__ = ["Direction", "Family", "update_direction"]
 
@@ -248,7 +248,7 @@ def update_direction(outputs, x, g=None, **options):
     **options
         power=0.75 (0: gradient, 3/4: half-inverse, 1: Gauss-Newton), damping=0.0, truncation=1e-10,
         method="auto" | "dense" | "krylov", rank=None, apart=False. truncation: singular values below this share
-        of the largest are left out; rank: at most so many are kept; apart: as in `minimise`.
+        of the largest are left out; rank: at most so many are kept; apart: as in `minimize`.
 
     Returns
     -------

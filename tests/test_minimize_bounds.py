@@ -8,7 +8,7 @@ from scipy.optimize import minimize, rosen_der
 import sparsedp as dp
 from benchmarks.bounded import PROBLEMS, compared
 from sparsedp.errors import UnstableStepError
-from sparsedp.optimise.quadratic import Quadratic
+from sparsedp.optimize.quadratic import Quadratic
 from sparsedp.tape import plain
 
 
@@ -44,7 +44,7 @@ def test_without_a_memory_the_step_is_steepest_descent():
 @pytest.mark.parametrize("n, k", [(6, 3), (12, 7), (40, 5)])
 def test_the_path_stops_at_its_first_minimum_and_the_step_is_no_worse(rng, monkeypatch, n, k):
     """By brute force; some entries at a bound, some far from it, and a few breakpoints at a time."""
-    monkeypatch.setattr("sparsedp.optimise.quadratic.BLOCK", 4)
+    monkeypatch.setattr("sparsedp.optimize.quadratic.BLOCK", 4)
     for _ in range(40):
         steps, changes, dense = memory(rng, n, k)
         g = rng.standard_normal(n)
@@ -85,9 +85,9 @@ def valley(x):
 
 def test_bounds_at_all_scales(rng):
     start, upper = rng.uniform(-1, 0.4, 20), np.where(np.arange(20) % 3, 2.0, 0.5)
-    plain_run = dp.minimise(valley, start, bounds=(-1.5, upper))
+    plain_run = dp.minimize(valley, start, bounds=(-1.5, upper))
     for height, length in ((2.0**600, 1.0), (2.0**-600, 1.0), (1.0, 2.0**400), (2.0**-300, 2.0**-300)):
-        scaled = dp.minimise(
+        scaled = dp.minimize(
             lambda x, height=height, length=length: height * valley(x / length),
             length * start, bounds=(-1.5 * length, upper * length),
         )  # fmt: skip
@@ -103,19 +103,19 @@ def test_refused_trials_beside_bounds(rng):
         return valley(x)
 
     upper = np.where(np.arange(8) % 4, 2.0, 0.9)
-    best = dp.minimise(walled, np.zeros(8), bounds=(-0.5, upper), maxiter=300)
+    best = dp.minimize(walled, np.zeros(8), bounds=(-0.5, upper), maxiter=300)
     known = minimize(valley, np.zeros(8), jac=rosen_der, bounds=[(-0.5, min(b, 0.95)) for b in upper], tol=1e-15)
     assert best.value == pytest.approx(known.fun, rel=1e-3)
     assert any(record.failed for record in best.history)
 
 
 def test_fixed_entries_corners_and_no_room():
-    best = dp.minimise(valley, np.zeros(4), bounds=(np.array([-1.0, 0.3, -1.0, -1.0]), np.array([2.0, 0.3, 2.0, 2.0])))
+    best = dp.minimize(valley, np.zeros(4), bounds=(np.array([-1.0, 0.3, -1.0, -1.0]), np.array([2.0, 0.3, 2.0, 2.0])))
     known = minimize(valley, [0, 0.3, 0, 0], jac=rosen_der, bounds=[(-1, 2), (0.3, 0.3), (-1, 2), (-1, 2)])
     assert best.x[1] == 0.3 and best.value == pytest.approx(known.fun, rel=1e-6)
-    corner = dp.minimise(lambda x: anp.sum(x), np.array([0.3, 0.9]), bounds=(0.1, 1.0))
+    corner = dp.minimize(lambda x: anp.sum(x), np.array([0.3, 0.9]), bounds=(0.1, 1.0))
     assert np.array_equal(corner.x, [0.1, 0.1]) and corner.converged and corner.evaluations < 5
-    still = dp.minimise(valley, np.full(3, 0.5), bounds=(0.5, 0.5))
+    still = dp.minimize(valley, np.full(3, 0.5), bounds=(0.5, 0.5))
     assert np.array_equal(still.x, np.full(3, 0.5)) and still.converged and still.evaluations == 1
-    single = dp.minimise(valley, np.zeros(4, np.float32), bounds=(-1.0, 0.7))
+    single = dp.minimize(valley, np.zeros(4, np.float32), bounds=(-1.0, 0.7))
     assert single.x.dtype == np.float32 and np.all(single.x <= np.float32(0.7))

@@ -1,1 +1,0 @@
-"""Optimisation over any nesting of arrays: minimise() and its methods."""

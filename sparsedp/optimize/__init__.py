@@ -1,0 +1,1 @@
+"""Optimization over any nesting of arrays: minimize() and its methods."""
