@@ -62,7 +62,7 @@ def tasks(shape, with_matrix):
     }
     found["NumPy slices with out="] = lambda: slices(u, out)
     if with_matrix:
-        matrix = uniform.explicit().matrix
+        matrix = uniform.matrix
         found["scipy CSR"] = lambda: matrix @ u.ravel()
     return found
 

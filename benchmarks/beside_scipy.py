@@ -29,7 +29,7 @@ START = np.array([1.0, 0.0, 0.0, 0.0])
 def allen_cahn(n):
     """(rate, rate by hand, its Jacobian, its derivative in nu, start)."""
     grid = dp.Grid((n, n), size=1.0)
-    op, matrix = dp.laplacian(grid), dp.laplacian(grid).explicit().matrix
+    op, matrix = dp.laplacian(grid), dp.laplacian(grid).matrix
     x, y = grid.centres()
     u = 0.4 * np.cos(np.pi * x) * np.cos(2 * np.pi * y) + 0.1
     return (
@@ -45,7 +45,7 @@ def burgers(n):
     """The same for u' = nu lap u - div(u^2/2), central, periodic."""
     grid = dp.Grid((n, n), size=1.0, periodic=True)
     op, out, mean = dp.laplacian(grid), dp.divergence(grid), dp.average(grid)
-    matrix, D, A = (part.explicit().matrix for part in (op, out, mean))
+    matrix, D, A = (part.matrix for part in (op, out, mean))
     x, y = grid.centres()
     u = np.sin(2 * np.pi * x) * np.cos(2 * np.pi * y) + 0.5
     return (

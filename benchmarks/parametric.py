@@ -32,7 +32,7 @@ def elliptic(shape, method, seed=0, **options):
 def entries(n, method="auto"):
     """matrix_solver with its arguments: the entries of a 2-D Laplacian, made unsymmetric, and data."""
     generator = np.random.default_rng(1)
-    matrix = sp.csr_array((-dp.laplacian(dp.Grid((n, n), size=1.0), dp.dirichlet)).explicit().matrix)
+    matrix = sp.csr_array((-dp.laplacian(dp.Grid((n, n), size=1.0), dp.dirichlet)).matrix)
     data = matrix.data * generator.uniform(0.9, 1.0, matrix.nnz)
     return dp.matrix_solver(matrix, method), [data, generator.standard_normal(n * n)]
 

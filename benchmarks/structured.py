@@ -73,7 +73,7 @@ def peer(hierarchy, b):
 def row(name, shape, repeats):
     """Measure one problem, print its row -> seconds of a solve."""
     op = PROBLEMS[name](shape)
-    matrix, kept = unknowns(op.explicit().matrix)
+    matrix, kept = unknowns(op.matrix)
     b, g = np.zeros((2, prod(shape)))
     b[kept], g[kept] = np.random.default_rng(0).standard_normal((2, kept.size))
     rs_setup, rs = least(lambda: pyamg.ruge_stuben_solver(matrix, **SMOOTH), 1 if prod(shape) > 10**6 else 2)

@@ -36,7 +36,7 @@ def too_long(p):
     return np.mean(dp.rollout(lambda u, p: u + p["dt"] * p["nu"] * L(u), p["start"], p, 20) ** 2)
 
 
-singular = (D @ dp.gradient(square)).explicit().matrix.toarray()
+singular = (D @ dp.gradient(square)).matrix.toarray()
 rough = np.linalg.inv(-singular + 1e-14 * np.diag(1 + np.arange(n * n) / n**2))  # regular by rounding alone
 forgotten = dp.from_matrix(rough, square.cells, square.cells, "pressure without projection")
 found = {

@@ -42,7 +42,7 @@ gradients = []
 for member in (L.explicit(), L.matrix_free()):
     _, apply_time = fastest(member, ink)
     (value, gradient), grad_time = fastest(dp.value_and_grad(scene(member)), ink)
-    stored = member.matrix.nnz if member.matrix is not None else 0
+    stored = member.matrix.nnz if member.form == "explicit" else 0
     gradients.append(gradient)
     print(f"{member.form:>12}  {1e3 * apply_time:10.2f}  {1e3 * grad_time:13.1f}  {stored:14d}  {value:.12f}")
 

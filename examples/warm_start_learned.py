@@ -14,7 +14,7 @@ grid = dp.Grid((n, n))
 box, energy = -dp.laplacian(grid), lambda x, b: np.sum(x * (0.5 * box(x) - b))
 solve = dp.inverse(box, "krylov", diff="unrolled", iterations=k, nullspace="project")  # the tape keeps all k
 *both, direct = (dp.inverse(box, name, 1e-3, nullspace="project") for name in ("krylov", "multigrid", "direct"))
-coarse = dp.prolong(grid, m, "linear").explicit().matrix.toarray().T
+coarse = dp.prolong(grid, m, "linear").matrix.toarray().T
 
 
 def smoke_divergence():

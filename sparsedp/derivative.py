@@ -11,9 +11,10 @@ from sparsedp.fields import check_function, is_whole
 from sparsedp.recipe import Made
 from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
 from sparsedp.traces import backward, forward_root, growing, reverse_root, split_box, trace
-from sparsedp.tree import flatten, leaves
+from sparsedp.tree import flatten
 
-__all__ = ["NO_JVP", "directions", "grad", "pullback", "pushforward", "traced", "value_and_grad", "vjp"]
+__all__ = ["NO_JVP", "directions", "forward", "grad", "pullback", "pushforward", "tangent_of", "traced",
+    "value_and_grad", "vjp", "zero_like"]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
 NO_JVP = (DerivativeError, NotImplementedError)
@@ -147,19 +148,33 @@ def pushforward(fun, x, tangent):
     >>> float(value), float(slope)
     (10.0, 5.0)
     """
-    roots = [
-        forward_root(direction) if is_variable(leaf) else None
-        for leaf, direction in zip(leaves(x), directions(x, tangent), strict=True)
-    ]
+    return forward(fun, x, directions(x, tangent))
+
+
+def forward(fun, x, tangents):
+    """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants)."""
+    roots = [None if tangent is None else forward_root(tangent) for tangent in tangents]
     result, number = traced(fun, x, roots)
     ends, rebuild = flatten(result)
     pairs = [split_box(end, number) for end in ends]
-    values = rebuild(value for value, node in pairs)
-    return values, rebuild(_no_tangent(value) if node is None else node.g for value, node in pairs)
+    slopes = [tangent_of(value, None if node is None else node.g) for value, node in pairs]
+    return rebuild(value for value, _ in pairs), rebuild(slopes)
+
+
+def tangent_of(value, slope):
+    """The tangent of a result: of its dtype; 0 where it does not depend on what moves; None where it has none."""
+    if not is_variable(value):
+        return None
+    return zero_like(value) if slope is None else fit("a rule", value, slope, slope)
+
+
+def zero_like(value):
+    """A plain zero of the shape and dtype of a value, traced or not."""
+    return np.zeros(np.shape(plain(value)), dtype_of(value))[()]
 
 
 def directions(x, tangent):
-    """Leaves of the tangent in the order of those of `x`; entries of dicts are paired by name."""
+    """Tangent of each leaf of `x`, None where it is not floating; entries of dicts are paired by name."""
     if isinstance(x, dict):
         if not isinstance(tangent, dict) or tangent.keys() != x.keys():
             raise ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
@@ -169,7 +184,9 @@ def directions(x, tangent):
             raise ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
         pairs = list(zip(x, tangent, strict=True))
     else:
-        if is_variable(x) and (not _is_array(tangent) or np.shape(tangent) != np.shape(x)):
+        if not is_variable(x):
+            return [None]
+        if not _is_array(tangent) or np.shape(tangent) != np.shape(x):
             raise ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
         return [tangent]
     return [leaf for branch, other in pairs for leaf in directions(branch, other)]
@@ -186,10 +203,6 @@ def _words(tree):
     if isinstance(tree, (tuple, list)):
         return f"a {type(tree).__name__} of length {len(tree)}"
     return f"an array of shape {np.shape(tree)}" if _is_array(tree) else type(tree).__name__
-
-
-def _no_tangent(value):
-    return anp.zeros_like(plain(value)) if is_variable(value) else None
 
 
 def vjp(fun, *x):

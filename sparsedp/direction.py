@@ -1,15 +1,14 @@
 """Derivatives of functions between trees: along tangents that some leaves have, and back from several results."""
 
 import autograd.numpy as anp
-import numpy as np
 
-from sparsedp.derivative import NO_JVP, directions, grad, traced
+from sparsedp.derivative import NO_JVP, directions, forward, grad, tangent_of, traced, zero_like
 from sparsedp.fields import check_function
-from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
-from sparsedp.traces import backward, forward_root, reverse_root, split_box
+from sparsedp.tape import dtype_of, isbox
+from sparsedp.traces import backward, reverse_root, split_box
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["hvp", "jvp", "pull_ends", "push", "zero_like"]
+__all__ = ["hvp", "jvp", "pull_ends", "push"]
 
 
 def jvp(fun, x, tangent):
@@ -44,8 +43,7 @@ def jvp(fun, x, tangent):
     (10.0, 5.0)
     """
     check_function("jvp", fun, "lambda u: ...")
-    moving = [direction if is_variable(leaf) else None for leaf, direction in zip(leaves(x), directions(x, tangent))]
-    return push(fun, x, moving)
+    return push(fun, x, directions(x, tangent))
 
 
 def hvp(loss, x, tangent):
@@ -84,20 +82,11 @@ def push(fun, tree, tangents):
     Forward, or by two reverse passes where a part of `fun` has no JVP.
     """
     try:
-        return _forward(fun, tree, tangents)
+        return forward(fun, tree, tangents)
     except NO_JVP:
         if any(dtype_of(t).kind == "c" for t in tangents if t is not None):
             raise
         return _twice_reverse(fun, tree, tangents)
-
-
-def _forward(fun, tree, tangents):
-    roots = [None if tangent is None else forward_root(tangent) for tangent in tangents]
-    result, number = traced(fun, tree, roots)
-    found, rebuild = flatten(result)
-    parts = [split_box(leaf, number) for leaf in found]
-    slopes = [_tangent(value, None if node is None else node.g) for value, node in parts]
-    return rebuild(value for value, _ in parts), rebuild(slopes)
 
 
 def _twice_reverse(fun, tree, tangents):
@@ -121,19 +110,8 @@ def _twice_reverse(fun, tree, tangents):
     known = dict(zip(used, starts, strict=True))
     values = [value for value, _ in parts]
     return rebuild(values), rebuild(
-        _tangent(value, slopes.get(known[place]) if place in known else None) for place, value in enumerate(values)
+        tangent_of(value, slopes.get(known[place]) if place in known else None) for place, value in enumerate(values)
     )
-
-
-def _tangent(value, slope):
-    if not is_variable(value):
-        return None
-    return zero_like(value) if slope is None else fit("a rule", value, slope, slope)
-
-
-def zero_like(value):
-    """A plain zero of the shape and dtype of a value, traced or not."""
-    return np.zeros(np.shape(plain(value)), dtype_of(value))[()]
 
 
 class _Ends:

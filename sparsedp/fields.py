@@ -27,12 +27,16 @@ __all__ = [
 FLOAT = np.dtype(float)
 
 
-def field_array(op, u):
-    """Argument of an operator -> contiguous native array of float32, float64 or a complex kind."""
+def field_array(op, u, batch=False):
+    """Argument of an operator -> contiguous native array of float32, float64 or a complex kind.
+
+    batch: leading axes are allowed, one field for each of their entries.
+    """
     if type(u) is not np.ndarray:
         check_plain(op.name, u)
         u = _array(op, u)
-    if u.shape != op.domain.shape:
+    shape = op.domain.shape
+    if u.shape != shape and not (batch and u.shape[-len(shape) :] == shape):
         raise ShapeError(f"{op.name} takes a field on {op.domain.told}, got an array of shape {u.shape}")
     if u.dtype.char not in "dfDF":
         if u.dtype.kind not in "biu":
@@ -57,12 +61,12 @@ def check_plain(name, *values):
         raise TypeError(f"{name} takes plain arrays, got a masked array; fill it first")
 
 
-def check_out(op, out, u, dtype):
+def check_out(op, out, u, dtype, shape):
     """Refuse a result array of another shape or dtype, or one that shares memory with `u`."""
-    wanted = f"out=np.empty({op.codomain.shape}, {dtype.name!r})"
+    wanted = f"out=np.empty({shape}, {dtype.name!r})"
     if not isinstance(out, np.ndarray):
         raise TypeError(f"{op.name} needs an array as out, got {type(out).__name__}; write {wanted}")
-    if out.shape != op.codomain.shape:
+    if out.shape != shape:
         raise ShapeError(f"{op.name} gives a field on {op.codomain}, got out of shape {out.shape}; write {wanted}")
     if out.dtype != dtype:
         raise TypeError(f"{op.name} gives {dtype} here, got out of dtype {out.dtype}; write {wanted}")

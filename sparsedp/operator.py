@@ -2,6 +2,7 @@
 
 import weakref
 from functools import cached_property
+from math import prod
 from numbers import Number
 
 import numpy as np
@@ -83,7 +84,10 @@ class Operator(Remade):
     # ------------------------------------------------------------ application
 
     def __call__(self, u):
-        """Apply to a field of exactly the shape of the domain; differentiable; the result is fresh."""
+        """Apply to a field of the shape of the domain, or to a batch of them; differentiable; the result is fresh.
+
+        Leading axes are a batch: from (50, *domain.shape) to (50, *codomain.shape).
+        """
         return apply_operator(self, u) if active or isbox(u) else self.apply(u)
 
     def apply(self, u, out=None):
@@ -91,13 +95,14 @@ class Operator(Remade):
 
         Parameters
         ----------
-        u : array, shape `domain.shape`
-        out : array, shape `codomain.shape`, optional
+        u : array, shape (..., *`domain.shape`)
+            Leading axes are a batch: one field for each of their entries.
+        out : array, shape (..., *`codomain.shape`), optional
             Reused for the result: contiguous, of the dtype of the result, no overlap with `u`.
 
         Returns
         -------
-        array, shape `codomain.shape`
+        array, shape (..., *`codomain.shape`)
 
         Raises
         ------
@@ -108,13 +113,21 @@ class Operator(Remade):
         ValueError
             If `out` overlaps `u` or is not contiguous.
         """
-        u = field_array(self, u)
+        u, shape = field_array(self, u, batch=True), self.codomain.shape
         dtype = u.dtype if self._real else result_dtype(self.structure, u.dtype)
+        lead = u.shape[: -len(self.domain.shape)]
+        if lead:
+            shape = lead + shape
         if out is None:
-            out = results.empty(self.codomain.shape, dtype)
+            out = results.empty(shape, dtype)
         else:
-            check_out(self, out, u, dtype)
-        self._acting.apply(u.reshape(-1), out.reshape(-1))
+            check_out(self, out, u, dtype, shape)
+        if lead:
+            many = prod(lead)
+            for field, result in zip(u.reshape(many, self.shape[1]), out.reshape(many, self.shape[0])):
+                self._acting.apply(field, result)
+        else:
+            self._acting.apply(u.reshape(-1), out.reshape(-1))
         return out
 
     @cached_property
@@ -236,7 +249,7 @@ class Operator(Remade):
         raise TypeError(f"numpy.{ufunc.__name__} does not take an operator; write {self.name}(u) for a field u")
 
     def __array__(self, *args, **options):
-        raise TypeError(f"{self.name} is no array; write op.explicit().matrix, op.to_scipy() or {self.name}(u)")
+        raise TypeError(f"{self.name} is no array; write op.matrix, op.to_scipy() or {self.name}(u)")
 
     # ------------------------------------------------------------ forms and borders
 
@@ -252,8 +265,8 @@ class Operator(Remade):
 
     @property
     def matrix(self):
-        """The entries as a csr_array with 32-bit indices, or None in the matrix-free form."""
-        return self._matrix_structure.matrix if self.form == "explicit" else None
+        """The entries as a csr_array with 32-bit indices: in the matrix-free form assembled when first asked for."""
+        return self._matrix_structure.matrix
 
     @property
     def separable(self):

@@ -23,7 +23,7 @@ from sparsedp.tree import leaves
 
 __all__ = [
     "Rule", "apply_operator", "called", "cast", "differentiable", "dtype_of", "fit", "is_variable", "isbox", "linear",
-    "plain",
+    "of_argument", "plain",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
@@ -232,6 +232,13 @@ def cast(g, dtype):
     if given == dtype or not isbox(g):
         return g if given == dtype else np.asarray(g, dtype)
     return linear("cast", lambda x: np.asarray(x, dtype), lambda x: np.asarray(x, given))[0](g)
+
+
+def of_argument(cotangent, value):
+    """What a product of fields gives for an argument: summed over batches, and for a real argument the real part."""
+    while np.ndim(cotangent) > np.ndim(value):
+        cotangent = anp.sum(cotangent, axis=0)
+    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent
 
 
 def linear(name, forward, transpose):

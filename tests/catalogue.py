@@ -78,7 +78,7 @@ CATALOGUE = [
     Entry("interior", lambda grid, _: dp.interior(grid, solid(grid))),
     Entry("identity", lambda grid, _: dp.identity(grid.edges)),
     Entry("diagonal", lambda grid, _: dp.diagonal(grid.cells, 1.0 + np.arange(grid.cells.size).reshape(grid.shape))),
-    Entry("from_matrix", lambda grid, boundary: dp.from_matrix(dp.laplacian(grid, boundary).explicit().matrix)),
+    Entry("from_matrix", lambda grid, boundary: dp.from_matrix(dp.laplacian(grid, boundary).matrix)),
     Entry(
         "from_linear_operator",
         lambda grid, boundary: dp.from_linear_operator(dp.gradient(grid, boundary).to_scipy(), grid.cells, grid.faces),

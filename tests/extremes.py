@@ -133,7 +133,7 @@ ANISOTROPIC = {
 
 
 def dense(op):
-    return op.explicit().matrix.toarray()
+    return op.matrix.toarray()
 
 
 def exact(op):

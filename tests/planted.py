@@ -40,7 +40,7 @@ def call(kind, name, grid, rng, error, jvp):
         return op, name
     if kind == "operator given":
         turned = dp.from_matrix(op.explicit().T.matrix * (1 + error))
-        act = lambda u: op.explicit().matrix @ u
+        act = lambda u: op.matrix @ u
         return dp.from_functions(
             lambda u: act(u.reshape(-1)).reshape(u.shape), turned_on(turned), grid.cells, grid.cells, name
         ), name

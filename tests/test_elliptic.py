@@ -30,7 +30,7 @@ def setting(boundary=dp.dirichlet, shape=(19, 17), method="auto", seed=0, **opti
 
 
 def dense(solve, k, shift):
-    D, G = (op.explicit().matrix.toarray() for op in (solve.D, solve.G))
+    D, G = (op.matrix.toarray() for op in (solve.D, solve.G))
     return shift * np.eye(D.shape[0]) - (D * k) @ G
 
 

@@ -219,7 +219,7 @@ TABLE = [
     (
         lambda: np.asarray(dp.laplacian(LINE)),
         TYPE,
-        "laplacian is no array; write op.explicit().matrix, op.to_scipy() or laplacian(u)",
+        "laplacian is no array; write op.matrix, op.to_scipy() or laplacian(u)",
     ),
     (
         lambda: dp.inverse(dp.from_matrix(np.diag([1e300, 1e-300]))),

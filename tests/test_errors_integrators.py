@@ -183,7 +183,7 @@ def test_unstable_steps_are_taken_when_allowed():
 
 
 def test_the_limit_itself_is_stable():
-    for op in (L, L.explicit(), dp.from_matrix(L.explicit().matrix)):
+    for op in (L, L.explicit(), dp.from_matrix(L.matrix)):
         assert np.all(np.abs(dp.stepper("euler", op, 0.5)(U, 1.0)) <= 1)
         with pytest.raises(UNSTABLE, match="the largest stable dt is"):
             dp.stepper("rk4", op, 0.7)(U, 1.0)

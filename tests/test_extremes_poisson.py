@@ -290,7 +290,7 @@ def test_small_and_prime_sizes(shape, boundary, method, rng):
     op = -dp.laplacian(stretched(*shape, periodic=boundary == "periodic"), BOUNDARIES[boundary])
     inv = solver(op, method, nullspace="project")
     check_all(inv, exact(op), *data(op, rng))
-    for wrong in (np.ones((*shape, 1)), np.ones(op.domain.size + 1), np.ones(()), 1.0):
+    for wrong in (np.ones((*shape, shape[-1] + 1)), np.ones(op.domain.size + 1), np.ones(()), 1.0):
         with pytest.raises(SHAPE, match="takes a field on cells"):
             inv(wrong)
         with pytest.raises(SHAPE, match="takes a field on cells"):

@@ -85,7 +85,7 @@ def test_field_not_finite_or_of_another_shape(scene, rng):
     for call in (run, dp.value_and_grad(lambda u: anp.sum(run(u)))):
         with np.errstate(invalid="ignore"), pytest.raises(NONFINITE, match=r"got \d+ that are NaN or infinite, the f"):
             call(bad)
-        for wrong in (u[None], u[:-1]):
+        for wrong in (u[..., None], u[:-1]):
             with pytest.raises(SHAPE):
                 call(wrong)
 

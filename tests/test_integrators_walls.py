@@ -76,7 +76,7 @@ def test_stages_of_imex_by_hand():
     """ARS(2,2,2) with dense matrices, the source at the times of its implicit stages."""
     d = 1 - np.sqrt(0.5)
     e, h, nu, t = 1 - 1 / (2 * d), 0.3, 0.7, 0.2
-    A, eye = nu * L.explicit().matrix.toarray(), np.eye(X.size)
+    A, eye = nu * L.matrix.toarray(), np.eye(X.size)
     s, rate = (lambda t: np.cos(X + 4 * t)), (lambda u, t: np.sin(u) * t)
     u = np.exp(X)
     n0 = rate(u, t)

@@ -29,7 +29,7 @@ def cells(op):
 def applied(op):
     """What an Operator says, its transpose and its entries."""
     u, g = (np.cos(np.arange(space.size)).reshape(space.shape) for space in (op.domain, op.codomain))
-    return op(u), op.T(g), op.explicit().matrix.toarray()
+    return op(u), op.T(g), op.matrix.toarray()
 
 
 def flow(step):

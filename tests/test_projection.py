@@ -46,8 +46,8 @@ def dense(grid, solid, boundary):
                 keep = keep @ np.diag(grid.join(*flags))
     if solid is not None:
         keep = keep @ np.diag(dp.average(grid)(solid.astype(float)) == 0.0)
-    D = dp.divergence(grid).explicit().matrix.toarray()
-    G = dp.gradient(grid, conditions or dp.neumann, solid).explicit().matrix.toarray()
+    D = dp.divergence(grid).matrix.toarray()
+    G = dp.gradient(grid, conditions or dp.neumann, solid).matrix.toarray()
     return keep - G @ np.linalg.pinv(D @ G, rcond=1e-12) @ D @ keep
 
 

@@ -47,7 +47,7 @@ def test_the_transposed_cycle_is_exact(cycle, sweeps, rng):
 
 def test_interpolation_keeps_constants_and_lines():
     grid = dp.Grid((23, 16), spacing=[np.linspace(1, 2, 23), np.ones(16)], periodic=(False, True))
-    levels = geometric_levels((-dp.laplacian(grid)).explicit().matrix, grid, 25, 20)
+    levels = geometric_levels((-dp.laplacian(grid)).matrix, grid, 25, 20)
     for _, P, R in levels[:-1]:
         assert P @ np.ones(P.shape[1]) == pytest.approx(1.0) and abs(P.T - R).nnz == 0
         assert P.indices.dtype == np.int32

@@ -74,7 +74,7 @@ def test_the_coarse_solve_drops_the_constants_and_nothing_else(rng):
     grid = dp.Grid((8, 8))
     weights = dp.diagonal(grid.faces, grid.join(1.0, 1e-12))
     op = -dp.divergence(grid) @ weights @ dp.gradient(grid)
-    solve = CoarseSolve(op.explicit().matrix)
+    solve = CoarseSolve(op.matrix)
     x = rng.standard_normal(64)
     x -= x.mean()
     for one, turned in ((solve, op), (solve.transpose(), op.T)):
@@ -253,9 +253,7 @@ def test_a_symmetric_matrix_without_a_diagonal(rng):
 
 CUBE = dp.Grid((25, 25, 23))
 LAYERS = dp.harmonic_average(CUBE)(np.where(np.arange(23) % 2, 1e6, 1.0) * np.ones(CUBE.shape))
-WIND = dp.from_matrix(
-    (dp.upwind(CUBE, 0, 1.0) - dp.laplacian(CUBE, dp.dirichlet)).explicit().matrix, CUBE.cells, CUBE.cells
-)
+WIND = dp.from_matrix((dp.upwind(CUBE, 0, 1.0) - dp.laplacian(CUBE, dp.dirichlet)).matrix, CUBE.cells, CUBE.cells)
 CHOICES = [
     (lambda: PROBLEMS["dirichlet"](), "direct", "572 unknowns in 2-D"),
     (
@@ -264,7 +262,7 @@ CHOICES = [
         "14375 unknowns in 3-D, a sum of 1-D factors",
     ),
     (
-        lambda: dp.from_matrix((-dp.laplacian(CUBE, dp.dirichlet)).explicit().matrix, CUBE.cells, CUBE.cells),
+        lambda: dp.from_matrix((-dp.laplacian(CUBE, dp.dirichlet)).matrix, CUBE.cells, CUBE.cells),
         "structured" if compiled() else "multigrid",
         "multigrid on the grid itself" if compiled() else "structured multigrid needs numba, which is not installed",
     ),

@@ -31,9 +31,7 @@ def elliptic(method, D, G, k):
 
 
 def entries(method, D, G, k):
-    matrix = (
-        (-D @ G).explicit().matrix if method == "separable" else (-D @ dp.diagonal(D.domain, k / k.max()) @ G).matrix
-    )
+    matrix = (-D @ G).matrix if method == "separable" else (-D @ dp.diagonal(D.domain, k / k.max()) @ G).matrix
     return dp.inverse(dp.from_matrix(matrix * k.max(), G.domain, G.domain), method)
 
 

@@ -161,7 +161,7 @@ def test_solids_with_dirichlet_faces(method, rng):
     inv = dp.inverse(op, method)
     assert inv.solver.system.null_space.count == 0
     open_cells = ~solid.ravel()
-    small = op.explicit().matrix.toarray()[open_cells][:, open_cells]
+    small = op.matrix.toarray()[open_cells][:, open_cells]
     b, g = np.where(solid, 0.0, rng.standard_normal((2, *grid.shape)))
     wanted = np.zeros(grid.shape)
     wanted[~solid] = np.linalg.solve(small, b[~solid])
@@ -185,7 +185,7 @@ def test_a_null_vector_that_is_not_known_beforehand(method, turned, rng):
     op = op.T if turned else op
     inv = dp.inverse(op, method, nullspace="project")
     space = inv.solver.system.null_space
-    matrix = op.explicit().matrix
+    matrix = op.matrix
     assert space.count == 1
     assert np.max(np.abs(matrix @ space.right)) <= 1e-12 and np.max(np.abs(matrix.T @ space.left)) <= 1e-12
     b, g = rng.standard_normal((2, *op.domain.shape))
@@ -199,7 +199,7 @@ def test_a_null_vector_that_is_not_known_beforehand(method, turned, rng):
 def test_components_of_a_lower_dimension():
     """A gradient along x only: every line is a component of its own."""
     grid = dp.Grid((5, 4))
-    line = dp.laplacian(dp.Grid(5)).explicit().matrix
+    line = dp.laplacian(dp.Grid(5)).matrix
     lines = dp.from_matrix(sp.kron(line, sp.eye_array(4)), grid.cells, grid.cells)
     inv = dp.inverse(lines, nullspace="project")
     assert inv.solver.system.null_space.count == 4
@@ -211,10 +211,10 @@ def test_components_of_a_lower_dimension():
 def test_labels_from_factors_are_those_from_entries():
     grid = dp.Grid((6, 5, 4), periodic=(True, False, False))
     op = dp.laplacian(grid)
-    explicit = dp.from_matrix(op.explicit().matrix)
+    explicit = dp.from_matrix(op.matrix)
     assert System(op).components == System(explicit).components == (None, 1)
     along = dp.upwind(grid, "y")  # every line of cells along y is a component
-    one, other = System(along).components, System(dp.from_matrix(along.explicit().matrix)).components
+    one, other = System(along).components, System(dp.from_matrix(along.matrix)).components
     assert one[1] == other[1] == 24 == len(np.unique(one[0])) == len(np.unique(one[0] * 1000 + other[0]))
 
 
@@ -239,7 +239,7 @@ def test_systems_that_cannot_be_solved(matrix, status, words):
 
 def test_a_singular_sparse_matrix():
     """The scaled Laplacian has a null vector that is neither ones nor volumes."""
-    matrix = dp.laplacian(dp.Grid((20, 20))).explicit().matrix
+    matrix = dp.laplacian(dp.Grid((20, 20))).matrix
     scale = sp.diags_array(1.0 + np.random.default_rng(0).random(400))
     with pytest.raises(dp.errors.ConvergenceError, match="singular") as caught:
         dp.inverse(dp.from_matrix(scale @ matrix @ scale), "direct")
@@ -255,7 +255,7 @@ def test_a_singular_sparse_matrix():
 def test_small_grids(shape, boundary, method, rng):
     op = -dp.laplacian(dp.Grid(shape), boundary)
     inv = dp.inverse(op, method, nullspace="project")
-    matrix = op.explicit().matrix.toarray()
+    matrix = op.matrix.toarray()
     b = rng.standard_normal(shape)
     wanted = np.linalg.pinv(matrix, rcond=1e-10) @ b.ravel()
     assert inv(b).ravel() == pytest.approx(wanted, rel=1e-8, abs=1e-9)

@@ -36,7 +36,7 @@ def operators(grid, boundary, rng):
     lap = -dp.laplacian(grid, boundary)
     D, G = dp.divergence(grid), dp.gradient(grid, boundary)
     k = dp.diagonal(grid.faces, rng.uniform(0.1, 9.0, grid.faces.size))
-    matrix = lap.explicit().matrix
+    matrix = lap.matrix
     return {
         "factors": lap,
         "shift": lap + 0.3 * dp.identity(grid.cells),

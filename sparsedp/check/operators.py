@@ -359,7 +359,8 @@ def fault_of(op, rng):
 def _shapes(probe):
     """Fields that hold as many numbers in another shape, or one number too many."""
     shape, size, mistakes = probe.op.domain.shape, probe.op.domain.size, []
-    for other in {(*shape, 1), (size + 1,), (1, size), (size,)} - {shape}:
+    others = {(*shape, 1), (size + 1,), (1, size), (size,)}
+    for other in [other for other in others if other[-len(shape) :] != shape]:  # leading axes are a batch
         try:
             probe.op(np.zeros(other))
             mistakes.append(f"takes shape {other} for {shape}")
@@ -393,12 +394,14 @@ def _dtypes(probe):
 
 
 def _layouts(probe):
-    """Fortran order, strides, a reversed and a read-only array: the bits of the contiguous copy."""
+    """Fortran order, strides, a reversed and a read-only array: the bits of the contiguous copy; and in a batch."""
     u = probe.domain()
     layouts = {"Fortran order": np.asfortranarray(u), "strided": np.stack([u, np.nan * u], axis=-1)[..., 0]}
     layouts["read-only"] = np.broadcast_to(u.copy(), u.shape)
     layouts["reversed"] = np.flip(np.flip(u).copy())
-    return [name for name, other in layouts.items() if not _equal(probe.op(other), probe.op(u))]
+    mistakes = [name for name, other in layouts.items() if not _equal(probe.op(other), probe.op(u))]
+    batch = probe.op(np.stack([u, 2.0 * u]))
+    return mistakes if _equal(batch[0], probe.op(u)) and _equal(batch[1], probe.op(2.0 * u)) else [*mistakes, "a batch"]
 
 
 def _freshness(probe):
@@ -530,7 +533,7 @@ class OperatorSummary(Summary):
 
     def __init__(self, op, probe, rows):
         listed = isinstance(op.structure, Matrix) or (probe and probe.matrix is not None and op.structure.has_entries)
-        nnz = int(op.explicit().matrix.nnz) if listed else None
+        nnz = int(op.matrix.nnz) if listed else None
         super().__init__(f"{op.name}: {op.domain} -> {op.codomain}", rows, op=op, size=probe and probe.size, nnz=nnz)
 
     @cached_property

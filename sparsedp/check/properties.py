@@ -55,7 +55,7 @@ def facts_of(op, listed, right):
         facts["bytes"] = bytes_of(op._matrix_structure if op.form == "explicit" else op.structure, OPENED)
     facts["seconds"] = _seconds(op.tangent, listed)
     square = fits(op.domain, op.codomain)
-    facts |= _signs(op.explicit().matrix, square) if listed else {}
+    facts |= _signs(op.matrix, square) if listed else {}
     facts["integration by parts"] = _by_parts(op.tangent)
     try:
         facts |= _stencil(op.tangent)
@@ -110,7 +110,7 @@ def _spectrum(op, symmetric):
     """
     whole = op.shape[0] <= DENSE_UP_TO
     if whole:
-        entries = op.explicit().matrix.toarray()
+        entries = op.matrix.toarray()
         values = np.linalg.eigvalsh(entries) if symmetric else np.linalg.eigvals(entries)
     else:
         options = {"v0": np.random.default_rng(0).standard_normal(op.shape[0]), "tol": 1e-6}

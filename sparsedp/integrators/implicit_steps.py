@@ -160,7 +160,7 @@ def shifted(jacobian, timed):
 
     def of_residual(x, b, h, params, t):
         J = jacobian(x, params, t) if timed else jacobian(x, params)
-        J = J.explicit().matrix if isinstance(J, Operator) else J
+        J = J.matrix if isinstance(J, Operator) else J
         return sp.eye_array(J.shape[0]) - h * J if sp.issparse(J) else np.eye(len(J)) - h * np.asarray(J)
 
     return of_residual

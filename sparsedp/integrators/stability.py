@@ -52,7 +52,7 @@ def least_eigenvalue(op):
         return float(np.min(found.eigenvalues))
     if not op.structure.has_entries:
         return None
-    matrix = op.explicit().matrix
+    matrix = op.matrix
     different = abs(matrix - matrix.T)
     if different.nnz and different.max() > 1e-14 * abs(matrix).max():
         return None

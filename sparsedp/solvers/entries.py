@@ -24,7 +24,7 @@ from sparsedp.solvers.choose import build, check_settings
 from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.record import SolveLog
 from sparsedp.space import Space
-from sparsedp.tape import Rule, cast, dtype_of, isbox, plain
+from sparsedp.tape import Rule, isbox, of_argument, plain
 from sparsedp.tree import copied
 
 __all__ = ["MatrixSolver", "matrix_solver"]
@@ -139,11 +139,11 @@ class MatrixSolver(Remade):
         Parameters
         ----------
         data : array, shape (entries,)
-        b : array, a field on the domain
+        b : array, a field on the domain; leading axes are a batch
 
         Returns
         -------
-        array, a field on the domain
+        array of the shape of b
         """
         check_plain(self.name, data, b)
         values = np.asarray(plain(data))
@@ -156,7 +156,7 @@ class MatrixSolver(Remade):
             first, many = int(np.argmax(wrong)), np.count_nonzero(wrong)
             place = f"row {self.rows[first]}, column {self.columns[first]}"
             raise NonFiniteError(f"data must be finite, got {many} that are NaN or infinite, the first at {place}")
-        if np.shape(plain(b)) != self.domain.shape:
+        if np.shape(plain(b))[-len(self.domain.shape) :] != self.domain.shape:
             raise ShapeError(f"b takes a field on {self.domain}, got an array of shape {np.shape(plain(b))}")
         return self._checked(data if isbox(data) else values, b if isbox(b) else np.asarray(b))
 
@@ -174,7 +174,7 @@ class MatrixSolver(Remade):
             def pull(g):
                 y = (self._free if transposed else self._adjoint)(data, g)
                 slopes = {0: lambda: -(row(y) * column(ans)), 1: lambda: y}
-                return tuple(_like(slopes[num](), (data, b)[num]) for num in nums)
+                return tuple(of_argument(slopes[num](), (data, b)[num]) for num in nums)
 
             return pull
 
@@ -204,8 +204,3 @@ class MatrixSolver(Remade):
         if last is None:
             return f"{self!r}, not set up yet"
         return f"{self!r}, {len(self._kept)} of {self._kept.most} set-ups kept, the last one:\n{last}"
-
-
-def _like(cotangent, value):
-    """The cotangent of a real argument of a complex solve is the real part."""
-    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent

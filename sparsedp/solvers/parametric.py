@@ -30,7 +30,7 @@ from sparsedp.solvers.record import SolveLog
 from sparsedp.space import fits
 from sparsedp.structure.base import Structure
 from sparsedp.structure.lazy import Chain, Diagonal
-from sparsedp.tape import Rule, cast, dtype_of, isbox, plain
+from sparsedp.tape import Rule, isbox, of_argument, plain
 from sparsedp.tree import copied
 
 __all__ = ["EllipticSolver", "elliptic_solver"]
@@ -124,12 +124,12 @@ class EllipticSolver(Remade):
         Parameters
         ----------
         k : float, or array of the shape of a field on the faces
-        b : array, a field on the cells
+        b : array, a field on the cells; leading axes are a batch
         shift : float
 
         Returns
         -------
-        array, a field on the cells, of the dtype of b
+        array of the shape and dtype of b
         """
         check_plain("elliptic_solver", k, b)
         k = self._coefficient(k)
@@ -168,7 +168,7 @@ class EllipticSolver(Remade):
                 x, y = (other, ans) if transposed else (ans, other)
                 slopes = {0: lambda: self.D.T(y) * self.G(x), 1: lambda: other, 2: lambda: -anp.sum(y * x)}
                 with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
-                    return tuple(_real(_representable(slopes[num]()), (k, b, shift)[num]) for num in nums)
+                    return tuple(_representable(of_argument(slopes[num](), (k, b, shift)[num])) for num in nums)
 
             return pull
 
@@ -217,11 +217,6 @@ def _representable(cotangent):
     if not np.all(np.isfinite(plain(cotangent))):
         raise NonFiniteError("a gradient of elliptic_solver is beyond 1.8e308; scale the loss or the right-hand side")
     return cotangent
-
-
-def _real(cotangent, value):
-    """The cotangent of a real argument of a complex solve is the real part."""
-    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent
 
 
 def _check_shift(shift):

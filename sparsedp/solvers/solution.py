@@ -3,6 +3,7 @@
 import weakref
 from functools import cached_property
 
+import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
@@ -118,6 +119,8 @@ class Inverse(Operator):
         diff="unrolled" of krylov, the iterations themselves are differentiated, in b and in `start`.
         """
         if self.solver.engine.unrolled:
+            if np.ndim(b) > len(self.domain.shape):  # a batch: each solve has steps of its own
+                return anp.array([self(field, start) for field in b])
             return self.solver.unroll(b, start, self.structure.transposed)
         if start is None:
             return super().__call__(b)
@@ -127,7 +130,7 @@ class Inverse(Operator):
 
     def apply(self, u, out=None):
         """Solve for a plain array, without the tape; see `Operator.apply`."""
-        return self._solve_from(u) if out is None else super().apply(u, out)
+        return self._solve_from(u) if out is None and np.ndim(u) == len(self.domain.shape) else super().apply(u, out)
 
     def _solve_from(self, b, start=None):
         start = None if start is None else np.asarray(start).reshape(-1)

@@ -228,8 +228,7 @@ class System:
     @cached_property
     def entries(self):
         """The operator as a csr_array with 32-bit indices, as it is."""
-        structure = self.op.structure
-        return structure.matrix if isinstance(structure, Matrix) else self.op.explicit().matrix
+        return self.op.matrix
 
     @cached_property
     def diagonal(self):

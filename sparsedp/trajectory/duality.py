@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from sparsedp.direction import push, zero_like
+from sparsedp.derivative import zero_like
+from sparsedp.direction import push
 from sparsedp.tape import is_variable
 from sparsedp.trajectory.keep import Each, marked
 from sparsedp.trajectory.layout import Layout

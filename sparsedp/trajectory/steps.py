@@ -5,7 +5,8 @@ from contextlib import contextmanager
 import numpy as np
 
 from sparsedp.constants import constant
-from sparsedp.direction import pull_ends, zero_like
+from sparsedp.derivative import zero_like
+from sparsedp.direction import pull_ends
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
 from sparsedp.tape import Rule, fit, plain
