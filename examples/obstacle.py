@@ -14,7 +14,7 @@ cylinder = (x - 0.7) ** 2 + (y - 0.45) ** 2 < 0.15**2
 across = grid.coordinates(1)
 
 # The wind enters at x = 0 with an unknown profile and leaves at x = 3; it sticks to the walls and to the cylinder.
-sides = {"x": ("inflow", "outflow"), "y": "no_slip"}
+sides = {"x": (dp.inflow, dp.outflow), "y": dp.no_slip}
 dt, steps = 0.35 / n, 3 * n
 step = dp.flow_step(grid, dt, viscosity=0.005, boundary=sides, solid=cylinder)
 columns = [int(place * n) for place in (1.3, 2.0, 2.7)]  # sensors read u there

@@ -15,7 +15,7 @@ from importlib import import_module as _import_module
 _WINDOW = {
     "grid": "Grid",
     "space": "Space",
-    "conditions": "dirichlet neumann robin",
+    "conditions": "dirichlet free_slip inflow neumann no_slip outflow robin",
     "tape": "differentiable",
     "derivative": "grad value_and_grad vjp",
     "direction": "hvp jvp",

@@ -5,7 +5,11 @@ from . import report as report
 from .advection.front import transport as transport
 from .blackbox import adopt as adopt
 from .conditions import dirichlet as dirichlet
+from .conditions import free_slip as free_slip
+from .conditions import inflow as inflow
 from .conditions import neumann as neumann
+from .conditions import no_slip as no_slip
+from .conditions import outflow as outflow
 from .conditions import robin as robin
 from .derivative import grad as grad
 from .derivative import value_and_grad as value_and_grad

@@ -1,23 +1,31 @@
-"""Boundary conditions: one for each side of each bounded axis.
+"""Boundary conditions: one for each side of each bounded axis, of a field or of a flow.
 
 All conditions are one form, a u + b du/dn = value at the wall, n pointing outwards:
 dirichlet is (1, 0), neumann is (0, 1), robin(a, b) the rest. With u_c the value in the cell next
 to the wall and h its width, the wall value and the slope follow from (u_w - u_c) / (h / 2) = du/dn:
 
     du/dn = (value - a u_c) / (a h / 2 + b),        u_w = (b u_c + value h / 2) / (a h / 2 + b).
+
+What a fluid does at a wall implies conditions of its velocity along the wall and of the pressure: FlowCondition.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from sparsedp.spacing import AXES, real_numbers
 
-__all__ = ["Condition", "check_condition", "dirichlet", "neumann", "resolve", "robin"]
+__all__ = [
+    "Condition", "FlowCondition", "check_condition", "dirichlet", "free_slip", "inflow", "neumann", "no_slip",
+    "outflow", "resolve", "robin",
+]  # fmt: skip
 
 
 class Condition:
     """a u + b du/dn = value on a wall. Frozen, equal by value. Use dirichlet, neumann or robin."""
 
     __slots__ = ("a", "b")
+    choices = "dirichlet, neumann, robin(a, b)"
     a: float
     b: float
 
@@ -77,15 +85,47 @@ def robin(a, b):
     return Condition(a, b)
 
 
-def resolve(grid, boundary):
+@dataclass(frozen=True)
+class FlowCondition:
+    """What a fluid does at a wall: one of no_slip, free_slip, inflow, outflow.
+
+    Parameters
+    ----------
+    name : str
+    closed : bool
+        Whether nothing passes.
+    along : Condition
+        Of the velocity along the wall.
+    pressure : Condition
+    """
+
+    name: str
+    closed: bool
+    along: Condition
+    pressure: Condition
+    choices = "no_slip, free_slip, inflow, outflow"  # no annotation: the same for all
+
+    def __repr__(self):
+        return self.name
+
+
+no_slip = FlowCondition("no_slip", True, dirichlet, neumann)  # the fluid sticks to it; `face_lift` moves it
+free_slip = FlowCondition("free_slip", True, neumann, neumann)  # the fluid glides along it
+inflow = FlowCondition("inflow", False, dirichlet, neumann)  # what passes is given: what the face field has there
+outflow = FlowCondition("outflow", False, neumann, dirichlet)  # open: what passes is found, the pressure is 0
+
+
+def resolve(grid, boundary, default=neumann):
     """Boundary argument -> for each axis (lower, upper), or None where the axis is periodic.
 
     Parameters
     ----------
     grid : Grid
-    boundary : Condition or dict
+    boundary : condition or dict
         One condition for all bounded sides, or a dict with keys "x", "y", "z", each a condition
-        or a pair (lower, upper). Axes that are not named are neumann.
+        or a pair (lower, upper).
+    default : Condition or FlowCondition
+        That of the axes that are not named; says which kind of conditions is meant.
 
     Returns
     -------
@@ -96,7 +136,7 @@ def resolve(grid, boundary):
     ValueError
         If a periodic axis or an axis the grid does not have is named.
     TypeError
-        If an entry is not a condition, or the grid not a grid.
+        If an entry is not a condition of that kind, or the grid not a grid.
 
     Examples
     --------
@@ -110,7 +150,7 @@ def resolve(grid, boundary):
     if isinstance(boundary, dict):
         _check_names(grid, boundary)
     return tuple(
-        None if periodic else _sides(axis, named.get(axis, neumann))
+        None if periodic else _sides(axis, named.get(axis, default), type(default))
         for axis, periodic in zip(AXES, grid.periodic, strict=False)
     )
 
@@ -129,8 +169,10 @@ def _check_names(grid, boundary):
             raise ValueError(f"axis {name} is periodic and takes no boundary condition; leave it out")
 
 
-def _sides(axis, entry):
-    sides = (entry, entry) if isinstance(entry, Condition) else entry
-    if not (isinstance(sides, (tuple, list)) and len(sides) == 2 and all(isinstance(s, Condition) for s in sides)):
-        raise TypeError(f"boundary on {axis} needs dirichlet, neumann, robin(a, b) or a pair of them, got {entry!r}")
+def _sides(axis, entry, kind):
+    sides = (entry, entry) if isinstance(entry, kind) else entry
+    if not (isinstance(sides, (tuple, list)) and len(sides) == 2 and all(isinstance(s, kind) for s in sides)):
+        names = [word for word in kind.choices.split(", ") if f"'{word}'" in repr(entry)]
+        advice = f"; write dp.{names[0]}" if names else ""
+        raise TypeError(f"boundary on {axis} needs {kind.choices} or a pair of them, got {entry!r}{advice}")
     return tuple(sides)

@@ -6,7 +6,7 @@ import numpy as np
 
 import sparsedp as dp
 
-OPPOSITE = {"no_slip": dp.dirichlet, "inflow": dp.dirichlet, "free_slip": dp.neumann, "outflow": dp.neumann}
+OPPOSITE = {dp.no_slip: dp.dirichlet, dp.inflow: dp.dirichlet, dp.free_slip: dp.neumann, dp.outflow: dp.neumann}
 
 
 class Dense:
@@ -116,7 +116,7 @@ class Dense:
 
     def pressure(self):
         """The same grid with what the pressure meets at its walls."""
-        of = lambda word: dp.dirichlet if word == "outflow" else dp.neumann
+        of = lambda word: dp.dirichlet if word == dp.outflow else dp.neumann
         found = Dense.__new__(Dense)
         found.__dict__.update(self.__dict__, sides=[pair and tuple(map(of, pair)) for pair in self.sides])
         return found
@@ -147,17 +147,17 @@ class Dense:
 
     def projection(self):
         """(P, pressure) as matrices: v + G p without divergence, p of mean 0 on each closed part."""
-        D, G, K = self.divergence(), self.pressure().gradient(), np.diag(1.0 * self.flags(("inflow", "outflow")))
-        G = self.flags(("outflow", "inflow"))[:, None] * G
+        D, G, K = self.divergence(), self.pressure().gradient(), np.diag(1.0 * self.flags((dp.inflow, dp.outflow)))
+        G = self.flags((dp.outflow, dp.inflow))[:, None] * G
         p = -np.linalg.pinv(D @ G, rcond=1e-12) @ D @ K
         volumes = np.array([np.prod([self.width(cell, a) for a in range(self.dim)]) for cell in self.cells])
         for rows in self.regions(D @ G):
             p[rows] -= volumes[rows] @ p[rows] / volumes[rows].sum()
         return K + G @ p, p
 
-    def viscous(self, solid_boundary="no_slip"):
+    def viscous(self, solid_boundary=dp.no_slip):
         """The Laplacian of a velocity, 0 on faces that are not free."""
-        L, free = np.zeros((len(self.faces),) * 2), self.flags(("outflow",))
+        L, free = np.zeros((len(self.faces),) * 2), self.flags((dp.outflow,))
         for (c, place), row in self.faces.items():
             for a in range(self.dim) if free[row] else ():
                 i = place[a]
@@ -191,7 +191,7 @@ class Dense:
 
     def convection(self, v, w):
         """div(w v) by loops over the sides of each control volume."""
-        out, free = np.zeros(len(self.faces)), self.flags(("outflow",))
+        out, free = np.zeros(len(self.faces)), self.flags((dp.outflow,))
         for (c, place), row in self.faces.items():
             for a in range(self.dim) if free[row] else ():
                 if a == c:

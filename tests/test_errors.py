@@ -134,7 +134,7 @@ TABLE = [
     (
         lambda: dp.gradient(LINE, "dirichlet"),
         TYPE,
-        "boundary on x needs dirichlet, neumann, robin(a, b) or a pair of them, got 'dirichlet'",
+        "boundary on x needs dirichlet, neumann, robin(a, b) or a pair of them, got 'dirichlet'; write dp.dirichlet",
     ),
     # fields
     (

@@ -18,7 +18,7 @@ def projections(shape):
         for spacing in (0.5, [rng.uniform(0.5, 1.5, n) for n in shape]):
             grid = dp.Grid(shape, spacing=spacing, periodic=periodic)
             bounded = [name for name, flag in zip(grid.axes, periodic) if not flag]
-            for boundary in ({}, dict.fromkeys(bounded[-1:], ("inflow", "outflow"))):
+            for boundary in ({}, dict.fromkeys(bounded[-1:], (dp.inflow, dp.outflow))):
                 P = dp.projection(grid, boundary=boundary, method="auto")
                 if P.structure.setup.passes is not None:
                     yield grid, P.structure.setup

@@ -10,7 +10,7 @@ from sparsedp.tree import leaves
 
 BLOCK = np.zeros((8, 6), bool)
 BLOCK[3:5, 2:4] = True
-CHANNEL = {"x": ("inflow", "outflow"), "y": ("free_slip", "no_slip")}
+CHANNEL = {"x": (dp.inflow, dp.outflow), "y": (dp.free_slip, dp.no_slip)}
 UNEVEN = [np.linspace(0.1, 0.2, 8), np.full(6, 0.15)]
 
 

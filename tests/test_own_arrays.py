@@ -55,7 +55,7 @@ def cubic(x, p):
 
 
 def walls(name):
-    return {"x": (dp.neumann, dp.dirichlet)} if name == "pressure" else {"x": ["inflow", "outflow"]}
+    return {"x": (dp.neumann, dp.dirichlet)} if name == "pressure" else {"x": [dp.inflow, dp.outflow]}
 
 
 # name -> (arguments that hold arrays, lists or dicts; builder; what it is used for)

@@ -1,6 +1,7 @@
 """The projection: divergence-free, symmetric, idempotent, one node on the tape, and what it refuses."""
 
 import pickle
+import re
 from itertools import product
 
 import autograd.numpy as anp
@@ -12,7 +13,7 @@ from sparsedp.derivative import pushforward, value_and_grad
 from sparsedp.ledger import recording
 
 SHAPES = [(7,), (1,), (8, 6), (1, 5), (2, 2), (1, 1), (5, 4, 3), (1, 2, 1), (40, 33)]
-OPEN = {"x": ("inflow", "outflow")}
+OPEN = {"x": (dp.inflow, dp.outflow)}
 
 
 def grids(shape):
@@ -37,12 +38,12 @@ def dense(grid, solid, boundary):
     keep = np.diag(np.ones(grid.faces.size))
     conditions = {}
     for axis, name in enumerate(grid.axes):
-        words = boundary.get(name, ("no_slip", "no_slip"))
+        words = boundary.get(name, (dp.no_slip, dp.no_slip))
         if not grid.periodic[axis]:
-            conditions[name] = tuple(dp.dirichlet if word == "outflow" else dp.neumann for word in words)
+            conditions[name] = tuple(dp.dirichlet if word == dp.outflow else dp.neumann for word in words)
             for side, word in zip((0, -1), words):
                 flags = [np.ones(part) for part in grid.faces.parts]
-                np.moveaxis(flags[axis], axis, 0)[side] = word in ("inflow", "outflow")
+                np.moveaxis(flags[axis], axis, 0)[side] = word in (dp.inflow, dp.outflow)
                 keep = keep @ np.diag(grid.join(*flags))
     if solid is not None:
         keep = keep @ np.diag(dp.average(grid)(solid.astype(float)) == 0.0)
@@ -101,7 +102,7 @@ def test_openings(shape, stretched):
 
 def test_pressure_is_the_potential():
     grid = dp.Grid((12, 9), size=(2.0, 1.0))
-    for boundary in ("free_slip", OPEN):
+    for boundary in (dp.free_slip, OPEN):
         P = dp.projection(grid, None, boundary)
         v = velocity(grid)
         G = dp.gradient(grid, {"x": (dp.neumann, dp.dirichlet)} if boundary is OPEN else dp.neumann)
@@ -161,16 +162,24 @@ def test_nan_anywhere_is_refused():
 
 def test_what_is_refused():
     grid = dp.Grid((4, 3), periodic=(False, True))
-    with pytest.raises(ValueError, match="the flow names axis 'z', but .* has x, y; leave it out"):
-        dp.projection(grid, boundary={"z": "inflow"})
-    with pytest.raises(ValueError, match="axis y is periodic, so the flow has no wall there; leave it out"):
-        dp.projection(grid, boundary={"y": "inflow"})
-    with pytest.raises(ValueError, match="the flow on x needs no_slip, .*, outflow or a pair of them, got 'glue'"):
-        dp.projection(grid, boundary={"x": "glue"})
+    with pytest.raises(ValueError, match="boundary names axis 'z', but .* has x, y; leave it out"):
+        dp.projection(grid, boundary={"z": dp.inflow})
+    with pytest.raises(ValueError, match="axis y is periodic and takes no boundary condition; leave it out"):
+        dp.projection(grid, boundary={"y": dp.inflow})
+    needs = "boundary on x needs no_slip, free_slip, inflow, outflow or a pair of them, got "
+    given = {"glue": "'glue'$", dp.neumann: "neumann$", "free_slip": "'free_slip'; write dp.free_slip"}
+    given[("inflow", dp.outflow)] = re.escape("('inflow', outflow); write dp.inflow")
+    for entry, words in given.items():
+        with pytest.raises(TypeError, match=needs + words):
+            dp.projection(grid, boundary={"x": entry})
+    with pytest.raises(TypeError, match="got 'no_slip'; write dp.no_slip"):  # a word of the first edition
+        dp.face_laplacian(grid, "no_slip")
+    with pytest.raises(TypeError, match=r"boundary on x needs dirichlet, neumann, robin\(a, b\) .*, got no_slip"):
+        dp.laplacian(grid, dp.no_slip)
     with pytest.raises(
         ValueError, match="the inflow on the lower x side enters a region without an outflow; open a side of it"
     ):
-        dp.projection(grid, boundary={"x": ("inflow", "no_slip")})
+        dp.projection(grid, boundary={"x": (dp.inflow, dp.no_slip)})
     barrier = np.zeros(grid.shape, bool)
     barrier[2] = True
     with pytest.raises(ValueError, match="enters a region without an outflow"):

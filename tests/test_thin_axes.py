@@ -13,7 +13,7 @@ from sparsedp.conditions import resolve
 from sparsedp.flow import passes
 
 SHAPES = [(1,), (2,), (3,), (1, 4), (4, 1), (1, 1), (2, 1), (3, 2), (1, 1, 4), (3, 1, 3), (1, 2, 1), (2, 2, 3)]
-WORDS = ("no_slip", "free_slip", "inflow", "outflow")
+WORDS = (dp.no_slip, dp.free_slip, dp.inflow, dp.outflow)
 
 
 def grids(shape):
@@ -81,7 +81,7 @@ def test_what_acts_on_a_velocity(shape, rng):
         for boundary, solid, dense in scenes(grid, rng):
             v, w = rng.standard_normal((2, grid.faces.size))
             near(dp.convection(grid, boundary, solid)(v, w), dense.convection(v, w))
-            for along in ("no_slip", "free_slip"):
+            for along in (dp.no_slip, dp.free_slip):
                 near(dp.face_laplacian(grid, boundary, solid, along)(v), dense.viscous(along) @ v)
 
 
@@ -213,7 +213,7 @@ def test_transport(scheme, condition, rng):
 def test_a_planted_mistake_in_the_passes(place, monkeypatch, rng):
     """Coefficients that are not those of D and G are seen before they are used; the contract solves instead."""
     grid, right = dp.Grid((1, 4), spacing=0.3), passes._matrices
-    boundary = {"x": ("inflow", "inflow"), "y": ("inflow", "outflow")}
+    boundary = {"x": (dp.inflow, dp.inflow), "y": (dp.inflow, dp.outflow)}
 
     def wrong(D, G, free, transposed):
         matrices = [sp.csr_array(matrix, copy=True) for matrix in right(D, G, free, transposed)]

@@ -205,7 +205,7 @@ def operators():
     yield "from_linear_operator", dp.from_linear_operator(aslinearoperator(sp.csr_array(BAND)))
     yield "exponential", dp.exponential(dp.laplacian(GRID, dp.dirichlet), 0.1)
     yield "power", dp.power(-dp.laplacian(BOX, dp.dirichlet), 0.5)
-    yield "projection", dp.projection(GRID, SOLID, {"x": ("no_slip", "outflow")})
+    yield "projection", dp.projection(GRID, SOLID, {"x": (dp.no_slip, dp.outflow)})
     yield "projection by transforms", dp.projection(BOX)
     yield "pressure", dp.projection(GRID).pressure
     yield "composed", dp.gradient(BOX) @ dp.inverse(dp.identity(BOX.cells) - dp.laplacian(BOX)) @ dp.divergence(BOX)
@@ -242,7 +242,7 @@ def travellers():
     lid = lid(lid.domain.join(0.0, 0.0, 0.0, 1.0))
     yield "flow_step", "lid", dp.flow_step(GRID, 0.01, half, walls=lid), of_flow
     v, w = numbers((2, GRID.faces.size))
-    yield "convection", "", dp.convection(GRID, {"x": "free_slip"}, SOLID), lambda c: bits(c, v, w)
+    yield "convection", "", dp.convection(GRID, {"x": dp.free_slip}, SOLID), lambda c: bits(c, v, w)
     yield "harmonic_average", "", dp.harmonic_average(GRID), lambda f: bits(f, np.exp(numbers(GRID.shape)))
     yield "value_and_grad", "", dp.value_and_grad(loss), of_pair
     yield "grad", "", dp.grad(loss), lambda f: [f(numbers(7)).tobytes()]
@@ -259,7 +259,8 @@ def travellers():
 
 # Public names that make nothing which is called later: values, runs, pictures, rooms.
 NOTHING_TO_CALL = {
-    "Grid", "Space", "Operator", "dirichlet", "neumann", "robin", "rollout", "minimize", "update_direction",
+    "Grid", "Space", "Operator", "dirichlet", "neumann", "robin", "no_slip", "free_slip", "inflow", "outflow",
+    "rollout", "minimize", "update_direction",
     "set_threads", "convergence", "v_curve", "animate", "plot", "certify", "stress", "workprec", "explain", "check",
     "errors", "report", "vjp", "jvp", "hvp",
 }  # fmt: skip

@@ -1,15 +1,14 @@
 """What acts on a velocity besides pressure: viscosity (face_laplacian, face_lift) and convection.
 
 Every component lives on its own faces. Along its own axis it is a field on nodes, and the wall faces
-hold the wall values; along the other axes it is a field between walls half a cell away, and what the
-fluid does there is a condition: no_slip and inflow are dirichlet, free_slip and outflow neumann.
+hold the wall values; along the other axes it is a field between walls half a cell away, with the
+condition that what the fluid does there implies (`along` of conditions.py).
 """
 
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.conditions import dirichlet, neumann
-from sparsedp.flow.walls import CLOSED, flow_sides
+from sparsedp.conditions import dirichlet, free_slip, no_slip, outflow, resolve
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.stencils import along, differences, means, one_sided, slopes, wall_slopes
@@ -25,18 +24,18 @@ from sparsedp.tree import copied
 __all__ = ["convection", "face_laplacian", "face_lift"]
 
 
-def face_laplacian(grid, boundary="no_slip", solid=None, solid_boundary="no_slip"):
+def face_laplacian(grid, boundary=no_slip, solid=None, solid_boundary=no_slip):
     """Faces -> faces: the Laplacian of each component of a velocity, 0 on faces that are not free.
 
     Parameters
     ----------
     grid : Grid
-    boundary : str or dict
-        What the fluid does at the walls: "no_slip", "free_slip", "inflow", "outflow", for all bounded
+    boundary : flow condition or dict
+        What the fluid does at the walls: no_slip, free_slip, inflow, outflow, for all bounded
         sides or as {"x": (lower, upper), ...}. Moving walls enter through `face_lift`.
     solid : bool array, shape `grid.shape`, optional
         Obstacles.
-    solid_boundary : "no_slip" or "free_slip"
+    solid_boundary : no_slip or free_slip
         What the fluid does along the obstacles.
 
     Returns
@@ -50,18 +49,20 @@ def face_laplacian(grid, boundary="no_slip", solid=None, solid_boundary="no_slip
     ShapeError
         If `solid` has another shape than the grid.
     ValueError
-        If a word of `boundary` or `solid_boundary` is not known.
+        If an axis is named that is periodic or not there.
+    TypeError
+        If `boundary` or `solid_boundary` holds what is no flow condition.
 
     Examples
     --------
     >>> from sparsedp import Grid
-    >>> L = face_laplacian(Grid((2, 2)), "no_slip")
+    >>> L = face_laplacian(Grid((2, 2)))
     >>> L(np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     array([ 0.,  0., -4., -4.,  0.,  0.,  0.,  0.,  0.,  0.,  0.,  0.])
     """
-    sides = flow_sides(grid, boundary)
-    if solid_boundary not in CLOSED:
-        raise ValueError(f"solid_boundary needs no_slip or free_slip, got {solid_boundary!r}")
+    sides = resolve(grid, boundary, no_slip)
+    if solid_boundary not in (no_slip, free_slip):
+        raise TypeError(f"solid_boundary needs dp.no_slip or dp.free_slip, got {solid_boundary!r}")
     free = Mask(_free(grid, sides, solid))
     if solid is None:
         blocks = {
@@ -72,19 +73,19 @@ def face_laplacian(grid, boundary="no_slip", solid=None, solid_boundary="no_slip
     else:
         flags = grid.faces.split(np.logical_or(*solid_faces(grid, check_solid(grid, solid))))
         whole = sp.block_diag(
-            [_around(grid, c, sides, flags[c], _along_wall(solid_boundary)) for c in range(grid.dim)], format="csr"
+            [_around(grid, c, sides, flags[c], solid_boundary.along) for c in range(grid.dim)], format="csr"
         )
         structure = Matrix(free.explicit() @ whole)
     return Operator(structure, grid.faces, grid.faces, "face_laplacian")
 
 
-def face_lift(grid, boundary="no_slip"):
+def face_lift(grid, boundary=no_slip):
     """Wall velocities -> faces: what walls that move along themselves add, L(v) + B(values).
 
     Parameters
     ----------
     grid : Grid
-    boundary : str or dict
+    boundary : flow condition or dict
         The same as for `face_laplacian`. Walls that are no_slip (and inflows) have a velocity along them.
 
     Returns
@@ -97,7 +98,9 @@ def face_lift(grid, boundary="no_slip"):
     Raises
     ------
     ValueError
-        If a word of `boundary` is not known.
+        If an axis is named that is periodic or not there.
+    TypeError
+        If `boundary` holds what is no flow condition.
 
     Examples
     --------
@@ -106,13 +109,13 @@ def face_lift(grid, boundary="no_slip"):
     >>> B(B.domain.join(0.0, 0.0, 0.0, 1.0))  # y-upper moves along x: a lid
     array([0., 0., 0., 2., 0., 0., 0., 0., 0., 0., 0., 0.])
     """
-    sides = flow_sides(grid, boundary)
+    sides = resolve(grid, boundary, no_slip)
     parts: list[tuple[int, ...]] = []
     blocks = {}
     for a in range(grid.dim):
-        for side, word in enumerate(sides[a] or ()):
+        for side, condition in enumerate(sides[a] or ()):
             for c in range(grid.dim):
-                if c != a and _along_wall(word) is dirichlet:
+                if c != a and condition.along is dirichlet:
                     factor = differences(grid, a) @ wall_slopes(grid, a, side, dirichlet)
                     blocks[c, len(parts)] = along(a, grid.dim, factor)
                     parts.append(tuple(1 if b == a else n for b, n in enumerate(grid.face_shape(c))))
@@ -121,7 +124,7 @@ def face_lift(grid, boundary="no_slip"):
     return Operator(structure, walls, grid.faces, "face_lift")
 
 
-def convection(grid, boundary="no_slip", solid=None):
+def convection(grid, boundary=no_slip, solid=None):
     """Grid -> convect(v, w): the momentum that w carries, div(w v) on the faces, by central differences.
 
     Each component of v and the velocity w that carries it are averaged to the sides of its control
@@ -148,7 +151,9 @@ def convection(grid, boundary="no_slip", solid=None):
     ShapeError
         If `solid` has another shape than the grid.
     ValueError
-        If a word of `boundary` is not known.
+        If an axis is named that is periodic or not there.
+    TypeError
+        If `boundary` holds what is no flow condition.
 
     Notes
     -----
@@ -162,7 +167,7 @@ def convection(grid, boundary="no_slip", solid=None):
     >>> convect(v, v)
     array([ 2.,  0., -2.,  0.])
     """
-    sides = flow_sides(grid, boundary)
+    sides = resolve(grid, boundary, no_slip)
     flux = _flux_parts(grid)
     carried, carrier, gain = {}, {}, {}
     for number, (c, a) in enumerate((c, a) for c in range(grid.dim) for a in range(grid.dim)):
@@ -200,20 +205,16 @@ def _bilinear(name, A, B, C, made):
 # ------------------------------------------------------------ the factors
 
 
-def _along_wall(word):
-    return dirichlet if word in ("no_slip", "inflow") else neumann
-
-
-def _conditions(words):
-    return None if words is None else tuple(map(_along_wall, words))
+def _conditions(pair):
+    return None if pair is None else tuple(condition.along for condition in pair)
 
 
 def _free(grid, sides, solid):
     """Faces whose velocity is found: not on closed walls or inflows, and not at an obstacle."""
     keep = [np.ones(part, dtype=bool) for part in grid.faces.parts]
-    for axis, words in enumerate(sides):
-        for side, word in zip((0, -1), words or (), strict=False):
-            np.moveaxis(keep[axis], axis, 0)[side] = word == "outflow"
+    for axis, pair in enumerate(sides):
+        for side, condition in zip((0, -1), pair or (), strict=False):
+            np.moveaxis(keep[axis], axis, 0)[side] = condition == outflow
     flat = np.concatenate([part.ravel() for part in keep])
     return flat if solid is None else flat & ~np.logical_or(*solid_faces(grid, check_solid(grid, solid)))
 

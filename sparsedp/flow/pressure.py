@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sparsedp.conditions import no_slip
 from sparsedp.fields import field_array
 from sparsedp.flow.setup import Setup
 from sparsedp.flow.splitting import Potential, Projected
@@ -27,7 +28,7 @@ from sparsedp.tree import copied
 __all__ = ["Projection", "projection"]
 
 
-def projection(grid, solid=None, boundary="no_slip", method="auto", rtol=1e-10, maxiter=None, **options):
+def projection(grid, solid=None, boundary=no_slip, method="auto", rtol=1e-10, maxiter=None, **options):
     """Grid -> the Operator faces -> faces that takes the divergence out of a velocity.
 
     Parameters
@@ -35,8 +36,8 @@ def projection(grid, solid=None, boundary="no_slip", method="auto", rtol=1e-10, 
     grid : Grid
     solid : bool array, shape `grid.shape`, optional
         Obstacles. Faces that touch one get 0.
-    boundary : str or dict
-        "no_slip", "free_slip" (both closed here), "inflow" (keeps the value that is given) or "outflow"
+    boundary : flow condition or dict
+        no_slip, free_slip (both closed here), inflow (keeps the value that is given) or outflow
         (pressure 0), for all bounded sides or as {"x": (lower, upper), ...}; axes that are not named are
         no_slip. An inflow is the value that the faces of that side already have.
     method, rtol, maxiter, **options
@@ -53,7 +54,9 @@ def projection(grid, solid=None, boundary="no_slip", method="auto", rtol=1e-10, 
     ShapeError
         If `solid` has another shape than the grid.
     ValueError
-        If a word of `boundary` is not known, or an inflow enters a region without an outflow.
+        If an axis is named that is periodic or not there, or an inflow enters a region without an outflow.
+    TypeError
+        If `boundary` holds what is no flow condition.
     NonFiniteError
         On use, if the velocity holds NaN or infinity anywhere, walls included.
     ConvergenceError

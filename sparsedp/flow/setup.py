@@ -4,8 +4,8 @@ from functools import cached_property
 
 import numpy as np
 
+from sparsedp.conditions import inflow, no_slip, resolve
 from sparsedp.flow.passes import Passes
-from sparsedp.flow.walls import CLOSED, flow_sides, pressure_conditions
 from sparsedp.grid import Grid
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.difference import divergence, gradient
@@ -28,14 +28,14 @@ class Setup(Remade):
     """
 
     def __init__(self, grid, solid, boundary, settings):
-        self.grid, self.sides = grid, flow_sides(grid, boundary)
+        self.grid, self.sides = grid, resolve(grid, boundary, no_slip)
         self.solid = None if solid is None else check_solid(grid, solid).copy()
-        words = {axis: pair for axis, pair in zip(grid.axes, self.sides, strict=True) if pair}
-        self.made = grid, self.solid, words, settings  # nothing that the caller may change
+        named = {axis: pair for axis, pair in zip(grid.axes, self.sides, strict=True) if pair}
+        self.made = grid, self.solid, named, settings  # nothing that the caller may change
         self.exponent = int(np.frexp(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))[1])
         near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
         self.D = divergence(near)
-        self.G = gradient(near, pressure_conditions(self.sides), self.solid)
+        self.G = gradient(near, self.pressure_conditions, self.solid)
         self.closed = np.flatnonzero(~self.open)
         self.inverse = _inverse(-self.D @ self.G, *settings)
         self.solver = self.inverse.solver
@@ -57,10 +57,10 @@ class Setup(Remade):
     def _make_passes(self):
         """The forward pair of passes, and the transposed one; None where they are not what the operators do."""
         free = []
-        for axis, words in enumerate(self.sides):
+        for axis, pair in enumerate(self.sides):
             line = np.ones(self.grid.node_count(axis), dtype=bool)
-            if words:
-                line[[0, -1]] = [word not in CLOSED for word in words]
+            if pair:
+                line[[0, -1]] = [not condition.closed for condition in pair]
             free.append(line)
         directions = (False,) if self.symmetric else (False, True)
         found = [Passes(self.grid, self.D, self.G, free, transposed) for transposed in directions]
@@ -82,7 +82,7 @@ class Setup(Remade):
     @cached_property
     def still(self):
         """Whether nothing can flow without divergence: one closed line of cells. P is 0, beside rounding."""
-        shut = all(words and all(word in CLOSED for word in words) for words in self.sides)
+        shut = all(pair and all(condition.closed for condition in pair) for pair in self.sides)
         return shut and sum(n > 1 for n in self.grid.shape) <= 1
 
     @cached_property
@@ -91,8 +91,8 @@ class Setup(Remade):
         found = []
         for axis, part in enumerate(self.grid.faces.parts):
             keep = np.ones(part, dtype=bool)
-            for side, word in zip((0, -1), self.sides[axis] or (), strict=False):
-                np.moveaxis(keep, axis, 0)[side] = word not in CLOSED
+            for side, condition in zip((0, -1), self.sides[axis] or (), strict=False):
+                np.moveaxis(keep, axis, 0)[side] = not condition.closed
             found.append(keep.ravel())
         flat = np.concatenate(found)
         if self.solid is not None:
@@ -100,10 +100,16 @@ class Setup(Remade):
             flat &= ~(below | above)
         return flat
 
+    @property
+    def pressure_conditions(self):
+        """Conditions of the pressure: 0 at an outflow, no slope elsewhere."""
+        pairs = zip(self.grid.axes, self.sides, strict=True)
+        return {axis: tuple(condition.pressure for condition in pair) for axis, pair in pairs if pair}
+
     @cached_property
     def symmetric(self):
         """Whether P is its own transpose."""
-        return all(self.grid.uniform) and all(word in CLOSED for pair in self.sides if pair for word in pair)
+        return all(self.grid.uniform) and all(condition.closed for pair in self.sides if pair for condition in pair)
 
     def _refuse_lost_inflow(self):
         """What enters must be able to leave, in every region apart."""
@@ -116,9 +122,9 @@ class Setup(Remade):
         if self.solid is not None:
             closed &= ~self.solid
         for axis, pair in enumerate(self.sides):
-            for side, word in zip((0, -1), pair or (), strict=False):
+            for side, condition in zip((0, -1), pair or (), strict=False):
                 cells = np.moveaxis(closed, axis, 0)
-                if word == "inflow" and cells.size and cells[side].any():
+                if condition == inflow and cells.size and cells[side].any():
                     where = f"{('lower', 'upper')[side]} {self.grid.axes[axis]} side"
                     raise ValueError(f"the inflow on the {where} enters a region without an outflow; open a side of it")
 

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from sparsedp.conditions import no_slip
 from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_function, is_number
 from sparsedp.flow.acceleration import Acceleration, Viscous, total
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
-from sparsedp.flow.walls import flow_sides, pressure_conditions
 from sparsedp.operators.boundary import identity, mask
 from sparsedp.operators.difference import gradient
 from sparsedp.recipe import Remade
@@ -33,12 +33,12 @@ def flow_step(
     dt,
     viscosity=0.0,
     force=None,
-    boundary="no_slip",
+    boundary=no_slip,
     solid=None,
     implicit=False,
     convective=True,
     walls=None,
-    solid_boundary="no_slip",
+    solid_boundary=no_slip,
 ):
     """Grid -> ``step(state, params)`` of incompressible flow, of order 2 in space and time.
 
@@ -134,7 +134,7 @@ class FlowStep(Remade):
         walls = constant(walls)
         self.made = grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
         self.pressure = self.project.pressure
-        self.slope = gradient(grid, pressure_conditions(flow_sides(grid, boundary)), solid)
+        self.slope = gradient(grid, self.project.structure.setup.pressure_conditions, solid)
         self.kept = mask(grid.faces, self.project.structure.setup.open)
         self.convect: Any = convection(grid, boundary, solid) if convective else None
         self.laplacian: Any = None
