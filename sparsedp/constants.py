@@ -3,8 +3,8 @@
 A pullback runs later than its call, and the caller may have written into an array in between (`work[:] = c` in a
 loop). So every array that goes into a node of a tape without being traced is replaced by a read-only copy.
 
-A large array that many nodes use is copied once: the last copy of the array at one place in memory is found again and
-compared bit by bit. That takes as long as a copy and saves the memory. Copies live as long as the tapes that hold them.
+A large array that many nodes use is copied once: the last copy of such a view of its owner is found again and compared
+bit by bit. That takes as long as a copy and saves the memory. Copies live as long as the tapes that hold them.
 """
 
 from copy import copy
@@ -21,7 +21,7 @@ FIXED = {float, int, bool, str, slice, type(None), type(Ellipsis), np.float64}
 
 # Functions whose pullbacks need no numbers of their constants, and those that call `constant_args`.
 sparing: set = set()
-copies: WeakValueDictionary = WeakValueDictionary()  # (address, shape, strides) of an array -> the last copy of it
+copies: WeakValueDictionary = WeakValueDictionary()  # (id of the owner, shape, strides) of an array -> the last copy of it
 
 
 def constant_args(args, nums):
@@ -77,10 +77,11 @@ def is_fixed(array):
 def _copied(value):
     if value.nbytes <= SMALL or value.dtype.kind not in "biufc" or value.real.itemsize not in BITS:
         return _frozen_copy(value)
-    place = value.__array_interface__["data"][0], value.shape, value.strides
-    known = copies.get(place)
+    owner = value if value.base is None else value.base
+    view = id(owner), value.shape, value.strides
+    known = copies.get(view)
     if known is None or not _same_bits(known, value):
-        known = copies[place] = _frozen_copy(value)
+        known = copies[view] = _frozen_copy(value)
     return known
 
 
