@@ -155,7 +155,7 @@ def number(line, x, cubic, period):
 
 def _component(move, u, w, lines, dt, sides, inflow):
     setting = move.setting
-    cubic, midpoint = setting.interpolation == "cubic", setting.form.endswith("midpoint")
+    cubic, midpoint = setting.interpolation == "cubic", setting.backtrace == "midpoint"
     at = np.meshgrid(*(line[3 : 3 + n] for line, n in zip(lines, u.shape)), indexing="ij")
     periods = [np.sum(h) if side == "wrap" else None for h, side in zip(setting.grid.widths, sides)]
 
@@ -175,7 +175,7 @@ def _component(move, u, w, lines, dt, sides, inflow):
     if setting.scheme == "semi_lagrangian":
         return f
     new = f + 0.5 * (u - look(f, places(-1.0), sides, inflow, cubic))
-    if setting.form.startswith("unclamped"):
+    if not setting.clamp:
         return new
     low = high = None
     for value in cell(u, there, sides, inflow):

@@ -29,7 +29,7 @@ CASES = [
     (
         lambda: dp.transport(GRID, "semi_lagrangian", form="flux"),
         ValueError,
-        "transport semi_lagrangian has no flux form; write form='midpoint'",
+        "transport semi_lagrangian does not use form; leave it out",
     ),
     (
         lambda: dp.transport(GRID, "semi_lagrangian")(bad(U, (1, 1)), V, 0.1),
@@ -37,7 +37,7 @@ CASES = [
         "transport semi_lagrangian needs a finite field, got 1 that are NaN or infinite, the first at (1, 1)",
     ),
     (
-        lambda: dp.transport(GRID, "semi_lagrangian", form="midpoint")(U, bad(V, slice(5, 7), np.inf), 0.1),
+        lambda: dp.transport(GRID, "semi_lagrangian", backtrace="midpoint")(U, bad(V, slice(5, 7), np.inf), 0.1),
         NonFiniteError,
         "transport semi_lagrangian needs a finite velocity, got 2 that are NaN or infinite, the first at 5",
     ),

@@ -141,10 +141,7 @@ def test_message(case):
 
 
 def test_messages_of_other_schemes(monkeypatch):
-    """What a scheme says that is not linear, has no second derivatives and only one form."""
-    monkeypatch.setattr(type(dp.transport(GRID).law), "forms", ("advective",))
-    with pytest.raises(ValueError, match="transport upwind has no flux form; write form='advective'"):
-        dp.transport(GRID, form="flux")
+    """What a scheme says that is not linear and has no second derivatives."""
     move = dp.transport(GRID)
     move.law.linear = move.law.twice = False
     message = "transport upwind is not linear in u and has no matrix; write scheme='upwind', or call move(u, v, dt)"
@@ -154,3 +151,31 @@ def test_messages_of_other_schemes(monkeypatch):
     slope = value_and_grad(lambda u: (move(u, V, 0.1) ** 2).sum())
     with pytest.raises(DerivativeError, match=message):
         value_and_grad(lambda u: (slope(u)[1] ** 2).sum())(U)
+
+
+UNUSED = {
+    "upwind": {"interpolation": "cubic", "backtrace": "midpoint", "clamp": False},
+    "van_leer": {"interpolation": "cubic", "backtrace": "midpoint", "clamp": False},
+    "semi_lagrangian": {"form": "advective", "clamp": False, "unstable": "allow"},
+    "maccormack": {"form": "flux", "unstable": "allow"},
+}
+
+
+@pytest.mark.parametrize("scheme", UNUSED)
+def test_an_option_that_a_scheme_does_not_use_is_refused(scheme):
+    for name, value in UNUSED[scheme].items():
+        with pytest.raises(ValueError, match=f"transport {scheme} does not use {name}; leave it out"):
+            dp.transport(GRID, scheme, **{name: value})
+
+
+@pytest.mark.parametrize("word", ["midpoint", "clamped", "unclamped midpoint"])
+def test_the_words_of_form_in_the_first_edition(word):
+    message = f"transport takes form from 'flux', 'advective', got '{word}'; write backtrace= or clamp="
+    with pytest.raises(ValueError, match=message):
+        dp.transport(GRID, "maccormack", form=word)
+
+
+@pytest.mark.parametrize("options", [{"clamp": 1}, {"clamp": None}, {"backtrace": np.array(["euler"])}, {"form": True}])
+def test_words_of_another_kind_are_refused(options):
+    with pytest.raises(ValueError, match="transport takes .* write"):
+        dp.transport(GRID, "maccormack", **options)

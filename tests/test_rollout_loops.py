@@ -21,7 +21,7 @@ SCENES = {  # grid, arguments of transport, inflow
     "box": (dp.Grid((3, 4, 2), periodic=(False, True, False)), {"velocity": "cells", "form": "flux"}, 0.0),
     "van_leer": (dp.Grid((5, 4)), {"scheme": "van_leer"}, 0.0),
     "semi_lagrangian": (dp.Grid((5, 4)), {"scheme": "semi_lagrangian", "boundary": dp.dirichlet}, 0.3),
-    "maccormack": (dp.Grid(9, periodic=True), {"scheme": "maccormack", "form": "unclamped midpoint"}, 0.0),
+    "maccormack": (dp.Grid(9, periodic=True), {"scheme": "maccormack", "backtrace": "midpoint", "clamp": False}, 0.0),
 }
 
 

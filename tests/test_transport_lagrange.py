@@ -12,10 +12,10 @@ from sparsedp.kernels import departure, team
 
 NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
 SCHEMES = [
-    ("semi_lagrangian", "euler"),
-    ("semi_lagrangian", "midpoint"),
-    ("maccormack", "clamped"),
-    ("maccormack", "unclamped midpoint"),
+    ("semi_lagrangian", {}),
+    ("semi_lagrangian", {"backtrace": "midpoint"}),
+    ("maccormack", {}),
+    ("maccormack", {"backtrace": "midpoint", "clamp": False}),
 ]
 GRIDS = [((7,), (True,)), ((6, 5), (False, True)), ((3, 4, 5), (False, True, False))]
 PLACES = [("cells", "faces"), ("faces", "faces"), ("cells", "cells"), ("faces", "cells")]
@@ -30,7 +30,7 @@ def setting(shape, periodic, scheme, form, interpolation, of="cells", velocity="
     """A transport and a point (u, v, dt, inflow) that is off all kinks."""
     grid = dp.Grid(shape, spacing=(0.3, 0.4, 0.5)[: len(shape)], periodic=periodic)
     move = dp.transport(
-        grid, scheme, velocity=velocity, of=of, interpolation=interpolation, form=form, solid=solid, **options
+        grid, scheme, velocity=velocity, of=of, interpolation=interpolation, **form, solid=solid, **options
     )
     rng = np.random.default_rng(5)
     v = 0.7 * rng.standard_normal(grid.faces.shape if velocity == "faces" else (grid.dim, *shape))
@@ -101,7 +101,7 @@ def test_solid(without_numba, scheme, form, of):
 
 
 def test_nothing_but_solid(without_numba):
-    move, (u, v, dt, _) = setting((3, 2), False, "maccormack", "clamped", "linear", solid=np.ones((3, 2), bool))
+    move, (u, v, dt, _) = setting((3, 2), False, "maccormack", {}, "linear", solid=np.ones((3, 2), bool))
     assert np.array_equal(move(u, v, dt), u)
 
 
@@ -114,7 +114,7 @@ def test_matrix(without_numba, of, interpolation):
     solid = np.zeros((6, 5), bool)
     solid[3, 1:3] = True
     move, (u, v, dt, _) = setting(
-        (6, 5), (True, False), "semi_lagrangian", "euler", interpolation, of, solid=solid, boundary=dp.dirichlet
+        (6, 5), (True, False), "semi_lagrangian", {}, interpolation, of, solid=solid, boundary=dp.dirichlet
     )
     op = move.operator(v, dt)
     assert op(u) == pytest.approx(move(u, v, dt), rel=1e-13, abs=1e-13)
@@ -123,14 +123,14 @@ def test_matrix(without_numba, of, interpolation):
 
 
 def test_no_matrix():
-    move, (_, v, dt, _) = setting((6, 5), True, "maccormack", "clamped", "linear")
+    move, (_, v, dt, _) = setting((6, 5), True, "maccormack", {}, "linear")
     with pytest.raises(ValueError, match="transport maccormack is not linear in u and has no matrix"):
         move.operator(v, dt)
 
 
 def test_second_derivatives(without_numba):
     """In the field of the linear scheme, any; else a typed error."""
-    move, (u, v, dt, _) = setting((6, 5), True, "semi_lagrangian", "euler", "linear")
+    move, (u, v, dt, _) = setting((6, 5), True, "semi_lagrangian", {}, "linear")
     slope = lambda u: dp.value_and_grad(lambda w: (move(w, v, dt) ** 3).sum())(u)[1]
     along = np.sin(np.arange(u.size)).reshape(u.shape)
     _, bend = dp.value_and_grad(lambda u: (slope(u) * along).sum())(u)
@@ -183,7 +183,7 @@ def _dense(points, w, scale, along=None):
 @pytest.mark.parametrize("shape", [(2000,), (60, 50), (11, 12, 13)])
 def test_bits_do_not_depend_on_threads(monkeypatch, scheme, shape):
     monkeypatch.setattr(team, "SERIAL", 0)
-    move, point = setting(shape, False, scheme, None, "linear")
+    move, point = setting(shape, False, scheme, {}, "linear")
     found = []
     for threads in (1, 2, 3):
         monkeypatch.setattr(kernels, "threads", lambda threads=threads: threads)

@@ -67,9 +67,9 @@ def test_rotating_hump():
     for scheme, interpolation, form in (
         ("semi_lagrangian", "linear", "midpoint"),
         ("semi_lagrangian", "cubic", "midpoint"),
-        ("maccormack", "linear", "clamped midpoint"),
+        ("maccormack", "linear", "midpoint"),
     ):
-        step = dp.transport(grid, scheme, dp.dirichlet, interpolation=interpolation, form=form).step(1 / n / 2)
+        step = dp.transport(grid, scheme, dp.dirichlet, interpolation=interpolation, backtrace=form).step(1 / n / 2)
         u = hump
         for _ in range(2 * n):
             u = step(u, wind)
@@ -100,8 +100,8 @@ def turned_blob(n, **options):
     ("least", "most", "sizes", "options"),
     [
         (0.9, 1.1, (160, 320), dict(scheme="semi_lagrangian")),
-        (1.9, 3.2, (48, 96), dict(scheme="semi_lagrangian", interpolation="cubic", form="midpoint")),
-        (1.9, 2.3, (48, 96), dict(scheme="maccormack", form="unclamped midpoint")),
+        (1.9, 3.2, (48, 96), dict(scheme="semi_lagrangian", interpolation="cubic", backtrace="midpoint")),
+        (1.9, 2.3, (48, 96), dict(scheme="maccormack", backtrace="midpoint", clamp=False)),
     ],
 )
 def test_order(least, most, sizes, options):

@@ -10,10 +10,10 @@ from looking_back import against_twin
 import sparsedp as dp
 
 SCHEMES = [
-    ("semi_lagrangian", "euler"),
-    ("semi_lagrangian", "midpoint"),
-    ("maccormack", "clamped"),
-    ("maccormack", "unclamped midpoint"),
+    ("semi_lagrangian", {}),
+    ("semi_lagrangian", {"backtrace": "midpoint"}),
+    ("maccormack", {}),
+    ("maccormack", {"backtrace": "midpoint", "clamp": False}),
 ]
 WIDTHS = (
     np.array([0.3, 0.4, 0.35, 0.5, 0.3, 0.25, 0.45]),
@@ -27,7 +27,7 @@ PLACES = [("cells", "faces"), ("faces", "faces"), ("cells", "cells"), ("faces", 
 def scene(shape, periodic, scheme, form, interpolation="linear", of="cells", velocity="faces", **options):
     widths = [h[:n] for h, n in zip(WIDTHS, shape)]
     grid = dp.Grid(shape, spacing=widths if len(shape) > 1 else [widths[0]], periodic=periodic)
-    move = dp.transport(grid, scheme, velocity=velocity, of=of, interpolation=interpolation, form=form, **options)
+    move = dp.transport(grid, scheme, velocity=velocity, of=of, interpolation=interpolation, **form, **options)
     rng = np.random.default_rng(5)
     v = 0.7 * rng.standard_normal(grid.faces.shape if velocity == "faces" else (grid.dim, *shape))
     return move, (rng.standard_normal(move.space.shape), v, 0.31, 0.4)
@@ -50,7 +50,7 @@ def test_twin(shape, periodic, scheme, form, boundary):
 def test_linear_fields_are_carried_exactly(scheme, form, interpolation):
     """u = a + b x + c y goes to a + b (x - w t) + c (y - z t), away from walls, for any widths."""
     grid = dp.Grid((14, 15), spacing=[np.tile(WIDTHS[0], 2), np.tile(WIDTHS[1], 3)])
-    move, (x, y) = dp.transport(grid, scheme, interpolation=interpolation, form=form), grid.centres()
+    move, (x, y) = dp.transport(grid, scheme, interpolation=interpolation, **form), grid.centres()
     v = grid.join(np.full((15, 15), 0.2), np.full((14, 16), -0.3))
     new, wanted = move(1.0 + 2.0 * x - 3.0 * y, v, 0.4), 1.0 + 2.0 * (x - 0.08) - 3.0 * (y + 0.12)
     assert new[4:-4, 4:-4] == pytest.approx(wanted[4:-4, 4:-4], rel=1e-13, abs=1e-13)
@@ -83,7 +83,7 @@ def test_gradient_is_that_of_the_value(scheme, form, interpolation):
 def test_matrix(interpolation, of):
     solid = np.zeros((7, 5), bool)
     solid[3, 1:3] = True
-    move, (u, v, dt, _) = scene((7, 5), (True, False), "semi_lagrangian", "euler", interpolation, of, solid=solid)
+    move, (u, v, dt, _) = scene((7, 5), (True, False), "semi_lagrangian", {}, interpolation, of, solid=solid)
     assert move.operator(v, dt)(u) == pytest.approx(move(u, v, dt), rel=1e-12, abs=1e-12)
 
 
@@ -110,7 +110,7 @@ def error(n, options):
     [
         (dict(scheme="semi_lagrangian"), 0.85, 1.15, (200, 400)),
         (dict(scheme="semi_lagrangian", interpolation="cubic"), 1.9, 3.3, (40, 80)),
-        (dict(scheme="maccormack", form="unclamped"), 1.8, 2.3, (80, 160)),
+        (dict(scheme="maccormack", clamp=False), 1.8, 2.3, (80, 160)),
     ],
     ids=lambda item: item.get("interpolation", item["scheme"]) if isinstance(item, dict) else "",
 )

@@ -23,11 +23,13 @@ from sparsedp.tape import Rule, isbox
 __all__ = ["Transport", "transport"]
 
 LAWS = {**dict.fromkeys(SCHEMES, Eulerian), "semi_lagrangian": SemiLagrangian, "maccormack": MacCormack}
-CHOICES = {
+CHOICES = {  # the first one is the default; a scheme says in `options` which of the last five it uses
     "velocity": ("faces", "cells"),
     "of": ("cells", "faces"),
-    "form": (None, *dict.fromkeys(form for law in LAWS.values() for form in law.forms)),
     "interpolation": ("linear", "cubic"),
+    "form": (None, "flux", "advective"),
+    "backtrace": ("euler", "midpoint"),
+    "clamp": (True, False),
     "unstable": ("raise", "allow"),
 }
 
@@ -40,6 +42,8 @@ def transport(
     of="cells",
     interpolation="linear",
     form=None,
+    backtrace="euler",
+    clamp=True,
     solid=None,
     unstable="raise",
 ):
@@ -68,17 +72,19 @@ def transport(
     interpolation : "linear" or "cubic"
         Of semi_lagrangian and maccormack. linear: order 1, no new extrema. cubic (Catmull-Rom): order 2 to 3
         where the field is smooth, small new extrema; widths of cells may change by a factor of 5 from one to the next.
-    form : str, optional
-        flux: du/dt = -div(v u), conserves the sum of u times volume. advective: du/dt = -v . grad u,
-        keeps constants. Default: flux for a velocity on faces, advective for one on cells.
-        semi_lagrangian: how a point looks back, "euler" (default) along its own velocity or "midpoint" along
-        the one half way. maccormack: "clamped" (default) to the least and greatest sample of the cell the
-        content comes from, "unclamped", "clamped midpoint", "unclamped midpoint".
+    form : "flux" or "advective", optional
+        Of upwind and van_leer. flux: du/dt = -div(v u), conserves the sum of u times volume. advective: du/dt =
+        -v . grad u, keeps constants. Default: flux for a velocity on faces, advective for one on cells.
+    backtrace : "euler" or "midpoint"
+        Of semi_lagrangian and maccormack: how a departure point is found, along the velocity at the point itself or
+        along the one half way.
+    clamp : bool
+        Of maccormack: to the least and greatest sample of the cell around the departure point.
     solid : bool array, shape grid.shape, optional
         Nothing passes through a face that touches a solid cell; what is in solid cells stays.
         semi_lagrangian, maccormack: looked at from outside, a solid cell has the mean of its fluid neighbours.
     unstable : "raise" or "allow"
-        What to do when a point would get a negative weight (CFL number above 1).
+        Of upwind and van_leer: what to do when a point would get a negative weight (CFL number above 1).
 
     Returns
     -------
@@ -89,7 +95,8 @@ def transport(
     Raises
     ------
     ValueError
-        If a word is not one of those above, or a condition is neither dirichlet nor neumann. On use: dt <= 0.
+        If a word is not one of those above, an option is given that the scheme does not use, or a condition is
+        neither dirichlet nor neumann. On use: dt <= 0.
     UnstableStepError
         On use, if the step is larger than the scheme allows.
     NonFiniteError, ShapeError, TypeError
@@ -99,7 +106,7 @@ def transport(
 
     Notes
     -----
-    Limiters and clamps (van_leer, maccormack but for "unclamped") have kinks in u where neighbours are equal, as in a
+    Limiters and clamps (van_leer, maccormack but for clamp=False) have kinks in u where neighbours are equal, as in a
     field that is 0 in places. The derivative is one of several there, and `check.gradient` says "inconclusive".
 
     Source
@@ -118,23 +125,26 @@ def transport(
     if not isinstance(grid, Grid):
         raise TypeError(f"transport takes a Grid, got {type(grid).__name__}; write dp.Grid((64, 64), size=1.0)")
     _check_word("scheme", scheme, tuple(LAWS))
-    given = {"velocity": velocity, "of": of, "form": form, "interpolation": interpolation, "unstable": unstable}
-    for name, word in given.items():
+    places = {"velocity": velocity, "of": of}
+    options = {
+        "interpolation": interpolation, "form": form, "backtrace": backtrace, "clamp": clamp, "unstable": unstable
+    }  # fmt: skip
+    for name, word in {**places, **options}.items():
         _check_word(name, word, CHOICES[name])
-    forms = LAWS[scheme].forms
-    if form is None:
-        form = "flux" if velocity == "faces" and "flux" in forms else forms[-1]
-    if form not in forms:
-        raise ValueError(f"transport {scheme} has no {form} form; write form={forms[0]!r}")
+    for name, word in options.items():
+        if word != CHOICES[name][0] and name not in LAWS[scheme].options:
+            raise ValueError(f"transport {scheme} does not use {name}; leave it out")
+    if "form" in LAWS[scheme].options and form is None:
+        options["form"] = "flux" if velocity == "faces" else "advective"
     solid = None if solid is None else check_solid(grid, solid).copy()
-    sides = _sides(grid, boundary)
-    return Transport(Setting(grid, scheme, sides, velocity, of, interpolation, form, solid, unstable))
+    return Transport(Setting(grid, scheme, _sides(grid, boundary), solid=solid, **places, **options))
 
 
 def _check_word(name, word, known):
-    if not isinstance(word, (str, type(None))) or word not in known:
+    if type(word) not in {type(one) for one in known} or word not in known:
         words = ", ".join(repr(w) for w in known if w is not None)
-        raise ValueError(f"transport takes {name} from {words}, got {word!r}; write one of them")
+        advice = "backtrace= or clamp=" if name == "form" else "one of them"  # words of form in the first edition
+        raise ValueError(f"transport takes {name} from {words}, got {word!r}; write {advice}")
 
 
 def _sides(grid, boundary):
@@ -249,7 +259,8 @@ class Transport(Remade):
     def __repr__(self):
         setting = self.setting
         conditions = {str(c) for pair in setting.sides for c in pair or ()}
-        words = [f"velocity on {setting.velocity}", f"{setting.form} form", *sorted(conditions)]
+        own = f"{setting.form} form" if setting.form else f"{setting.interpolation}, {setting.backtrace}"
+        words = [f"velocity on {setting.velocity}", own, *sorted(conditions)]
         if setting.solid is not None:
             words.append(f"{np.count_nonzero(setting.solid)} solid cells")
         return f"<transport {setting.scheme}: {self.space}, {', '.join(words)}>"

@@ -25,7 +25,9 @@ class Setting(NamedTuple):
     velocity: str
     of: str
     interpolation: str
-    form: str
+    form: str | None  # None where the scheme has none
+    backtrace: str
+    clamp: bool
     solid: Any  # boolean array of the shape of the grid, or None
     unstable: str
 
@@ -71,15 +73,15 @@ class Law:
     setting : Setting
     walls : Space
         Where inflow values live: one part for each wall of each component, x-lower, x-upper, y-lower, ...
-    forms : tuple of str
-        The values of `form` that the scheme knows.
+    options : tuple of str
+        The options of `transport` that the scheme uses.
     linear : bool
         Whether the step is linear in (u, inflow).
     twice : bool
         Whether `pull` and `push` take traced values too, so that derivatives of every order follow.
     """
 
-    forms: tuple[str, ...] = ("flux", "advective")
+    options: tuple[str, ...] = ("form", "unstable")
     linear = False
     twice = False
     forward: Any

@@ -26,13 +26,13 @@ BLOCK = 1 << 14  # points that NumPy works on at a time: what is made on the way
 class MacCormack(SemiLagrangian):
     """See the head of the file."""
 
-    forms = ("unclamped midpoint", "clamped midpoint", "unclamped", "clamped")
+    options = ("interpolation", "backtrace", "clamp")
     linear = False
     signs = (1, -1)
 
     def __init__(self, setting):
         super().__init__(setting)
-        self.clamped = setting.form.startswith("clamped")
+        self.clamped = setting.clamp
 
     def _stages(self, component, u, inflow, trajectories, room):
         """Samples of u and of f, the value before it is clamped, `extrema` of u or None."""

@@ -30,14 +30,14 @@ __all__ = ["SemiLagrangian"]
 class SemiLagrangian(Law):
     """See the head of the file."""
 
-    forms: tuple[str, ...] = ("midpoint", "euler")
+    options: tuple[str, ...] = ("interpolation", "backtrace")
     linear = True
     signs: tuple[int, ...] = (1,)  # of the steps along which points look: backwards in time
 
     def __init__(self, setting):
         super().__init__(setting)
         self.components = components(setting)
-        self.backtrace = Midpoint(setting) if setting.form.endswith("midpoint") else Euler()
+        self.backtrace = Midpoint(setting) if setting.backtrace == "midpoint" else Euler()
         self.to_points = velocity_at_points(setting)
         self.scratch, dim, ends = Scratch(), setting.grid.dim, [setting.grid.dim * n for n in setting.space.offsets]
         self.parts = [(slice(*pair), (dim, -1)) for pair in zip(ends, ends[1:], strict=False)]  # of the velocity
