@@ -80,8 +80,7 @@ def upwind(shape, n, repeats):
         return lambda: dp.value_and_grad(loss)((u, v))[1]
 
     tasks = {
-        "rollout of move.step": through(move.step(dt), {}),
-        "rollout of a plain function of move": through(lambda u, v: move(u, v, dt), {}),
+        "rollout": through(lambda u, v: move(u, v, dt), {}),
         "move, every step on the tape": through(lambda u, v: move(u, v, dt)),
         "autograd over slices": through(sliced_by_hand(shape, dt)),
         "autograd over roll": through(sliced(shape, dt)),
@@ -94,7 +93,7 @@ def upwind(shape, n, repeats):
     print(f"{'':38} {'ms':>9} {'x slices':>9} {'limit':>6} {'error':>9} {'peak / trajectory':>18}")
     for name, seconds in best.items():
         error = max(np.max(np.abs(a - b)) / np.max(np.abs(b)) for a, b in zip(slopes[name], first))
-        limit = f"{LIMITS[len(shape)]:g}" if name == "rollout of move.step" else ""
+        limit = f"{LIMITS[len(shape)]:g}" if name == "rollout" else ""
         print(
             f"{name:38} {1e3 * seconds:9.1f} {best['autograd over slices'] / seconds:9.1f} {limit:>6} {error:9.1e}"
             f" {peak(tasks[name]) / trajectory:18.2f}"
@@ -121,7 +120,8 @@ def peak(task):
 def memory(shape, n, budgets):
     """Print one block: bytes, steps run again, and whether the bits stay."""
     u, v = np.random.default_rng(0).random(shape), np.full((2, *shape), 0.3)
-    step = dp.transport(dp.Grid(shape, size=1.0, periodic=True), velocity="cells").step(0.4 / sum(shape))
+    move, dt = dp.transport(dp.Grid(shape, size=1.0, periodic=True), velocity="cells"), 0.4 / sum(shape)
+    step = lambda u, v: move(u, v, dt)
     print(f"\n{shape[0]} x {shape[1]} cells, {n} upwind steps, a state has {u.nbytes / 1e6:g} MB")
     print(f"{'memory':>10} {'kept':>6} {'steps / n':>10} {'optimum':>8} {'peak MB':>8} {'s':>7}  bits of 1000 steps")
     exact = None

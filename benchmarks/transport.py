@@ -52,11 +52,11 @@ def wave(n, options):
     x, y = grid.centres()
     mode = np.sin(2 * pi * x) * np.sin(2 * pi * y)
     steps = 2 * n
-    move = dp.transport(grid, **options).step(END / steps)
+    move, dt = dp.transport(grid, **options), END / steps
 
     def loss(wind):
         v = grid.join(wind[0] * np.ones(grid.shape), wind[1] * np.ones(grid.shape))
-        return anp.mean(mode * dp.rollout(move, 1 + 0.5 * mode, v, steps))
+        return anp.mean(mode * dp.rollout(lambda u, v: move(u, v, dt), 1 + 0.5 * mode, v, steps))
 
     return loss
 

@@ -10,7 +10,8 @@ sizes = [int(word) for word in sys.argv[1:] if word.isdigit()]
 n, steps = sizes[0] if sizes else 64, 60 * (sizes[0] if sizes else 64) // 64
 grid = dp.Grid(n, size=1.0, periodic=True)
 (x,) = grid.centres()
-step = dp.transport(grid, velocity="cells").step(0.5 / n / 1.3)  # upwind, one velocity for each cell
+move, dt = dp.transport(grid, velocity="cells"), 0.5 / n / 1.3  # upwind, one velocity for each cell
+step = lambda u, v: move(u, v, dt)
 start = np.exp(-(((x - 0.3) / 0.06) ** 2) / 2)
 hidden = 1 + 0.3 * np.sin(2 * np.pi * x)
 

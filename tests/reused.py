@@ -190,7 +190,10 @@ def rollout_of_a_chain():
 @case("rollout")
 def rollout_of_transport():
     move = dp.transport(LINE)
-    return (lambda u, v: dp.rollout(move.step(0.01), u, v, 6)), [lambda s: field(6, s), lambda s: field(7, s)]
+    return (lambda u, v: dp.rollout(lambda u, v: move(u, v, 0.01), u, v, 6)), [
+        lambda s: field(6, s),
+        lambda s: field(7, s),
+    ]
 
 
 @case("flow_step")

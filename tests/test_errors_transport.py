@@ -126,9 +126,9 @@ CASES = [
         "transport upwind.operator needs constant v and dt, got traced ones; call move(u, v, dt) instead",
     ),
     (
-        lambda: value_and_grad(lambda x: dp.transport(GRID).step(x)(U, V).sum())(0.1),
-        DerivativeError,
-        "step needs constant dt and inflow, got traced ones; write lambda u, p: move(u, p[0], p[1]) instead",
+        lambda: dp.transport(GRID).step(0.1),
+        AttributeError,
+        "transport has no attribute 'step'; write lambda u, v: move(u, v, dt)",
     ),
 ]
 

@@ -52,7 +52,7 @@ def test_each_gradient_alone_beside_solids(scheme, of, rng):
 def test_single_precision_in_a_rollout(scheme, rng):
     """State, or params, or both: the gradient comes in the dtype of each, close to that in double precision."""
     move, u, v, q = scene(scheme, rng)
-    step = move.step(0.02, q)
+    step = lambda u, v: move(u, v, 0.02, q)
     slopes = dp.value_and_grad(lambda x: anp.sum(dp.rollout(step, *x, 7) ** 2))
     wanted = slopes((u, v))[1]
     for kinds in product((np.float32, np.float64), repeat=2):

@@ -127,11 +127,6 @@ BUILDERS = {
         moved,
     ),
     "semi_lagrangian": ((SOLID,), lambda s: dp.transport(GRID, "semi_lagrangian", solid=s), lambda m: m(CELLS, K, 0.1)),
-    "transport step": (
-        (np.array(0.01), np.linspace(1.0, 2.0, 14)),
-        lambda dt, inflow: dp.transport(GRID, boundary=dp.dirichlet).step(dt, inflow),
-        lambda step: value_and_grad(lambda v: anp.sum(step(CELLS, v) ** 2))(0.1 * K),
-    ),
     "transport operator": ((0.1 * K,), lambda v: dp.transport(GRID).operator(v, 0.01), cells),
     "stepper": (
         (np.array(0.01), np.array(1e-3)),

@@ -46,8 +46,8 @@ def bend(u, p):
 
 
 LOOPS = {  # step, state, params, options
-    "whole": (MOVE.step(0.02), U, V, {}),
-    "plain forms": (MOVE.step(0.02), U, V, {"memory": (4 + 3) * U.nbytes + 2 * V.nbytes}),
+    "whole": (lambda u, v: MOVE(u, v, 0.02), U, V, {}),
+    "plain forms": (lambda u, v: MOVE(u, v, 0.02), U, V, {"memory": (4 + 3) * U.nbytes + 2 * V.nbytes}),
     "taped": (bend, U, WIDE, {"memory": (4 + 3 + 2) * U.nbytes}),
     "taped once": (bend, U, WIDE, {"memory": "1 MB"}),
     "linked": (bend, U, WIDE, {}),
@@ -114,7 +114,7 @@ import sys, time
 import numpy as np, autograd.numpy as anp, sparsedp as dp
 grid = dp.Grid(40, size=1.0, periodic=True)
 move = dp.transport(grid)
-step = {"whole": move.step(1e-3), "linked": lambda u, v: move(u, v, 1e-3)}[sys.argv[1]]
+step = lambda u, v: move(u, v, 1e-3)
 u, v = np.sin(np.arange(40.0)), np.cos(np.arange(40.0))
 loss = lambda n: lambda u: anp.sum(dp.rollout(step, u, v, n) ** 2)
 wanted = dp.value_and_grad(loss(50))(u)[1].tobytes()

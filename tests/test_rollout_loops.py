@@ -29,7 +29,7 @@ def scene(name):
     grid, options, inflow = SCENES[name]
     move = dp.transport(grid, **options)
     u, v = RNG.standard_normal(move.space.shape), 0.4 * RNG.standard_normal(move.setting.velocity_shapes[0])
-    return move.step(0.15, inflow), u, v, RNG.standard_normal(u.shape)
+    return (lambda u, v: move(u, v, 0.15, inflow)), u, v, RNG.standard_normal(u.shape)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -97,15 +97,15 @@ def test_the_loop_stops_at_the_step_that_goes_wrong():
     move = dp.transport(dp.Grid(8, periodic=True))
     u, v = np.arange(8.0), np.full(8, 1.5)
     with pytest.raises(UnstableStepError, match="dt = 1 is too large at 8 of 8 points"):
-        dp.rollout(move.step(1.0), u, v, 5)
+        dp.rollout(lambda u, v: move(u, v, 1.0), u, v, 5)
     with pytest.raises(NonFiniteError, match="cannot represent the result"):
         bold = dp.transport(dp.Grid(8, periodic=True), unstable="allow")
-        dp.rollout(bold.step(1e30), np.cos(np.arange(8.0)), v, 40)
+        dp.rollout(lambda u, v: bold(u, v, 1e30), np.cos(np.arange(8.0)), v, 40)
     with pytest.raises(NonFiniteError, match="finite inflow"):
         open_ = dp.transport(dp.Grid(4), boundary=dp.dirichlet)
-        dp.rollout(open_.step(0.1, np.array([np.nan, 0.0])), u[:4], np.ones(5), 3)
+        dp.rollout(lambda u, v: open_(u, v, 0.1, np.array([np.nan, 0.0])), u[:4], np.ones(5), 3)
     bold = dp.transport(dp.Grid(8, periodic=True), unstable="allow")
-    sawtooth = dp.rollout(bold.step(1.0), np.tile([1.0, -1.0], 4), v, 3)
+    sawtooth = dp.rollout(lambda u, v: bold(u, v, 1.0), np.tile([1.0, -1.0], 4), v, 3)
     assert np.allclose(sawtooth, -8 * np.tile([1.0, -1.0], 4))  # grows by exactly 2 a step
 
 

@@ -36,7 +36,7 @@ class Doubling:
 @pytest.mark.parametrize("kind", ["function", "plain forms"])
 def test_forward(kind):
     move = dp.transport(dp.Grid(8, periodic=True))
-    step = Doubling(move) if kind == "plain forms" else growing(move.step(0.2))
+    step = Doubling(move) if kind == "plain forms" else growing(lambda u, v: move(u, v, 0.2))
     state = np.ones(8), np.ones(8)
     with pytest.raises(UnstableStepError, match=f"^in step 3 of rollout: {LIMIT}"):
         dp.rollout(step, state, None, 6)

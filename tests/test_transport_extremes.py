@@ -188,10 +188,10 @@ def test_islands_and_cells_of_high_aspect(scheme):
 
 def test_ten_thousand_steps():
     grid = dp.Grid(16, size=1.0, periodic=True)
-    step, u, v = dp.transport(grid).step(0.03), np.random.default_rng(3).random(16), np.ones(16)
+    move, u, v = dp.transport(grid), np.random.default_rng(3).random(16), np.ones(16)
     mass = u.sum()
     for _ in range(10_000):
-        u = step(u, v)
+        u = move(u, v, 0.03)
     np.testing.assert_allclose(u, mass / 16, rtol=1e-11)
     assert (
         repr(dp.transport(grid, solid=u > 9))

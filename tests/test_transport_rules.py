@@ -178,23 +178,7 @@ def test_kinks_get_the_mean_of_both_sides(velocity, kink):
         assert slope[index] == pytest.approx((loss(v + unit) - loss(v - unit)) / (2 * h), abs=1e-8)
 
 
-# ---- the step with a fixed dt ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
-@pytest.mark.parametrize("velocity, form", FORMS)
-@pytest.mark.parametrize("of", ["cells", "faces"])
-def test_the_step_with_a_fixed_dt(scheme, velocity, form, of):
-    move, args, _ = scene(scheme, GRIDS["2-D"], velocity, form, of)
-    u, v, g = args["u"], args["v"], np.random.default_rng(4).normal(size=move.space.shape)
-    step = move.step(args["dt"], args["inflow"])
-    assert repr(step) == f"<step of {move!r}, dt = 0.02>"
-    np.testing.assert_array_equal(step(u, v), move(u, v, args["dt"], args["inflow"]))
-    of_u, of_v = value_and_grad(lambda p: anp.sum(g * step(*p)))((u, v))[1]
-    narrow = value_and_grad(lambda v: anp.sum(g * step(u, v)))(v.astype(np.float32))[1]
-    np.testing.assert_allclose(narrow, of_v, rtol=1e-6, atol=1e-6)
-    tangent = pushforward(lambda p: step(*p), (u, v), (u, v))[1]
-    assert np.sum(tangent * g) == pytest.approx(np.sum(of_u * u) + np.sum(of_v * v), rel=1e-12)
+# ---- constants of a step --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer", "semi_lagrangian", "maccormack", "convection"])
@@ -214,11 +198,3 @@ def test_an_array_may_be_reused_before_the_pullback(scheme):
         pull = pullback(moved, buffers[number])[1]
         others[1 - number][:] = 0.01
         assert np.array_equal(pull(buffers[0]), wanted)
-
-
-def test_a_step_keeps_its_inflow():
-    move, u, v = dp.transport(dp.Grid(3), boundary=dp.dirichlet), np.ones(3), 0.5 * np.ones(4)
-    inflow = np.array([2.0, 0.0])
-    step, wanted = move.step(0.5, inflow), move(u, v, 0.5, inflow)
-    inflow[:] = 9.0
-    assert np.array_equal(step(u, v), wanted) and np.array_equal(dp.rollout(step, u, v, 1), wanted)

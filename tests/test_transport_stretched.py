@@ -94,7 +94,8 @@ def error(n, options):
     grid = dp.Grid(n, spacing=[widths], periodic=True)
     (x,) = grid.centres()
     x = x - x[0] + 0.5 * widths[0]
-    step, steps = dp.transport(grid, velocity="cells", **options).step(0.5 / n), 2 * n
+    move, steps = dp.transport(grid, velocity="cells", **options), 2 * n
+    step = lambda u, v: move(u, v, 0.5 / n)
     wave = lambda p: 1 / (2 + anp.sin(2 * np.pi * (x - p)))
     value = dp.rollout(step, wave(0.0), np.ones(n), steps)
     loss = lambda p: anp.sum(grid.volumes * (dp.rollout(step, wave(p), np.ones(n), steps) - wave(0.3)) ** 2)

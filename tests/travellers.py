@@ -235,7 +235,6 @@ def travellers():
         move = dp.transport(GRID, scheme, solid=SOLID)
         u, v = numbers(GRID.shape), 0.3 * numbers(GRID.faces.size)
         yield "transport", scheme, move, lambda move, u=u, v=v: bits(move, u, v, 0.1)
-        yield "transport", f"{scheme}, step", move.step(0.1), lambda step, u=u, v=v: of_step(step, u, v)
     yield "flow_step", "", dp.flow_step(GRID, 0.01, 0.1, push, solid=SOLID), of_flow
     yield "flow_step", "implicit", dp.flow_step(BOX, 0.01, 0.1, implicit=True, convective=False), of_flow
     lid = dp.face_lift(GRID)

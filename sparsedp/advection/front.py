@@ -7,7 +7,6 @@ from sparsedp.advection.law import Law, Setting
 from sparsedp.advection.maccormack import MacCormack
 from sparsedp.advection.rule import rule_of
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
-from sparsedp.advection.step import Step
 from sparsedp.advection.still import Still
 from sparsedp.advection.values import check_step, flat_numbers
 from sparsedp.conditions import dirichlet, neumann, resolve
@@ -229,32 +228,9 @@ class Transport(Remade):
         flat = flat_numbers(name, "v", v, setting.velocity_shapes)
         return Operator(Matrix(self.law.matrix(flat, float(dt))), self.space, self.space, name)
 
-    def step(self, dt, inflow=0.0):
-        """Time step, inflow -> ``step(u, v)``, the form that rollout takes.
-
-        Parameters
-        ----------
-        dt : float
-            [time]
-        inflow : float or array
-            As for the call [unit].
-
-        Returns
-        -------
-        Step
-
-        Raises
-        ------
-        DerivativeError
-            If dt or inflow are traced; write ``lambda u, p: move(u, p[0], p[1])`` for a derivative in them.
-
-        Examples
-        --------
-        >>> step = transport(Grid(3, periodic=True)).step(0.5)
-        >>> step(np.array([1.0, 0.0, 0.0]), np.ones(3))
-        array([0.5, 0.5, 0. ])
-        """
-        return Step(self, dt, inflow)
+    def __getattr__(self, name):
+        advice = "; write lambda u, v: move(u, v, dt)" if name == "step" else ""  # of the first edition
+        raise AttributeError(f"transport has no attribute {name!r}{advice}")
 
     def __repr__(self):
         setting = self.setting
