@@ -14,8 +14,8 @@ from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite
 from sparsedp.ledger import active, count
 from sparsedp.recipe import Remade
+from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.colouring import Coloured
-from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.probing import REFUSED, changes, points_near, typical
 from sparsedp.solvers.sparsity import dense_pattern, find_pattern, pattern_of
 from sparsedp.solvers.translates import translated_pattern
@@ -114,7 +114,7 @@ class Adopted(Remade):
         self._f, self._sparsity, self._derivative, self.name = f, sparsity, derivative, name
         self._shapes, self.way, self._coloured = found
         self.runs = 0
-        self._points, self._alone = Kept(), RLock()  # foreign code may work in arrays of its own: one thread at a time
+        self._points, self._alone = Cache(), RLock()  # foreign code may work in arrays of its own: one thread at a time
         direct: Rule
         transposed = Rule(f"{name}.T", self._back, self._only_in_g(lambda h, x: direct(h, x)))
         direct = Rule(f"{name}.J", self._along, self._only_in_g(lambda h, x: transposed(h, x)))

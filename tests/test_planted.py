@@ -71,8 +71,8 @@ BUGS = {
     ),
     "a stale set-up after a change of the coefficient": Bug(
         "solvers/parametric.py",
-        "known = self._kept.find((k, shift))",
-        "known = self._kept.last",
+        "known = self._cache.find((k, shift))",
+        "known = self._cache.last",
         "tests/test_elliptic.py",
     ),
     "a residual tested before unscaling": Bug(

@@ -167,7 +167,7 @@ def used(method):
     b, k = op(np.ones((24, 25))), np.ones(grid.faces.size)
     value_and_grad(lambda b: anp.sum(inv(b, start=0 * b) ** 2 + inv(b)))(b)
     value_and_grad(lambda k: anp.sum(solve(k, grid.volumes)))(k + 1e-3 * np.arange(k.size))
-    kept = (inv, inv.solver.engine, inv.solver.system, solve, solve._kept.last)
+    kept = (inv, inv.solver.engine, inv.solver.system, solve, solve._cache.last)
     return [weakref.ref(thing) for thing in kept]
 
 

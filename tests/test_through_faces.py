@@ -7,8 +7,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp import kernels
-from sparsedp.solvers.assembly import Assembly
-from sparsedp.solvers.parametric import Elliptic
+from sparsedp.solvers.parametric import Assembly, Elliptic
 from sparsedp.structure import lazy
 
 pytestmark = pytest.mark.skipif(not kernels.compiled(), reason="the fused pass needs numba")

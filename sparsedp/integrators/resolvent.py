@@ -19,8 +19,8 @@ import numpy as np
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import tell
 from sparsedp.operators.boundary import identity
+from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose import build
-from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.record import SolveLog
 from sparsedp.solvers.system import System
 from sparsedp.tape import Rule, cast, dtype_of
@@ -49,7 +49,7 @@ class Resolvent:
 
     def __init__(self, op, name, settings, most=2):
         self.op, self.name, self.settings = op, name, settings
-        self.info, self._kept = SolveLog(), Kept(most)
+        self.info, self._kept = SolveLog(), Cache(most)
         self._checked, self._free = self._rule(False, True), self._rule(False, False)
         self._adjoint = self._rule(True, False)
 

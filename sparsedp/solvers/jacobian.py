@@ -17,9 +17,9 @@ from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_functions, from_matrix
+from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose import build
 from sparsedp.solvers.colouring import Coloured
-from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.linearisation import Linearisation
 from sparsedp.solvers.small import Small
 from sparsedp.solvers.sparsity import dense_pattern, find_pattern
@@ -53,7 +53,7 @@ class Jacobians:
         self._spaces: dict = {}  # size -> the cells that the unknowns were found to lie on
         self._patterns: dict = {}  # size -> Coloured, or None when only products will do
         self._around: dict = {}  # size -> Surroundings, where Operators tell that the unknowns lie on cells
-        self._points, self._matrices = Kept(), Kept()
+        self._points, self._matrices = Cache(), Cache()
         self._alone = RLock()  # held by the thread that looks for a pattern
 
     def __str__(self):

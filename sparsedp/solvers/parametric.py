@@ -1,4 +1,4 @@
-"""Solves whose operator depends on a parameter: x of (shift - D diag(k) G) x = b, differentiable in k, b and shift.
+"""Solves whose operator depends on parameters: x of (shift - D diag(k) G) x = b, differentiable in k, b and shift.
 
 With A = shift - D diag(k) G and A x = b, a change of the data gives
 
@@ -10,30 +10,110 @@ so with the adjoint solve A^T y = g, one for all arguments,
 
 The transposed solve is a rule of the same form with D, G exchanged for G^T, D^T: each is the other's
 helper, and derivatives of every order follow.
+
+A matrix with the entries k at the places (i, j) of a fixed pattern is of that form too: D = -R^T and G = C, where R
+and C pick the value at the row and at the column of each entry. The cotangent of an entry is -y_i x_j, and only the
+places of the pattern are ever touched.
 """
 
 from functools import cached_property
 from math import prod
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
+import scipy.sparse as sp
 
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
+from sparsedp.operators.given import from_matrix
 from sparsedp.recipe import Remade
-from sparsedp.solvers.assembly import Assembly
+from sparsedp.solvers import facts
+from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose import build, check_settings
-from sparsedp.solvers.kept import Kept
 from sparsedp.solvers.record import SolveLog
-from sparsedp.space import fits
+from sparsedp.space import Space, fits
 from sparsedp.structure.base import Structure
 from sparsedp.structure.lazy import Chain, Diagonal
 from sparsedp.tape import Rule, isbox, of_argument, plain
 from sparsedp.tree import copied
 
-__all__ = ["EllipticSolver", "elliptic_solver"]
+__all__ = ["Assembly", "Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]
+
+
+class ParametricSolver(Remade):
+    """x of (shift - D diag(k) G) x = b as a rule in (k, b, shift).
+
+    A subclass has a `name` and makes the Operator: ``_operator(k, shift)``, of arrays that nobody else writes into.
+
+    Attributes
+    ----------
+    info : SolveLog
+        Records of the last forward and the last adjoint solve, and of the last set-up.
+    """
+
+    name: str
+    _operator: Any
+
+    def __init__(self, D, G, settings):
+        self.D, self.G = D, G
+        self.info = SolveLog()
+        self._settings, self._cache = settings, Cache()
+
+    def _rule(self, transposed, checked=False):
+        """The solve (or the transposed solve) as a rule in (k, b, shift). Not cached: it holds this solver."""
+
+        def forward(k, b, shift):
+            inv = self._inverse(np.asarray(k), float(shift))
+            return (inv.T if transposed else inv if checked else inv.tangent).apply(b)
+
+        def vjp(nums, ans, k, b, shift):
+            def pull(g):
+                other = self._rule(not transposed)(k, g, shift)
+                x, y = (other, ans) if transposed else (ans, other)
+                slopes = {0: lambda: self.D.T(y) * self.G(x), 1: lambda: other, 2: lambda: -anp.sum(y * x)}
+                with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+                    return tuple(self._finite(of_argument(slopes[num](), (k, b, shift)[num])) for num in nums)
+
+            return pull
+
+        def jvp(nums, tangents, ans, k, b, shift):
+            first, second = (self.D.T, self.G.T) if transposed else (self.G, self.D)
+            change = {0: lambda t: second(t * first(ans)), 1: lambda t: t, 2: lambda t: -t * ans}
+            total = sum(change[num](t) for num, t in zip(nums, tangents, strict=True))
+            return self._rule(transposed)(k, total, shift)
+
+        return Rule(f"{self.name}.T" if transposed else self.name, forward, vjp, jvp)
+
+    def _finite(self, cotangent):
+        """Refuse products of two solutions that overflow."""
+        if not np.all(np.isfinite(plain(cotangent))):
+            raise NonFiniteError(f"a gradient of {self.name} is beyond 1.8e308; scale the loss or the right-hand side")
+        return cotangent
+
+    def _inverse(self, k, shift):
+        """The set-up for this content, from the last two or new."""
+        k = k.astype(np.result_type(k, np.float64), copy=False)
+        known = self._cache.find((k, shift))
+        if known is not None:
+            return known
+        op = self._operator(k.copy(), shift)
+        return self._cache.put((k, shift), build(op, name=self.name, log=self.info, solves="few", **self._settings))
+
+    def __str__(self):
+        if not len(self._cache):
+            return f"{self!r}, not set up yet"
+        return f"{self!r}, {len(self._cache)} of {self._cache.most} set-ups kept, the last one:\n{self._cache.last}"
+
+
+def _settings(method, rtol, maxiter, nullspace, options):
+    check_settings(method, rtol, maxiter, nullspace)
+    return dict(method=method, rtol=float(rtol), maxiter=maxiter, nullspace=nullspace, options=copied(options))
+
+
+# ---------------------------------------------------------------- a coefficient on the faces
 
 
 def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **options):
@@ -93,30 +173,17 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
             f"elliptic_solver needs D @ G to be square: {D.name} maps {D.domain} to {D.codomain}, "
             f"{G.name} {G.domain} to {G.codomain}"
         )
-    check_settings(method, rtol, maxiter, nullspace)
-    settings = dict(method=method, rtol=float(rtol), maxiter=maxiter, nullspace=nullspace, options=copied(options))
-    return EllipticSolver(D, G, settings)
+    return EllipticSolver(D, G, _settings(method, rtol, maxiter, nullspace, options))
 
 
-class EllipticSolver(Remade):
-    """solve(k, b, shift=0.0), made by `elliptic_solver`.
+class EllipticSolver(ParametricSolver):
+    """solve(k, b, shift=0.0), made by `elliptic_solver`."""
 
-    Attributes
-    ----------
-    info : SolveLog
-        Records of the last forward and the last adjoint solve, and of the last set-up.
-    """
-
-    def __init__(self, D, G, settings):
-        self.D, self.G = D, G
-        self.info = SolveLog()
-        self._settings = settings
-        self._kept = Kept()
-        self._assembly = Assembly(D, G)
+    name = "elliptic_solver"
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
-        return EllipticSolver, (self.D, self.G, self._settings)  # what is kept is set up again
+        return EllipticSolver, (self.D, self.G, self._settings)  # what is cached is set up again
 
     def __call__(self, k, b, shift=0.0):
         """Solve (shift - D diag(k) G) x = b.
@@ -153,44 +220,6 @@ class EllipticSolver(Remade):
             return k * np.ones(space.shape)
         return k if isbox(k) else values
 
-    # ------------------------------------------------------------ rules
-
-    def _rule(self, transposed, checked=False):
-        """The solve (or the transposed solve) as a rule in (k, b, shift). Not kept: it holds this solver."""
-
-        def forward(k, b, shift):
-            inv = self._inverse(k, float(shift))
-            return (inv.T if transposed else inv if checked else inv.tangent).apply(b)
-
-        def vjp(nums, ans, k, b, shift):
-            def pull(g):
-                other = self._rule(not transposed)(k, g, shift)
-                x, y = (other, ans) if transposed else (ans, other)
-                slopes = {0: lambda: self.D.T(y) * self.G(x), 1: lambda: other, 2: lambda: -anp.sum(y * x)}
-                with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
-                    return tuple(_representable(of_argument(slopes[num](), (k, b, shift)[num])) for num in nums)
-
-            return pull
-
-        def jvp(nums, tangents, ans, k, b, shift):
-            first, second = (self.D.T, self.G.T) if transposed else (self.G, self.D)
-            change = {0: lambda t: second(t * first(ans)), 1: lambda t: t, 2: lambda t: -t * ans}
-            total = sum(change[num](t) for num, t in zip(nums, tangents, strict=True))
-            return self._rule(transposed)(k, total, shift)
-
-        return Rule("elliptic_solver.T" if transposed else "elliptic_solver", forward, vjp, jvp)
-
-    # ------------------------------------------------------------ set-up
-
-    def _inverse(self, k, shift):
-        """The set-up for this content, from the last two or new."""
-        k = np.asarray(k, dtype=float)
-        known = self._kept.find((k, shift))
-        if known is not None:
-            return known
-        op, settings = self._operator(k.copy(), shift), self._settings
-        return self._kept.put((k, shift), build(op, name="elliptic_solver", log=self.info, solves="few", **settings))
-
     def _operator(self, k, shift):
         name = f"{shift:g} - {self.D.name} @ diag(k) @ {self.G.name}"
         if k.size and np.all(k == k[0]) and self._product.separable and self._settings["method"] != "direct":
@@ -200,23 +229,15 @@ class EllipticSolver(Remade):
         return Operator(Elliptic(self._assembly, k, shift), self.G.domain, self.D.codomain, name)
 
     @cached_property
+    def _assembly(self):
+        return Assembly(self.D, self.G)
+
+    @cached_property
     def _product(self):
         return self.D @ self.G
 
     def __repr__(self):
         return f"<elliptic_solver: shift - {self.D.name} @ diag(k) @ {self.G.name} on {self.G.domain}>"
-
-    def __str__(self):
-        if not len(self._kept):
-            return f"{self!r}, not set up yet"
-        return f"{self!r}, {len(self._kept)} of {self._kept.most} set-ups kept, the last one:\n{self._kept.last}"
-
-
-def _representable(cotangent):
-    """Refuse products of two solutions that overflow."""
-    if not np.all(np.isfinite(plain(cotangent))):
-        raise NonFiniteError("a gradient of elliptic_solver is beyond 1.8e308; scale the loss or the right-hand side")
-    return cotangent
 
 
 def _check_shift(shift):
@@ -269,3 +290,191 @@ class Elliptic(Structure):
 
     def explicit(self):
         return self._entries
+
+
+class Assembly:
+    """The sparse map from k to the entries: entry (i, j) is -sum over faces f of D[i, f] k[f] G[f, j].
+
+    One product with it gives the matrix for a new k; the pattern, with its diagonal, is found once.
+
+    Parameters
+    ----------
+    D, G : Operator
+    """
+
+    def __init__(self, D, G):
+        self.D, self.G = D, G
+        self.has_entries = D.structure.has_entries and G.structure.has_entries
+
+    @cached_property
+    def magnitudes(self):
+        """x -> |G| x, |D| x, and those of the transposes in the order in which they act."""
+        D, G = self.D.structure, self.G.structure
+        plain, turned = (G, D), (D.transpose(), G.transpose())
+        return tuple(map(facts.magnitude, plain)), tuple(map(facts.magnitude, turned))
+
+    @cached_property
+    def _plan(self):
+        """(map, indices, indptr, positions of the diagonal)."""
+        size = self.G.domain.size
+        rows, columns, faces, values = self._contributions()
+        own = np.arange(size, dtype=np.int64) * (size + 1)
+        keys, place = np.unique(np.concatenate([rows.astype(np.int64) * size + columns, own]), return_inverse=True)
+        place = place.astype(np.int32)
+        coefficients = sp.csr_array((values, (place[: rows.size], faces)), shape=(keys.size, self.D.domain.size))
+        indptr = np.searchsorted(keys, np.arange(size + 1, dtype=np.int64) * size).astype(np.int32)
+        return coefficients, (keys % max(size, 1)).astype(np.int32), indptr, place[rows.size :]
+
+    def _contributions(self):
+        """Row, column, face and value of every product -D[i, f] G[f, j]."""
+        D, G = self.D.structure.explicit().tocsc(), self.G.structure.explicit()
+        face = np.repeat(np.arange(G.shape[0]), np.diff(D.indptr))  # of each entry of D
+        many = np.diff(G.indptr)[face]  # entries of G that it meets
+        mine = np.repeat(np.arange(face.size), many)
+        first = np.cumsum(many) - many
+        theirs = G.indptr[face[mine]] + np.arange(mine.size) - first[mine]
+        return D.indices[mine], G.indices[theirs], face[mine].astype(np.int32), -D.data[mine] * G.data[theirs]
+
+    def matrix(self, k, shift):
+        """csr_array of shift - D diag(k) G; its pattern does not depend on k."""
+        coefficients, indices, indptr, own = self._plan
+        data = coefficients @ k
+        data[own] += shift
+        matrix = sp.csr_array((data, indices, indptr), shape=(self.G.domain.size,) * 2)
+        matrix.has_canonical_format = True
+        return matrix
+
+
+# ---------------------------------------------------------------- the entries of a matrix
+
+
+def matrix_solver(pattern, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", domain=None, **options):
+    """Sparsity pattern -> solve(data, b): x of A x = b, where A has the entries `data` on the pattern.
+
+    Parameters
+    ----------
+    pattern : sparse matrix or 2-D array, square
+        Its places count, not its values; a stored 0 is a place.
+    method, rtol, maxiter, nullspace, **options
+        As in `inverse`; options go to the method.
+    domain : Space, int or tuple of int, optional
+        Where b and x live. Default: flat arrays.
+
+    Returns
+    -------
+    MatrixSolver
+        Call it as ``solve(data, b)``. `solve.rows` and `solve.columns` hold the place of each entry.
+        Differentiable in data and b, to every order. The set-up depends on the content of data; the
+        last two are kept. `solve.info` holds the records.
+
+    Raises
+    ------
+    ShapeError
+        If the pattern is not square or does not fit the domain; on use, if data or b has another shape.
+    TypeError
+        On use, if data does not hold numbers.
+    NonFiniteError
+        On use, if data or b holds NaN or infinity.
+    ConvergenceError, IncompatibleError
+        On use, as for `inverse`.
+
+    Notes
+    -----
+    Formula: data_bar_ij = -y_i x_j on the pattern, with A^T y = g: one adjoint solve for data and b.
+    Null space: as for `inverse`. The derivative in data of a singular system is that along changes
+    which keep its null vectors, such as those that leave every row sum 0.
+    Cost: one set-up for each new content of data, one solve, one adjoint solve, memory of the order of
+    the entries: no outer product is formed.
+
+    Examples
+    --------
+    >>> from sparsedp import value_and_grad
+    >>> solve = matrix_solver([[1, 0], [1, 1]])
+    >>> data, b = np.array([2.0, 1.0, 4.0]), np.array([2.0, 5.0])
+    >>> solve(data, b)
+    array([1., 1.])
+    >>> value_and_grad(lambda data: solve(data, b)[1])(data)
+    (1.0, array([ 0.125, -0.25 , -0.25 ]))
+    """
+    settings = _settings(method, rtol, maxiter, nullspace, options)
+    pattern = _canonical(pattern)
+    domain = domain if isinstance(domain, Space) else Space(pattern.shape[0] if domain is None else domain)
+    if pattern.shape != (domain.size, domain.size):
+        raise ShapeError(f"matrix_solver takes a square pattern of {domain.size} rows, got shape {pattern.shape}")
+    return MatrixSolver(pattern, domain, settings)
+
+
+def _canonical(pattern):
+    """csr_array of ones with sorted indices, each place once."""
+    entries = pattern if sp.issparse(pattern) else np.asarray(pattern)
+    if entries.ndim != 2:
+        raise ShapeError(f"matrix_solver takes a 2-D pattern, got an array of shape {entries.shape}")
+    places = sp.coo_array(entries)
+    found = sp.csr_array((np.ones(places.nnz), (places.row, places.col)), shape=places.shape)
+    found.sum_duplicates()
+    found.sort_indices()
+    found.data = np.ones(found.nnz)
+    return found
+
+
+class MatrixSolver(ParametricSolver):
+    """solve(data, b), made by `matrix_solver`.
+
+    Attributes
+    ----------
+    rows, columns : int arrays, shape (entries,)
+        Place of each entry, in the order of data: row by row, columns ascending.
+    domain : Space
+    """
+
+    name = "matrix_solver"
+
+    def __init__(self, pattern, domain, settings):
+        self.domain, self._pattern = domain, pattern
+        self.rows = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
+        self.columns = pattern.indices
+        super().__init__(-self._picking(self.rows).T, self._picking(self.columns), settings)
+
+    def recipe(self):
+        """The call that makes it again: see recipe.py."""
+        return MatrixSolver, (self._pattern, self.domain, self._settings)
+
+    def _picking(self, place):
+        """Operator: a field -> for each entry the value at its row, or its column."""
+        shape = (place.size, self.domain.size)
+        matrix = sp.csr_array((np.ones(place.size), place, np.arange(place.size + 1)), shape=shape)
+        return from_matrix(matrix, self.domain, name="entries")
+
+    def __call__(self, data, b):
+        """Solve A x = b.
+
+        Parameters
+        ----------
+        data : array, shape (entries,)
+        b : array, a field on the domain; leading axes are a batch
+
+        Returns
+        -------
+        array of the shape of b
+        """
+        check_plain(self.name, data, b)
+        values = np.asarray(plain(data))
+        if values.shape != self.rows.shape:
+            raise ShapeError(f"data takes one value for each of {self.rows.size} entries, got shape {values.shape}")
+        if values.dtype.kind not in "biufc":
+            raise TypeError(f"data must hold numbers, got dtype {values.dtype}")
+        wrong = ~np.isfinite(values)
+        if wrong.any():
+            first, many = int(np.argmax(wrong)), np.count_nonzero(wrong)
+            place = f"row {self.rows[first]}, column {self.columns[first]}"
+            raise NonFiniteError(f"data must be finite, got {many} that are NaN or infinite, the first at {place}")
+        if np.shape(plain(b))[-len(self.domain.shape) :] != self.domain.shape:
+            raise ShapeError(f"b takes a field on {self.domain}, got an array of shape {np.shape(plain(b))}")
+        return self._rule(False, True)(data if isbox(data) else values, b if isbox(b) else np.asarray(b), 0.0)
+
+    def _operator(self, data, shift):
+        matrix = sp.csr_array((data, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)
+        return from_matrix(matrix, self.domain, self.domain, name=f"matrix of {self.rows.size} entries")
+
+    def __repr__(self):
+        return f"<{self.name}: {self.rows.size} entries on {self.domain}>"

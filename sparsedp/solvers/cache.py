@@ -1,11 +1,11 @@
-"""Kept: the last few values that were made from arrays, found again by the content of those arrays."""
+"""Cache: the last few values that were made from arrays, found again by the content of those arrays."""
 
 import numpy as np
 
-__all__ = ["Kept"]
+__all__ = ["Cache"]
 
 
-class Kept:
+class Cache:
     """Values keyed by content. Holds copies of the keys; keys must be plain, never traced.
 
     The list of entries is replaced, never changed: other threads may be looking through it.
