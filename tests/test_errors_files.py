@@ -208,7 +208,7 @@ def test_a_demo_without_room(tmp_path):
         "from sparsedp.__main__ import main\n"
         "from sparsedp.report.demo import story\n"
         "story.ITERATIONS = 2\n"
-        "limit(600)\n"
+        "limit(200)\n"
         "sys.exit(main(['demo', '--size', '12', '--out', sys.argv[1]]))"
     )
     done = process(code, tmp_path)

@@ -9,20 +9,21 @@ Every well is pumped in turn, and each time all sensors are read. Unknown is log
 each cell. Lengths are in units of the longest side, pressures in rate / conductivity.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import autograd.numpy as np
 from numpy.random import default_rng
 
 import sparsedp as dp
 
-__all__ = ["RTOL", "Ground", "Survey", "objective", "regulariser", "survey"]
+__all__ = ["NOISE", "Ground", "Survey", "objective", "regulariser", "survey"]
 
 RIVERS = {"x": dp.dirichlet, "y": dp.neumann}
 RADIUS = 0.05  # of the gravel pack around a well [longest side]
 RTOL = 1e-10  # of every solve, on its true residual
 NOISE = 0.005  # of a reading, relative to the mean square over the sensors
 SMOOTHNESS = 3e-4  # weight of the regulariser, against misfit / noise
+SEED = 0  # of the noise
 WELLS, SENSORS = (4, 3), (24, 20)
 
 
@@ -66,8 +67,7 @@ def regulariser(grid):
     return lambda logk: SMOOTHNESS * np.sum(volumes * slope(logk) ** 2)
 
 
-@dataclass(frozen=True, eq=False)
-class Survey:
+class Survey(NamedTuple):
     """What is known about the ground: where the wells and sensors are, and what was read.
 
     `readings` has the shape (wells, sensors); `noise` is the standard deviation in each experiment.
@@ -79,13 +79,13 @@ class Survey:
     noise: np.ndarray
 
 
-def survey(grid, logk, seed=0):
+def survey(grid, logk):
     """Hidden ground -> Survey. It is made on a grid of its own, finer than those that invert it."""
     wells, sensors = lattice(WELLS, grid.size), lattice(SENSORS, grid.size)
     exact = Ground(grid, wells, sensors).readings(logk)
     noise = NOISE * np.sqrt(np.mean(exact**2, axis=1, keepdims=True))
     # Uniform numbers of standard deviation 1: their stream is the same with every version of NumPy.
-    spread = np.sqrt(12) * (default_rng(seed).random(exact.shape) - 0.5)
+    spread = np.sqrt(12) * (default_rng(SEED).random(exact.shape) - 0.5)
     return Survey(wells, sensors, exact + noise * spread, noise)
 
 

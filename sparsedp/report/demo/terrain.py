@@ -5,8 +5,8 @@ Of a file nothing is unpickled, and no memory is asked for before it is known to
 
 import os
 import zipfile
-from dataclasses import dataclass
 from math import prod
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,8 +24,7 @@ LEAST = 4  # values along an axis
 DEFLATE = 1100  # no zip member can grow by more than this factor
 
 
-@dataclass(frozen=True, eq=False)
-class Terrain:
+class Terrain(NamedTuple):
     """A 2-D array, axis 0 is x, and where it came from."""
 
     field: np.ndarray
@@ -59,19 +58,15 @@ def load(path=None):
     return Terrain(rows[::-1].T.astype(float), f"elevation model {SAMPLE} from matplotlib's sample data")
 
 
-def generated(shape, seed=1):
+def generated(shape):
     """Shape -> crests and hollows, the same in every run.
 
-    Waves with random phases and the spectrum of relief, amplitude (4 + w^2)^-1.2 for w waves per box;
-    minus their absolute value has a crest wherever the sum changes sign. The waves are laid over
-    twice the box and cut, since their sum is periodic.
+    Minus the absolute value of a sum of waves has a crest wherever the sum changes sign; turned and shorter waves of
+    less weight make the relief rough.
     """
-    double = tuple(2 * n for n in shape)
-    per_box = [np.fft.fftfreq(n, 1 / max(shape)) for n in double]
-    waves = np.add.outer(*map(np.square, per_box))
-    phases = np.random.default_rng(seed).random(double)  # uniform numbers: their stream never changes
-    relief = np.fft.ifft2((4 + waves) ** -1.2 * np.exp(2j * np.pi * phases)).real
-    return -np.abs(relief[: shape[0], : shape[1]])
+    x, y = np.indices(shape) / max(shape)
+    waves = (np.sin(k * (x * np.cos(3 * k) + y * np.sin(3 * k)) + k) / k for k in range(3, 40, 3))
+    return -np.abs(sum(waves))
 
 
 def remap(source, grid):
@@ -168,9 +163,19 @@ def read_field(path):
         raise FileNotFoundError(f"{path} is not there or is no plain file; give the path of a .npy, .npz or .png file")
     try:
         with path.open("rb") as stream:
-            return _checked(path, reader(path, stream))
+            field = reader(path, stream)
     except OSError as error:
         raise ValueError(f"{path} cannot be opened: {error.strerror}") from error
+    _check_shape(path, field.shape)
+    if min(field.shape) < LEAST:
+        raise ValueError(f"{path} needs at least {LEAST} values along each axis, got shape {field.shape}")
+    with np.errstate(over="ignore"):
+        field = field.astype(float)
+    check_finite(path, field, "needs finite values")
+    largest = np.abs(field).max()
+    if np.ptp(field / 2) <= 5e-13 * largest:  # halves: a difference of two values may overflow
+        raise ValueError(f"{path} holds the same value everywhere ({largest:g}); the demo needs a field that varies")
+    return np.ldexp(field, -np.frexp(largest)[1])  # by a power of two: nothing is rounded, nothing overflows
 
 
 def _npy(path, stream):
@@ -199,8 +204,7 @@ def read_array(path, stream, size):
     promised, held = prod(shape) * dtype.itemsize, max(size - stream.tell(), 0)
     if promised > held:
         raise ValueError(f"{path} promises {promised} bytes of data in its header, but holds {held}")
-    _check_amount(path, prod(shape))
-    _check_rank(path, shape)
+    _check_shape(path, shape)
     data = stream.read(promised)
     if len(data) < promised:
         raise ValueError(f"{path} ends before the data that its header promises")
@@ -210,9 +214,8 @@ def read_array(path, stream, size):
 def _header(path, stream):
     """(shape, whether in Fortran order, dtype) that a .npy header promises. Nothing behind the header is read."""
     try:
-        version = np.lib.format.read_magic(stream)
-        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        shape, fortran, dtype = readers[version](stream)
+        form = np.lib.format
+        shape, fortran, dtype = getattr(form, "read_array_header_{}_{}".format(*form.read_magic(stream)))(stream)
     except Exception as error:  # whatever goes wrong in foreign bytes means the same
         raise ValueError(f"{path} has no readable .npy header (a pickle?); save the field with numpy.save") from error
     if not all(0 <= n < 2**63 for n in shape):
@@ -228,36 +231,17 @@ def _png(path, stream):
     head = stream.read(24)
     if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n":
         raise ValueError(f"{path} is not a PNG picture")
-    _check_amount(path, int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"))
+    _check_shape(path, [int.from_bytes(size, "big") for size in (head[16:20], head[20:])])
     try:
-        picture = plots.read_picture(path)
+        return plots.read_picture(path)[::-1].T
     except ImportError:
         raise
     except Exception as error:  # a broken picture fails in many ways, all with the same meaning
         raise ValueError(f"{path} is not a whole PNG picture") from error
-    return picture[::-1].T
 
 
-def _check_amount(path, count):
-    if count > MOST:
-        raise ValueError(f"{path} holds {count} values, at most {MOST} are taken; thin it out first")
-
-
-def _check_rank(path, shape):
+def _check_shape(path, shape):
+    if prod(shape) > MOST:
+        raise ValueError(f"{path} holds {prod(shape)} values, at most {MOST} are taken; thin it out first")
     if len(shape) != 2:
         raise ValueError(f"{path} needs a 2-D array, got shape {shape}")
-
-
-def _checked(path, field):
-    _check_rank(path, field.shape)
-    if min(field.shape) < LEAST:
-        raise ValueError(f"{path} needs at least {LEAST} values along each axis, got shape {field.shape}")
-    with np.errstate(over="ignore"):
-        field = field.astype(float)
-    check_finite(path, field, "needs finite values")
-    largest = np.abs(field).max()
-    if largest > 0:
-        field = np.ldexp(field, -np.frexp(largest)[1])  # by a power of two: nothing is rounded, nothing overflows
-    if np.ptp(field) <= 1e-12 * np.abs(field).max():
-        raise ValueError(f"{path} holds the same value everywhere ({largest:g}); the demo needs a field that varies")
-    return field
