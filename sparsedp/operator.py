@@ -271,7 +271,7 @@ class Operator(Remade):
     @property
     def separable(self):
         """Whether it is a Kronecker sum: one 1-D factor for each axis."""
-        return getattr(self.structure, "separable", False)
+        return self.structure.separable
 
     def explicit(self):
         """The same operator, applied through its matrix."""

@@ -13,7 +13,6 @@ import numpy as np
 from sparsedp.derivative import pullback
 from sparsedp.errors import ShapeError, UnstableStepError
 from sparsedp.fields import is_number, rounded_down
-from sparsedp.solvers.facts import magnitude
 from sparsedp.tape import dtype_of, is_variable, plain
 from sparsedp.tree import flatten, leaves
 
@@ -36,7 +35,7 @@ class Viscous:
 
     def __init__(self, laplacian, walls, viscosity, dt):
         self.laplacian, self.walls, self.viscosity, self.dt = laplacian, walls, viscosity, dt
-        rows = magnitude(laplacian.structure)(np.ones(laplacian.domain.size))
+        rows = laplacian.structure.magnitude()(np.ones(laplacian.domain.size))
         self._steepest = float(np.max(rows, initial=0.0))  # no eigenvalue is beyond the largest sum of a row
         if not callable(viscosity):
             self._check(viscosity)

@@ -11,7 +11,6 @@ from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.recipe import Remade
 from sparsedp.solvers.choose import build
-from sparsedp.solvers.facts import magnitude
 from sparsedp.solvers.scaling import largest
 
 __all__ = ["Setup"]
@@ -46,7 +45,7 @@ class Setup(Remade):
             forward if self.symmetric else (self.G.structure.transpose(), self.D.structure.transpose()),
             strict=True,
         )
-        self.reach = tuple(largest(magnitude(first)(np.ones(grid.faces.size))) for first in self.firsts)
+        self.reach = tuple(largest(first.magnitude()(np.ones(grid.faces.size))) for first in self.firsts)
         fast = self.solver.engine.method == "separable" and self.grid.cells.size > 0
         self.passes = self._make_passes() if fast else None
 

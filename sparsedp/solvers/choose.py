@@ -210,7 +210,7 @@ def _chosen(system, solves):
 def _transforms(system, dimension):
     """Whether the operator is a sum of 1-D factors, and transforms along them are cheap."""
     structure = system.op.structure
-    if dimension < 2 or system.size < SEPARABLE_FROM or not getattr(structure, "separable", False):
+    if dimension < 2 or system.size < SEPARABLE_FROM or not structure.separable:
         return False
     found = spectrum(structure) if system.active is None else None
     return found is not None and all(

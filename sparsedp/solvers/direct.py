@@ -15,8 +15,8 @@ from scipy.sparse.linalg import splu
 
 from sparsedp.errors import ConvergenceError
 from sparsedp.solvers.contract import Engine
-from sparsedp.solvers.facts import probes
 from sparsedp.solvers.record import failure
+from sparsedp.structure.base import probes
 
 __all__ = ["Direct", "direct_engine"]
 

@@ -14,10 +14,10 @@ from sparsedp.errors import ConvergenceError
 from sparsedp.fields import is_whole
 from sparsedp.operator import Operator
 from sparsedp.solvers.contract import Engine, norm
-from sparsedp.solvers.facts import probes
 from sparsedp.solvers.iterations import conjugate_gradients, gmres
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.record import failure
+from sparsedp.structure.base import probes
 from sparsedp.tape import plain
 
 __all__ = ["Krylov", "krylov_engine"]

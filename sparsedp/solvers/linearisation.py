@@ -7,7 +7,6 @@ import numpy as np
 
 from sparsedp.errors import ConvergenceError
 from sparsedp.ledger import thread
-from sparsedp.solvers import facts
 from sparsedp.solvers.contract import norm
 from sparsedp.solvers.record import failure
 
@@ -124,7 +123,7 @@ class Linearisation:
         v = rng.uniform(0.5, 1.5, x.size) * rng.choice([-1.0, 1.0], x.size)
         with np.errstate(all="ignore"):
             wanted = equation.tangent(x, leaves)(v)
-        size = np.maximum(facts.magnitude(self.op.structure)(np.abs(v)), np.abs(wanted))
+        size = np.maximum(self.op.structure.magnitude()(np.abs(v)), np.abs(wanted))
         size += 1e-8 * np.max(size, initial=0.0)  # rounding of large rows is no difference in small ones
         share = np.abs(self.product(v) - wanted) / np.where(size > 0, size, 1.0)
         row = int(np.argmax(share)) if share.size else 0

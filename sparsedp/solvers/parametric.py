@@ -30,7 +30,6 @@ from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
 from sparsedp.operators.given import from_matrix
 from sparsedp.recipe import Remade
-from sparsedp.solvers import facts
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose import build, check_settings
 from sparsedp.solvers.record import SolveLog
@@ -311,7 +310,7 @@ class Assembly:
         """x -> |G| x, |D| x, and those of the transposes in the order in which they act."""
         D, G = self.D.structure, self.G.structure
         plain, turned = (G, D), (D.transpose(), G.transpose())
-        return tuple(map(facts.magnitude, plain)), tuple(map(facts.magnitude, turned))
+        return tuple(tuple(structure.magnitude() for structure in pair) for pair in (plain, turned))
 
     @cached_property
     def _plan(self):

@@ -106,16 +106,10 @@ def spectrum(structure):
     Spectrum or None
     """
     shape = structure.out_parts[0]
-    axes, shift = [Axis("identity", np.zeros(n)) for n in shape], 0.0
-    for term in structure.blocks.get((0, 0), ()):
-        if not term.axes:
-            shift += term.scale
-        for a in term.axes:
-            found = diagonalise(term.factors[a].scaled(term.scale))
-            if found is None:
-                return None
-            axes[a] = found
-    return Spectrum(shape, tuple(axes), shift)
+    axes: list = [Axis("identity", np.zeros(n)) for n in shape]
+    for a, line in structure.lines.items():
+        axes[a] = diagonalise(line)
+    return None if None in axes else Spectrum(shape, tuple(axes), structure.shift)
 
 
 class Separable(Engine):
@@ -155,15 +149,13 @@ class Swept(Engine):
 def _swept(structure, found):
     """The engine that spares the transforms along the first axis, or None when they are as good."""
     first, modes = found.shape[0], found.eigenvalues[0].size
-    terms = [term for term in structure.blocks.get((0, 0), ()) if term.axes == (0,)]
-    if not terms or first < 3 or modes < (WIDE_COMPILED if kernels.compiled() else WIDE_PLAIN):
+    if 0 not in structure.lines or first < 3 or modes < (WIDE_COMPILED if kernels.compiled() else WIDE_PLAIN):
         return None
     rest = Spectrum(found.shape, (Axis("identity", np.zeros(first)), *found.axes[1:]), found.shift)
     sums = rest.eigenvalues[0].reshape(-1)
     if rest.fourier:
         sums = np.repeat(sums, 2)  # real and imaginary parts
-    (term,) = terms
-    elimination = sweep(term.factors[0].scaled(term.scale), sums)
+    elimination = sweep(structure.lines[0], sums)
     return None if elimination is None else Swept(rest, elimination)
 
 
@@ -180,7 +172,7 @@ def separable_engine(system):
         If the operator is not such a sum.
     """
     structure = system.op.structure
-    found = spectrum(structure) if getattr(structure, "separable", False) and system.active is None else None
+    found = spectrum(structure) if structure.separable and system.active is None else None
     if found is None:
         raise ValueError(f"separable needs a sum of 1-D factors that can be diagonalised, got {system.given}")
     return _swept(structure, found) or Separable(found)

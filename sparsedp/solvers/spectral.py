@@ -130,7 +130,7 @@ def power(op, exponent):
 
 
 def _spectrum(op, name):
-    found = spectrum(op.structure) if getattr(op, "separable", False) else None
+    found = spectrum(op.structure) if op.separable else None
     if found is None:
         raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}")
     return found

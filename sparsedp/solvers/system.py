@@ -4,14 +4,15 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
 from sparsedp.errors import NonFiniteError
+from sparsedp.grid import Grid
 from sparsedp.operator import Operator
-from sparsedp.solvers import facts
-from sparsedp.solvers.mirrored import factor_symmetric, matrix_symmetric, pinned
 from sparsedp.solvers.nullspace import ROUNDING, find_null_space
 from sparsedp.solvers.scaling import remainder
 from sparsedp.space import Space
+from sparsedp.structure.base import probes
 from sparsedp.structure.explicit import Matrix
 from sparsedp.structure.kronecker import Kronecker
 
@@ -48,7 +49,7 @@ class System:
         if abs(exponent) > FAR:
             self.exponent = int(np.clip(exponent, -1000, 1000))
             self.op = op * 2.0**-self.exponent
-            _check_kept(op, self.op)
+            _check_underflow(op, self.op)
             for name in ("_magnitudes", "sums", "norms", "faces"):
                 self.__dict__.pop(name, None)
 
@@ -82,7 +83,7 @@ class System:
         """Grid of the cells that a square operator acts on, lengths divided by powers of two; or None."""
         grid = self.op.domain.grid or self.op.codomain.grid
         kinds = {space.kind for space in (self.op.domain, self.op.codomain) if space.grid is not None}
-        return facts.rescaled(grid) if grid is not None and kinds == {"cells"} else None
+        return _rescaled(grid) if grid is not None and kinds == {"cells"} else None
 
     @cached_property
     def faces(self):
@@ -103,7 +104,7 @@ class System:
     @cached_property
     def _magnitudes(self):
         structure = self.op.structure
-        return facts.magnitude(structure), facts.magnitude(structure.transpose())
+        return structure.magnitude(), structure.transpose().magnitude()
 
     @cached_property
     def sums(self):
@@ -158,10 +159,12 @@ class System:
 
         An engine builder that knows them better than the entries do sets them first.
         """
-        structure = self.op.structure
-        if self.active is None and facts.is_sum_of_factors(structure):
-            return facts.components_of_factors(structure)
-        return facts.components_of_entries(self.entries, self.active) if structure.has_entries else (None, 1)
+        structure, labels, count = self.op.structure, None, 1
+        if self.active is None and structure.separable:
+            labels, count = structure.components()
+        elif structure.has_entries:
+            labels, count = _linked(self.entries, self.active)
+        return (None, 1) if count == 1 else (labels, count)
 
     @cached_property
     def null_space(self):
@@ -174,7 +177,7 @@ class System:
     def volumes(self):
         """Cell volumes as a flat array, up to a power of two; ones where there is no grid."""
         space = self.op.domain if self.op.domain.grid is not None else self.op.codomain
-        space = space if space.grid is None else getattr(facts.rescaled(space.grid), space.kind)
+        space = space if space.grid is None else getattr(_rescaled(space.grid), space.kind)
         return space.volumes.reshape(-1)
 
     @cached_property
@@ -187,7 +190,7 @@ class System:
         candidates = [1.0]
         if np.any(self.volumes != self.volumes[:1]):
             candidates += [self.volumes, 1.0 / self.volumes]
-        if facts.is_sum_of_factors(self.op.structure):
+        if self.op.structure.separable:
             return self._weights_of_factors()
         for weights in candidates:
             if self._symmetric_with(weights):
@@ -202,8 +205,9 @@ class System:
     def _weights_of_factors(self):
         grid = (self.op.domain if self.op.domain.grid is not None else self.op.codomain).grid
         for power in (0.0, 1.0, -1.0):
-            widths = None if grid is None else grid.widths
-            if all(factor_symmetric(term, widths, power) for term in self.op.structure.blocks.get((0, 0), ())):
+            lines = self.op.structure.lines.items()
+            scales = {axis: 1.0 if grid is None else grid.widths[axis][:, None] ** power for axis, _ in lines}
+            if all(_symmetric(sp.csr_array(line.matrix * scales[axis])) for axis, line in lines):
                 uniform = power == 0 or np.all(self.volumes == self.volumes[:1])
                 return 1.0 if uniform else self.volumes**power
         return None
@@ -211,16 +215,16 @@ class System:
     def _symmetric_with(self, weights):
         if isinstance(self.op.structure, Matrix) or "entries" in self.__dict__:
             scaled = self.matrix * (weights if np.isscalar(weights) else weights[:, None])
-            return matrix_symmetric(sp.csr_array(scaled))
+            return _symmetric(sp.csr_array(scaled))
         return self._symmetric_to_probes(weights)
 
     def _symmetric_to_probes(self, weights):
-        x, y = (self._kept(probe) for probe in facts.probes(self.size)[:2])
+        x, y = (self._masked(probe) for probe in probes(self.size)[:2])
         left, right = y @ (weights * self.product(x)), x @ (weights * self.product(y))
         size = np.abs(y) @ (weights * self.magnitude(np.abs(x)))
         return abs(left - right) <= 1e-13 * size
 
-    def _kept(self, x):
+    def _masked(self, x):
         return x if self.active is None else np.where(self.active, x, 0.0)
 
     # ------------------------------------------------------------ entries
@@ -234,9 +238,9 @@ class System:
     def diagonal(self):
         """The diagonal on all unknowns (0 on what is not one), or None when only products are known."""
         structure = self.op.structure
-        if facts.is_sum_of_factors(structure):
-            return self._kept(facts.diagonal_of_factors(structure))
-        return self._kept(self.entries.diagonal()) if structure.has_entries else None
+        if structure.separable:
+            return self._masked(structure.diagonal())
+        return self._masked(self.entries.diagonal()) if structure.has_entries else None
 
     @cached_property
     def sign(self):
@@ -255,7 +259,7 @@ class System:
         """
         matrix = self.entries
         if self.active is not None:
-            matrix = pinned(matrix, ~self.active)
+            matrix = _pinned(matrix, ~self.active)
         if np.any(matrix.data == 0):
             matrix = matrix.copy()
             matrix.eliminate_zeros()
@@ -272,7 +276,7 @@ class System:
             return self.matrix
         flags = np.zeros(self.size, dtype=bool)
         flags[anchors] = True
-        return pinned(self.matrix, flags)
+        return _pinned(self.matrix, flags)
 
     # ------------------------------------------------------------ the test of a solution
 
@@ -291,8 +295,47 @@ class System:
         return np.finfo(float).eps * (float(np.sqrt(rows @ rows)) + data)
 
 
-def _check_kept(op, scaled):
+def _check_underflow(op, scaled):
     """Entries that vanish when the largest is scaled to 1 are too far apart for one solve."""
     before, after = op.structure, scaled.structure
     if isinstance(before, Matrix) and np.count_nonzero(before.matrix.data) != np.count_nonzero(after.matrix.data):
         raise NonFiniteError(f"the entries of {op} span more than 1e308; rescale its rows or columns")
+
+
+def _rescaled(grid):
+    """The grid with its lengths divided by powers of two, so that volumes are near 1, and so are their squares."""
+    widths = [np.ldexp(h, -int(np.frexp(np.max(h, initial=0.0))[1])) for h in grid.widths]
+    return Grid(grid.shape, spacing=widths, periodic=grid.periodic)
+
+
+def _linked(matrix, active):
+    """Matrix -> (labels, count): which unknowns are linked by entries that are not 0.
+
+    What is not active is linked to nothing (None: all are).
+    """
+    links = matrix.tocoo()
+    keep = links.data != 0
+    if active is not None:
+        keep &= active[links.row] & active[links.col]
+    pattern = sp.csr_array((np.ones(np.count_nonzero(keep)), (links.row[keep], links.col[keep])), shape=matrix.shape)
+    count, labels = connected_components(pattern, directed=False)
+    return labels, count
+
+
+def _pinned(matrix, flags):
+    """Matrix -> copy whose flagged rows and columns are those of the identity, scaled to its entries."""
+    row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    keep = ~(flags[row] | flags[matrix.indices])
+    size = matrix.diagonal()[~flags]
+    largest = size[np.argmax(np.abs(size))] if size.size and np.any(size) else 1.0
+    kept = sp.csr_array((matrix.data * keep, matrix.indices, matrix.indptr), shape=matrix.shape)
+    result = sp.csr_array(kept + sp.diags_array(np.where(flags, largest, 0.0), format="csr"))
+    result.eliminate_zeros()
+    return result
+
+
+def _symmetric(matrix):
+    """Whether the entries equal their mirror images up to rounding."""
+    turned = matrix.T.tocsr()
+    excess = abs(matrix - turned) - ROUNDING * (abs(matrix) + abs(turned))
+    return excess.nnz == 0 or float(excess.max()) <= 0

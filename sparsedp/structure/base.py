@@ -5,9 +5,10 @@ import scipy.sparse as sp
 
 from sparsedp.recipe import Uncached
 
-__all__ = ["INT32_LIMIT", "Scaled", "Structure", "compact", "result_dtype"]
+__all__ = ["INT32_LIMIT", "Scaled", "Structure", "compact", "probes", "result_dtype"]
 
 INT32_LIMIT = 2**31
+PROBES = 3  # random vectors with which a map without entries is examined
 
 
 class Structure(Uncached):
@@ -20,6 +21,8 @@ class Structure(Uncached):
         float64 or complex128: the field the entries live in.
     has_entries : bool
         Whether `explicit()` can list the entries without applying the map to every unit vector.
+    separable : bool
+        Whether it is a Kronecker sum: one 1-D factor for each axis.
     passes : int
         How many passes over memory the map takes where it is not fused: for the choice of a form.
     """
@@ -28,6 +31,7 @@ class Structure(Uncached):
     dtype = np.dtype(float)
     has_entries = True
     is_identity = False
+    separable = False
     passes = 1  # over memory, of the matrix-free form
 
     def apply(self, x, out):
@@ -45,6 +49,14 @@ class Structure(Uncached):
     def scaled(self, factor):
         """factor * A."""
         return Scaled(self, factor)
+
+    def magnitude(self):
+        """The function x -> an upper bound of |A| x, entry by entry, for x >= 0."""
+        if self.has_entries:
+            return abs(self.explicit()).dot
+        # A map that only acts: the largest response to random signs stands for every row.
+        largest = max(float(np.max(np.abs(self.product(x)), initial=0.0)) for x in probes(self.shape[1]))
+        return lambda x: np.full(self.shape[0], largest * np.max(np.abs(x), initial=0.0))
 
     def tangent(self):
         """The same map inside derivative rules: without checks that only primal data must meet."""
@@ -79,6 +91,10 @@ class Scaled(Structure):
     def scaled(self, factor):
         return Scaled(self.inner, self.factor * factor)
 
+    def magnitude(self):
+        inner = self.inner.magnitude()
+        return lambda x: abs(self.factor) * inner(x)
+
     def tangent(self):
         inner = self.inner.tangent()
         return self if inner is self.inner else Scaled(inner, self.factor)
@@ -103,6 +119,12 @@ def compact(matrix):
         matrix = sp.csr_array(arrays, shape=matrix.shape)
         matrix.has_canonical_format = True
     return matrix
+
+
+def probes(size):
+    """The same few vectors of random signs in every run."""
+    generator = np.random.default_rng(0)
+    return [generator.choice([-1.0, 1.0], size) for _ in range(PROBES)]
 
 
 def columns_by_application(structure):

@@ -6,9 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
 from sparsedp import kernels
 from sparsedp.structure.base import Structure, compact
+from sparsedp.structure.factor import Factor
 
 __all__ = ["Kronecker", "Term"]
 
@@ -68,11 +70,47 @@ class Kronecker(Structure):
         one = {(c, c): (Term(1.0, (None,) * len(self.out_parts[0])),) for c in range(count)}
         return self.out_parts == self.in_parts and self.blocks == one
 
+    # ------------------------------------------------------------ what is known of a Kronecker sum
+
     @cached_property
-    def separable(self):
+    def separable(self):  # type: ignore[override]
         """Whether it is a Kronecker sum on one component: one factor along one axis in each term."""
         one = len(self.out_parts) == len(self.in_parts) == 1 and self.out_parts == self.in_parts
-        return one and all(len(term.axes) <= 1 for term in self.blocks.get((0, 0), ()))
+        return one and all(len(term.axes) <= 1 for term in self.terms)
+
+    @property
+    def terms(self):
+        """The terms of the first component."""
+        return self.blocks.get((0, 0), ())
+
+    @cached_property
+    def lines(self):
+        """The factor along each axis that has one, with its scale; what else there is, is a shift."""
+        return {axis: term.factors[axis].scaled(term.scale) for term in self.terms for axis in term.axes}
+
+    @property
+    def shift(self):
+        """The multiple of the identity beside the factors."""
+        return sum(term.scale for term in self.terms if not term.axes)
+
+    def diagonal(self):
+        """The diagonal of a Kronecker sum."""
+        total = np.full(self.out_parts[0], float(self.shift))
+        for axis, line in self.lines.items():
+            total += _along(line.matrix.diagonal(), axis, total.ndim)
+        return total.reshape(-1)
+
+    def components(self):
+        """(labels, count): components of a Kronecker sum are the products of those along the axes."""
+        shape, count = self.out_parts[0], 1
+        labels = np.zeros(shape, dtype=np.int64)
+        for axis, n in enumerate(shape):
+            many, line = n, np.arange(n)
+            if axis in self.lines:
+                many, line = connected_components(self.lines[axis].matrix, directed=False)
+            labels = labels * many + _along(line, axis, len(shape))
+            count *= many
+        return labels.reshape(-1), count
 
     # ------------------------------------------------------------ algebra
 
@@ -83,10 +121,12 @@ class Kronecker(Structure):
     def scaled(self, factor):
         if np.iscomplexobj(factor):
             return super().scaled(factor)
-        scale = {
-            key: tuple(Term(factor * term.scale, term.factors) for term in terms) for key, terms in self.blocks.items()
-        }
-        return Kronecker(self.out_parts, self.in_parts, scale)
+        return self._each(lambda term: Term(factor * term.scale, term.factors))
+
+    def _each(self, change):
+        """The same blocks with every term changed."""
+        blocks = {key: tuple(map(change, terms)) for key, terms in self.blocks.items()}
+        return Kronecker(self.out_parts, self.in_parts, blocks)
 
     def composed(self, other):
         """self @ other, both Kronecker with matching components."""
@@ -104,6 +144,9 @@ class Kronecker(Structure):
         for key, terms in other.blocks.items():
             blocks[key] = blocks.get(key, ()) + terms
         return Kronecker(self.out_parts, self.in_parts, blocks)
+
+    def magnitude(self):
+        return self._each(_absolute).product
 
     # ------------------------------------------------------------ forms
 
@@ -195,6 +238,15 @@ class TermPass:
             u = step
         rows, before, after = self.steps[-1]
         kernels.along_axis(u.reshape(before), out.reshape(after), rows, self.scale, accumulate)
+
+
+def _along(line, axis, dim):
+    """One number for each point of an axis, ready to be spread over the others."""
+    return line.reshape([-1 if a == axis else 1 for a in range(dim)])
+
+
+def _absolute(term):
+    return Term(abs(term.scale), tuple(factor and Factor(abs(factor.matrix)) for factor in term.factors))
 
 
 def _components(flat, parts):

@@ -39,6 +39,9 @@ class Diagonal(Structure):
     def scaled(self, factor):
         return Diagonal(self.values * factor)
 
+    def magnitude(self):
+        return lambda x: np.abs(self.values) * x
+
 
 class Mask(Diagonal):
     """Zero outside `keep`, exactly: what is masked out may be NaN."""
@@ -95,6 +98,10 @@ class Chain(Structure):
     def scaled(self, factor):
         return Chain([self.members[0].scaled(factor), *self.members[1:]])
 
+    def magnitude(self):
+        members = [member.magnitude() for member in reversed(self.members)]
+        return lambda x: reduce(lambda y, member: member(y), members, x)
+
     def tangent(self):
         tangents = [member.tangent() for member in self.members]
         same = all(a is b for a, b in zip(tangents, self.members, strict=True))
@@ -128,6 +135,10 @@ class Sum(Structure):
 
     def scaled(self, factor):
         return Sum([member.scaled(factor) for member in self.members])
+
+    def magnitude(self):
+        members = [member.magnitude() for member in self.members]
+        return lambda x: sum(member(x) for member in members)
 
     def tangent(self):
         tangents = [member.tangent() for member in self.members]
