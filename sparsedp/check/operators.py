@@ -23,7 +23,7 @@ from sparsedp.structure.explicit import Matrix
 from sparsedp.structure.lazy import Chain, Sum
 from sparsedp.tree import norm
 
-__all__ = ["OperatorSummary", "fault_of", "field", "operator", "transpose", "twin"]
+__all__ = ["OperatorSummary", "fault_of", "field", "layouts", "operator", "transpose", "twin"]
 
 LIMIT = 10.0
 DTYPES = ("float64", "complex128", "float32", "complex64")
@@ -393,13 +393,20 @@ def _dtypes(probe):
     return mistakes
 
 
+def layouts(u):
+    """Array -> its name in words: the same numbers, laid out otherwise in memory."""
+    return {
+        "Fortran order": np.asfortranarray(u),
+        "strided": np.stack([u, np.nan * u], axis=-1)[..., 0],
+        "read-only": np.broadcast_to(u.copy(), u.shape),
+        "reversed": np.flip(np.flip(u).copy()),
+    }
+
+
 def _layouts(probe):
-    """Fortran order, strides, a reversed and a read-only array: the bits of the contiguous copy; and in a batch."""
+    """The bits of the contiguous copy in every layout; and in a batch."""
     u = probe.domain()
-    layouts = {"Fortran order": np.asfortranarray(u), "strided": np.stack([u, np.nan * u], axis=-1)[..., 0]}
-    layouts["read-only"] = np.broadcast_to(u.copy(), u.shape)
-    layouts["reversed"] = np.flip(np.flip(u).copy())
-    mistakes = [name for name, other in layouts.items() if not _equal(probe.op(other), probe.op(u))]
+    mistakes = [name for name, other in layouts(u).items() if not _equal(probe.op(other), probe.op(u))]
     batch = probe.op(np.stack([u, 2.0 * u]))
     return mistakes if _equal(batch[0], probe.op(u)) and _equal(batch[1], probe.op(2.0 * u)) else [*mistakes, "a batch"]
 

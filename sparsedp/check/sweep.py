@@ -268,10 +268,11 @@ class Line:
 
     def sweep(self, steps):
         """Evaluate the loss at x + t d and x - t d for every new t of `steps`."""
-        new = [self._level(step) for step in steps if step not in {level.step for level in self.levels}]
+        new = [self.level(step) for step in steps if step not in {level.step for level in self.levels}]
         self.levels = sorted([*self.levels, *new], key=lambda level: -level.step)
 
-    def _level(self, step):
+    def level(self, step):
+        """The losses at x + t d and x - t d."""
         (plus, ahead, note), (minus, behind, other) = self.end(step), self.end(-step)
         return Level(step, plus, minus, ahead, behind, SAME if plus == minus == self.base else note or other)
 

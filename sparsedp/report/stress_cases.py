@@ -1,6 +1,6 @@
 """The stress cases of a scene: extreme values of its parameters, and what has to come out of each.
 
-CASES is the table: for each group the parameters it applies to, the values to try, and the judge of what comes out.
+CASES is the table: for each group a function that lists its cases, the values to try and the judge of what comes out.
 """
 
 import math
@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp.check.sweep import Point
+from sparsedp.check.operators import layouts
+from sparsedp.check.sweep import Line, Point, Trials, generator, joined
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
 from sparsedp.report.certificate import distance
 from sparsedp.report.stability import SEED, STEADY, growth_of
-from sparsedp.tape import is_variable
 from sparsedp.tree import copied, flatten, norm
 
 __all__ = ["CASES", "FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
@@ -29,7 +29,7 @@ DIFFERENCES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-2, 1e-7)  # their steps, in units of x
 GOOD, BAD = 1e-5, 1e-2  # gaps between gradient and differences
 UNSEEN = 100 * EPS  # changes of the value, relative, that no difference sees
 ROUNDING = 8 * EPS  # change of x in its last digits
-WEAK, LOST = 1e-8, 1e-5  # changes of the result by that: allowed, and too large
+DIGITS = {"good": 1e-8, "bad": 1e-5}  # changes of the result by a change in the last digits: allowed, and too large
 FINER = 8.0  # of the time step, to tell physics that grows from a step that does
 LARGEST = 960  # power of 2 up to which a value is sure to be representable
 
@@ -99,6 +99,11 @@ class Scene:
     def run(self, other):
         """What the loss gives there."""
         return run(self.loss, self.at(other))
+
+    def sheltered(self, x):
+        """The loss there, NaN whatever it raises: a scene may raise anything."""
+        value = _attempt(self.loss, x)
+        return math.nan if isinstance(value, Exception) else value
 
     def growth_at(self, other):
         """How a step grows there."""
@@ -187,7 +192,7 @@ def finite(scene, other):
     if not out.finite:
         what = f"value {out.value:g}" if not math.isfinite(out.value) else "the gradient is not finite"
         return scene.fault(other), math.nan, f"{what}, and no error"
-    return _against_differences(scene.loss, scene.at(other), out)
+    return _against_differences(scene, other, out)
 
 
 def steady(scene, other):
@@ -273,166 +278,160 @@ def growing(scene, _):
     return FAILED, growth.factor, "grows, and does not with a smaller step"
 
 
-def _against_differences(loss, x, out):
-    """The gradient against central differences along itself, in units of each leaf: its root mean square."""
-    found, rebuild = flatten(x)
-    units = [_rms(leaf) or 1.0 for leaf in found if is_variable(leaf)]
-    slopes = [unit * g for unit, g in zip(units, out.gradient, strict=True)]
-    size = norm(slopes)
-    if size == 0:
+def _against_differences(scene, other, out):
+    """The gradient against central differences along itself: the step that serves is found, not chosen."""
+    point, gradient = Point(scene.at(other)), joined([np.conj(g) for g in out.gradient])
+    if not np.any(gradient):
         return PASSED, 0.0, "gradient 0"
-    stretch = math.sqrt(sum(map(np.size, slopes)))  # of a direction of norm 1, so that entries move by t
-    wanted = size * stretch  # the derivative along it
+    direction = point.directions(gradient, 1, generator(SEED), ("random 1", "gradient"))[-1]
+    line = Line(*direction, point, gradient, Trials(scene.sheltered), out.value)
+    wanted = abs(line.slope)
     if wanted <= UNSEEN * abs(out.value):
         return PASSED, 0.0, "the gradient is smaller than differences can see"
-
-    def value(t):
-        moves = (t * stretch * unit * np.conj(s / size) for unit, s in zip(units, slopes, strict=True))
-        moved = rebuild(leaf + next(moves) if is_variable(leaf) else leaf for leaf in found)
-        result = _attempt(lambda x: float(loss(x)), moved)
-        return math.nan if isinstance(result, Exception) else result  # the step is of no use, whatever was raised
-
     gaps = []
-    for t in DIFFERENCES:
-        gap = abs(value(t) / (2 * t) - value(-t) / (2 * t) - wanted) / wanted
+    for step in DIFFERENCES:
+        level = line.level(step)
+        gap = abs(level.difference - level.slope) / wanted
         gaps.append(gap if math.isfinite(gap) else math.inf)
         if gap <= GOOD:
             return PASSED, gap, ""
     best, _, third, *_ = sorted(gaps)
-    if not math.isfinite(best):
-        return DEGRADED, math.nan, "no difference could be taken beside it"
-    if out.flagged:
-        return DEGRADED, best, "the gradient grows without bound on its way back"
     noise = 10 * EPS * abs(out.value) / (max(DIFFERENCES) * wanted)  # of the coarsest difference
-    if best <= BAD or noise > BAD:
-        return DEGRADED, best, "gradient against differences"
-    if third - best <= 0.1 * best:
-        return FAILED, best, "the differences settle on another gradient"
-    return DEGRADED, best, "the differences do not settle: a kink, noise or a steep change"
+    return next((word, best if math.isfinite(best) else math.nan, note) for holds, word, note in (
+        (not math.isfinite(best), DEGRADED, "no difference could be taken beside it"),
+        (out.flagged, DEGRADED, "the gradient grows without bound on its way back"),
+        (best <= BAD or noise > BAD, DEGRADED, "gradient against differences"),
+        (third - best <= 0.1 * best, FAILED, "the differences settle on another gradient"),
+        (True, DEGRADED, "the differences do not settle: a kink, noise or a steep change"),
+    ) if holds)  # fmt: skip
 
 
 def _rms(leaf):
     return norm(leaf) / math.sqrt(max(np.size(leaf), 1))
 
 
-# ---------------------------------------------------------------- the table
+# ---------------------------------------------------------------- cases: (scene, name, x) -> case, other x, judge
+
+
+def as_given(scene):
+    """The scene as a whole: what stands for a value are the other values of all parameters."""
+    rng = np.random.default_rng(SEED)
+    moved = [(name, x, rng.choice([-1.0, 1.0], np.shape(x))) for name, x in scene.leaves.items()]
+    yield "value and gradient", {}, finite
+    yield "two runs", {}, near
+    amplified = partial(near, note="rounding is amplified by {:.0e}", unit=ROUNDING, **DIGITS)
+    yield "last digits of x changed", {name: x * (1 + sign * ROUNDING) for name, x, sign in moved}, amplified
+    yield "growth in one step", {}, growing
+
+
+def scalings(scene, name, x):
+    for exponent in (1, -1, 10, -10, 100, -100, 900, -900) if np.any(x) else ():
+        yield f"times 2^{exponent}", x * 2.0**exponent, partial(scaled, exponent=exponent)
+
+
+def legal_range(scene, name, x):
+    if name in scene.ranges:
+        low, high = scene.ranges[name]
+        spread = np.geomspace if low > 0 and high > 10 * low else np.linspace
+        values = {f"all {value:.3g}": value for value in spread(low, high, 5)}
+        values |= {"below its range": 2 * low - high, "above its range": 2 * high - low}
+        if np.size(x) > 1:
+            odd = np.arange(np.size(x)).reshape(np.shape(x)) % 2
+            values[f"jumps {low:.3g} to {high:.3g}"] = np.where(odd, high, low)
+            values["random in its range"] = _random(x, low, high)
+        for case, value in values.items():
+            if np.all(np.isfinite(value)):
+                yield case, np.zeros_like(x) + value, steady
+
+
+def zeros_and_signs(scene, name, x):
+    if name not in scene.named.values():
+        yield "all 0", 0.0 * x, finite
+        yield "sign changed", -1.0 * x, finite
+
+
+def jumps(scene, name, x):
+    if np.size(x) > 1 and np.all(x > 0) and name not in scene.ranges:
+        half = np.arange(x.size).reshape(x.shape) < x.size // 2
+        yield "jump of 1e8", x * np.where(half, 1e-4, 1e4), finite
+        yield "random over 8 decades", x * 10.0 ** _random(x, -4, 4), finite
+
+
+def constants_added(scene, name, x):
+    """Incompatible data of a singular system are projected or refused, never amplified."""
+    if np.size(x) > 1 and np.any(x):
+        amplified = partial(near, note="amplified by {:.0e}: is a null space left in?")
+        yield "plus 1e-14 of itself", x + 1e-14 * _rms(x), partial(amplified, unit=1e-14, **DIGITS)
+        yield "plus 1e-07 of itself", x + 1e-7 * _rms(x), partial(amplified, good=1e-3, bad=0.1, unit=1e-7)
+        yield "plus 1 of itself", x + _rms(x), finite
+
+
+def not_finite(scene, name, x):
+    for bad in (math.nan, math.inf) if name in scene.steepest else ():
+        spoilt = np.array(x)
+        spoilt[scene.steepest[name]] = bad
+        yield f"one {bad}", spoilt, partial(refused, located=True)
+
+
+def kinds_of_arrays(scene, name, x):
+    if isinstance(x, np.ndarray) and x.ndim:
+        for case, same in layouts(x).items():
+            yield case, same, near
+        yield "float32", x.astype(np.float32), partial(near, good=1e-4, bad=1e-2)
+        for other in (np.resize(x, (len(x) + 1, *x.shape[1:])), x + 1j * x):
+            yield f"shape {other.shape}, {other.dtype}", other, refused
+
+
+def all_integers(scene):
+    yield "all integers", {name: np.asarray(x).astype(int) for name, x in scene.leaves.items()}, refused
+
+
+def factors(scene, name, x):
+    if name in scene.named.values():
+        for factor in (1e-8, 1e-4, 1e-2, 1e-1, 1e1, 1e2, 1e4, 1e8):
+            yield f"times {factor:g}", x * factor, steady
+        if name == scene.named["viscosity"]:
+            yield "0", 0.0 * x, finite
+
+
+def wrong_signs(scene, name, x):
+    if name in scene.named.values():
+        for value in (0.0 * x, -x) if name == scene.named["time step"] else (-x,):
+            yield f"{np.min(value):g}", value, refused
 
 
 def _random(x, low, high):
     return np.random.default_rng(SEED).uniform(low, high, np.shape(x))
 
 
-def _last_digits(scene, *_):
-    rng = np.random.default_rng(SEED)
-    return {"last digits of x changed": {
-        name: x * (1 + ROUNDING * rng.choice([-1.0, 1.0], np.shape(x))) for name, x in scene.leaves.items()
-    }}  # fmt: skip
-
-
-def _within(scene, name, x):
-    low, high = scene.ranges[name]
-    spread = np.geomspace if low > 0 and high > 10 * low else np.linspace
-    cases = {f"all {value:.3g}": np.full_like(x, value) for value in spread(low, high, 5)}
-    odd = np.arange(np.size(x)).reshape(np.shape(x)) % 2
-    mixed = {f"jumps {low:.3g} to {high:.3g}": np.where(odd, high, low), "random in its range": _random(x, low, high)}
-    return cases | mixed if np.size(x) > 1 else cases
-
-
-def _outside(scene, name, x):
-    low, high = scene.ranges[name]
-    ends = {"below its range": 2 * low - high, "above its range": 2 * high - low}
-    return {case: np.full_like(x, value) for case, value in ends.items() if math.isfinite(value)}
-
-
-def _jumps(scene, name, x):
-    half = np.arange(x.size).reshape(x.shape) < x.size // 2
-    return {"jump of 1e8": x * np.where(half, 1e-4, 1e4), "random over 8 decades": x * 10.0 ** _random(x, -4, 4)}
-
-
-def _spoilt(scene, name, x):
-    hole = np.zeros(np.shape(x), bool)
-    hole[scene.steepest[name]] = True
-    return {f"one {bad}": np.where(hole, bad, x) for bad in (math.nan, math.inf)}
-
-
-def _copies(scene, name, x):
-    fixed, wide = x.copy(), np.full((*x.shape, 2), np.nan, x.dtype)
-    fixed.flags.writeable = False
-    wide[..., 0] = x
-    back = x[::-1].copy()[::-1]
-    return {"read-only": fixed, "Fortran order": np.asfortranarray(x), "strided": wide[..., 0], "reversed": back}
-
-
-def _not_fields(scene, name, x):
-    shape = (len(x) + 1, *x.shape[1:])
-    return {f"shape {shape}": np.resize(x, shape), "complex": x + 1j * x}
-
-
-def _wrong_signs(scene, name, x):
-    values = (0.0 * x, -x) if name == scene.named["time step"] else (-x,)
-    return {f"{np.min(value):g}": value for value in values}
-
-
 class Group(NamedTuple):
-    """Cases of one kind, of one parameter (its name and value), or of the scene as a whole (then values are dicts)."""
+    """Cases of one kind."""
 
     name: str
-    applies: Any  # (scene, name, x) -> bool; None: the scene as a whole
-    rows: tuple  # of pairs: (scene, name, x) -> {case: value}, and judge
+    cases: Any  # of one parameter; of the scene as a whole where `whole` is set
+    whole: bool = False
     legal: bool = False  # values outside the range of a parameter are left out
 
 
-LOST_DIGITS = partial(near, good=WEAK, bad=LOST, note="rounding is amplified by {:.0e}", unit=ROUNDING)
-# Incompatible data of a singular system are projected or refused, never amplified.
-AMPLIFIED = "amplified by {:.0e}: is a null space left in?"
-TINY_SHIFT = partial(near, good=WEAK, bad=LOST, note=AMPLIFIED, unit=1e-14)
-SMALL_SHIFT = partial(near, good=1e-3, bad=0.1, note=AMPLIFIED, unit=1e-7)
-
 CASES = (
-    Group("as given", None, (
-        (lambda *_: {"value and gradient": {}}, finite),
-        (lambda *_: {"two runs": {}}, near),
-        (_last_digits, LOST_DIGITS),
-        (lambda *_: {"growth in one step": {}}, growing),
-    )),
-    Group("scaling", lambda s, name, x: np.any(x), tuple(
-        (lambda s, name, x, e=e: {f"times 2^{e}": x * 2.0**e}, partial(scaled, exponent=e))
-        for e in (1, -1, 10, -10, 100, -100, 900, -900)
-    ), legal=True),
-    Group("legal range", lambda s, name, x: name in s.ranges, ((_within, steady), (_outside, steady))),
-    Group("zeros and signs", lambda s, name, x: name not in s.named.values(), (
-        (lambda s, name, x: {"all 0": 0.0 * x, "sign changed": -1.0 * x}, finite),
-    ), legal=True),
-    Group("jumps", lambda s, name, x: np.size(x) > 1 and np.all(x > 0) and name not in s.ranges, ((_jumps, finite),)),
-    Group("constant added", lambda s, name, x: np.size(x) > 1 and np.any(x), (
-        (lambda s, name, x: {"plus 1e-14 of itself": x + 1e-14 * _rms(x)}, TINY_SHIFT),
-        (lambda s, name, x: {"plus 1e-07 of itself": x + 1e-7 * _rms(x)}, SMALL_SHIFT),
-        (lambda s, name, x: {"plus 1 of itself": x + _rms(x)}, finite),
-    ), legal=True),
-    Group("not finite", lambda s, name, x: name in s.steepest, ((_spoilt, partial(refused, located=True)),)),
-    Group("kinds of arrays", lambda s, name, x: isinstance(x, np.ndarray) and x.ndim, (
-        (_copies, near),
-        (lambda s, name, x: {"float32": x.astype(np.float32)}, partial(near, good=1e-4, bad=1e-2)),
-        (_not_fields, refused),
-    )),
-    Group("kinds of arrays", None, (
-        (lambda s, *_: {"all integers": {name: np.asarray(x).astype(int) for name, x in s.leaves.items()}}, refused),
-    )),
-    Group("time step and viscosity", lambda s, name, x: name in s.named.values(), (
-        (lambda s, name, x: {f"times {f:g}": x * f for f in (1e-8, 1e-4, 1e-2, 1e-1, 1e1, 1e2, 1e4, 1e8)}, steady),
-        (lambda s, name, x: {"0": 0.0 * x} if name == s.named["viscosity"] else {}, finite),
-    ), legal=True),
-    Group("time step and viscosity", lambda s, name, x: name in s.named.values(), ((_wrong_signs, refused),)),
-)  # fmt: skip
+    Group("as given", as_given, whole=True),
+    Group("scaling", scalings, legal=True),
+    Group("legal range", legal_range),
+    Group("zeros and signs", zeros_and_signs, legal=True),
+    Group("jumps", jumps),
+    Group("constant added", constants_added, legal=True),
+    Group("not finite", not_finite),
+    Group("kinds of arrays", kinds_of_arrays),
+    Group("kinds of arrays", all_integers, whole=True),
+    Group("time step and viscosity", factors, legal=True),
+    Group("time step and viscosity", wrong_signs),
+)
 
 
 def cases(scene, groups):
     """Scene and names of groups -> (group, parameter, case, function that gives (word, figure, note))."""
     for group in (group for group in CASES if group.name in groups):
-        for name, x in scene.leaves.items() if group.applies else [("", None)]:
-            if group.applies and not group.applies(scene, name, x):
-                continue
-            for values, judge in group.rows:
-                for case, value in values(scene, name, x).items():
-                    if not group.legal or scene.legal(name, value):
-                        yield group.name, name, case, partial(judge, scene, {name: value} if name else value)
+        for name, x in [("", None)] if group.whole else scene.leaves.items():
+            for case, value, judge in group.cases(scene) if group.whole else group.cases(scene, name, x):
+                if not group.legal or scene.legal(name, value):
+                    yield group.name, name, case, partial(judge, scene, value if group.whole else {name: value})
