@@ -340,7 +340,7 @@ class Audit(Result):
     def to_dict(self):
         """The audit as plain numbers, strings and lists."""
         lines = [{name: getattr(one, name) for name in FIELDS} for one in self.lines]
-        return {**vars(self), "notes": list(self.notes), "lines": lines, "rows": list(self.rows)}
+        return super().to_dict() | {"lines": lines, "rows": self.rows}
 
     def __str__(self):
         parts = [f"gradient at {self.size} values, loss {self.value:.6g}, {self.evaluations} evaluations"]

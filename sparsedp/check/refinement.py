@@ -1,6 +1,7 @@
 """Order of accuracy: how the error falls when the grid is refined."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -48,7 +49,17 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
         raise ValueError(f"order needs at least three increasing sizes, got {sizes}")
     if expected is not None and np.ndim(expected) == 0:
         expected = expected - 0.1, expected + 0.1
-    return Refinement(sizes, tuple(float(error_at(n)) for n in sizes), expected)
+    errors = tuple(float(error_at(n)) for n in sizes)
+    slopes = tuple(_slope(sizes[i : i + 2], errors[i : i + 2]) for i in range(len(sizes) - 1))
+    found, verdict, reason = _slope(sizes[-3:], errors[-3:]), "inconclusive", "no order was expected"
+    if math.isnan(found):
+        reason = "an error is 0 or not finite: no slope"
+    elif expected is not None:
+        verdict = "agrees" if expected[0] <= found <= expected[1] else "disagrees"
+        reason = f"expected {expected[0]:g} to {expected[1]:g}"
+    return Refinement(
+        sizes=sizes, errors=errors, orders=slopes, order=found, expected=expected, verdict=verdict, reason=reason
+    )
 
 
 class Refinement(Result):
@@ -71,27 +82,12 @@ class Refinement(Result):
     errors: tuple[float, ...]
     orders: tuple[float, ...]
     order: float
+    expected: Any
+    verdict: str
     reason: str
-    _word = "a refinement"
-
-    def __init__(self, sizes, errors, expected=None):
-        orders = tuple(_slope(sizes[i : i + 2], errors[i : i + 2]) for i in range(len(sizes) - 1))
-        order, interval = _slope(sizes[-3:], errors[-3:]), expected and tuple(map(float, expected))
-        verdict, reason = "inconclusive", "no order was expected"
-        if math.isnan(order):
-            reason = "an error is 0 or not finite: no slope"
-        elif interval:
-            verdict = "agrees" if interval[0] <= order <= interval[1] else "disagrees"
-            reason = f"expected {interval[0]:g} to {interval[1]:g}"
-        super().__init__(sizes=sizes, errors=errors, orders=orders, order=order)
-        super().__init__(expected=interval, verdict=verdict, reason=reason)
 
     def __float__(self):
         return self.order
-
-    def to_dict(self):
-        """The refinement as plain numbers, strings and lists."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
 
     def __str__(self):
         orders = ["", *(f"{slope:.2f}" for slope in self.orders)]

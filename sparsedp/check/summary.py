@@ -7,24 +7,28 @@ __all__ = ["Result", "Row", "Summary", "table"]
 
 
 class Result:
-    """What a check gives back: frozen, and true only when its verdict is "agrees"."""
+    """What an instrument gives: frozen, as plain data, as text; true unless it has a verdict other than "agrees"."""
 
-    verdict: str
-    _word = "a result"
+    _word = ""  # what it is called; default: its class
+    _plain: tuple = ()  # names of the attributes that are plain data; default: all that were given
 
     def __init__(self, **values):
         self.__dict__.update(values)
 
     def __setattr__(self, name, value):
-        raise AttributeError(f"{self._word} is frozen; {name} cannot be set")
+        raise AttributeError(f"{self._word or f'a {type(self).__name__.lower()}'} is frozen; {name} cannot be set")
 
     @property
     def ok(self):
         """Whether the verdict is "agrees"."""
-        return self.verdict == "agrees"
+        return getattr(self, "verdict", "agrees") == "agrees"
 
     def __bool__(self):
         return self.ok
+
+    def to_dict(self):
+        """The result as plain numbers, strings, lists and dicts."""
+        return {name: getattr(self, name) for name in self._plain or vars(self)}
 
     def __repr__(self):
         return str(self)
@@ -62,7 +66,9 @@ class Summary(Result):
     rows: tuple[Row, ...]
     limit: float
     failed: tuple[str, ...]
+    verdict: str
     _word = "a finding"
+    _plain = ("title", "verdict", "limit", "worst")
 
     def __init__(self, title, rows, limit=10.0, **values):
         failed = tuple(row.name for row in rows if row.ok is False)
@@ -77,8 +83,7 @@ class Summary(Result):
 
     def to_dict(self):
         """The summary as plain numbers, strings and lists."""
-        rows = [row._asdict() for row in self.rows]
-        return {"title": self.title, "verdict": self.verdict, "limit": self.limit, "worst": self.worst, "rows": rows}
+        return super().to_dict() | {"rows": [row._asdict() for row in self.rows]}
 
     def _head(self):
         """Lines above the rows."""

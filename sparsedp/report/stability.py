@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp.check.summary import Result, table
 from sparsedp.derivative import NO_JVP, pushforward
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
-from sparsedp.report.table import Result, aligned
 from sparsedp.tape import is_variable
 from sparsedp.tree import flatten, leaves, norm
 
@@ -136,7 +136,7 @@ class StabilityMap(Result):
 
     def __str__(self):
         rows = [(f"{dt:.1e}", *map(_cell, row)) for dt, row in zip(self.time_steps, self.factors, strict=True)]
-        return aligned(rows, (" \\ ".join(self.names), *(f"{nu:.1e}" for nu in self.viscosities)))
+        return table(rows, (" \\ ".join(self.names), *(f"{nu:.1e}" for nu in self.viscosities)))
 
 
 def _cell(factor):

@@ -104,6 +104,7 @@ class Stress(Result):
     rows: list
     left_out: list
     map: Any
+    _plain = ("counts", "rows", "left_out")
 
     @property
     def counts(self):
@@ -115,13 +116,14 @@ class Stress(Result):
         """The rows that FAILED."""
         return [row for row in self.rows if row["outcome"] == FAILED]
 
-    def __bool__(self):
-        return not self.failures
+    @property
+    def verdict(self):
+        """ "disagrees" when something FAILED, else "agrees"."""
+        return "disagrees" if self.failures else "agrees"
 
     def to_dict(self):
         """Everything as plain numbers, strings, lists and dicts."""
-        rows = [dict(row) for row in self.rows]
-        return {"counts": self.counts, "rows": rows, "left_out": self.left_out, "map": self.map and self.map.to_dict()}
+        return super().to_dict() | {"map": self.map and self.map.to_dict()}
 
     def markdown(self):
         """The table in Markdown, the map and what was left out."""

@@ -1,4 +1,4 @@
-"""What all instruments give: a value that prints itself, and one table as text, Markdown, CSV and files.
+"""The one writer of tables: text, Markdown, CSV and files.
 
 A table is a list of rows (dicts) and the names of the columns that are shown.
 """
@@ -7,30 +7,11 @@ import csv
 import io
 import math
 
-from sparsedp.check.summary import table as aligned
+from sparsedp.check.summary import Result, table
 from sparsedp.files import write_file
 from sparsedp.report import plots
 
-__all__ = ["Result", "aligned", "csv_text", "left_out", "markdown_table", "text_of", "text_table", "write_table"]
-
-
-class Result:
-    """What an instrument gives: attributes that nobody sets, plain data, a text."""
-
-    _plain: tuple = ()  # names of the attributes that are plain data
-
-    def __init__(self, **values):
-        self.__dict__.update(values)
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"a {type(self).__name__.lower()} is frozen; {name} cannot be set")
-
-    def to_dict(self):
-        """The result as plain numbers, strings, lists and dicts."""
-        return {name: getattr(self, name) for name in self._plain}
-
-    def __repr__(self):
-        return str(self)
+__all__ = ["Result", "csv_text", "left_out", "markdown_table", "text_of", "text_table", "write_table"]
 
 
 def text_of(value):
@@ -42,7 +23,7 @@ def text_of(value):
 
 def text_table(rows, names):
     """Table -> text in columns."""
-    return aligned(_cells(rows, names), names)
+    return table(_cells(rows, names), names)
 
 
 def markdown_table(rows, names):
