@@ -238,6 +238,18 @@ def test_median_length_of_bodies():
     assert statistics.median(body_length(f) for _, f in functions()) < 10
 
 
+def test_the_table_of_places_is_true():
+    """CONTRIBUTING.md, "Where do I change X?": the file is there, and has the name."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Where do I change X?")[1].split("## ")[0]
+    rows = re.findall(r"^\| .* \| `(.*)` \| `(.*)` \|$", text, re.MULTILINE)
+    assert len(rows) >= 20
+    for path, name in rows:
+        assert re.search(rf"^(def|class)? ?{name}\b", (ROOT / path).read_text(encoding="utf-8"), re.MULTILINE), (
+            path,
+            name,
+        )
+
+
 # ---- the shop window -----------------------------------------------------------------------------------------------
 
 

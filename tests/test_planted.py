@@ -82,7 +82,7 @@ BUGS = {
         "tests/test_solvers_use.py::test_a_small_right_hand_side_gives_the_same_bits",
     ),
     "off by one in the last step": Bug(
-        "trajectory/way.py",
+        "trajectory/backward_pass.py",
         "range(run.n - 1, -1, -1)",
         "range(run.n - 2, -1, -1)",
         "tests/test_rollout.py",

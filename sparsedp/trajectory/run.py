@@ -7,6 +7,7 @@ import numpy as np
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.fields import place, surely_finite
 from sparsedp.ledger import active, count, thread
+from sparsedp.trajectory.backward_pass import BackwardPass
 from sparsedp.trajectory.keep import Last
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.trajectory.pieces import Scale
@@ -14,7 +15,6 @@ from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import Record, looked_at
 from sparsedp.trajectory.schedule import stride
 from sparsedp.trajectory.steps import Steps, carries
-from sparsedp.trajectory.way import Way
 
 __all__ = ["Run"]
 
@@ -213,7 +213,7 @@ class Run:
             self.forward(args)
         steps = Steps(self, args, frozenset(wanted))
         with steps.guarded("on the way back through step"):
-            state = Way(self, steps, frozenset(wanted)).back(g)
+            state = BackwardPass(self, steps, frozenset(wanted)).back(g)
         found = [*(state or [None] * len(self.state.places)), *steps.gradients()]
         for number in wanted:
             self._check_gradient(number, found[number], g)

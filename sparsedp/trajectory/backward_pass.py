@@ -7,10 +7,10 @@ from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import LIMIT, Growth
 from sparsedp.trajectory.schedule import stride
 
-__all__ = ["Way"]
+__all__ = ["BackwardPass"]
 
 
-class Way:
+class BackwardPass:
     """One backward pass over all steps.
 
     Parameters
