@@ -77,8 +77,8 @@ BUGS = {
     ),
     "a residual tested before unscaling": Bug(
         "solvers/contract.py",
-        "        system, goal = self.system, self.system.rtol * data",
-        "        system, goal = self.system, self.system.rtol * max(data, 1.0)",
+        "        system, goal, transposed = self.system, run.rtol * data, run.transposed",
+        "        system, goal, transposed = self.system, run.rtol * max(data, 1.0), run.transposed",
         "tests/test_solvers_use.py::test_a_small_right_hand_side_gives_the_same_bits",
     ),
     "off by one in the last step": Bug(
@@ -126,8 +126,9 @@ BUGS = {
     ),
     "a tolerance that the adjoint ignores": Bug(
         "solvers/contract.py",
-        "        system, goal = self.system, self.system.rtol * data",
-        "        system, goal = self.system, (1e-2 if transposed else self.system.rtol) * data",
+        "        system, goal, transposed = self.system, run.rtol * data, run.transposed",
+        "        system, transposed = self.system, run.transposed\n"
+        "        goal = (1e-2 if transposed else run.rtol) * data",
         "tests/test_solvers.py tests/test_solvers_methods.py tests/test_solvers_use.py",
     ),
 }

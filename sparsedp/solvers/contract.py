@@ -4,6 +4,7 @@
    scaled back. Between, scaling would change no bit, because every method is homogeneous.
 2. A solve is judged by its true residual r = b - A x, recomputed: |r| <= rtol |b| (converged), or
    |r| <= 8 eps (|A| |x| + |b|), the attainable accuracy (converged_at_roundoff). Never absolutely.
+   The tolerance is that of the call: who can do with less (a Newton step, a correction) asks `approximate`.
 3. inv.T solves with the true transpose of the same set-up. 4. A derivative rule calls it once.
 5. Data and solution are projected on both sides of a singular system (see nullspace.py); primal data
    that are not compatible are refused unless nullspace="project"; derivatives are never refused.
@@ -32,8 +33,6 @@ need not be exact: the contract refines with further calls on the residual. Attr
 
 Its builder is a function (system, **options) -> engine; `system` is a System (system.py).
 """
-
-from functools import partial
 
 import numpy as np
 
@@ -88,8 +87,6 @@ class Solver(Remade):
         Why this method, in words.
     """
 
-    observed = True  # whether those who take part in solves are asked
-
     def __init__(self, system, engine, nullspace, log, name, made, reason=""):
         self.made, self.reason = made, reason
         self.served = not thread.calls  # whether a solve was counted for this set-up
@@ -101,43 +98,49 @@ class Solver(Remade):
         # Factors and hierarchies do not travel: what was asked for does, and is set up again.
         return _remade, self.made
 
-    def __copy__(self):
-        """Another contract around the same engine: who asks for it changes the tolerance or the log."""
-        twin = object.__new__(type(self))
-        twin.__dict__.update(self.__dict__)
-        return twin
-
     def solve(self, b, transposed=False, checked=True, start=None):
         """Flat b (float64 or complex128) -> flat x. `checked`: primal data, refused when not compatible."""
         if b.dtype.kind == "c" and not self.system.complex:
             return self._in_parts(b, transposed, checked, start)
         if self.system.complex:
             b = b.astype(complex)
-        return (self._counted if thread.calls else self.solved)(b, transposed, checked, start)
+        if thread.observers:
+            return thread.observers[-1].linear(self, b, transposed, checked, start)
+        return self.solved(b, transposed, checked, start)
 
-    def _counted(self, b, transposed, checked, start):
-        """As `solved`, seen by the ledger and by those who take part in solves."""
+    def solved(self, b, transposed=False, checked=True, start=None, rtol=None):
+        """The solve itself, counted and recorded. One to a tolerance of its own, `rtol`, is not in the log."""
+        if not thread.calls:
+            return self._solved(b, transposed, checked, start, rtol)
         if self.served:
             count(self.name, "reused")
         self.served = True
-        act = partial(thread.observers[-1].linear, self) if thread.observers and self.observed else self.solved
-        return timed(self.name, "adjoint" if transposed else "solve", act, b, transposed, checked, start)
+        return timed(self.name, "adjoint" if transposed else "solve", self._solved, b, transposed, checked, start, rtol)
 
-    def solved(self, b, transposed=False, checked=True, start=None):
-        """The solve itself, recorded in the log."""
-        run = Run()
+    def approximate(self, b, rtol, transposed=False):
+        """About A^-1 b, to the relative residual `rtol` where that can be had: the caller sees to what is left."""
+        try:
+            return self.solved(b, transposed, False, rtol=rtol)
+        except ConvergenceError as error:
+            if error.best is None:
+                raise
+            return error.best.reshape(-1)
+
+    def _solved(self, b, transposed, checked, start, rtol):
+        run = Run(transposed, checked and not transposed, rtol or self.system.rtol)
         thread.solves += 1
         try:
-            return self._scaled(b, run, transposed, checked and not transposed, start)
+            return self._scaled(b, run, start)
         finally:
-            self.log.note(run.info(), transposed)
+            if rtol is None:
+                self.log.note(run.info(), transposed)
             if thread.calls:
                 count(self.name, "iterations", run.iterations)
                 count(self.name, "skipped", int(run.status == "exact_zero_rhs"))
 
     def unroll(self, b, start, transposed):
         """The engine's iterations on the tape. The record is that of the solve: its derivatives are no solves."""
-        run = Run()
+        run = Run(transposed)
         try:
             x = self.engine.unroll(b, start, transposed, run)
         except ConvergenceError as error:
@@ -146,9 +149,7 @@ class Solver(Remade):
         data, solution = (np.array(plain(value), dtype=float).reshape(-1) for value in (b, x))
         solution = shifted(solution, self.system.exponent)
         _, rest, length = self.system.residual(solution, data, transposed)
-        size = norm(data)
-        run.residual = rest / size if size else 0.0
-        run.backward_error = rest / (self.system.norm(transposed) * length + size or 1.0)
+        run.measure(rest, norm(data), self.system.norm(transposed) * length)
         self.log.note(run.info(), transposed)
         return x
 
@@ -162,13 +163,14 @@ class Solver(Remade):
         self.log.note(merged(*infos), transposed)
         return parts[0] + 1j * parts[1]
 
-    def _scaled(self, b, run, transposed, checked, start):
+    def _scaled(self, b, run, start):
+        """The solve with data and solution in the middle of the range of floats."""
         (size, total), exponent = self._measured(b), 0
         if not in_range(size):
             top = largest(b)
             if not np.isfinite(top):
                 run.status = "nonfinite_input"
-                space = self.system.op.domain if transposed else self.system.op.codomain
+                space = self.system.op.domain if run.transposed else self.system.op.codomain
                 check_finite(self.name, b.reshape(space.shape), "takes finite numbers")
             if top == 0:
                 run.status = "exact_zero_rhs"
@@ -179,54 +181,53 @@ class Solver(Remade):
         exponent -= self.system.exponent
         if start is not None:
             start = shifted(start, -exponent).astype(b.dtype)
-        x = self._compatible(b, (size, total), run, transposed, checked, start)
-        return self._unscaled(x, exponent, run) if exponent else x
-
-    def _measured(self, b):
-        """Norm of the data, and their sum where a null space asks for it (else None)."""
-        return measured(b) if self.system.null_space.count else (norm(b), None)
-
-    def _unscaled(self, x, exponent, run):
+        x = self._compatible(b, size, total, run, start)
+        if not exponent:
+            return x
         x = shifted(x, exponent)
         if not np.isfinite(largest(x)):
             run.status = "not_representable"
             raise NonFiniteError(f"the solution of {self.name} is beyond 1.8e308; scale the right-hand side down")
         return x
 
+    def _measured(self, b):
+        """Norm of the data, and their sum where a null space asks for it (else None)."""
+        return measured(b) if self.system.null_space.count else (norm(b), None)
+
     # ------------------------------------------------------------ null space
 
-    def _compatible(self, b, measures, run, transposed, checked, start):
-        """Project, refuse what must be refused, solve. `measures`: norm and sum of b."""
-        space, raw, (size, total) = self.system.null_space, measures[0], measures
+    def _compatible(self, b, raw, total, run, start):
+        """Project, refuse what must be refused, solve. `raw`, `total`: norm and sum of b."""
+        space, size, refuses = self.system.null_space, raw, run.checked and self.nullspace == "raise"
         if self.system.active is not None:
-            b, run.defect = self._on_unknowns(b, raw, run, checked)
+            b = self._on_unknowns(b, raw, run, refuses)
             size, total = self._measured(b)
         if space.count:
-            sums = space.sums(b, transposed, total)
-            defect, worst = space.defect(b, sums, size, self.system.rtol * raw, transposed)
+            sums = space.sums(b, run.transposed, total)
+            defect, worst = space.defect(b, sums, size, run.rtol * raw, run.transposed)
             run.defect = max(run.defect, defect)
-            if checked and self.nullspace == "raise" and defect > COMPATIBLE:
+            if refuses and defect > COMPATIBLE:
                 self._refuse_defect(run, defect, worst)
-            before, (b, size) = size, space.projected(b, transposed, sums=sums)
+            before, (b, size) = size, space.projected(b, run.transposed, sums=sums)
             if size < 0.7 * before:  # most of it was taken out: what is left needs its own digits
-                b, size = space.projected(b, transposed, into=b)
+                b, size = space.projected(b, run.transposed, into=b)
         if size <= 8 * EPS * raw and start is None:
             run.status = "converged_at_roundoff" if size else "exact_zero_rhs"
             return np.zeros_like(b)
-        return self._refined(b, size, run, transposed, start)
+        return self._refined(b, size, run, start)
 
-    def _on_unknowns(self, b, raw, run, checked):
+    def _on_unknowns(self, b, raw, run, refuses):
         outside = np.where(self.system.active, 0.0, b)
-        share = norm(outside) / raw if raw else 0.0
-        if checked and self.nullspace == "raise" and share > 8 * EPS:
-            run.defect, run.status = share, "incompatible_rhs"
+        run.defect = norm(outside) / raw if raw else 0.0
+        if refuses and run.defect > 8 * EPS:
+            run.status = "incompatible_rhs"
             cell = place(int(np.argmax(np.abs(outside))), self.system.op.codomain.shape)
             raise IncompatibleError(
                 f"{self.name}: the right-hand side must be 0 where there is no unknown (solid or isolated cells, "
                 f"coefficient 0), but is not in cell {cell}; set it to 0 or write nullspace='project'",
                 info=run.info(),
             )
-        return np.where(self.system.active, b, 0.0), share
+        return np.where(self.system.active, b, 0.0)
 
     def _refuse_defect(self, run, defect, worst):
         run.status = "incompatible_rhs"
@@ -242,11 +243,15 @@ class Solver(Remade):
 
     # ------------------------------------------------------------ accuracy
 
-    def _refined(self, b, data, run, transposed, start):
+    def _refined(self, b, data, run, start):
         """Call the engine on the residual until the true residual is accepted, or does not fall."""
-        system, goal = self.system, self.system.rtol * data
-        x, r, residual, length = self._begun(b, data, transposed, start)
-        word = "" if x is None else system.accepts(residual, goal, length, data, transposed)
+        system, goal, transposed = self.system, run.rtol * data, run.transposed
+        x, r, residual, length, word, trouble = start, b, data, 0.0, "", ""
+        if start is not None:
+            r, residual, length = system.residual(start, b, transposed)
+            if system.null_space.count:
+                r, residual = system.null_space.projected(r, transposed)
+            word = system.accepts(residual, goal, length, data, transposed)
         for _ in range(ROUNDS if not word else 0):
             step, used, trouble = self._correction(r, r is b, residual, goal, transposed)
             run.iterations += used
@@ -259,25 +264,23 @@ class Solver(Remade):
             elif reached <= residual or x is None:
                 x, r, residual, length = trial, r_trial, reached, size
                 word = system.accepts(residual, goal, length, data, transposed)
-            if trouble or not fell or not self.engine.refines or self._is_enough(word, residual, x, data, transposed):
+            if trouble or not fell or not self.engine.refines or word == "converged":
+                break
+            # Attainable by the norm of A is not the end where rows differ in size: go on to their own rounding.
+            if word and residual <= 2 * system.rounding(x, data, transposed):
                 break
         x = np.zeros_like(b) if x is None else x
-        return self._verdict(x, length, run, word or trouble or "stagnated", residual, data, transposed)
-
-    def _is_enough(self, word, residual, x, data, transposed):
-        """Attainable by the norm of A is not the end where rows differ in size: go on to their own rounding."""
-        if word != "converged_at_roundoff":
-            return bool(word)
-        return residual <= 2 * self.system.rounding(x, data, transposed)
-
-    def _begun(self, b, data, transposed, start):
-        """(x, residual, its norm, norm of x) before the first call of the engine."""
-        if start is None:
-            return None, b, data, 0.0
-        r, size, length = self.system.residual(start, b, transposed)
-        if self.system.null_space.count:
-            r, size = self.system.null_space.projected(r, transposed)
-        return start, r, size, length
+        run.status = word or trouble or "stagnated"
+        run.measure(residual, data, system.norm(transposed) * length)
+        if word or not self.engine.refines:
+            return x
+        op = system.given.T if transposed else system.given
+        raise ConvergenceError(
+            f"{self.engine.method} on {op}: relative residual {run.residual:.1e} after {run.iterations} "
+            f"{self.engine.unit}, wanted {run.rtol:g} ({run.status})",
+            info=run.info(),
+            best=x.reshape(op.domain.shape),
+        )
 
     def _correction(self, r, is_data, residual, goal, transposed):
         """One call of the engine, on a residual in the middle of the range of floats."""
@@ -290,19 +293,6 @@ class Solver(Remade):
         if self.system.active is not None:
             step[~self.system.active] = 0.0
         return (shifted(step, exponent) if exponent else step), used, trouble
-
-    def _verdict(self, x, length, run, word, residual, data, transposed):
-        size = self.system.norm(transposed) * length + data
-        run.status, run.residual, run.backward_error = word, residual / data if data else 0.0, residual / size
-        if word.startswith("converged") or not self.engine.refines:
-            return x
-        op = self.system.given.T if transposed else self.system.given
-        raise ConvergenceError(
-            f"{self.engine.method} on {op}: relative residual {run.residual:.1e} after {run.iterations} "
-            f"{self.engine.unit}, wanted {self.system.rtol:g} ({word})",
-            info=run.info(),
-            best=x.reshape(op.domain.shape),
-        )
 
 
 def _remade(build, arguments):

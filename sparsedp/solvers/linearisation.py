@@ -1,6 +1,5 @@
 """The Jacobian of a residual at one point, as Newton's method and the derivative rules use it."""
 
-from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -70,16 +69,8 @@ class Linearisation:
         found = None if self.small is None else self.small.solve(-F, forcing)
         if found is not None:
             return found[0]
-        solver = copy(self.inv.solver)
-        solver.system = copy(solver.system)
-        solver.system.rtol = max(forcing, solver.system.rtol)
-        solver.observed, self.inv.solver.served = False, True  # what it leaves, the next step takes away
-        try:
-            return solver.solve(-F, checked=False)
-        except ConvergenceError as error:
-            if error.best is None:
-                raise
-            return error.best.reshape(-1)  # a step that is not exact may still lead downhill
+        solver = self.inv.solver
+        return solver.approximate(-F, max(forcing, solver.system.rtol))
 
     def solve(self, b, transposed):
         """(J^-1 b or J^-T b to the full tolerance, its record). Refused when the root is not isolated."""

@@ -86,15 +86,23 @@ class SolveLog:
 
 
 class Run:
-    """The figures of a solve while it runs."""
+    """The figures of a solve while it runs, and what was asked of it."""
 
-    __slots__ = ("backward_error", "clock", "defect", "iterations", "residual", "status")
+    __slots__ = (
+        "backward_error", "checked", "clock", "defect", "iterations", "residual", "rtol", "status", "transposed",
+    )  # fmt: skip
 
-    def __init__(self):
+    def __init__(self, transposed=False, checked=False, rtol=0.0):
+        self.transposed, self.checked, self.rtol = transposed, checked, rtol
         self.status = ""
         self.iterations = 0
         self.residual = self.backward_error = self.defect = 0.0
         self.clock = perf_counter()
+
+    def measure(self, residual, data, terms):
+        """Note the norm of the residual, relative to that of the data, and to the sum of both terms of it."""
+        self.residual = residual / data if data else 0.0
+        self.backward_error = residual / (terms + data or 1.0)
 
     def info(self):
         """Freeze the figures."""
