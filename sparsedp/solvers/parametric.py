@@ -432,16 +432,16 @@ class MatrixSolver(ParametricSolver):
         self.domain, self._pattern = domain, pattern
         self.rows = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
         self.columns = pattern.indices
-        super().__init__(-self._picking(self.rows).T, self._picking(self.columns), settings)
+        super().__init__(self._picking(self.rows, -1.0).T, self._picking(self.columns, 1.0), settings)
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
         return MatrixSolver, (self._pattern, self.domain, self._settings)
 
-    def _picking(self, place):
-        """Operator: a field -> for each entry the value at its row, or its column."""
+    def _picking(self, place, sign):
+        """Operator: a field -> for each entry the value at its row, or its column, times the sign."""
         shape = (place.size, self.domain.size)
-        matrix = sp.csr_array((np.ones(place.size), place, np.arange(place.size + 1)), shape=shape)
+        matrix = sp.csr_array((np.full(place.size, sign), place, np.arange(place.size + 1)), shape=shape)
         return from_matrix(matrix, self.domain, name="entries")
 
     def __call__(self, data, b):
