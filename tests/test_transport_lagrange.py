@@ -162,10 +162,10 @@ def test_loops_against_the_matrix_and_nothing_is_read_beside_the_samples(shape, 
         steep = departure.gradient(points, samples, w, scale, g, np.empty(w.shape))
         for axis in axes:
             np.testing.assert_allclose(steep[axis], -scale[axis] * g * (slope[axis] @ samples), **close)
-        low, high, stencils = np.empty((3, n))
-        departure.extrema(points, samples, w, scale, low, high, stencils)
+        low, high = bounds = np.empty((2, n))
+        departure.gather(points, samples, w, scale, np.empty(n), bounds)
         assert np.isfinite([low, high]).all() and (low <= high).all()
-        corners, *shares = departure.bound_shares(points, samples, stencils)
+        corners, *shares = departure.bound_shares(points, samples, w, scale, np.arange(n))
         for share, bound in zip(shares, (low, high)):
             np.testing.assert_array_equal(np.sum(share * samples[corners], axis=0), bound)
 

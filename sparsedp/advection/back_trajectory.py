@@ -1,7 +1,4 @@
-"""The velocity at the points of a field, and with which velocity a point looks back to its departure point.
-
-Interpolation to the points is linear along each axis in which they differ; at a wall the only cell. For the
-x-faces of cells of equal width that is the mean of the four y-faces around.
+"""With which velocity a point looks back to its departure point.
 
 With s = dt / spacing the departure point of point i is, in index coordinates,
 
@@ -17,45 +14,10 @@ import numpy as np
 
 from sparsedp.advection.interpolant import Interpolant
 from sparsedp.advection.law import component_shapes
-from sparsedp.conditions import neumann
-from sparsedp.operator import Operator
-from sparsedp.operators.stencils import means, pick
-from sparsedp.space import Space
-from sparsedp.structure.kronecker import Kronecker, Term
 
-__all__ = ["Euler", "Midpoint", "velocity_at_points"]
+__all__ = ["Euler", "Midpoint"]
 
 NONE = np.empty(0)
-
-
-def velocity_at_points(setting):
-    """Setting -> Operator from the velocity as it is given to (component, axis, point); None when that is the same."""
-    grid, shapes = setting.grid, component_shapes(setting)
-    given = grid.faces.parts if setting.velocity == "faces" else (grid.shape,) * grid.dim
-    if (setting.velocity == "cells" and setting.of == "cells") or (setting.velocity == setting.of and grid.dim == 1):
-        return None
-    own = [None] if setting.of == "cells" else range(grid.dim)
-    parts = [shape for shape in shapes for _ in range(grid.dim)]
-    blocks = {
-        (grid.dim * c + axis, axis): (Term(1.0, _factors(setting, component, axis)),)
-        for c, component in enumerate(own)
-        for axis in range(grid.dim)
-    }
-    structure = Kronecker(parts, given, blocks)
-    rows, columns = structure.shape
-    return Operator(structure, Space(columns), Space(rows), "velocity at the points")
-
-
-def _factors(setting, component, axis):
-    """Factors that take velocity component `axis` to the points of field component `component` (None: cells)."""
-    grid, factors = setting.grid, [None] * setting.grid.dim
-    if component == axis and setting.velocity == "faces":
-        return tuple(factors)
-    if setting.velocity == "faces":
-        factors[axis] = pick(grid, axis, False).scaled(0.5) + pick(grid, axis, True).scaled(0.5)
-    if component is not None:
-        factors[component] = means(grid, component, None if grid.periodic[component] else (neumann, neumann))
-    return tuple(factors)
 
 
 class Euler:
@@ -94,11 +56,10 @@ class Midpoint:
     def vjp(self, number, w, step, g):
         """See Euler."""
         (interpolant, half, samples), direct, bent = self._half_way(number, w, step), np.empty_like(w), np.zeros_like(w)
-        for axis, row in enumerate(samples):
-            interpolant.pad_vjp(interpolant.scatter(g[axis], half), direct[axis], NONE)
-            bent += interpolant.gradient(row, half, g[axis])
-        direct += bent
-        return direct, bent
+        for row, part, target in zip(samples, g, direct, strict=True):
+            interpolant.pad_vjp(interpolant.gather_vjp(part, half, np.empty), target, NONE)
+            bent += interpolant.gradient(row, half, part, np.empty_like(w))
+        return direct + bent, bent
 
     def jvp(self, number, w, trajectory, dw, ddt):
         """See Euler."""

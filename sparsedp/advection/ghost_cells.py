@@ -4,6 +4,7 @@ Beyond a wall the field goes on with the value of the nearest point (neumann) or
 if that stood one spacing away from the last point; a periodic axis wraps. Where two axes meet, the later one decides.
 """
 
+from functools import reduce
 from math import prod
 
 import numpy as np
@@ -11,12 +12,13 @@ import scipy.sparse as sp
 
 from sparsedp.conditions import neumann
 from sparsedp.kernels.departure import PAD
+from sparsedp.operators.stencils import cell_beside
 
-__all__ = ["GhostCells", "filling"]
+__all__ = ["filling", "sample_sources"]
 
 
-class GhostCells:
-    """The linear map from (field, inflow values) to the field with ghost cells, and its transpose.
+def sample_sources(shape, sides, wall, closed):
+    """Where the field with ghost cells comes from: numbers of points, and after them of inflow values.
 
     Parameters
     ----------
@@ -29,88 +31,46 @@ class GhostCells:
     closed : bool
         Go on with the nearest point at all walls.
     """
-
-    def __init__(self, shape, sides, wall=0, closed=False):
-        self.shape, self.sides = shape, sides
-        self.padded = tuple(n + 2 * PAD for n in shape)
-        self.inside = tuple(slice(PAD, PAD + n) for n in shape)
-        self.steps = []  # axis, what is written, where it comes from: other samples, or the numbers of inflow values
-        for axis, (n, pair) in enumerate(zip(shape, sides, strict=True)):
-            for start in range(0, PAD, n) if pair is None else ():  # an axis of few points wraps more than once
-                stop = min(start + n, PAD)
-                low, high = slice(PAD - stop, PAD - start), slice(PAD + n + start, PAD + n + stop)
-                self._copy(axis, low, slice(low.start + n, low.stop + n))
-                self._copy(axis, high, slice(high.start - n, high.stop - n))
-            for side, condition in enumerate(pair or ()):
-                layers, last = ((slice(PAD), PAD), (slice(PAD + n, None), PAD + n - 1))[side]
-                if closed or condition == neumann:
-                    self._copy(axis, layers, slice(last, last + 1))
-                else:
-                    self.steps.append((axis, self._layers(axis, layers), self._plate(axis, wall)))
-                wall += prod(shape) // n
-        self.inflow_end = wall  # the first inflow value after those of this field
-
-    def _layers(self, axis, layers):
-        """Index of layers along an axis; earlier axes have their ghost cells already, later ones not."""
-        return (slice(None),) * axis + (layers,) + self.inside[axis + 1 :]
-
-    def _copy(self, axis, target, source):
-        self.steps.append((axis, self._layers(axis, target), self._layers(axis, source)))
-
-    def _plate(self, axis, wall):
-        """Numbers of the inflow values of a wall, which go on beyond the ends of the earlier axes."""
-        plate = tuple(1 if a == axis else n for a, n in enumerate(self.shape))
-        numbers = wall + np.arange(prod(plate)).reshape(plate)
-        for a in range(axis):
-            around = [(PAD, PAD) if b == a else (0, 0) for b in range(len(plate))]
-            numbers = np.pad(numbers, around, mode="wrap" if self.sides[a] is None else "edge")
-        return numbers
-
-    def pad(self, u, inflow, out):
-        """Field, inflow values -> samples, flat, written to out."""
-        samples = out.reshape(self.padded)
-        samples[self.inside] = u.reshape(self.shape)
-        for _, target, source in self.steps:
-            samples[target] = samples[source] if type(source) is tuple else inflow[source]
-        return out
-
-    def pad_vjp(self, samples, of_u, of_inflow):
-        """The transpose of `pad`: written to of_u, added to of_inflow. The samples are used up."""
-        samples = samples.reshape(self.padded)
-        for axis, target, source in self.steps[::-1]:
-            given = samples[target]
-            if type(source) is not tuple:
-                np.add.at(of_inflow, source, given.sum(axis, keepdims=True))
-            else:
-                into = samples[source]
-                into += given if into.shape == given.shape else given.sum(axis, keepdims=True)
-        of_u.reshape(self.shape)[...] = samples[self.inside]
+    found = np.arange(prod(shape)).reshape(shape)
+    wall += found.size
+    for axis, pair in enumerate(sides):
+        plate, beyond = tuple(1 if a == axis else n for a, n in enumerate(shape)), []
+        for side, condition in enumerate(pair or ()):
+            layer = np.take(found, [-side], axis)
+            if not closed and condition != neumann:
+                layer = wall + np.arange(prod(plate)).reshape(plate)
+                for earlier in range(axis):
+                    layer = _extended(layer, earlier, "wrap" if sides[earlier] is None else "edge")
+            wall += prod(plate)
+            beyond.append(np.repeat(layer, PAD, axis))
+        found = np.concatenate([beyond[0], found, beyond[1]], axis) if pair else _extended(found, axis, "wrap")
+    return found.ravel()
 
 
-def filling(solid, periodic):
+def _extended(numbers, axis, mode):
+    return np.pad(numbers, [(PAD, PAD) if a == axis else (0, 0) for a in range(numbers.ndim)], mode)
+
+
+def filling(grid, solid):
     """Solid cells -> csr_array that leaves fluid cells alone and fills the others from them.
 
     A solid cell gets the mean of the cells next to it that are fluid or filled already, layer by layer inwards: what
     a neumann wall does too.
     """
+    lines = [_beside(grid, axis) for axis in range(grid.dim)]
+    beside = reduce(lambda first, second: sp.kronsum(second, first, "csr"), lines)
     known, total = ~solid.ravel(), sp.eye_array(solid.size, format="csr")
-    here, there = _neighbours(solid.shape, periodic)
     while True:
-        new = ~known[here] & known[there]
-        if not new.any():  # all is filled, or there is no fluid to fill it from
+        layer = sp.diags_array(1.0 * ~known) @ beside @ sp.diags_array(1.0 * known)
+        count = layer.sum(axis=1)
+        if not count.any():  # all is filled, or there is no fluid to fill it from
             return total
-        layer = sp.csr_array((np.ones(np.count_nonzero(new)), (here[new], there[new])), (solid.size,) * 2)
-        count = layer @ np.ones(solid.size)
-        mean, rest = sp.diags_array(1 / np.maximum(count, 1)) @ layer, sp.diags_array((count == 0).astype(float))
+        mean, rest = sp.diags_array(1 / np.maximum(count, 1)) @ layer, sp.diags_array(1.0 * (count == 0))
         total = sp.csr_array((mean + rest) @ total)
         known |= count > 0
 
 
-def _neighbours(shape, periodic):
-    """Cells and cells beside them, each pair both ways round."""
-    cells, pairs = np.arange(prod(shape)).reshape(shape), []
-    for axis, wraps in enumerate(periodic):
-        line = np.arange(shape[axis] if wraps else shape[axis] - 1)
-        one, two = (np.take(cells, (line + k) % shape[axis], axis).ravel() for k in (0, 1))
-        pairs += [(one, two), (two, one)]
-    return (np.concatenate(side) for side in zip(*pairs, strict=True))
+def _beside(grid, axis):
+    """Cells along an axis -> the sum of the cells beside each of them; a link to itself, at a wall, does no harm."""
+    below, above = (cell_beside(grid, axis, upper).matrix for upper in (False, True))
+    return below.T @ above + above.T @ below

@@ -1,18 +1,19 @@
 """One component of a field between its points: padded, interpolated at departure points, and back."""
 
 from functools import cached_property
+from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.advection.ghost_cells import GhostCells, filling
+from sparsedp.advection.ghost_cells import filling, sample_sources
 from sparsedp.advection.index_coordinates import Stretched, Uniform
 from sparsedp.advection.law import component_shapes
 from sparsedp.kernels import departure
-from sparsedp.operators.boundary import solid_faces
+from sparsedp.kernels.departure import PAD
 
-__all__ = ["Interpolant", "Trajectory", "components"]
+__all__ = ["Interpolant", "Trajectory"]
 
 
 class Trajectory(NamedTuple):
@@ -25,24 +26,6 @@ class Trajectory(NamedTuple):
     slopes: Any  # derivative of the displacement in the velocity, above and below; None: 1
 
 
-def components(setting):
-    """Setting -> an Interpolant for each component of the moved field."""
-    solids: list = [None] * setting.grid.dim
-    if setting.solid is not None and setting.solid.any():
-        if setting.of == "cells":
-            solids = [setting.solid.ravel()]
-        else:
-            below, above = solid_faces(setting.grid, setting.solid)
-            solids = [(below | above)[slice(*ends)] for ends in _ends(setting)]
-    return [
-        Interpolant(setting, number, setting.interpolation, solids[number]) for number in range(len(_ends(setting)))
-    ]
-
-
-def _ends(setting):
-    return list(zip(setting.space.offsets, setting.space.offsets[1:], strict=False))
-
-
 class Interpolant:
     """Component `number` of a field: linear or cubic; `closed`: walls repeat the nearest value, nothing flows in.
 
@@ -50,17 +33,21 @@ class Interpolant:
     ----------
     span : slice
         Where the component stands in the flat field.
-    solid : bool array or None
-        Its points that keep their value.
     """
 
-    def __init__(self, setting, number, interpolation, solid=None, closed=False):
+    def __init__(self, setting, number, interpolation, closed=False):
         shapes, grid, sides = component_shapes(setting), setting.grid, setting.sides
-        self.setting, self.solid = setting, solid
-        self.span = slice(*_ends(setting)[number])
-        wall = sum(2 * np.prod(s) // n for s in shapes[:number] for n, pair in zip(s, sides, strict=True) if pair)
-        self.ghosts = GhostCells(shapes[number], sides, int(wall), closed)
+        self.setting, self.closed = setting, closed
+        self.span = slice(*setting.space.offsets[number : number + 2])
+        wall = sum(2 * prod(s) // n for s in shapes[:number] for n, pair in zip(s, sides, strict=True) if pair)
         self.points = departure.Points.of(shapes[number], grid.periodic, interpolation)
+        self.inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
+        self.sources = sample_sources(shapes[number], sides, wall, closed)
+        outside = np.ones(self.points.padded, bool)
+        outside[self.inside] = False
+        inflow, outside = self.sources >= self.points.size, outside.ravel()
+        self.copies, self.plates = np.flatnonzero(outside & ~inflow), np.flatnonzero(inflow)
+        self.copied, self.entering = self.sources[self.copies], self.sources[self.plates] - self.points.size
         uniform = all(grid.uniform)
         self.coordinates = Uniform(grid) if uniform else Stretched(setting, number, interpolation)
 
@@ -70,9 +57,9 @@ class Interpolant:
 
         Faces that touch a solid keep their value and lend it to others.
         """
-        if self.setting.of == "faces" or self.solid is None:
+        if self.setting.of == "faces" or self.setting.solid is None or self.closed:
             return None
-        forward = filling(self.setting.solid, self.setting.grid.periodic)
+        forward = filling(self.setting.grid, self.setting.solid)
         return forward, sp.csr_array(forward.T)
 
     def trajectory(self, velocity, step):
@@ -81,29 +68,34 @@ class Interpolant:
 
     def pad(self, u, inflow, room=np.empty):
         """Component, inflow values -> samples: the field with its ghost cells."""
-        return self.ghosts.pad(u if self.fill is None else self.fill[0] @ u, inflow, room(self.points.samples))
+        u, samples = u if self.fill is None else self.fill[0] @ u, room(self.points.samples)
+        samples.reshape(self.points.padded)[self.inside] = u.reshape(self.points.shape)
+        samples[self.copies] = u[self.copied]
+        samples[self.plates] = inflow[self.entering]
+        return samples
 
     def pad_vjp(self, samples, of_u, of_inflow):
-        """Cotangent of samples, which is used up -> written to of_u, added to of_inflow."""
-        self.ghosts.pad_vjp(samples, of_u, of_inflow)
+        """Cotangent of samples -> written to of_u, added to of_inflow."""
+        of_u.reshape(self.points.shape)[...] = samples.reshape(self.points.padded)[self.inside]
+        np.add.at(of_u, self.copied, samples[self.copies])
+        np.add.at(of_inflow, self.entering, samples[self.plates])
         if self.fill is not None:
             of_u[:] = self.fill[1] @ of_u
 
-    def gather(self, samples, trajectory, out):
-        """Values at the departure points -> out."""
-        return departure.gather(self.points, samples, trajectory.displacement, trajectory.scale, out)
+    def gather(self, samples, trajectory, out, bounds=departure.NO_BOUNDS):
+        """Values at the departure points -> out; least and greatest sample of the cells around them -> bounds."""
+        return departure.gather(self.points, samples, trajectory.displacement, trajectory.scale, out, bounds)
 
-    def scatter(self, g, trajectory, room=np.empty, out=None):
-        """The transpose of `gather` -> samples, added to `out` if it is given."""
-        if out is None:
-            out = room(self.points.samples)
-            out[:] = 0.0
-        return departure.scatter(self.points, trajectory.displacement, trajectory.scale, g, out)
+    def gather_vjp(self, g, trajectory, room, samples=None):
+        """The transpose of `gather` -> cotangent of samples, added to `samples` if there are some."""
+        if samples is None:
+            samples = room(self.points.samples)
+            samples[:] = 0.0
+        return departure.scatter(self.points, trajectory.displacement, trajectory.scale, g, samples)
 
-    def gradient(self, samples, trajectory, g, out=None):
-        """g times the derivative of `gather` in the velocity of the trajectory -> (axis, point)."""
-        velocity, _, d, scale, slopes = trajectory
-        out = np.empty(velocity.shape) if out is None else out
+    def gradient(self, samples, trajectory, g, out):
+        """g times the derivative of `gather` in the velocity of the trajectory -> out (axis, point)."""
+        _, _, d, scale, slopes = trajectory
         departure.gradient(self.points, samples, d, scale, g, out)
         if slopes is None:
             return out
@@ -119,18 +111,17 @@ class Interpolant:
 
     def jvp(self, samples, change, trajectory, dm):
         """Samples and their tangent, that of the velocity of the trajectory or None -> tangent of `gather`."""
-        total, ones = self.gather(change, trajectory, np.empty(self.points.size)), np.ones(self.points.size)
-        return total if dm is None else total + np.sum(self.gradient(samples, trajectory, ones) * dm, axis=0)
+        total = self.gather(change, trajectory, np.empty(self.points.size))
+        if dm is not None:
+            total += np.sum(self.gradient(samples, trajectory, np.ones(total.size), np.empty(dm.shape)) * dm, axis=0)
+        return total
 
     def matrix(self, trajectory):
         """`gather` after `pad` as a csr_array in the component, without inflow."""
         n = self.points.size
-        numbers = self.ghosts.pad(
-            np.arange(float(n)), np.full(self.ghosts.inflow_end, -1.0), np.empty(self.points.samples)
-        )
         found = sp.csr_array((n, n))
         for index, weight in departure.entries(self.points, trajectory.displacement, trajectory.scale):
-            columns = numbers[index].astype(np.int64)
-            inside = columns >= 0
-            found = found + sp.csr_array((weight[inside], (np.flatnonzero(inside), columns[inside])), (n, n))
+            columns = self.sources[index]
+            weight = np.where(columns < n, weight, 0.0)
+            found = found + sp.csr_array((weight, np.minimum(columns, n - 1), np.arange(n + 1)), (n, n))
         return found if self.fill is None else found @ self.fill[0]

@@ -19,7 +19,6 @@ from sparsedp.kernels import departure
 
 __all__ = ["MacCormack"]
 
-NONE = np.empty(0)
 BLOCK = 1 << 14  # points that NumPy works on at a time: what is made on the way stays in the cache
 
 
@@ -35,52 +34,49 @@ class MacCormack(SemiLagrangian):
         self.clamped = setting.clamp
 
     def _stages(self, component, u, inflow, trajectories, room):
-        """Samples of u and of f, the value before it is clamped, `extrema` of u or None."""
+        """Samples of u and of f, the value before it is clamped, least and greatest sample of u (if they count)."""
         n, (back, ahead) = u.size, trajectories
         first = component.pad(u, inflow, room)
-        f = component.gather(first, back, room(n))
+        bounds = room(2 * n).reshape(2, n) if self.clamped else departure.NO_BOUNDS
+        f = component.gather(first, back, room(n), bounds)
         second = component.pad(f, inflow, room)
         new = component.gather(second, ahead, room(n))
-        for part in _blocks(n):
+        for start in range(0, n, BLOCK):
+            part = slice(start, start + BLOCK)
             new[part] = f[part] + 0.5 * (u[part] - new[part])
-        bounds = (room(n), room(n), room(n)) if self.clamped else None
-        if bounds:
-            departure.extrema(component.points, first, back.displacement, back.scale, *bounds)
         return first, second, new, bounds
+
+    def _clamps(self, component, first, back, new, bounds):
+        """Points where the clamp acts: which, the share of the value that stays, samples and shares of the bounds."""
+        some = np.flatnonzero((new <= bounds[0]) | (new >= bounds[1]))
+        (low, high), value = bounds[:, some], new[some]
+        below, above = _step(low, value), _step(value, high)
+        index, least, greatest = departure.bound_shares(component.points, first, back.displacement, back.scale, some)
+        return some, 1.0 - below - above, index, least * below + greatest * above
 
     def advect(self, component, u, inflow, trajectories, room, out):
         """See the base class."""
         *_, new, bounds = self._stages(component, u, inflow, trajectories, room)
-        if bounds:
-            np.clip(new, *bounds[:2], out=out)
-        else:
-            out[:] = new
+        np.clip(new, *(bounds if self.clamped else (-np.inf, np.inf)), out=out)
 
     def advect_vjp(self, component, g, u, inflow, trajectories, room, into, speeds):
         """See the base class."""
-        n, points, (back, ahead) = u.size, component.points, trajectories
+        back, ahead = trajectories
         first, second, new, bounds = self._stages(component, u, inflow, trajectories, room)
-        own, of_f, of_first, (of_u, of_inflow) = room(n), room(n), room(points.samples), into or (NONE, inflow.copy())
-        of_b = new  # which is used up
-        of_first[:] = 0.0
-        for part in _blocks(n):
-            free = 1.0
-            if bounds:
-                low, high, stencils = (array[part] for array in bounds)
-                below, above = _step(low, new[part]), _step(new[part], high)
-                free = 1.0 - below - above
-                some = np.flatnonzero(free != 1.0)
-                index, least, greatest = departure.bound_shares(points, first, stencils[some])
-                of_bound = least * below[some] + greatest * above[some]
-                np.add.at(of_first, index, of_bound * g[part][some])
-            own[part] = free * g[part]
-            of_b[part] = -0.5 * own[part]
-        component.pad_vjp(component.scatter(of_b, ahead, room), of_f, of_inflow)
+        own, of_f, of_first, (of_u, of_inflow) = room(u.size), room(u.size), None, into or (None, inflow.copy())
+        own[:] = g
+        if self.clamped:
+            some, free, index, shares = self._clamps(component, first, back, new, bounds)
+            own[some] *= free
+            of_first = room(first.size)
+            of_first[:] = 0.0
+            np.add.at(of_first, index, shares * g[some])
+        of_b = np.multiply(-0.5, own, out=new)
+        component.pad_vjp(component.gather_vjp(of_b, ahead, room), of_f, of_inflow)
         of_f += own
         if into is not None:
-            component.pad_vjp(component.scatter(of_f, back, out=of_first), of_u, of_inflow)
-            for part in _blocks(n):
-                of_u[part] += 0.5 * own[part]
+            component.pad_vjp(component.gather_vjp(of_f, back, room, of_first), of_u, of_inflow)
+            of_u -= of_b
         if speeds is not None:
             component.gradient(first, back, of_f, speeds[0])
             component.gradient(second, ahead, of_b, speeds[1])
@@ -90,20 +86,13 @@ class MacCormack(SemiLagrangian):
         first, second, new, bounds = self._stages(component, u, inflow, trajectories, np.empty)
         change = component.pad(du, dinflow)
         df = component.jvp(first, change, trajectories[0], dm[0])
-        db = component.jvp(second, component.pad(df, dinflow), trajectories[1], dm[1])
-        total = df + 0.5 * (du - db)
-        if bounds is not None:
-            below, above = _step(bounds[0], new), _step(new, bounds[1])
-            index, least, greatest = departure.bound_shares(component.points, first, bounds[2])
-            total *= 1.0 - below - above
-            total += np.sum((least * below + greatest * above) * change[index], axis=0)
+        total = df + 0.5 * (du - component.jvp(second, component.pad(df, dinflow), trajectories[1], dm[1]))
+        if self.clamped:
+            some, free, index, shares = self._clamps(component, first, trajectories[0], new, bounds)
+            total[some] = free * total[some] + np.sum(shares * change[index], axis=0)
         return total
 
 
 def _step(a, b):
     """1, 1/2, 0 where a > b, a = b, a < b."""
     return 0.5 * (a > b) + 0.5 * (a >= b)
-
-
-def _blocks(n):
-    return [slice(start, start + BLOCK) for start in range(0, n, BLOCK)]

@@ -18,11 +18,13 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp import results
-from sparsedp.advection.back_trajectory import Euler, Midpoint, velocity_at_points
-from sparsedp.advection.interpolant import components
-from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
+from sparsedp.advection.back_trajectory import Euler, Midpoint
+from sparsedp.advection.interpolant import Interpolant
+from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law, component_shapes
 from sparsedp.advection.scratch import FEW, Scratch
+from sparsedp.advection.velocities import velocity_at_points
 from sparsedp.fields import check_finite, surely_finite
+from sparsedp.operators.boundary import solid_faces
 
 __all__ = ["SemiLagrangian"]
 
@@ -36,11 +38,13 @@ class SemiLagrangian(Law):
 
     def __init__(self, setting):
         super().__init__(setting)
-        self.components = components(setting)
+        numbers, solid = range(len(component_shapes(setting))), setting.solid
+        self.components = [Interpolant(setting, number, setting.interpolation) for number in numbers]
         self.backtrace = Midpoint(setting) if setting.backtrace == "midpoint" else Euler()
-        self.to_points = velocity_at_points(setting)
-        self.scratch, dim, ends = Scratch(), setting.grid.dim, [setting.grid.dim * n for n in setting.space.offsets]
-        self.parts = [(slice(*pair), (dim, -1)) for pair in zip(ends, ends[1:], strict=False)]  # of the velocity
+        self.to_points, self.scratch = velocity_at_points(setting), Scratch()
+        self.solid = None  # points that keep their value
+        if solid is not None:
+            self.solid = solid.ravel() if setting.of == "cells" else np.logical_or(*solid_faces(setting.grid, solid))
 
     # ------------------------------------------------------------ one component, which `maccormack` does in its own way
 
@@ -54,7 +58,7 @@ class SemiLagrangian(Law):
         Those of the velocities of the trajectories are written to the arrays `speeds`; None leaves a part out.
         """
         if into is not None:
-            component.pad_vjp(component.scatter(g, trajectories[0], room), *into)
+            component.pad_vjp(component.gather_vjp(g, trajectories[0], room), *into)
         if speeds is not None:
             component.gradient(component.pad(u, inflow, room), trajectories[0], g, speeds[0])
 
@@ -70,15 +74,26 @@ class SemiLagrangian(Law):
         borrowed: list = []
         return (np.empty if u.size <= FEW else self.scratch.lender(borrowed)), borrowed
 
+    def _by_component(self, v):
+        """Velocity at the points, flat -> for each component an array (axis, point)."""
+        dim = self.setting.grid.dim
+        return [v[dim * c.span.start : dim * c.span.stop].reshape(dim, -1) for c in self.components]
+
     def _velocities(self, v, room=np.empty):
-        """Velocity as it is given -> for each component an array (axis, point)."""
+        """Velocity as it is given -> for each component its number, itself and the velocity (axis, point)."""
         if self.to_points is not None:
             v = self.to_points.apply(v, out=room(self.to_points.shape[0]))
-        return [v[part].reshape(shape) for part, shape in self.parts]
+        return [(*pair, w) for pair, w in zip(enumerate(self.components), self._by_component(v), strict=True)]
 
     def _trajectories(self, number, w, dt):
         steps, component = [dt * sign for sign in self.signs], self.components[number]
         return [component.trajectory(self.backtrace.velocity(number, w, step), step) for step in steps]
+
+    def _keep_solid(self, moved, u):
+        """What is in a solid stays: written to the moved field."""
+        if self.solid is not None:
+            np.copyto(moved, u, where=self.solid)
+        return moved
 
     def _check(self, u, v, inflow):
         """Name the first number that is not finite; the trajectories would hide it."""
@@ -93,73 +108,69 @@ class SemiLagrangian(Law):
         """The advected field."""
         self._check(u, v, inflow)
         out, (room, borrowed) = results.empty(u.shape, float), self._room(u)
-        for number, (component, w) in enumerate(zip(self.components, self._velocities(v, room), strict=True)):
-            span, solid = component.span, component.solid
-            trajectories = self._trajectories(number, w, dt)
+        for number, component, w in self._velocities(v, room):
+            span, trajectories = component.span, self._trajectories(number, w, dt)
             self.advect(component, u[span], inflow, trajectories, room, out[span])
-            if solid is not None:
-                np.copyto(out[span], u[span], where=solid)
         self.scratch.give(*borrowed)
-        return out
+        return self._keep_solid(out, u)
 
     def pull(self, nums, g, u, v, dt, inflow):
         """Cotangent of the advected field -> those of the arguments `nums`."""
         field, speed = FIELD in nums or INFLOW in nums, VELOCITY in nums or STEP in nums
-        (room, borrowed), g, rate, of_w = self._room(u), np.ascontiguousarray(g), 0.0, []
+        (room, borrowed), g, rate = self._room(u), np.ascontiguousarray(g), 0.0
+        moved = g if self.solid is None else np.where(self.solid, 0.0, g)
         of_u, of_inflow = np.empty(u.size if field else 0), np.zeros(inflow.size)
-        own = np.empty if self.to_points is None else room  # then they are handed out
-        for number, (component, w) in enumerate(zip(self.components, self._velocities(v, room), strict=True)):
-            span, solid, trajectories = component.span, component.solid, self._trajectories(number, w, dt)
-            part = g[span] if solid is None else np.where(solid, 0.0, g[span])
-            targets = (of_u[span], of_inflow) if field else None
-            changes = [own(w.size).reshape(w.shape) for _ in trajectories] if speed else None
-            self.advect_vjp(component, part, u[span], inflow, trajectories, room, targets, changes)
-            if field and solid is not None:
-                of_u[span] += np.where(solid, g[span], 0.0)
+        of_w = (np.empty if self.to_points is None else room)(u.size * self.setting.grid.dim if speed else 0)
+        for number, component, w in self._velocities(v, room):
+            span, trajectories = component.span, self._trajectories(number, w, dt)
+            changes = None
+            if speed:
+                others = [room(w.size).reshape(w.shape) for _ in trajectories[1:]]
+                changes = [self._by_component(of_w)[number], *others]
+            into = (of_u[span], of_inflow) if field else None
+            self.advect_vjp(component, moved[span], u[span], inflow, trajectories, room, into, changes)
             if changes is not None:
-                back, gain = self._of_velocity(number, w, trajectories, changes, STEP in nums)
-                of_w.append(back.reshape(-1))
-                rate += gain
+                rate += self._of_velocity(number, w, trajectories, changes, STEP in nums)
+        if field and self.solid is not None:
+            of_u += g - moved
         found = {FIELD: of_u, INFLOW: of_inflow, STEP: rate / dt}
         if VELOCITY in nums:
-            flat = of_w[0] if len(of_w) == 1 else np.concatenate(of_w)
-            found[VELOCITY] = flat if self.to_points is None else self.to_points.T.apply(flat)
+            found[VELOCITY] = of_w if self.to_points is None else self.to_points.T.apply(of_w)
         self.scratch.give(*borrowed)
         return tuple(found[num] for num in nums)
 
     def _of_velocity(self, number, w, trajectories, changes, timed):
-        """Cotangents of the velocities of the trajectories -> that of w, and dt times that of dt if it is asked for."""
-        total, rate = None, 0.0
+        """Cotangents of the velocities of the trajectories -> that of w, in the first of them; dt times that of dt."""
+        rate = 0.0
         for change, trajectory in zip(changes, trajectories, strict=True):
             rate += _dot(change, trajectory.velocity) if timed else 0.0
             back, bent = self.backtrace.vjp(number, w, trajectory.step, change)
             rate += _dot(bent, w) if timed and bent is not None else 0.0
-            total = back if total is None else np.add(total, back, out=total)
-        return total, rate
+            if change is not changes[0]:
+                changes[0] += back
+            elif back is not change:
+                change[:] = back
+        return rate
 
     def push(self, tangents, u, v, dt, inflow):
         """{argument: tangent} -> tangent of the advected field."""
-        tangents = {num: np.ascontiguousarray(t) if num != STEP else t for num, t in tangents.items()}
-        du, dinflow = tangents.get(FIELD, np.zeros(u.size)), tangents.get(INFLOW, np.zeros(inflow.size))
-        dv, ddt, out = tangents.get(VELOCITY, np.zeros(v.size)), tangents.get(STEP, 0.0) / dt, np.empty(u.size)
-        moves, velocities = VELOCITY in tangents or STEP in tangents, (self._velocities(v), self._velocities(dv))
-        for number, (component, w, dw) in enumerate(zip(self.components, *velocities, strict=True)):
+        zeros = {FIELD: np.zeros(u.size), VELOCITY: np.zeros(v.size), STEP: 0.0, INFLOW: np.zeros(inflow.size)}
+        given = {num: np.ascontiguousarray(t) if num != STEP else t for num, t in tangents.items()}
+        du, dv, ddt, dinflow = (given.get(num, zero) for num, zero in zeros.items())
+        moves, out = VELOCITY in tangents or STEP in tangents, np.empty(u.size)
+        for (number, component, w), (*_, dw) in zip(self._velocities(v), self._velocities(dv), strict=True):
             span, trajectories = component.span, self._trajectories(number, w, dt)
-            dm = [self.backtrace.jvp(number, w, t, dw, ddt) if moves else None for t in trajectories]
+            dm = [self.backtrace.jvp(number, w, t, dw, ddt / dt) if moves else None for t in trajectories]
             out[span] = self.advect_jvp(component, u[span], inflow, trajectories, du[span], dinflow, dm)
-            if component.solid is not None:
-                np.copyto(out[span], du[span], where=component.solid)
-        return out
+        return self._keep_solid(out, du)
 
     def matrix(self, v, dt):
         """The step as a csr_array in u."""
-        blocks = []
-        for number, (component, w) in enumerate(zip(self.components, self._velocities(v), strict=True)):
-            block, solid = component.matrix(*self._trajectories(number, w, dt)), component.solid
-            if solid is not None:
-                block = sp.diags_array(1.0 - solid) @ block + sp.diags_array(1.0 * solid)
-            blocks.append(block)
-        return sp.csr_array(sp.block_diag(blocks, format="csr"))
+        blocks = [c.matrix(*self._trajectories(number, w, dt)) for number, c, w in self._velocities(v)]
+        moved = sp.csr_array(sp.block_diag(blocks, format="csr"))
+        if self.solid is None:
+            return moved
+        return sp.csr_array(sp.diags_array(1.0 * ~self.solid) @ moved + sp.diags_array(1.0 * self.solid))
 
 
 def _dot(a, b):

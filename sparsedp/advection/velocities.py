@@ -1,82 +1,97 @@
-"""From the velocity as the user gives it to the velocity where a scheme needs it: one sparse matrix.
+"""From the velocity as the user gives it to the velocity where a scheme needs it: one sparse matrix for each block.
 
-Linear interpolation between centres; the mean of both ends inside a cell. The flow through the side of the
-control volume of a face, which covers half of two cells, is the mean of both weighted with their
+Linear interpolation between centres, at a wall the only cell; the mean of both ends inside a cell. The flow through
+the side of the control volume of a face, which covers half of two cells, is the mean of both weighted with their
 widths: then constants are kept by a flow without divergence, on stretched grids too.
 """
-
-from functools import reduce
 
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.conditions import neumann
-from sparsedp.operators.stencils import cell_beside, means
+from sparsedp.operator import Operator
+from sparsedp.operators.stencils import cell_beside, means, pick
+from sparsedp.space import Space
+from sparsedp.structure.factor import Factor
+from sparsedp.structure.kronecker import Kronecker, Term
 
-__all__ = ["interpolation"]
+__all__ = ["interpolation", "velocity_at_points"]
+
+
+def velocity_at_points(setting):
+    """Setting -> Operator from the velocity as it is given to (component, axis, point); None when that is the same."""
+    if setting.velocity == setting.of and (setting.of == "cells" or setting.grid.dim == 1):
+        return None
+    return _operator(setting, _between)
 
 
 def interpolation(setting):
-    """Setting -> csr_array from the given velocity to the needed one, flat; None where they are the same."""
-    grid, on_points = setting.grid, setting.velocity == "cells" and setting.form == "advective"
+    """Setting -> csr_array from the velocity as it is given to that on the sides (or points) of control volumes, flat.
+
+    None where they are the same.
+    """
+    on_points = setting.velocity == "cells" and setting.form == "advective"
     if setting.of == "cells" and (on_points or setting.velocity == "faces"):
         return None
-    offsets = grid.faces.offsets if setting.velocity == "faces" else [b * grid.cells.size for b in range(grid.dim + 1)]
-    components = [None] if setting.of == "cells" else range(grid.dim)
-    blocks = []
-    for own in components:
-        for axis in range(grid.dim):
-            lines = [_line(setting, own, axis, along, on_points) for along in range(grid.dim)]
-            block = sp.csr_array(reduce(lambda x, y: sp.kron(x, y, "csr"), lines))
-            before, after = offsets[axis], offsets[-1] - offsets[axis + 1]
-            empty = [sp.csr_array((block.shape[0], n)) for n in (before, after)]
-            blocks.append(sp.hstack([empty[0], block, empty[1]], "csr"))
-    return sp.csr_array(sp.vstack(blocks, "csr"))
+    return _operator(setting, _between if on_points else _onto_sides).matrix
 
 
-def _line(setting, own, axis, along, on_points):
-    """The 1-D matrix along one axis, for velocity component `axis` and field component `own` (None: cells)."""
+def _operator(setting, line):
+    """Operator from the given velocity to all its components at each component of the field, axis by axis.
+
+    ``line(setting, own, axis, along)`` is the factor along one axis for velocity component `axis` and field component
+    `own` (None: cells); None where nothing is done.
+    """
     grid = setting.grid
-    given = grid.node_count(along) if setting.velocity == "faces" and along == axis else grid.shape[along]
-    if on_points:
-        return means(grid, along, _free(grid, along)).matrix if along == own else sp.eye_array(given)
+    components, axes = [None] if setting.of == "cells" else range(grid.dim), range(grid.dim)
+    blocks, parts = {}, []
+    given = grid.faces.parts if setting.velocity == "faces" else (grid.shape,) * grid.dim
+    for own in components:
+        for axis in axes:
+            factors = tuple(line(setting, own, axis, along) for along in axes)
+            blocks[len(parts), axis] = (Term(1.0, factors),)
+            parts.append(tuple(n if f is None else f.shape[0] for n, f in zip(given[axis], factors, strict=True)))
+    structure = Kronecker(parts, given, blocks)
+    rows, columns = structure.shape
+    return Operator(structure, Space(columns), Space(rows), "velocity at the points")
+
+
+def _between(setting, own, axis, along):
+    """To the points of the field."""
+    grid, on_faces = setting.grid, setting.velocity == "faces" and along == axis
+    if on_faces == (along == own):
+        return None
+    return _mean_of_faces(grid, along) if on_faces else _mean_of_cells(grid, along)
+
+
+def _onto_sides(setting, own, axis, along):
+    """To the sides across `axis` of the control volumes of the field."""
+    grid, on_faces = setting.grid, setting.velocity == "faces" and along == axis
     if along == own:
-        if axis != own:
-            return _shared(grid, along)
-        return _inside(grid, along, setting.velocity == "faces")
-    if along == axis and setting.velocity == "cells":
-        return means(grid, along, _free(grid, along)).matrix
-    return sp.eye_array(given)
+        return _inside(grid, along, on_faces) if axis == own else _shared(grid, along)
+    return _mean_of_cells(grid, along) if along == axis and not on_faces else None
 
 
-def _free(grid, axis):
-    return None if grid.periodic[axis] else (neumann, neumann)
+def _mean_of_faces(grid, axis):
+    return pick(grid, axis, False).scaled(0.5) + pick(grid, axis, True).scaled(0.5)
+
+
+def _mean_of_cells(grid, axis):
+    return means(grid, axis, None if grid.periodic[axis] else (neumann, neumann))
 
 
 def _shared(grid, axis):
     """Cells -> faces of an axis: the mean weighted with the widths."""
     lower, upper = (cell_beside(grid, axis, side).matrix for side in (False, True))
-    h = grid.widths[axis]
-    low, high = lower @ h, upper @ h
-    total = np.maximum(low + high, np.finfo(float).tiny)
-    return sp.diags_array(low / total) @ lower + sp.diags_array(high / total) @ upper
+    both = (lower + upper) @ sp.diags_array(grid.widths[axis])
+    return Factor(sp.diags_array(1.0 / np.maximum(both.sum(axis=1), np.finfo(float).tiny)) @ both)
 
 
-def _inside(grid, axis, from_faces):
+def _inside(grid, axis, on_faces):
     """Faces (or cells) of an axis -> the cell centres, as interfaces between faces, and the walls."""
-    n, nodes = grid.shape[axis], grid.node_count(axis)
-    cell = np.arange(n)
+    n = grid.shape[axis]
+    centres = _mean_of_faces(grid, axis).matrix if on_faces else sp.eye_array(n, format="csr")
     if grid.periodic[axis]:  # interface f is cell f - 1
-        row, last = (cell + 1) % max(n, 1), n
-        ends = []
-    else:
-        row, last = cell + 1, n + 2
-        ends = [(0, 0), (n + 1, nodes - 1 if from_faces else n - 1)]
-    if from_faces:
-        entries = [(row, cell, 0.5), (row, (cell + 1) % max(nodes, 1), 0.5)]
-    else:
-        entries = [(row, cell, 1.0)]
-    columns = nodes if from_faces else n
-    entries += [(np.array([r]), np.array([c]), 1.0) for r, c in ends if columns]
-    rows, points, values = (np.concatenate([np.broadcast_to(e[k], e[0].shape) for e in entries]) for k in range(3))
-    return sp.csr_array(sp.coo_array((values, (rows, points)), shape=(last if columns else 0, columns)))
+        return Factor(centres[np.arange(-1, n - 1)])
+    walls = sp.eye_array(centres.shape[1], format="csr")
+    return Factor(sp.vstack([walls[[0]], centres, walls[[-1]]], "csr"))

@@ -13,6 +13,7 @@ import os
 import numpy as np
 
 from sparsedp.kernels import reference
+from sparsedp.kernels.layout import CHUNK, LOWERED, REMAINDER, TOTALS
 
 __all__ = [
     "along_axis",
@@ -20,6 +21,7 @@ __all__ = [
     "kronecker_sum",
     "lowered",
     "remainder",
+    "run",
     "set_threads",
     "squares",
     "sweep",
@@ -29,6 +31,7 @@ __all__ = [
 ]
 
 FEW = 16384  # numbers that are not worth a compiled sum, and not the import of numba
+NONE = np.empty(0)
 
 
 @functools.cache
@@ -92,12 +95,19 @@ def set_threads(n=None):
     _chosen[:] = [n]
 
 
-def _loop(module, name):
-    """A compiled loop of a module of this folder; None where there is no numba, or it does not work here."""
-    if not compiled():
-        return None
-    loop = getattr(importlib.import_module(f"{__name__}.{module}"), name)
-    return loop if loop.compiled else None
+_module = functools.cache(importlib.import_module)  # finding it again takes longer than a small loop
+
+
+def run(module, name, rows, work, threads, *args):
+    """Run a compiled loop of a module of this folder over some rows -> whether there is one and it works here.
+
+    `work` is the count of numbers that decides whether several threads are worth it.
+    """
+    loop = getattr(_module(f"{__name__}.{module}"), name) if compiled() else None
+    if loop is None or not loop.compiled:
+        return False
+    loop.run(rows, work, threads, *args)
+    return True
 
 
 def kronecker_sum(u, out, axes, shift):
@@ -123,12 +133,10 @@ def kronecker_sum(u, out, axes, shift):
     >>> out
     array([[[ 0.,  1., -6.]]])
     """
-    loop = _loop("stencil", "kronecker_sum") if u.size else None
-    if loop is None:
-        reference.kronecker_sum(u, out, axes, shift)
-        return
     bands = [np.zeros((3, n)) if axis is None else np.stack(axis) for n, axis in zip(u.shape, axes, strict=True)]
-    loop.run(u.shape[0] * u.shape[1], u.size, threads(), u, out, *bands, shift)
+    rows = u.shape[0] * u.shape[1]
+    if not u.size or not run("stencil", "kronecker_sum", rows, u.size, threads(), u, out, *bands, shift):
+        reference.kronecker_sum(u, out, axes, shift)
 
 
 def along_axis(u, out, rows, scale, accumulate):
@@ -157,16 +165,14 @@ def along_axis(u, out, rows, scale, accumulate):
     >>> out
     array([[[3., 6.]]])
     """
-    lines = out.shape[2] == 1 and len(rows.offsets) > 0
-    loop = _loop("stencil", "along_rows" if lines else "across_rows") if out.size else None
-    if loop is None:
-        reference.product_along(u, out, rows, scale, accumulate)
-    elif lines:
-        diagonals = rows.offsets, rows.start, rows.stop, rows.values
-        loop.run(out.size, out.size, threads(), u[:, :, 0], out[:, :, 0], *diagonals, scale, accumulate)
+    if out.shape[2] == 1 and rows.offsets.size:
+        fields, diagonals = (u[:, :, 0], out[:, :, 0]), (rows.offsets, rows.start, rows.stop, rows.values)
+        given = "along_rows", out.size, out.size, threads(), *fields, *diagonals, scale, accumulate
     else:
-        matrix = rows.indptr, rows.indices, rows.data
-        loop.run(out.shape[0] * out.shape[1], out.size, threads(), u, out, *matrix, scale, accumulate)
+        matrix, many = (rows.indptr, rows.indices, rows.data), out.shape[0] * out.shape[1]
+        given = "across_rows", many, out.size, threads(), u, out, *matrix, scale, accumulate
+    if not out.size or not run("stencil", *given):
+        reference.product_along(u, out, rows, scale, accumulate)
 
 
 def sweep(x, lower, upper, inverses, column, row, ends):
@@ -197,11 +203,9 @@ def sweep(x, lower, upper, inverses, column, row, ends):
     array([[-0.33333333],
            [ 1.66666667]])
     """
-    loop = _loop("elimination", "eliminate") if x.size else None
-    if loop is None:
-        reference.eliminate(x, lower, upper, inverses, column, row, ends)
-    else:
-        loop.run(x.shape[1], x.size, threads(), x, lower, upper, inverses, column, row, ends)
+    given = x, lower, upper, inverses, column, row, ends
+    if not x.size or not run("elimination", "eliminate", x.shape[1], x.size, threads(), *given):
+        reference.eliminate(*given)
 
 
 def through_faces(u, k, lines, out, closed):
@@ -219,10 +223,8 @@ def through_faces(u, k, lines, out, closed):
     closed : bool
         Whether faces with k = 0 carry 0, whatever the cells hold.
     """
-    loop = _loop("stencil", "through_faces")
-    if loop is not None:
-        loop.run(u.shape[0] * u.shape[1], u.size, threads(), u, *k, *lines, out, closed)
-    return loop is not None
+    rows = u.shape[0] * u.shape[1]
+    return run("stencil", "through_faces", rows, u.size, threads(), u, *k, *lines, out, closed)
 
 
 def squares(x):
@@ -234,7 +236,7 @@ def squares(x):
     >>> print(squares(np.array([3.0, -4.0])))
     25.0
     """
-    return _measure(False, None, x, 0.0, None)[1] if x.size > FEW else reference.square(x)
+    return totals(x)[1] if x.size > FEW else reference.square(x)
 
 
 def totals(x):
@@ -246,7 +248,7 @@ def totals(x):
     >>> print(*totals(np.array([3.0, -4.0])))
     -1.0 25.0
     """
-    return _measure(False, None, x, 0.0, None)
+    return _measure(TOTALS, NONE, x, 0.0, NONE)
 
 
 def lowered(x, number, out):
@@ -261,7 +263,7 @@ def lowered(x, number, out):
     """
     if out is not x:
         np.copyto(out, x)
-    return _measure(True, None, out, number, out)[1]
+    return _measure(LOWERED, NONE, out, number, out)[1]
 
 
 def remainder(b, out, x):
@@ -274,19 +276,14 @@ def remainder(b, out, x):
     >>> print(*remainder(np.array([4.0, 6.0]), out, np.array([2.0, 0.0])), out)
     4.0 25.0 [3. 4.]
     """
-    return _measure(False, b, x, 0.0, out)
+    return _measure(REMAINDER, b, x, 0.0, out)
 
 
-def _measure(lower, b, x, number, out):
-    """See `sparsedp.kernels.reference.measure`."""
-    loop = _loop("reductions", "measure") if x.size > FEW and x.flags.c_contiguous else None
-    if loop is None:
-        return reference.measure(lower, b, x, number, out)
-    from sparsedp.kernels.reductions import CHUNK, LOWERED, REMAINDER, TOTALS
-
-    mode, none = LOWERED if lower else TOTALS if b is None else REMAINDER, np.zeros(0)
-    chunks = -(-x.size // CHUNK)
-    sums = np.empty((2, chunks))
-    given = none if b is None else b, x, number, none if out is None else out
-    loop.run(chunks, x.size, threads(), mode, *given, sums)
-    return float(sums[0].sum()), float(sums[1].sum())
+def _measure(*given):
+    """Mode, b, x, number, out -> two sums; see `sparsedp.kernels.reductions`."""
+    x = given[2]
+    sums = np.empty((2, -(-x.size // CHUNK)))
+    if x.size > FEW and x.flags.c_contiguous:
+        if run("reductions", "measure", sums.shape[1], x.size, threads(), *given, sums):
+            return float(sums[0].sum()), float(sums[1].sum())
+    return reference.measure(*given)

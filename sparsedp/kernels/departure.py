@@ -9,7 +9,6 @@ it is their test, what runs without numba, and the matrix of a step. Arrays are 
 NaN among the displacements does no harm.
 """
 
-from functools import cache
 from itertools import product
 from math import prod
 from typing import Any, NamedTuple
@@ -18,11 +17,12 @@ import numpy as np
 
 from sparsedp import kernels
 
-__all__ = ["PAD", "Points", "bound_shares", "entries", "extrema", "gather", "gradient", "scatter"]
+__all__ = ["NO_BOUNDS", "PAD", "TILE", "Points", "bound_shares", "entries", "gather", "gradient", "scatter"]
 
 PAD = 3  # what cubic interpolation reads beyond the clamped departure points
+TILE = 256  # points; up to 24 rows of 2 KB are in use at a time, which fits the L1 cache with what is read
 
-NONE, NO_ROWS = np.empty(0), np.empty((0, 0))
+NONE, NO_BOUNDS = np.empty(0), np.empty((2, 0))
 
 # The weights of the four samples from the one before the cell on: coefficients of 1, t, t^2, t^3 in the fraction t of
 # the cell, and the weight at a point (t = 0): for the value and for the slope. A linear slope jumps at the points.
@@ -46,44 +46,35 @@ class Points(NamedTuple):
     padded: tuple  # the shape with ghost cells
     size: int  # number of points
     samples: int  # number of points and ghost cells
-    axes: (
-        Any  # for each axis: points, stride, samples before the first stencil, ends of the places, last cell, periodic
-    )
-    weights: Any  # a table for each axis: of the value, of the slope
+    # for each axis: points, stride, samples before the first stencil, ends of the places, last cell, periodic
+    axes: Any
+    reach: Any  # for each of three axes: stride, and which of the four samples count, from and to
+    weights: Any  # a table of the value and one of the slope
 
     @classmethod
     def of(cls, shape, periodic, interpolation):
         """Shape, whether each axis is periodic, linear or cubic -> Points."""
-        padded, axes = tuple(n + 2 * PAD for n in shape), []
-        beyond = 1.5 if interpolation == "linear" else 2.0
+        padded = tuple(n + 2 * PAD for n in shape)
+        axes, reach = [], [(0, 1, 2)] * (3 - len(shape))
+        beyond, used = (1.5, (1, 3)) if interpolation == "linear" else (2.0, (0, 4))
         for axis, (n, wraps) in enumerate(zip(shape, periodic, strict=True)):
-            ends = (0, n) if wraps else (-beyond, n - 1 + beyond)
-            axes.append((n, prod(padded[axis + 1 :]), PAD - 1, *ends, n, wraps))
-        tables = np.array([[table] * len(shape) for table in WEIGHTS[interpolation]], float)
-        return cls(tuple(shape), padded, prod(shape), prod(padded), np.array(axes, float), tables)
-
-
-@cache
-def _loops():
-    """The module of the compiled loops; it imports numba."""
-    from sparsedp.kernels import interpolation
-
-    return interpolation
+            stride, ends = prod(padded[axis + 1 :]), (0, n) if wraps else (-beyond, n - 1 + beyond)
+            axes.append((n, stride, PAD - 1, *ends, n, wraps))
+            reach.append((stride, *used))
+        tables = np.array(axes, float), np.array(reach), np.array(WEIGHTS[interpolation], float)
+        return cls(tuple(shape), padded, prod(shape), prod(padded), *tables)
 
 
 def _run(name, points, threads, *args):
     """Run a compiled loop over all points -> whether there is one."""
-    loop = getattr(_loops(), name) if kernels.compiled() else None
-    if loop is None or not loop.compiled:
-        return False
-    loop.run(-(-points.size // _loops().TILE), points.size << len(points.shape), threads, *args)
-    return True
+    return kernels.run("interpolation", name, -(-points.size // TILE), points.size << len(points.shape), threads, *args)
 
 
-def _depart(points, w, scale):
-    """Departure points -> first samples of their stencils, fractions of a cell (axis, point)."""
+def _depart(points, w, scale, some=None):
+    """Departure points (of some points) -> first samples of their stencils, fractions of a cell (axis, point)."""
+    some = np.arange(points.size) if some is None else some
     n, stride, before, low, high, last, periodic = points.axes.T[:, :, None]
-    place = np.indices(points.shape, float).reshape(w.shape) - scale[:, None] * w
+    place = np.unravel_index(some, points.shape) - scale[:, None] * w[:, some]
     with np.errstate(invalid="ignore"):
         place = np.where(periodic != 0, place - n * np.floor(place / n), place)
         place = np.minimum(np.where(place >= low, place, low), high)  # NaN goes to the lower end
@@ -95,24 +86,27 @@ def entries(points, w, scale, along=None):
     """Columns of W, the value (along an axis: the slope), as pairs: for each point a sample and its weight."""
     (first, fractions), rows = _depart(points, w, scale), []
     for axis, t in enumerate(fractions):
-        a, b, c, d, at_point = points.weights[int(axis == along), axis].T[:, :, None]
+        a, b, c, d, at_point = points.weights[int(axis == along)].T[:, :, None]
         rows.append(np.where(t != 0, ((d * t + c) * t + b) * t + a, at_point))
     for steps in product(*([m for m in range(4) if row[m].any()] for row in rows)):
         weight = prod(row[m] for m, row in zip(steps, rows, strict=True))
         yield (first + points.axes[:, 1] @ steps).astype(np.int64), weight
 
 
-def gather(points, samples, w, scale, out):
-    """Interpolated values at the departure points, W samples -> out."""
-    args = samples, w, scale, points.axes, points.weights[:1], NONE, out[None], False
+def gather(points, samples, w, scale, out, bounds=NO_BOUNDS):
+    """Interpolated values at the departure points, W samples -> out; least and greatest sample of their cells."""
+    args = samples, w, scale, points.axes, points.reach, points.weights[:1], NONE, out[None], bounds
     if not _run("interpolate", points, kernels.threads(), *args):
         out[:] = sum(weight * samples[index] for index, weight in entries(points, w, scale))
+        if bounds.size:
+            cells = samples[_corners(points, w, scale)]
+            bounds[:] = np.min(cells, axis=0), np.max(cells, axis=0)
     return out
 
 
 def scatter(points, w, scale, g, samples):
     """The transpose of `gather`: samples += W^T g. Points share samples, so one thread does it."""
-    if not _run("interpolate", points, 1, samples, w, scale, points.axes, points.weights[:1], g, NO_ROWS, True):
+    if not _run("scatter", points, 1, w, scale, points.axes, points.reach, points.weights[:1], g, samples):
         for index, weight in entries(points, w, scale):
             samples += np.bincount(index, weight * g, samples.size)
     return samples
@@ -120,7 +114,7 @@ def scatter(points, w, scale, g, samples):
 
 def gradient(points, samples, w, scale, g, out):
     """g times the derivative of `gather` in w -> out (axis, point)."""
-    args = samples, w, scale, points.axes, points.weights, g, out, False
+    args = samples, w, scale, points.axes, points.reach, points.weights, g, out, NO_BOUNDS
     if not _run("interpolate", points, kernels.threads(), *args):
         for axis, row in enumerate(out):
             slope = sum(weight * samples[index] for index, weight in entries(points, w, scale, axis))
@@ -128,25 +122,16 @@ def gradient(points, samples, w, scale, g, out):
     return out
 
 
-def _corners(points, stencils):
-    """First samples of some stencils -> samples of the cells in them, one row for each corner."""
+def _corners(points, w, scale, some=None):
+    """Samples of the cells of departure points, one row for each corner."""
     steps = np.array(list(product((1, 2), repeat=len(points.shape)))) @ points.axes[:, 1]
-    return (steps[:, None] + stencils).astype(np.int64)
+    return (steps[:, None] + _depart(points, w, scale, some)[0]).astype(np.int64)
 
 
-def extrema(points, samples, w, scale, low, high, stencils):
-    """Least and greatest sample of the cell around each departure point, and the first sample of its stencil."""
-    if not _run("extrema", points, kernels.threads(), samples, w, scale, points.axes, low, high, stencils):
-        stencils[:] = _depart(points, w, scale)[0]
-        cells = samples[_corners(points, stencils)]
-        np.min(cells, axis=0, out=low)
-        np.max(cells, axis=0, out=high)
-
-
-def bound_shares(points, samples, stencils):
-    """First samples of some stencils -> samples of their cells (corner, point), and the weight of each in the mean of
-    those that are the least of the cell, and in that of the greatest."""
-    corners = _corners(points, stencils)
+def bound_shares(points, samples, w, scale, some):
+    """Samples of the cells of some departure points (corner, point), and the weight of each in the mean of those that
+    are the least of the cell, and in that of the greatest."""
+    corners = _corners(points, w, scale, some)
     cells = samples[corners]
     least, greatest = cells == np.min(cells, axis=0), cells == np.max(cells, axis=0)
     return corners, least / least.sum(axis=0), greatest / greatest.sum(axis=0)

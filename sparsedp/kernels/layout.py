@@ -1,10 +1,13 @@
-"""Plain records of arrays that the kernels read. No classes with behaviour, no autograd."""
+"""Plain records of arrays that the kernels read, and words for what they do. No classes with behaviour."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Rows", "Tridiagonal"]
+__all__ = ["CHUNK", "LOWERED", "REMAINDER", "TOTALS", "Rows", "Tridiagonal"]
+
+CHUNK = 4096  # numbers whose sums are kept apart
+TOTALS, LOWERED, REMAINDER = range(3)  # what is done on the way over an array that is summed up
 
 
 class Rows(NamedTuple):

@@ -4,12 +4,10 @@ Each chunk leaves its own sums, added up at the end: the bits do not depend on t
 the sums may be taken in any order, so that they fill the vector units.
 """
 
+from sparsedp.kernels.layout import CHUNK, LOWERED, TOTALS
 from sparsedp.kernels.team import kernel
 
-__all__ = ["CHUNK", "LOWERED", "REMAINDER", "TOTALS", "measure"]
-
-CHUNK = 4096  # numbers whose sums are kept apart
-TOTALS, LOWERED, REMAINDER = range(3)  # what is done on the way over the array
+__all__ = ["measure"]
 
 
 @kernel(

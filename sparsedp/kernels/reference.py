@@ -3,6 +3,8 @@
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.kernels.layout import LOWERED, TOTALS
+
 __all__ = ["eliminate", "kronecker_sum", "measure", "product_along", "square"]
 
 SHORT = 8192  # numbers that BLAS sums up on one thread
@@ -46,13 +48,13 @@ def eliminate(x, lower, upper, inverses, column, row, ends):
         x[i] -= (others + column[i] * x[-1] if cyclic else others) * inverses[i]
 
 
-def measure(lowered, b, x, number, out):
-    """Two sums: of x, x^2; or, with out -= number, of out^2; or, with out = b - out, of x^2 and out^2."""
+def measure(mode, b, x, number, out):
+    """Two sums. TOTALS: of x, x^2; LOWERED: out -= number, of out^2; REMAINDER: out = b - out, of x^2, out^2."""
     with np.errstate(over="ignore"):  # the caller sees inf, or did not ask for the sum
-        if lowered:
+        if mode == LOWERED:
             np.subtract(out, number, out=out)
             return 0.0, square(out)
-        if b is None:
+        if mode == TOTALS:
             return float(x.sum()), square(x)
         np.subtract(b, out, out=out)
         return square(x), square(out)

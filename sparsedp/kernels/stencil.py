@@ -13,31 +13,29 @@ __all__ = ["across_rows", "along_rows", "kronecker_sum", "through_faces"]
 TILE = 1024  # numbers of a row that are worked on at a time: all of its diagonals find them in the L1 cache
 
 
-@kernel("read3 write3 read2 read2 read2 real")
+@kernel("read3 write3 read2 read2 read2 real", fastmath={"contract"})  # a product and a sum are one instruction
 def kronecker_sum(u, out, far, middle, along, shift, start, stop):
     """out = shift u + sum of T_a u, T_a tridiagonal and cyclic along axis a: rows lower, centre, upper."""
     n0, n1, n = u.shape
-    last = n - 1
+    rows, last = n0 * n1, n - 1
+    cells, totals = u.reshape(rows, n), out.reshape(rows, n)
     lower, centre, upper = along[0], along[1], along[2]
     for row in range(start, stop):
         i, k = row // n1, row % n1
         a, b, c, d = middle[0, k], middle[2, k], far[0, i], far[2, i]
-        weight = shift + far[1, i] + middle[1, k]
-        here, result = u[i, k], out[i, k]
+        weight, here, result = shift + far[1, i] + middle[1, k], cells[row], totals[row]
         # where there is no neighbour the cell itself is read, times 0
-        before1, after1 = u[i, ((k if k else n1) - 1 if a != 0.0 else k)], u[i, ((k + 1) % n1 if b != 0.0 else k)]
-        before0, after0 = u[((i if i else n0) - 1 if c != 0.0 else i), k], u[((i + 1) % n0 if d != 0.0 else i), k]
-        for j in (0, last):
-            left = here[(j if j else n) - 1] if lower[j] != 0.0 else 0.0
-            right = here[j + 1 if j < last else 0] if upper[j] != 0.0 else 0.0
-            total = (weight + centre[j]) * here[j] + (lower[j] * left + upper[j] * right)
-            result[j] = total + (a * before1[j] + b * after1[j])
+        before1 = cells[row + (k - 1) % n1 - k if a != 0.0 else row]
+        after1 = cells[row + (k + 1) % n1 - k if b != 0.0 else row]
+        before0 = cells[(row - n1) % rows if c != 0.0 else row]
+        after0 = cells[(row + n1) % rows if d != 0.0 else row]
         for j in range(1, last):
             total = (weight + centre[j]) * here[j] + (lower[j] * here[j - 1] + upper[j] * here[j + 1])
-            result[j] = total + (a * before1[j] + b * after1[j])
-        if n0 > 1:  # apart: with more streams in one loop the compiler gives up its vectors
-            for j in range(n):
-                result[j] += c * before0[j] + d * after0[j]
+            result[j] = total + (a * before1[j] + b * after1[j]) + (c * before0[j] + d * after0[j])
+        for j in (0, last):
+            total = (weight + centre[j]) * here[j] + (a * before1[j] + b * after1[j]) + (c * before0[j] + d * after0[j])
+            total += lower[j] * here[(j - 1) % n] if lower[j] != 0.0 else 0.0
+            result[j] = total + (upper[j] * here[(j + 1) % n] if upper[j] != 0.0 else 0.0)
 
 
 @kernel("read3 write3 index1 index1 read1 real flag")
@@ -88,20 +86,17 @@ def through_faces(u, k0, k1, k2, lines0, lines1, lines2, out, closed, start, sto
     `closed`: faces with k = 0 carry 0, whatever the cells hold.
     """
     n0, n1, n = u.shape
-    carried = np.empty(n + 1)
+    cells, totals, carried = u.reshape(n0 * n1, n), out.reshape(n0 * n1, n), np.empty(n + 1)
     for row in range(start, stop):
         i, k = row // n1, row % n1
-        here, result, inside, faces = u[i, k], out[i, k], carried[1:n], k2[i, k]
-        below, above = lines2[0, 1:n], lines2[1, 1:n]
-        conduct, ahead = faces[1:n], here[1:]
+        here, result, inside, faces = cells[row], totals[row], carried[1:n], k2[i, k]
+        below, above, conduct, ahead = lines2[0, 1:n], lines2[1, 1:n], faces[1:n], here[1:]
         for f in range(n - 1):
             inside[f] = conduct[f] * (below[f] * here[f] + above[f] * ahead[f])
-        carried[0] = faces[0] * (lines2[1, 0] * here[0])
-        if faces.size == n:  # periodic
-            carried[0] += faces[0] * (lines2[0, 0] * here[n - 1])
-            carried[n] = carried[0]
-        else:
-            carried[n] = faces[n] * (lines2[0, n] * here[n - 1])
+        for f in (0, n):  # the walls, or the face at both ends
+            low = lines2[0, f] * here[(f - 1) % n] if lines2[0, f] != 0.0 else 0.0
+            high = lines2[1, f] * here[f % n] if lines2[1, f] != 0.0 else 0.0
+            carried[f] = faces[f % faces.size] * (low + high)
         if closed:
             for f in range(faces.size):
                 carried[f] = carried[f] if faces[f] != 0.0 else 0.0
@@ -110,19 +105,16 @@ def through_faces(u, k0, k1, k2, lines0, lines1, lines2, out, closed, start, sto
         for j in range(n):
             result[j] = to_above[j] * carried[j] + to_below[j] * next_ones[j]
         for side in range(4):  # across rows: the face below and above in axis 1, then in axis 0
-            axis, upper = 1 - side // 2, side % 2
-            if axis == 1 and n1 == 1:
+            upper, (count, stride, line) = side % 2, (n1, 1, lines1) if side < 2 else (n0, n1, lines0)
+            if count == 1:
                 continue
+            place = row // stride % count
+            f = place + upper
+            weight, below_f, above_f = line[3 - upper, f], line[0, f], line[1, f]
             # beyond a wall there is no cell: the cell itself is read, times 0
-            if axis == 1:
-                f, count, line = k + upper, k1.shape[1], lines1
-                lower_end, upper_end = (n1 - 1, 0) if count == n1 else (0, n1 - 1)
-                faces, low, high = k1[i, f % count], u[i, f - 1 if f else lower_end], u[i, f if f < n1 else upper_end]
-            else:
-                f, count, line = i + upper, k0.shape[0], lines0
-                lower_end, upper_end = (n0 - 1, 0) if count == n0 else (0, n0 - 1)
-                faces, low, high = k0[f % count, k], u[f - 1 if f else lower_end, k], u[f if f < n0 else upper_end, k]
-            weight, below_f, above_f = line[2, f] if upper else line[3, f], line[0, f], line[1, f]
+            low = cells[row + ((f - 1) % count - place) * stride if below_f != 0.0 else row]
+            high = cells[row + (f % count - place) * stride if above_f != 0.0 else row]
+            faces = k1[i, f % k1.shape[1]] if side < 2 else k0[f % k0.shape[0], k]
             for j in range(n):
                 flux = weight * (faces[j] * (below_f * low[j] + above_f * high[j]))
                 result[j] += 0.0 if closed and faces[j] == 0.0 else flux
