@@ -8,8 +8,8 @@ os.environ["MPLBACKEND"] = "Agg"  # before anything can import matplotlib
 
 import hypothesis
 import numpy as np
+import pairwise
 import pytest
-import scripts
 
 hypothesis.settings.register_profile(
     "house",
@@ -30,27 +30,18 @@ def seeds():
 
 @pytest.fixture
 def rng(request):
-    """A generator of its own for each test, the same in every run."""
-    return np.random.default_rng(zlib.crc32(request.node.nodeid.encode()))
-
-
-def pytest_collection_modifyitems(items):
-    """What looks at examples comes last: by then they have run beside the other tests."""
-    items.sort(key=lambda item: item.path.name.startswith("test_examples"))
+    """A generator of its own for each test, the same in every run (a worker writes the group behind an @)."""
+    return np.random.default_rng(zlib.crc32(request.node.nodeid.split("@")[0].encode()))
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtestloop(session):
-    """Begin the examples at the last one, so that those who wait at the end meet them half-way.
-
-    The very first is the one with the most to compile: when the tests need it, it is on the disk.
-    """
-    if not session.config.option.collectonly:
-        chosen = [item for item in session.items if getattr(item, "originalname", None) == "test_it_runs"]
-        for name in sorted((item.callspec.params["name"] for item in chosen[::-1]), key="poisson_adjoint.py".__ne__):
-            scripts.begun(name)
+def pytest_collection_modifyitems(items):
+    """What a sample leaves out gets the marker `whole`, before -m looks at it."""
+    for item in pairwise.left_out(items):
+        item.add_marker(pytest.mark.whole)
 
 
-def pytest_sessionfinish():
-    """After an interruption or with -x the examples that wait are not begun."""
-    scripts.BESIDE.shutdown(wait=False, cancel_futures=True)
+@pytest.fixture(params=[pairwise.sample, pytest.param(list, marks=pytest.mark.whole)], ids=["sample", "whole"])
+def drawn(request):
+    """For loops inside a test: a sample of a list of scenes, tuples of what they are made of, or all of it."""
+    return request.param

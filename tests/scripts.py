@@ -1,15 +1,11 @@
-"""The examples as processes of their own, small; each runs once in a session, beside the other tests.
-
-One process works through them while the tests run on the other core. Who needs an example that has not begun runs it
-at once, so at the end two run at a time.
-"""
+"""The examples as processes of their own, small; each runs once in a session, on the worker that looks at it."""
 
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
+import pytest
 from sources import ROOT
 
 from sparsedp.kernels.team import NOTICE
@@ -42,9 +38,26 @@ SMALL = {
     "residual_or_physics.py": "10",
     "solver_in_the_loop.py": "48",
 }  # cells, the end time, or gradients; the others run with 16
-BESIDE = ThreadPoolExecutor(1)
+DEFAULT = {"heat_rod.py", "new_operator.py", "plan.py", "pressure_projection.py", "two_families.py"}
 
 
+def marks(name):
+    """Of whatever looks at an example: one worker runs it, once, and most of them only with the marker `whole`."""
+    return [pytest.mark.xdist_group(name), *([] if name in DEFAULT else [pytest.mark.whole])]
+
+
+def example(name):
+    """Decorator of a test that looks at an example."""
+
+    def marked(test):
+        for mark in marks(name):
+            test = mark(test)
+        return test
+
+    return marked
+
+
+@cache
 def done(name, *options_of_its_own):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
     command = [sys.executable, str(ROOT / "examples" / name), SMALL.get(name, "16"), *options_of_its_own]
@@ -52,21 +65,9 @@ def done(name, *options_of_its_own):
     return subprocess.run(command, env=environment, **options)
 
 
-@cache
-def begun(name, *options):
-    """An example that waits for its turn beside the tests, runs, or has run."""
-    return BESIDE.submit(done, name, *options)
-
-
-@cache
-def ended(name, *options):
-    waiting = begun(name, *options)
-    return done(name, *options) if waiting.cancel() else waiting.result()
-
-
 def run(name, *options):
     """What an example prints when it runs small."""
-    found = ended(name, *options)
+    found = done(name, *options)
     assert found.returncode == 0, found.stderr
     assert found.stderr.replace(NOTICE, "") == ""  # the first one to use a loop says that it is compiled
     return found.stdout

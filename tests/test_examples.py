@@ -3,13 +3,13 @@
 import re
 
 import pytest
-from scripts import EXAMPLES, run
+from scripts import EXAMPLES, example, marks, run
 from sources import ROOT
 
 LINES = {"solver_in_the_loop.py": 125}  # two solvers, a network and a study; the others stay below 60
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in EXAMPLES])
 def test_it_runs(name):
     assert run(name).strip()
 
@@ -23,6 +23,7 @@ def test_short_and_on_both_pages(name):
     assert f"`examples/{name}`" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
+@example("heat_rod.py")
 def test_heat_rod():
     printed = run("heat_rod.py")
     assert "three lines against L(u): difference 0e+00" in printed
@@ -31,6 +32,7 @@ def test_heat_rod():
     assert after < before / 10
 
 
+@example("two_families.py")
 def test_two_families():
     printed = run("two_families.py")
     losses = re.findall(r"(?:explicit|matrix-free) .* (\d\.\d+)$", printed, re.MULTILINE)
@@ -39,12 +41,14 @@ def test_two_families():
     assert "agrees" in printed and "FAILS" not in printed
 
 
+@example("new_operator.py")
 def test_new_operator():
     printed = run("new_operator.py")
     assert printed.count(": agrees") >= 3
     assert "wind that never turns: disagrees" in printed
 
 
+@example("poisson_control.py")
 def test_poisson_control():
     """Case B2: the optimum to 1e-8 within 60 iterations, as many on every grid (+-3)."""
     rows = re.findall(r"^ +(\d+)\^2 +(\S+) +\S+ +\S+ +(\S+) +(\d+) +\d+$", run("poisson_control.py"), re.MULTILINE)
@@ -55,6 +59,7 @@ def test_poisson_control():
         assert max(counts) - min(counts) <= 3
 
 
+@example("warm_start.py")
 def test_warm_start():
     """Case B6: plain CG 100 to 170 iterations to 1e-3; multigrid at most 5, and at most 10 to 1e-6."""
     printed = run("warm_start.py")
@@ -65,6 +70,7 @@ def test_warm_start():
     assert coarse <= 5 and fine <= 10
 
 
+@example("implicit_or_unrolled.py")
 def test_implicit_or_unrolled():
     """Case B8: the same gradient, at least 20 times less memory, at least 5 times less time."""
     rows = re.findall(r"^(\S.*?) +(\d+)\^2 +(\S+) +(\S+) +(\S+)$", run("implicit_or_unrolled.py"), re.MULTILINE)
@@ -81,6 +87,7 @@ def test_implicit_or_unrolled():
     assert 1e-8 <= table["CG, 200 iterations unrolled", 96][2] <= 1e-4  # and not here
 
 
+@example("inexact_solves.py")
 def test_inexact_solves():
     """Case B7: the published figures, at least 80 % fewer sweeps at no larger error, and one exact step."""
     rows = re.findall(r"^(\S.*?) +(\d+) +(?:-|\d+) +(\d\.\S+) +\S+$", run("inexact_solves.py"), re.MULTILINE)
@@ -92,6 +99,7 @@ def test_inexact_solves():
     assert exact <= 1e-14
 
 
+@example("stiff_chemistry.py")
 def test_stiff_chemistry():
     """Case A6: the integral and its gradient within 1e-3, in few steps."""
     number = r"(\S+)"
@@ -106,6 +114,7 @@ def test_stiff_chemistry():
     assert explicit > 10 * implicit
 
 
+@example("plan.py")
 def test_plan():
     """Two scenes that share a law: one forward and one adjoint solve each, different derivatives left out."""
     pump, survey, data = run("plan.py").split("\n\n", 2)
@@ -113,6 +122,7 @@ def test_plan():
     assert "pump    solves 1 + 1 adjoint\nsurvey  solves 1 + 1 adjoint" in data
 
 
+@example("audit.py")
 def test_audit():
     """Three verdicts; the rule at fault is named."""
     rows = {line[:28].strip(): line[28:].split() for line in run("audit.py").splitlines()[1:-1]}
@@ -123,6 +133,7 @@ def test_audit():
     assert len(others) == 3 and all(rows[name][0] == "inconclusive" for name in others)
 
 
+@example("shock.py")
 def test_shock():
     """Case A9: cubic is nearer to the exact slope, and its profile within 1e-3."""
     found = dict(re.findall(r"^(\w+) +1/64 .* (\S+)%", run("shock.py"), re.MULTILINE))
@@ -131,6 +142,7 @@ def test_shock():
     assert float(profiles[-1]) < 1e-3
 
 
+@example("certified.py")
 def test_certified():
     """Estimated errors are the true ones; certified solves reach the same loss for fewer iterations."""
     printed = run("certified.py")
@@ -144,6 +156,7 @@ def test_certified():
         assert loss == other and int(fewer) <= 0.7 * int(full)
 
 
+@example("error_against_time.py")
 def test_error_against_time():
     """A front: first order behind second, the exponential as exact in a quarter of the steps; solvers of Poisson."""
     burgers, poisson, _ = run("error_against_time.py").split("fastest at an error of 1 %:")
@@ -159,6 +172,7 @@ def test_error_against_time():
     assert poisson.count("1e-10") >= 12 and "fastest" not in poisson
 
 
+@example("stiff_and_extreme.py")
 def test_stiff_and_extreme():
     """Three scenes pass; the long explicit step and the null space left in are found."""
     rows = dict(re.findall(r"^(\S.*?) +stress: .* (\d+) FAILED$", run("stiff_and_extreme.py"), re.MULTILINE))
@@ -168,6 +182,7 @@ def test_stiff_and_extreme():
     assert "changes its sign from step to step" in run("stiff_and_extreme.py")
 
 
+@example("velocity_recovery.py")
 def test_velocity_recovery():
     """Case A1: 9.30 from rest stalls; from a constant velocity loss <= 1e-6, error <= 0.1 where the marker passes."""
     rows = re.findall(
@@ -178,6 +193,7 @@ def test_velocity_recovery():
     assert table["constant", "lbfgs"][1] <= 1e-6 and table["constant", "lbfgs"][2] <= 0.1
 
 
+@example("update_directions.py")
 def test_update_directions():
     """Case C1: first steps and ends of three directions as published; rate 1 is exact after one step."""
     printed = run("update_directions.py")
@@ -188,6 +204,7 @@ def test_update_directions():
     assert re.search(r"rate 1 .*\(0\.00000000, 0\.00000000\)", printed)
 
 
+@example("half_inverse.py")
 def test_half_inverse():
     """Case C2: the loss after one epoch as published, far below Adam's; Levenberg-Marquardt <= 3e-8 on all samples."""
     row = r"^(\S.*?\S)  +(\d+) +(\S+) +(\S+) +(\S+)"
@@ -199,6 +216,7 @@ def test_half_inverse():
     assert float(re.search(r"it sees: (\S+)", printed)[1]) <= found["Levenberg-Marquardt"][0]
 
 
+@example("adopt_a_simulator.py")
 def test_adopt_a_simulator():
     """At most 20 runs for a Jacobian on both grids, the entries of the stencil, and an audit that agrees."""
     printed = run("adopt_a_simulator.py")
@@ -209,6 +227,7 @@ def test_adopt_a_simulator():
     assert "agrees" in printed
 
 
+@example("inverse_heat.py")
 def test_inverse_heat():
     """Case C3: one physical gradient beats 1000 gradients; with few jumps and no network below the published 50.4."""
     found = re.findall(r"^(\S.*?) +\d+ +(\S+) +\S+  (\d+)", run("inverse_heat.py"), re.MULTILINE)
@@ -216,6 +235,7 @@ def test_inverse_heat():
     assert len(errors) == 3 and errors[0] > 1.2 * errors[1] and errors[2] <= 50.4
 
 
+@example("control.py")
 def test_control():
     """Case C5 in two scenes: a weaker force than the one that made the end, which is met; far beyond cross-entropy."""
     found = re.findall(r"^(adjoint|cross).* +(\d+) +\S+ +\S+ +(\S+) +(\S+) +(\S+)$", run("control.py"), re.MULTILINE)
@@ -224,6 +244,7 @@ def test_control():
     assert runs <= 3 * gradients and other > 100 * miss
 
 
+@example("solver_in_the_loop.py")
 def test_solver_in_the_loop():
     """Case C4 after 48 gradients: the network helps, through 4 steps more than through 1, and loses no mass."""
     found = re.findall(r"^(\S.*?)(?:  +[\d.]+){3} +(\S+) +(\S+) +(\S+)$", run("solver_in_the_loop.py"), re.MULTILINE)

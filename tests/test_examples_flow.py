@@ -4,13 +4,14 @@ import re
 
 import numpy as np
 import pytest
-from scripts import run
+from scripts import example, run
 
 
 def rows(text, pattern):
     return [tuple(map(float, found.groups())) for found in re.finditer(pattern, text, re.MULTILINE)]
 
 
+@example("pressure_projection.py")
 def test_pressure_projection():
     """Case B3: gradient descent as published, the least loss within 6 solves forward and adjoint."""
     printed = run("pressure_projection.py")
@@ -20,6 +21,7 @@ def test_pressure_projection():
     assert all(float(size) <= 1e-12 for size in re.findall(r": (\de-\d+)", printed))
 
 
+@example("plume.py")
 def test_plume():
     """Case B4: the largest wind of every step to five digits."""
     printed = run("plume.py")
@@ -30,6 +32,7 @@ def test_plume():
     assert found[0][3] == 0.008125 and "agrees" in printed
 
 
+@example("plume_inverse.py")
 def test_plume_inverse():
     """Case B5, its start: the losses with no wind and after one step of descent; then Adam goes down."""
     printed = run("plume_inverse.py")
@@ -38,6 +41,7 @@ def test_plume_inverse():
     assert rows(printed, r"at the end +loss +(\S+) ")[0][0] < 150
 
 
+@example("taylor_green.py")
 def test_taylor_green():
     """Case B9: both figures at 25^2, order 2, derivatives within the discretisation error."""
     printed = run("taylor_green.py")
@@ -47,12 +51,14 @@ def test_taylor_green():
     assert np.allclose(rows(printed, r"dalpha (\S+), dJ/dnu (\S+) of"), 1, atol=0.01)
 
 
+@example("cavity.py")
 def test_cavity():
     """Case B10 at 32^2; 64^2 within 2 % and 128^2 within 0.6 % are in test_flow_cases.py."""
     found = rows(run("cavity.py"), r"^ +(\d+)\^2  (\S+) +(\S+) +(\S+) +(\S+)%")
     assert [row[0] for row in found] == [16, 32] and found[1][4] <= 2.5 < found[0][4]
 
 
+@example("convection.py")
 def test_convection():
     """Case B11 at 32^2: heat flow and both velocities."""
     cells, nusselt, u, v = rows(run("convection.py"), r"^ +(\d+)\^2 +(\S+) +(\S+) +(\S+)")[-1]
@@ -64,12 +70,14 @@ def test_convection():
     )
 
 
+@example("obstacle.py")
 def test_obstacle():
     printed = run("obstacle.py")
     before, after = rows(printed, r"profile (\S+) -> (\S+)$")[0]
     assert "agrees" in printed and after < 0.1 * before
 
 
+@example("shape.py")
 def test_shape():
     printed = run("shape.py")
     table = rows(printed, r"^ +(0\.\d+) +(0\.\d+) +(0\.\d+) +(\S+) +(\S+) +(\S+) +(\S+) +(\S+)$")
@@ -78,6 +86,7 @@ def test_shape():
     assert rows(printed, r"^(\S+) of the drag")[0][0] == pytest.approx(0.75, abs=1e-3)
 
 
+@example("burgers.py")
 def test_burgers():
     """Cases A7 and A8: published forward figures; the start within 0.03 with the steepness as regulariser."""
     printed = run("burgers.py")
@@ -87,6 +96,7 @@ def test_burgers():
     assert float(rows[2][2]) <= 0.03
 
 
+@example("burgers.py")
 def test_burgers_from_an_observation_in_a_file(tmp_path):
     """Case A8b but for its numbers: what is seen comes from a file. A constant stays what it is."""
     (tmp_path / "seen.txt").write_text("0.5\n" * 128)

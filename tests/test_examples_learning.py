@@ -2,13 +2,14 @@
 
 import re
 
-from scripts import run
+from scripts import example, run
 
 
 def rows(text, pattern):
     return [(found[1].strip(), *map(float, found.groups()[1:])) for found in re.finditer(pattern, text, re.MULTILINE)]
 
 
+@example("conductivity_design.py")
 def test_conductivity_design():
     """Case B12: ratio 0.75 +- 0.005 at n = 200, both contents as known, and the exact conductivity."""
     printed = run("conductivity_design.py")
@@ -19,6 +20,7 @@ def test_conductivity_design():
     assert plate[3] < 0.5
 
 
+@example("warm_start_learned.py")
 def test_warm_start_learned():
     """Every learned guess is far better after k iterations, and none does what multigrid does from zero."""
     printed = run("warm_start_learned.py")
@@ -29,6 +31,7 @@ def test_warm_start_learned():
         assert zero[4] <= cycles + 0.5 and zero[4] <= 5 < plain < zero[3]
 
 
+@example("residual_or_physics.py")
 def test_residual_or_physics():
     """Case A8: the adjoint finds the start, a network with the adjoint keeps the physics; residuals break it."""
     found = rows(run("residual_or_physics.py"), r"^(\w.*?) +\d+ +\d+\.\d +\d+\.\d +(\S+) +(\S+) +(\S+) +(\S+)$")

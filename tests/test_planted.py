@@ -147,7 +147,7 @@ def copied(tmp_path):
 def failures(folder, tests):
     """Run tests in a copy -> (exit code, what was printed). The plain kernels: nothing is compiled again."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "SPARSEDP_NUMBA": "0"}
-    command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "--tb=line", *tests.split()]
+    command = [sys.executable, "-m", "pytest", "-n0", "-x", "-p", "no:cacheprovider", "--tb=line", *tests.split()]
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
     )

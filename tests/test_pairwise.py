@@ -1,0 +1,38 @@
+"""Samples of cross products hold every pair, are small, and are the same in every run."""
+
+from itertools import combinations, product
+
+import pairwise
+import pytest
+
+
+def pairs(rows, ways=2):
+    return {values for row in rows for values in combinations(enumerate(row), ways)}
+
+
+@pytest.mark.parametrize("ways", [1, 2, 3])
+def test_every_pair_is_there_and_few_rows_are(ways):
+    rows = [row for row in product("abcdef", "ghi", "jklm", "no") if row[0] != "a" or row[3] == "n"]
+    found = [rows[n] for n in pairwise.chosen(rows, ways)]
+    assert pairs(found, ways) == pairs(rows, ways)
+    assert len(found) <= {1: 6, 2: 30, 3: 85}[ways]
+    assert pairwise.chosen(rows, ways) == pairwise.chosen(rows, ways)
+
+
+def test_short_lists():
+    assert pairwise.sample([]) == []
+    assert pairwise.sample([("a",), ("b",)]) == [("a",), ("b",)]
+    assert pairwise.chosen([(0, 1), (0, 1)]) != []
+
+
+@pytest.mark.sampled
+@pytest.mark.parametrize("c", range(4))
+@pytest.mark.parametrize("a, b", [(0, 1), (2, 3)])
+@pytest.mark.parametrize("d", range(4))
+def test_this_one_is_sampled(a, b, c, d, request):
+    """Two of 32 in each pair: 16 rows, and -m sees the others as `whole`."""
+    of_this = [item for item in request.session.items if item.function.__name__ == request.function.__name__]
+    inside = {
+        tuple(item.callspec.params[name] for name in "acd") for item in of_this if not item.get_closest_marker("whole")
+    }
+    assert len(of_this) < 32 or len(pairs(inside)) == 8 + 8 + 16
