@@ -41,7 +41,9 @@ def pytest_collection_modifyitems(items):
         item.add_marker(pytest.mark.whole)
 
 
-@pytest.fixture(params=[pairwise.sample, pytest.param(list, marks=pytest.mark.whole)], ids=["sample", "whole"])
+@pytest.fixture(
+    scope="session", params=[pairwise.sample, pytest.param(list, marks=pytest.mark.whole)], ids=["sample", "whole"]
+)
 def drawn(request):
     """For loops inside a test: a sample of a list of scenes, tuples of what they are made of, or all of it."""
     return request.param

@@ -23,6 +23,7 @@ def _python(folder, *words, **environment):
     return subprocess.run([sys.executable, *words], capture_output=True, text=True, env=environment, check=False)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not kernels.compiled(), reason="needs numba")
 def test_the_first_use_says_so_once_and_later_ones_say_nothing(tmp_path):
     first = _python(tmp_path, "-c", APPLY)

@@ -180,6 +180,7 @@ def test_no_cells(method, shape, boundary):
 # ---- coefficients ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled
 @STRONG
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann], ids=str)
 @pytest.mark.parametrize("name", COEFFICIENTS)
@@ -208,6 +209,7 @@ def check_backward_error(op, inv, projection, b, g):
         assert np.linalg.norm(data - A @ x) <= 1e-12 * size
 
 
+@pytest.mark.sampled
 @STRONG
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann], ids=str)
 @pytest.mark.parametrize("name", ANISOTROPIC)
@@ -240,6 +242,7 @@ def test_anisotropy_on_a_larger_grid(boundary, method, rng):
 # ---- scale of the operator ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled
 @EVERY
 @IN_SCENES
 @pytest.mark.parametrize("exponent", [-900, 900])
@@ -260,6 +263,7 @@ def test_scale_of_the_operator(scene, method, exponent, rng):
         assert (far.info.forward if solve is far else far.info.adjoint).status == "not_representable"
 
 
+@pytest.mark.sampled
 @EVERY
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann], ids=str)
 @pytest.mark.parametrize("shape, exponent", [((14, 13), -450), ((14, 13), -300), ((14, 13), 300), ((14, 13), 450),
@@ -283,6 +287,7 @@ def test_scale_of_lengths(shape, exponent, boundary, method, rng):
 # ---- sizes -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled
 @EVERY
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 @pytest.mark.parametrize("shape", SMALL)

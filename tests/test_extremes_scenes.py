@@ -61,6 +61,7 @@ def test_field_zero(column, method, rng):
     assert np.any(slopes[0])
 
 
+@pytest.mark.sampled
 @EVERY
 @IN_COLUMNS
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])
@@ -81,6 +82,7 @@ def test_field_not_finite(column, method, bad, rng):
             pull(run, np.ones(shape), g)
 
 
+@pytest.mark.sampled
 @EVERY
 @IN_COLUMNS
 @pytest.mark.parametrize("exponent", [-963, -301, 900, 963])
@@ -97,6 +99,7 @@ def test_scale_of_the_data(column, method, exponent, rng):
     assert value == np.ldexp(np.sum(g * run(x)), exponent)
 
 
+@pytest.mark.sampled
 @EVERY
 @IN_COLUMNS
 @pytest.mark.parametrize("kind", KINDS)
@@ -209,6 +212,7 @@ def test_rollout_for_all_diffusion_numbers(method, number, boundary, rng):
     check_rollout(grid, method, speeds(grid), 1.0 / number, rng, boundary, rel=1e-6)
 
 
+@pytest.mark.sampled(1)
 @EVERY
 @IN_HARD
 def test_rollout_with_jumps_and_flat_cells(method, name, rng):

@@ -122,6 +122,7 @@ def oscillator_by_scipy(p, start=2.0, end=8.0):
     return solve_ivp(rate, (0.0, end), [start, 0.0], method="DOP853", rtol=1e-13, atol=1e-13).y[0, -1]
 
 
+@pytest.mark.slow
 def test_every_mode_and_order():
     """Gradient, tangent and both Hessian products beside differences of SciPy's solution."""
     slope = (oscillator_by_scipy(5.001) - oscillator_by_scipy(4.999)) / 2e-3
@@ -178,6 +179,7 @@ def test_complex_and_single_precision():
     assert pulled.dtype == np.float32 and pulled == pytest.approx(np.exp(-1.0), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_without_extrapolation_the_way_out_is_another_method():
     """Errors of crank_nicolson fall more slowly than its tolerance: a smaller one would be refused, too."""
 

@@ -45,6 +45,7 @@ def errors(method, reaction, n):
     return np.sqrt(np.mean((end(params) - exact(X, 1.0, params[1])) ** 2)), np.hypot(of_nu, of_w - wanted)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", ORDERS)
 @pytest.mark.parametrize("reaction", [0.0, 1.0])
 def test_moving_walls(method, reaction):

@@ -106,6 +106,12 @@ def collected():
     return [(f"{m.place}:{line}", text) for m in modules() for line, text in errors_in(m.tree)]
 
 
+def is_printed(text, known):
+    """Whether an expected message is this one; only those that hold its longest part are looked at closely."""
+    longest = max(text.split(HOLE), key=len)
+    return any(map(pattern(text).fullmatch, (message for message in known if longest in message)))
+
+
 def shown(text):
     return text.replace(HOLE, "{}")
 
@@ -117,7 +123,7 @@ def test_every_message_is_a_sentence_written_at_its_place():
 
 def test_every_message_is_printed_by_a_test():
     known = expected()
-    silent = [f"{at} {shown(text)}" for at, text in collected() if not any(map(pattern(text).fullmatch, known))]
+    silent = [f"{at} {shown(text)}" for at, text in collected() if not is_printed(text, known)]
     assert not silent, f"{len(silent)} messages are in no test:\n" + "\n".join(silent)
 
 

@@ -53,6 +53,7 @@ def test_a_rule_without_a_forward_derivative(rng, method):
     assert np.allclose(with_it.x, without.x, rtol=1e-9) and np.allclose(with_it.covariance, without.covariance)
 
 
+@pytest.mark.slow
 def test_lotka_volterra(rng):
     """Three rates from 42 noisy numbers, beside SciPy; 200 steps of rk4 for each evaluation."""
 

@@ -10,11 +10,12 @@ import pytest
 import sparsedp as dp
 from sparsedp import results
 
-SHAPE = (results.LARGE // 8,)
+SHAPE = (1 << 15,)
 
 
 @pytest.fixture(autouse=True)
-def _nothing_waits():
+def _nothing_waits(monkeypatch):
+    monkeypatch.setattr(results, "LARGE", 8 * SHAPE[0])  # quick to fill
     results._spare.clear()
     yield
     results._spare.clear()

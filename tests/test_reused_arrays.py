@@ -102,6 +102,7 @@ def places():
                 yield pytest.param(name, number, id=f"{name}-{number}")
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize(("name", "place"), list(places()))
 def test_one_array_for_all_calls(name, place, way):

@@ -65,6 +65,7 @@ def pairs(i, state):
     return {"mean": anp.mean(state), "pair": (state[1:], np.array([2.0, 2.0])), "i": i} if i % 3 == 1 else None
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("memory", [None, 136, 160, 256])
 @pytest.mark.parametrize("name", KEEPS)
 def test_every_kind_of_result(name, memory):
@@ -101,6 +102,7 @@ def few(s, p, f=0.0):
     return u * anp.cos(p["k"] * u) + 0.1 * p["k"] + 0.1 * f, count + 1, empty
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("options", [{}, {"memory": 200}, {"memory": "1 kB"}, {"truncate": 1}], ids=str)
 @pytest.mark.parametrize("inputs", [False, True])
 @pytest.mark.parametrize("keep", ["last", "all", "function", "nothing"])

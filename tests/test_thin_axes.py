@@ -16,12 +16,14 @@ SHAPES = [(1,), (2,), (3,), (1, 4), (4, 1), (1, 1), (2, 1), (3, 2), (1, 1, 4), (
 WORDS = (dp.no_slip, dp.free_slip, dp.inflow, dp.outflow)
 
 
-def grids(shape):
+@pytest.fixture
+def grids(shape, drawn):
     """Uniform and stretched, with every choice of periodic axes."""
     rng = np.random.default_rng(3)
-    for periodic in product((False, True), repeat=len(shape)):
-        yield dp.Grid(shape, spacing=0.3, periodic=periodic)
-        yield dp.Grid(shape, spacing=[rng.uniform(0.5, 2.0, n) for n in shape], periodic=periodic)
+    return [
+        dp.Grid(shape, spacing=[rng.uniform(0.5, 2.0, n) for n in shape] if stretched else 0.3, periodic=periodic)
+        for *periodic, stretched in drawn(list(product((False, True), repeat=len(shape) + 1)))
+    ]
 
 
 def flows(grid, most, rng):
@@ -58,9 +60,9 @@ def projections(grid, rng):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_projection(shape, rng):
+def test_projection(shape, grids, rng):
     """P, its transpose, the pressure, both at once, and their transposes; D as the user makes it finds nothing."""
-    for grid in grids(shape):
+    for grid in grids:
         for P, solid, dense in projections(grid, rng):
             matrix, pressure = dense.projection()
             v, w, q = *rng.standard_normal((2, grid.faces.size)), rng.standard_normal(shape)
@@ -76,8 +78,8 @@ def test_projection(shape, rng):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_what_acts_on_a_velocity(shape, rng):
-    for grid in grids(shape):
+def test_what_acts_on_a_velocity(shape, grids, rng):
+    for grid in grids:
         for boundary, solid, dense in scenes(grid, rng):
             v, w = rng.standard_normal((2, grid.faces.size))
             near(dp.convection(grid, boundary, solid)(v, w), dense.convection(v, w))
@@ -86,10 +88,10 @@ def test_what_acts_on_a_velocity(shape, rng):
 
 
 @pytest.mark.parametrize("shape", [(1,), (2,), (1, 3), (3, 1), (1, 1), (1, 2, 1), (2, 1, 2)])
-def test_flow_step(shape, rng):
+def test_flow_step(shape, grids, rng):
     """Value, and gradient against the step written with dense matrices."""
     dt, nu = 0.01, 0.05
-    for grid in grids(shape):
+    for grid in grids:
         for boundary, solid, dense in scenes(grid, rng, (16, 3, 1)):
             try:
                 step = dp.flow_step(grid, dt, nu, boundary=boundary, solid=solid)
@@ -131,9 +133,9 @@ def walls(grid, rng):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_catalogue(shape, rng):
+def test_catalogue(shape, grids, rng):
     """Both forms of every operator between cells and faces."""
-    for grid in grids(shape):
+    for grid in grids:
         for boundary, solid, dense in walls(grid, rng):
             empty = Dense(grid, dense.sides)
             D, G = dense.divergence(), dense.gradient(dp.dirichlet)
@@ -168,9 +170,9 @@ METHODS = ("auto", "direct", "multigrid", "structured", "separable", "krylov")
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_inverses(shape, rng):
+def test_inverses(shape, grids, rng):
     """Every method that takes the operator: A x = b with the dense A, for the transpose too."""
-    for grid in grids(shape):
+    for grid in grids:
         for boundary, solid, dense in walls(grid, rng):
             A = -dense.divergence() @ dense.gradient()
             k = rng.uniform(0.5, 2.0, grid.faces.size)

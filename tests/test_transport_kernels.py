@@ -108,6 +108,7 @@ def parabola(a, b, c, e):
     return (a + 2 * b) / 6, (2 * a + b) / 6, one / 6, one / 3, one / 3, one / 6
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("limiter", [minmod, parabola])
 @pytest.mark.parametrize("velocity, form", FORMS)
 def test_other_limiters(limiter, velocity, form, monkeypatch):

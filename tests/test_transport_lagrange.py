@@ -45,6 +45,7 @@ def every_case(test):
     return pytest.mark.parametrize(("shape", "periodic"), GRIDS)(test)
 
 
+@pytest.mark.sampled
 @every_case
 def test_twin(without_numba, shape, periodic, scheme, form, interpolation, of, velocity, boundary):
     """Value and cotangents of field, velocity, step and inflow; the tangent against them."""
