@@ -11,11 +11,12 @@ from residuals import rate as rate_of
 import sparsedp as dp
 from sparsedp import kernels
 from sparsedp.derivative import pullback, value_and_grad
+from sparsedp.errors import NonFiniteError
 from sparsedp.integrators.functions import Function
 from sparsedp.ledger import recording
+from sparsedp.solvers.choose import build_dense
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Newton
-from sparsedp.solvers.small import Small
 
 RATES = np.array([0.04, 1e4, 3e7])
 
@@ -165,31 +166,38 @@ def test_no_diffusion_and_hardly_any(method):
 # ---- small systems --------------------------------------------------------------------------------------------------
 
 
-def test_small_systems_give_what_the_general_path_gives():
-    """While calls are counted, the general path runs."""
+def test_small_systems_take_the_same_path_while_calls_are_counted():
     step, u = dp.stepper("tr_bdf2", robertson, 0.3), np.array([0.9, 2e-5, 0.1])
     loss = lambda p: anp.sum(step(u, p) * np.array([1.0, 1e4, -2.0]))
     value, g = value_and_grad(loss)(RATES)
     assert step.info.hierarchy == "dense LU, 3 rows" and step.info.adjoint.residual <= 1e-10
     with recording():
         other, of_other = value_and_grad(loss)(RATES)
-    assert value == pytest.approx(other, rel=1e-14) and g == pytest.approx(of_other, rel=1e-11)
+    assert value == other
+    np.testing.assert_array_equal(g, of_other)
+
+
+def dense(A):
+    return build_dense(A, lambda: dp.from_matrix(A), 1e-12, "raise", "dense")
 
 
 def test_dense_factors_solve_and_know_when_they_cannot():
     rng = np.random.default_rng(0)
     A, b = rng.standard_normal((7, 7)), rng.standard_normal(7)
-    for scale in (1.0, 2.0**900, 2.0**-900):
-        small = Small(scale * A)
-        np.testing.assert_allclose(scale * A @ small.solve(b, 1e-12)[0], b, rtol=1e-10)
-        np.testing.assert_allclose(scale * A.T @ small.solve(b, 1e-12, True)[0], b, rtol=1e-10)
-        assert small.norm == np.max(np.sum(np.abs(scale * A), 1))
-    x, info = Small(A).solve(2.0**800 * b, 1e-12)
-    np.testing.assert_array_equal(x, 2.0**800 * Small(A).solve(b, 1e-12)[0])
-    assert info.status == "converged" and info.residual <= 1e-12
-    assert Small(A).solve(0 * b, 1e-12) is None and Small(A).solve(b * np.nan, 1e-12) is None
-    for singular in (np.zeros((3, 3)), np.ones((3, 3)), np.diag([1.0, 1e-14]), np.diag([1.0, np.nan])):
-        assert not Small(singular).sound
+    for scale in (1.0, 2.0**150, 2.0**-150):
+        solver = dense(scale * A)
+        np.testing.assert_allclose(scale * A @ solver.solve(b), b, rtol=1e-10)
+        np.testing.assert_allclose(scale * A.T @ solver.solve(b, True), b, rtol=1e-10)
+        assert solver.system.norm() == np.max(np.sum(np.abs(scale * A), 1))
+    solver = dense(A)
+    np.testing.assert_array_equal(solver.solve(2.0**800 * b), 2.0**800 * solver.solve(b))
+    assert solver.log.forward.status == "converged" and solver.log.forward.residual <= 1e-12
+    assert not solver.solve(0 * b).any() and solver.log.forward.status == "exact_zero_rhs"
+    with pytest.raises(NonFiniteError, match="dense"):
+        solver.solve(b * np.nan)
+    beyond = (2.0**900 * A, 2.0**-900 * A)  # for these the general path scales
+    for matrix in (np.zeros((3, 3)), np.ones((3, 3)), np.diag([1.0, 1e-14]), np.diag([1.0, np.nan]), *beyond):
+        assert dense(matrix) is None
 
 
 # ---- grids ----------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from sparsedp.ledger import count, spent
 from sparsedp.operators.given import check_operator
 from sparsedp.solvers.amg import multigrid_engine
 from sparsedp.solvers.contract import Nothing, Solver
-from sparsedp.solvers.direct import direct_engine
+from sparsedp.solvers.direct import DenseLU, DenseSystem, Direct
 from sparsedp.solvers.krylov import krylov_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
 from sparsedp.solvers.record import SolveLog, failure
@@ -20,12 +20,12 @@ from sparsedp.solvers.system import System
 from sparsedp.space import fits
 from sparsedp.tree import copied
 
-__all__ = ["METHODS", "build", "check_settings", "inverse"]
+__all__ = ["METHODS", "build", "build_dense", "check_settings", "inverse"]
 
 # word -> function (system, **options) -> engine; see contract.py. Options are keyword-only.
 METHODS = {
     "separable": separable_engine,
-    "direct": direct_engine,
+    "direct": Direct,
     "structured": structured_engine,
     "multigrid": multigrid_engine,
     "krylov": krylov_engine,
@@ -128,15 +128,31 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
     if system.complex and word != "direct":
         raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct'")
     engine = _engine(system, word, options) if engine is None or options else engine
-    log = SolveLog() if log is None else log
-    log.setup_seconds, log.hierarchy = perf_counter() - clock, engine.hierarchy
     name = name or f"inverse({op.name})"
+    made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
+    solver = Solver(system, engine, nullspace, log or SolveLog(), name, made, reason)
+    _note_setup(solver, clock)
+    return Inverse(solver, reason)
+
+
+def build_dense(matrix, make, rtol, nullspace, name):
+    """Small 2-D array, and ``make()`` that gives the Operator -> Solver; None where the array may be singular."""
+    clock = perf_counter()
+    engine = DenseLU(system := DenseSystem(matrix, make, rtol))
+    if not engine.well_conditioned:
+        return None
+    solver = Solver(system, engine, nullspace, SolveLog(), name, None, "a small full matrix")
+    _note_setup(solver, clock)
+    return solver
+
+
+def _note_setup(solver, clock):
+    log, name = solver.log, solver.name
+    log.setup_seconds, log.hierarchy = perf_counter() - clock, solver.engine.hierarchy
     if recordings:
         count(name, "setup")
-        count(name, "hierarchy", int(engine.hierarchical))
+        count(name, "hierarchy", int(solver.engine.hierarchical))
         spent(name, "setup", log.setup_seconds)
-    made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
-    return Inverse(Solver(system, engine, nullspace, log, name, made, reason), reason)
 
 
 def check_settings(method, rtol, maxiter, nullspace):

@@ -2,11 +2,13 @@
 
 Dense LU up to 64 unknowns, banded LU for 1-D chains, sparse LU (SuperLU) otherwise. A singular system
 is factored with one unknown of each component pinned. Rounding is left to the contract's refinement.
+A full matrix of up to 64 unknowns takes microseconds to factor; finding its components, signs and symmetries takes a
+thousand times longer. `DenseSystem` does without them; what needs them, a singular matrix say, is not for it.
 SciPy changes the pivots of LAPACK while a solve runs, and back: every solve gets pivots of its own, for another
 thread may be solving with the same factors.
 """
 
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.linalg as la
@@ -15,37 +17,32 @@ from scipy.sparse.linalg import splu
 
 from sparsedp.errors import ConvergenceError
 from sparsedp.solvers.contract import Engine
+from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.record import failure
+from sparsedp.solvers.scaling import in_range, norm
+from sparsedp.solvers.system import System
 from sparsedp.structure.base import probes
 
-__all__ = ["Direct", "direct_engine"]
+__all__ = ["DENSE_UP_TO", "DenseLU", "DenseSystem", "Direct"]
 
 DENSE_UP_TO = 64
 BAND_UP_TO = 8  # half bandwidth up to which banded LU is used
 MOST_GROWTH = 2.0**49  # |A^-1| |A| beyond this leaves no digit
+LEAST_CONDITION = 2.0**-40  # 1 / (|A^-1| |A|): below this a full matrix may be a singular one
 
 
-def direct_engine(system):
-    """System -> Direct: LU factors, kept.
+class Direct(Engine):
+    """The engine that solves with kept LU factors.
 
     Parameters
     ----------
     system : System
-
-    Returns
-    -------
-    Direct
 
     Raises
     ------
     ConvergenceError
         With status setup_failed, when the matrix cannot be inverted and its null space is not known.
     """
-    return Direct(system)
-
-
-class Direct(Engine):
-    """The engine that solves with kept LU factors."""
 
     method = "direct"
     overwrites = False
@@ -55,7 +52,7 @@ class Direct(Engine):
         self._anchors = system.null_space.anchors()
         lower, upper = _bandwidths(matrix)
         if system.size <= DENSE_UP_TO:
-            self._solve, words = _dense(matrix)
+            self._solve, words = _dense(matrix.toarray())[0], "dense LU"
         elif max(lower, upper) <= BAND_UP_TO:
             self._solve, words = _banded(matrix, lower, upper)
         else:
@@ -87,10 +84,72 @@ class Direct(Engine):
             )
 
 
-def _dense(matrix):
-    factors, pivots = la.lapack.get_lapack_funcs("getrf", dtype=matrix.dtype)(matrix.toarray())[:2]
-    getrs = la.lapack.get_lapack_funcs("getrs", dtype=matrix.dtype)
-    return (lambda b, transposed: getrs(factors, pivots.copy(), b, trans=int(transposed))[0]), "dense LU"
+class DenseSystem(System):
+    """A small full system, of which only sizes are known.
+
+    Parameters
+    ----------
+    matrix : float64 array, shape (n, n)
+    make : callable
+        ``make()``: the Operator, for those who ask.
+    rtol : float
+    """
+
+    active, null_space = None, NullSpace(None, np.zeros(0), np.zeros(0), 0)  # type: ignore[assignment]
+    complex, exponent = False, 0  # type: ignore[assignment]
+
+    def __init__(self, matrix, make, rtol):
+        self.dense, self._make = matrix, make
+        self.size, self.rtol, self.maxiter = len(matrix), rtol, None
+        self.sizes = np.abs(matrix)
+        self.norms = float(self.sizes.sum(1).max(initial=0.0)), float(self.sizes.sum(0).max(initial=0.0))
+
+    @cached_property
+    def given(self):  # type: ignore[override]
+        """The matrix as an Operator."""
+        return self._make()
+
+    @property
+    def op(self):  # type: ignore[override]
+        """The same: it is not scaled."""
+        return self.given
+
+    def product(self, x, transposed=False):
+        return (self.dense.T if transposed else self.dense) @ x
+
+    applied = product
+
+    def magnitude(self, x, transposed=False):
+        return (self.sizes.T if transposed else self.sizes) @ x
+
+    def terms(self, x):
+        return norm(self.sizes @ np.abs(x))
+
+
+class DenseLU(Engine):
+    """The engine of a DenseSystem. `well_conditioned`: whether it may be used."""
+
+    method = "direct"
+    overwrites = False
+
+    def __init__(self, system):
+        self.hierarchy = f"dense LU, {system.size} rows"
+        size = system.norm(False)
+        self.well_conditioned = in_range(size)
+        if self.well_conditioned:
+            self._solve, condition = _dense(system.dense, size)
+            self.well_conditioned = condition > LEAST_CONDITION
+
+    def solve(self, b, goal, transposed):
+        return self._solve(b, transposed), 0, ""
+
+
+def _dense(matrix, size=None):
+    """2-D array -> (solve(b, transposed), 1 / (|A^-1| |A|) where its norm is given)."""
+    getrf, getrs, gecon = la.lapack.get_lapack_funcs(("getrf", "getrs", "gecon"), dtype=matrix.dtype)
+    factors, pivots, singular = getrf(matrix)
+    condition = 0.0 if size is None or singular else gecon(factors, size, norm="I")[0]
+    return (lambda b, transposed: getrs(factors, pivots.copy(), b, trans=int(transposed))[0]), condition
 
 
 def _bandwidths(matrix):

@@ -11,26 +11,90 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.derivative import NO_JVP, pushforward
+from sparsedp.derivative import NO_JVP, pushforward, traced
 from sparsedp.errors import ConvergenceError, DerivativeError, ShapeError
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_functions, from_matrix
 from sparsedp.solvers.cache import Cache
-from sparsedp.solvers.choose import build
+from sparsedp.solvers.choose import build, build_dense
 from sparsedp.solvers.colouring import Coloured
-from sparsedp.solvers.linearisation import Linearisation
-from sparsedp.solvers.small import Small
+from sparsedp.solvers.direct import DENSE_UP_TO
+from sparsedp.solvers.record import failure
+from sparsedp.solvers.solution import Inverse
 from sparsedp.solvers.sparsity import dense_pattern, find_pattern
-from sparsedp.solvers.surroundings import Surroundings, cells_met
-from sparsedp.tape import isbox
+from sparsedp.tape import called, isbox
+from sparsedp.traces import ReverseNode, untraced
 
-__all__ = ["Jacobians"]
+__all__ = ["Jacobians", "Linearisation"]
 
 FULL_UP_TO = 16  # unknowns: a full Jacobian takes fewer products than the search for its pattern
 FULL_AT_MOST = 2000  # unknowns: a larger Jacobian that is not sparse is left as products
+SYMMETRIC = 1e-12  # of the largest entry: by how much a symmetric Jacobian may differ from its transpose
 AGREES = 1e-8  # relative difference up to which two forms of one Jacobian are taken for equal
+
+
+class Linearisation:
+    """J at one point, as Newton's method and the derivative rules use it.
+
+    Parameters
+    ----------
+    solver : Solver
+        Of J.
+    point : (equation, x, leaves)
+        Plain copies.
+    checked : bool
+        Whether J is known to be the derivative of the residual.
+    """
+
+    def __init__(self, solver, point, checked):
+        self.solver, self.point, self.checked = solver, point, checked
+        self.product, self.terms = solver.system.applied, solver.system.terms  # J x; a size of the terms of that
+
+    def __str__(self):
+        return str(Inverse(self.solver, self.solver.reason))
+
+    @property
+    def norm(self):
+        """|J|_inf, or an upper bound."""
+        system = self.solver.system
+        return float(np.ldexp(system.norm(), system.exponent))
+
+    @property
+    def singular(self):
+        """Whether a null space of J, or an unknown that no equation uses, is known."""
+        system = self.solver.system
+        return system.active is not None or system.null_space.count > 0
+
+    def step(self, F, forcing):
+        """The Newton step -J^-1 F, up to the relative residual `forcing`. Never refused: the next residual judges."""
+        return self.solver.approximate(-F, max(forcing, self.solver.system.rtol))
+
+    def solve(self, b, transposed):
+        """(J^-1 b or J^-T b to the full tolerance, its record). Refused when the root is not isolated."""
+        solver = self.solver
+        if self.singular and solver.nullspace == "raise":
+            raise ConvergenceError(
+                f"the Jacobian {solver.system.given} is singular at the solution: the root is not isolated and has no "
+                "derivative; add an equation that fixes it or write nullspace='project'",
+                info=failure("setup_failed"),
+            )
+        x = solver.solve(b, transposed, checked=False)
+        return x, solver.log.adjoint if transposed else solver.log.forward
+
+    def defect(self):
+        """How far J is from the derivative of the residual along a random direction: (largest, its row)."""
+        equation, x, leaves = self.point
+        rng = np.random.default_rng(0)
+        v = rng.uniform(0.5, 1.5, x.size) * rng.choice([-1.0, 1.0], x.size)
+        with np.errstate(all="ignore"):
+            wanted = equation.tangent(x, leaves)(v)
+        size = np.maximum(self.solver.system.given.structure.magnitude()(np.abs(v)), np.abs(wanted))
+        size += 1e-8 * np.max(size, initial=0.0)  # rounding of large rows is no difference in small ones
+        share = np.abs(self.product(v) - wanted) / np.where(size > 0, size, 1.0)
+        row = int(np.argmax(share)) if share.size else 0
+        return (float(share[row]) if share.size else 0.0), row
 
 
 class Jacobians:
@@ -52,22 +116,21 @@ class Jacobians:
         self.way = ""
         self._spaces: dict = {}  # size -> the cells that the unknowns were found to lie on
         self._patterns: dict = {}  # size -> Coloured, or None when only products will do
-        self._around: dict = {}  # size -> Surroundings, where Operators tell that the unknowns lie on cells
         self._points, self._matrices = Cache(), Cache()
         self._alone = RLock()  # held by the thread that looks for a pattern
 
     def __str__(self):
         counts = {size: "" if c is None else f", {c.count} products" for size, c in self._patterns.items()}
         lines = [f"  {size} unknowns{many}" for size, many in counts.items()]
-        return "\n".join([*lines, str(self._points.last.inv) if len(self._points) else "  not set up yet"])
+        return "\n".join([*lines, str(self._points.last) if len(self._points) else "  not set up yet"])
 
     # ------------------------------------------------------------ set-ups
 
     def fresh(self, equation, x, leaves):
         """The Jacobian at this point, made now."""
-        op, small, exact = self._made(equation, x, leaves)
+        solver, exact = self._made(equation, x, leaves)
         point = equation, x.copy(), [np.array(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
-        known = Linearisation(op, self._inverse, point, exact, self.settings["rtol"], small)
+        known = Linearisation(solver, point, exact)
         return self._points.put(_key(equation, x, leaves), known)
 
     def kept(self, equation, x, leaves):
@@ -75,12 +138,22 @@ class Jacobians:
         known = self._points.find(_key(equation, x, leaves)) or self.fresh(equation, x, leaves)
         return self.fresh(equation, x, leaves) if self.enlarged(known) else known
 
-    def _inverse(self, op):
-        settings = dict(self.settings, name=f"{self.name}.jacobian", solves="few")
-        if op.form != "explicit":
-            return build(op, **settings | (dict(method="krylov") if not op.structure.has_entries else {}))
-        key = (op.matrix.indptr, op.matrix.indices, op.matrix.data)
-        return self._matrices.find(key) or self._matrices.put(key, build(op, **settings))
+    def _solver(self, op):
+        if op.form == "explicit":
+            return self._solver_of(op.matrix, lambda: op)
+        products = {} if op.structure.has_entries else dict(method="krylov")
+        return build(op, **self.settings | products, name=f"{self.name}.jacobian", solves="few").solver
+
+    def _solver_of(self, matrix, make):
+        """The Solver of an assembled Jacobian, of which ``make()`` is the Operator: kept or set up."""
+        settings, solver = dict(self.settings, name=f"{self.name}.jacobian"), None
+        key = matrix.indptr, matrix.indices, matrix.data
+        known = self._matrices.find(key)
+        if known is not None:
+            return known
+        if len(matrix.indptr) <= DENSE_UP_TO + 1 and settings["method"] in ("auto", "direct"):
+            solver = build_dense(matrix.toarray(), make, settings["rtol"], settings["nullspace"], settings["name"])
+        return self._matrices.put(key, solver or build(make(), **settings, solves="few").solver)
 
     def suspected(self, known):
         """As `enlarged`, for a Newton step that did not do well. A Jacobian that was given may be a simpler one."""
@@ -124,26 +197,24 @@ class Jacobians:
     # ------------------------------------------------------------ three ways to a Jacobian
 
     def _made(self, equation, x, leaves):
-        """(Operator or what makes it, dense factors or None, whether it is the derivative itself)."""
+        """(the Solver of the Jacobian, whether it is the derivative itself for certain)."""
         name = f"{self.name}.jacobian"
         if self.given is not None:
             self.way = "given"
             given = self.given(equation.layout.split(x), *equation.params(leaves))
-            return self._as_operator(given, equation.size, name), None, False
+            return self._solver(self._as_operator(given, equation.size, name)), False
         with self._alone:
             coloured = self._coloured(equation, x, leaves)
         if coloured is None:
             forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
-            return from_functions(forward, backward, equation.size, equation.size, name), None, True
+            return self._solver(from_functions(forward, backward, equation.size, equation.size, name)), True
         matrix = coloured.matrix(self._product(equation, x, leaves, coloured.by_rows))
-        small = None
-        if equation.size <= Small.most and self.settings["method"] in ("auto", "direct"):
-            small = Small(matrix.toarray())
-        around = self._around.get(equation.size)
-        shape = equation.layout.shapes[0]  # a field of another shape may have as many unknowns
-        space = around.space if around is not None and around.suit(matrix, shape) else equation.size
+        space = self._spaces.get(equation.size)
+        # A field of another shape may have as many unknowns.
+        suits = space is not None and equation.layout.shapes[0] == space.shape and _is_symmetric(matrix, space)
+        make = partial(from_matrix, matrix, *(space if suits else equation.size,) * 2, name)
         full = coloured.by_rows and coloured.pattern.nnz == equation.size**2
-        return partial(from_matrix, matrix, space, space, name), small, full
+        return self._solver_of(matrix, make), full
 
     def _as_operator(self, given, size, name):
         if isbox(given):
@@ -209,10 +280,10 @@ class Jacobians:
         shapes = equation.layout.shapes
         shape = shapes[0] if len(shapes) == 1 else None
         # One tape serves all products with J^T; each with J takes a run of its own.
-        mirrored = pattern is not None and _mirrored(pattern) and _has_vjp(equation, x, leaves)
-        coloured = None if pattern is None else Coloured(pattern, shape, True if self.by_rows or mirrored else None)
-        space = self._spaces.get(equation.size) if mirrored else None
-        self._around[equation.size] = None if space is None else Surroundings(space, pattern)
+        symmetric = pattern is not None and _is_own_transpose(pattern) and _has_vjp(equation, x, leaves)
+        coloured = None if pattern is None else Coloured(pattern, shape, True if self.by_rows or symmetric else None)
+        if not symmetric:
+            self._spaces.pop(equation.size, None)
         self._patterns[equation.size] = coloured
 
     def _search(self, equation, x, leaves):
@@ -242,7 +313,7 @@ def _key(equation, x, leaves):
     return (x, *leaves, *equation.statics, *equation.layout.shapes)
 
 
-def _mirrored(pattern):
+def _is_own_transpose(pattern):
     """Whether a pattern is its own transpose."""
     turned = pattern.T.tocsr()
     turned.sort_indices()
@@ -286,3 +357,53 @@ def _has_vjp(equation, x, leaves):
     except NO_JVP:
         return False
     return True
+
+
+# ---------------------------------------------------------------- the grid of the Jacobian
+
+
+def _is_symmetric(matrix, space):
+    """Whether the matrix, its rows times the volumes of their cells, is symmetric: multigrid needs that."""
+    weighed = sp.csr_array(matrix * space.grid.volumes.reshape(-1, 1))
+    gap = abs(weighed - weighed.T).max()
+    return bool(gap <= SYMMETRIC * abs(weighed).max())
+
+
+class Watched(ReverseNode):
+    """A node that notes, in a list that its root holds, the spaces that Operators map from."""
+
+    __slots__ = ("found",)
+    found: Any
+
+    def __init__(self, value, fun, args, options, nums, parents):
+        super().__init__(value, fun, args, options, nums, parents)
+        self.found, op = parents[0].found, called(fun, args)
+        if isinstance(op, Operator):
+            self.found.append(op.domain)
+
+
+untraced[Watched] = untraced[ReverseNode]  # comparisons, shapes, rounding: plain values for this kind too
+
+
+def cells_met(equation, x, leaves):
+    """The cells of the first grid that an Operator in the residual acts on, if x is one field on them; else None.
+
+    Parameters
+    ----------
+    equation : Equation
+    x : flat array
+    leaves : tuple of arrays
+
+    Returns
+    -------
+    Space or None
+    """
+    layout = equation.layout
+    if len(layout.shapes) != 1 or len(layout.shapes[0]) < 2:
+        return None  # on one axis banded LU needs no geometry
+    root = Watched.new_root()
+    root.found = []
+    with np.errstate(all="ignore"):
+        traced(lambda y: equation(y, *leaves), x, [root])
+    fitting = (s for s in root.found if s.grid is not None and s.kind == "cells" and s.shape == layout.shapes[0])
+    return next(fitting, None)

@@ -24,10 +24,9 @@ import numpy as np
 from sparsedp.direction import push
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import check_finite
-from sparsedp.solvers.contract import norm
+from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.scaling import in_range
-from sparsedp.solvers.small import Small, size_of
+from sparsedp.solvers.scaling import in_range, norm
 
 __all__ = ["Newton", "length"]
 
@@ -65,7 +64,7 @@ class Newton:
         self.x: np.ndarray
         self.F: Any = None
         self.size = 0.0  # |F|
-        self.steps, self.keeps = steps, steps or equation.size > Small.most
+        self.steps, self.keeps = steps, steps or equation.size > DENSE_UP_TO
         self.J: Any = None
         self.stale = False  # whether J is that of an earlier iterate
         self.largest = 0.0  # residual met
@@ -240,7 +239,7 @@ class Newton:
 
 def length(v):
     """2-norm of a flat array of any magnitude."""
-    size = size_of(v) if v.size <= Small.most else norm(v)
+    size = norm(v)
     if in_range(size):
         return size
     exponent = _exponent(v)

@@ -218,7 +218,8 @@ class Root(Remade):
                     series[equation.size] = newton.J
 
     def _note_setup(self, known):
-        self.info.setup_seconds, self.info.hierarchy = known.told
+        log = known.solver.log
+        self.info.setup_seconds, self.info.hierarchy = log.setup_seconds, log.hierarchy
 
     def _vjp(self, nums, ans, equation, guess, *leaves):
         places = [num - 2 for num in nums]

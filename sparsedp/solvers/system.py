@@ -10,7 +10,7 @@ from sparsedp.errors import NonFiniteError
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import ROUNDING, find_null_space
-from sparsedp.solvers.scaling import remainder
+from sparsedp.solvers.scaling import norm, remainder
 from sparsedp.space import Space
 from sparsedp.structure.base import probes
 from sparsedp.structure.explicit import Matrix
@@ -68,6 +68,14 @@ class System:
         if self.active is not None:
             y[~self.active] = 0.0
         return y
+
+    def applied(self, x):
+        """A x as it was given: not scaled, for all that is not an unknown too."""
+        return self.given._flat.apply(x)
+
+    def terms(self, x):
+        """A size of the terms that A x is the sum of."""
+        return float(np.ldexp(self.norm(), self.exponent)) * norm(x)
 
     @cached_property
     def _assembled(self):
