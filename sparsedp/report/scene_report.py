@@ -5,6 +5,7 @@ The folder gets Markdown, CSV and pictures of each instrument, and a page that s
 
 import contextlib
 import inspect
+import math
 import os
 import re
 import runpy
@@ -19,8 +20,8 @@ from sparsedp.files import write_file
 from sparsedp.report import plots
 from sparsedp.report.certificate import certify
 from sparsedp.report.plan import explain
-from sparsedp.report.stress_table import stress
-from sparsedp.report.table import csv_text, markdown_table, write_table
+from sparsedp.report.stress_table import Stress, stress
+from sparsedp.report.table import Result, csv_text, markdown_table, write_table
 from sparsedp.report.work_precision import Rows, words_of, workprec
 
 __all__ = ["Source", "audited", "claim", "load", "write_report"]
@@ -31,10 +32,10 @@ PAGE = "report.md"
 GOAL = 0.01  # the error that the page recommends a method for, in a sentence
 GOALS = 0.1, GOAL, 1e-3, 1e-4, 1e-6  # and in a table
 LEFT = "left out"  # in every sentence about it
-MEANING = {
-    "agrees": "The gradient is what differences of the loss say, and no stiff or extreme case failed.",
+MEANING = {  # the worst first: one that is wrong beats one that is open
     "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
     "inconclusive": "Nothing is proved: the reason stands below. This is no pass.",
+    "agrees": "The gradient is what differences of the loss say, and no stiff or extreme case failed.",
 }
 
 
@@ -168,14 +169,17 @@ def write_report(source, folder, force=False):
     """
     claim(folder, [PAGE], force)
     with audited(source.name):
-        results = [_attempt(run, source) for _, _, run, _ in CHAPTERS]
-    verdict = _verdict(results[0], results[-1])
+        results = [_attempt(chapter.run, source) for chapter in CHAPTERS]
+    words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
+    verdict = next(word for word in MEANING if word in words)
     page, left, lines = [f"# {source.name}: {verdict}", "", MEANING[verdict]], [], []
-    for (title, failed, _, tell), result in zip(CHAPTERS, results, strict=True):
-        sentences = [f"{failed}, {result}"] if isinstance(result, str) else list(tell(result, folder))
+    for chapter, result in zip(CHAPTERS, results, strict=True):
+        sentences = [f"{chapter.failed}, {result}"] if isinstance(result, str) else list(chapter.tell(result))
+        if isinstance(result, Result):
+            _save(folder, chapter, result)
         lines += sentences
         left += [f"- {one}" for one in sentences if LEFT in one]
-        page += ["", f"## {title}", "", *(f"- {one}" for one in sentences if LEFT not in one)]
+        page += ["", f"## {chapter.title}", "", *(f"- {one}" for one in sentences if LEFT not in one)]
         page += ["", *_goals(result)] if isinstance(result, Rows) else []
     page += ["", "## What was left out, and why", "", *left, "", *_details(folder)]
     write_file(folder / PAGE, "\n".join(page))
@@ -190,98 +194,87 @@ def _attempt(run, source):
         return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _verdict(audit, trial):
-    """Wrong beats open: a gradient that disagrees or a case that FAILED, then anything that was not decided."""
-    if getattr(audit, "verdict", None) == "disagrees" or not trial:
-        return "disagrees"
-    return "inconclusive" if isinstance(audit, str) or isinstance(trial, str) else audit.verdict
+def _save(folder, chapter, result):
+    if isinstance(result, Rows):  # it knows its name
+        result.save(folder)
+        return
+    text = result.markdown() if isinstance(result, Stress) else f"```text\n{result}\n```\n"
+    draw = result.plot if getattr(result, "map", None) else chapter.draw and partial(chapter.draw, result)
+    write_table(folder, chapter.stem, f"# {chapter.title}\n\n{text}", csv_text(result.rows), draw)
 
 
-def _write(folder, stem, title, result, rows, draw=None):
-    write_table(folder, stem, f"# {title}\n\n```text\n{result}\n```\n", csv_text(rows), draw)
-
-
-def _audit(audit, folder):
-    _write(folder, "audit", "Audit of the gradient", audit, audit.rows, partial(plots.v_curve, audit))
+def _audit(audit):
     digits = f", {audit.digits} digits" if audit.digits is not None else ""
     yield f"gradient: {audit.verdict}{digits}{': ' if audit.reason else ''}{audit.reason}"
     if audit.culprit:
         yield f"at fault: {audit.culprit}"
 
 
-def _workprec(table, folder):
+def _workprec(table):
     if table is None:
         yield "error against run time: left out; the file gives no workprec_options (problem, methods, over, reference)"
         return
-    table.save(folder)
-    error, words = _judged_by(table)
-    best = table.best(GOAL, error)
-    if best is None:
+    words, row = table.judged.replace("_", " "), table.best(GOAL, table.judged)
+    if row is None:
         yield f"error against run time: no method reaches a {words} of {GOAL:g}, see {table.stem}.md"
     else:
-        name, settings, _, seconds = _method(table, best, error)
-        yield f"fastest at a {words} of {100 * GOAL:g} %: {name} ({settings}), {seconds} s"
+        spent = f"{row['method']} ({words_of(row)}), {table.seconds(row, table.judged):.1e} s"
+        yield f"fastest at a {words} of {100 * GOAL:g} %: {spent}"
     yield from (f"error against run time left out {sentence}" for sentence in table.left_out)
-
-
-def _judged_by(table):
-    """The error that methods are compared by, as a column and in words: that of the gradient, where there is one."""
-    error = "gradient_error" if table.pareto() else "forward_error"
-    return error, error.replace("_", " ")
-
-
-def _method(table, row, error):
-    """A row as texts: method, settings, error, seconds."""
-    return row["method"], words_of(row), f"{100 * row[error]:.2g} %", f"{table.seconds(row, error):.1e}"
 
 
 def _goals(table):
     """The fastest method for each error, as lines of a Markdown table."""
-    error, words = _judged_by(table)
-    names = f"{words} at most", "fastest method", "its settings", f"its {words}", "seconds"
-    best = [table.best(goal, error) for goal in GOALS]
-    lines = [_method(table, row, error) if row else ["none here"] for row in best]
-    lines = [(f"{100 * goal:g} %", *line) for goal, line in zip(GOALS, lines, strict=True)]
-    return markdown_table([dict(zip(names, line, strict=False)) for line in lines], names)
+    rows = []
+    for goal in GOALS:
+        row = table.best(goal, table.judged) or {"method": "none here", "settings": "{}", table.judged: math.nan}
+        rows.append({**row, "at most": f"{100 * goal:g} %", "settings": words_of(row)})
+    return markdown_table(rows, ("at most", "method", "settings", table.judged, "seconds_forward"))
 
 
-def _certificate(certificate, folder):
-    _write(folder, "certificate", "Error that solves leave", certificate, certificate.solves)
+def _certificate(certificate):
     yield f"error of the gradient from its solves: about {certificate.gradient_error:.1e}; {certificate.advice}"
 
 
-def _plan(plan, folder):
-    _write(folder, "plan", "What was computed, and what was left out", plan, plan.rows)
+def _plan(plan):
     yield f"one gradient: {plan.sums}"
     yield from (f"left out: {sentence}" for sentence in plan.left_out)
 
 
-def _stress(trial, folder):
-    text = f"# Stiff and extreme cases\n\n{trial.markdown()}"
-    write_table(folder, "stress", text, trial.csv(), trial.map and trial.plot)
+def _stress(trial):
     yield trial.summary
     for row in trial.failures:
         yield ": ".join(["FAILED", f"{row['parameter']} {row['case']}".strip(), row["note"]])
     yield from (f"stress left out {sentence}" for sentence in trial.left_out)
 
 
-# Title, what is said when the instrument fails, the instrument, and what it says (and writes). The audit comes first
-# and the stress cases last: both have a say in the verdict.
+class Chapter(NamedTuple):
+    """An instrument of the report, the file it writes, and the sentences it tells."""
+
+    stem: str
+    title: str
+    failed: str  # what is said when it fails
+    run: Any
+    tell: Any
+    draw: Any = None
+
+
+# The audit comes first and the stress cases last: both have a say in the verdict.
 CHAPTERS = (
-    ("Is the gradient right?", "gradient: not audited", lambda s: check.gradient(s.loss, s.x), _audit),
-    ("Which method for which error?", "error against run time: not measured",
-     lambda s: workprec(**s.workprec) if s.workprec else None, _workprec),
-    ("How exact is the gradient, and how exact need the solves be?", "certificate: not made",
-     lambda s: certify(s.loss, s.x), _certificate),
-    ("What one gradient computes", "plan: not made", lambda s: explain(s.loss, s.x), _plan),
-    ("Stiff and extreme cases", "stress: not run", lambda s: stress(s.loss, s.x, **s.stress), _stress),
+    Chapter("audit", "Is the gradient right?", "gradient: not audited",
+            lambda s: check.gradient(s.loss, s.x), _audit, plots.v_curve),
+    Chapter("workprec", "Which method for which error?", "error against run time: not measured",
+            lambda s: workprec(**s.workprec) if s.workprec else None, _workprec),
+    Chapter("certificate", "How exact is the gradient, and how exact need the solves be?", "certificate: not made",
+            lambda s: certify(s.loss, s.x), _certificate),
+    Chapter("plan", "What one gradient computes", "plan: not made", lambda s: explain(s.loss, s.x), _plan),
+    Chapter("stress", "Stiff and extreme cases", "stress: not run",
+            lambda s: stress(s.loss, s.x, **s.stress), _stress),
 )  # fmt: skip
 
 
 def _details(folder):
-    names = sorted(
-        path.name for path in folder.iterdir() if path.suffix in (".md", ".csv", ".png") and path.name != PAGE
-    )
+    names = sorted({path.name for kind in ("md", "csv", "png") for path in folder.glob(f"*.{kind}")} - {PAGE})
     links = ", ".join(f"[{name}]({name})" for name in names)
     pictures = [f"![{name}]({name})" for name in names if name.endswith(".png")]
     return ["## Details", "", f"Tables and numbers: {links}", "", *pictures, ""]

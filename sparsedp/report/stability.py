@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.check.summary import Result, table
+from sparsedp.check.sweep import Point, joined
 from sparsedp.derivative import NO_JVP, pushforward
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
-from sparsedp.tape import is_variable
 from sparsedp.tree import flatten, leaves, norm
 
 __all__ = ["SEED", "STEADY", "Growth", "StabilityMap", "growth_of", "stability_map"]
@@ -70,44 +70,28 @@ def _first_rollout(loss, x):
 
 
 def _measured(advance, state):
-    rng = np.random.default_rng(SEED)
-    change = [np.asarray(rng.standard_normal(np.shape(leaf))) for leaf in _floating(state)]
-    size = norm(change) or 1.0
+    change = np.random.default_rng(SEED).standard_normal(Point(state).vector.size)
     logarithms, flips = [], []
     for _ in range(STEPS):
-        change = [part / size for part in change]
-        before = change
-        state, change = _pushed(advance, state, before)
+        before = change / (norm(change) or 1.0)
+        state, change = _pushed(advance, Point(state), before)
         size = norm(change)
         if size == 0 or not np.isfinite(size):
-            return Growth(0.0) if size == 0 else Growth(np.inf, flips=True)
+            return Growth(float(size), flips=size > 0)
         logarithms.append(np.log(size))
-        flips.append(sum(float(np.sum(a * b).real) for a, b in zip(before, change, strict=True)) < 0)
-    return Growth(float(np.exp(np.mean(logarithms[-SETTLED:]))), float(np.mean(flips[-SETTLED:])) > 0.5)
+        flips.append(before @ change < 0)
+    return Growth(float(np.exp(np.mean(logarithms[-SETTLED:]))), bool(np.mean(flips[-SETTLED:]) > 0.5))
 
 
-def _pushed(advance, state, change):
+def _pushed(advance, point, change):
     """(next state, change of it) for a change of the state."""
     try:
-        after, moved = pushforward(advance, state, _with(state, change))
-        return after, _floating(moved)
+        after, moved = pushforward(advance, point.tree(), point.tree(change))
+        return after, joined([np.asarray(leaf) for leaf in leaves(moved) if leaf is not None])
     except NO_JVP:  # a rule without a JVP
-        here = _floating(state)
-        t = SMALL * (norm(here) or 1.0)
-        after = advance(state)
-        other = advance(_with(state, [a + t * b for a, b in zip(here, change, strict=True)]))
-        return after, [(b - a) / t for a, b in zip(_floating(after), _floating(other), strict=True)]
-
-
-def _floating(state):
-    return [leaf for leaf in leaves(state) if is_variable(leaf)]
-
-
-def _with(state, parts):
-    """The tree of a state with other floating leaves."""
-    found, rebuild = flatten(state)
-    fresh = iter(parts)
-    return rebuild([next(fresh) if is_variable(leaf) else leaf for leaf in found])
+        t = SMALL * (norm(point.vector) or 1.0)
+        after, other = advance(point.tree()), advance(point.tree(point.vector + t * change))
+        return after, (Point(other).vector - Point(after).vector) / t
 
 
 class StabilityMap(Result):
@@ -131,7 +115,7 @@ class StabilityMap(Result):
 
     def to_dict(self):
         """The map as plain lists; None where the step is refused."""
-        factors = [[None if np.isnan(f) else float(f) for f in row] for row in self.factors]
+        factors = [[None if np.isnan(factor) else factor for factor in row] for row in self.factors.tolist()]
         return {"time_steps": self.time_steps.tolist(), "viscosities": self.viscosities.tolist(), "factors": factors}
 
     def __str__(self):

@@ -283,8 +283,8 @@ def _against_differences(scene, other, out):
     point, gradient = Point(scene.at(other)), joined([np.conj(g) for g in out.gradient])
     if not np.any(gradient):
         return PASSED, 0.0, "gradient 0"
-    direction = point.directions(gradient, 1, generator(SEED), ("random 1", "gradient"))[-1]
-    line = Line(*direction, point, gradient, Trials(scene.sheltered), out.value)
+    name, direction = point.directions(gradient, 1, generator(SEED), ("random 1", "gradient"))[-1]
+    line = Line(name, direction, point, gradient, Trials(scene.sheltered), out.value)
     wanted = abs(line.slope)
     if wanted <= UNSEEN * abs(out.value):
         return PASSED, 0.0, "the gradient is smaller than differences can see"

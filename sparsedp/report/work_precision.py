@@ -322,6 +322,11 @@ class Rows(Result):
         """What the files of `save` are called."""
         return self.scene.replace("/", "-")
 
+    @property
+    def judged(self):
+        """The error that methods are compared by: that of the gradient, where there is one."""
+        return "gradient_error" if self.pareto() else "forward_error"
+
     def seconds(self, row, error="gradient_error"):
         """The run time that belongs to an error: of the value, or of value and gradient."""
         return row["seconds_forward"] + (row["seconds_backward"] if error == "gradient_error" else 0.0)
@@ -396,8 +401,7 @@ class Rows(Result):
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        error = "gradient_error" if self.pareto() else "forward_error"
-        return write_table(folder, self.stem, self.markdown(), self.csv(), partial(self.plot, error=error))
+        return write_table(folder, self.stem, self.markdown(), self.csv(), partial(self.plot, error=self.judged))
 
     def __str__(self):
         table = text_table(*self._shown())
