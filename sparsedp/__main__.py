@@ -11,6 +11,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 REFUSED = 2  # exit code of a bad input, the same as argparse's
 INTERRUPTED = 130  # exit code of what Ctrl-C ends, the same as a shell's
@@ -20,8 +21,6 @@ LOOPS = [  # where loops are defined
     *(f"sparsedp.kernels.{name}" for name in "elimination fluxes interpolation projection reductions stencil".split()),
     "sparsedp.solvers.multigrid.loops",
 ]
-OUT = "where the results go (default: %(default)s)"
-SCENE = "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"
 
 
 def main(arguments=None):
@@ -64,41 +63,11 @@ def refuse(reason, code=REFUSED):
 def _parser():
     parser = Parser(prog="python -m sparsedp", description="Sparse differentiable physics.")
     rooms = parser.add_subparsers(required=True, metavar="command")
-    demo = rooms.add_parser(
-        "demo",
-        help="find the hidden ground under a real terrain from well readings",
-        description="Recover a hidden field from sensor readings by adjoint optimization, and check the gradient.",
-    )
-    demo.add_argument("--input", type=Path, metavar="FILE", help="a 2-D field as .npy, .npz or .png (default: terrain)")
-    demo.add_argument("--size", type=int, default=64, metavar="N", help="cells along the longest side (default: 64)")
-    demo.add_argument("--out", type=Path, default=Path("sparsedp-demo"), metavar="DIR", help=OUT)
-    demo.add_argument("--force", action="store_true", help="overwrite results of an earlier run")
-    demo.set_defaults(run=run_demo)
-    check = rooms.add_parser(
-        "check",
-        help="audit the gradient of a loss in a file",
-        description="Audit a gradient. Exit code: 0 agrees, 1 disagrees, 3 inconclusive, 2 refused, 130 interrupted.",
-    )
-    check.add_argument("scene", metavar="SCENE", help=SCENE)
-    check.add_argument("--quick", action="store_true", help="two directions only, for a loss that takes minutes")
-    check.set_defaults(run=run_check)
-    report = rooms.add_parser(
-        "report",
-        help="audit, plan, certificate, error against run time and stress of a loss in a file, in one folder",
-        description="All instruments on one scene. Exit code: 0 agrees, 1 disagrees or a case FAILED, "
-        "3 inconclusive, 2 refused, 130 interrupted. In the file, workprec_options and stress_options may hold dicts "
-        "of arguments.",
-    )
-    report.add_argument("scene", metavar="SCENE", help=SCENE)
-    report.add_argument("--out", type=Path, default=Path("sparsedp-report"), metavar="DIR", help=OUT)
-    report.add_argument("--force", action="store_true", help="overwrite an earlier report")
-    report.set_defaults(run=run_report)
-    loops = rooms.add_parser(
-        "compile",
-        help="compile all loops for this machine now, not at their first use",
-        description="Compile all loops and keep them on disk. Without numba there is nothing to compile.",
-    )
-    loops.set_defaults(run=run_compile)
+    for name, (run, words, arguments) in COMMANDS.items():
+        room = rooms.add_parser(name, help=words, description=words)
+        for argument in arguments.split():
+            room.add_argument(argument, **ARGUMENTS[argument])
+        room.set_defaults(run=run, out=Path(f"sparsedp-{name}"))
     return parser
 
 
@@ -170,6 +139,26 @@ def run_demo(options):
     except (ValueError, OSError, ImportError) as error:
         return refuse(error)
     return 0 if story.tell(hidden, options.out, options.force) else 1
+
+
+ARGUMENTS: dict[str, Any] = {
+    "scene": {"help": "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"},
+    "--input": {"type": Path, "metavar": "FILE", "help": "a 2-D field as .npy, .npz or .png (default: terrain)"},
+    "--size": {"type": int, "default": 64, "metavar": "N", "help": "cells along the longest side (default: 64)"},
+    "--out": {"type": Path, "metavar": "DIR", "help": "where the results go (default: %(default)s)"},
+    "--force": {"action": "store_true", "help": "overwrite results of an earlier run"},
+    "--quick": {"action": "store_true", "help": "two directions only, for a loss that takes minutes"},
+}
+COMMANDS = {  # what it runs, what it says of itself, its arguments
+    "demo": (run_demo, "find the hidden ground under a real terrain from well readings, by adjoint optimization",
+             "--input --size --out --force"),
+    "check": (run_check, "audit the gradient of a loss in a file. Exit code: 0 agrees, 1 disagrees, 3 inconclusive, "
+              "2 refused, 130 interrupted", "scene --quick"),
+    "report": (run_report, "audit, plan, certificate, error against run time and stress of a loss in a file, in one "
+               "folder; the file may hold dicts of arguments, workprec_options and stress_options. Exit code as check",
+               "scene --out --force"),
+    "compile": (run_compile, "compile all loops for this machine now, not at their first use", ""),
+}  # fmt: skip
 
 
 if __name__ == "__main__":
