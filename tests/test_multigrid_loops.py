@@ -19,20 +19,12 @@ GRIDS += [
 ]
 
 
-def level_of(shape, periodic, rng):
-    """A finest level with random coefficients, and its engine."""
-    from sparsedp.solvers.multigrid.levels import Level
-    from sparsedp.solvers.multigrid.spread import Spread
-
+def engine_of(shape, periodic, rng):
+    """The engine of a finest level with random coefficients."""
     grid = dp.Grid(shape, spacing=[rng.uniform(0.5, 2, n) for n in shape], periodic=periodic)
     faces = dp.diagonal(grid.faces, rng.uniform(0.1, 9.0, grid.faces.size))
     op = 0.3 * dp.identity(grid.cells) - dp.divergence(grid) @ faces @ dp.gradient(grid, dp.dirichlet)
-    engine = dp.inverse(op, "structured", precision="double").solver.engine
-    from sparsedp.solvers.multigrid.reading import stencil_of
-    from sparsedp.solvers.system import System
-
-    stencil, spread = stencil_of(System(op)), Spread(grid)
-    return Level(spread.natural(stencil, np.zeros(grid.cells.size, bool)), finest=True), engine
+    return dp.inverse(op, "structured", precision="double").solver.engine
 
 
 def matrix_of(function, rows, columns):
@@ -42,11 +34,12 @@ def matrix_of(function, rows, columns):
     )
 
 
-def dense(natural, extras=True):
-    """Natural -> its matrix."""
-    number = np.arange(natural.free.size).reshape(natural.shape)
-    matrix = np.diag(natural.extra.reshape(-1)) if extras else np.zeros((number.size,) * 2)
-    for links, step in zip(natural.links, natural.steps, strict=True):
+def dense(level, extras=True):
+    """Level -> its matrix."""
+    cells = level.layout.cells
+    number = np.arange(cells(level.extra).size).reshape(level.layout.shape)
+    matrix = np.diag(cells(level.extra).reshape(-1)) if extras else np.zeros((number.size,) * 2)
+    for links, step in zip(cells(level.links), level.steps, strict=True):
         there = np.roll(number, [-d for d in step], range(number.ndim))
         for i, j, a in zip(number.flat, there.flat, links.flat, strict=True):
             matrix[i, i], matrix[j, j] = matrix[i, i] + a, matrix[j, j] + a
@@ -54,63 +47,61 @@ def dense(natural, extras=True):
     return matrix
 
 
-def prolongation(level, weights):
-    """The weights as a matrix, by the definition of the tables."""
-    from sparsedp.solvers.multigrid.interpolation import Transfer
+def prolongation(level):
+    """The weights of black-box interpolation as a matrix."""
+    from sparsedp.solvers.multigrid.interpolation import Transfer, interpolated
 
-    layout = level.layout
-    colours, rows = range(len(layout.colours)), Transfer(layout, range(len(layout.colours))).rows
-    coarse = layout.wrap(layout.zeros(1))
+    layout, coarse = level.layout, level.layout.coarse()
+    transfer = Transfer(layout, coarse, interpolated(level)[0], 1)
 
-    def interpolated(values):
-        layout.cells(coarse[0], 0)[...] = values
-        layout.wrap(coarse)
-        field = layout.zeros(len(colours))
-        for weight, (colour, _, far) in zip(weights, rows, strict=False):
-            layout.body(field[colour])[:] += layout.body(weight) * layout.body(coarse[0], far)
-        return level.in_order(field)
+    def interpolated_field(values):
+        field = coarse.zeros()
+        coarse.cells(field)[...] = values
+        return layout.cells(transfer.prolong(coarse.wrap(field), layout.zeros()))
 
-    return matrix_of(interpolated, layout.shape, layout.halves)
+    return matrix_of(interpolated_field, layout.shape, coarse.shape), transfer
 
 
 @pytest.mark.parametrize("shape, periodic", GRIDS)
 def test_the_coarse_matrix_is_that_of_galerkin(shape, periodic, rng):
-    """Of the links; extras are summed up by rows, which keeps them on the diagonal."""
-    from sparsedp.solvers.multigrid.coarsening import Natural, coarsened
-    from sparsedp.solvers.multigrid.interpolation import interpolated
+    """Of the links; extras are summed up by rows, which keeps them on the diagonal. Twice: of 5 points, and of 9."""
+    level = engine_of(shape, periodic, rng).level
+    for _ in range(2):
+        P, _ = prolongation(level)
+        wanted = P.T @ dense(level, extras=False) @ P
+        extra = level.layout.cells(level.extra).reshape(-1)
+        level, _ = level.coarsened()
+        wanted += np.diag(P.T @ (extra * P.sum(axis=1)))
+        assert np.max(np.abs(dense(level) - wanted)) <= 1e-13 * np.max(np.abs(wanted))
 
-    level, _ = level_of(shape, periodic, rng)
-    layout, count = level.layout, len(level.layout.colours)
-    weights = interpolated(level)
-    P, found = prolongation(level, weights), coarsened(level, weights)
-    links = np.stack([level.in_order(level.links[m : m + count]) for m in range(0, len(level.links) - count, count)])
-    steps, nothing = np.eye(layout.dim, dtype=int), np.zeros(layout.shape)
-    extra = level.in_order(level.extra)
-    A = dense(Natural(layout.shape, layout.periodic, [tuple(s) for s in steps], links, extra, nothing), extras=False)
-    wanted = P.T @ A @ P + np.diag(P.T @ (extra.reshape(-1) * P.sum(axis=1)))
-    assert np.max(np.abs(dense(found) - wanted)) <= 1e-13 * np.max(np.abs(wanted))
+
+@pytest.mark.parametrize("shape, periodic", GRIDS)
+def test_restriction_is_the_transpose_of_interpolation(shape, periodic, rng):
+    level = engine_of(shape, periodic, rng).level
+    (P, transfer), layout, coarse = prolongation(level), level.layout, level.layout.coarse()
+
+    def restricted(values):
+        field = layout.zeros()
+        layout.cells(field)[...] = values
+        return coarse.cells(transfer.restrict(layout.wrap(field), coarse.zeros()))
+
+    assert np.max(np.abs(matrix_of(restricted, coarse.shape, layout.shape) - P.T)) <= 1e-14
 
 
 @pytest.mark.parametrize("shape, periodic", GRIDS)
 def test_the_cycle_is_symmetric_and_positive(shape, periodic, rng):
-    _, engine = level_of(shape, periodic, rng)
-    fine, layout = engine.fine, engine.fine.layout
-    red = np.zeros(layout.shape, bool)
-    for q in fine.red:
-        red[layout.natural(q)] = True
-    held = red & (engine.factors[1] > 0.0)
-    r, z = layout.zeros(2, len(fine.red))
+    engine = engine_of(shape, periodic, rng)
+    fine, layout = engine.fine, engine.layout
+    held = layout.cells(engine.level.root).reshape(-1) > 0.0
 
     def cycle(field):
-        layout.split(field, r, fine.red)
-        layout.wrap(r)
-        fine.x[...] = fine.over * r
-        fine.precondition(r, z, engine.sums)
-        out = np.zeros(layout.shape)
-        layout.merge(z, fine.red, out)
-        return out
+        fine.b[...] = 0.0
+        layout.cells(fine.b)[...] = field
+        layout.wrap(fine.b)
+        fine.cycle()
+        return layout.cells(fine.x)
 
-    M = matrix_of(cycle, layout.shape, layout.shape)[np.ix_(held.reshape(-1), held.reshape(-1))]
+    M = matrix_of(cycle, layout.shape, layout.shape)[np.ix_(held, held)]
     assert np.max(np.abs(M - M.T)) <= 1e-12 * np.max(np.abs(M))
     assert np.linalg.eigvalsh(M + M.T).min() > 0.0
 
@@ -120,20 +111,17 @@ def test_every_neighbour_is_where_the_layout_says(shape, rng):
     from sparsedp.solvers.multigrid.layout import Layout
 
     for periodic in product((False, True), repeat=len(shape)):
-        shape = tuple(n + n % 2 if flag else n for n, flag in zip(shape, periodic, strict=True))
-        layout, field = Layout(shape, periodic), rng.standard_normal(shape)
-        colours = range(len(layout.colours))
-        rows = layout.zeros(len(colours))
-        layout.split(field, rows, colours)
-        layout.wrap(rows)
+        layout, values = Layout(shape, periodic), rng.standard_normal(shape)
+        field = layout.zeros()
+        layout.cells(field)[...] = values
+        layout.wrap(field)
         for step in product((-1, 0, 1), repeat=len(shape)):
-            beside, shifted = layout.zeros(len(colours)), np.empty(shape)
-            for q in colours:
-                colour, far = layout.neighbour(q, step)
-                layout.body(beside[q])[:] = layout.body(rows[colour], far)
-            layout.merge(beside, colours, shifted)
-            wanted = np.roll(field, [-d for d in step], range(len(shape)))
+            shifted = layout.zeros()
+            shifted.reshape(-1)[layout.middle] = layout.beside(field, step)
+            wanted = np.roll(values, [-d for d in step], range(len(shape)))
             for axis, (n, d, flag) in enumerate(zip(shape, step, periodic, strict=True)):
                 if d and not flag:
                     np.moveaxis(wanted, axis, 0)[n - 1 if d > 0 else 0] = 0.0
-            assert np.array_equal(shifted, wanted)
+            assert np.array_equal(layout.cells(shifted), wanted)
+            second = layout.every_second(field, (0,) * len(shape), step)
+            assert np.array_equal(second, wanted[(slice(None, None, 2),) * len(shape)])

@@ -261,7 +261,7 @@ def test_cells_without_content_do_not_count_as_weak(n, rng):
 
 
 def test_anisotropy_is_refused_honestly_and_left_to_others(rng):
-    grid = dp.Grid((64, 64), size=(1.0, 1e4))
+    grid = dp.Grid((128, 128), size=(1.0, 1e4))
     op, b = conductance(grid, 1 + rng.random(grid.shape)), rng.standard_normal(grid.shape)
     with pytest.raises(dp.errors.ConvergenceError) as caught:
         dp.inverse(op, "structured")(b)

@@ -130,36 +130,40 @@ class Structured(Engine):
 
     def __init__(self, stencil, free, maxiter=None, dtype=np.float32):
         from sparsedp.solvers.multigrid import loops
+        from sparsedp.solvers.multigrid.layout import Layout
         from sparsedp.solvers.multigrid.levels import Level, hierarchy
         from sparsedp.solvers.multigrid.spread import Spread
 
         self.scale, self.maxiter, self.loops = stencil.scale, maxiter or MAXITER, loops
         self.spread = spread = Spread(stencil.grid)
         threads = kernels.threads() if prod(stencil.grid.shape) >= SERIAL else 1
-        level = Level(spread.natural(stencil, free), finest=True)
-        scale, root = level.in_order(level.scale), level.in_order(level.root)
-        level.weak -= spread.between(root)
-        self.fine, self.weak_share, self.hierarchy = hierarchy(level, spread.coarsenings, dtype, threads)
+        self.layout = layout = Layout(spread.shape, stencil.grid.periodic)
+        extra, flags = layout.zeros(), layout.zeros(dtype=bool)
+        spread.put(stencil.extra, layout.cells(extra))
+        spread.put(free.reshape(stencil.grid.shape), layout.cells(flags))
+        self.level = level = Level(layout, spread.links(stencil, layout), extra, layout.wrap(flags), dtype, threads)
+        level.weak = spread.taken(level.weak)
+        self.fine, self.weak_share, self.hierarchy = hierarchy(level, spread.coarsenings)
         self.hierarchy += ", cycle in double precision" if dtype == np.float64 else ""
         volumes, filled = spread.volumes()
+        scale, root = layout.cells(level.scale), layout.cells(level.root)
         self.factors = scale * volumes, scale  # what a right-hand side of A, and of its transpose, is multiplied with
         gauges = root / filled, root  # how a scaled residual measures in the user's cells, but for a number
         self.tops = tuple((float(gauge.max(initial=0.0)) or 1.0) / abs(self.scale) for gauge in gauges)
         self.norm = 2.0 * float(np.max(gauges[0] * root, initial=0.0)) / abs(self.scale)
-        layout, red = self.fine.layout, self.fine.red
-        self.gauges = layout.zeros(2, len(red), dtype=dtype)
-        for rows, gauge, top in zip(self.gauges, gauges, self.tops):
-            layout.split(gauge / (top * abs(self.scale)), rows, red)
-        self.vectors = layout.zeros(4, len(red))  # x, r, q, and the right-hand side of the black cells
-        self.light = layout.zeros(3, len(red), dtype=dtype)  # z and two directions
-        self.sums, self.field = np.zeros(layout.halves[0]), np.zeros(spread.shape)
+        self.gauges = layout.zeros(2, dtype=dtype)
+        for field, gauge, top in zip(self.gauges, gauges, self.tops):
+            layout.cells(field)[...] = gauge / (top * abs(self.scale))
+        self.vectors = layout.zeros(3)  # x, r, q
+        self.directions = layout.zeros(2, dtype=dtype)
+        self.sums = np.zeros(layout.shape[0])
         self.lock = threading.Lock()
 
-    def couple(self, x, out, tables):
-        """out += c x."""
-        rows = tables.shape[1]
-        ends = np.arange(len(tables))[:, None] * rows + np.array([0, rows])
-        self.fine.run(self.loops.couple, self.fine.double, x, out, tables.reshape(-1, 4), ends, self.fine.layout.sizes)
+    def run(self, loop, *arguments):
+        """A loop on all planes, in the precision of the cycle."""
+        loop = loop.single if self.level.dtype == np.float32 else loop
+        flat = (array.reshape(-1) if np.ndim(array) > 1 else array for array in arguments)
+        loop.run(self.layout.shape[0], self.sums.size * self.layout.sizes[0], self.level.threads, *flat)
 
     def solve(self, b, goal, transposed):
         with self.lock:
@@ -176,22 +180,18 @@ class _Run:
     """
 
     def __init__(self, engine, b, goal, transposed):
-        self.engine, self.fine, self.transposed = engine, engine.fine, transposed
+        self.engine, self.layout, self.transposed = engine, engine.layout, transposed
         self.data, self.gauge, self.top = norm(b), engine.gauges[int(transposed)], engine.tops[transposed]
         self.unit = 2.0 ** (np.frexp(self.data)[1] - np.frexp(self.top)[1])
         self.goal = SURE * goal / (self.unit * self.top)
-        self.x, self.r, self.q, self.black = engine.vectors
-        self.z, self.p, self.old = engine.light
-        for vector in (self.x, self.q, self.p, self.old):
+        self.x, self.r, self.q = engine.vectors
+        self.p, self.old = engine.directions
+        for vector in (self.x, self.r, self.q, self.p, self.old):
             vector[...] = 0.0
-        fine, layout, field = self.fine, self.fine.layout, engine.field
+        field = self.layout.cells(self.r)
         engine.spread.put(b.reshape(engine.spread.grid.shape), field)
         field *= engine.factors[transposed]
         field *= engine.scale / self.unit
-        layout.split(field, self.black, fine.black)
-        layout.split(field, self.r, fine.red)
-        engine.couple(layout.wrap(self.black), self.r, fine.to_red)
-        layout.wrap(self.r)
         self.step(0.0)
 
     def iterate(self):
@@ -223,25 +223,23 @@ class _Run:
 
     def precondition(self):
         """z = M r -> r . z."""
-        self.fine.precondition(self.r, self.z, self.engine.sums)
-        return float(self.engine.sums.sum())
+        self.engine.fine.cycle()
+        return float(self.engine.fine.sums.sum())
 
     def direct(self, beta):
         """The next direction p and its image q -> p . q. x catches up with the last step."""
-        fine, loops, sums = self.fine, self.engine.loops, self.engine.sums
-        sizes = fine.layout.sizes
+        engine = self.engine
         self.p, self.old = self.old, self.p
-        fine.run(loops.advance, self.x, self.p, self.old, self.z, sizes, self.alpha, beta)
-        tables = fine.to_black, fine.to_red
-        fine.run(loops.image, fine.double, self.p, self.p, self.q, *tables, sizes, sums, 1.0, -1.0, 0.0)
-        return float(sums.sum())
+        advance = engine.loops.advance
+        engine.run(advance, self.x, self.p, self.old, engine.fine.x, self.layout.sizes, self.alpha, beta)
+        engine.level.apply(self.p, self.q, engine.sums)
+        return float(engine.sums.sum())
 
     def step(self, alpha):
         """r -= alpha q -> its size."""
-        self.alpha, fine, sums = alpha, self.fine, self.engine.sums
-        fine.run(
-            self.engine.loops.update, self.r, self.q, fine.x, self.gauge, fine.layout.sizes, sums, alpha, fine.over
-        )
+        self.alpha, engine, sums = alpha, self.engine, self.engine.sums
+        update = engine.loops.update
+        engine.run(update, self.r, self.q, engine.fine.b, self.gauge, self.layout.sizes, sums, alpha)
         return float(np.sqrt(sums.sum()))
 
     def rounding(self):
@@ -254,12 +252,7 @@ class _Run:
 
     def solution(self):
         """x as a flat field."""
-        engine, fine, layout, field = self.engine, self.fine, self.fine.layout, self.engine.field
         self.x += self.alpha * self.p
-        engine.couple(layout.wrap(self.x), self.black, fine.to_black)
-        layout.merge(self.x, fine.red, field)
-        layout.merge(self.black, fine.black, field)
+        engine, field = self.engine, self.layout.cells(self.x)
         field *= engine.factors[not self.transposed]
-        out = engine.spread.taken(field) * self.unit
-        field[...] = 0.0
-        return out.reshape(-1)
+        return (engine.spread.taken(field) * self.unit).reshape(-1)

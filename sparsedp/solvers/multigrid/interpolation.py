@@ -11,104 +11,112 @@ from itertools import product
 
 import numpy as np
 
+from sparsedp.solvers.multigrid import loops
+
 __all__ = ["Transfer", "interpolated"]
 
 WEAK = 1e-10  # a cell held by less than this share of its diagonal is not interpolated
 
 
 class Transfer:
-    """How the cells of some colours take from the coarse cells around.
-
-    Attributes
-    ----------
-    rows : list of (colour, corner, distance)
-        For each weight the cell and the coarse cell. The weight of a coarse cell on itself is kept as one half and
-        used twice, so that all tables have an even number of rows.
-    up, ends : int64 arrays
-        Table of interpolation, and where it begins and ends for each of the colours.
-    down : int64 array
-        Table of restriction, its transpose.
-    """
-
-    def __init__(self, layout, colours):
-        self.rows: list = []
-        up: list = []
-        ends: list = []
-        down: list = []
-        for m, colour in enumerate(colours):
-            kind, first = layout.colours[colour], len(up)
-            for corner in product(*(range(1 + p) for p in kind)):
-                far = sum(s * pitch for s, pitch in zip(corner, layout.pitch))
-                for _ in range(1 if any(kind) else 2):
-                    up.append((len(self.rows), 0, 0, far))
-                    down.append((len(self.rows), -far, m, -far))
-                self.rows.append((colour, corner, far))
-            ends.append((first, len(up)))
-        self.up, self.ends, self.down = np.array(up), np.array(ends), np.array(down)
-
-    def scaled(self, weights, level, coarse, stretch, dtype):
-        """The weights of all colours -> those of these colours, of the levels scaled to a unit diagonal."""
-        layout = level.layout
-        numbers = {row: n for n, row in enumerate(Transfer(layout, range(len(layout.colours))).rows)}
-        out = layout.zeros(len(self.rows), dtype=dtype)
-        for row, (colour, corner, far) in zip(out, self.rows):
-            value = layout.body(weights[numbers[colour, corner, far]]) * layout.body(coarse, far)
-            value *= layout.body(level.root[colour])
-            layout.body(row)[:] = value * (stretch if colour else 0.5 * stretch)
-        return layout.wrap(out)
-
-
-def interpolated(level):
-    """Level -> weights of all cells on the coarse ones, and what their sums miss to 1: exactly 0 where nothing is held.
+    """Interpolation from a coarse grid, and restriction, its transpose.
 
     Parameters
     ----------
-    level : Level
-
-    Returns
-    -------
-    array
-        The weights, in the order of `Transfer.rows`; a row of 0; what is missing, a row for each colour.
+    fine, coarse : Layout
+    weights : array
+        For each of the steps around a coarse cell a field of coarse cells: their weights on the fine cells there.
+    threads : int
     """
-    layout = level.layout
-    rows = Transfer(layout, range(len(layout.colours))).rows
-    number = {(layout.colours[colour], corner): n for n, (colour, corner, _) in enumerate(rows)}
-    weights = layout.zeros(len(rows) + 1 + len(layout.colours))
-    missing = weights[len(rows) + 1 :]
-    layout.cells(weights[0], 0)[...] = 1.0
-    layout.wrap(weights[0])
-    for colour in sorted(range(1, len(layout.colours)), key=lambda q: sum(layout.colours[q])):
-        kind = layout.colours[colour]
-        shares = _shares(level, colour)
-        lost = layout.body(level.extra[colour])
+
+    def __init__(self, fine, coarse, weights, threads):
+        self.fine, self.coarse, self.threads = fine, coarse, threads
+        self.weights = weights.reshape(len(weights), -1)
+        steps, rows = _around(fine.dim), []
+        self.steps = np.array(steps) @ fine.pitch
+        self.ends = np.zeros(9, np.int64)
+        for kind, parities in enumerate(product((0, 1), repeat=3)):
+            parities = parities[:: 4 - fine.dim]  # the loop has three axes; in 2-D there are no odd lines in a plane
+            for number, step in enumerate(steps):
+                if tuple(np.abs(step)) == parities:
+                    corner = (np.array(parities) - step) // 2
+                    rows.append((number, corner @ coarse.pitch))
+            self.ends[kind + 1] = len(rows)
+        self.table = np.array(rows)
+
+    def _run(self, loop, layout, *arguments):
+        loop = loop.single if self.weights.dtype == np.float32 else loop
+        sizes = self.fine.sizes, self.coarse.sizes
+        loop.run(layout.shape[0], self.fine.sizes[0] * self.fine.shape[0], self.threads, *arguments, *sizes)
+
+    def restrict(self, r, out):
+        """out = P^T r; r has its ghost cells filled."""
+        self._run(loops.restrict, self.coarse, self.weights, r.reshape(-1), out.reshape(-1), self.steps)
+        return out
+
+    def prolong(self, e, x):
+        """x += P e; e has its ghost cells filled."""
+        self._run(loops.prolong, self.fine, self.weights, e.reshape(-1), x.reshape(-1), self.table, self.ends)
+        return x
+
+
+def _around(dim):
+    """A cell and all around it, as steps."""
+    return list(product((-1, 0, 1), repeat=dim))
+
+
+def interpolated(level):
+    """Level -> the weights of `Transfer`, and a field: what their sums miss to 1, exactly 0 where nothing is held."""
+    layout, coarse = level.layout, level.layout.coarse()
+    steps = _around(layout.dim)
+    weights, missing = coarse.zeros(len(steps)), layout.zeros()
+    number = {step: m for m, step in enumerate(steps)}
+    coarse.cells(weights[number[(0,) * layout.dim]])[...] = 1.0
+    coarse.wrap(weights)
+    for kind in sorted(product((0, 1), repeat=layout.dim), key=sum)[1:]:
+        sides = [step for step in steps if tuple(map(abs, step)) == kind]  # of the coarse cells around
+        shares = _shares(level, kind)
+        lost = layout.every_second(level.extra, kind)
         total = sum(shares.values(), lost)
-        held = total > WEAK * layout.body(level.root[colour]) ** 2
+        held = total > WEAK * layout.every_second(level.root, kind) ** 2
         factor = np.divide(1.0, total, out=np.zeros_like(total), where=held)
         lost = np.where(held, lost * factor, 1.0)
         for offset, share in shares.items():
             share *= factor
-            beside, far = layout.neighbour(colour, offset)
-            other = layout.colours[beside]
-            for corner in product(*(range(1 + p) for p in other)):
-                own = tuple(s + (1 + d) // 2 if p else 0 for s, d, p in zip(corner, offset, kind))
-                out, given = layout.body(weights[number[kind, own]]), layout.body(weights[number[other, corner]], far)
-                out += share * given if any(other) else share
-            lost += share * layout.body(missing[beside], far)
-        layout.body(missing[colour])[:] = lost
-        first = number[kind, (0,) * layout.dim]
-        layout.wrap(weights[first : first + 2 ** sum(kind)])
-        layout.wrap(missing[colour])
-    return weights
+            lost += share * layout.every_second(missing, kind, offset)
+            for side in sides:
+                if all(d in (0, -s) for d, s in zip(offset, side)):
+                    near = tuple(0 if d else s for d, s in zip(offset, side))  # seen from the neighbour
+                    # the coarse cells on this side of the cells
+                    corner = tuple(
+                        slice(ghosts + (s < 0), ghosts + (s < 0) + n)
+                        for ghosts, s, n in zip(coarse.before, side, share.shape)
+                    )
+                    weights[(number[side], *corner)] += share * weights[(number[near], *corner)]
+        layout.every_second(missing, kind)[...] = lost
+        layout.wrap(missing)
+        for side in sides:
+            _fold(coarse, weights[number[side]], side)
+    return weights, missing
 
 
-def _shares(level, colour):
-    """The links of the cells of a colour, those along even axes summed up: by the offset that is left."""
-    layout, kind = level.layout, level.layout.colours[colour]
+def _fold(layout, weight, side):
+    """Weights on cells below a coarse one were written one line too far at the end of periodic axes."""
+    for axis, (ghosts, n, flag) in enumerate(zip(layout.before, layout.shape, layout.periodic)):
+        lines = np.moveaxis(weight, axis, 0)
+        if flag and side[axis] < 0:
+            lines[ghosts] = lines[ghosts + n]
+    layout.wrap(weight)
+
+
+def _shares(level, kind):
+    """The links of the cells of a kind, those along even axes summed up: by the offset that is left."""
     shares: dict = {}
-    first, _, last = level.ends[colour]
-    for (link, shift, _, _), step in zip(level.near[first:last], level.steps[first:last]):
-        offset = tuple(d * p for d, p in zip(step, kind))
-        if any(offset):
-            a = layout.body(level.links[link], shift)
-            shares[offset] = shares[offset] + a if offset in shares else a.copy()
+    for link, step in zip(level.links, level.steps):
+        back = tuple(-d for d in step)
+        for there, place in ((step, (0,) * len(step)), (back, back)):
+            offset = tuple(d * p for d, p in zip(there, kind))
+            if any(offset):
+                a = level.layout.every_second(link, kind, place)
+                shares[offset] = shares[offset] + a if offset in shares else a.copy()
     return shares

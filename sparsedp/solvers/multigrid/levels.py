@@ -1,19 +1,23 @@
-"""The levels of the structured multigrid: a matrix as links between cells, and its scaling to a unit diagonal."""
+"""The levels of the structured multigrid: their matrices, Galerkin's coarse ones, and the cycle through them."""
 
+from itertools import product
 from math import prod
-from typing import Any
 
 import numpy as np
 
-from sparsedp.solvers.multigrid.coarsening import coarsened
-from sparsedp.solvers.multigrid.cycle import Coarse, Coarsest, Finest
-from sparsedp.solvers.multigrid.interpolation import interpolated
-from sparsedp.solvers.multigrid.layout import Layout
-from sparsedp.solvers.multigrid.smoother import links_around
+from sparsedp.solvers.contract import norm
+from sparsedp.solvers.multigrid import loops
+from sparsedp.solvers.multigrid.interpolation import Transfer, interpolated
+from sparsedp.solvers.multigrid.layout import axis_steps, steps_around
+from sparsedp.solvers.multigrid.reading import numbered
 
-__all__ = ["Level", "hierarchy"]
+__all__ = ["COARSEST", "Level", "hierarchy"]
 
-STRETCH = {2: 1.0, 3: 1.08}  # of the correction of the finest level: in 3-D it does what a second visit would
+COARSEST = 100  # cells that are solved by a dense matrix
+RANK = 1e-14  # eigenvalues below, of a matrix with a unit diagonal, are 0
+ROUNDING = 1e-10  # share of the diagonal below which an extra is rounding
+SMOOTHED = 4.0  # the smoother damps the eigenvalues from the largest one to this part of it
+POWERS, MARGIN = 10, 1.1  # steps of power iteration, and what they may miss: the smoother converges up to 1.25
 WEAK = 0.1  # a cell is weak along an axis that holds it with less than this share of another one
 EXAMINED = 1000  # cells of the smallest level that is examined
 
@@ -23,93 +27,201 @@ class Level:
 
     Parameters
     ----------
-    natural : Natural
-    finest : bool
-
-    Attributes
-    ----------
-    near, ends, steps_of
-        See `links_around`.
-    root, scale : arrays
-        Root of the diagonal, and one over it; 0 where there is no unknown.
-    weak : int
-        Number of cells that are held much weaker along one axis than along another.
-    """
-
-    def __init__(self, natural, finest=False):
-        self.layout = layout = Layout(natural.shape, natural.periodic)
-        count = len(layout.colours)
-        self.links = layout.zeros((len(natural.links) + 1) * count)
-        links, self.extra = self.links[:-count], self.links[-count:]
-        self.finest, self.free = finest, layout.zeros(count, dtype=bool)
-        for m, part in enumerate(natural.links):
-            layout.split(part, links[m * count : (m + 1) * count], range(count))
-        layout.split(np.where(natural.free, 0.0, natural.extra), self.extra, range(count))
-        layout.split(natural.free, self.free, range(count))
-        layout.wrap(links)
-        self.near, self.ends, self.steps = links_around(layout, natural.steps)
-        self.root, self.scale = layout.zeros(count), layout.zeros(count)
-        self.weak = 0
-        for q, (first, _, last) in enumerate(self.ends):
-            rows = layout.zeros(1 + layout.dim)
-            total, *held = layout.body(rows)
-            total += layout.body(self.extra[q])
-            for (link, shift, _, _), step in zip(self.near[first:last], self.steps[first:last]):
-                a = layout.body(links[link], shift)
-                total += a
-                for own, d in zip(held, step):
-                    if d:
-                        own += a
-            total, *held = (layout.cells(row, q) for row in rows)
-            self.weak += int(np.count_nonzero(np.minimum.reduce(held) < WEAK * np.maximum.reduce(held)))
-            root = layout.cells(self.root[q], q)
-            np.sqrt(np.maximum(total, 0.0), out=root)
-            np.divide(1.0, root, out=layout.cells(self.scale[q], q), where=root > 0.0)
-        layout.wrap(self.root), layout.wrap(self.scale)
-
-    def coupling(self, q, at):
-        """Row `at` of `near`, of the cells of colour q, in the matrix with a unit diagonal."""
-        link, shift, other, far = self.near[at]
-        body = self.layout.body
-        return body(self.links[link], shift) * body(self.scale[q]) * body(self.scale[other], far)
-
-    def in_order(self, rows):
-        """A field in natural order."""
-        out = np.empty(self.layout.shape)
-        self.layout.merge(rows, range(len(rows)), out)
-        return out
-
-    @property
-    def weak_share(self):
-        """Share of the cells that are held much weaker along one axis than along another; of few cells 0."""
-        cells = prod(self.layout.shape)
-        return self.weak / cells if cells >= EXAMINED else 0.0
-
-
-def hierarchy(level, coarsenings, dtype, threads):
-    """The finest level -> Finest, which knows the level below it, and so on; largest share of weak cells; words.
-
-    Parameters
-    ----------
-    level : Level
-    coarsenings : int
-        Number of levels below.
+    layout : Layout
+    links : array
+        For each of the steps a field of a. Ghost cells are filled here.
+    extra : field
+    free : field of bool
+        Cells of singular components, which nothing holds.
     dtype : float32 or float64
         Type of the cycle.
     threads : int
+
+    Attributes
+    ----------
+    root, scale : fields
+        Root of the diagonal, and one over it; 0 where there is no unknown.
+    coupling : array
+        The links of the matrix scaled to a unit diagonal, in double precision.
+    weak : field of bool
+        Cells that are held much weaker along one axis than along another.
     """
-    layout, share = level.layout, level.weak_share
-    first = Finest(level, dtype, threads)
-    above: Any = first
-    for number in range(coarsenings):
-        weights = interpolated(level)
-        natural = coarsened(level, weights)
-        stretch = 1.0 if number else STRETCH[layout.dim] ** 0.5  # there and back
-        if number + 1 == coarsenings:
-            above.connect(level, weights, Coarsest(natural, above.layout, dtype), stretch)
-        else:
-            held, level = level, Level(natural)
-            above.connect(held, weights, Coarse(level, above.layout, dtype, threads), stretch)
-            above, share = above.below, max(share, level.weak_share)
-    top, bottom = (" x ".join(map(str, shape)) for shape in (layout.shape, natural.shape))
-    return first, share, f"{coarsenings + 1} levels, {top} to {bottom}"
+
+    def __init__(self, layout, links, extra, free, dtype, threads):
+        self.layout, self.dtype, self.threads = layout, dtype, threads
+        self.links, self.extra, self.free = layout.wrap(links), extra, free
+        self.steps = axis_steps(layout.dim) if len(links) == layout.dim else steps_around(layout.dim)
+        self.pitches = np.array(self.steps) @ layout.pitch
+        held, size, self.root, self.scale = layout.zeros(layout.dim), layout.zeros(), layout.zeros(), layout.zeros()
+        total, middle = np.where(free, 0.0, extra), layout.middle
+        for link, step in zip(self.links, self.steps):
+            for a in (link.reshape(-1)[middle], layout.beside(link, [-d for d in step])):
+                total.reshape(-1)[middle] += a
+                size.reshape(-1)[middle] += np.abs(a)
+                for axis in np.flatnonzero(step):
+                    held[axis].reshape(-1)[middle] += a
+        self.extra = np.where(free, 0.0, extra)
+        layout.cells(self.root)[...] = np.sqrt(np.maximum(layout.cells(total), 0.0))
+        np.divide(1.0, self.root, out=self.scale, where=self.root > 0.0)
+        layout.wrap(self.root), layout.wrap(self.scale)
+        self.weak = layout.cells(held.min(axis=0) < WEAK * held.max(axis=0))
+        self.coupling = np.zeros((len(links), self.root.size))
+        for out, link, step in zip(self.coupling, self.links, self.steps):
+            out[middle] = link.reshape(-1)[middle] * self.scale.reshape(-1)[middle] * layout.beside(self.scale, step)
+        layout.wrap(self.coupling.reshape(links.shape))
+        self.bound = 1.0 + float(np.max(size * self.scale**2))  # no eigenvalue is larger (Gershgorin)
+
+    @property
+    def weak_share(self):
+        """Share of the cells that are weak; of few cells 0."""
+        return np.count_nonzero(self.weak) / self.weak.size if self.weak.size >= EXAMINED else 0.0
+
+    def apply(self, x, out, sums=None):
+        """out = A x with a unit diagonal, in double precision; x has its ghost cells filled. x . out to sums."""
+        sums = np.zeros(self.layout.shape[0]) if sums is None else sums
+        image = loops.image.single if x.dtype == np.float32 else loops.image
+        arrays = self.coupling, x.reshape(-1), out.reshape(-1)
+        image.run(self.layout.shape[0], x.size, self.threads, *arrays, self.pitches, self.layout.sizes, sums)
+        return self.layout.wrap(out)
+
+    def largest(self):
+        """The largest eigenvalue of A with a unit diagonal: a bound if no link is negative, else by power iteration."""
+        if self.bound <= 2.0 + ROUNDING and len(self.links) == self.layout.dim:
+            return self.bound
+        x, y, size = *self.layout.zeros(2), 1.0
+        self.layout.cells(x)[...] = np.random.default_rng(0).standard_normal(self.layout.shape)
+        for _ in range(POWERS):
+            self.apply(self.layout.wrap(x), y)
+            size = norm(self.layout.cells(y).reshape(-1))
+            x, y = y / (size or 1.0), x
+        return min(self.bound, MARGIN * size)
+
+    def coarsened(self):
+        """The next level: Galerkin's P^T A P."""
+        layout, coarse = self.layout, self.layout.coarse()
+        weights, missing = interpolated(self)
+        for weight, step in zip(weights, product((-1, 0, 1), repeat=layout.dim)):
+            coarse.cells(weight)[...] *= layout.every_second(self.root, (0,) * layout.dim, step)
+        coarse.wrap(weights)
+        transfer = Transfer(layout, coarse, weights, self.threads)
+        # the image of the constant: of its missing part only, so that nothing is added up that cancels
+        y = self.scale * self.extra - self.apply(self.root * missing, layout.zeros())
+        extra = transfer.restrict(layout.wrap(y), coarse.zeros())
+        links = self._probed(transfer)
+        inside = [(flags & (self.root > 0.0)).astype(float) for flags in (self.free, ~self.free)]
+        sizes = Transfer(layout, coarse, np.abs(weights), self.threads)
+        free, tied = (sizes.restrict(flags, coarse.zeros()) > 0.0 for flags in inside)
+        free &= ~tied
+        _without_negative(coarse, links, extra, free)
+        level = Level(coarse, links, extra, free, self.dtype, self.threads)
+        return level, Transfer(layout, coarse, (weights * level.scale).astype(self.dtype), self.threads)
+
+    def _probed(self, transfer):
+        """The links of P^T A P, from its action on cells that are three apart."""
+        layout, coarse = self.layout, transfer.coarse
+        lines = [numbered(n, flag) for n, flag in zip(coarse.shape, coarse.periodic)]
+        counts = [int(line.max()) + 1 for line in lines]
+        colours, steps = np.full(coarse.padded, -1), steps_around(coarse.dim)
+        coarse.cells(colours)[...] = np.ravel_multi_index(np.ix_(*lines), counts)
+        coarse.wrap(colours)
+        links, x, y, z = coarse.zeros(len(steps)), layout.zeros(), layout.zeros(), coarse.zeros()
+        flat, middle = links.reshape(len(steps), -1), coarse.middle
+        held = layout.wrap(self.extra * self.scale**2)  # extras are summed up by rows: they stay on the diagonal
+        for colour in range(prod(counts)):
+            x[...] = 0.0
+            transfer.prolong((colours == colour).astype(float), x)
+            y = self.apply(x, y)
+            y -= np.multiply(held, x, out=x)
+            transfer.restrict(y, z)
+            for link, step in zip(flat, steps):
+                np.copyto(link[middle], -z.reshape(-1)[middle], where=coarse.beside(colours, step) == colour)
+        for link, step in zip(links, steps):
+            around = [n for d, n, flag in zip(step, coarse.shape, coarse.periodic) if d and flag]
+            link *= 0.0 if 1 in around else 0.5 ** around.count(2)  # a cell itself; a cell on both sides
+        return links
+
+
+def _without_negative(layout, links, extra, free):
+    """No link below 0 at a free cell that loses an extra of its own.
+
+    A fine cell beside an obstacle that cannot be interpolated along its axis has no weights, and the constant is
+    then not carried exactly: Galerkin's product has an extra where the matrix has none. It is left out, so that the
+    coarse matrix has the same null vector; with links >= 0 around it, it stays without negative eigenvalues.
+    """
+    lost = layout.wrap(free & (np.abs(extra) > ROUNDING * np.abs(links).sum(axis=0)))
+    for link, step in zip(links if lost.any() else (), steps_around(layout.dim)):
+        flat = link.reshape(-1)[layout.middle]
+        touched = lost.reshape(-1)[layout.middle] | layout.beside(lost, step)
+        flat[touched & (flat < 0.0)] = 0.0
+
+
+class Smoothed:
+    """A level in the cycle, with a smoother: Chebyshev's polynomial of degree 2.
+
+    Attributes
+    ----------
+    b, x : fields
+        Right-hand side and solution, with ghost cells filled.
+    """
+
+    def __init__(self, level):
+        self.layout, self.threads, self.pitches = level.layout, level.threads, level.pitches
+        self.coupling = level.coupling.astype(level.dtype, copy=False)
+        self.b, self.x, self.r = self.layout.zeros(3, dtype=level.dtype)
+        self.sums = np.zeros(self.layout.shape[0])
+        middle, radius = (level.largest() / 2.0) * (1.0 + np.array([1.0, -1.0]) / SMOOTHED)
+        one, two = 1.0 / (middle + np.array([1.0, -1.0]) * np.sqrt(0.5) * radius)
+        # x = two steps of damped Jacobi from zero, of which the first is a number times b; then its residual
+        self.down = np.array([(0.0, one + two - one * two, one * two), (-1.0, 1.0, 1.0)], level.dtype)
+        self.up = np.array([(1.0 - one, one, one), (1.0 - two, two, two)], level.dtype)
+
+    def _smooth(self, x, between, out, factors):
+        smooth = loops.smooth.single if out.dtype == np.float32 else loops.smooth
+        arrays = (field.reshape(-1) for field in (x, self.b, between, out))
+        tables = factors, self.pitches, self.layout.sizes, self.sums
+        smooth.run(self.layout.shape[0], out.size, self.threads, self.coupling, *arrays, *tables)
+
+    def cycle(self):
+        """x = what a V-cycle makes of b; b . x to sums."""
+        self._smooth(self.b, self.x, self.r, self.down)
+        self.layout.wrap(self.x)
+        self.transfer.restrict(self.r, self.below.b)
+        self.below.cycle()
+        self.transfer.prolong(self.below.x, self.x)
+        self._smooth(self.x, self.x[:0], self.r, self.up)
+        self.x, self.r = self.r, self.x
+
+
+class Coarsest:
+    """The level that is solved by a dense matrix."""
+
+    def __init__(self, level):
+        self.layout, cells = level.layout, level.layout.cells
+        self.b, self.x = self.layout.zeros(2, dtype=level.dtype)
+        columns, unit, image = [], *self.layout.zeros(2)
+        for number in np.ndindex(*self.layout.shape):
+            cells(unit)[...] = 0.0
+            cells(unit)[number] = 1.0
+            columns.append(cells(level.apply(self.layout.wrap(unit), image)).flatten())
+        values, vectors = np.linalg.eigh(np.array(columns))
+        kept = np.abs(values) > RANK  # not the null vectors, nor those of cells whose weights depend on each other
+        self.inverse = ((vectors[:, kept] / values[kept]) @ vectors[:, kept].T).astype(level.dtype)
+
+    def cycle(self):
+        """x = what solves b."""
+        b, x = self.layout.cells(self.b), self.layout.cells(self.x)
+        x[...] = (self.inverse * b.reshape(-1)).sum(axis=1).reshape(x.shape)
+        self.layout.wrap(self.x)
+
+
+def hierarchy(level, coarsenings):
+    """The finest level, number of those below -> (Smoothed, which knows the level below it, and so on; shapes)."""
+    first = above = Smoothed(level)
+    shares = [level.weak_share]
+    for number in range(coarsenings, 0, -1):
+        level, above.transfer = level.coarsened()
+        above.below = Smoothed(level) if number > 1 else Coarsest(level)
+        above = above.below
+        shares.append(level.weak_share)
+    top, bottom = (" x ".join(map(str, layout.shape)) for layout in (first.layout, above.layout))
+    return first, max(shares), f"{coarsenings + 1} levels, {top} to {bottom}"

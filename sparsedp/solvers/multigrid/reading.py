@@ -9,7 +9,7 @@ import numpy as np
 from sparsedp.solvers.multigrid.stencil import Stencil, Unfit, cleaned
 from sparsedp.structure.explicit import Matrix
 
-__all__ = ["stencil_of"]
+__all__ = ["numbered", "stencil_of"]
 
 AGREES = 1e-12  # relative difference to the operator on a random field that is taken for rounding
 
@@ -107,13 +107,13 @@ def _colours(grid):
         return sum((axis + 1) * place for axis, place in enumerate(places)) % many, many
     total, count = np.zeros(grid.shape, int), 1
     for axis, (n, flag) in enumerate(zip(grid.shape, grid.periodic)):
-        line = _line(n, flag)
+        line = numbered(n, flag)
         total += count * line.reshape([-1 if a == axis else 1 for a in range(grid.dim)])
         count *= int(line.max(initial=0)) + 1
     return total, count
 
 
-def _line(n, periodic):
+def numbered(n, periodic):
     """Numbers for the cells of an axis so that any three in a row differ, around the end of a periodic one too."""
     if not periodic or n % 3 == 0:
         return np.arange(n) % 3

@@ -11,9 +11,7 @@ from math import ceil, log2, prod
 
 import numpy as np
 
-from sparsedp.solvers.multigrid.coarsening import Natural
-from sparsedp.solvers.multigrid.coarsest import COARSEST
-from sparsedp.solvers.multigrid.smoother import axis_steps
+from sparsedp.solvers.multigrid.levels import COARSEST
 
 __all__ = ["Spread"]
 
@@ -73,13 +71,6 @@ class Spread:
         filled = [np.where(w > 0, w, np.minimum(np.roll(w, 1), np.roll(w, -1))) for w in found]
         return tuple(reduce(np.multiply.outer, lines) for lines in (found, filled))
 
-    def between(self, root):
-        """How many cells without content have an equation.
-
-        They are linked along one axis only, which slows nothing down: they are not weak.
-        """
-        return sum(np.count_nonzero(np.compress(w == 0, root, axis)) for axis, w in enumerate(self._widths()))
-
     def put(self, field, out):
         """Field -> the cells of the grid in natural order."""
         for own, here in self.pieces:
@@ -92,19 +83,15 @@ class Spread:
             out[own] = array[here]
         return out
 
-    def natural(self, stencil, free):
-        """Stencil, flags of the cells of singular components -> Natural."""
-        steps, extra, flags = axis_steps(self.dim), np.zeros(self.shape), np.zeros(self.shape, bool)
-        links = np.zeros((len(steps), *self.shape))
-        self.put(stencil.extra, extra)
-        self.put(free.reshape(self.grid.shape), flags)
-        for axis, (c, out) in enumerate(zip(stencil.links, links)):
+    def links(self, stencil, layout):
+        """The links of a stencil, as fields of a layout."""
+        links = layout.zeros(self.dim)
+        for axis, (c, out) in enumerate(zip(stencil.links, layout.cells(links))):
             c = np.moveaxis(c, axis, 0)
             c = np.roll(c, -1, 0) if self.grid.periodic[axis] else c[1:]
             self.put(np.moveaxis(c, 0, axis), out)
             self._bridge(np.moveaxis(out, axis, 0), axis)
-        periodic = tuple(flag and n > 1 for flag, n in zip(self.grid.periodic, self.shape))
-        return Natural(self.shape, periodic, steps, links, extra, flags)
+        return links
 
     def _bridge(self, lines, axis):
         """Links across cells without content; none beyond a wall, nor from a cell to itself."""
