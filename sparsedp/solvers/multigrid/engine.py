@@ -13,8 +13,8 @@ import numpy as np
 
 from sparsedp import kernels
 from sparsedp.solvers.contract import Engine, norm
-from sparsedp.solvers.multigrid.reading import stencil_of
-from sparsedp.solvers.multigrid.stencil import Unfit
+from sparsedp.solvers.multigrid.stencil import Unfit, components, stencil_of
+from sparsedp.solvers.nullspace import NullSpace
 
 __all__ = ["Structured", "structured_engine", "structured_if_suited"]
 
@@ -86,15 +86,14 @@ def structured_if_suited(system):
 
 def _built(system, dtype=None):
     """The engine; raises Unfit. The type of its cycle, where it is not given, is found from the coefficients."""
-    from sparsedp.solvers.multigrid.facts import components_of_stencil, null_space_of_stencil
-
     stencil, faces = stencil_of(system), system.faces
-    if faces is not None and faces.connected:
-        system.components = labels, count = None, 1
+    if faces is not None and faces.connected:  # what is known need not be found from the entries
+        system.components = None, 1
+        if faces.held:
+            system.null_space = NullSpace(None, np.zeros(system.size), np.zeros(system.size), 0)
     else:
-        system.components = labels, count = components_of_stencil(stencil, system.active)
-    system.null_space = null_space_of_stencil(stencil, labels, count, system.active)
-    free = system.null_space.right > 0 if system.null_space.count else np.zeros(system.size, bool)
+        system.components = components(stencil)
+    free = system.null_space.right != 0 if system.null_space.count else np.zeros(system.size, bool)
     engine = Structured(stencil, free, system.maxiter, dtype or _precision(stencil, faces))
     if system.grid.cells.size and all(system.grid.uniform):
         system.norms = engine.norm, engine.norm
@@ -106,9 +105,8 @@ def _precision(stencil, faces):
     limit = SINGLE_UP_TO / max(1, *stencil.grid.shape)
     if faces is not None and faces.largest <= limit * faces.smallest:
         return np.float32
-    linked = [np.where(c > 0, c, np.inf).min(initial=np.inf) for c in stencil.inner]
-    small = all(c.max(initial=0.0) <= limit * least for c, least in zip(stencil.inner, linked))
-    return np.float32 if small else np.float64
+    smooth = all(c.max(initial=0.0) <= limit * c.min(initial=np.inf, where=c > 0) for c in stencil.links)
+    return np.float32 if smooth else np.float64
 
 
 class Structured(Engine):

@@ -9,7 +9,6 @@ from sparsedp.solvers.contract import norm
 from sparsedp.solvers.multigrid import loops
 from sparsedp.solvers.multigrid.interpolation import Transfer, interpolated
 from sparsedp.solvers.multigrid.layout import axis_steps, steps_around
-from sparsedp.solvers.multigrid.reading import numbered
 
 __all__ = ["COARSEST", "Level", "hierarchy"]
 
@@ -153,6 +152,14 @@ def _without_negative(layout, links, extra, free):
         flat = link.reshape(-1)[layout.middle]
         touched = lost.reshape(-1)[layout.middle] | layout.beside(lost, step)
         flat[touched & (flat < 0.0)] = 0.0
+
+
+def numbered(n, periodic):
+    """Numbers for the cells of an axis so that any three in a row differ, around the end of a periodic one too."""
+    if not periodic or n % 3 == 0:
+        return np.arange(n) % 3
+    fours = min(4 * (n % 3), n)
+    return np.concatenate([np.arange(fours) % 4, np.arange(n - fours) % 3]) if fours < n else np.arange(n)
 
 
 class Smoothed:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.solvers.multigrid.stencil import CLEAN, Stencil, cleaned
+from sparsedp.solvers.multigrid.stencil import CLEAN, Stencil, cleaned, forward
 from sparsedp.structure.base import Scaled
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Chain, Diagonal
@@ -64,7 +64,7 @@ def of_lines(lines, k, grid, unit=1.0):
         line, faces = lines[axis], np.moveaxis(part, axis, 0)
         area = unit * _area(grid, axis)
         factor = line.link.reshape((-1,) + (1,) * (grid.dim - 1)) * area
-        links.append(np.moveaxis(faces * factor, 0, axis))
+        links.append(forward(np.moveaxis(faces * factor, 0, axis), axis, grid.periodic[axis]))
         cells = np.moveaxis(extra, axis, 0)
         for values, shift in ((line.below, -1), (line.above, 0)):
             for f in np.flatnonzero(values):

@@ -87,17 +87,13 @@ class Spread:
         """The links of a stencil, as fields of a layout."""
         links = layout.zeros(self.dim)
         for axis, (c, out) in enumerate(zip(stencil.links, layout.cells(links))):
-            c = np.moveaxis(c, axis, 0)
-            c = np.roll(c, -1, 0) if self.grid.periodic[axis] else c[1:]
-            self.put(np.moveaxis(c, 0, axis), out)
+            self.put(c, out)
             self._bridge(np.moveaxis(out, axis, 0), axis)
         return links
 
     def _bridge(self, lines, axis):
-        """Links across cells without content; none beyond a wall, nor from a cell to itself."""
+        """Links across cells without content."""
         place, total, periodic = self.places[axis], self.shape[axis], self.grid.periodic[axis]
-        if not periodic or total == 1:
-            lines[total - 1] = 0.0
         gap = place[np.diff(place, append=total if periodic else place[-1] + 1) == 2]
         lines[gap] *= 2.0
         lines[gap + 1] = lines[gap]
