@@ -13,7 +13,6 @@ For euler the cotangent of m is that of w. For midpoint, with I the interpolatio
 import numpy as np
 
 from sparsedp.advection.interpolant import Interpolant
-from sparsedp.advection.law import component_shapes
 
 __all__ = ["Euler", "Midpoint"]
 
@@ -40,8 +39,8 @@ class Midpoint:
     """Departure points i - s m, m being the velocity half way."""
 
     def __init__(self, setting):
-        many = len(component_shapes(setting))
-        self.interpolants = [Interpolant(setting, number, "linear", closed=True) for number in range(many)]
+        numbers = range(len(setting.space.parts))
+        self.interpolants = [Interpolant(setting, number, "linear", closed=True) for number in numbers]
 
     def _half_way(self, number, w, step):
         """Interpolant, trajectory half way, samples of each component of w."""

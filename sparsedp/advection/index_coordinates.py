@@ -14,8 +14,6 @@ Beyond a wall the points go on at the distance of the width of the last cell.
 
 import numpy as np
 
-from sparsedp.advection.law import component_shapes
-
 __all__ = ["Stretched", "Uniform"]
 
 LAYERS = 4  # points beyond each end
@@ -38,7 +36,7 @@ class Stretched:
     """Cells of any width, for component `number` of the field."""
 
     def __init__(self, setting, number, interpolation):
-        grid, self.shape = setting.grid, component_shapes(setting)[number]
+        grid, self.shape = setting.grid, setting.space.parts[number]
         self.lines = []
         for axis, h in enumerate(grid.widths):
             nodes = np.concatenate([[0.0], np.cumsum(h)])
@@ -72,42 +70,42 @@ class Line:
     """
 
     def __init__(self, positions, widths, period, scheme):
-        self.positions, self.period, n = positions, period, positions.size
+        self.positions, self.period = positions, period
         if period is None:
             far = np.arange(1, LAYERS + 1)
             before, after = positions[0] - far[::-1] * widths[0], positions[-1] + far * widths[-1]
             self.knots = np.concatenate([before, positions, after])
         else:
-            turn = np.arange(-LAYERS, n + LAYERS)
-            self.knots = positions[turn % n] + period * (turn // n)
+            turn = np.arange(-LAYERS, positions.size + LAYERS)
+            self.knots = positions[turn % positions.size] + period * (turn // positions.size)
         self.gaps = np.diff(self.knots)
-        self.tangents = None if scheme is None else np.gradient(self.knots)
-        if scheme is None:
-            return
-        ratio = np.maximum(self.gaps[1:] / self.gaps[:-1], self.gaps[:-1] / self.gaps[1:]).max()
-        if ratio > STEEPEST * (1 + 1e-9):
-            raise ValueError(
-                f"transport {scheme} with cubic interpolation needs points whose distances change by at most "
-                f"a factor of {STEEPEST:g} from one to the next, got {ratio:.3g}; write interpolation='linear'"
-            )
+        self.first = self.last = self.gaps  # slopes of the position at both ends of a gap
+        if scheme is not None:
+            _check_monotone(scheme, self.gaps)
+            tangents = np.gradient(self.knots)
+            self.first, self.last = tangents[:-1], tangents[1:]
 
     def index(self, x):
         """Places -> index coordinates, and their slopes in x above and below."""
-        turns, n = 0.0, self.positions.size
+        turns = 0.0
         if self.period is None:
             x = np.clip(x, self.knots[0], self.knots[-1])
         else:
             turns = np.floor((x - self.positions[0]) / self.period)
             x = x - turns * self.period
         cell = np.clip(np.searchsorted(self.knots, x, "right") - 1, 0, self.gaps.size - 1)
-        gap, aim = self.gaps[cell], x - self.knots[cell]
-        if self.tangents is None:
-            part, above = aim / gap, 1.0 / gap
-            below = np.where(part == 0, 1.0 / self.gaps[np.maximum(cell - 1, 0)], above)
-        else:
-            part, above = _inverse(aim, gap, self.tangents[cell], self.tangents[cell + 1])
-            below = above
-        return cell - LAYERS + part + turns * n, above, below
+        part, above = _inverse(x - self.knots[cell], self.gaps[cell], self.first[cell], self.last[cell])
+        below = np.where(part == 0, 1.0 / self.last[np.maximum(cell - 1, 0)], above)
+        return cell - LAYERS + part + turns * self.positions.size, above, below
+
+
+def _check_monotone(scheme, gaps):
+    ratio = np.maximum(gaps[1:] / gaps[:-1], gaps[:-1] / gaps[1:]).max()
+    if ratio > STEEPEST * (1 + 1e-9):
+        raise ValueError(
+            f"transport {scheme} with cubic interpolation needs points whose distances change by at most "
+            f"a factor of {STEEPEST:g} from one to the next, got {ratio:.3g}; write interpolation='linear'"
+        )
 
 
 def _inverse(aim, gap, first, last):

@@ -9,7 +9,6 @@ import scipy.sparse as sp
 
 from sparsedp.advection.ghost_cells import filling, sample_sources
 from sparsedp.advection.index_coordinates import Stretched, Uniform
-from sparsedp.advection.law import component_shapes
 from sparsedp.kernels import departure
 from sparsedp.kernels.departure import PAD
 
@@ -36,20 +35,18 @@ class Interpolant:
     """
 
     def __init__(self, setting, number, interpolation, closed=False):
-        shapes, grid, sides = component_shapes(setting), setting.grid, setting.sides
+        shapes, grid, sides = setting.space.parts, setting.grid, setting.sides
         self.setting, self.closed = setting, closed
         self.span = slice(*setting.space.offsets[number : number + 2])
         wall = sum(2 * prod(s) // n for s in shapes[:number] for n, pair in zip(s, sides, strict=True) if pair)
         self.points = departure.Points.of(shapes[number], grid.periodic, interpolation)
         self.inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
         self.sources = sample_sources(shapes[number], sides, wall, closed)
-        outside = np.ones(self.points.padded, bool)
-        outside[self.inside] = False
-        inflow, outside = self.sources >= self.points.size, outside.ravel()
-        self.copies, self.plates = np.flatnonzero(outside & ~inflow), np.flatnonzero(inflow)
+        outside = np.flatnonzero(np.pad(np.zeros(shapes[number], bool), PAD, constant_values=True))
+        inflow = self.sources[outside] >= self.points.size
+        self.copies, self.plates = outside[~inflow], outside[inflow]
         self.copied, self.entering = self.sources[self.copies], self.sources[self.plates] - self.points.size
-        uniform = all(grid.uniform)
-        self.coordinates = Uniform(grid) if uniform else Stretched(setting, number, interpolation)
+        self.coordinates = Uniform(grid) if all(grid.uniform) else Stretched(setting, number, interpolation)
 
     @cached_property
     def fill(self):

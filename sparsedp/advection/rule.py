@@ -23,7 +23,10 @@ def rule_of(law):
             flat = prepare(law, *args)
             g = raised(FIELD, law, g)
             traced = type(g) is not np.ndarray or any(map(isbox, flat))
-            found = _traced_pull(law, nums, g, flat) if traced else law.pull(nums, g, *flat)
+            if traced and not law.twice:
+                found = tuple(back(g) for back, _ in _turned(law, nums, flat))
+            else:
+                found = law.pull(nums, g, *flat)
             for num, back in zip(nums, () if type(found) is Finite else found):
                 if not surely_finite(plain(back)):
                     _check_slope(law, "the gradient in " + LETTERS.get(num, "dt"), back, (g,))
@@ -34,8 +37,11 @@ def rule_of(law):
     def jvp(nums, tangents, ans, *args):
         flat = prepare(law, *args)
         along = {num: raised(num, law, tangent) for num, tangent in zip(nums, tangents, strict=True)}
-        traced = any(map(isbox, (*args, *tangents)))
-        found = _traced_push(law, along, flat) if traced else law.push(along, *flat)
+        if any(map(isbox, (*args, *tangents))) and not law.twice:
+            rules = zip(_turned(law, nums, flat), along.values(), strict=True)
+            found = sum(ahead(tangent) for (_, ahead), tangent in rules)
+        else:
+            found = law.push(along, *flat)
         _check_slope(law, "the tangent", found, tangents)
         return unflatten(ans, found)
 
@@ -50,35 +56,17 @@ def _check_slope(law, what, slope, given):
     check_finite(f"transport {law.setting.scheme}", np.asarray(slope), f"cannot represent {what}")
 
 
-def _traced_pull(law, nums, g, flat):
-    if law.twice:
-        return law.pull(nums, g, *flat)
-    _check_linear(law, nums, flat)
-    flat = tuple(map(plain, flat))
-    return tuple(_turned(law, num, flat)[0](g) for num in nums)
+def _turned(law, nums, flat):
+    """For each argument the rules from g to its cotangent, and back: linear, and free of u and inflow.
 
+    A linear scheme has every derivative in u and inflow as long as v and dt are constant.
+    """
+    name, plain_flat = f"transport {law.setting.scheme}", tuple(map(plain, flat))
+    if not (law.linear and set(nums) <= {FIELD, INFLOW}) or isbox(flat[1]) or isbox(flat[2]):
+        raise DerivativeError(f"{name} has first derivatives only; for second ones write scheme='upwind'")
 
-def _traced_push(law, along, flat):
-    if law.twice:
-        return law.push(along, *flat)
-    _check_linear(law, along, flat)
-    flat = tuple(map(plain, flat))
-    return sum(_turned(law, num, flat)[1](tangent) for num, tangent in along.items())
+    def rules(num):
+        pull = lambda g: law.pull((num,), np.asarray(g), *plain_flat)[0]
+        return linear(f"{name}.T", pull, lambda tangent: law.push({num: tangent}, *plain_flat))
 
-
-def _turned(law, num, flat):
-    """The rules from g to the cotangent of u or inflow, and back: linear, and free of u and inflow."""
-
-    def pull(g):
-        return law.pull((num,), np.asarray(g), *flat)[0]
-
-    return linear(f"transport {law.setting.scheme}.T", pull, lambda tangent: law.push({num: tangent}, *flat))
-
-
-def _check_linear(law, nums, flat):
-    """A linear scheme has every derivative in u and inflow as long as v and dt are constant."""
-    if law.linear and set(nums) <= {FIELD, INFLOW} and not isbox(flat[1]) and not isbox(flat[2]):
-        return
-    raise DerivativeError(
-        f"transport {law.setting.scheme} has first derivatives only; for second ones write scheme='upwind'"
-    )
+    return map(rules, nums)

@@ -20,10 +20,11 @@ import scipy.sparse as sp
 from sparsedp import results
 from sparsedp.advection.back_trajectory import Euler, Midpoint
 from sparsedp.advection.interpolant import Interpolant
-from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law, component_shapes
+from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
 from sparsedp.advection.scratch import FEW, Scratch
+from sparsedp.advection.stability import check_numbers
 from sparsedp.advection.velocities import velocity_at_points
-from sparsedp.fields import check_finite, surely_finite
+from sparsedp.fields import surely_finite
 from sparsedp.operators.boundary import solid_faces
 
 __all__ = ["SemiLagrangian"]
@@ -38,7 +39,7 @@ class SemiLagrangian(Law):
 
     def __init__(self, setting):
         super().__init__(setting)
-        numbers, solid = range(len(component_shapes(setting))), setting.solid
+        numbers, solid = range(len(setting.space.parts)), setting.solid
         self.components = [Interpolant(setting, number, setting.interpolation) for number in numbers]
         self.backtrace = Midpoint(setting) if setting.backtrace == "midpoint" else Euler()
         self.to_points, self.scratch = velocity_at_points(setting), Scratch()
@@ -97,12 +98,8 @@ class SemiLagrangian(Law):
 
     def _check(self, u, v, inflow):
         """Name the first number that is not finite; the trajectories would hide it."""
-        if not surely_finite(u):
-            check_finite(self.name, u.reshape(self.setting.space.shape), "needs a finite field")
-        if not surely_finite(v):
-            check_finite(self.name, v.reshape(self.setting.velocity_shapes[-1]), "needs a finite velocity")
-        if inflow.size:
-            check_finite(self.name, inflow, "needs finite inflow values")
+        if not all(map(surely_finite, (u, v, inflow))):
+            check_numbers(self.setting, u, v, inflow)
 
     def forward(self, u, v, dt, inflow):
         """The advected field."""

@@ -11,7 +11,6 @@ from sparsedp.tape import cast, dtype_of, isbox, plain
 __all__ = ["LETTERS", "check_step", "flat_numbers", "prepare", "raised", "result_like", "unflatten"]
 
 FLOAT = np.dtype(float)
-NONE = np.empty(0)
 LETTERS = {FIELD: "u", VELOCITY: "v", INFLOW: "inflow"}
 
 
@@ -54,7 +53,7 @@ def flat_numbers(name, letter, value, shapes):
             f"{name} takes real numbers as {letter}, got dtype {kind}; write {letter}.real or {letter}.astype(float)"
         )
     if isbox(value):
-        return anp.reshape(cast(value, np.dtype(float)), (-1,))
+        return anp.reshape(cast(value, FLOAT), (-1,))
     return np.ascontiguousarray(value, dtype=float).reshape(-1)
 
 
@@ -67,41 +66,32 @@ def _shape(name, letter, value):
 
 
 def _inflow(name, inflow, walls):
-    if type(inflow) is float and -np.inf < inflow < np.inf:
-        return np.full(walls.size, inflow) if walls.size else NONE
-    if not walls.size and np.shape(inflow) == () and not isbox(inflow) and np.isfinite(inflow):
-        return NONE
+    if type(inflow) is float:
+        return np.full(walls.size, inflow)
     if np.shape(inflow) == ():
-        inflow = flat_numbers(name, "inflow", inflow, ((),))
-        return inflow * np.ones(walls.size) if isbox(inflow) else np.full(walls.size, inflow[0])
+        return flat_numbers(name, "inflow", inflow, ((),)) * np.ones(walls.size)
     return flat_numbers(name, "inflow", inflow, (walls.shape,))
 
 
 def result_like(u, flat, shape):
     """Flat float64 result -> field of the dtype of u (bool and int become float64)."""
-    kind = u.dtype if type(u) is np.ndarray else dtype_of(u)
-    if kind == FLOAT:
-        return flat.reshape(shape)
-    flat = flat if kind.char != "f" else np.asarray(flat, kind.newbyteorder("="))
-    return flat.reshape(shape)
+    kind = dtype_of(u)
+    return (flat.astype(kind.newbyteorder("=")) if kind.char == "f" else flat).reshape(shape)
 
 
 def raised(num, law, tangent):
     """Tangent of an argument as it was given -> flat float64 as the law has it."""
-    if num != STEP and type(tangent) is np.ndarray and tangent.dtype == FLOAT and tangent.ndim:
+    if num == STEP:
+        return tangent
+    if type(tangent) is np.ndarray and tangent.dtype == FLOAT and tangent.ndim:
         return tangent.reshape(-1)
-    if num == INFLOW and np.shape(tangent) == ():
-        return tangent * np.ones(law.walls.size)
-    if num in LETTERS:
-        return anp.reshape(cast(tangent, np.dtype(float)), (-1,))
-    return tangent
+    tangent = anp.reshape(cast(tangent, FLOAT), (-1,))
+    return tangent * np.ones(law.walls.size) if num == INFLOW and tangent.size == 1 else tangent
 
 
 def unflatten(value, cotangent):
     """Flat cotangent -> the shape in which the argument was given; a number for all walls gets their sum."""
-    if type(cotangent) is np.ndarray and type(value) is np.ndarray and value.ndim:
-        return cotangent.reshape(value.shape)
     shape = np.shape(value)
-    if shape == ():
-        return cotangent if type(cotangent) is float else anp.sum(cotangent)
-    return anp.reshape(cotangent, shape)
+    if shape == () and type(cotangent) is not float:
+        return anp.sum(cotangent)
+    return cotangent.reshape(shape) if shape else cotangent
