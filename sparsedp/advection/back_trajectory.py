@@ -12,7 +12,7 @@ For euler the cotangent of m is that of w. For midpoint, with I the interpolatio
 
 import numpy as np
 
-from sparsedp.advection.interpolant import Interpolant
+from sparsedp.advection.interpolant import Interpolant, Pass
 
 __all__ = ["Euler", "Midpoint"]
 
@@ -43,26 +43,25 @@ class Midpoint:
         self.interpolants = [Interpolant(setting, number, "linear", closed=True) for number in numbers]
 
     def _half_way(self, number, w, step):
-        """Interpolant, trajectory half way, samples of each component of w."""
+        """For each component of w the pass to the departure points half way."""
         interpolant = self.interpolants[number]
-        return interpolant, interpolant.trajectory(w, 0.5 * step), [interpolant.pad(row, NONE) for row in w]
+        half = interpolant.trajectory(w, 0.5 * step)
+        return [Pass(interpolant, half, row, NONE) for row in w]
 
     def velocity(self, number, w, step):
         """See Euler."""
-        interpolant, half, samples = self._half_way(number, w, step)
-        return np.stack([interpolant.gather(row, half, np.empty(w.shape[1])) for row in samples])
+        return np.stack([row.value() for row in self._half_way(number, w, step)])
 
     def vjp(self, number, w, step, g):
         """See Euler."""
-        (interpolant, half, samples), direct, bent = self._half_way(number, w, step), np.empty_like(w), np.zeros_like(w)
-        for row, part, target in zip(samples, g, direct, strict=True):
-            interpolant.pad_vjp(interpolant.gather_vjp(part, half, np.empty), target, NONE)
-            bent += interpolant.gradient(row, half, part, np.empty_like(w))
+        direct, (bent, change) = np.empty_like(w), np.zeros((2, *w.shape))
+        for row, part, target in zip(self._half_way(number, w, step), g, direct, strict=True):
+            row.vjp(part, (target, NONE), change)
+            bent += change
         return direct + bent, bent
 
     def jvp(self, number, w, trajectory, dw, ddt):
         """See Euler."""
-        interpolant, half, samples = self._half_way(number, w, trajectory.step)
-        changes, dhalf = [interpolant.pad(row, NONE) for row in dw], dw + ddt * w
-        moved = [interpolant.jvp(*pair, half, dhalf) for pair in zip(samples, changes, strict=True)]
+        rows, dhalf = self._half_way(number, w, trajectory.step), dw + ddt * w
+        moved = [row.jvp(part, NONE, dhalf) for row, part in zip(rows, dw, strict=True)]
         return np.stack(moved) + ddt * trajectory.velocity

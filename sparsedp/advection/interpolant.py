@@ -12,7 +12,7 @@ from sparsedp.advection.index_coordinates import Stretched, Uniform
 from sparsedp.kernels import departure
 from sparsedp.kernels.departure import PAD
 
-__all__ = ["Interpolant", "Trajectory"]
+__all__ = ["Interpolant", "Pass", "Trajectory"]
 
 
 class Trajectory(NamedTuple):
@@ -79,17 +79,6 @@ class Interpolant:
         if self.fill is not None:
             of_u[:] = self.fill[1] @ of_u
 
-    def gather(self, samples, trajectory, out, bounds=departure.NO_BOUNDS):
-        """Values at the departure points -> out; least and greatest sample of the cells around them -> bounds."""
-        return departure.gather(self.points, samples, trajectory.displacement, trajectory.scale, out, bounds)
-
-    def gather_vjp(self, g, trajectory, room, samples=None):
-        """The transpose of `gather` -> cotangent of samples, added to `samples` if there are some."""
-        if samples is None:
-            samples = room(self.points.samples)
-            samples[:] = 0.0
-        return departure.scatter(self.points, trajectory.displacement, trajectory.scale, g, samples)
-
     def gradient(self, samples, trajectory, g, out):
         """g times the derivative of `gather` in the velocity of the trajectory -> out (axis, point)."""
         _, _, d, scale, slopes = trajectory
@@ -106,13 +95,6 @@ class Interpolant:
         )
         return np.multiply(0.5, above * upper + below * lower, out=out)
 
-    def jvp(self, samples, change, trajectory, dm):
-        """Samples and their tangent, that of the velocity of the trajectory or None -> tangent of `gather`."""
-        total = self.gather(change, trajectory, np.empty(self.points.size))
-        if dm is not None:
-            total += np.sum(self.gradient(samples, trajectory, np.ones(total.size), np.empty(dm.shape)) * dm, axis=0)
-        return total
-
     def matrix(self, trajectory):
         """`gather` after `pad` as a csr_array in the component, without inflow."""
         n = self.points.size
@@ -122,3 +104,54 @@ class Interpolant:
             weight = np.where(columns < n, weight, 0.0)
             found = found + sp.csr_array((weight, np.minimum(columns, n - 1), np.arange(n + 1)), (n, n))
         return found if self.fill is None else found @ self.fill[0]
+
+
+class Pass:
+    """A component between its points, at the departure points of a trajectory, and the derivatives of that.
+
+    Parameters
+    ----------
+    interpolant : Interpolant
+    trajectory : Trajectory
+    u, inflow : array
+    room : function
+        Size -> array.
+    """
+
+    def __init__(self, interpolant, trajectory, u, inflow, room=np.empty):
+        self.interpolant, self.trajectory, self.given, self.room = interpolant, trajectory, (u, inflow), room
+        self.places = trajectory.displacement, trajectory.scale
+
+    @cached_property
+    def samples(self):
+        """The component with its ghost cells."""
+        return self.interpolant.pad(*self.given, self.room)
+
+    def value(self, out=None, bounds=departure.NO_BOUNDS):
+        """Values at the departure points; least and greatest sample of the cells around them -> bounds."""
+        points = self.interpolant.points
+        out = self.room(points.size) if out is None else out
+        return departure.gather(points, self.samples, *self.places, out, bounds)
+
+    def vjp(self, g, into, speed, clamped=None):
+        """Cotangent of the values -> that of u is written, that of inflow added to the pair `into`.
+
+        That of the velocity is written to `speed`; None leaves a part out. `clamped`: samples, and their cotangents.
+        """
+        if into is not None:
+            points = self.interpolant.points
+            samples = self.room(points.samples)
+            samples[:] = 0.0
+            if clamped is not None:
+                np.add.at(samples, *clamped)
+            self.interpolant.pad_vjp(departure.scatter(points, *self.places, g, samples), *into)
+        if speed is not None:
+            self.interpolant.gradient(self.samples, self.trajectory, g, speed)
+
+    def jvp(self, du, dinflow, dm):
+        """Tangents of u, of inflow and of the velocity (or None) -> that of the values."""
+        total = Pass(self.interpolant, self.trajectory, du, dinflow).value()
+        if dm is None:
+            return total
+        slopes = self.interpolant.gradient(self.samples, self.trajectory, np.ones(total.size), np.empty(dm.shape))
+        return total + np.sum(slopes * dm, axis=0)

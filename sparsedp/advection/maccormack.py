@@ -33,63 +33,57 @@ class MacCormack(SemiLagrangian):
         super().__init__(setting)
         self.clamped = setting.clamp
 
-    def _stages(self, component, u, inflow, trajectories, room):
-        """Samples of u and of f, the value before it is clamped, least and greatest sample of u (if they count)."""
-        n, (back, ahead) = u.size, trajectories
-        first = component.pad(u, inflow, room)
-        bounds = room(2 * n).reshape(2, n) if self.clamped else departure.NO_BOUNDS
-        f = component.gather(first, back, room(n), bounds)
-        second = component.pad(f, inflow, room)
-        new = component.gather(second, ahead, room(n))
+    def _stages(self, part):
+        """Both passes, the value before it is clamped, least and greatest sample of u (if they count)."""
+        n, first = part.u.size, part.look()
+        bounds = part.room(2 * n).reshape(2, n) if self.clamped else departure.NO_BOUNDS
+        f = first.value(bounds=bounds)
+        second = part.look(1, f)
+        new = second.value()
         for start in range(0, n, BLOCK):
-            part = slice(start, start + BLOCK)
-            new[part] = f[part] + 0.5 * (u[part] - new[part])
+            some = slice(start, start + BLOCK)
+            new[some] = f[some] + 0.5 * (part.u[some] - new[some])
         return first, second, new, bounds
 
-    def _clamps(self, component, first, back, new, bounds):
+    def _clamps(self, part, first, new, bounds):
         """Points where the clamp acts: which, the share of the value that stays, samples and shares of the bounds."""
         some = np.flatnonzero((new <= bounds[0]) | (new >= bounds[1]))
         (low, high), value = bounds[:, some], new[some]
         below, above = _step(low, value), _step(value, high)
-        index, least, greatest = departure.bound_shares(component.points, first, back.displacement, back.scale, some)
+        points = part.component.points
+        index, least, greatest = departure.bound_shares(points, first.samples, *first.places, some)
         return some, 1.0 - below - above, index, least * below + greatest * above
 
-    def advect(self, component, u, inflow, trajectories, room, out):
+    def advect(self, part, out):
         """See the base class."""
-        *_, new, bounds = self._stages(component, u, inflow, trajectories, room)
+        *_, new, bounds = self._stages(part)
         np.clip(new, *(bounds if self.clamped else (-np.inf, np.inf)), out=out)
 
-    def advect_vjp(self, component, g, u, inflow, trajectories, room, into, speeds):
+    def advect_vjp(self, part, g, into, speeds):
         """See the base class."""
-        back, ahead = trajectories
-        first, second, new, bounds = self._stages(component, u, inflow, trajectories, room)
-        own, of_f, of_first, (of_u, of_inflow) = room(u.size), room(u.size), None, into or (None, inflow.copy())
+        (first, second, new, bounds), clamped = self._stages(part), None
+        own, of_f = part.room(g.size), part.room(g.size)
+        of_inflow = into[1] if into else part.inflow.copy()
         own[:] = g
         if self.clamped:
-            some, free, index, shares = self._clamps(component, first, back, new, bounds)
+            some, free, index, shares = self._clamps(part, first, new, bounds)
             own[some] *= free
-            of_first = room(first.size)
-            of_first[:] = 0.0
-            np.add.at(of_first, index, shares * g[some])
+            clamped = index, shares * g[some]
         of_b = np.multiply(-0.5, own, out=new)
-        component.pad_vjp(component.gather_vjp(of_b, ahead, room), of_f, of_inflow)
+        second.vjp(of_b, (of_f, of_inflow), speeds[1])
         of_f += own
+        first.vjp(of_f, into, speeds[0], clamped)
         if into is not None:
-            component.pad_vjp(component.gather_vjp(of_f, back, room, of_first), of_u, of_inflow)
-            of_u -= of_b
-        if speeds is not None:
-            component.gradient(first, back, of_f, speeds[0])
-            component.gradient(second, ahead, of_b, speeds[1])
+            np.subtract(into[0], of_b, out=into[0])
 
-    def advect_jvp(self, component, u, inflow, trajectories, du, dinflow, dm):
+    def advect_jvp(self, part, du, dinflow, dm):
         """See the base class."""
-        first, second, new, bounds = self._stages(component, u, inflow, trajectories, np.empty)
-        change = component.pad(du, dinflow)
-        df = component.jvp(first, change, trajectories[0], dm[0])
-        total = df + 0.5 * (du - component.jvp(second, component.pad(df, dinflow), trajectories[1], dm[1]))
+        first, second, new, bounds = self._stages(part)
+        df = first.jvp(du, dinflow, dm[0])
+        total = df + 0.5 * (du - second.jvp(df, dinflow, dm[1]))
         if self.clamped:
-            some, free, index, shares = self._clamps(component, first, trajectories[0], new, bounds)
-            total[some] = free * total[some] + np.sum(shares * change[index], axis=0)
+            some, free, index, shares = self._clamps(part, first, new, bounds)
+            total[some] = free * total[some] + np.sum(shares * part.component.pad(du, dinflow)[index], axis=0)
         return total
 
 

@@ -14,12 +14,14 @@ Source: A. Staniforth, J. Cote, Monthly Weather Review 119 (1991) 2206-2223;
 R. Keys, IEEE Trans. Acoustics, Speech and Signal Processing 29 (1981) 1153-1160.
 """
 
+from typing import Any, NamedTuple
+
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp import results
 from sparsedp.advection.back_trajectory import Euler, Midpoint
-from sparsedp.advection.interpolant import Interpolant
+from sparsedp.advection.interpolant import Interpolant, Pass
 from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
 from sparsedp.advection.scratch import FEW, Scratch
 from sparsedp.advection.stability import check_numbers
@@ -27,7 +29,24 @@ from sparsedp.advection.velocities import velocity_at_points
 from sparsedp.fields import surely_finite
 from sparsedp.operators.boundary import solid_faces
 
-__all__ = ["SemiLagrangian"]
+__all__ = ["Part", "SemiLagrangian"]
+
+
+class Part(NamedTuple):
+    """One component in a step."""
+
+    number: int
+    component: Interpolant
+    u: Any
+    inflow: Any
+    w: Any  # velocity at the points (axis, point)
+    trajectories: list  # one for each sign of the scheme
+    room: Any  # size -> array
+
+    def look(self, number=0, u=None):
+        """The pass along a trajectory, of u itself or of another field."""
+        u = self.u if u is None else u
+        return Pass(self.component, self.trajectories[number], u, self.inflow, self.room)
 
 
 class SemiLagrangian(Law):
@@ -49,24 +68,20 @@ class SemiLagrangian(Law):
 
     # ------------------------------------------------------------ one component, which `maccormack` does in its own way
 
-    def advect(self, component, u, inflow, trajectories, room, out):
+    def advect(self, part, out):
         """The advected component -> out."""
-        component.gather(component.pad(u, inflow, room), trajectories[0], out)
+        part.look().value(out)
 
-    def advect_vjp(self, component, g, u, inflow, trajectories, room, into, speeds):
+    def advect_vjp(self, part, g, into, speeds):
         """Cotangent of the advected component -> that of u is written, that of inflow added to the pair `into`.
 
         Those of the velocities of the trajectories are written to the arrays `speeds`; None leaves a part out.
         """
-        if into is not None:
-            component.pad_vjp(component.gather_vjp(g, trajectories[0], room), *into)
-        if speeds is not None:
-            component.gradient(component.pad(u, inflow, room), trajectories[0], g, speeds[0])
+        part.look().vjp(g, into, speeds[0])
 
-    def advect_jvp(self, component, u, inflow, trajectories, du, dinflow, dm):
+    def advect_jvp(self, part, du, dinflow, dm):
         """Tangents of u, of inflow and of the velocity of each trajectory (or None) -> tangent."""
-        samples, change = component.pad(u, inflow), component.pad(du, dinflow)
-        return component.jvp(samples, change, trajectories[0], dm[0])
+        return part.look().jvp(du, dinflow, dm[0])
 
     # ------------------------------------------------------------ the whole field
 
@@ -75,20 +90,22 @@ class SemiLagrangian(Law):
         borrowed: list = []
         return (np.empty if u.size <= FEW else self.scratch.lender(borrowed)), borrowed
 
+    def _velocities(self, v, room=np.empty):
+        """Velocity as it is given -> for each component an array (axis, point)."""
+        if self.to_points is not None:
+            v = self.to_points.apply(v, out=room(self.to_points.shape[0]))
+        return self._by_component(v)
+
     def _by_component(self, v):
-        """Velocity at the points, flat -> for each component an array (axis, point)."""
         dim = self.setting.grid.dim
         return [v[dim * c.span.start : dim * c.span.stop].reshape(dim, -1) for c in self.components]
 
-    def _velocities(self, v, room=np.empty):
-        """Velocity as it is given -> for each component its number, itself and the velocity (axis, point)."""
-        if self.to_points is not None:
-            v = self.to_points.apply(v, out=room(self.to_points.shape[0]))
-        return [(*pair, w) for pair, w in zip(enumerate(self.components), self._by_component(v), strict=True)]
-
-    def _trajectories(self, number, w, dt):
-        steps, component = [dt * sign for sign in self.signs], self.components[number]
-        return [component.trajectory(self.backtrace.velocity(number, w, step), step) for step in steps]
+    def _parts(self, u, v, dt, inflow, room=np.empty):
+        """The components of a step, one after the other."""
+        for number, (component, w) in enumerate(zip(self.components, self._velocities(v, room), strict=True)):
+            steps = [dt * sign for sign in self.signs]
+            looks = [component.trajectory(self.backtrace.velocity(number, w, step), step) for step in steps]
+            yield Part(number, component, u[component.span], inflow, w, looks, room)
 
     def _keep_solid(self, moved, u):
         """What is in a solid stays: written to the moved field."""
@@ -105,9 +122,8 @@ class SemiLagrangian(Law):
         """The advected field."""
         self._check(u, v, inflow)
         out, (room, borrowed) = results.empty(u.shape, float), self._room(u)
-        for number, component, w in self._velocities(v, room):
-            span, trajectories = component.span, self._trajectories(number, w, dt)
-            self.advect(component, u[span], inflow, trajectories, room, out[span])
+        for part in self._parts(u, v, dt, inflow, room):
+            self.advect(part, out[part.component.span])
         self.scratch.give(*borrowed)
         return self._keep_solid(out, u)
 
@@ -118,16 +134,12 @@ class SemiLagrangian(Law):
         moved = g if self.solid is None else np.where(self.solid, 0.0, g)
         of_u, of_inflow = np.empty(u.size if field else 0), np.zeros(inflow.size)
         of_w = (np.empty if self.to_points is None else room)(u.size * self.setting.grid.dim if speed else 0)
-        for number, component, w in self._velocities(v, room):
-            span, trajectories = component.span, self._trajectories(number, w, dt)
-            changes = None
+        for part, change in zip(self._parts(u, v, dt, inflow, room), self._by_component(of_w), strict=True):
+            span, changes = part.component.span, [None] * len(self.signs)
             if speed:
-                others = [room(w.size).reshape(w.shape) for _ in trajectories[1:]]
-                changes = [self._by_component(of_w)[number], *others]
-            into = (of_u[span], of_inflow) if field else None
-            self.advect_vjp(component, moved[span], u[span], inflow, trajectories, room, into, changes)
-            if changes is not None:
-                rate += self._of_velocity(number, w, trajectories, changes, STEP in nums)
+                changes = [change, *(room(change.size).reshape(change.shape) for _ in self.signs[1:])]
+            self.advect_vjp(part, moved[span], (of_u[span], of_inflow) if field else None, changes)
+            rate += self._of_velocity(part, changes, STEP in nums) if speed else 0.0
         if field and self.solid is not None:
             of_u += g - moved
         found = {FIELD: of_u, INFLOW: of_inflow, STEP: rate / dt}
@@ -136,13 +148,13 @@ class SemiLagrangian(Law):
         self.scratch.give(*borrowed)
         return tuple(found[num] for num in nums)
 
-    def _of_velocity(self, number, w, trajectories, changes, timed):
+    def _of_velocity(self, part, changes, timed):
         """Cotangents of the velocities of the trajectories -> that of w, in the first of them; dt times that of dt."""
         rate = 0.0
-        for change, trajectory in zip(changes, trajectories, strict=True):
+        for change, trajectory in zip(changes, part.trajectories, strict=True):
             rate += _dot(change, trajectory.velocity) if timed else 0.0
-            back, bent = self.backtrace.vjp(number, w, trajectory.step, change)
-            rate += _dot(bent, w) if timed and bent is not None else 0.0
+            back, bent = self.backtrace.vjp(part.number, part.w, trajectory.step, change)
+            rate += _dot(bent, part.w) if timed and bent is not None else 0.0
             if change is not changes[0]:
                 changes[0] += back
             elif back is not change:
@@ -155,15 +167,16 @@ class SemiLagrangian(Law):
         given = {num: np.ascontiguousarray(t) if num != STEP else t for num, t in tangents.items()}
         du, dv, ddt, dinflow = (given.get(num, zero) for num, zero in zeros.items())
         moves, out = VELOCITY in tangents or STEP in tangents, np.empty(u.size)
-        for (number, component, w), (*_, dw) in zip(self._velocities(v), self._velocities(dv), strict=True):
-            span, trajectories = component.span, self._trajectories(number, w, dt)
-            dm = [self.backtrace.jvp(number, w, t, dw, ddt / dt) if moves else None for t in trajectories]
-            out[span] = self.advect_jvp(component, u[span], inflow, trajectories, du[span], dinflow, dm)
+        for part, dw in zip(self._parts(u, v, dt, inflow), self._velocities(dv), strict=True):
+            span, vary = part.component.span, self.backtrace.jvp
+            dm = [vary(part.number, part.w, t, dw, ddt / dt) if moves else None for t in part.trajectories]
+            out[span] = self.advect_jvp(part, du[span], dinflow, dm)
         return self._keep_solid(out, du)
 
     def matrix(self, v, dt):
         """The step as a csr_array in u."""
-        blocks = [c.matrix(*self._trajectories(number, w, dt)) for number, c, w in self._velocities(v)]
+        nothing = np.zeros(self.setting.space.size), v, dt, np.zeros(self.walls.size)
+        blocks = [part.component.matrix(*part.trajectories) for part in self._parts(*nothing)]
         moved = sp.csr_array(sp.block_diag(blocks, format="csr"))
         if self.solid is None:
             return moved

@@ -29,10 +29,9 @@ def fold(x, widths, padding):
         wide, reach, n = np.moveaxis(x, axis, 0), width // 2, x.shape[axis] - width + 1
         core = wide[reach : reach + n].copy()
         if padding != "zero" and n:
-            sources = np.arange(-reach, n + reach)
-            sources = sources % n if padding == "periodic" else np.clip(sources, 0, n - 1)
-            for ghost in (*range(reach), *range(n + reach, n + 2 * reach)):
-                core[sources[ghost]] += wide[ghost]
+            sources = np.pad(np.arange(n), reach, MODES[padding])
+            for ghosts in (slice(reach), slice(n + reach, None)):
+                np.add.at(core, sources[ghosts], wide[ghosts])
         x = np.moveaxis(core, 0, axis)
     return np.ascontiguousarray(x)
 

@@ -17,14 +17,10 @@ def eliminate(x, lower, upper, inverses, column, row, ends, start, stop):
         filled = ends[left:right].max()
         final = x[n - 1, left:right]
         for i in range(n - cyclic):
-            here, pivots = x[i, left:right], inverses[i, left:right]
-            if i:
-                low, before = lower[i], x[i - 1, left:right]
-                for j in range(here.size):
-                    here[j] = (here[j] - low * before[j]) * pivots[j]
-            else:
-                for j in range(here.size):
-                    here[j] *= pivots[j]
+            here, pivots, low = x[i, left:right], inverses[i, left:right], lower[i] if i else 0.0
+            before = x[max(i - 1, 0), left:right]
+            for j in range(here.size):
+                here[j] = (here[j] - low * before[j]) * pivots[j]
             if cyclic and (i < filled or i == n - 2):
                 links = row[i, left:right]
                 for j in range(here.size):

@@ -5,6 +5,8 @@ x0, x1, x2 are the components of a face field, in three axes; a component is emp
 periodic axis the last cell and the first face meet round the end.
 """
 
+from numba import njit
+
 from sparsedp.kernels.team import kernel
 
 __all__ = ["net_flow", "push"]
@@ -39,22 +41,25 @@ def net_flow(x, x0, x1, x2, lines0, lines1, lines2, b, start, stop):
     return total, whole
 
 
+@njit(error_model="numpy")
+def _across(x, p, lines, out):
+    """`push` for faces across the middle axis."""
+    n = p.shape[1]
+    for i in range(out.shape[0]):
+        for f in range(out.shape[1]):
+            a, b, c = lines[0, f], lines[1, f], lines[2, f]
+            given, result, low, high = x[i, f], out[i, f], p[i, (f - 1) % n], p[i, f % n]
+            for j in range(result.size):
+                result[j] = a * given[j] + b * low[j] + c * high[j]
+
+
 @kernel("read3 read3 read3 read3 read2 read2 read2 write3 write3 write3")
 def push(x0, x1, x2, p, lines0, lines1, lines2, out0, out1, out2, start, stop):
     """out = keep x + below p[f - 1] + above p[f]; the rows of `lines` hold keep, below and above of the faces."""
     n0, n1, n2 = p.shape
-    for f in range(out0.shape[0]):
-        a, b, c, below, above = lines0[0, f], lines0[1, f], lines0[2, f], p[(f - 1) % n0], p[f % n0]
-        for k in range(n1):
-            x, out, low, high = x0[f, k], out0[f, k], below[k], above[k]
-            for j in range(n2):
-                out[j] = a * x[j] + b * low[j] + c * high[j]
-    for i in range(n0):
-        for f in range(out1.shape[1]):
-            a, b, c = lines1[0, f], lines1[1, f], lines1[2, f]
-            x, out, low, high = x1[i, f], out1[i, f], p[i, (f - 1) % n1], p[i, f % n1]
-            for j in range(n2):
-                out[j] = a * x[j] + b * low[j] + c * high[j]
+    plate = 1, len(out0), n1 * n2
+    _across(x0.reshape(plate), p.reshape(1, n0, n1 * n2), lines0, out0.reshape(plate))
+    _across(x1, p, lines1, out1)
     for i in range(n0):
         for k in range(n1):
             x, out, here = x2[i, k], out2[i, k], p[i, k]
