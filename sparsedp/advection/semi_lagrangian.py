@@ -90,11 +90,9 @@ class SemiLagrangian(Law):
         borrowed: list = []
         return (np.empty if u.size <= FEW else self.scratch.lender(borrowed)), borrowed
 
-    def _velocities(self, v, room=np.empty):
+    def _velocities(self, v):
         """Velocity as it is given -> for each component an array (axis, point)."""
-        if self.to_points is not None:
-            v = self.to_points.apply(v, out=room(self.to_points.shape[0]))
-        return self._by_component(v)
+        return self._by_component(v if self.to_points is None else self.to_points.apply(v))
 
     def _by_component(self, v):
         dim = self.setting.grid.dim
@@ -102,7 +100,7 @@ class SemiLagrangian(Law):
 
     def _parts(self, u, v, dt, inflow, room=np.empty):
         """The components of a step, one after the other."""
-        for number, (component, w) in enumerate(zip(self.components, self._velocities(v, room), strict=True)):
+        for number, (component, w) in enumerate(zip(self.components, self._velocities(v), strict=True)):
             steps = [dt * sign for sign in self.signs]
             looks = [component.trajectory(self.backtrace.velocity(number, w, step), step) for step in steps]
             yield Part(number, component, u[component.span], inflow, w, looks, room)
