@@ -211,6 +211,16 @@ def test_linear_fields_are_exact():
     np.testing.assert_allclose(dp.sample(grid, places)(u), 2 * places[:, 0] - 3 * places[:, 1] + 1, rtol=1e-12)
 
 
+def test_the_border_to_scipy_conjugates(rng):
+    """rmatvec is the adjoint, .T the plain transpose."""
+    matrix = random_field(rng, dp.Grid((4, 3)).cells, complex)
+    op, x, y = dp.from_matrix(matrix), matrix[0].copy(), matrix[:, 1].copy()
+    for border in (op, op.to_scipy()):
+        np.testing.assert_allclose(border.matvec(x), matrix @ x, rtol=1e-14)
+        np.testing.assert_allclose(border.rmatvec(y), matrix.conj().T @ y, rtol=1e-14)
+    np.testing.assert_allclose(op.T @ y, matrix.T @ y, rtol=1e-14)
+
+
 @pytest.mark.parametrize("builder", [dp.gradient, dp.laplacian])
 def test_products_and_sums_stay_factor_defined(builder):
     grid = dp.Grid((5, 4), spacing=0.5)
