@@ -15,6 +15,7 @@ import sparsedp as dp
 from sparsedp.__main__ import main
 from sparsedp.report.demo import scene, story, terrain
 
+pytestmark = pytest.mark.xdist_group("demo")  # most of them look at one run
 PICTURES = importlib.util.find_spec("matplotlib") is not None
 WRITTEN = (*(story.PICTURES if PICTURES else ()), *story.ARRAYS)
 

@@ -244,6 +244,13 @@ def test_the_virtual_environment_is_the_one_of_the_page():
     assert f"{folder}/" in (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
 
 
+def test_the_lists_of_tests_name_files():
+    text = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    lists = dict(re.findall(r"^(\w+)=\(([^)]+)\)$", text, flags=re.MULTILINE))
+    for name in ("quick", "plain"):
+        assert all((ROOT / "tests" / f"test_{word}.py").exists() for word in lists[name].split()), name
+
+
 def test_the_oldest_versions_are_those_of_the_requirements():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     named = [*project["dependencies"], *(one for group in project["optional-dependencies"].values() for one in group)]
