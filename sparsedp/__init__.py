@@ -28,7 +28,7 @@ _WINDOW = {
     "solvers.choose": "inverse",
     "solvers.parametric": "elliptic_solver matrix_solver",
     "solvers.roots": "implicit",
-    "solvers.spectral": "exponential power",
+    "solvers.separable": "exponential power",
     "flow.momentum": "convection face_laplacian face_lift",
     "advection.front": "transport",
     "flow.pressure": "projection",

@@ -60,8 +60,8 @@ from .solvers.choose import inverse as inverse
 from .solvers.parametric import elliptic_solver as elliptic_solver
 from .solvers.parametric import matrix_solver as matrix_solver
 from .solvers.roots import implicit as implicit
-from .solvers.spectral import exponential as exponential
-from .solvers.spectral import power as power
+from .solvers.separable import exponential as exponential
+from .solvers.separable import power as power
 from .space import Space as Space
 from .tape import differentiable as differentiable
 from .trajectory.front import rollout as rollout

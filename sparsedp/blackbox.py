@@ -15,10 +15,7 @@ from sparsedp.fields import check_finite
 from sparsedp.ledger import active, count
 from sparsedp.recipe import Remade
 from sparsedp.solvers.cache import Cache
-from sparsedp.solvers.colouring import Coloured
-from sparsedp.solvers.probing import REFUSED, changes, points_near, typical
-from sparsedp.solvers.sparsity import dense_pattern, find_pattern, pattern_of
-from sparsedp.solvers.translates import translated_pattern
+from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_of, stencil_pattern
 from sparsedp.tape import Rule, plain
 from sparsedp.tree import copied
 
@@ -30,6 +27,10 @@ CENTRAL = np.finfo(float).eps ** (1 / 3)  # step of central differences, relativ
 SHARES = 1.0, 1e-2  # of the step of central differences: Jacobians and probes
 MOST = {STEP: (1e-9, 1e-12), DIFFERENCES: (1e-4, 1e-4)}  # what a row may lack of a probe: of itself, of the largest row
 GROWS = 1e-5  # what it may lack of a difference if that grows with the step: rounding does not
+REFUSED = ValueError, ArithmeticError, RuntimeError  # what foreign code raises where it has no result
+POINTS = 3  # points at which a pattern is probed
+NEARER = 1.0, 0.1, 1e-3, 0.0  # shares of the way, until the code takes the point; it takes x itself
+SMALLER = 1.0, -1.0, 1e-2, -1e-2, 1e-4, -1e-4
 TIMES = 2, 5, 11  # steps at which what a row lacks is looked at again
 
 
@@ -250,7 +251,7 @@ class Adopted(Remade):
             step, along = self._steps(x), self._product(x, DIFFERENCES)
             products.insert(0, lambda v: along(step * v.reshape(x.shape)))
             near.insert(0, x)
-        guess = None if grid is None else translated_pattern(products, grid)
+        guess = None if grid is None else stencil_pattern(products, grid)
         if guess is not None:
             coloured = Coloured(_united(guess, known), grid, by_rows=False)
             if self._holds(coloured, near):
@@ -379,3 +380,67 @@ def _grows(lacks, v, along, matrix):
     """
     gaps = [along(times * v) - times * (matrix @ v.reshape(-1)) - times * lacks for times in TIMES]
     return np.all([~(np.abs(gap) > 0.1 * np.abs(lacks)) for gap in gaps], axis=0) & (lacks != 0)
+
+
+# ---------------------------------------------------------------- points that foreign code takes
+
+
+def points_near(run, x):
+    """Three points near x that `run` takes.
+
+    Parameters
+    ----------
+    run : callable
+        ``run(x) -> y``, arrays; may raise or return NaN.
+    x : array
+
+    Returns
+    -------
+    list of arrays
+    """
+    rng, size = np.random.default_rng(0), typical(x)
+    parts = [0.1 * x * rng.uniform(-1, 1, x.shape) + 0.05 * size * rng.standard_normal(x.shape) for _ in range(POINTS)]
+    return [next(x + share * part for share in NEARER if _taken(run, x + share * part, share)) for part in parts]
+
+
+def _taken(run, x, share):
+    try:
+        return share == 0 or bool(np.all(np.isfinite(run(x))))
+    except REFUSED:
+        return False
+
+
+def changes(run, x):
+    """v -> how run(x) changes when x moves along v, flat: a tenth of the size of x, less where that is refused.
+
+    Parameters
+    ----------
+    run : callable
+    x : array
+
+    Returns
+    -------
+    callable
+    """
+    size, before = 0.1 * typical(x), run(x)
+
+    def product(v):
+        refusal = None
+        for share in SMALLER:
+            try:
+                change = np.ravel(run(x + share * size * v.reshape(x.shape)) - before)
+            except REFUSED as error:
+                refusal = error
+                continue
+            if np.all(np.isfinite(change)):
+                return change
+        if refusal is not None:
+            raise refusal
+        return change
+
+    return product
+
+
+def typical(x):
+    """Root mean square of an array, 1 where that is 0 or the array is empty."""
+    return (np.sqrt(np.mean(x**2)) if x.size else 0.0) or 1.0

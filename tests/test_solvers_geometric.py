@@ -5,7 +5,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp import kernels
-from sparsedp.solvers.geometric import geometric_levels
+from sparsedp.solvers.amg import geometric_levels
 
 
 def smooth(shape, boundary, periodic=False):

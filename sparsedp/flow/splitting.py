@@ -14,15 +14,11 @@ from typing import Any
 import numpy as np
 
 from sparsedp.fields import check_finite, place
-from sparsedp.ledger import active as recordings
-from sparsedp.ledger import count, thread
 from sparsedp.solvers.record import Run
 from sparsedp.solvers.scaling import in_range, largest, norm, shifted
 from sparsedp.structure.base import Structure
 
 __all__ = ["Potential", "Projected"]
-
-EPS = np.finfo(float).eps
 
 
 class Splitting:
@@ -63,7 +59,8 @@ class Splitting:
 
         None when that is not below the tolerance, or the data are near an end of the range of floats.
         """
-        setup, turned, run = self.setup, self.transposed, Run()
+        setup, turned = self.setup, self.transposed
+        run = Run(turned)
         passes, b = setup.passes[turned], np.empty(setup.grid.cells.size)
         flow, length = passes.net_flow(x, b)
         reached = setup.reach[turned] * length
@@ -79,20 +76,7 @@ class Splitting:
         if source is not None:
             b += source
             residual = norm(b)
-        goal = setup.solver.system.rtol * flow
-        if not residual <= max(goal, 8 * EPS * reached):
-            return None
-        self._note(run, residual, goal, flow)
-        return p
-
-    def _note(self, run, residual, goal, flow):
-        run.status = "converged" if residual <= goal else "converged_at_roundoff"
-        run.residual = residual / flow if flow else 0.0
-        thread.solves += 1
-        solver = self.setup.solver
-        if recordings:
-            count(solver.name, "adjoint" if self.transposed else "solve")
-        solver.log.note(run.info(), self.transposed)
+        return p if setup.solver.accepts(run, residual, flow, reached) else None
 
     def _with_care(self, x, out, source):
         """The same in the middle of the range of floats, and by the contract, which refines or raises."""

@@ -18,8 +18,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.solvers.separable import spectrum
-from sparsedp.solvers.spectral import SpectralFunction
+from sparsedp.solvers.separable import SpectralFunction, spectrum
 from sparsedp.tape import Rule, cast, dtype_of, isbox
 
 __all__ = ["Function", "Functions", "phi"]

@@ -4,20 +4,24 @@ One cycle is a linear map M ~ A^-1. With pre-smoothing sweeps s_1 ... s_m, prolo
 and post-smoothing sweeps t_1 ... t_n, its transpose is the cycle on A^T with prolongation R^T,
 restriction P^T, pre-smoothing t_n^T ... t_1^T and post-smoothing s_m^T ... s_1^T; the transpose of a
 forward Gauss-Seidel sweep on A is a backward sweep on A^T.
+
+A geometric hierarchy interpolates linearly between the centres of pairs of cells, axis by axis: two neighbours along
+each axis become one cell of the next grid, P is the Kronecker product of interpolations along the axes, R = P^T, and
+the next matrix is R A P. P keeps constants, so a null space of constants goes down all levels.
 """
 
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
-from scipy.sparse import csr_array, csr_matrix
+from scipy.sparse import coo_array, csr_array, csr_matrix, kron
 from scipy.sparse.csgraph import connected_components
 
 from sparsedp.fields import is_number, is_whole
-from sparsedp.solvers.geometric import geometric_levels
 from sparsedp.solvers.krylov import Krylov
 
-__all__ = ["Multigrid", "multigrid_engine"]
+__all__ = ["Multigrid", "geometric_levels", "multigrid_engine"]
 
 CYCLES = {"V": 1, "W": 2}
 SWEEPS = {"forward": "backward", "backward": "forward"}  # each with its mirror image
@@ -223,6 +227,58 @@ def _without_residues(built):
         levels.append(Level(A, None if last else csr_array(level.P), None if last else csr_array(level.R)))
         reference = reference if last else abs(level.R) @ reference
     return levels
+
+
+def geometric_levels(matrix, grid, levels, coarsest):
+    """Matrix on the cells of a grid -> [(A, P, R), ...]; P and R are None on the last level.
+
+    Parameters
+    ----------
+    matrix : csr_array
+    grid : Grid
+    levels : int
+        Most levels.
+    coarsest : int
+        Unknowns from which on no next level is made.
+    """
+    widths: list = list(grid.widths)
+    built: list = []
+    while len(built) < levels - 1 and matrix.shape[0] > coarsest:
+        lines = [_interpolation(h, periodic) for h, periodic in zip(widths, grid.periodic, strict=True)]
+        P = csr_array(reduce(lambda a, b: kron(a, b, format="csr"), lines))
+        R = csr_array(P.T)
+        built.append((matrix, P, R))
+        matrix = _short(R @ matrix @ P)
+        widths = [np.add.reduceat(h, np.arange(0, h.size, 2)) for h in widths]
+    return [*((_short(A), _short(P), _short(R)) for A, P, R in built), (_short(matrix), None, None)]
+
+
+def _interpolation(widths, periodic):
+    """The 1-D matrix: a cell takes from the pair it is in and from the pair next to it, by the distance of centres."""
+    n = widths.size
+    pairs = (n + 1) // 2
+    ends = np.concatenate([[0.0], np.cumsum(widths)])
+    fine = 0.5 * (ends[1:] + ends[:-1])
+    coarse = 0.5 * (ends[np.minimum(2 * np.arange(pairs) + 2, n)] + ends[2 * np.arange(pairs)])
+    cell, own = np.arange(n), np.arange(n) // 2
+    other = own + np.where(cell % 2, 1, -1)
+    wrapped = other % pairs
+    reach = coarse[wrapped] - coarse[own] + ends[-1] * ((other >= pairs).astype(float) - (other < 0))
+    inside = (other == wrapped) | (periodic and pairs > 2)
+    share = np.where(inside, (fine - coarse[own]) / np.where(inside, reach, 1.0), 0.0)
+    share = np.clip(share, 0.0, 1.0)  # a pair of one cell has its own centre
+    entries = np.concatenate([1.0 - share, share]), (np.tile(cell, 2), np.concatenate([own, wrapped]))
+    line = csr_array(coo_array(entries, shape=(n, pairs)))
+    line.eliminate_zeros()
+    return line
+
+
+def _short(matrix):
+    """With sorted 32-bit indices, which PyAMG's sweeps ask for."""
+    matrix = csr_array(matrix)
+    matrix.sort_indices()
+    matrix.indices, matrix.indptr = matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32)
+    return matrix
 
 
 class CoarseSolve:

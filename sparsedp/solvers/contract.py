@@ -48,6 +48,7 @@ __all__ = ["Engine", "Solver", "norm"]
 
 EPS = np.finfo(float).eps
 COMPATIBLE = 1e-6  # largest relative defect of primal data that is taken for rounding
+FAR_OFF = 0.1  # a residual beyond this share of the data is no solution, whatever the size of x
 ROUNDS = 8  # refinements; each must halve the residual
 
 
@@ -137,6 +138,20 @@ class Solver(Remade):
             if thread.calls:
                 count(self.name, "iterations", run.iterations)
                 count(self.name, "skipped", int(run.status == "exact_zero_rhs"))
+
+    def accepts(self, run, residual, data, terms):
+        """Whether a solution that was found elsewhere is one: by its true residual, which the finder knows.
+
+        `residual`, `data`, `terms`: norms of the residual, of the data, and of all that the residual is the sum of.
+        """
+        run.status = self.system.accepts(residual, self.system.rtol * data, terms)
+        if run.status:
+            run.measure(residual, data, max(terms - data, 0.0))
+            thread.solves += 1
+            if thread.calls:
+                count(self.name, "adjoint" if run.transposed else "solve")
+            self.log.note(run.info(), run.transposed)
+        return bool(run.status)
 
     def unroll(self, b, start, transposed):
         """The engine's iterations on the tape. The record is that of the solve: its derivatives are no solves."""
@@ -251,7 +266,7 @@ class Solver(Remade):
             r, residual, length = system.residual(start, b, transposed)
             if system.null_space.count:
                 r, residual = system.null_space.projected(r, transposed)
-            word = system.accepts(residual, goal, length, data, transposed)
+            word = self._word(run, residual, goal, length, data)
         for _ in range(ROUNDS if not word else 0):
             step, used, trouble = self._correction(r, r is b, residual, goal, transposed)
             run.iterations += used
@@ -263,7 +278,7 @@ class Solver(Remade):
                 trouble = "nonfinite_output"
             elif reached <= residual or x is None:
                 x, r, residual, length = trial, r_trial, reached, size
-                word = system.accepts(residual, goal, length, data, transposed)
+                word = self._word(run, residual, goal, length, data)
             if trouble or not fell or not self.engine.refines or word == "converged":
                 break
             # Attainable by the norm of A is not the end where rows differ in size: go on to their own rounding.
@@ -281,6 +296,12 @@ class Solver(Remade):
             info=run.info(),
             best=x.reshape(op.domain.shape),
         )
+
+    def _word(self, run, residual, goal, length, data):
+        """The status word of a solution of this length, "" while it is none."""
+        if goal < residual and residual > FAR_OFF * data:  # huge along an unknown null vector: any size of rounding
+            return ""
+        return self.system.accepts(residual, goal, self.system.norm(run.transposed) * length + data)
 
     def _correction(self, r, is_data, residual, goal, transposed):
         """One call of the engine, on a residual in the middle of the range of floats."""

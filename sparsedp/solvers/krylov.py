@@ -2,6 +2,9 @@
 
 Conjugate gradients run on S = sign * diag(w) * A, symmetric and positive, with w the volumes on
 stretched grids. Then A x = b is S x = sign w b, and A^T y = g is S z = sign g with y = w z.
+
+The iterations, on plain flat arrays, are stopped by the caller's test. Both keep the best iterate, and name what went
+wrong with a status word ("" when nothing did).
 """
 
 from functools import partial
@@ -14,7 +17,6 @@ from sparsedp.errors import ConvergenceError
 from sparsedp.fields import is_whole
 from sparsedp.operator import Operator
 from sparsedp.solvers.contract import Engine, norm
-from sparsedp.solvers.iterations import conjugate_gradients, gmres
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.record import failure
 from sparsedp.structure.base import probes
@@ -23,6 +25,7 @@ from sparsedp.tape import plain
 __all__ = ["Krylov", "krylov_engine"]
 
 RESTART = 30
+DIVERGED = 1e8  # growth of the residual over the first one
 MOST_NUMBERS = 2**27  # in the basis of GMRES: 1 GB
 
 
@@ -207,3 +210,155 @@ def _preconditioner(system, given):
     raise ValueError(
         f"preconditioner must be None, 'jacobi' (for a diagonal of one sign), an Operator or a function, got {given!r}"
     )
+
+
+# ---------------------------------------------------------------- the iterations
+
+
+def dot(x, y):
+    """Inner product without BLAS: its threads would stall compiled kernels."""
+    return float(np.einsum("i,i->", x, y))
+
+
+class Best:
+    """The best iterate so far, and how long ago it was found."""
+
+    def __init__(self, x, residual, window):
+        self.x, self.residual, self.window = x.copy(), residual, window
+        self.first, self.found = residual, 0
+
+    def trouble(self, x, residual, number):
+        """Note an iterate; a status word when the iteration should end."""
+        if not np.isfinite(residual) or residual > DIVERGED * self.first:
+            return "diverged"
+        if residual < self.residual:
+            np.copyto(self.x, x)
+            self.residual, self.found = residual, number
+        return "stagnated" if number - self.found >= self.window else ""
+
+
+def conjugate_gradients(apply, b, precondition, measure, accepted, maxiter, window, best_of=True):
+    """Preconditioned conjugate gradients for S x = b from 0; S symmetric and positive (semi-)definite.
+
+    Parameters
+    ----------
+    apply : callable
+        S p, as a fresh array.
+    b : array
+        Overwritten: it becomes the residual.
+    precondition : callable
+        z ~ S^-1 r as a fresh array, symmetric and positive.
+    measure : callable
+        Norm of the true residual from the residual of S.
+    accepted : callable
+        accepted(residual norm, x) -> bool.
+    maxiter, window : int
+        Most iterations; most iterations without a better iterate.
+    best_of : bool
+        Whether `maxiter` iterations give the best iterate, or the last one.
+
+    Returns
+    -------
+    (x, iterations, word)
+    """
+    r, x = b, np.zeros_like(b)
+    best = Best(x, measure(r), window)
+    z = precondition(r)
+    p, rz = z.copy(), dot(r, z)
+    scratch = np.empty_like(b)
+    for number in range(1, maxiter + 1):
+        q = apply(p)
+        pq = dot(p, q)
+        if not (pq > 0 and rz > 0):
+            return best.x, number - 1, _without_descent(pq, rz, p, q, r, z)
+        x += np.multiply(p, rz / pq, out=scratch)
+        r -= np.multiply(q, rz / pq, out=scratch)
+        residual = measure(r)
+        if accepted(residual, x):
+            return x, number, ""
+        trouble = best.trouble(x, residual, number)
+        if trouble:
+            return best.x, number, trouble
+        z = precondition(r)
+        rz, before = dot(r, z), rz
+        p *= rz / before
+        p += z
+    return best.x if best_of else x, maxiter, "max_iterations"
+
+
+def _without_descent(pq, rz, p, q, r, z):
+    """Why p.Sp or r.z is not positive: rounding, or an operator that is not definite."""
+    if not np.isfinite(pq) or not np.isfinite(rz):
+        return "diverged"
+    noise = 1e-13 * np.sqrt(dot(p, p) * dot(q, q)), 1e-13 * np.sqrt(dot(r, r) * dot(z, z))
+    return "stagnated" if abs(pq) <= noise[0] or abs(rz) <= noise[1] else "indefinite_operator"
+
+
+def gmres(apply, b, precondition, goal, accepted, maxiter, restart):
+    """Restarted GMRES for A x = b from 0, preconditioned from the right: its residuals are those of A.
+
+    Parameters
+    ----------
+    apply, precondition : callables
+        A p and z ~ A^-1 r, as fresh arrays.
+    b : array
+    goal : float
+        Residual norm at which a cycle ends.
+    accepted : callable
+        accepted(residual norm, x) -> bool, asked at the end of each cycle.
+    maxiter, restart : int
+
+    Returns
+    -------
+    (x, iterations, word)
+
+    Notes
+    -----
+    Source: Saad and Schultz, SIAM J. Sci. Stat. Comput. 7, 1986.
+    """
+    x, r, used = np.zeros_like(b), b, 0
+    residual = np.sqrt(dot(r, r))
+    basis = np.empty((restart + 1, b.size))
+    while True:
+        change, steps = _gmres_cycle(apply, r, residual, precondition, goal, basis, min(restart, maxiter - used))
+        used += steps
+        trial = x + precondition(change)
+        r = b - apply(trial)
+        before, residual = residual, np.sqrt(dot(r, r))
+        if not residual < before:
+            return x, used, "stagnated" if np.isfinite(residual) else "diverged"
+        x = trial
+        if accepted(residual, x):
+            return x, used, ""
+        if used >= maxiter:
+            return x, used, "max_iterations"
+        if residual > 0.999 * before:
+            return x, used, "stagnated"
+
+
+def _gmres_cycle(apply, r, residual, precondition, goal, basis, steps):
+    """(the combination of basis vectors with the smallest residual, how many there are).
+
+    In the basis, A acts as a Hessenberg matrix with one row more than columns. With `null`, the vector that is 0 times
+    that matrix and begins with 1, the smallest residual is |r| / |null|: no system need be solved to know it.
+    """
+    hessenberg, null = np.zeros((steps + 1, steps)), np.zeros(steps + 1)
+    null[0] = 1.0
+    np.divide(r, residual, out=basis[0])
+    for j in range(steps):
+        w = apply(precondition(basis[j]))
+        for _ in range(2):  # once is not enough: orthogonality is lost to rounding
+            overlap = basis[: j + 1] @ w
+            w -= overlap @ basis[: j + 1]
+            hessenberg[: j + 1, j] += overlap
+        hessenberg[j + 1, j] = length = np.sqrt(dot(w, w))
+        if not length > 0:
+            break
+        null[j + 1] = -(null[: j + 1] @ hessenberg[: j + 1, j]) / length
+        if residual <= 0.9 * goal * np.sqrt(dot(null, null)):
+            break
+        np.divide(w, length, out=basis[j + 1])
+    data = np.zeros(j + 2)
+    data[0] = residual
+    shares = np.linalg.lstsq(hessenberg[: j + 2, : j + 1], data, rcond=None)[0]  # of rank j for a singular A
+    return shares @ basis[: j + 1], j + 1

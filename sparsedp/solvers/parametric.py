@@ -34,7 +34,7 @@ from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose import build, check_settings
 from sparsedp.solvers.record import SolveLog
 from sparsedp.space import Space, fits
-from sparsedp.structure.base import Structure
+from sparsedp.structure.base import Structure, compact
 from sparsedp.structure.lazy import Chain, Diagonal
 from sparsedp.tape import Rule, isbox, of_argument, plain
 from sparsedp.tree import copied
@@ -248,12 +248,12 @@ def _check_shift(shift):
 
 
 class Elliptic(Structure):
-    """shift - D diag(k) G as a structure: applied without a matrix, assembled by one product.
+    """shift - D diag(k) G as a structure: applied without a matrix.
 
     Parameters
     ----------
     assembly : Assembly
-        D, G and the map from k to the entries.
+        D and G.
     k : array, shape (faces,)
     shift : float
     """
@@ -292,9 +292,7 @@ class Elliptic(Structure):
 
 
 class Assembly:
-    """The sparse map from k to the entries: entry (i, j) is -sum over faces f of D[i, f] k[f] G[f, j].
-
-    One product with it gives the matrix for a new k; the pattern, with its diagonal, is found once.
+    """What does not depend on k: D, G, and bounds of their magnitudes.
 
     Parameters
     ----------
@@ -313,35 +311,14 @@ class Assembly:
         return tuple(tuple(structure.magnitude() for structure in pair) for pair in (plain, turned))
 
     @cached_property
-    def _plan(self):
-        """(map, indices, indptr, positions of the diagonal)."""
-        size = self.G.domain.size
-        rows, columns, faces, values = self._contributions()
-        own = np.arange(size, dtype=np.int64) * (size + 1)
-        keys, place = np.unique(np.concatenate([rows.astype(np.int64) * size + columns, own]), return_inverse=True)
-        place = place.astype(np.int32)
-        coefficients = sp.csr_array((values, (place[: rows.size], faces)), shape=(keys.size, self.D.domain.size))
-        indptr = np.searchsorted(keys, np.arange(size + 1, dtype=np.int64) * size).astype(np.int32)
-        return coefficients, (keys % max(size, 1)).astype(np.int32), indptr, place[rows.size :]
-
-    def _contributions(self):
-        """Row, column, face and value of every product -D[i, f] G[f, j]."""
-        D, G = self.D.structure.explicit().tocsc(), self.G.structure.explicit()
-        face = np.repeat(np.arange(G.shape[0]), np.diff(D.indptr))  # of each entry of D
-        many = np.diff(G.indptr)[face]  # entries of G that it meets
-        mine = np.repeat(np.arange(face.size), many)
-        first = np.cumsum(many) - many
-        theirs = G.indptr[face[mine]] + np.arange(mine.size) - first[mine]
-        return D.indices[mine], G.indices[theirs], face[mine].astype(np.int32), -D.data[mine] * G.data[theirs]
+    def _entries(self):
+        return self.D.structure.explicit(), self.G.structure.explicit()
 
     def matrix(self, k, shift):
-        """csr_array of shift - D diag(k) G; its pattern does not depend on k."""
-        coefficients, indices, indptr, own = self._plan
-        data = coefficients @ k
-        data[own] += shift
-        matrix = sp.csr_array((data, indices, indptr), shape=(self.G.domain.size,) * 2)
-        matrix.has_canonical_format = True
-        return matrix
+        """csr_array of shift - D diag(k) G."""
+        D, G = self._entries
+        slopes = sp.csr_array((G.data * np.repeat(k, np.diff(G.indptr)), G.indices, G.indptr), shape=G.shape)
+        return compact(shift * sp.eye_array(D.shape[0], format="csr") - D @ slopes)
 
 
 # ---------------------------------------------------------------- the entries of a matrix
