@@ -12,6 +12,8 @@ from autograd.test_util import check_grads
 from planted import call, rule, scene
 
 import sparsedp as dp
+from sparsedp.check.nodes import witnessed
+from sparsedp.ledger import recording
 
 AUDIT = dp.check.gradient
 GRID = dp.Grid((5, 4), spacing=0.7)
@@ -240,3 +242,16 @@ def test_a_fault_inside_rollout_transport_and_steps():
         found = AUDIT(loss, x, directions=2)
         assert found.verdict == "disagrees" and found.culprit == name
     assert AUDIT(lambda v: anp.sum(dp.rollout(lambda u, w: move(u, w, 0.02), ink, v, 3) ** 2), wind, directions=1)
+
+
+@pytest.mark.parametrize("memory", [None, 2000])
+def test_the_search_looks_at_the_tape_that_a_loop_keeps(memory):
+    """Whatever a rollout keeps, or runs again: those who look at the nodes change nothing."""
+    cube = dp.differentiable("cube", lambda u: u**3, lambda nums, ans, u: lambda g: (3.003 * u**2 * g,))
+    loss = lambda u: anp.sum(dp.rollout(lambda u, p: 0.01 * cube(u) + u, u, None, 5, memory=memory) ** 2)
+    plain, seen = (dp.explain(loss, X).counts["rollout.step", "recomputed"] for _ in range(2))
+    with witnessed() as nodes, recording() as calls:
+        dp.value_and_grad(loss)(X)
+    assert plain == seen == calls["rollout.step", "recomputed"]
+    assert sum(node.name == "cube" for node in nodes) >= 5
+    assert AUDIT(loss, X).culprit == "cube"

@@ -4,8 +4,6 @@ The loss of a call f is <g, f(x)> with a fixed random g. Its gradient by the rul
 any loss. An Operator is linear: <A u, g> - <u, A^T g> and A (u + v) - A u - A v tell all, without differences.
 """
 
-from typing import Any
-
 import autograd.numpy as anp
 import numpy as np
 
@@ -41,59 +39,58 @@ def culprit_of(loss, point, rng=None):
         In the order of the calls. A call that others are made inside of (a time loop, a root) is named
         only when none of those is at fault.
     """
+    rng = generator(rng)
+    cleared: set[int] = set()  # Operators that were found right
     with np.errstate(all="ignore"):
         with witnessed() as nodes:
             value_and_grad(loss)(point.tree())
-        fault = _Search(nodes, generator(rng)).first([node for node in nodes if node.inside is None])
-    return (fault[0], ", ".join(fault)) if fault else (None, NOBODY)
-
-
-class _Search:
-    """Examines calls; of many calls of one rule some, the first and the last among them. A fault: (name, reason)."""
-
-    def __init__(self, nodes, rng):
-        self.nodes, self.rng = nodes, rng
-        groups: dict[Any, list] = {}
-        for node in nodes:
-            groups.setdefault(id(node.subject), []).append(node)
-        self.chosen = {
-            id(calls[round(place)])
-            for calls in groups.values()
-            for place in np.linspace(0, len(calls) - 1, min(MOST, len(calls)))
-        }
-        self.cleared: set[int] = set()  # Operators that were found right
-
-    def first(self, calls):
-        """The first fault among calls, or inside of one."""
-        for node in calls:
-            inner = [other for other in self.nodes if other.inside is node]
-            alone = node.plain and not isinstance(node.value, tuple)  # else only what is inside can be judged
-            fault = self._fault(node) if alone and id(node) in self.chosen else None
-            if fault or not alone:
-                fault = self.first(inner) or fault
+        for node in _examined(nodes):
+            fault = _fault(node, cleared, rng)
             if fault:
-                return fault
+                return fault[0], ", ".join(fault)
+    return None, NOBODY
+
+
+def _examined(nodes):
+    """Calls that can be judged alone, those inside of a call before it; of many calls of one rule some."""
+    inner: dict[int, list] = {}
+    groups: dict[int, list] = {}
+    for node in nodes:
+        inner.setdefault(id(node.inside), []).append(node)
+        groups.setdefault(id(node.subject), []).append(node)
+    spread = [(calls, np.linspace(0, len(calls) - 1, min(MOST, len(calls)))) for calls in groups.values()]
+    chosen = {id(calls[round(place)]) for calls, places in spread for place in places}
+
+    def ordered(outer):
+        for node in inner.get(id(outer), ()):
+            yield from ordered(node)
+            if node.plain and not isinstance(node.value, tuple) and id(node) in chosen:
+                yield node
+
+    return ordered(None)
+
+
+def _fault(node, cleared, rng):
+    """(name, reason) of what is wrong with a call: its Operator, an Operator that it applies, or its rule; or None."""
+    if isinstance(node.subject, Operator):
+        return _of_operator(node.subject, cleared, rng)
+    with recording() as calls:
+        reason = _wrong_rule(node, rng)
+    if not reason:
         return None
+    actors = [actor for found in calls.actors.values() for actor in found.values() if isinstance(actor, Operator)]
+    return next(filter(None, (_of_operator(op, cleared, rng) for op in actors)), (node.name, reason))
 
-    def _fault(self, node):
-        if isinstance(node.subject, Operator):
-            return self._of_operator(node.subject)
-        with recording() as calls:
-            reason = _wrong_rule(node, self.rng)
-        actors = [actor for found in calls.actors.values() for actor in found.values() if isinstance(actor, Operator)]
-        inner = filter(None, map(self._of_operator, actors if reason else ()))
-        return next(inner, (node.name, reason) if reason else None)
 
-    def _of_operator(self, op):
-        """A fault of an Operator; of an inverse, rather of the operator that it inverts."""
-        if id(op) in self.cleared:
-            return None
-        self.cleared.add(id(op))
-        reason = fault_of(op, self.rng)
-        if reason and isinstance(op, Inverse) and fault_of(op.solver.system.given, self.rng):
-            reason += f"; so is that of {op.solver.system.given.name}, which it inverts"
-        name = op.T.name if op.name.endswith(".T") else op.name  # it and its transpose are one operator
-        return (name, reason) if reason else None
+def _of_operator(op, cleared, rng):
+    """A fault of an Operator that was not found right before; of an inverse, rather of the operator that it inverts."""
+    if id(op) in cleared:
+        return None
+    cleared.add(id(op))
+    reason = fault_of(op, rng)
+    if reason and isinstance(op, Inverse) and fault_of(op.solver.system.given, rng):
+        reason += f"; so is that of {op.solver.system.given.name}, which it inverts"
+    return (op.name.removesuffix(".T"), reason) if reason else None  # it and its transpose are one operator
 
 
 def _wrong_rule(node, rng):
@@ -115,9 +112,7 @@ def _wrong_rule(node, rng):
     if not np.all(np.isfinite(gradient)):
         return "its VJP gives NaN or infinity"
     # In each argument alone, and the largest entry: a loss of many entries hides single ones.
-    directions = [
-        pair for pair in point.directions(gradient, DIRECTIONS, rng) if pair[0] not in ("constant", "gradient")
-    ]
+    directions = [pair for pair in point.directions(gradient, DIRECTIONS, rng) if pair[0] not in SKIPPED]
     judged = examined(trials, point, base, gradient, directions, default_steps(point.eps), True)
     for one in judged:
         if one.word == "disagrees":

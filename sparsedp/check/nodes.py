@@ -29,7 +29,8 @@ class Node:
     plain : bool
         Whether no argument belongs to an outer trace.
     inside : Node or None
-        The call whose derivative made this one, as a time loop does that runs its steps again.
+        The call whose derivative made this one, as a time loop does that runs its steps again; None for the steps
+        of a loop that keeps its tape: they stand before the loop.
     again : callable
         ``again(values)`` is the same call with other values of these arguments.
     """
@@ -71,7 +72,6 @@ def witnessed(nodes=None):
         """A node that reports itself."""
 
         vjp: Any
-        asks_again = nodes is None  # calls inside a loop are looked for on its way back
 
         def __init__(self, value, fun, args, options, nums, parents):
             super().__init__(value, fun, args, options, nums, parents)
