@@ -324,14 +324,11 @@ class Audit(Result):
         return tuple(
             {
                 "direction": one.direction,
-                "step": level.step,
-                "plus": level.plus,
-                "minus": level.minus,
+                **level._asdict(),
                 "difference": level.difference,
                 "slope": level.slope,
                 "gap": _share(level.difference - level.slope, one.scale),
                 "one_sided": _share((level.plus + level.minus - 2 * one.line.base) / level.step, one.scale),
-                "note": level.note,
             }
             for one in self.lines
             for level in one.line.levels

@@ -232,14 +232,14 @@ def curves(lines, ax, xlabel, ylabel, title=None):
     """
     best = unbeaten([point for x, y in lines.values() for point in zip(x, y, strict=True)])
     ax.plot(*np.reshape(best, (-1, 2)).T, color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
+    return _dressed(lines, ax, xlabel, ylabel, title)
+
+
+def _dressed(lines, ax, xlabel, ylabel, title, xscale="log"):
     for name, (x, y) in lines.items():
         ax.plot(x, y, marker=".", markersize=4, linewidth=1, label=name)
-    return _dressed(ax, xlabel, ylabel, title)
-
-
-def _dressed(ax, xlabel, ylabel, title, xscale="log"):
     ax.set(xlabel=xlabel, ylabel=ylabel, title=title, xscale=xscale, yscale="log")
-    if ax.get_legend_handles_labels()[1]:  # curves; a map has none
+    if lines:  # a map has none
         ax.grid(visible=True, color="0.93")
         ax.legend(frameon=False, fontsize="small")
     return ax
@@ -282,12 +282,11 @@ def convergence(best, ax=None, against="iteration"):
     ax = _current(ax)
     records = [(getattr(record, against), record.value, record.gradient_norm) for record in best.history]
     across, values, norms = np.array(records, float).T
-    least = values.min()
-    loss = ("loss", values) if least > 0 else ("loss - least loss", values - least)
-    for name, heights in (loss, ("gradient norm", norms)):
-        # A height of 0 has no logarithm and leaves a gap.
-        ax.plot(across, np.where(heights > 0, heights, np.nan), marker=".", linewidth=1, label=name)
-    return _dressed(ax, against, "", f"{best.method}: {best.message.split(':')[0]}", xscale="linear")
+    least = min(values.min(), 0.0)
+    lines = {"loss - least loss" if values.min() <= 0 else "loss": values - least, "gradient norm": norms}
+    # A height of 0 has no logarithm and leaves a gap.
+    lines = {name: (across, np.where(heights > 0, heights, np.nan)) for name, heights in lines.items()}
+    return _dressed(lines, ax, against, "", f"{best.method}: {best.message.split(':')[0]}", xscale="linear")
 
 
 def v_curve(audit, ax=None):
@@ -319,13 +318,13 @@ def v_curve(audit, ax=None):
     >>> v_curve(result, figure().add_subplot()).get_xlabel()
     'step'
     """
-    ax = _current(ax)
-    for name in dict.fromkeys(row["direction"] for row in audit.rows):
-        points = [(row["step"], abs(row["gap"])) for row in audit.rows
-                  if row["direction"] == name and not row["note"] and row["gap"]]  # fmt: skip
-        ax.plot(*np.reshape(points, (-1, 2)).T, marker=".", linewidth=1, label=name)
+    lines: dict = {one.direction: ([], []) for one in audit.lines}
+    for row in audit.rows:
+        if not row["note"] and row["gap"]:  # 0 has no logarithm
+            for axis, value in zip(lines[row["direction"]], (row["step"], abs(row["gap"])), strict=True):
+                axis.append(value)
     title = f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}"
-    return _dressed(ax, "step", "|difference - gradient| / |derivative|", title)
+    return _dressed(lines, _current(ax), "step", "|difference - gradient| / |derivative|", title)
 
 
 def stability_chart(growth, ax):
@@ -346,7 +345,7 @@ def stability_chart(growth, ax):
     image = ax.pcolormesh(*axes, values, vmin=0, vmax=2, cmap="coolwarm", shading="nearest")
     ax.figure.colorbar(image, ax=ax, label="growth factor of a step (2 and more: red)")
     ax.plot(*growth.here[::-1], marker="*", color="black", markersize=12)
-    return _dressed(ax, growth.names[1], growth.names[0], "stable: blue; grows: red; refused: grey")
+    return _dressed({}, ax, growth.names[1], growth.names[0], "stable: blue; grows: red; refused: grey")
 
 
 # ---------------------------------------------------------------- figures and files

@@ -412,11 +412,10 @@ class Rows(Result):
 
 
 def _append(path, row):
-    """Add a finished row to a CSV file."""
-    before = path.read_bytes() if path.exists() else b""
-    torn = b"" if before.endswith(b"\n") or not before else b"\n"  # somebody cut its last line off
-    header, line = csv_text([row], COLUMNS).encode().split(b"\n", 1)
-    write_file(path, before + torn + line if before else header + b"\n" + line)
+    """Add a finished row to a CSV file, on a line of its own: somebody may have cut the last one off."""
+    before = path.read_text(encoding="utf-8") if path.exists() else ""
+    lines = csv_text([row], COLUMNS)
+    write_file(path, f"{before.rstrip()}\n{lines.partition(chr(10))[2]}" if before else lines)
 
 
 def _finished(path):
@@ -436,5 +435,4 @@ def _finished(path):
 
 
 def _number(text):
-    value = float(text or "nan")
-    return int(value) if value.is_integer() and "." not in text and "e" not in text else value
+    return int(text) if text.isdigit() else float(text or "nan")
