@@ -9,6 +9,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.check.summary import table
+from sparsedp.ledger import thread
 
 AUDIT = dp.check.gradient
 X = np.linspace(1.0, 2.0, 20)
@@ -73,6 +74,19 @@ def test_numbers_linear_losses_and_solves():
     assert AUDIT(lambda u: anp.sum(u * X), X).digits >= 10
     solve = dp.inverse(-dp.laplacian(GRID, dp.dirichlet))
     assert AUDIT(lambda b: anp.sum(solve(anp.exp(b)) ** 2), np.sin(np.arange(30.0)).reshape(6, 5)).digits >= 6
+
+
+def test_what_is_judged_is_not_recorded():
+    """A ledger that is open may change how things are called; one run on its own tells which solves there are."""
+    solve, seen = dp.inverse(-dp.laplacian(GRID, dp.dirichlet), "krylov", rtol=1e-9), []
+
+    def loss(b):
+        seen.append(bool(thread.calls))
+        return anp.sum(solve(b) ** 2)
+
+    assert AUDIT(loss, np.sin(np.arange(30.0)).reshape(6, 5)) and seen.count(True) == 1
+    del seen[:]
+    assert AUDIT(lambda u: seen.append(bool(thread.calls)) or smooth(u), X) and not any(seen)
 
 
 def test_rules_without_a_jvp_and_losses_that_write_into_their_argument():

@@ -134,7 +134,7 @@ def _audit(trials, point, gradient, steps, extend, count, rng, quick, beside=Fal
     """The audit at one point; `quick`: names of its directions, or None for all; `beside`: that beside kinks."""
     loss, taped, judged, hessian = trials.loss, gradient is None, [], None
     slope = (lambda tree: value_and_grad(loss)(tree)[1]) if taped else gradient
-    base = trials.value(point.tree())
+    base = trials.base(point)
     vector, doubts = _own_gradient(point, trials, base, slope)
     notes = []
     if math.isfinite(base) and np.all(np.isfinite(vector)):

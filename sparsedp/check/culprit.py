@@ -11,7 +11,7 @@ from sparsedp.check.judge import examined, forward_mode
 from sparsedp.check.nodes import witnessed
 from sparsedp.check.operators import fault_of, field
 from sparsedp.check.sweep import Point, Trials, default_steps, generator
-from sparsedp.derivative import value_and_grad
+from sparsedp.derivative import pullback, value_and_grad
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
 from sparsedp.solvers.solution import Inverse
@@ -74,10 +74,11 @@ def _fault(node, cleared, rng):
     """(name, reason) of what is wrong with a call: its Operator, an Operator that it applies, or its rule; or None."""
     if isinstance(node.subject, Operator):
         return _of_operator(node.subject, cleared, rng)
-    with recording() as calls:
-        reason = _wrong_rule(node, rng)
+    reason = _wrong_rule(node, rng)
     if not reason:
         return None
+    with recording() as calls:
+        pullback(node.again, node.values)[1](np.ones_like(node.value))
     actors = [actor for found in calls.actors.values() for actor in found.values() if isinstance(actor, Operator)]
     return next(filter(None, (_of_operator(op, cleared, rng) for op in actors)), (node.name, reason))
 
@@ -105,7 +106,7 @@ def _wrong_rule(node, rng):
         return anp.sum(anp.real(g * node.again(values)))
 
     trials = Trials(loss)
-    base = trials.value(point.tree())
+    base = trials.base(point)
     if not np.isfinite(base):
         return ""
     gradient = point.gradient(value_and_grad(loss)(point.tree())[1])

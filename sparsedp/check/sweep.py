@@ -10,14 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
-from sparsedp.ledger import recording
+from sparsedp.ledger import recording, thread
 from sparsedp.tape import is_variable
 from sparsedp.tree import copied, flatten, norm
 
 __all__ = ["POINTS", "REFUSALS", "Line", "Point", "Trials", "default_steps", "generator", "joined", "noise_of"]
 
 REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # what a loss may raise away from x
-SOLVES = ("solve", "adjoint")  # kinds under which the ledger counts solves
 MOST_LEAVES = 8  # with more leaves than this, none gets a direction of its own
 SAME = "the loss does not change"
 
@@ -164,7 +163,7 @@ class Trials:
     Attributes
     ----------
     solved : bool
-        Whether the ledger showed a solve of this library in the first evaluation.
+        Whether the loss takes a solve of this library at the point.
     tolerance : float
         The loosest relative tolerance of iterative ones.
     eps : float
@@ -181,7 +180,7 @@ class Trials:
         self.count += 1
         self.tick()
         with np.errstate(all="ignore"):
-            value = np.asarray(self.loss(tree) if self.count > 1 else self._first(tree))
+            value = np.asarray(self.loss(tree))
         if value.shape != ():
             raise ShapeError(f"the loss must be a scalar, got an array of shape {value.shape}; sum it")
         if value.dtype.kind == "c":
@@ -192,12 +191,16 @@ class Trials:
             self.eps = max(self.eps, float(np.finfo(value.dtype).eps))
         return float(value)
 
-    def _first(self, tree):
-        with recording() as calls:
-            value = self.loss(tree)
-        self.solved = any(kind in SOLVES for _, kind in calls)
-        solvers = [actor for found in calls.actors.values() for actor in found.values() if hasattr(actor, "engine")]
-        self.tolerance = max((solver.system.rtol for solver in solvers if solver.engine.iterative), default=0.0)
+    def base(self, point):
+        """The loss at the point. Solves are looked at in one more run: recording is no part of what is judged."""
+        before = thread.solves
+        value = self.value(point.tree())
+        self.solved = thread.solves > before
+        if self.solved:
+            with recording() as calls, np.errstate(all="ignore"):
+                self.loss(point.tree())
+            solvers = [actor for found in calls.actors.values() for actor in found.values() if hasattr(actor, "engine")]
+            self.tolerance = max((solver.system.rtol for solver in solvers if solver.engine.iterative), default=0.0)
         return value
 
     def attempt(self, tree):
