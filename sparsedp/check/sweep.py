@@ -14,7 +14,18 @@ from sparsedp.ledger import recording, thread
 from sparsedp.tape import is_variable
 from sparsedp.tree import copied, flatten, norm
 
-__all__ = ["POINTS", "REFUSALS", "Line", "Point", "Trials", "default_steps", "generator", "joined", "noise_of"]
+__all__ = [
+    "POINTS",
+    "REFUSALS",
+    "Line",
+    "Point",
+    "Trials",
+    "default_steps",
+    "generator",
+    "joined",
+    "noise_of",
+    "solvers_of",
+]
 
 REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # what a loss may raise away from x
 MOST_LEAVES = 8  # with more leaves than this, none gets a direction of its own
@@ -199,8 +210,8 @@ class Trials:
         if self.solved:
             with recording() as calls, np.errstate(all="ignore"):
                 self.loss(point.tree())
-            solvers = [actor for found in calls.actors.values() for actor in found.values() if hasattr(actor, "engine")]
-            self.tolerance = max((solver.system.rtol for solver in solvers if solver.engine.iterative), default=0.0)
+            loose = [solver.system.rtol for _, solver in solvers_of(calls) if solver.engine.iterative]
+            self.tolerance = max(loose, default=0.0)
         return value
 
     def attempt(self, tree):
@@ -210,6 +221,11 @@ class Trials:
         except REFUSALS as error:
             return np.nan, f"{type(error).__name__}: {error}"
         return (value, "") if np.isfinite(value) else (np.nan, "the loss overflows")
+
+
+def solvers_of(calls):
+    """Recorded calls -> pairs of name and solver, of all that solved."""
+    return [(name, one) for name, found in calls.actors.items() for one in found.values() if hasattr(one, "engine")]
 
 
 class Level(NamedTuple):

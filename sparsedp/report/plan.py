@@ -5,6 +5,7 @@ from importlib.util import find_spec
 from time import perf_counter
 
 from sparsedp.check.nodes import bytes_held, witnessed
+from sparsedp.check.sweep import solvers_of
 from sparsedp.derivative import value_and_grad
 from sparsedp.fields import check_function
 from sparsedp.ledger import recording
@@ -241,21 +242,20 @@ def _matrices(calls, name, operators):
 
 def _solves(calls):
     """What the solvers did not build or solve."""
-    found = []
-    for name, actors in calls.actors.items():
-        engines = [actor.engine for actor in actors.values() if hasattr(actor, "engine")]
-        for engine in engines:
-            if not engine.hierarchical:
-                found.append(f"multigrid hierarchy for {name}: not built, {engine.method} needs none")
-        if engines and not calls[name, "setup"]:
-            found.append(f"set-up of {name}: made before, {calls[name, 'reused']} solves reuse it")
-        if engines and calls[name, "solve"] and not calls[name, "adjoint"]:
-            found.append(f"adjoint solve of {name}: nothing asks for it")
-    if not any(hasattr(actor, "engine") for actors in calls.actors.values() for actor in actors.values()):
+    solvers, found = solvers_of(calls), {}
+    for name, solver in solvers:
+        found |= {
+            f"multigrid hierarchy for {name}: not built, {solver.engine.method} needs none":
+                not solver.engine.hierarchical,
+            f"set-up of {name}: made before, {calls[name, 'reused']} solves reuse it": not calls[name, "setup"],
+            f"adjoint solve of {name}: nothing asks for it": calls[name, "solve"] and not calls[name, "adjoint"],
+        }  # fmt: skip
+    sentences = [sentence for sentence, holds in found.items() if holds]
+    if not solvers:
         yield "solves: none, so no hierarchy, no factors, no set-up"
-    elif not found and not total(calls, "hierarchy"):
+    elif not sentences and not total(calls, "hierarchy"):
         yield "multigrid hierarchies: none built in this run"
-    yield from dict.fromkeys(found)
+    yield from sentences
 
 
 def _extras(loaded):
