@@ -558,21 +558,33 @@ class OperatorSummary(Summary):
 
     def _head(self):
         op, facts = self.op, self.facts
-        parts = [op.form, str(op.dtype), "entries not listed" if self.nnz is None else f"{self.nnz} entries"]
-        parts += [f"{facts['bytes']} bytes"] if "bytes" in facts else []
-        parts += [] if self.size is None else [f"sqrt(|A|_1 |A|_inf) = {self.size:.3g}"]
+        entries = "entries not listed" if self.nnz is None else f"{self.nnz} entries"
         times = [f"{1e6 * seconds:.3g} us {form}" for form, seconds in facts.get("seconds", {}).items()]
-        short = [f"{name} {_word(facts[name])}" for name in SHORT if name in facts]
-        lines = [", ".join(parts), ", ".join(times) and f"one application: {', '.join(times)}", ", ".join(short)]
+        short = [f"{name} {_word(facts[name])}" for name in SHORT if facts.get(name) is not None]
+        lines = [
+            f"{op.form}, {op.dtype}, {entries}",
+            times and f"one application: {', '.join(times)}",
+            ", ".join(short),
+        ]
         lines += [f"{name}: {facts[name]}" for name in LONG if name in facts]
         return [*super()._head(), *(f"  {line}" for line in lines if line)]
 
 
-SHORT = ("row sums", "symmetric", "definite", "M-matrix", "null space", "spectral radius", "stable step")
+SHORT = (
+    "bytes",
+    "size",
+    "row sums",
+    "symmetric",
+    "definite",
+    "M-matrix",
+    "null space",
+    "spectral radius",
+    "stable step",
+)
 LONG = "integration by parts", "order", "acts as"
 
 
 def _word(value):
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return value if isinstance(value, str) else f"{value:.4g}"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -91,17 +91,12 @@ class Summary(Result):
 
     def __str__(self):
         words = {True: "ok", False: "FAILS", None: "-"}
-        cells = [
-            (
-                row.name,
-                "" if row.figure is None else f"{row.figure:.3g}",
-                "" if row.limit is None else f"<= {row.limit:g}",
-                words[row.ok],
-                row.note,
-            )
-            for row in self.rows
-        ]
+        rows = [(row.name, row.figure, row.limit, words[row.ok], row.note) for row in self.rows]
+        cells = [["" if x is None else form.format(x) for form, x in zip(FORMS, row, strict=True)] for row in rows]
         return "\n".join([*self._head(), table(cells)])
+
+
+FORMS = "{}", "{:.3g}", "<= {:g}", "{}", "{}"  # of the cells of a row
 
 
 def table(lines: Any, head=None, indent="  "):
