@@ -1,4 +1,4 @@
-"""Results of checks: values with a verdict that print their table."""
+"""What checks and instruments give: frozen values that print themselves, and their columns of text."""
 
 import math
 from typing import Any, NamedTuple

@@ -242,13 +242,14 @@ def _matrices(calls, name, operators):
 
 def _solves(calls):
     """What the solvers did not build or solve."""
-    solvers, found = solvers_of(calls), {}
+    solvers = solvers_of(calls)
+    found: dict[str, bool] = {}
     for name, solver in solvers:
         found |= {
             f"multigrid hierarchy for {name}: not built, {solver.engine.method} needs none":
                 not solver.engine.hierarchical,
             f"set-up of {name}: made before, {calls[name, 'reused']} solves reuse it": not calls[name, "setup"],
-            f"adjoint solve of {name}: nothing asks for it": calls[name, "solve"] and not calls[name, "adjoint"],
+            f"adjoint solve of {name}: nothing asks for it": calls[name, "solve"] > 0 == calls[name, "adjoint"],
         }  # fmt: skip
     sentences = [sentence for sentence, holds in found.items() if holds]
     if not solvers:
