@@ -238,7 +238,7 @@ def _even(system):
     """Whether all cells are linked, about equally strongly along each axis and along different ones."""
     if system.faces is None or not system.faces.connected:
         return False
-    links = [c[c > 0] for c in system.faces.stencil().links if c.any()]
+    links = [c[c > 0] for c in system.faces.links if c.any()]
     tops = [float(c.max()) for c in links]
     along = all(top <= EVEN_ALONG * c.min() for c, top in zip(links, tops))
     return along and max(tops) <= EVEN_BETWEEN * min(tops)

@@ -94,7 +94,7 @@ class System:
 
     @cached_property
     def faces(self):
-        """The coefficients of the faces, where the operator is made of them and no probing is needed; else None."""
+        """The stencil, where the operator is made of differences over faces and no entries are needed; else None."""
         if self.grid is None or self.grid.dim == 1:
             return None
         from sparsedp.solvers.multigrid.lines import faces_of

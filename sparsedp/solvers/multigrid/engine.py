@@ -89,22 +89,20 @@ def _built(system, dtype=None):
     stencil, faces = stencil_of(system), system.faces
     if faces is not None and faces.connected:  # what is known need not be found from the entries
         system.components = None, 1
-        if faces.held:
+        if faces.extra.any():
             system.null_space = NullSpace(None, np.zeros(system.size), np.zeros(system.size), 0)
     else:
         system.components = components(stencil)
     free = system.null_space.right != 0 if system.null_space.count else np.zeros(system.size, bool)
-    engine = Structured(stencil, free, system.maxiter, dtype or _precision(stencil, faces))
+    engine = Structured(stencil, free, system.maxiter, dtype or _precision(stencil))
     if system.grid.cells.size and all(system.grid.uniform):
         system.norms = engine.norm, engine.norm
     return engine
 
 
-def _precision(stencil, faces):
+def _precision(stencil):
     """The type that resolves how weakly the cells with the largest coefficients may be held together."""
     limit = SINGLE_UP_TO / max(1, *stencil.grid.shape)
-    if faces is not None and faces.largest <= limit * faces.smallest:
-        return np.float32
     smooth = all(c.max(initial=0.0) <= limit * c.min(initial=np.inf, where=c > 0) for c in stencil.links)
     return np.float32 if smooth else np.float64
 
@@ -143,10 +141,10 @@ class Structured(Engine):
         level.weak = spread.taken(level.weak)
         self.fine, self.weak_share, self.hierarchy = hierarchy(level, spread.coarsenings)
         self.hierarchy += ", cycle in double precision" if dtype == np.float64 else ""
-        volumes, filled = spread.volumes()
+        volumes = spread.volumes()
         scale, root = layout.cells(level.scale), layout.cells(level.root)
         self.factors = scale * volumes, scale  # what a right-hand side of A, and of its transpose, is multiplied with
-        gauges = root / filled, root  # how a scaled residual measures in the user's cells, but for a number
+        gauges = root / volumes, root  # how a scaled residual measures in the user's cells, but for a number
         self.tops = tuple((float(gauge.max(initial=0.0)) or 1.0) / abs(self.scale) for gauge in gauges)
         self.norm = 2.0 * float(np.max(gauges[0] * root, initial=0.0)) / abs(self.scale)
         self.gauges = layout.zeros(2, dtype=dtype)

@@ -48,18 +48,17 @@ class Level:
 
     def __init__(self, layout, links, extra, free, dtype, threads):
         self.layout, self.dtype, self.threads = layout, dtype, threads
-        self.links, self.extra, self.free = layout.wrap(links), extra, free
+        self.links, self.free = layout.wrap(links), free
         self.steps = axis_steps(layout.dim) if len(links) == layout.dim else steps_around(layout.dim)
         self.pitches = np.array(self.steps) @ layout.pitch
-        held, size, self.root, self.scale = layout.zeros(layout.dim), layout.zeros(), layout.zeros(), layout.zeros()
-        total, middle = np.where(free, 0.0, extra), layout.middle
+        held, self.root, self.scale = layout.zeros(layout.dim), layout.zeros(), layout.zeros()
+        self.extra, middle = np.where(free, 0.0, extra), layout.middle
+        total = self.extra.copy()
         for link, step in zip(self.links, self.steps):
             for a in (link.reshape(-1)[middle], layout.beside(link, [-d for d in step])):
                 total.reshape(-1)[middle] += a
-                size.reshape(-1)[middle] += np.abs(a)
                 for axis in np.flatnonzero(step):
                     held[axis].reshape(-1)[middle] += a
-        self.extra = np.where(free, 0.0, extra)
         layout.cells(self.root)[...] = np.sqrt(np.maximum(layout.cells(total), 0.0))
         np.divide(1.0, self.root, out=self.scale, where=self.root > 0.0)
         layout.wrap(self.root), layout.wrap(self.scale)
@@ -68,7 +67,6 @@ class Level:
         for out, link, step in zip(self.coupling, self.links, self.steps):
             out[middle] = link.reshape(-1)[middle] * self.scale.reshape(-1)[middle] * layout.beside(self.scale, step)
         layout.wrap(self.coupling.reshape(links.shape))
-        self.bound = 1.0 + float(np.max(size * self.scale**2))  # no eigenvalue is larger (Gershgorin)
 
     @property
     def weak_share(self):
@@ -84,16 +82,14 @@ class Level:
         return self.layout.wrap(out)
 
     def largest(self):
-        """The largest eigenvalue of A with a unit diagonal: a bound if no link is negative, else by power iteration."""
-        if self.bound <= 2.0 + ROUNDING and len(self.links) == self.layout.dim:
-            return self.bound
-        x, y, size = *self.layout.zeros(2), 1.0
+        """The largest eigenvalue of A with a unit diagonal, by power iteration; on the finest level it is at most 2."""
+        x, y, size = *self.layout.zeros(2), 2.0
         self.layout.cells(x)[...] = np.random.default_rng(0).standard_normal(self.layout.shape)
-        for _ in range(POWERS):
+        for _ in range(POWERS if len(self.links) > self.layout.dim else 0):
             self.apply(self.layout.wrap(x), y)
-            size = norm(self.layout.cells(y).reshape(-1))
-            x, y = y / (size or 1.0), x
-        return min(self.bound, MARGIN * size)
+            size = MARGIN * norm(self.layout.cells(y).reshape(-1))
+            x, y = y * (MARGIN / (size or 1.0)), x
+        return size or 1.0
 
     def coarsened(self):
         """The next level: Galerkin's P^T A P."""

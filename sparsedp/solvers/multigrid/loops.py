@@ -27,6 +27,12 @@ def copy(out, a):
 
 
 @inner
+def clear(out):
+    for k in range(out.size):  # a slice would not be vectorised
+        out[k] = 0.0
+
+
+@inner
 def add_two(out, a, x, b, y):
     """out += a x + b y."""
     for k in range(out.size):
@@ -37,7 +43,7 @@ def add_two(out, a, x, b, y):
 def neighbours(out, c, at, x, place, steps):
     """out = c x. Where its cells begin: `at` in c, `place` in x."""
     n = out.size
-    out[:] = 0.0
+    clear(out)
     for m in range(steps.size):
         d = steps[m]
         forward, backward = c[m, at : at + n], c[m, at - d : at - d + n]
@@ -184,7 +190,7 @@ def restrict(weights, r, out, steps, fine, coarse, start, stop):
             at = (GHOST + g) * coarse[0] + coarse[4] + j * coarse[1] + 1
             place = (GHOST + 2 * g) * fine[0] + fine[4] + 2 * j * fine[1] + 1
             row = out[at : at + n]
-            row[:] = 0.0
+            clear(row)
             for m in range(steps.size):
                 weight, values = weights[m, at : at + n], r[place + steps[m] :]
                 for k in range(n):
@@ -203,7 +209,7 @@ def prolong(weights, e, x, table, ends, fine, coarse, start, stop):
             kind = 4 * (g & 1) + 2 * (j & 1)
             for p in range(2):
                 row = sums[p]
-                row[:] = 0.0
+                clear(row)
                 for m in range(ends[kind + p], ends[kind + p + 1]):
                     number, place = table[m, 0], at + table[m, 1]
                     weight, values = weights[number, place : place + half], e[place : place + half]

@@ -36,9 +36,9 @@ class Spread:
 
     def __init__(self, grid):
         self.grid, self.dim = grid, grid.dim
-        shape, self.coarsenings = _halved(grid.shape), 1
-        while prod(shape) > COARSEST:
-            shape, self.coarsenings = _halved(shape), self.coarsenings + 1
+        self.coarsenings = 1
+        while prod(-(-n // 2**self.coarsenings) for n in grid.shape) > COARSEST:
+            self.coarsenings += 1
         self.places: list[np.ndarray] = []
         self.shape: tuple[int, ...] = ()
         for n, flag in zip(grid.shape, grid.periodic):
@@ -58,18 +58,10 @@ class Spread:
         totals = (-(-(n - 1) // 2**step) * 2**step + 1 for step in range(steps + 1))
         return max(total for total in totals if total - n <= allowed)
 
-    def _widths(self):
-        """Widths of the cells along each axis; 0 in those without content."""
-        found = [np.zeros(total) for total in self.shape]
-        for out, place, h in zip(found, self.places, self.grid.widths):
-            out[place] = h
-        return found
-
     def volumes(self):
-        """Volumes of the cells, 0 in those without content; and with that of a neighbour there."""
-        found = self._widths()
-        filled = [np.where(w > 0, w, np.minimum(np.roll(w, 1), np.roll(w, -1))) for w in found]
-        return tuple(reduce(np.multiply.outer, lines) for lines in (found, filled))
+        """Volumes of the cells; those without content have one like their neighbours, to measure residuals with."""
+        places = zip(self.shape, self.places, self.grid.widths)
+        return reduce(np.multiply.outer, [np.interp(np.arange(total), place, h) for total, place, h in places])
 
     def put(self, field, out):
         """Field -> the cells of the grid in natural order."""
@@ -97,10 +89,6 @@ class Spread:
         gap = place[np.diff(place, append=total if periodic else place[-1] + 1) == 2]
         lines[gap] *= 2.0
         lines[gap + 1] = lines[gap]
-
-
-def _halved(shape):
-    return tuple((n + 1) // 2 for n in shape)
 
 
 def _runs(place):

@@ -1,4 +1,4 @@
-"""Stencil: a symmetric 5- or 7-point matrix on the cells of a grid; read off the entries of an operator, and checked."""
+"""Stencil: a symmetric 5- or 7-point matrix on the cells of a grid; read off the entries of an operator."""
 
 from typing import Any, NamedTuple
 
@@ -44,6 +44,18 @@ class Stencil(NamedTuple):
             out += np.roll(flux, 1, axis) - flux
         return out
 
+    @property
+    def connected(self):
+        """Whether every cell is linked to all of its neighbours."""
+        size, grid = self.extra.size, self.grid
+        whole = sum(size if flag and n > 1 else size - size // n for n, flag in zip(grid.shape, grid.periodic))
+        return size > 1 and sum(map(np.count_nonzero, self.links)) == whole
+
+    def within(self, exponent):
+        """Whether |A|_inf is certainly between 2^-exponent and 2^exponent; where it is known to be near 1."""
+        low, high = (abs(self.scale) * bound(self.grid.volumes) for bound in (np.max, np.min))
+        return 0.5 / low > 2.0**-exponent and (4 * self.grid.dim + 1) / high < 2.0**exponent
+
     def checked(self):
         """The stencil times the number that makes it positive and near 1; refuses what multigrid cannot smooth."""
         values = np.array([array.flat[np.argmax(np.abs(array))] for array in (*self.links, self.extra) if array.size])
@@ -88,7 +100,7 @@ def stencil_of(system):
     if grid.dim == 1:
         raise Unfit("the grid is 1-D")
     if system.faces is not None:
-        return system.faces.stencil()
+        return system.faces
     if not structure.has_entries or system.complex:
         raise Unfit("it is not made of differences over single faces")
     active = np.ones(grid.shape, bool) if system.active is None else system.active.reshape(grid.shape)
