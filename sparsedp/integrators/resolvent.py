@@ -70,11 +70,16 @@ class Resolvent:
         inv = inv.T if transposed else inv if checked else inv.tangent
         if self._kernel is None:
             return inv.apply(b)
-        flat = np.asarray(b, dtype=np.result_type(b, np.float64)).reshape(-1)
-        moving = self._kernel.project(flat, transposed)
-        x = self._kernel.project(inv.apply(moving.reshape(np.shape(b))).reshape(-1), transposed)
-        x = (x + (flat - moving)).reshape(np.shape(b))
+        b = np.asarray(b)
+        wide = b.astype(np.result_type(b, np.float64), copy=False)
+        moving = self._projected(wide, transposed)
+        x = self._projected(inv.apply(moving), transposed) + (wide - moving)
         return x.astype(np.result_type(b, np.float32), copy=False)
+
+    def _projected(self, b, transposed):
+        """b without what L leaves as it is, field by field of a batch."""
+        fields = np.ascontiguousarray(b).reshape(-1, self.op.shape[0])
+        return np.array([self._kernel.project(field, transposed) for field in fields]).reshape(b.shape)
 
     @cached_property
     def _kernel(self):
