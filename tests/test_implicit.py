@@ -138,7 +138,7 @@ def test_the_adjoint_uses_the_jacobian_at_the_root_not_the_last_one(monkeypatch)
         return np.max(np.abs(flat(pull(np.ones(x.shape))) - wanted)) / np.max(np.abs(wanted))
 
     assert gap() <= 1e-12
-    monkeypatch.setattr(Jacobians, "kept", lambda self, *point: self._points.last)
+    monkeypatch.setattr(Jacobians, "cached", lambda self, *point: self._points.last)
     assert gap() > 1e-4
 
 

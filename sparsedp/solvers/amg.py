@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from sparsedp.fields import is_number, is_whole
 from sparsedp.solvers.krylov import Krylov
 
-__all__ = ["Multigrid", "geometric_levels", "multigrid_engine"]
+__all__ = ["Multigrid", "coarse_solver", "geometric_levels", "multigrid_engine"]
 
 CYCLES = {"V": 1, "W": 2}
 SWEEPS = {"forward": "backward", "backward": "forward"}  # each with its mirror image
@@ -122,7 +122,7 @@ class Multigrid(Krylov):
         if grid is None:
             built = _ruge_stueben(matrix, strength, levels)
         else:
-            built = [Level(*level) for level in geometric_levels(matrix, grid, levels, COARSEST)]
+            built = geometric_levels(matrix, grid, levels, COARSEST)
         self.forward = Hierarchy(built, visits, *sweeps)
         self._transposed: Any = None
         self.hierarchy = self.forward.words
@@ -151,19 +151,20 @@ class Hierarchy:
     def __init__(self, levels, visits, before, after, coarse=None):
         self.levels, self.visits = levels, visits
         self.before, self.after = before, after
-        self._coarse = coarse or CoarseSolve(levels[-1].A)
+        self._coarse = coarse or coarse_solver(levels[-1].A)
 
     def transpose(self):
         """The hierarchy of the transposed cycle."""
         levels = [Level(_turned(level.A), _turned(level.R), _turned(level.P)) for level in self.levels]
         before, after = (tuple(SWEEPS[sweep] for sweep in reversed(side)) for side in (self.after, self.before))
-        return Hierarchy(levels, self.visits, before, after, self._coarse.transpose())
+        coarse = self._coarse
+        return Hierarchy(levels, self.visits, before, after, lambda b, transposed: coarse(b, not transposed))
 
     def cycle(self, b, number=0):
         """One cycle from 0: M b, as a fresh array."""
         level = self.levels[number]
         if number == len(self.levels) - 1:
-            return self._coarse(b)
+            return self._coarse(b, False)
         x = np.zeros_like(b)
         self._smooth(level.A, x, b, self.before)
         rest = level.R @ (b - level.A @ x)
@@ -230,7 +231,7 @@ def _without_residues(built):
 
 
 def geometric_levels(matrix, grid, levels, coarsest):
-    """Matrix on the cells of a grid -> [(A, P, R), ...]; P and R are None on the last level.
+    """Matrix on the cells of a grid -> Levels; P and R are None on the last one.
 
     Parameters
     ----------
@@ -250,25 +251,21 @@ def geometric_levels(matrix, grid, levels, coarsest):
         built.append((matrix, P, R))
         matrix = _short(R @ matrix @ P)
         widths = [np.add.reduceat(h, np.arange(0, h.size, 2)) for h in widths]
-    return [*((_short(A), _short(P), _short(R)) for A, P, R in built), (_short(matrix), None, None)]
+    return [*(Level(*map(_short, level)) for level in built), Level(_short(matrix), None, None)]
 
 
 def _interpolation(widths, periodic):
-    """The 1-D matrix: a cell takes from the pair it is in and from the pair next to it, by the distance of centres."""
-    n = widths.size
-    pairs = (n + 1) // 2
+    """The 1-D matrix: a cell takes from the two pairs whose centres are next to its own, by the distance."""
+    n, wraps = widths.size, periodic and widths.size > 4  # with two pairs, both sides of a cell are the same one
     ends = np.concatenate([[0.0], np.cumsum(widths)])
     fine = 0.5 * (ends[1:] + ends[:-1])
-    coarse = 0.5 * (ends[np.minimum(2 * np.arange(pairs) + 2, n)] + ends[2 * np.arange(pairs)])
-    cell, own = np.arange(n), np.arange(n) // 2
-    other = own + np.where(cell % 2, 1, -1)
-    wrapped = other % pairs
-    reach = coarse[wrapped] - coarse[own] + ends[-1] * ((other >= pairs).astype(float) - (other < 0))
-    inside = (other == wrapped) | (periodic and pairs > 2)
-    share = np.where(inside, (fine - coarse[own]) / np.where(inside, reach, 1.0), 0.0)
-    share = np.clip(share, 0.0, 1.0)  # a pair of one cell has its own centre
-    entries = np.concatenate([1.0 - share, share]), (np.tile(cell, 2), np.concatenate([own, wrapped]))
-    line = csr_array(coo_array(entries, shape=(n, pairs)))
+    coarse = 0.5 * (ends[np.minimum(np.arange(2, n + 2, 2), n)] + ends[:-1:2])
+    around = np.concatenate([[coarse[-1] - ends[-1]], coarse, [coarse[0] + ends[-1]]])
+    fine = fine if wraps else np.clip(fine, coarse[0], coarse[-1])
+    below = np.searchsorted(around, fine, side="right") - 1
+    share = (fine - around[below]) / (around[below + 1] - around[below])
+    places = np.tile(np.arange(n), 2), np.concatenate([below - 1, below]) % coarse.size
+    line = csr_array(coo_array((np.concatenate([1.0 - share, share]), places), shape=(n, coarse.size)))
     line.eliminate_zeros()
     return line
 
@@ -281,26 +278,13 @@ def _short(matrix):
     return matrix
 
 
-class CoarseSolve:
-    """Dense LU of the coarsest matrix. Its null modes, constants on a component, are dropped.
+def coarse_solver(matrix):
+    """The matrix of the coarsest level -> solve(b, transposed): dense LU without the null modes.
 
-    A component whose rows sum to 0 is made regular by adding the mean, scaled to its entries: for
-    compatible data the solution is the one with mean 0, and that of the transposed system likewise.
+    A component whose rows sum to 0 (constants are its null mode) is made regular by adding the mean, scaled to its
+    entries: for compatible data the solution is the one with mean 0, and that of the transposed system likewise.
     Other singular matrices (null vectors that are not constant) get the pseudo-inverse.
     """
-
-    def __init__(self, matrix, solve=None, transposed=False):
-        self._transposed = transposed
-        self._solve = solve or _coarse_solver(matrix)
-
-    def __call__(self, b):
-        return self._solve(b, self._transposed)
-
-    def transpose(self):
-        return CoarseSolve(None, self._solve, not self._transposed)
-
-
-def _coarse_solver(matrix):
     dense, size = matrix.toarray(), matrix.shape[0]
     count, labels = connected_components(matrix, directed=False)
     sums, sizes = matrix @ np.ones(size), abs(matrix) @ np.ones(size)

@@ -9,7 +9,7 @@ from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, spent
 from sparsedp.operators.given import check_operator
 from sparsedp.solvers.amg import multigrid_engine
-from sparsedp.solvers.contract import Nothing, Solver
+from sparsedp.solvers.contract import EmptySystem, Solver
 from sparsedp.solvers.direct import DenseLU, DenseSystem, Direct
 from sparsedp.solvers.krylov import krylov_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
@@ -176,7 +176,7 @@ def _check_options(word, options):
 
 def _engine(system, word, options):
     if system.unknowns == 0:
-        return Nothing()
+        return EmptySystem()
     if system.empty_row is not None:
         raise ConvergenceError(
             f"row {system.empty_row} of {system.given} has no entries, but its unknown is used in other rows; "

@@ -65,7 +65,7 @@ class Engine:
     unrolled = False
 
 
-class Nothing(Engine):
+class EmptySystem(Engine):
     """The engine of a system without unknowns: it is never called."""
 
     method = "none"

@@ -19,9 +19,9 @@ from sparsedp.errors import ConvergenceError
 from sparsedp.solvers.contract import Engine
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.record import failure
-from sparsedp.solvers.scaling import in_range, norm
+from sparsedp.solvers.scaling import in_range, length
 from sparsedp.solvers.system import System
-from sparsedp.structure.base import probes
+from sparsedp.structure.base import probes, rows_of
 
 __all__ = ["DENSE_UP_TO", "DenseLU", "DenseSystem", "Direct"]
 
@@ -123,7 +123,7 @@ class DenseSystem(System):
         return (self.sizes.T if transposed else self.sizes) @ x
 
     def terms(self, x):
-        return norm(self.sizes @ np.abs(x))
+        return length(self.sizes @ np.abs(x))
 
 
 class DenseLU(Engine):
@@ -153,7 +153,7 @@ def _dense(matrix, size=None):
 
 
 def _bandwidths(matrix):
-    row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    row = rows_of(matrix)
     offsets = matrix.indices - row
     return -int(offsets.min(initial=0)), int(offsets.max(initial=0))
 
@@ -161,7 +161,7 @@ def _bandwidths(matrix):
 def _banded(matrix, lower, upper):
     size = matrix.shape[0]
     bands = np.zeros((2 * lower + upper + 1, size), matrix.dtype)  # `lower` extra rows for the pivots
-    row = np.repeat(np.arange(size), np.diff(matrix.indptr))
+    row = rows_of(matrix)
     bands[lower + upper + row - matrix.indices, matrix.indices] = matrix.data
     factor, solve = la.lapack.get_lapack_funcs(("gbtrf", "gbtrs"), dtype=matrix.dtype)
     factors, pivots, _ = factor(bands, lower, upper)

@@ -1,6 +1,6 @@
 """The Jacobian J = dF/dx of a residual at a point, set up for solves: given, assembled by colours, or as products.
 
-Set-ups are kept by content, the last two: of the point (x and the parameters, for the derivative rules),
+Set-ups are cached by content, the last two: of the point (x and the parameters, for the derivative rules),
 and of the entries (a residual that is linear in x is set up once). Forward solves never look a point up.
 """
 
@@ -22,7 +22,7 @@ from sparsedp.solvers.choose import build, build_dense
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.record import failure
 from sparsedp.solvers.solution import Inverse
-from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern
+from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like
 from sparsedp.tape import called, isbox
 from sparsedp.traces import ReverseNode, untraced
 
@@ -53,12 +53,6 @@ class Linearisation:
 
     def __str__(self):
         return str(Inverse(self.solver, self.solver.reason))
-
-    @property
-    def norm(self):
-        """|J|_inf, or an upper bound."""
-        system = self.solver.system
-        return float(np.ldexp(system.norm(), system.exponent))
 
     @property
     def singular(self):
@@ -110,7 +104,7 @@ class Jacobians:
 
     def __init__(self, name, jacobian, sparsity, settings):
         self.name, self.given, self.settings = name, jacobian, settings
-        self.sparsity: Any = None if sparsity is None else _pattern(sparsity)
+        self.sparsity: Any = None if sparsity is None else pattern_like(sparsity)
         self.by_rows = None  # True: the residual has no JVP
         self.way = ""
         self._spaces: dict = {}  # size -> the cells that the unknowns were found to lie on
@@ -132,8 +126,8 @@ class Jacobians:
         known = Linearisation(solver, point, exact)
         return self._points.put(_key(equation, x, leaves), known)
 
-    def kept(self, equation, x, leaves):
-        """The Jacobian at this point for a derivative: kept or made, and checked against the residual."""
+    def cached(self, equation, x, leaves):
+        """The Jacobian at this point for a derivative: found again or made, and checked against the residual."""
         known = self._points.find(_key(equation, x, leaves)) or self.fresh(equation, x, leaves)
         return self.fresh(equation, x, leaves) if self.enlarged(known) else known
 
@@ -144,7 +138,7 @@ class Jacobians:
         return build(op, **self.settings | products, name=f"{self.name}.jacobian", solves="few").solver
 
     def _solver_of(self, matrix, make):
-        """The Solver of an assembled Jacobian, of which ``make()`` is the Operator: kept or set up."""
+        """The Solver of an assembled Jacobian, of which ``make()`` is the Operator: found again or set up."""
         settings, solver = dict(self.settings, name=f"{self.name}.jacobian"), None
         key = matrix.indptr, matrix.indices, matrix.data
         known = self._matrices.find(key)
@@ -243,43 +237,35 @@ class Jacobians:
 
     def _coloured(self, equation, x, leaves):
         """The coloured pattern for this many unknowns; None: only products will do."""
-        size, method = equation.size, self.settings["method"]
-        if size not in self._patterns:
-            if self.by_rows is None:
-                self.by_rows = not _has_jvp(equation, x, leaves)
-            if self.sparsity is not None:
-                found, self.way = self._given_pattern(size), "assembled on the pattern given"
-            elif method == "krylov":
-                found, self.way = None, "products only, as asked"
-            elif size <= FULL_UP_TO:
-                found, self.way = dense_pattern(size, size), "assembled, all entries"
-            else:
-                found, self._spaces[size] = self._search(equation, x, leaves), cells_met(equation, x, leaves)
-                found = self._not_sparse(found, size, method)
-            self._colour(found, equation, x, leaves)
+        size, method, pattern = equation.size, self.settings["method"], self.sparsity
+        if size in self._patterns:
+            return self._patterns[size]
+        if self.by_rows is None:
+            self.by_rows = not _can(pushforward, lambda y: equation(y, *leaves), x, np.ones_like(x))
+        if pattern is not None:
+            self.way = "assembled on the pattern given"
+            if pattern.shape != (size, size):
+                raise ShapeError(f"the sparsity of {self.name} must have shape {(size, size)}, got {pattern.shape}")
+        elif method == "krylov":
+            self.way = "products only, as asked"
+        elif size <= FULL_UP_TO:
+            pattern, self.way = dense_pattern(size, size), "assembled, all entries"
+        else:
+            pattern, self.way = self._search(equation, x, leaves), "assembled on a pattern found by probing"
+            self._spaces[size] = cells_met(equation, x, leaves)
+            if pattern is None and method == "auto" and size > FULL_AT_MOST:
+                self.way = f"products only: {size} unknowns and a Jacobian that is not sparse"
+            elif pattern is None:
+                pattern, self.way = dense_pattern(size, size), "assembled, all entries: it is not sparse"
+        self._colour(pattern, equation, x, leaves)
         return self._patterns[size]
-
-    def _given_pattern(self, size):
-        pattern = self.sparsity
-        if pattern.shape != (size, size):
-            raise ShapeError(f"the sparsity of {self.name} must have shape {(size, size)}, got {pattern.shape}")
-        return pattern
-
-    def _not_sparse(self, found, size, method):
-        if found is not None:
-            self.way = "assembled on a pattern found by probing"
-            return found
-        if method == "auto" and size > FULL_AT_MOST:
-            self.way = f"products only: {size} unknowns and a Jacobian that is not sparse"
-            return None
-        self.way = "assembled, all entries: it is not sparse"
-        return dense_pattern(size, size)
 
     def _colour(self, pattern, equation, x, leaves):
         shapes = equation.layout.shapes
         shape = shapes[0] if len(shapes) == 1 else None
         # One tape serves all products with J^T; each with J takes a run of its own.
-        symmetric = pattern is not None and _is_own_transpose(pattern) and _has_vjp(equation, x, leaves)
+        symmetric = pattern is not None and _is_own_transpose(pattern)
+        symmetric = symmetric and _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
         coloured = None if pattern is None else Coloured(pattern, shape, True if self.by_rows or symmetric else None)
         if not symmetric:
             self._spaces.pop(equation.size, None)
@@ -319,13 +305,6 @@ def _is_own_transpose(pattern):
     return np.array_equal(turned.indptr, pattern.indptr) and np.array_equal(turned.indices, pattern.indices)
 
 
-def _pattern(sparsity):
-    pattern = sp.csr_array(sparsity, copy=True)
-    pattern.sum_duplicates()
-    pattern.data = np.ones(pattern.nnz)
-    return pattern
-
-
 def _points(x):
     rng = np.random.default_rng(0)
     scale = np.sqrt(np.mean(x**2)) or 1.0
@@ -342,17 +321,10 @@ def _is_valid(equation, x, leaves):
         return False
 
 
-def _has_jvp(equation, x, leaves):
+def _can(derive, *args):
+    """Whether a derivative can be taken: foreign rules may lack one."""
     try:
-        pushforward(lambda y: equation(y, *leaves), x, np.ones_like(x))
-    except NO_JVP:
-        return False
-    return True
-
-
-def _has_vjp(equation, x, leaves):
-    try:
-        equation.transposed(x, leaves)(np.ones_like(x))
+        derive(*args)
     except NO_JVP:
         return False
     return True

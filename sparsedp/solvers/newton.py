@@ -26,9 +26,9 @@ from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import check_finite
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.scaling import in_range, norm
+from sparsedp.solvers.scaling import in_range, length
 
-__all__ = ["Newton", "length"]
+__all__ = ["Newton"]
 
 HALVINGS = 30
 DECREASE = 1e-4  # share of the decrease a linear residual would show that a step must reach
@@ -193,21 +193,20 @@ class Newton:
         return "converged_at_roundoff" if residual <= ROUNDING * size else ""
 
     def _sizes(self):
-        """|F|, |b| and |J| |x| + |b|, in a unit in which the first is near 1."""
+        """|F|, |b| and |J| |x| + |b|, in a unit in which no square leaves the range of floats."""
         with np.errstate(over="ignore", invalid="ignore"):
-            if in_range(self.size):
-                data = length(self.J.product(self.x) - self.F)
-                return self.size, data, self.J.terms(self.x) + data
-            unit = -_exponent(self.F)  # so that no square leaves the range of floats
-            F = np.ldexp(self.F, unit)
-            data = length(np.ldexp(self.J.product(self.x), unit) - F)
-            return norm(F), data, float(np.ldexp(self.J.norm, unit)) * length(self.x) + data
+            F = np.ldexp(self.F, self._unit)
+            data = length(np.ldexp(self.J.product(self.x), self._unit) - F)
+            return length(F), data, float(np.ldexp(self.J.terms(self.x), self._unit)) + data
+
+    @property
+    def _unit(self):
+        return 0 if in_range(self.size) else -int(np.frexp(np.max(np.abs(self.F), initial=0.0))[1])
 
     def _rounding(self, step):
         """The status word when what is left of F is rounding, else ""."""
         residual, _, size = self._sizes()
-        unit = 0 if in_range(self.size) else -_exponent(self.F)
-        size += float(np.ldexp(self.largest + length(self._terms()), unit))
+        size += float(np.ldexp(self.largest + length(self._terms()), self._unit))
         far = self._value(self.x + FAR * step)
         if far is None or not residual <= 8 * ROUNDING * size:
             return ""
@@ -235,16 +234,3 @@ class Newton:
             info=run.info(),
             best=self.equation.layout.rounded(self.x),
         ) from None
-
-
-def length(v):
-    """2-norm of a flat array of any magnitude."""
-    size = norm(v)
-    if in_range(size):
-        return size
-    exponent = _exponent(v)
-    return float(np.ldexp(norm(np.ldexp(v, -exponent)), exponent))
-
-
-def _exponent(v):
-    return int(np.frexp(np.max(np.abs(v), initial=0.0))[1])

@@ -37,50 +37,40 @@ class NullSpace:
         self.labels = labels
         self.right, self.left = right, left
         self.count = count
-        self._products = self._dots(right, left) if count else np.zeros(0)
-        self._sides = (_thin(labels, right), _thin(labels, left)) if count else (right, left)
+        self._products = self._dots(right, left)
+        self._sides = tuple(_thin(labels, side) for side in (right, left))
 
-    def _sums(self, left, values, total=None):
-        """Sum of left * values over each component. `total`: that of the values, if it is known."""
-        if self.labels is None and np.isscalar(left):
-            return np.array([left * (values.sum() if total is None else total)])
+    def _dots(self, side, values):
+        """Sum of side * values over each component; `side` is 0 beside them."""
+        return np.array([np.einsum("i,i->", side, values)]) if self.count == 1 else self._sums(side * values)
+
+    def _sums(self, values):
         if self.labels is None:
-            return np.array([np.einsum("i,i->", left, values)])
-        if values.dtype.kind == "c" or self.left.dtype.kind == "c":  # bincount is real
-            product = left * values
-            return self._binned(product.real) + 1j * self._binned(product.imag)
-        return self._binned(left * values)
-
-    def _dots(self, left, values, total=None):
-        """The same where `left` is 0 beside the components."""
-        if self.labels is None or self.count != 1:
-            return self._sums(left, values, total)
-        return np.array([np.einsum("i,i->", left, values)])
-
-    def _binned(self, values):
+            return np.array([values.sum()])
+        if values.dtype.kind == "c":  # bincount is real
+            return self._sums(values.real) + 1j * self._sums(values.imag)
         return np.bincount(self.labels + 1, values, self.count + 1)[1:]
 
     def sums(self, b, transposed=False, total=None):
         """l.b on each component; `total` is the sum of b, if it is known."""
-        return self._dots(self._sides[not transposed], b, total)
+        side = self._sides[not transposed]
+        return np.array([side * (b.sum() if total is None else total)]) if np.isscalar(side) else self._dots(side, b)
 
-    def project(self, b, transposed=False, into=None, sums=None):
+    def project(self, b, transposed=False, into=None):
         """Take out, component by component, the part along the null space. The same map for b and x.
 
-        `into`: array for the result; `sums`: what `sums(b)` gave, when it is known.
+        `into`: array for the result.
         """
-        if not self.count:
-            return b
-        return self.projected(b, transposed, into, sums)[0]
+        return self.projected(b, transposed, into)[0] if self.count else b
 
     def projected(self, b, transposed=False, into=None, sums=None):
-        """What `project` gives, and its norm."""
+        """What `project` gives, and its norm. `sums`: what `sums(b)` gave, when it is known."""
         right = self._sides[transposed]
-        real = b.dtype == np.float64 and self.right.dtype == np.float64
+        real = b.dtype == np.float64 == self.right.dtype
         if sums is None:
             sums = self.sums(b, transposed, measured(b)[1] if real else None)
         shares = sums / self._products
-        if self.labels is None and np.isscalar(right) and real:
+        if np.isscalar(right) and real:
             into = np.empty_like(b) if into is None else into
             return into, float(np.sqrt(kernels.lowered(b, right * shares[0], into)))
         part = right * (shares[0] if self.count == 1 else np.append(shares, 0.0)[self.labels])
@@ -92,22 +82,17 @@ class NullSpace:
 
         `size` is the norm of b, `floor` a size below which |b| on a component counts as noise.
         """
+        lengths = self._lengths[not transposed]
         if self.labels is None and size > floor:
-            return float(abs(sums[0]) / (size * self._lone[not transposed])), 0
-        lengths = np.sqrt(self._lengths[not transposed])
-        sizes = np.array([size]) if self.labels is None else np.sqrt(self._sums(np.conj(b), b).real)
-        sizes = np.maximum(sizes, floor)
+            return float(abs(sums[0]) / (size * lengths[0])), 0
+        sizes = np.maximum(np.sqrt(self._sums(np.conj(b) * b).real), floor)
         shares = np.abs(sums) / np.where(sizes > 0, sizes * lengths, 1.0)
         worst = int(np.argmax(shares))
         return float(shares[worst]), worst
 
     @cached_property
     def _lengths(self):
-        return tuple(self._dots(np.conj(side), side).real for side in (self.right, self.left))
-
-    @cached_property
-    def _lone(self):
-        return tuple(float(np.sqrt(lengths[0])) for lengths in self._lengths)
+        return tuple(np.sqrt(self._dots(np.conj(side), side).real) for side in (self.right, self.left))
 
     def cells(self, number):
         """Indices of the unknowns of one component."""
@@ -115,13 +100,13 @@ class NullSpace:
 
     def anchors(self):
         """One unknown for each component, where it can be pinned: the largest |l r|."""
+        if not self.count:
+            return np.array([], dtype=int)
         weight = np.abs(self.right * self.left)
-        if self.labels is None:
-            return np.array([int(np.argmax(weight))]) if self.count else np.array([], dtype=int)
-        order = np.lexsort((-weight, self.labels))
-        _, first = np.unique(self.labels[order], return_index=True)
-        found = order[first]
-        return found[self.labels[found] >= 0]
+        labels = np.zeros(weight.size, dtype=int) if self.labels is None else self.labels
+        order = np.lexsort((-weight, labels))
+        found = order[np.unique(labels[order], return_index=True)[1]]
+        return found[labels[found] >= 0]
 
 
 def _thin(labels, side):
@@ -141,16 +126,18 @@ def find_null_space(system):
         If a null vector of the other side cannot be found, or is orthogonal to this one.
     """
     labels, count = system.components
+    labels = np.zeros(system.size, dtype=int) if labels is None else labels
     if system.active is not None:  # what is not active goes into a bin of its own
-        labels = np.where(system.active, 0 if labels is None else labels, count)
+        labels = np.where(system.active, labels, count)
     right, has_right = _candidates(system, labels, count, transposed=False)
     left, has_left = _candidates(system, labels, count, transposed=True)
     for number in np.flatnonzero(has_right != has_left):
-        cells = np.arange(system.size) if labels is None else np.flatnonzero(labels == number)
+        cells = np.flatnonzero(labels == number)
+        block = system.entries[cells][:, cells]
         if has_right[number]:
-            left[cells] = _computed(system.entries[cells][:, cells].T)
+            left[cells] = _computed(block.T)
         else:
-            right[cells] = _computed(system.entries[cells][:, cells])
+            right[cells] = _computed(block)
     return assembled(labels, right, left, has_right | has_left)
 
 
@@ -161,16 +148,12 @@ def _candidates(system, labels, count, transposed):
     if np.any(system.volumes != system.volumes[:1]):
         candidates.insert(0 if transposed else 1, system.volumes)
     active = 1.0 if system.active is None else system.active
+    members = np.bincount(labels, minlength=count + 1)[:count] > 0
     for candidate in candidates:
         candidate = candidate * active
         wrong = np.abs(system.product(candidate, transposed)) > ROUNDING * system.magnitude(candidate, transposed)
-        if labels is None:
-            fresh = np.array([system.size > 0 and not wrong.any()]) & ~known
-            chosen = slice(None) if fresh[0] else slice(0)
-        else:
-            failures, members = (np.bincount(labels, values, count + 1)[:count] for values in (wrong, None))
-            fresh = (failures == 0) & (members > 0) & ~known
-            chosen = np.append(fresh, False)[labels]
+        fresh = members & ~known & (np.bincount(labels, wrong, count + 1)[:count] == 0)
+        chosen = np.append(fresh, False)[labels]
         found[chosen] = candidate[chosen]
         known |= fresh
     return found, known
@@ -194,10 +177,11 @@ def _computed(matrix):
 
 
 def assembled(labels, right, left, singular):
-    numbers = np.append(np.where(singular, np.cumsum(singular) - 1, -1), -1)
+    """Labels of all components, r and l on them, which of them are singular -> NullSpace of those."""
     count = int(np.count_nonzero(singular))
-    labels = None if labels is None or not count else numbers[labels]
-    space = NullSpace(None if count == 1 and np.all(labels == 0) else labels, right, left, count)
-    if count and np.any(np.abs(space._products) <= 1e-10 * np.sqrt(space._lengths[0] * space._lengths[1])):
+    if labels is not None and count:
+        labels = np.append(np.where(singular, np.cumsum(singular) - 1, -1), -1)[labels]
+    space = NullSpace(None if not count or np.all(labels == 0) else labels, right, left, count)
+    if count and np.any(np.abs(space._products) <= 1e-10 * space._lengths[0] * space._lengths[1]):
         raise ArithmeticError("the right and the left null vector are orthogonal")
     return space

@@ -33,8 +33,9 @@ from sparsedp.recipe import Remade
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose import build, check_settings
 from sparsedp.solvers.record import SolveLog
+from sparsedp.solvers.sparsity import pattern_like
 from sparsedp.space import Space, fits
-from sparsedp.structure.base import Structure, compact
+from sparsedp.structure.base import Structure, compact, rows_of
 from sparsedp.structure.lazy import Chain, Diagonal
 from sparsedp.tape import Rule, isbox, of_argument, plain
 from sparsedp.tree import copied
@@ -317,7 +318,7 @@ class Assembly:
     def matrix(self, k, shift):
         """csr_array of shift - D diag(k) G."""
         D, G = self._entries
-        slopes = sp.csr_array((G.data * np.repeat(k, np.diff(G.indptr)), G.indices, G.indptr), shape=G.shape)
+        slopes = sp.csr_array((G.data * k[rows_of(G)], G.indices, G.indptr), shape=G.shape)
         return compact(shift * sp.eye_array(D.shape[0], format="csr") - D @ slopes)
 
 
@@ -373,24 +374,14 @@ def matrix_solver(pattern, method="auto", rtol=1e-10, maxiter=None, nullspace="r
     (1.0, array([ 0.125, -0.25 , -0.25 ]))
     """
     settings = _settings(method, rtol, maxiter, nullspace, options)
-    pattern = _canonical(pattern)
+    entries = pattern if sp.issparse(pattern) else np.asarray(pattern)
+    if entries.ndim != 2:
+        raise ShapeError(f"matrix_solver takes a 2-D pattern, got an array of shape {entries.shape}")
+    pattern = pattern_like(entries)
     domain = domain if isinstance(domain, Space) else Space(pattern.shape[0] if domain is None else domain)
     if pattern.shape != (domain.size, domain.size):
         raise ShapeError(f"matrix_solver takes a square pattern of {domain.size} rows, got shape {pattern.shape}")
     return MatrixSolver(pattern, domain, settings)
-
-
-def _canonical(pattern):
-    """csr_array of ones with sorted indices, each place once."""
-    entries = pattern if sp.issparse(pattern) else np.asarray(pattern)
-    if entries.ndim != 2:
-        raise ShapeError(f"matrix_solver takes a 2-D pattern, got an array of shape {entries.shape}")
-    places = sp.coo_array(entries)
-    found = sp.csr_array((np.ones(places.nnz), (places.row, places.col)), shape=places.shape)
-    found.sum_duplicates()
-    found.sort_indices()
-    found.data = np.ones(found.nnz)
-    return found
 
 
 class MatrixSolver(ParametricSolver):
@@ -407,7 +398,7 @@ class MatrixSolver(ParametricSolver):
 
     def __init__(self, pattern, domain, settings):
         self.domain, self._pattern = domain, pattern
-        self.rows = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
+        self.rows = rows_of(pattern)
         self.columns = pattern.indices
         super().__init__(self._picking(self.rows, -1.0).T, self._picking(self.columns, 1.0), settings)
 
@@ -439,11 +430,7 @@ class MatrixSolver(ParametricSolver):
             raise ShapeError(f"data takes one value for each of {self.rows.size} entries, got shape {values.shape}")
         if values.dtype.kind not in "biufc":
             raise TypeError(f"data must hold numbers, got dtype {values.dtype}")
-        wrong = ~np.isfinite(values)
-        if wrong.any():
-            first, many = int(np.argmax(wrong)), np.count_nonzero(wrong)
-            place = f"row {self.rows[first]}, column {self.columns[first]}"
-            raise NonFiniteError(f"data must be finite, got {many} that are NaN or infinite, the first at {place}")
+        check_finite("data", values, where=lambda entry: f"row {self.rows[entry]}, column {self.columns[entry]}")
         if np.shape(plain(b))[-len(self.domain.shape) :] != self.domain.shape:
             raise ShapeError(f"b takes a field on {self.domain}, got an array of shape {np.shape(plain(b))}")
         return self._rule(False, True)(data if isbox(data) else values, b if isbox(b) else np.asarray(b), 0.0)

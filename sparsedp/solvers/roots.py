@@ -262,7 +262,7 @@ class Root(Remade):
         """(forward, vjp, jvp) of s with A s = b, A = J or J^T."""
 
         def forward(equation, x, b, *leaves):
-            known = self._jacobians.kept(equation, x, leaves)
+            known = self._jacobians.cached(equation, x, leaves)
             self._note_setup(known)
             s, info = known.solve(b, transposed)
             if transposed:

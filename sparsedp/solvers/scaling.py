@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp import kernels
 
-__all__ = ["in_range", "largest", "measured", "norm", "remainder", "shifted"]
+__all__ = ["in_range", "largest", "length", "measured", "norm", "remainder", "shifted"]
 
 SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve computes leaves the range of floats
 
@@ -17,6 +17,15 @@ def norm(x):
     x = x.view(float) if x.dtype.kind == "c" else x
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
         return float(np.sqrt(kernels.squares(x)))
+
+
+def length(x):
+    """2-norm of a flat real array of any magnitude."""
+    size = norm(x)
+    if in_range(size):
+        return size
+    exponent = int(np.frexp(largest(x))[1])
+    return float(np.ldexp(norm(shifted(x, -exponent)), exponent))
 
 
 def measured(x):

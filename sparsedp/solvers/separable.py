@@ -117,36 +117,28 @@ def spectrum(structure):
 
 
 class Separable(Engine):
-    """The engine: forward transforms, division by the eigenvalues, backward transforms."""
+    """The engine: forward transforms, division by the eigenvalues, backward transforms.
+
+    With an `elimination`, the spectrum is that of all axes but the first, and elimination takes the place of division.
+    """
 
     method = "separable"
     unit = "refinements"
     overwrites = False
 
-    def __init__(self, found):
-        self.spectrum = found
-        self.weights = found.inverse_weights()
-        self.hierarchy = found.words
-
-    def solve(self, b, goal, transposed):
-        return self.spectrum.apply(self.weights, b, transposed), 0, ""
-
-
-class Swept(Engine):
-    """The engine: forward transforms along all axes but the first, elimination, backward transforms."""
-
-    method = "separable"
-    unit = "refinements"
-    overwrites = False
-
-    def __init__(self, found, elimination):
+    def __init__(self, found, elimination=None):
         self.spectrum, self.elimination = found, elimination
-        self.hierarchy = f"elimination({found.shape[0]}) x {found.words.split(' x ', 1)[1]}"
+        self.weights = found.inverse_weights() if elimination is None else None
+        self.hierarchy = found.words
+        if elimination is not None:
+            self.hierarchy = f"elimination({found.shape[0]}) x {found.words.split(' x ', 1)[1]}"
 
     def solve(self, b, goal, transposed):
         y = self.spectrum.forward(b, transposed)
-        numbers = y.view(float) if y.dtype.kind == "c" else y
-        self.elimination.solve(numbers.reshape(len(y), -1), transposed)
+        if self.elimination is None:
+            y *= self.weights
+        else:
+            self.elimination.solve(y.view(float).reshape(len(y), -1), transposed)
         return self.spectrum.backward(y, transposed), 0, ""
 
 
@@ -157,10 +149,8 @@ def _swept(structure, found):
         return None
     rest = Spectrum(found.shape, (Axis("identity", np.zeros(first)), *found.axes[1:]), found.shift)
     sums = rest.eigenvalues[0].reshape(-1)
-    if rest.fourier:
-        sums = np.repeat(sums, 2)  # real and imaginary parts
-    elimination = sweep(structure.lines[0], sums)
-    return None if elimination is None else Swept(rest, elimination)
+    elimination = sweep(structure.lines[0], np.repeat(sums, 2) if rest.fourier else sums)  # real and imaginary parts
+    return None if elimination is None else Separable(rest, elimination)
 
 
 def separable_engine(system):

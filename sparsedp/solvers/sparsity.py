@@ -18,11 +18,9 @@ A guess at the pattern on a grid takes fewer: what a few cells touch, moved over
 
 Two ways, and the better one is taken. On a grid the colour (a . i) mod c of the column with index i, for
 a lattice vector a, is valid when no difference of two columns in a row is a multiple of c; stencils reach
-the least count this way (3 for three points, 5 for five, 7 for seven). Any other pattern is coloured by
-independent sets, one after the other.
+the least count this way (3 for three points, 5 for five, 7 for seven). Any other pattern is coloured column by column.
 
-Source: Curtis, Powell and Reid, On the estimation of sparse Jacobian matrices, 1974; Luby, A simple
-parallel algorithm for the maximal independent set problem, 1986.
+Source: Curtis, Powell and Reid, On the estimation of sparse Jacobian matrices, 1974.
 """
 
 from itertools import islice
@@ -31,7 +29,9 @@ from itertools import product as combinations
 import numpy as np
 import scipy.sparse as sp
 
-__all__ = ["Coloured", "colour", "dense_pattern", "find_pattern", "pattern_of", "stencil_pattern"]
+from sparsedp.structure.base import rows_of
+
+__all__ = ["Coloured", "colour", "dense_pattern", "find_pattern", "pattern_like", "pattern_of", "stencil_pattern"]
 
 FIRST = 8  # blocks of the first level
 SAMPLE = 3  # columns that are looked at first
@@ -40,7 +40,7 @@ SHORT = 8  # an axis that is not longer counts kinds of values, u and v of a rea
 SMALLEST = 256  # unknowns below which a guess saves nothing
 WIDEST = 64  # cells touched by one; more is no stencil
 MOST_DIFFERENCES = 4096  # a pattern with more is not a stencil
-SMALL = 20_000  # up to this many columns independent sets are tried even if a lattice is near the best
+SMALL = 20_000  # up to this many columns they are coloured one by one even if a lattice is near the best
 MOST_TRIALS = 2_000_000  # products of a lattice vector and a difference, for each count
 
 
@@ -116,6 +116,12 @@ def pattern_of(row, column, shape):
     pattern.sort_indices()
     pattern.data = np.ones(pattern.nnz)
     return pattern
+
+
+def pattern_like(matrix):
+    """Sparse matrix or 2-D array -> the pattern of its places; a stored 0 is one."""
+    places = sp.coo_array(matrix)
+    return pattern_of(places.row, places.col, places.shape)
 
 
 def dense_pattern(rows, columns):
@@ -222,7 +228,7 @@ class Coloured:
             if turned.max(initial=-1) + 1 < self.count:
                 self.by_rows, self.colours = True, turned
         # Where each entry stands in the table of products: (colour of the column, row), or mirrored.
-        row = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
+        row = rows_of(pattern)
         one, other = (row, pattern.indices) if self.by_rows else (pattern.indices, row)
         self._place = self.colours[one], other
 
@@ -262,7 +268,7 @@ def colour(pattern, shape=None):
     if shape is not None and len(shape) > 1 and np.prod(shape) == size and (found is None or found.max() >= least):
         found = _fewer(found, _lattice(links, shape, least))
     if found is None or found.max() >= (least if size <= SMALL else 2 * least):
-        found = _fewer(found, _independent_sets(links))
+        found = _fewer(found, _one_by_one(links))
     return found
 
 
@@ -290,7 +296,7 @@ def _lattice(links, shape, least):
 
 def _differences(links, shape):
     """Differences of the indices of linked columns, shape (dim, many), one of each pair; None when there are many."""
-    row = np.repeat(np.arange(links.shape[0]), np.diff(links.indptr))
+    row = rows_of(links)
     upper = links.indices > row
     steps = [b - a for a, b in zip(np.unravel_index(row[upper], shape), np.unravel_index(links.indices[upper], shape))]
     code = np.zeros(np.count_nonzero(upper), np.int64)
@@ -300,26 +306,10 @@ def _differences(links, shape):
     return np.stack([step[first] for step in steps]) if first.size <= MOST_DIFFERENCES else None
 
 
-def _independent_sets(links):
-    """Colour after colour, a maximal set of columns without links, grown from random priorities."""
-    size = links.shape[0]
-    priority = np.random.default_rng(0).permutation(size) + size * np.diff(links.indptr).astype(float)
-    colours, number = np.full(size, -1), 0
-    while np.any(colours < 0):
-        left = np.flatnonzero(colours < 0)
-        part = links[left][:, left]
-        colours[left[_independent(part, priority[left])]] = number
-        number += 1
+def _one_by_one(links):
+    """The first colour that no linked column has yet, for the columns with most links first."""
+    colours = np.full(links.shape[0], -1)
+    for column in np.argsort(-np.diff(links.indptr), kind="stable"):
+        taken = set(colours[links.indices[links.indptr[column] : links.indptr[column + 1]]].tolist())
+        colours[column] = next(number for number in range(len(taken) + 1) if number not in taken)
     return colours
-
-
-def _independent(links, priority):
-    """A maximal set of vertices without links, every one of which is linked to itself."""
-    free, chosen = np.ones(priority.size, dtype=bool), np.zeros(priority.size, dtype=bool)
-    while free.any():
-        weight = np.where(free, priority, -1.0)
-        best = np.maximum.reduceat(weight[links.indices], links.indptr[:-1])
-        fresh = free & (weight == best)
-        chosen |= fresh
-        free &= ~((links @ fresh.astype(np.int32)) > 0)
-    return chosen

@@ -10,9 +10,9 @@ from sparsedp.errors import NonFiniteError
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import ROUNDING, find_null_space
-from sparsedp.solvers.scaling import norm, remainder
+from sparsedp.solvers.scaling import length, remainder
 from sparsedp.space import Space
-from sparsedp.structure.base import probes
+from sparsedp.structure.base import probes, rows_of
 from sparsedp.structure.explicit import Matrix
 from sparsedp.structure.kronecker import Kronecker
 
@@ -74,7 +74,7 @@ class System:
 
     def terms(self, x):
         """A size of the terms that A x is the sum of."""
-        return float(np.ldexp(self.norm(), self.exponent)) * norm(x)
+        return float(np.ldexp(self.norm() * length(x), self.exponent))
 
     @cached_property
     def _assembled(self):
@@ -194,13 +194,9 @@ class System:
         Tried are ones, the cell volumes and their inverses. A Kronecker sum is examined factor by
         factor, an assembled matrix entry by entry, the rest with random vectors.
         """
-        candidates = [1.0]
-        if np.any(self.volumes != self.volumes[:1]):
-            candidates += [self.volumes, 1.0 / self.volumes]
-        if self.op.structure.separable:
-            return self._weights_of_factors()
-        for weights in candidates:
-            if self._symmetric_with(weights):
+        uniform = not np.any(self.volumes != self.volumes[:1])
+        for power in (0,) if uniform else (0, 1, -1):
+            if self._symmetric_with(power, weights := self.volumes**power if power else 1.0):
                 return weights
         return None
 
@@ -209,20 +205,14 @@ class System:
         """Whether A is symmetric after scaling its rows by `weights`."""
         return self.weights is not None
 
-    def _weights_of_factors(self):
-        grid = (self.op.domain if self.op.domain.grid is not None else self.op.codomain).grid
-        for power in (0.0, 1.0, -1.0):
-            lines = self.op.structure.lines.items()
-            scales = {axis: 1.0 if grid is None else grid.widths[axis][:, None] ** power for axis, _ in lines}
-            if all(_symmetric(sp.csr_array(line.matrix * scales[axis])) for axis, line in lines):
-                uniform = power == 0 or np.all(self.volumes == self.volumes[:1])
-                return 1.0 if uniform else self.volumes**power
-        return None
-
-    def _symmetric_with(self, weights):
-        if isinstance(self.op.structure, Matrix) or "entries" in self.__dict__:
-            scaled = self.matrix * (weights if np.isscalar(weights) else weights[:, None])
-            return _symmetric(sp.csr_array(scaled))
+    def _symmetric_with(self, power, weights):
+        structure = self.op.structure
+        if structure.separable:
+            grid = self.op.domain.grid or self.op.codomain.grid
+            scales = [1.0] * 3 if grid is None else [h[:, None] ** power for h in grid.widths]
+            return all(_symmetric(sp.csr_array(line.matrix * scales[a])) for a, line in structure.lines.items())
+        if isinstance(structure, Matrix) or "entries" in self.__dict__:
+            return _symmetric(sp.csr_array(self.matrix * (weights if power == 0 else weights[:, None])))
         return self._symmetric_to_probes(weights)
 
     def _symmetric_to_probes(self, weights):
@@ -328,7 +318,7 @@ def _linked(matrix, active):
 
 def _pinned(matrix, flags):
     """Matrix -> copy whose flagged rows and columns are those of the identity, scaled to its entries."""
-    row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    row = rows_of(matrix)
     keep = ~(flags[row] | flags[matrix.indices])
     size = matrix.diagonal()[~flags]
     largest = size[np.argmax(np.abs(size))] if size.size and np.any(size) else 1.0

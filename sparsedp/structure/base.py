@@ -5,7 +5,7 @@ import scipy.sparse as sp
 
 from sparsedp.recipe import Uncached
 
-__all__ = ["INT32_LIMIT", "Scaled", "Structure", "compact", "probes", "result_dtype"]
+__all__ = ["INT32_LIMIT", "Scaled", "Structure", "compact", "probes", "result_dtype", "rows_of"]
 
 INT32_LIMIT = 2**31
 PROBES = 3  # random vectors with which a map without entries is examined
@@ -125,6 +125,11 @@ def probes(size):
     """The same few vectors of random signs in every run."""
     generator = np.random.default_rng(0)
     return [generator.choice([-1.0, 1.0], size) for _ in range(PROBES)]
+
+
+def rows_of(matrix):
+    """csr_array -> the row of each entry."""
+    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
 def columns_by_application(structure):

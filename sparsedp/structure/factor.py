@@ -8,6 +8,7 @@ import scipy.sparse as sp
 from sparsedp.errors import NonFiniteError
 from sparsedp.kernels.layout import Rows, Tridiagonal
 from sparsedp.recipe import Uncached
+from sparsedp.structure.base import rows_of
 
 __all__ = ["Factor"]
 
@@ -78,7 +79,7 @@ class Factor(Uncached):
     def rows(self):
         """The record that the kernels read (see kernels/layout.py)."""
         m = self.matrix
-        row = np.repeat(np.arange(m.shape[0]), np.diff(m.indptr))
+        row = rows_of(m)
         offset = m.indices - row
         offsets = np.unique(offset)
         if offsets.size > MOST_DIAGONALS:
@@ -97,7 +98,7 @@ class Factor(Uncached):
         """The three-point record of the fused kernel, or None when a row reaches further."""
         n, columns = self.shape
         m = self.matrix
-        row = np.repeat(np.arange(n), np.diff(m.indptr))
+        row = rows_of(m)
         if n != columns or not np.all(np.isin((m.indices - row) % max(n, 1), [0, 1, max(n, 1) - 1])):
             return None
         bands = np.zeros((3, n))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from sparsedp import kernels
+from sparsedp.structure.base import rows_of
 from sparsedp.structure.kronecker import Kronecker
 
 __all__ = ["ThroughFaces", "entries_beside", "through_faces"]
@@ -35,7 +36,7 @@ def entries_beside(left, right, axis, n, periodic):
 def _beside(factor, scale, n, faces, periodic):
     """A factor from cells to faces -> its entries for the cell below and the cell above each face, or None."""
     m = factor.matrix
-    row = np.repeat(np.arange(faces), np.diff(m.indptr))
+    row = rows_of(m)
     below, above = np.zeros(faces), np.zeros(faces)
     is_above = m.indices == row
     is_below = (m.indices == row - 1) | (periodic & (row == 0) & (m.indices == n - 1))
