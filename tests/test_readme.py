@@ -142,7 +142,7 @@ def commands(text):
             yield line
 
 
-def run(arguments, folder):
+def run_python(arguments, folder):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
     done = subprocess.run(
         [sys.executable, *arguments],
@@ -178,7 +178,7 @@ def run_demo(arguments, folder):
             kept.append(word)
     if "--input" in kept:
         terrain(folder / kept[kept.index("--input") + 1])
-    run(["-m", "sparsedp", "demo", *kept, "--size", "24", "--out", str(folder / "out")], folder)
+    run_python(["-m", "sparsedp", "demo", *kept, "--size", "24", "--out", str(folder / "out")], folder)
     assert any((folder / "out").iterdir()), "the demo wrote nothing"
 
 
@@ -192,18 +192,19 @@ def check_install(arguments):
     assert asked <= extras, f"pyproject.toml has no extras {sorted(asked - extras)}"
 
 
-def obey(words, folder):
-    """Run or check one command of the page."""
+def obey(words, folder, run):
+    """Check one command of the page; what takes long is given to `run`."""
     if words[:3] == ["python", "-m", "pip"]:
         check_install(words[3:])
     elif words[:4] == ["python", "-m", "sparsedp", "demo"]:
-        run_demo(words[4:], folder)
+        run(run_demo, words[4:], folder)
     elif words[:3] == ["python", "-m", "sparsedp"]:
-        run(words[1:], folder)
+        run(run_python, words[1:], folder)
     elif words[:3] == ["python", "-m", "pytest"]:
         assert "python -m pytest" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     elif words[0] == "python" and words[1].startswith("examples/"):
-        run([str(ROOT / words[1]), *words[2:]], folder)
+        assert (ROOT / words[1]).exists()
+        run(run_python, [str(ROOT / words[1]), *words[2:]], folder)
     elif words[0] == "python" and words[1].startswith("benchmarks/"):
         compile((ROOT / words[1]).read_text(encoding="utf-8"), words[1], "exec")  # takes minutes: not run here
     elif words[0] == ".ci/run":
@@ -212,13 +213,21 @@ def obey(words, folder):
         assert words[:2] == ["git", "clone"] or words[0] == "cd", f"teach tests/test_readme.py: {shlex.join(words)}"
 
 
-def test_shell_blocks(tmp_path):
+@pytest.mark.parametrize(
+    "run",
+    [
+        pytest.param(lambda *_: None, id="recognised"),
+        pytest.param(lambda command, *given: command(*given), id="run", marks=pytest.mark.slow),
+    ],
+)
+def test_shell_blocks(tmp_path, run):
+    """Every command is known; the demo and the examples themselves run beside it by default, and here as `slow`."""
     listed = [words for block in blocks(page()) if block.language in SHELL for words in commands(block.text)]
     assert listed, "README.md has no shell block"
     for number, words in enumerate(listed):
         folder = tmp_path / str(number)
         folder.mkdir()
-        obey(words, folder)
+        obey(words, folder, run)
 
 
 def test_the_two_commands():
