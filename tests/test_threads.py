@@ -239,6 +239,7 @@ def rate(u, p):
     return p * u * (1 - u)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("tolerance", [None, 1e-4])
 @pytest.mark.parametrize(
     "method",
