@@ -218,3 +218,27 @@ def test_a_stage_without_a_root_says_what_to_change():
     step = dp.stepper("backward_euler", lambda u, p: -1.0 - u**2, 1.0)
     with pytest.raises(dp.errors.ConvergenceError, match=r"; take a smaller dt, or give stepper a tolerance$"):
         step(np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (
+            lambda: dp.stepper("rk4", lambda u, p: -u, 0.5, tolerence=1e-10),
+            "method auto takes the options .*, got 'tolerence'",
+        ),
+        (lambda: dp.stepper("tr_bdf2", lambda u, p: -u, 0.5, tolerence=1e-10), "method auto takes the options"),
+        (
+            lambda: dp.stepper("rk4", lambda u, p: -u, 0.5, jacobian=lambda u, p: L),
+            "rk4 solves nothing; leave out jacobian",
+        ),
+        (lambda: dp.stepper("euler", lambda u, p: -u, 0.5, cycle="V"), "euler solves nothing; leave out cycle"),
+        (lambda: dp.implicit(lambda x: x, foo=1), "method auto takes the options .*, got 'foo'"),
+        (lambda: dp.elliptic_solver(dp.divergence(dp.Grid(4)), dp.gradient(dp.Grid(4)), foo=1), "got 'foo'"),
+        (lambda: dp.matrix_solver(np.eye(2), "direct", foo=1), r"method direct takes the options \(none\), got 'foo'"),
+        (lambda: dp.projection(dp.Grid(4), foo=1), "got 'foo'"),
+    ],
+)
+def test_an_option_that_nobody_takes_is_refused_at_once(make, message):
+    with pytest.raises(TypeError, match=message):
+        make()

@@ -18,7 +18,6 @@ from sparsedp.operators.boundary import check_solid
 from sparsedp.recipe import Remade
 from sparsedp.structure.explicit import Matrix
 from sparsedp.tape import Rule, isbox
-from sparsedp.tree import copied
 
 __all__ = ["Step", "Transport", "transport"]
 
@@ -241,23 +240,3 @@ class Transport(Remade):
         if setting.solid is not None:
             words.append(f"{np.count_nonzero(setting.solid)} solid cells")
         return f"<transport {setting.scheme}: {self.space}, {', '.join(words)}>"
-
-
-class Step:
-    """``step(u, v)``: transport with fixed dt and inflow, made by ``Transport.step``."""
-
-    __slots__ = ("dt", "inflow", "transport")
-
-    def __init__(self, transport, dt, inflow):
-        if isbox(dt) or isbox(inflow):
-            raise DerivativeError(
-                "step needs constant dt and inflow, got traced ones; write lambda u, p: move(u, p[0], p[1]) instead"
-            )
-        self.transport = transport
-        self.dt, self.inflow = copied((dt, inflow))  # the caller may reuse the arrays
-
-    def __call__(self, u, v):
-        return self.transport(u, v, self.dt, self.inflow)
-
-    def __repr__(self):
-        return f"<step of {self.transport!r}, dt = {self.dt:g}>"

@@ -77,7 +77,7 @@ def projection(grid, solid=None, boundary=no_slip, method="auto", rtol=1e-10, ma
     array([2., 3., 2., 3., 0., 0., 0., 0.])
     """
     check_grid("projection", grid)
-    check_settings(method, rtol, maxiter, "project")
+    check_settings(method, rtol, maxiter, "project", options)
     settings = (method, float(rtol), maxiter, copied(options))
     return Projection(Setup(grid, solid, boundary, settings))
 

@@ -127,7 +127,9 @@ def stepper(
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     if unstable not in ("raise", "allow"):
         raise ValueError(f"unstable must be 'raise' or 'allow', got {unstable!r}")
-    check_settings(solver, rtol, maxiter, "raise")
+    check_settings(solver, rtol, maxiter, "raise", set(options) - {"sparsity"})  # which `implicit` takes
+    if (method in EXPLICIT or method == "etdrk4") and (options or jacobian is not None):
+        raise TypeError(f"{method} solves nothing; leave out {', '.join([*options] or ['jacobian'])}")
     if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
         raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
     if not all(map(_is_floor, leaves(floor))):

@@ -115,7 +115,7 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     check_operator("inverse", op)
     if not fits(op.domain, op.codomain):
         raise ShapeError(f"inverse takes a square operator, got one from {op.domain} to {op.codomain}; write op.T @ op")
-    check_settings(method, rtol, maxiter, nullspace)
+    check_settings(method, rtol, maxiter, nullspace, options)
     return build(op, method, float(rtol), maxiter, nullspace, copied(options))
 
 
@@ -155,8 +155,8 @@ def _note_setup(solver, clock):
         spent(name, "setup", log.setup_seconds)
 
 
-def check_settings(method, rtol, maxiter, nullspace):
-    """Refuse settings that no method can take."""
+def check_settings(method, rtol, maxiter, nullspace, options=()):
+    """Refuse settings that the method, or with "auto" every method, cannot take."""
     if method not in ("auto", *METHODS):
         raise ValueError(f"method must be auto, {', '.join(METHODS)}, got {method!r}")
     if not (is_number(rtol) and 0 < rtol < 1):
@@ -165,10 +165,13 @@ def check_settings(method, rtol, maxiter, nullspace):
         raise ValueError(f"maxiter must be a whole number >= 1 or None, got {maxiter!r}")
     if nullspace not in ("raise", "project"):
         raise ValueError(f"nullspace must be 'raise' or 'project', got {nullspace!r}")
+    _check_options(method, options)
 
 
 def _check_options(word, options):
-    known = [name for name, p in inspect.signature(METHODS[word]).parameters.items() if p.kind == p.KEYWORD_ONLY]
+    makers = METHODS.values() if word == "auto" else [METHODS[word]]
+    parameters = [p for make in makers for p in inspect.signature(make).parameters.values()]
+    known = list(dict.fromkeys(p.name for p in parameters if p.kind == p.KEYWORD_ONLY))
     for name in options:
         if name not in known:
             raise TypeError(f"method {word} takes the options {', '.join(known) or '(none)'}, got {name!r}")

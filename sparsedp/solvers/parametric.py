@@ -109,7 +109,7 @@ class ParametricSolver(Remade):
 
 
 def _settings(method, rtol, maxiter, nullspace, options):
-    check_settings(method, rtol, maxiter, nullspace)
+    check_settings(method, rtol, maxiter, nullspace, options)
     return dict(method=method, rtol=float(rtol), maxiter=maxiter, nullspace=nullspace, options=copied(options))
 
 

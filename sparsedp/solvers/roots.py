@@ -115,7 +115,7 @@ def implicit(
     if not (callable(residual) and (jacobian is None or callable(jacobian))):
         given = [("residual", residual), ("jacobian", jacobian)][callable(residual)]
         raise TypeError(f"implicit takes a function as {given[0]}, got {type(given[1]).__name__}; write lambda x: ...")
-    check_settings(method, rtol, maxiter, nullspace)
+    check_settings(method, rtol, maxiter, nullspace, options)
     if maxiter is None:
         raise ValueError("maxiter must be a whole number >= 1, got None")
     settings = dict(method=method, nullspace=nullspace, options=copied(options))
