@@ -6,7 +6,7 @@ from sparsedp.derivative import NO_JVP, directions, forward, grad, tangent_of, t
 from sparsedp.fields import check_function
 from sparsedp.tape import dtype_of, isbox
 from sparsedp.traces import backward, reverse_root, split_box
-from sparsedp.tree import flatten, leaves
+from sparsedp.tree import copied, flatten, leaves
 
 __all__ = ["hvp", "jvp", "pull_ends", "push"]
 
@@ -43,7 +43,7 @@ def jvp(fun, x, tangent):
     (10.0, 5.0)
     """
     check_function("jvp", fun, "lambda u: ...")
-    return push(fun, x, directions(x, tangent))
+    return copied(push(fun, x, directions(x, tangent)))  # the caller may write into x, the tangent and the results
 
 
 def hvp(loss, x, tangent):

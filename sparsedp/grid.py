@@ -147,7 +147,7 @@ class Grid(Uncached):
         return _outer(lengths)
 
     def split(self, v):
-        """Face field (or 3-D edge field) -> tuple of components. Differentiable.
+        """Face field (or 3-D edge field; in 2-D write ``grid.edges.split``) -> tuple of components. Differentiable.
 
         Parameters
         ----------
@@ -173,7 +173,7 @@ class Grid(Uncached):
         return (self.edges if on_edges else self.faces).split(v)
 
     def join(self, *parts):
-        """Components -> face field (or 3-D edge field), one flat array. Differentiable.
+        """Components -> face field (or 3-D edge field; in 2-D ``grid.edges.join``), one flat array. Differentiable.
 
         Parameters
         ----------

@@ -8,6 +8,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.fields import check_plain
 from sparsedp.recipe import Uncached
 from sparsedp.tape import Rule, dtype_of, isbox, linear, plain
 
@@ -103,6 +104,7 @@ class Space(Uncached):
             raise ShapeError(f"split takes a field on {self.told}, got an array of shape {np.shape(v)}")
         if isbox(v):
             return tuple(rule(v) for rule in self._parted)
+        check_plain("split", v)
         flat = np.asarray(v).reshape(-1)
         spans = zip(self.offsets, self.offsets[1:], self.parts, strict=False)
         return tuple(flat[start:stop].reshape(part) for start, stop, part in spans)
@@ -126,6 +128,7 @@ class Space(Uncached):
         """
         if len(parts) != len(self.parts):
             raise ShapeError(f"join on {self} takes {len(self.parts)} components, got {len(parts)}")
+        check_plain("join", *parts)
         found = [
             part if np.shape(part) == shape else _broadcast(self, part, shape)
             for part, shape in zip(parts, self.parts, strict=True)

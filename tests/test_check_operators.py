@@ -79,9 +79,17 @@ def test_the_card_as_text_and_data():
     assert repr(card) == text
 
 
-def mutating(u):
-    u *= 2
-    return u
+class Mutating(Structure):
+    """Twice a field, which it writes into; `from_functions` would hand it a read-only one."""
+
+    shape, has_entries = (CELLS.size,) * 2, False
+
+    def apply(self, x, out):
+        x *= 2
+        out[:] = x
+
+    def transpose(self):
+        return self
 
 
 class Reused:
@@ -106,7 +114,8 @@ MISTAKES = {
     "no transpose": (given(shift, None), {"transpose, float64", "twin, transposed"}),
     "affine": (given(lambda u: u + 1, lambda g: g), {"linearity, float64"}),
     "quadratic": (given(lambda u: u * np.abs(u), lambda g: g), {"linearity, float64", "twin, forward, float64"}),
-    "input modified": (given(mutating, lambda g: 2 * g), {"input unmodified, result fresh"}),
+    "input modified": (Operator(Mutating(), CELLS, CELLS, "foreign"), {"input unmodified, result fresh"}),
+    "input modified, as a function": (given(lambda u: np.multiply(u, 2, out=u), lambda g: 2 * g), {"application"}),
     "with a state": (given(Reused(), lambda g: g), {"same bits twice"}),
     "imaginary part dropped": (
         given(lambda u: np.real(u) + 0 * u, lambda g: np.real(g) + 1j * np.imag(g) if np.iscomplexobj(g) else g),

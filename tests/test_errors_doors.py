@@ -51,6 +51,17 @@ TABLE = [
         SHAPE,
         "values on walls have no volumes; take those of grid.cells, faces, nodes or edges",
     ),
+    (lambda: dp.diagonal(GRID.cells, MASKED), TYPE, "diagonal takes plain arrays, got a masked array; fill it first"),
+    (
+        lambda: GRID.split(np.ma.masked_array(V)),
+        TYPE,
+        "split takes plain arrays, got a masked array; fill it first",
+    ),
+    (
+        lambda: GRID.join(*map(np.ma.masked_array, GRID.split(V))),
+        TYPE,
+        "join takes plain arrays, got a masked array; fill it first",
+    ),
     (lambda: dp.from_matrix(MASKED), TYPE, "matrix takes plain arrays, got a masked array; fill it first"),
     (
         lambda: dp.from_linear_operator(np.eye(3)),

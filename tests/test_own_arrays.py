@@ -210,3 +210,19 @@ def test_every_builder_is_here():
     public = {name for name in dir(dp) if callable(getattr(dp, name)) and name.islower() and name[0] != "_"}
     here = {name.split(",")[0].split(" ")[0] for name in BUILDERS}
     assert public - here == set(f"{unbuilt} {calls} {shown}".split()) - here
+
+
+def test_results_of_jvp_are_the_callers_own():
+    x, t = np.ones(3), np.full(3, 2.0)
+    value, slope = dp.jvp(lambda u: u, x, t)
+    value[0], slope[0] = 9.0, 9.0
+    assert np.array_equal(x, np.ones(3)) and np.array_equal(t, np.full(3, 2.0))
+
+
+def test_a_function_that_writes_into_the_field_is_refused():
+    """It would change the array of the caller."""
+    double = dp.from_functions(lambda u: np.multiply(u, 2, out=u), lambda g: 2 * g, 3, 3)
+    x = np.ones(3)
+    with pytest.raises(ValueError, match="read-only"):
+        double(x)
+    assert np.array_equal(x, np.ones(3))

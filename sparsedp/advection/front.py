@@ -19,7 +19,7 @@ from sparsedp.recipe import Remade
 from sparsedp.structure.explicit import Matrix
 from sparsedp.tape import Rule, isbox
 
-__all__ = ["Step", "Transport", "transport"]
+__all__ = ["Transport", "transport"]
 
 LAWS = {**dict.fromkeys(SCHEMES, Eulerian), "semi_lagrangian": SemiLagrangian, "maccormack": MacCormack}
 CHOICES = {  # the first one is the default; a scheme says in `options` which of the last five it uses

@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp.conditions import resolve
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite
+from sparsedp.fields import check_finite, check_plain
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, wall_slopes
@@ -177,6 +177,7 @@ def diagonal(space, values):
     if isbox(values):
         raise DerivativeError("diagonal needs constant values, got traced ones; write values * u instead")
     _check_space(space, "diagonal")
+    check_plain("diagonal", values)
     values = np.asarray(values)
     if values.dtype.kind not in "biufc":
         raise TypeError(f"diagonal on {space} needs numbers, got dtype {values.dtype}; write values.astype(float)")

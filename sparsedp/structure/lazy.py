@@ -7,6 +7,7 @@ import scipy.sparse as sp
 
 from sparsedp import kernels
 from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.fields import frozen
 from sparsedp.recipe import Remade
 from sparsedp.structure.base import Structure, compact, result_dtype
 from sparsedp.structure.through import through_faces
@@ -165,7 +166,7 @@ class Functions(Remade, Structure):
     def apply(self, x, out):
         if self.forward is None:
             raise DerivativeError("this operator has no transpose; give from_functions its second function")
-        y = np.asarray(self.forward(x.reshape(self.domain)))
+        y = np.asarray(self.forward(frozen(x.reshape(self.domain))))  # the field is the caller's
         if y.shape != self.codomain:
             raise ShapeError(f"the function must return an array of shape {self.codomain}, got {y.shape}")
         if y.dtype.kind == "c" and out.dtype.kind != "c":
