@@ -50,8 +50,8 @@ class MacCormack(SemiLagrangian):
         some = np.flatnonzero((new <= bounds[0]) | (new >= bounds[1]))
         (low, high), value = bounds[:, some], new[some]
         below, above = _step(low, value), _step(value, high)
-        points = part.component.points
-        index, least, greatest = departure.bound_shares(points, first.samples, *first.places, some)
+        points, (displacement, scale) = part.component.points, first.places
+        index, least, greatest = departure.bound_shares(points, first.samples, displacement, scale, some)
         return some, 1.0 - below - above, index, least * below + greatest * above
 
     def advect(self, part, out):

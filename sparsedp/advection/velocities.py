@@ -44,7 +44,8 @@ def _operator(setting, line):
     """
     grid = setting.grid
     components, axes = [None] if setting.of == "cells" else range(grid.dim), range(grid.dim)
-    blocks, parts = {}, []
+    blocks: dict = {}
+    parts: list = []
     given = grid.faces.parts if setting.velocity == "faces" else (grid.shape,) * grid.dim
     for own in components:
         for axis in axes:

@@ -165,6 +165,7 @@ def along_axis(u, out, rows, scale, accumulate):
     >>> out
     array([[[3., 6.]]])
     """
+    given: tuple
     if out.shape[2] == 1 and rows.offsets.size:
         fields, diagonals = (u[:, :, 0], out[:, :, 0]), (rows.offsets, rows.start, rows.stop, rows.values)
         given = "along_rows", out.size, out.size, threads(), *fields, *diagonals, scale, accumulate

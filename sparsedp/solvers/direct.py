@@ -95,8 +95,8 @@ class DenseSystem(System):
     rtol : float
     """
 
-    active, null_space = None, NullSpace(None, np.zeros(0), np.zeros(0), 0)  # type: ignore[assignment]
-    complex, exponent = False, 0  # type: ignore[assignment]
+    active, null_space = None, NullSpace(None, np.zeros(0), np.zeros(0), 0)
+    complex, exponent = False, 0
 
     def __init__(self, matrix, make, rtol):
         self.dense, self._make = matrix, make
@@ -105,12 +105,12 @@ class DenseSystem(System):
         self.norms = float(self.sizes.sum(1).max(initial=0.0)), float(self.sizes.sum(0).max(initial=0.0))
 
     @cached_property
-    def given(self):  # type: ignore[override]
+    def given(self):
         """The matrix as an Operator."""
         return self._make()
 
     @property
-    def op(self):  # type: ignore[override]
+    def op(self):
         """The same: it is not scaled."""
         return self.given
 
