@@ -36,6 +36,7 @@ def bends(grid, v):
     return grid.join(*parts)
 
 
+@pytest.mark.slow
 def test_plume_forward():
     """B4: the published maximum of the velocity in every step, to 5 digits."""
     grid = dp.Grid((32, 40), size=(80.0, 100.0))

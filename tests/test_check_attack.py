@@ -161,6 +161,7 @@ def scene(seed):
     return loss, rng.standard_normal(grid.shape) * 10.0 ** rng.uniform(-1, 0.5)
 
 
+@pytest.mark.slow
 def test_random_smooth_scenes_agree():
     found = Counter(AUDIT(*scene(seed), directions=2).verdict for seed in range(100))
     assert found["agrees"] >= 95 and found["disagrees"] == 0, found

@@ -147,6 +147,7 @@ def test_hessians_that_are_not_known():
     assert found and found.hessian is None and "Hessian product: not available (TypeError)" in str(found)
 
 
+@pytest.mark.slow
 def test_a_right_gradient_among_kinks_is_not_accused_and_a_wrong_one_is():
     """Clamped MacCormack on a field with ties: along one of the directions the kinks lie too close to be split."""
     grid = dp.Grid((24, 24), size=1.0, periodic=True)

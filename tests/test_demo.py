@@ -87,6 +87,7 @@ def test_nothing_is_overwritten_unasked(finished):
     assert before == {name: (folder / name).read_bytes() for name in os.listdir(folder)}
 
 
+@pytest.mark.slow
 def test_own_field_and_force(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(story, "ITERATIONS", 3)
     np.save(tmp_path / "ground.npy", relief())

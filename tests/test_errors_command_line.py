@@ -303,6 +303,7 @@ def test_ctrl_c(tmp_path, command, top):
     assert not list(tmp_path.glob("sparsedp-report/*"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_ctrl_c_in_the_demo(tmp_path):
     """While the optimizer runs: it may keep its best point, but the demo ends, and no file is written."""

@@ -78,6 +78,7 @@ def test_gradient_is_the_dense_formula(name):
     np.testing.assert_allclose(flat(pull(g)), flat(dense_gradient(problem, x, g)), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_checker_agrees_and_sees_planted_mistakes(monkeypatch):
     """J for its transpose, and a second derivative that holds x still."""
     problem = PROBLEMS["advection 1-D"]()

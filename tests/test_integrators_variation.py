@@ -136,6 +136,7 @@ def test_every_mode_and_order():
     assert value_and_grad(gradient)(5.0)[1] == pytest.approx(bend, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [4, pytest.param(40, marks=pytest.mark.slow)])
 def test_in_loops(count):
     """A rollout and a plain loop cut the run at fixed times: right, or refused where a cut falls into the jump."""

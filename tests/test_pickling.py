@@ -45,6 +45,7 @@ def test_same_bits_of_copies(one):
         assert use(twin) == wanted
 
 
+@pytest.mark.slow
 def test_same_bits_in_a_fresh_process(tmp_path):
     """All of them at once: a new interpreter has seen none of the numbers."""
     for _, _, thing, use in ALL:

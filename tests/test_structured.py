@@ -78,6 +78,7 @@ def test_components_and_null_space_are_those_of_the_entries(rng):
             assert mine.null_space.count == known.null_space.count
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("shape", [(64, 64), (257, 100), (131, 128), (33, 32, 31), (40, 40, 40)])
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann])
 def test_at_most_12_iterations_for_smooth_coefficients(shape, boundary, rng):

@@ -143,7 +143,7 @@ OPERATORS = {
     "separable": ("separable", lambda: -dp.laplacian(PLANE, dp.dirichlet)),
     "separable by elimination": ("separable", lambda: -dp.laplacian(dp.Grid((32, 600), size=1.0), dp.dirichlet)),
     "separable, Neumann": ("separable", lambda: -dp.laplacian(ROOM)),
-    "krylov": ("krylov", lambda: wind(PLANE)),
+    "krylov": ("krylov", lambda: wind(dp.Grid((8, 9), size=1.0))),
     "structured": ("structured", lambda: heat(PLANE)),
     "structured, 3-D": ("structured", lambda: heat(ROOM)),
     "auto": ("auto", lambda: heat(PLANE)),

@@ -38,6 +38,7 @@ def arguments(move, rng):
     return rng.normal(size=move.space.shape), rng.normal(size=shape), 0.015, rng.normal(size=move.walls.shape)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("dim", SHAPES)
 @pytest.mark.parametrize("velocity, form", FORMS)
 @pytest.mark.parametrize("of", ["cells", "faces"])
