@@ -7,6 +7,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp import kernels
+from sparsedp.kernels.team import NOTICE
 
 SHAPES = {1: (40,), 2: (12, 11), 3: (8, 7, 6)}
 METHODS = ["direct", "separable", "multigrid", "structured", "krylov"]
@@ -63,4 +64,5 @@ def test_bits_follow_the_coefficients(how, dim, method, capfd):
         x = solved(how, method, D, G, k * factor, b)[0] * factor
         np.testing.assert_allclose(x, wanted[0], rtol=1e-7)
     ctypes.CDLL(None).fflush(None)
-    assert capfd.readouterr() == ("", "")  # PyAMG prints, in C++, where entries are far from 1
+    printed, told = capfd.readouterr()
+    assert (printed, told.replace(NOTICE, "")) == ("", "")  # PyAMG prints, in C++, where entries are far from 1
