@@ -205,8 +205,10 @@ class Operator(Remade):
         structure = algebra.total(self.structure, other.structure)
         return Operator(structure, self.domain, self.codomain, f"{self.name} + {other.name}")
 
+    __radd__ = __add__  # for its advice: no sum of an operator and something else is defined
+
     def __sub__(self, other):
-        return self + (-other) if isinstance(other, Operator) else NotImplemented
+        return self + (-other) if isinstance(other, (Operator, Number)) else NotImplemented
 
     def __neg__(self):
         return self * -1.0
@@ -288,11 +290,11 @@ class Operator(Remade):
 
     def matvec(self, x):
         """Flat product A x, as SciPy calls it."""
-        return self @ np.asarray(x).reshape(self.domain.size)
+        return self @ np.asarray(x).reshape(-1)
 
     def rmatvec(self, y):
         """Flat product A^H y: conjugated, as SciPy wants it (`.T` is not)."""
-        return np.conj(self.T @ np.conj(np.asarray(y).reshape(self.codomain.size)))
+        return np.conj(self.T @ np.conj(np.asarray(y).reshape(-1)))
 
     def to_scipy(self):
         """The operator as a scipy.sparse.linalg.LinearOperator on flat arrays."""

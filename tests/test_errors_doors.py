@@ -193,3 +193,15 @@ RENAMED = {"minimise": "dp.minimize", "part": "dp.component(grid, axis)", "embed
 def test_a_name_of_the_first_edition_tells_the_new_one(name, now):
     with pytest.raises(AttributeError, match=re.escape(now) + "$"):
         getattr(dp, name)
+
+
+@pytest.mark.parametrize("act", [lambda: LAP - 1, lambda: 1 + LAP, lambda: LAP + 2.5])
+def test_a_number_is_no_operator(act):
+    with pytest.raises(TypeError, match=re.escape("cannot be added to -laplacian; write -laplacian + c * dp.identity")):
+        act()
+
+
+@pytest.mark.parametrize("act", [lambda: LAP.matvec(np.ones(3)), lambda: LAP.rmatvec(np.ones((13, 1)))])
+def test_a_flat_product_takes_a_flat_array_of_the_size(act):
+    with pytest.raises(SHAPE, match=re.escape("@ x takes a flat x of shape (12,); for a field write op(u)")):
+        act()
