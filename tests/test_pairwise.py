@@ -31,7 +31,8 @@ def test_short_lists():
 @pytest.mark.parametrize("d", range(4))
 def test_this_one_is_sampled(a, b, c, d, request):
     """Two of 32 in each pair: 16 rows, and -m sees the others as `whole`."""
-    of_this = [item for item in request.session.items if item.function.__name__ == request.function.__name__]
+    name = request.node.originalname
+    of_this = [item for item in request.session.items if getattr(item, "originalname", None) == name]
     inside = {
         tuple(item.callspec.params[name] for name in "acd") for item in of_this if not item.get_closest_marker("whole")
     }
