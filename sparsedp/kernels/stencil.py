@@ -29,9 +29,11 @@ def kronecker_sum(u, out, far, middle, along, shift, start, stop):
         after1 = cells[row + (k + 1) % n1 - k if b != 0.0 else row]
         before0 = cells[(row - n1) % rows if c != 0.0 else row]
         after0 = cells[(row + n1) % rows if d != 0.0 else row]
-        for j in range(1, last):
+        for j in range(1, last):  # the compiler makes two loops of it: in 2-D there is nothing to read along axis 0
             total = (weight + centre[j]) * here[j] + (lower[j] * here[j - 1] + upper[j] * here[j + 1])
-            result[j] = total + (a * before1[j] + b * after1[j]) + (c * before0[j] + d * after0[j])
+            if n0 > 1:
+                total += c * before0[j] + d * after0[j]
+            result[j] = total + (a * before1[j] + b * after1[j])
         for j in (0, last):
             total = (weight + centre[j]) * here[j] + (a * before1[j] + b * after1[j]) + (c * before0[j] + d * after0[j])
             total += lower[j] * here[(j - 1) % n] if lower[j] != 0.0 else 0.0
