@@ -54,7 +54,7 @@ def _stencils(w, scale, axes, reach, tables, left, right, room):
         line = axis + 3 - dim
         begin[line] = 0 if at_points and len(tables) > 1 else reach[line, 1]
         for kind in range(len(tables)):
-            for m in range(begin[line], reach[line, 2]):
+            for m in range(begin[line], 4 - begin[line]):
                 weight, (a, b, c, d, at_point) = weights[kind, line, m, :many], tables[kind, m]
                 for j in range(number.size):
                     t = fraction[j]
@@ -72,7 +72,7 @@ def interpolate(samples, w, scale, axes, reach, tables, g, out, bounds, start, s
     """
     room, dim, slopes = _room(), len(axes), len(tables) > 1
     first, weights, begin, rows = room
-    value, slope = rows[0], rows[1]
+    value, slope, _ = rows
     for left in range(start * TILE, min(stop * TILE, w.shape[1]), TILE):
         right = min(left + TILE, w.shape[1])
         _stencils(w, scale, axes, reach, tables, left, right, room)
@@ -81,22 +81,20 @@ def interpolate(samples, w, scale, axes, reach, tables, g, out, bounds, start, s
         bounds[0, left:right], bounds[1, left:right] = np.inf, -np.inf
         for i in range(begin[0], reach[0, 2]):
             for k in range(begin[1], reach[1, 2]):
-                value[:], slope[:] = 0.0, 0.0
-                for m in range(begin[2], reach[2, 2]):
-                    line, a, b = samples[i * reach[0, 0] + k * reach[1, 0] + m :], weights[0, 2, m], weights[1, 2, m]
-                    if slopes:
-                        for j in range(many):
-                            sample = line[first[j]]
-                            value[j] += a[j] * sample
-                            slope[j] += b[j] * sample
-                    else:
-                        for j in range(many):
-                            value[j] += a[j] * line[first[j]]
-                    if 0 < i < 3 and 0 < k < 3 and 0 < m < 3:
-                        least, greatest = bounds[0, left:right], bounds[1, left:right]
-                        for j in range(least.size):
-                            sample = line[first[j]]
-                            least[j], greatest[j] = min(least[j], sample), max(greatest[j], sample)
+                rows[:2] = 0.0
+                near = samples[i * reach[0, 0] + k * reach[1, 0] :]
+                for m in range(begin[2], 4 - begin[2], 2):  # in pairs: half the passes over the sums
+                    line, (a, b), (c, d) = near[m:], weights[0, 2, m : m + 2], weights[1, 2, m : m + 2]
+                    for j in range(many):
+                        one, two = line[first[j]], line[first[j] + np.uint64(1)]
+                        value[j] += a[j] * one + b[j] * two
+                        if slopes:
+                            slope[j] += c[j] * one + d[j] * two
+                for m in range(1, 3 if 0 < i < 3 and 0 < k < 3 else 1):
+                    line, least, greatest = near[m:], bounds[0, left:right], bounds[1, left:right]
+                    for j in range(least.size):
+                        sample = line[first[j]]
+                        least[j], greatest[j] = min(least[j], sample), max(greatest[j], sample)
                 for axis in range(len(out)):  # its factor is the slope, the others are values
                     steep = axis + 3 - dim if slopes else -1
                     a, b, c = weights[int(steep == 0), 0, i], weights[int(steep == 1), 1, k], rows[int(steep == 2)]
@@ -113,8 +111,7 @@ def interpolate(samples, w, scale, axes, reach, tables, g, out, bounds, start, s
 @kernel("read2 read1 read2 index2 read3 read1 write1")
 def scatter(w, scale, axes, reach, tables, g, samples, start, stop):
     """samples += W^T g: for one thread, as points share samples."""
-    room = _room()
-    first, weights, begin, rows = room
+    room = first, weights, begin, rows = _room()
     for left in range(start * TILE, min(stop * TILE, w.shape[1]), TILE):
         right = min(left + TILE, w.shape[1])
         _stencils(w, scale, axes, reach, tables, left, right, room)
