@@ -25,6 +25,7 @@ __all__ = [
 ]
 
 FLOAT = np.dtype(float)
+SHORT = 8192  # numbers of which one product of BLAS is taken: it uses one thread up to 10000
 
 
 def field_array(op, u, batch=False):
@@ -91,7 +92,7 @@ def check_finite(name, values, needs="must be finite", where=None):
 
 def surely_finite(value):
     """One pass without a temporary array; False also when a finite sum is too large."""
-    if type(value) is np.ndarray and value.size < 4096 and value.dtype == FLOAT and value.flags.c_contiguous:
+    if type(value) is np.ndarray and value.size <= SHORT and value.dtype == FLOAT and value.flags.c_contiguous:
         flat = value.reshape(-1)
         if isfinite(np.vdot(flat, flat)):  # one cheap call; a square may overflow where the value does not
             return True
