@@ -1,10 +1,8 @@
 """Structured multigrid: on the grid itself, compiled, for symmetric 5- and 7-point operators that no transform solves.
 
 - `engine`: what the contract calls: conjugate gradients with the cycle as preconditioner.
-- `stencil`, `reading`, `lines`, `facts`: an operator as a stencil, its components and null space.
-- `spread`: cells without content in between, so that any size coarsens well.
+- `stencil`, `lines`: an operator as a stencil, from its entries or from the factors of its differences.
 - `layout`: in which order a level keeps its numbers.
-- `interpolation`, `coarsening`, `coarsest`, `levels`: the set-up.
-- `smoother`, `cycle`: what a solve does on the levels.
+- `interpolation`, `levels`: the set-up, and the cycle.
 - `loops`: the compiled functions.
 """

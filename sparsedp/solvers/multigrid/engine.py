@@ -7,7 +7,6 @@ so are the directions kept; the equations, the solution and the residual are dou
 """
 
 import threading
-from math import prod
 
 import numpy as np
 
@@ -128,20 +127,18 @@ class Structured(Engine):
         from sparsedp.solvers.multigrid import loops
         from sparsedp.solvers.multigrid.layout import Layout
         from sparsedp.solvers.multigrid.levels import Level, hierarchy
-        from sparsedp.solvers.multigrid.spread import Spread
 
-        self.scale, self.maxiter, self.loops = stencil.scale, maxiter or MAXITER, loops
-        self.spread = spread = Spread(stencil.grid)
-        threads = kernels.threads() if prod(stencil.grid.shape) >= SERIAL else 1
-        self.layout = layout = Layout(spread.shape, stencil.grid.periodic)
-        extra, flags = layout.zeros(), layout.zeros(dtype=bool)
-        spread.put(stencil.extra, layout.cells(extra))
-        spread.put(free.reshape(stencil.grid.shape), layout.cells(flags))
-        self.level = level = Level(layout, spread.links(stencil, layout), extra, layout.wrap(flags), dtype, threads)
-        level.weak = spread.taken(level.weak)
-        self.fine, self.weak_share, self.hierarchy = hierarchy(level, spread.coarsenings)
+        grid, self.scale, self.maxiter, self.loops = stencil.grid, stencil.scale, maxiter or MAXITER, loops
+        threads = kernels.threads() if grid.cells.size >= SERIAL else 1
+        self.layout = layout = Layout(grid.shape, grid.periodic)
+        links, extra, flags = layout.zeros(grid.dim), layout.zeros(), layout.zeros(dtype=bool)
+        for field, values in zip((*links, extra, flags), (*stencil.links, stencil.extra, free)):
+            layout.cells(field)[...] = values.reshape(grid.shape)
+        steps = [tuple(step) for step in np.eye(grid.dim, dtype=int).tolist()]
+        self.level = level = Level(layout, steps, links, extra, layout.wrap(flags), dtype, threads)
+        self.fine, self.weak_share, self.hierarchy = hierarchy(level)
         self.hierarchy += ", cycle in double precision" if dtype == np.float64 else ""
-        volumes = spread.volumes()
+        volumes = grid.volumes
         scale, root = layout.cells(level.scale), layout.cells(level.root)
         self.factors = scale * volumes, scale  # what a right-hand side of A, and of its transpose, is multiplied with
         gauges = root / volumes, root  # how a scaled residual measures in the user's cells, but for a number
@@ -185,7 +182,7 @@ class _Run:
         for vector in (self.x, self.r, self.q, self.p, self.old):
             vector[...] = 0.0
         field = self.layout.cells(self.r)
-        engine.spread.put(b.reshape(engine.spread.grid.shape), field)
+        field[...] = b.reshape(self.layout.shape)
         field *= engine.factors[transposed]
         field *= engine.scale / self.unit
         self.step(0.0)
@@ -251,4 +248,4 @@ class _Run:
         self.x += self.alpha * self.p
         engine, field = self.engine, self.layout.cells(self.x)
         field *= engine.factors[not self.transposed]
-        return (engine.spread.taken(field) * self.unit).reshape(-1)
+        return (field * self.unit).reshape(-1)

@@ -7,11 +7,10 @@ says, given the values of all cells around. Sources: J. E. Dendy, Black box mult
 Sci. Stat. Comput. 8 (1987) 673-685.
 """
 
-from itertools import product
-
 import numpy as np
 
 from sparsedp.solvers.multigrid import loops
+from sparsedp.solvers.multigrid.layout import steps_around
 
 __all__ = ["Transfer", "interpolated"]
 
@@ -31,92 +30,52 @@ class Transfer:
 
     def __init__(self, fine, coarse, weights, threads):
         self.fine, self.coarse, self.threads = fine, coarse, threads
-        self.weights = weights.reshape(len(weights), -1)
-        steps, rows = _around(fine.dim), []
-        self.steps = np.array(steps) @ fine.pitch
-        self.ends = np.zeros(9, np.int64)
-        for kind, parities in enumerate(product((0, 1), repeat=3)):
-            parities = parities[:: 4 - fine.dim]  # the loop has three axes; in 2-D there are no odd lines in a plane
-            for number, step in enumerate(steps):
-                if tuple(np.abs(step)) == parities:
-                    corner = (np.array(parities) - step) // 2
-                    rows.append((number, corner @ coarse.pitch))
-            self.ends[kind + 1] = len(rows)
-        self.table = np.array(rows)
+        self.weights = weights.reshape(3, -1, 3, weights[0].size)  # the loops have three axes
 
-    def _run(self, loop, layout, *arguments):
-        loop = loop.single if self.weights.dtype == np.float32 else loop
-        sizes = self.fine.sizes, self.coarse.sizes
-        loop.run(layout.shape[0], self.fine.sizes[0] * self.fine.shape[0], self.threads, *arguments, *sizes)
+    def _run(self, loop, layout, source, out):
+        loop = loop.single if out.dtype == np.float32 else loop
+        arrays = self.weights, source.reshape(-1), out.reshape(-1), self.fine.sizes, self.coarse.sizes
+        loop.run(layout.shape[0], self.fine.sizes[0] * self.fine.shape[0], self.threads, *arrays)
+        return out
 
     def restrict(self, r, out):
         """out = P^T r; r has its ghost cells filled."""
-        self._run(loops.restrict, self.coarse, self.weights, r.reshape(-1), out.reshape(-1), self.steps)
-        return out
+        return self._run(loops.restrict, self.coarse, r, out)
 
     def prolong(self, e, x):
         """x += P e; e has its ghost cells filled."""
-        self._run(loops.prolong, self.fine, self.weights, e.reshape(-1), x.reshape(-1), self.table, self.ends)
-        return x
-
-
-def _around(dim):
-    """A cell and all around it, as steps."""
-    return list(product((-1, 0, 1), repeat=dim))
+        return self._run(loops.prolong, self.fine, e, x)
 
 
 def interpolated(level):
-    """Level -> the weights of `Transfer`, and a field: what their sums miss to 1, exactly 0 where nothing is held."""
+    """Level -> the weights of `Transfer`; those in ghost cells are seen from where the cell is repeated."""
     layout, coarse = level.layout, level.layout.coarse()
-    steps = _around(layout.dim)
-    weights, missing = coarse.zeros(len(steps)), layout.zeros()
-    number = {step: m for m, step in enumerate(steps)}
-    coarse.cells(weights[number[(0,) * layout.dim]])[...] = 1.0
+    odd = layout.zeros(layout.dim, dtype=bool)  # around the end of a periodic axis of odd length two cells are even
+    layout.cells(odd)[...] = np.indices(layout.shape) % 2
+    layout.wrap(odd)
+    steps = steps_around(layout.dim)
+    weights, number = coarse.zeros(len(steps)), {step: m for m, step in enumerate(steps)}
+    views, done = coarse.cells(weights), {(0,) * layout.dim}
+    views[len(steps) // 2] = 1.0
+    for side in sorted(steps, key=np.count_nonzero)[1:]:
+        total, weight = layout.cells(level.extra, side, 2).copy(), views[number[side]]
+        for step, link in level.around.items():
+            offset = tuple(d * abs(s) for d, s in zip(step, side))  # links along even axes are summed up
+            near = tuple(s + d for s, d in zip(side, offset))
+            share = layout.cells(link, side, 2) if any(offset) else 0.0
+            total += share
+            if near in done and near != side:
+                weight += share * views[number[near]]
+        kind = np.array(side, bool).reshape(-1, *(1,) * layout.dim)
+        held = np.all(layout.cells(odd, side, 2) == kind, axis=0)
+        held &= total > WEAK * layout.cells(level.root, side, 2) ** 2
+        weight *= np.divide(1.0, total, out=np.zeros_like(total), where=held)
+        done.add(side)
     coarse.wrap(weights)
-    for kind in sorted(product((0, 1), repeat=layout.dim), key=sum)[1:]:
-        sides = [step for step in steps if tuple(map(abs, step)) == kind]  # of the coarse cells around
-        shares = _shares(level, kind)
-        lost = layout.every_second(level.extra, kind)
-        total = sum(shares.values(), lost)
-        held = total > WEAK * layout.every_second(level.root, kind) ** 2
-        factor = np.divide(1.0, total, out=np.zeros_like(total), where=held)
-        lost = np.where(held, lost * factor, 1.0)
-        for offset, share in shares.items():
-            share *= factor
-            lost += share * layout.every_second(missing, kind, offset)
-            for side in sides:
-                if all(d in (0, -s) for d, s in zip(offset, side)):
-                    near = tuple(0 if d else s for d, s in zip(offset, side))  # seen from the neighbour
-                    # the coarse cells on this side of the cells
-                    corner = tuple(
-                        slice(ghosts + (s < 0), ghosts + (s < 0) + n)
-                        for ghosts, s, n in zip(coarse.before, side, share.shape)
-                    )
-                    weights[(number[side], *corner)] += share * weights[(number[near], *corner)]
-        layout.every_second(missing, kind)[...] = lost
-        layout.wrap(missing)
-        for side in sides:
-            _fold(coarse, weights[number[side]], side)
-    return weights, missing
-
-
-def _fold(layout, weight, side):
-    """Weights on cells below a coarse one were written one line too far at the end of periodic axes."""
-    for axis, (ghosts, n, flag) in enumerate(zip(layout.before, layout.shape, layout.periodic)):
-        lines = np.moveaxis(weight, axis, 0)
-        if flag and side[axis] < 0:
-            lines[ghosts] = lines[ghosts + n]
-    layout.wrap(weight)
-
-
-def _shares(level, kind):
-    """The links of the cells of a kind, those along even axes summed up: by the offset that is left."""
-    shares: dict = {}
-    for link, step in zip(level.links, level.steps):
-        back = tuple(-d for d in step)
-        for there, place in ((step, (0,) * len(step)), (back, back)):
-            offset = tuple(d * p for d, p in zip(there, kind))
-            if any(offset):
-                a = level.layout.every_second(link, kind, place)
-                shares[offset] = shares[offset] + a if offset in shares else a.copy()
-    return shares
+    for axis, (n, ghosts, m) in enumerate(zip(layout.shape, coarse.before, coarse.shape)):
+        if layout.periodic[axis] and n % 2:  # the first coarse cell is one fine cell behind the last one, not two
+            lines = weights.reshape(*(3,) * layout.dim, *coarse.padded)
+            lines = np.moveaxis(lines, (axis, layout.dim + axis), (0, 1))
+            lines[:2, ghosts + m], lines[2, ghosts + m] = lines[1:, ghosts], 0.0
+            lines[1:, ghosts - 1], lines[0, ghosts - 1] = lines[:2, ghosts + m - 1], 0.0
+    return weights

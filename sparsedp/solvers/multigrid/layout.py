@@ -9,19 +9,14 @@ from itertools import product
 
 import numpy as np
 
-__all__ = ["GHOST", "Layout", "axis_steps", "steps_around"]
+__all__ = ["GHOST", "Layout", "steps_around"]
 
 GHOST = 3  # ghost planes in front and behind; along the other axes there is one ghost cell
 
 
-def axis_steps(dim):
-    """Steps of the links on the finest level."""
-    return [tuple(int(a == axis) for a in range(dim)) for axis in range(dim)]
-
-
 def steps_around(dim):
-    """Steps of the links on the other levels: half of the cells around."""
-    return [step for step in product((-1, 0, 1), repeat=dim) if step > (0,) * dim]
+    """Steps to a cell itself, in the middle of the list, and to all around it."""
+    return list(product((-1, 0, 1), repeat=dim))
 
 
 class Layout:
@@ -51,25 +46,15 @@ class Layout:
         self.sizes = np.array(
             [plane, width, shape[0], lines, lead, shape[-1], periodic[0], flag, periodic[-1]], np.int64
         )
-        self.middle = slice(2 * plane, -2 * plane)  # of the flat array: all cells, and the planes next to them
 
     def zeros(self, *count, dtype=float):
         """Fields."""
         return np.zeros((*count, *self.padded), dtype)
 
-    def cells(self, fields):
-        """Fields -> their values in the cells of the grid. A view."""
-        return fields[(..., *(slice(ghosts, ghosts + n) for ghosts, n in zip(self.before, self.shape)))]
-
-    def beside(self, field, step):
-        """Field -> for the flat `middle` the values at a step. A view."""
-        far = int(np.dot(step, self.pitch))
-        return field.reshape(-1)[self.middle.start + far : self.middle.stop + far]
-
-    def every_second(self, field, parities, step=(0, 0, 0)):
-        """Field -> the values at a step from the cells whose indices have these parities. A view."""
-        places = zip(self.before, parities, step, self.shape)
-        return field[tuple(slice(ghosts + p + d, ghosts + d + n, 2) for ghosts, p, d, n in places)]
+    def cells(self, fields, step=(0, 0, 0), every=1):
+        """Fields -> their values at a step from the cells of the grid, or from those with even indices. A view."""
+        places = zip(self.before, step, self.shape)
+        return fields[(..., *(slice(ghosts + d, ghosts + d + n, every) for ghosts, d, n in places))]
 
     def coarse(self):
         """The layout of the cells with even indices."""

@@ -4,19 +4,21 @@ from itertools import product
 from math import prod
 
 import numpy as np
+from scipy.sparse.linalg import LinearOperator, eigsh
 
-from sparsedp.solvers.contract import norm
 from sparsedp.solvers.multigrid import loops
 from sparsedp.solvers.multigrid.interpolation import Transfer, interpolated
-from sparsedp.solvers.multigrid.layout import axis_steps, steps_around
+from sparsedp.solvers.multigrid.layout import steps_around
 
-__all__ = ["COARSEST", "Level", "hierarchy"]
+__all__ = ["Level", "hierarchy"]
 
 COARSEST = 100  # cells that are solved by a dense matrix
 RANK = 1e-14  # eigenvalues below, of a matrix with a unit diagonal, are 0
 ROUNDING = 1e-10  # share of the diagonal below which an extra is rounding
+CARRIED = 1e-12  # what weights may miss to 1 by rounding
 SMOOTHED = 4.0  # the smoother damps the eigenvalues from the largest one to this part of it
-POWERS, MARGIN = 10, 1.1  # steps of power iteration, and what they may miss: the smoother converges up to 1.25
+NEAR = 2.5  # a bound of the eigenvalues that is good enough; without links below 0 it is at most 2
+MARGIN = 1.05  # what Lanczos may miss; the smoother converges up to 1.25
 WEAK = 0.1  # a cell is weak along an axis that holds it with less than this share of another one
 EXAMINED = 1000  # cells of the smallest level that is examined
 
@@ -27,6 +29,8 @@ class Level:
     Parameters
     ----------
     layout : Layout
+    steps : list of tuples
+        To the cells that a cell is linked to, of each pair of opposite ones the step forward.
     links : array
         For each of the steps a field of a. Ghost cells are filled here.
     extra : field
@@ -38,40 +42,39 @@ class Level:
 
     Attributes
     ----------
+    around : dict
+        Step forward or back -> field of the links there.
     root, scale : fields
         Root of the diagonal, and one over it; 0 where there is no unknown.
     coupling : array
         The links of the matrix scaled to a unit diagonal, in double precision.
-    weak : field of bool
-        Cells that are held much weaker along one axis than along another.
+    bound : float
+        Of the eigenvalues with a unit diagonal: each row has a disc of Gershgorin.
+    weak_share : float
+        Share of the cells that are held much weaker along one axis than along another; of few cells 0.
     """
 
-    def __init__(self, layout, links, extra, free, dtype, threads):
-        self.layout, self.dtype, self.threads = layout, dtype, threads
-        self.links, self.free = layout.wrap(links), free
-        self.steps = axis_steps(layout.dim) if len(links) == layout.dim else steps_around(layout.dim)
-        self.pitches = np.array(self.steps) @ layout.pitch
-        held, self.root, self.scale = layout.zeros(layout.dim), layout.zeros(), layout.zeros()
-        self.extra, middle = np.where(free, 0.0, extra), layout.middle
-        total = self.extra.copy()
-        for link, step in zip(self.links, self.steps):
-            for a in (link.reshape(-1)[middle], layout.beside(link, [-d for d in step])):
-                total.reshape(-1)[middle] += a
-                for axis in np.flatnonzero(step):
-                    held[axis].reshape(-1)[middle] += a
-        layout.cells(self.root)[...] = np.sqrt(np.maximum(layout.cells(total), 0.0))
+    def __init__(self, layout, steps, links, extra, free, dtype, threads):
+        self.layout, self.steps, self.dtype, self.threads = layout, steps, dtype, threads
+        self.links, self.free, self.extra = layout.wrap(links), free, np.where(free, 0.0, extra)
+        self.pitches = np.array(steps) @ layout.pitch
+        self.around, cells = dict(zip(steps, self.links)), layout.cells
+        for step, link in zip(steps, self.links):
+            back, other = tuple(-d for d in step), layout.zeros()
+            cells(other)[...] = cells(link, back)
+            self.around[back] = layout.wrap(other)
+        held = [cells(sum(a for step, a in self.around.items() if step[axis])) for axis in range(layout.dim)]
+        weak = np.min(held, axis=0) < WEAK * np.max(held, axis=0)
+        self.weak_share = np.count_nonzero(weak) / weak.size if weak.size >= EXAMINED else 0.0
+        self.root, self.scale = layout.zeros(2)
+        cells(self.root)[...] = np.sqrt(np.maximum(cells(sum(self.around.values(), self.extra)), 0.0))
         np.divide(1.0, self.root, out=self.scale, where=self.root > 0.0)
         layout.wrap(self.root), layout.wrap(self.scale)
-        self.weak = layout.cells(held.min(axis=0) < WEAK * held.max(axis=0))
-        self.coupling = np.zeros((len(links), self.root.size))
-        for out, link, step in zip(self.coupling, self.links, self.steps):
-            out[middle] = link.reshape(-1)[middle] * self.scale.reshape(-1)[middle] * layout.beside(self.scale, step)
-        layout.wrap(self.coupling.reshape(links.shape))
-
-    @property
-    def weak_share(self):
-        """Share of the cells that are weak; of few cells 0."""
-        return np.count_nonzero(self.weak) / self.weak.size if self.weak.size >= EXAMINED else 0.0
+        self.bound = 1.0 + float(np.max(cells(sum(map(abs, self.around.values())) * self.scale**2)))
+        coupling = layout.zeros(len(steps))
+        for out, link, step in zip(coupling, self.links, steps):
+            cells(out)[...] = cells(link) * cells(self.scale) * cells(self.scale, step)
+        self.coupling = layout.wrap(coupling).reshape(len(steps), -1)
 
     def apply(self, x, out, sums=None):
         """out = A x with a unit diagonal, in double precision; x has its ghost cells filled. x . out to sums."""
@@ -81,81 +84,78 @@ class Level:
         image.run(self.layout.shape[0], x.size, self.threads, *arrays, self.pitches, self.layout.sizes, sums)
         return self.layout.wrap(out)
 
+    def operator(self):
+        """A with a unit diagonal, for flat vectors of the cells in natural order."""
+        x, y = self.layout.zeros(2)
+        size = prod(self.layout.shape)
+
+        def image(vector):
+            self.layout.cells(x)[...] = vector.reshape(self.layout.shape)
+            return self.layout.cells(self.apply(self.layout.wrap(x), y)).flatten()
+
+        return LinearOperator((size, size), matvec=image, dtype=float)
+
     def largest(self):
-        """The largest eigenvalue of A with a unit diagonal, by power iteration; on the finest level it is at most 2."""
-        x, y, size = *self.layout.zeros(2), 2.0
-        self.layout.cells(x)[...] = np.random.default_rng(0).standard_normal(self.layout.shape)
-        for _ in range(POWERS if len(self.links) > self.layout.dim else 0):
-            self.apply(self.layout.wrap(x), y)
-            size = MARGIN * norm(self.layout.cells(y).reshape(-1))
-            x, y = y * (MARGIN / (size or 1.0)), x
-        return size or 1.0
+        """An upper bound of the eigenvalues of A with a unit diagonal, not far above them."""
+        if self.bound <= NEAR:
+            return self.bound
+        start = np.random.default_rng(0).standard_normal(prod(self.layout.shape))
+        value = eigsh(self.operator(), 1, which="LA", v0=start, tol=MARGIN - 1.0, return_eigenvectors=False)
+        return min(self.bound, MARGIN * float(value[0]))
 
     def coarsened(self):
         """The next level: Galerkin's P^T A P."""
         layout, coarse = self.layout, self.layout.coarse()
-        weights, missing = interpolated(self)
-        for weight, step in zip(weights, product((-1, 0, 1), repeat=layout.dim)):
-            coarse.cells(weight)[...] *= layout.every_second(self.root, (0,) * layout.dim, step)
-        coarse.wrap(weights)
-        transfer = Transfer(layout, coarse, weights, self.threads)
-        # the image of the constant: of its missing part only, so that nothing is added up that cancels
-        y = self.scale * self.extra - self.apply(self.root * missing, layout.zeros())
+        steps, weights = steps_around(layout.dim), interpolated(self)
+        forward, links = self._galerkin(coarse, dict(zip(steps, weights)))
+        free, tied = (
+            sum(
+                layout.cells(flags & (self.root > 0.0), step, 2) & (coarse.cells(w) != 0)
+                for w, step in zip(weights, steps)
+            )
+            for flags in (self.free, ~self.free)
+        )
+        nothing = coarse.zeros(dtype=bool)
+        coarse.cells(nothing)[...] = (free > 0) & ~(tied > 0)
+        for weight, step in zip(coarse.cells(weights), steps):
+            weight *= layout.cells(self.root, step, 2)
+        transfer = Transfer(layout, coarse, coarse.wrap(weights), self.threads)
+        # the image of the constant: of what P misses of it only, so that nothing is added up that cancels
+        missing = self.root - transfer.prolong(np.ones(coarse.padded), layout.zeros())
+        missing[np.abs(missing) <= CARRIED * self.root] = 0.0
+        y = self.scale * self.extra - self.apply(layout.wrap(missing), layout.zeros())
         extra = transfer.restrict(layout.wrap(y), coarse.zeros())
-        links = self._probed(transfer)
-        inside = [(flags & (self.root > 0.0)).astype(float) for flags in (self.free, ~self.free)]
-        sizes = Transfer(layout, coarse, np.abs(weights), self.threads)
-        free, tied = (sizes.restrict(flags, coarse.zeros()) > 0.0 for flags in inside)
-        free &= ~tied
-        _without_negative(coarse, links, extra, free)
-        level = Level(coarse, links, extra, free, self.dtype, self.threads)
+        _without_negative(coarse, forward, links, nothing & (np.abs(extra) > ROUNDING * np.abs(links).sum(axis=0)))
+        level = Level(coarse, forward, links, extra, coarse.wrap(nothing), self.dtype, self.threads)
         return level, Transfer(layout, coarse, (weights * level.scale).astype(self.dtype), self.threads)
 
-    def _probed(self, transfer):
-        """The links of P^T A P, from its action on cells that are three apart."""
-        layout, coarse = self.layout, transfer.coarse
-        lines = [numbered(n, flag) for n, flag in zip(coarse.shape, coarse.periodic)]
-        counts = [int(line.max()) + 1 for line in lines]
-        colours, steps = np.full(coarse.padded, -1), steps_around(coarse.dim)
-        coarse.cells(colours)[...] = np.ravel_multi_index(np.ix_(*lines), counts)
-        coarse.wrap(colours)
-        links, x, y, z = coarse.zeros(len(steps)), layout.zeros(), layout.zeros(), coarse.zeros()
-        flat, middle = links.reshape(len(steps), -1), coarse.middle
-        held = layout.wrap(self.extra * self.scale**2)  # extras are summed up by rows: they stay on the diagonal
-        for colour in range(prod(counts)):
-            x[...] = 0.0
-            transfer.prolong((colours == colour).astype(float), x)
-            y = self.apply(x, y)
-            y -= np.multiply(held, x, out=x)
-            transfer.restrict(y, z)
-            for link, step in zip(flat, steps):
-                np.copyto(link[middle], -z.reshape(-1)[middle], where=coarse.beside(colours, step) == colour)
-        for link, step in zip(links, steps):
-            around = [n for d, n, flag in zip(step, coarse.shape, coarse.periodic) if d and flag]
-            link *= 0.0 if 1 in around else 0.5 ** around.count(2)  # a cell itself; a cell on both sides
-        return links
+    def _galerkin(self, coarse, weights):
+        """The steps and links of P^T A P: for each pair of coarse cells the entries of fine cells around them."""
+        steps = steps_around(coarse.dim)
+        forward = steps[len(steps) // 2 + 1 :]
+        links, entries = coarse.zeros(len(forward)), self.around | {(0,) * coarse.dim: -sum(self.around.values())}
+        for out, step in zip(coarse.cells(links), forward):
+            if not any(d and (n > 1 or not flag) for d, n, flag in zip(step, coarse.shape, coarse.periodic)):
+                continue  # a cell is not linked to itself
+            for (side, weight), (there, entry) in product(weights.items(), entries.items()):
+                other = tuple(s + d - 2 * t for s, d, t in zip(side, there, step))  # seen from the other coarse cell
+                if other in weights:
+                    far = coarse.cells(weights[other], step)
+                    out += coarse.cells(weight) * self.layout.cells(entry, side, 2) * far
+        return forward, links
 
 
-def _without_negative(layout, links, extra, free):
+def _without_negative(layout, steps, links, lost):
     """No link below 0 at a free cell that loses an extra of its own.
 
     A fine cell beside an obstacle that cannot be interpolated along its axis has no weights, and the constant is
     then not carried exactly: Galerkin's product has an extra where the matrix has none. It is left out, so that the
     coarse matrix has the same null vector; with links >= 0 around it, it stays without negative eigenvalues.
     """
-    lost = layout.wrap(free & (np.abs(extra) > ROUNDING * np.abs(links).sum(axis=0)))
-    for link, step in zip(links if lost.any() else (), steps_around(layout.dim)):
-        flat = link.reshape(-1)[layout.middle]
-        touched = lost.reshape(-1)[layout.middle] | layout.beside(lost, step)
-        flat[touched & (flat < 0.0)] = 0.0
-
-
-def numbered(n, periodic):
-    """Numbers for the cells of an axis so that any three in a row differ, around the end of a periodic one too."""
-    if not periodic or n % 3 == 0:
-        return np.arange(n) % 3
-    fours = min(4 * (n % 3), n)
-    return np.concatenate([np.arange(fours) % 4, np.arange(n - fours) % 3]) if fours < n else np.arange(n)
+    layout.wrap(lost)
+    for link, step in zip(layout.cells(links), steps):
+        touched = layout.cells(lost) | layout.cells(lost, step)
+        link[touched & (link < 0.0)] = 0.0
 
 
 class Smoothed:
@@ -199,14 +199,9 @@ class Coarsest:
     """The level that is solved by a dense matrix."""
 
     def __init__(self, level):
-        self.layout, cells = level.layout, level.layout.cells
+        self.layout, operator = level.layout, level.operator()
         self.b, self.x = self.layout.zeros(2, dtype=level.dtype)
-        columns, unit, image = [], *self.layout.zeros(2)
-        for number in np.ndindex(*self.layout.shape):
-            cells(unit)[...] = 0.0
-            cells(unit)[number] = 1.0
-            columns.append(cells(level.apply(self.layout.wrap(unit), image)).flatten())
-        values, vectors = np.linalg.eigh(np.array(columns))
+        values, vectors = np.linalg.eigh([operator.matvec(unit) for unit in np.eye(operator.shape[0])])
         kept = np.abs(values) > RANK  # not the null vectors, nor those of cells whose weights depend on each other
         self.inverse = ((vectors[:, kept] / values[kept]) @ vectors[:, kept].T).astype(level.dtype)
 
@@ -217,14 +212,14 @@ class Coarsest:
         self.layout.wrap(self.x)
 
 
-def hierarchy(level, coarsenings):
-    """The finest level, number of those below -> (Smoothed, which knows the level below it, and so on; shapes)."""
+def hierarchy(level):
+    """The finest level -> (Smoothed, which knows the level below it, and so on; largest share of weak cells; text)."""
     first = above = Smoothed(level)
-    shares = [level.weak_share]
-    for number in range(coarsenings, 0, -1):
+    levels = [level]
+    while len(levels) == 1 or prod(level.layout.shape) > COARSEST:
         level, above.transfer = level.coarsened()
-        above.below = Smoothed(level) if number > 1 else Coarsest(level)
+        above.below = Smoothed(level) if prod(level.layout.shape) > COARSEST else Coarsest(level)
         above = above.below
-        shares.append(level.weak_share)
-    top, bottom = (" x ".join(map(str, layout.shape)) for layout in (first.layout, above.layout))
-    return first, max(shares), f"{coarsenings + 1} levels, {top} to {bottom}"
+        levels.append(level)
+    top, bottom = (" x ".join(map(str, end.layout.shape)) for end in (first, above))
+    return first, max(each.weak_share for each in levels), f"{len(levels)} levels, {top} to {bottom}"

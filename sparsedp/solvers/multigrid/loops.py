@@ -40,6 +40,13 @@ def add_two(out, a, x, b, y):
 
 
 @inner
+def add(out, a, x):
+    """out += a x."""
+    for k in range(out.size):
+        out[k] += a[k] * x[k]
+
+
+@inner
 def neighbours(out, c, at, x, place, steps):
     """out = c x. Where its cells begin: `at` in c, `place` in x."""
     n = out.size
@@ -181,45 +188,47 @@ def smooth(c, x, b, between, out, factors, steps, sizes, sums, start, stop):
     fill(out, start, stop, sizes)
 
 
-@kernel("~read2 ~read1 ~write1 index1 index1 index1")
-def restrict(weights, r, out, steps, fine, coarse, start, stop):
-    """out = the weighted sum of the fine cells around each coarse one; weights are fields of the coarse cells."""
-    n = coarse[5]
+@kernel("~read4 ~read1 ~write1 index1 index1")
+def restrict(weights, r, out, fine, coarse, start, stop):
+    """out = the weighted sum of the fine cells around each coarse one.
+
+    Weights, by the steps along three axes (in 2-D there is none along the second), are fields of the coarse cells.
+    """
+    n, across = coarse[5], weights.shape[1] // 2
     for g in range(start, stop):
         for j in range(coarse[3]):
             at = (GHOST + g) * coarse[0] + coarse[4] + j * coarse[1] + 1
-            place = (GHOST + 2 * g) * fine[0] + fine[4] + 2 * j * fine[1] + 1
             row = out[at : at + n]
             clear(row)
-            for m in range(steps.size):
-                weight, values = weights[m, at : at + n], r[place + steps[m] :]
-                for k in range(n):
-                    row[k] += weight[k] * values[2 * k]
+            for a in range(-1, 2):
+                for b in range(-across, across + 1):
+                    place = (GHOST + 2 * g + a) * fine[0] + fine[4] + (2 * j + b) * fine[1]
+                    for c in range(3):
+                        weight, values = weights[a + 1, b + across, c, at : at + n], r[place + c :]
+                        for k in range(n):
+                            row[k] += weight[k] * values[2 * k]
     fill(out, start, stop, coarse)
 
 
-@kernel("~read2 ~read1 ~write1 index2 index1 index1 index1")
-def prolong(weights, e, x, table, ends, fine, coarse, start, stop):
-    """x += the transpose of `restrict`. Rows of the table: number of a weight, distance of the coarse cell."""
-    n, half = fine[5], coarse[5]
-    sums = np.zeros((2, half), x.dtype)  # of the even cells of a line, and of the odd ones
+@kernel("~read4 ~read1 ~write1 index1 index1")
+def prolong(weights, e, x, fine, coarse, start, stop):
+    """x += the transpose of `restrict`. Between two coarse lines, or planes, a line takes from both."""
+    n, half, across = fine[5], coarse[5], weights.shape[1] // 2
+    even, odd = np.zeros(half, x.dtype), np.zeros(half, x.dtype)  # the cells of a line
     for g in range(start, stop):
         for j in range(fine[3]):
-            at = (GHOST + g // 2) * coarse[0] + coarse[4] + j // 2 * coarse[1] + 1
-            kind = 4 * (g & 1) + 2 * (j & 1)
-            for p in range(2):
-                row = sums[p]
-                clear(row)
-                for m in range(ends[kind + p], ends[kind + p + 1]):
-                    number, place = table[m, 0], at + table[m, 1]
-                    weight, values = weights[number, place : place + half], e[place : place + half]
-                    for k in range(half):
-                        row[k] += weight[k] * values[k]
+            clear(even)
+            clear(odd)
+            for a in range(g // 2, (g + 1) // 2 + 1):
+                for b in range(j // 2, (j + 1) // 2 + 1):
+                    at = (GHOST + a) * coarse[0] + coarse[4] + b * coarse[1] + 1
+                    below, same, above = weights[g - 2 * a + 1, j - 2 * b + across]
+                    add(even, same[at : at + half], e[at : at + half])
+                    forward, backward = above[at : at + half], below[at + 1 : at + 1 + half]
+                    add_two(odd, forward, e[at : at + half], backward, e[at + 1 : at + 1 + half])
             at = (GHOST + g) * fine[0] + fine[4] + j * fine[1] + 1
-            line, even, odd = x[at : at + n], sums[0], sums[1]
-            for k in range(n // 2):
+            line = x[at : at + n + 1]  # the last may be a ghost cell
+            for k in range(half):
                 line[2 * k] += even[k]
                 line[2 * k + 1] += odd[k]
-            if n % 2:
-                line[n - 1] += even[half - 1]
     fill(x, start, stop, fine)
