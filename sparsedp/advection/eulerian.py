@@ -34,7 +34,7 @@ from sparsedp.tape import isbox
 
 __all__ = ["Eulerian"]
 
-NOTHING: Any = None
+NOTHING = np.zeros(0)
 
 
 class Eulerian(Law):
@@ -48,7 +48,7 @@ class Eulerian(Law):
 
     @cached_property
     def loops(self):
-        return Loops(self.reference, self.scratch)
+        return Loops(self.reference)
 
     def forward(self, u, v, dt, inflow):
         if able():
@@ -59,12 +59,12 @@ class Eulerian(Law):
         return found
 
     def _forward(self, u, v, dt, inflow):
-        speeds, out, wrong, spare = self.loops.speeds(v), results.empty(u.shape, float), 0.0, list[Any]()
+        w, out, wrong, spare = self.reference.on_sides(v), results.empty(u.shape, float), 0.0, list[Any]()
         x, lend = u, self.scratch.lender(spare)
         for number, keep in enumerate(self.scheme.stages, 1):
             new = lend(u.size) if number < len(self.scheme.stages) else out
-            slopes = self.loops.slopes(x, inflow, False, spare)
-            wrong += self.loops.stage(x, slopes, speeds, dt, inflow, u, keep, new)
+            slopes = self.loops.slopes(x, inflow, False, lend)
+            wrong += self.loops.stage(x, slopes, w, dt, inflow, u, keep, new)
             x = new
         self.scratch.give(*spare)
         if wrong or not isfinite(self._unseen(v, inflow)):
@@ -85,22 +85,21 @@ class Eulerian(Law):
     def pull(self, nums, g, u, v, dt, inflow):
         if not able() or any(map(isbox, (g, u, v, dt, inflow))):
             return self.reference.pull(nums, g, u, v, dt, inflow)
-        wanted, field = VELOCITY in nums or STEP in nums, FIELD in nums or INFLOW in nums
-        gspeeds = self.loops.blank() if wanted else NOTHING
-        args = np.ascontiguousarray(g), u, self.loops.speeds(v), dt, inflow, gspeeds
-        of_field, of_inflow, good = self._pull(*args, field)
+        w, field = self.reference.on_sides(v), FIELD in nums or INFLOW in nums
+        gw = results.empty(w.shape, float) if VELOCITY in nums or STEP in nums else NOTHING
+        of_field, of_inflow, good = self._pull(np.ascontiguousarray(g), u, w, dt, inflow, gw, field)
         found = {FIELD: of_field, INFLOW: of_inflow}
-        if wanted:
-            found[VELOCITY] = self.loops.of_velocity(*gspeeds)
-            good &= found[VELOCITY] is gspeeds[0] or surely_finite(found[VELOCITY])
+        if gw.size:
+            found[VELOCITY] = self.reference.of_sides(gw)
+            good &= found[VELOCITY] is gw or surely_finite(found[VELOCITY])
         if STEP in nums:  # a step is homogeneous in the velocity times dt
             found[STEP] = float(np.vdot(v, found[VELOCITY])) / dt
             good &= isfinite(found[STEP])
         backs = tuple(found[num] for num in nums)
         return Finite(backs) if good else backs
 
-    def _pull(self, g, u, speeds, dt, inflow, gspeeds, field):
-        """Cotangents of u (field: where it is wanted) and inflow, those of the velocity into gspeeds; all finite?"""
+    def _pull(self, g, u, w, dt, inflow, gw, field):
+        """Cotangents of u (field: where it is wanted) and inflow, that of w into gw; all finite?"""
         spare: list = []
         known: list = []
         lend = self.scratch.lender(spare)
@@ -108,18 +107,18 @@ class Eulerian(Law):
             x = u
             if known:
                 x = lend(u.size)
-                self.loops.stage(*known[-1][:2], speeds, dt, inflow, u, known[-1][2], x)
-            known.append((x, self.loops.slopes(x, inflow, True, spare), keep))
-        ginflow, rest, wrong, added = np.zeros(inflow.size), None, 0.0, False
+                self.loops.stage(*known[-1][:2], w, dt, inflow, u, known[-1][2], x)
+            known.append((x, self.loops.slopes(x, inflow, True, lend), keep))
+        ginflow, rest, wrong, fresh = np.zeros(inflow.size), None, 0.0, True
         while known:
             x, slopes, keep = known.pop()
             if keep:  # a share of the cotangent goes to the first field
                 rest, g = (keep * g if rest is None else rest + keep * g), (1.0 - keep) * g
-            gu = (lend(u.size) if known else results.empty(u.shape, float)) if field or known else None
-            wrong += self.loops.pull(g, x, slopes, speeds, dt, inflow, gu, ginflow, gspeeds, added)
-            g, added = gu, True
+            gu = lend(u.size) if known else results.empty(u.shape, float) if field else NOTHING
+            wrong += self.loops.pull(g, x, slopes, w, dt, inflow, gu, ginflow, gw, fresh)
+            g, fresh = gu, False
         self.scratch.give(*spare)
-        if g is not None and rest is not None:
+        if rest is not None and field:
             g += rest
         return g, ginflow, wrong == 0.0 and isfinite(ginflow.sum())
 

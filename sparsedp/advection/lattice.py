@@ -15,18 +15,34 @@ from sparsedp.advection.law import component_shapes
 from sparsedp.conditions import neumann
 from sparsedp.operators.boundary import solid_faces
 
-__all__ = ["Axis", "Lattice", "lattices", "opened", "place_words", "spread", "take"]
+__all__ = ["Axis", "Lattice", "beside", "lattices", "place_words"]
 
 
 class Axis(NamedTuple):
     """One axis of a lattice."""
 
-    points: int
-    sides: int
     periodic: bool
     widths: np.ndarray  # of the control volumes; infinite where there is none
-    gaps: np.ndarray  # between the points beside a side; at a wall the width of the control volume
+    gaps: np.ndarray  # between the points beside a side, both ends included; at a wall the width of the control volume
     closed: tuple  # for each wall, whether what comes from outside is the point's own value
+
+    @property
+    def sides(self):
+        """How many sides there are."""
+        return self.widths.size + (not self.periodic)
+
+    @property
+    def around(self):
+        """The distances to both neighbours."""
+        return self.gaps[:-1], self.gaps[1:]
+
+    @property
+    def distances(self):
+        """The distances to both neighbours, or to walls, over half a width."""
+        gaps = self.gaps.copy()
+        if not self.periodic:
+            gaps[[0, -1]] /= 2
+        return 2 * gaps[:-1] / self.widths, 2 * gaps[1:] / self.widths
 
 
 class Lattice(NamedTuple):
@@ -36,6 +52,15 @@ class Lattice(NamedTuple):
     axes: tuple
     solid: Any  # boolean array, or None
     label: str  # words for messages
+
+    @property
+    def open(self):
+        """For each axis, whether the lower and upper sides of points let something through: not those of solids."""
+        solid, found = self.solid, []
+        for number, axis in enumerate(self.axes):
+            outside = None if axis.periodic else [np.zeros_like(solid.take([0], number))] * 2
+            found.append([~(solid | other) for other in beside(solid, number, outside)])
+        return np.array(found)
 
 
 def lattices(setting):
@@ -63,34 +88,19 @@ def _axis(setting, axis, staggered):
     with np.errstate(divide="ignore"):
         widths = np.where(widths > 0, widths, np.inf)
     if periodic:
-        gaps = np.roll(cells, 1) if staggered else between
+        gaps = np.append(cells[-1:], cells) if staggered else np.append(between, between[:1])
     else:
         gaps = np.concatenate([widths[:1], inner, widths[-1:]])
     sides = setting.sides[axis] or (None, None)
-    points = widths.size
-    return Axis(points, gaps.size if points else 0, periodic, widths, gaps, tuple(side == neumann for side in sides))
+    return Axis(periodic, widths, gaps, tuple(side == neumann for side in sides))
 
 
-def spread(line, number, shape):
-    """One number for each point along an axis -> one for each point."""
-    return np.broadcast_to(line.reshape([-1 if a == number else 1 for a in range(len(shape))]), shape)
-
-
-def take(x, axis, number, shift):
-    """From sides to points: what stands at the lower (0) or upper (1) side of each point."""
-    return np.take(x, (np.arange(axis.points) + shift) % max(axis.sides, 1), number)
-
-
-def opened(lattice, number):
-    """Whether the sides across an axis let something through: False where one touches a solid."""
-    axis, many = lattice.axes[number], list(lattice.shape)
-    many[number] = axis.sides
-    if lattice.solid is None:
-        return np.ones(many, bool)
-    if axis.periodic:
-        return ~(lattice.solid | np.roll(lattice.solid, 1, number))
-    solid = np.pad(lattice.solid, [(1, 1) if a == number else (0, 0) for a in range(len(many))])
-    return ~(np.delete(solid, -1, number) | np.delete(solid, 0, number))
+def beside(x, number, outside=None):
+    """What stands below and above the points along an axis; `outside`: beyond its walls, None if it is periodic."""
+    if outside is None:
+        return np.roll(x, 1, number), np.roll(x, -1, number)
+    padded, points = np.concatenate([outside[0], x, outside[1]], number), np.arange(x.shape[number])
+    return padded.take(points, number), padded.take(points + 2, number)
 
 
 def place_words(setting, index):

@@ -19,7 +19,7 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.advection.lattice import lattices, opened, spread, take
+from sparsedp.advection.lattice import beside, lattices
 from sparsedp.advection.velocities import interpolation
 from sparsedp.derivative import pullback, pushforward
 from sparsedp.kernels.fluxes import SCHEMES
@@ -37,52 +37,50 @@ class Reference:
         self.flux = 1.0 if setting.form == "flux" else 0.0
 
     @cached_property
-    def between(self):
+    def _between(self):
         """From the velocity as given to that on sides (or points) and its transpose; None where they are the same."""
         found = interpolation(self.setting)
         return None if found is None else (found, sp.csr_array(found.T))
+
+    def on_sides(self, v):
+        """Velocity as given -> that on the sides of all components (or at their points), axis by axis."""
+        return v if self._between is None else self._between[0] @ v
+
+    def of_sides(self, gw):
+        """The cotangent of `on_sides` -> that of the velocity as given."""
+        return gw if self._between is None else self._between[1] @ gw
 
     @cached_property
     def tables(self):
         """For the points of all axes of all components, one after the other: a dict of arrays, see `_table`."""
         found, starts = [], {"point": 0, "wall": self.setting.space.size, "speed": 0, "row": 0}
         for lattice in lattices(self.setting):
-            own = starts["point"] + np.arange(prod(lattice.shape)).reshape(lattice.shape)
+            own = _numbers(starts, "point", lattice.shape)
             found += [self._table(lattice, number, own, starts) for number in range(len(lattice.axes))]
-            starts["point"] += own.size
         return {name: np.concatenate([table[name].ravel() for table in found]) for name in found[0]}
 
     def _table(self, lattice, number, own, starts):
         """Of one axis: columns of the field and inflow, of slopes and of the velocity; lengths; what is open."""
-        axis, shape = lattice.axes[number], lattice.shape
-        index = spread(np.arange(axis.points), number, shape)
-        stride, walls = prod(shape[number + 1 :]), own.size // axis.points
-        row, count = starts["row"] + np.arange(own.size).reshape(shape), own.size if self.points else walls * axis.sides
-        block, rest = np.divmod(row - starts["row"], axis.points * stride)
-        free, found = opened(lattice, number), {"own": own}
+        axis, shape, walls, none = lattice.axes[number], list(lattice.shape), None, None
+        rows, points = _numbers(starts, "row", shape), np.arange(axis.widths.size)
+        if not axis.periodic:
+            ends = own.take([0], number), own.take([-1], number)
+            walls = [_numbers(starts, "wall", end.shape) for end in ends]
+            walls = [end if closed else wall for end, closed, wall in zip(ends, axis.closed, walls, strict=True)]
+            none = [np.full_like(end, -1) for end in ends]
+        shape[number] = points.size if self.points else axis.sides
+        speeds = _numbers(starts, "speed", shape)
+        is_open = np.ones((2, *own.shape), bool) if lattice.solid is None else lattice.open[number]
+        spread = [-1 if a == number else 1 for a in range(own.ndim)]
+        found = {"own": own}
         for side, name in enumerate(("lower", "upper")):
-            end = index == side * (axis.points - 1)
-            beside = np.where(end, (1 - 2 * side) * (axis.points - 1), 2 * side - 1) * stride
-            outside = end & (not axis.periodic)
-            ghost = own if axis.closed[side] else starts["wall"] + side * walls + block * stride + rest % stride
-            is_open = found[f"open {name}"] = take(free, axis, number, side)
-            found[f"z {name}"] = np.where(is_open, np.where(outside, ghost, own + beside), own)
-            found[f"slope {name}"] = np.where(outside | ~is_open, -1, row + beside)
-            sides = (index + side) % axis.sides
-            speeds = (
-                row - starts["row"] if self.points else block * axis.sides * stride + sides * stride + rest % stride
-            )
-            found[f"w {name}"] = starts["speed"] + speeds
-            line = axis.gaps if self.points and not self.limited else axis.widths
-            lengths = take(line, axis, 0, side) if line is axis.gaps else line
-            found[f"weight {name}"] = is_open / spread(lengths, number, shape)
-            halved = axis.gaps * np.where(
-                np.isin(np.arange(axis.sides), (0, axis.points)) & (not axis.periodic), 0.5, 1
-            )
-            found[f"distance {name}"] = spread(2 * take(halved, axis, 0, side) / axis.widths, number, shape)
-        starts["row"] += own.size
-        starts["speed"] += count
-        starts["wall"] += 0 if axis.periodic else 2 * walls
+            found[f"z {name}"] = np.where(is_open[side], beside(own, number, walls)[side], own)
+            found[f"slope {name}"] = np.where(is_open[side], beside(rows, number, none)[side], -1)
+            places = points if self.points else (points + side) % axis.sides
+            found[f"w {name}"] = speeds.take(places, number)
+            length = axis.around[side] if self.points and not self.limited else axis.widths
+            found[f"weight {name}"] = is_open[side] / length.reshape(spread)
+            found[f"distance {name}"] = np.broadcast_to(axis.distances[side].reshape(spread), own.shape)
         return found
 
     @cached_property
@@ -102,7 +100,7 @@ class Reference:
             found[f"z {side}"] = pick(tables[f"z {side}"], n + self.walls.size)
             found[f"slope {side}"] = pick(tables[f"slope {side}"], rows.size)
             speeds = pick(tables[f"w {side}"], size, tables[f"weight {side}"])
-            found[f"speed {side}"] = speeds if self.between is None else sp.csr_array(speeds @ self.between[0])
+            found[f"speed {side}"] = speeds if self._between is None else sp.csr_array(speeds @ self._between[0])
         return found
 
     @cached_property
@@ -190,4 +188,11 @@ def _with(args, nums, some):
     found = list(args)
     for num, value in zip(nums, some, strict=True):
         found[num] = value
+    return found
+
+
+def _numbers(starts, name, shape):
+    """The next numbers of a kind, one for each place."""
+    found = starts[name] + np.arange(prod(shape)).reshape(shape)
+    starts[name] += found.size
     return found

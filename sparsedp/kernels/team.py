@@ -62,7 +62,7 @@ def _types(words, narrow):
             found[f"{mark}read{dimensions}"] = types.Array(kind, dimensions, "C", readonly=True)
             found[f"{mark}write{dimensions}"] = types.Array(kind, dimensions, "C")
         found[f"index{dimensions}"] = types.Array(types.int64, dimensions, "C", readonly=True)
-    found["mask1"] = types.Array(types.boolean, 1, "C", readonly=True)
+        found[f"mask{dimensions}"] = types.Array(types.boolean, dimensions, "C", readonly=True)
     return [found[word] for word in words.split()]
 
 
@@ -80,7 +80,7 @@ class Kernel:
         Its last two arguments are the rows it works on, `start` and `stop`.
     words : str
         The types of its other arguments: read1 to read4 (may be read-only), write1 to write4 (float64), index1 to
-        index4 (int64), mask1 (bool), real, int, flag. With ~ before it an array is of float32 in `single`.
+        index4 (int64), mask1 to mask4 (bool), real, int, flag. With ~ before it an array is of float32 in `single`.
     uses : dict, optional
         {name: function} that the loop, and these functions themselves, call by that name. They are compiled with it,
         and stand in the same file: that is where numba looks whether what it has kept is still good.
