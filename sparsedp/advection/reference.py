@@ -52,67 +52,57 @@ class Reference:
 
     @cached_property
     def tables(self):
-        """For the points of all axes of all components, one after the other: a dict of arrays, see `_table`."""
+        """For lower and upper sides (rows) of the points of all axes of all components: arrays, see `_table`."""
         found, starts = [], {"point": 0, "wall": self.setting.space.size, "speed": 0, "row": 0}
         for lattice in lattices(self.setting):
             own = _numbers(starts, "point", lattice.shape)
             found += [self._table(lattice, number, own, starts) for number in range(len(lattice.axes))]
-        return {name: np.concatenate([table[name].ravel() for table in found]) for name in found[0]}
+        return [np.concatenate([part.reshape(2, -1) for part in parts], 1) for parts in zip(*found, strict=True)]
 
     def _table(self, lattice, number, own, starts):
-        """Of one axis: columns of the field and inflow, of slopes and of the velocity; lengths; what is open."""
-        axis, shape, walls, none = lattice.axes[number], list(lattice.shape), None, None
-        rows, points = _numbers(starts, "row", shape), np.arange(axis.widths.size)
+        """Of one axis: columns of points, of those beside them or walls, of slopes, of speeds; 1 / length; c and e."""
+        axis, many, walls, none = lattice.axes[number], list(lattice.shape), None, None
+        line = [2, *(-1 if a == number else 1 for a in range(own.ndim))]
         if not axis.periodic:
             ends = own.take([0], number), own.take([-1], number)
-            walls = [_numbers(starts, "wall", end.shape) for end in ends]
-            walls = [end if closed else wall for end, closed, wall in zip(ends, axis.closed, walls, strict=True)]
+            given = [_numbers(starts, "wall", end.shape) for end in ends]
+            walls = [end if closed else wall for end, closed, wall in zip(ends, axis.closed, given, strict=True)]
             none = [np.full_like(end, -1) for end in ends]
-        shape[number] = points.size if self.points else axis.sides
-        speeds = _numbers(starts, "speed", shape)
+        many[number] = axis.widths.size if self.points else axis.sides
+        speeds = _numbers(starts, "speed", many)
+        at = np.arange(axis.widths.size) + [[0], [0 if self.points else 1]]
         is_open = np.ones((2, *own.shape), bool) if lattice.solid is None else lattice.open[number]
-        spread = [-1 if a == number else 1 for a in range(own.ndim)]
-        found = {"own": own}
-        for side, name in enumerate(("lower", "upper")):
-            found[f"z {name}"] = np.where(is_open[side], beside(own, number, walls)[side], own)
-            found[f"slope {name}"] = np.where(is_open[side], beside(rows, number, none)[side], -1)
-            places = points if self.points else (points + side) % axis.sides
-            found[f"w {name}"] = speeds.take(places, number)
-            length = axis.around[side] if self.points and not self.limited else axis.widths
-            found[f"weight {name}"] = is_open[side] / length.reshape(spread)
-            found[f"distance {name}"] = np.broadcast_to(axis.distances[side].reshape(spread), own.shape)
-        return found
+        z = np.where(is_open, beside(own, number, walls), own)
+        slope = np.where(is_open, beside(_numbers(starts, "row", own.shape), number, none), -1)
+        w = np.array([speeds.take(places, number, mode="wrap") for places in at])
+        lengths = axis.around if self.points and not self.limited else (axis.widths, axis.widths)
+        distance = np.broadcast_to(np.reshape(axis.distances, line), z.shape)
+        return np.array([own, own]), z, slope, w, is_open / np.reshape(lengths, line), distance
 
     @cached_property
     def matrices(self):
         """From (field, inflow) to what is below and above, from the velocity to that over length, from points ..."""
-        tables, n = self.tables, self.setting.space.size
-        rows = np.arange(tables["own"].size)
-        size = 1 + max(tables["w lower"].max(), tables["w upper"].max())
+        own, z, slope, w, weight, _ = self.tables
+        n, rows = self.setting.space.size, np.arange(own.shape[1])
 
-        def pick(columns, many, values=1.0):
-            values = np.broadcast_to(values, rows.shape)
+        def pick(columns, many, values):
             keep = (columns >= 0) & (values != 0)
             return sp.csr_array((values[keep], (rows[keep], columns[keep].astype(np.int32))), (rows.size, many))
 
-        found = {"own": pick(tables["own"], n)}
-        for side in ("lower", "upper"):
-            found[f"z {side}"] = pick(tables[f"z {side}"], n + self.walls.size)
-            found[f"slope {side}"] = pick(tables[f"slope {side}"], rows.size)
-            speeds = pick(tables[f"w {side}"], size, tables[f"weight {side}"])
-            found[f"speed {side}"] = speeds if self._between is None else sp.csr_array(speeds @ self._between[0])
-        return found
+        ones, speeds = np.ones(rows.size), [pick(w[side], 1 + w.max(), weight[side]) for side in range(2)]
+        return {
+            "own": pick(own[0], n, ones),
+            "z": [pick(side, n + self.walls.size, ones) for side in z],
+            "slope": [pick(side, rows.size, ones) for side in slope],
+            "speed": [x if self._between is None else sp.csr_array(x @ self._between[0]) for x in speeds],
+        }
 
     @cached_property
     def _maps(self):
-        """The matrices as functions of plain and traced arrays, and the transpose of the first one."""
-        found = {}
-        for name, matrix in self.matrices.items():
-            turned = sp.csr_array(matrix.T)
-            found[name], back = (_applied(m, rule) for m, rule in zip((matrix, turned), _rules(matrix, turned)))
-            if name == "own":
-                found["total"] = back
-        return found
+        """The matrices as functions of plain and traced arrays; total: sums over what stands at the sides of points."""
+        found = {name: [_applied(x) for x in pair] for name, pair in self.matrices.items() if name != "own"}
+        own = self.matrices["own"]
+        return {**found, "own": _applied(own), "total": _applied(sp.csr_array(own.T))}
 
     def _given(self, low, high):
         """p and m on the lower sides, then on the upper ones, and what leaves the points through both."""
@@ -124,30 +114,33 @@ class Reference:
     def _stage(self, u, low, high, inflow):
         maps, z = self._maps, anp.concatenate([u, inflow])
         (p_low, p_high), (m_low, m_high), leaves = self._given(low, high)
-        below, above = maps["z lower"](z), maps["z upper"](z)
+        below, above = (side(z) for side in maps["z"])
         enters = p_low * below - m_high * above
         if self.limited:
             own = maps["own"](u)
             ahead, behind = self._slopes(own - below, above - own)
-            enters = enters + p_low * maps["slope lower"](ahead) + m_high * maps["slope upper"](behind)
+            enters = enters + p_low * maps["slope"][0](ahead) + m_high * maps["slope"][1](behind)
             enters = enters - p_high * ahead - m_low * behind
         return (1.0 - maps["total"](leaves)) * u + maps["total"](enters)
 
     def _slopes(self, a, b):
         with np.errstate(all="ignore"):
-            given = plain(a), plain(b), self.tables["distance lower"], self.tables["distance upper"]
-            ahead, behind, *slopes = self.limited(*given)
+            given = plain(a), plain(b)
+            ahead, behind, *slopes = self.limited(*given, *self.tables[-1])
         if isbox(a) or isbox(b):
             da, db = a - given[0], b - given[1]
             ahead, behind = ahead + slopes[0] * da + slopes[1] * db, behind + slopes[2] * da + slopes[3] * db
         return ahead, behind
 
+    def _courant(self, v, dt):
+        """The velocity times dt over length, on lower and upper sides."""
+        return [dt * side(v) for side in self._maps["speed"]]
+
     def step(self, u, v, dt, inflow):
         """The moved field."""
-        low, high = dt * self._maps["speed lower"](v), dt * self._maps["speed upper"](v)
-        found = u
+        courant, found = self._courant(v, dt), u
         for keep in self.scheme.stages:
-            new = self._stage(found, low, high, inflow)
+            new = self._stage(found, *courant, inflow)
             found = keep * u + (1.0 - keep) * new if keep else new
         return found
 
@@ -162,24 +155,19 @@ class Reference:
 
     def rate(self, v):
         """What the weight 1 - dt * rate of each point is made of."""
-        return self._maps["total"](self._given(self._maps["speed lower"](v), self._maps["speed upper"](v))[2])
+        return self._maps["total"](self._given(*self._courant(v, 1.0))[2])
 
     def matrix(self, v, dt):
         """The step in the columns of u."""
-        low, high = dt * self._maps["speed lower"](v), dt * self._maps["speed upper"](v)
-        (p, _), (_, m), _ = self._given(low, high)
+        (p, _), (_, m), _ = self._given(*self._courant(v, dt))
         n, total = self.setting.space.size, self.matrices["own"].T
-        enters = (
-            sp.diags_array(p) @ self.matrices["z lower"][:, :n] - sp.diags_array(m) @ self.matrices["z upper"][:, :n]
-        )
+        below, above = (side[:, :n] for side in self.matrices["z"])
+        enters = sp.diags_array(p) @ below - sp.diags_array(m) @ above
         return sp.csr_array(sp.diags_array(1.0 - dt * self.rate(v)) + total @ enters)
 
 
-def _rules(matrix, turned):
-    return linear("transport", matrix.__matmul__, turned.__matmul__)
-
-
-def _applied(matrix, rule):
+def _applied(matrix):
+    rule = linear("transport", matrix.__matmul__, sp.csr_array(matrix.T).__matmul__)[0]
     return lambda x: rule(x) if isbox(x) else matrix @ x
 
 
