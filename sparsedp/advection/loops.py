@@ -52,33 +52,34 @@ class Loops:
     def components(self):
         found, starts = [], (0, 0, 0)
         for lattice in lattices(self.setting):
-            rows, numbers, cells, speed, wall = [], [], prod(lattice.shape), 0, 0
+            rows, tables, cells, speed, wall = [], [], prod(lattice.shape), 0, 0
             for number, axis in enumerate(lattice.axes):
                 stride, points, sides = prod(lattice.shape[number + 1 :]), axis.widths.size, axis.sides
                 last, walls = number == len(lattice.axes) - 1, cells // points
                 extra = 0 if self.points else stride * (sides - points)
-                end = speed + cells + extra * (walls // stride)
                 given = [not (axis.periodic or closed) for closed in axis.closed]
-                row = points, stride, last, axis.periodic, not self.points, speed, extra, wall, wall + walls, *given
-                lines = [line if np.any(line != line[0]) else line[:1] for line in self._lines(axis)]
-                begins = np.cumsum([sum(map(len, numbers)), *map(len, lines)])
-                rows.append((*row, *begins))
-                numbers += lines
-                speed, wall = end, wall + (0 if axis.periodic else 2 * walls)
+                lines = self._lines(axis)
+                rows.append([points, stride, last, axis.periodic, not self.points, False, speed, extra])
+                rows[-1] += [wall, wall + walls, *given, sum(map(len, tables)), len(lines) > 1]
+                tables.append(lines)
+                speed += cells + extra * (walls // stride)
+                wall += 0 if axis.periodic else 2 * walls
             ends = starts[0] + cells, starts[1] + wall, starts[2] + speed
             free = np.zeros(0, bool) if lattice.solid is None else lattice.open.ravel()
             tiles = cells // lattice.shape[-1] * -(-lattice.shape[-1] // fluxes.TILE)
-            table, axes = np.concatenate(numbers), np.array(rows, np.int64)
+            table, axes = np.concatenate(tables).T.copy(), np.array(rows, np.int64)
+            axes[:, fluxes.UNEVEN] = free.size or any(np.any(x[:, :4] != x[0, 0]) for x in tables)
             found.append(Component(*map(slice, starts, ends), free, table, axes, tiles))
             starts = ends
         return found
 
     def _lines(self, axis):
-        """The rows of an axis in the table."""
+        """The columns of an axis in the table: one for each place along it, or one for all."""
         between = self.points and self.limiter is None  # lengths between points, not of control volumes
         own = axis.around if between else (axis.widths, axis.widths)
         theirs = own if between else beside(axis.widths, 0)
-        return [*(1.0 / length for length in (*own, *theirs)), *axis.distances]
+        lines = np.transpose([*(1.0 / length for length in (*own, *theirs)), *(axis.distances if self.limiter else ())])
+        return lines if np.any(lines != lines[0]) else lines[:1]
 
     def slopes(self, u, inflow, steep, lend):
         """For each component the slopes and (steep) their derivatives in a and b; empty for a scheme of first order."""
@@ -92,22 +93,17 @@ class Loops:
             found.append(arrays)
         return found
 
+    def _given(self, part, u, inflow, w, slopes, dt):
+        """What the loops over fields and velocities begin with."""
+        numbers = u[part.field], inflow[part.inflow], w[part.speed], part.free, slopes
+        return *numbers, self.many, dt, part.table, part.axes, self.flux
+
     def stage(self, u, slopes, w, dt, inflow, u0, keep, out):
         """out = keep u0 + (1 - keep) (u + dt du/dt); how many points have too small a weight or an infinite value."""
         wrong = 0.0
         for part, (values, _) in zip(self.components, slopes, strict=True):
-            given = (
-                u[part.field],
-                inflow[part.inflow],
-                w[part.speed],
-                part.free,
-                values,
-                self.many,
-                dt,
-                part.table,
-                part.axes,
-            )
-            rest = self.flux, self.least, u0[part.field], keep, out[part.field]
+            given = self._given(part, u, inflow, w, values, dt)
+            rest = self.least, u0[part.field], keep, out[part.field]
             wrong += part.run(fluxes.stage, *given, *rest)
         return wrong
 
@@ -119,19 +115,9 @@ class Loops:
         """
         wrong = 0.0
         for part, (values, steep) in zip(self.components, slopes, strict=True):
-            given = (
-                u[part.field],
-                inflow[part.inflow],
-                w[part.speed],
-                part.free,
-                values,
-                self.many,
-                dt,
-                part.table,
-                part.axes,
-            )
+            given = self._given(part, u, inflow, w, values, dt)
             targets = gu[part.field], ginflow[part.inflow], gw[part.speed]
-            wrong += part.run(fluxes.pull, g[part.field], *given, self.flux, *targets, fresh, steep)
+            wrong += part.run(fluxes.pull, g[part.field], *given, *targets, fresh, steep)
             if steep.size and gu.size:
                 wrong += part.run(fluxes.jumps, steep, self.many, part.free, part.axes, *targets[:2])
         return wrong
