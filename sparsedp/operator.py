@@ -208,7 +208,7 @@ class Operator(Remade):
     __radd__ = __add__  # for its advice: no sum of an operator and something else is defined
 
     def __sub__(self, other):
-        return self + (-other) if isinstance(other, (Operator, Number)) else NotImplemented
+        return self + other * -1.0 if isinstance(other, (Operator, Number)) else NotImplemented  # type: ignore[operator]
 
     def __neg__(self):
         return self * -1.0

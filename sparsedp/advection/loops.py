@@ -52,7 +52,8 @@ class Loops:
     def components(self):
         found, starts = [], (0, 0, 0)
         for lattice in lattices(self.setting):
-            rows, tables, cells, speed, wall = [], [], prod(lattice.shape), 0, 0
+            rows, cells, speed, wall = [], prod(lattice.shape), 0, 0
+            tables: list = []
             for number, axis in enumerate(lattice.axes):
                 stride, points, sides = prod(lattice.shape[number + 1 :]), axis.widths.size, axis.sides
                 last, walls = number == len(lattice.axes) - 1, cells // points
@@ -60,7 +61,7 @@ class Loops:
                 given = [not (axis.periodic or closed) for closed in axis.closed]
                 lines = self._lines(axis)
                 rows.append([points, stride, last, axis.periodic, not self.points, False, speed, extra])
-                rows[-1] += [wall, wall + walls, *given, sum(map(len, tables)), len(lines) > 1]
+                rows[-1] += [wall, wall + walls, *given, sum(len(table) for table in tables), len(lines) > 1]
                 tables.append(lines)
                 speed += cells + extra * (walls // stride)
                 wall += 0 if axis.periodic else 2 * walls
@@ -69,7 +70,8 @@ class Loops:
             tiles = cells // lattice.shape[-1] * -(-lattice.shape[-1] // fluxes.TILE)
             table, axes = np.concatenate(tables).T.copy(), np.array(rows, np.int64)
             axes[:, fluxes.UNEVEN] = free.size or any(np.any(x[:, :4] != x[0, 0]) for x in tables)
-            found.append(Component(*map(slice, starts, ends), free, table, axes, tiles))
+            field, inflow, speeds = map(slice, starts, ends)
+            found.append(Component(field, inflow, speeds, free, table, axes, tiles))
             starts = ends
         return found
 

@@ -138,9 +138,9 @@ class Reference:
 
     def step(self, u, v, dt, inflow):
         """The moved field."""
-        courant, found = self._courant(v, dt), u
+        (low, high), found = self._courant(v, dt), u
         for keep in self.scheme.stages:
-            new = self._stage(found, *courant, inflow)
+            new = self._stage(found, low, high, inflow)
             found = keep * u + (1.0 - keep) * new if keep else new
         return found
 

@@ -101,9 +101,9 @@ SCHEMES = {"upwind": Scheme(), "van_leer": Scheme(van_leer, stages=(0.0, 0.5), m
 class Side(NamedTuple):
     """One side of the cells of a piece; all places for the first cell of the tile, unsigned."""
 
-    beyond: int  # where the cell on the other side is, in the field
-    speed: int  # where the velocity is
-    wall: int  # where the inflow is
+    beyond: Any  # where the cell on the other side is, in the field
+    speed: Any  # where the velocity is
+    wall: Any  # where the inflow is
     inner: float  # 0.0 where nothing but a wall is there: `beyond` is then the cell itself
     shown: float  # 0.0 where inflow is given at that wall
 
@@ -132,8 +132,8 @@ def side_of(axes, a, upper, piece, first, where):
         step = 0 if walls else (1 - n) * step
     speed = axes[a, SPEED] + first + block * axes[a, EXTRA] + upper * axes[a, ON_SIDES] * (stride if walls else step)
     wall, closed = axes[a, WALL + upper] + block * stride + rest - begin, last * walls
-    places = uint64(first + step), uint64(speed), uint64(wall)
-    return Side(*places, 1.0 - closed, 1.0 - closed * axes[a, GIVEN + upper])
+    beyond, speed, wall = uint64(first + step), uint64(speed), uint64(wall)
+    return Side(beyond, speed, wall, 1.0 - closed, 1.0 - closed * axes[a, GIVEN + upper])
 
 
 def sides_of(axes, a, number, first, size, where):
@@ -247,7 +247,7 @@ def stage(u, inflow, w, free, slopes, many, dt, table, axes, flux, least, u0, ke
                     low, high = ratio * speed[m + j], -ratio * speed[h + j]  # into the cells
                     leaves[j] += max(low, 0.0) + max(high, 0.0) - flux * (low + high)
                     enters[j] += max(low, 0.0) * (below.shown * u[i + j]) + max(high, 0.0) * (above.shown * u[k + j])
-                for upper in range(2 if slopes.size or below.shown * above.shown == 0.0 else 0):
+                for upper in range(2 if slopes.size or below.shown * above.shown == 0.0 else 0):  # type: ignore[assignment]
                     (i, _, wall, inner, shown), m, sign = (above, h, -1.0) if upper else (below, m, 1.0)
                     own, theirs = slope_places(a, upper, many, u.size)
                     for j in range(b, b if shown else e):

@@ -2,6 +2,7 @@
 
 from itertools import product
 from math import prod
+from typing import Any
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
@@ -166,6 +167,9 @@ class Smoothed:
     b, x : fields
         Right-hand side and solution, with ghost cells filled.
     """
+
+    transfer: Transfer
+    below: Any
 
     def __init__(self, level):
         self.layout, self.threads, self.pitches = level.layout, level.threads, level.pitches
