@@ -12,7 +12,7 @@ import sys
 from functools import partial
 from itertools import pairwise
 from math import prod
-from time import perf_counter, process_time
+from time import perf_counter
 
 import autograd.numpy as anp
 import numpy as np
@@ -22,6 +22,7 @@ from scipy.fft import dstn, idstn
 import sparsedp as dp
 from benchmarks import burgers, flow, scenes, structured
 from benchmarks.rollout import sliced_by_hand
+from benchmarks.structured import least
 from benchmarks.triad import best_times, triad
 
 ROWS = []  # (words, floor, aim, function -> (figure, error))
@@ -72,22 +73,12 @@ def separable(shape):
     return best["ours"] / best["bare"], inv.info.forward.residual
 
 
-def least(task, repeats=3):
-    """Smallest time of the processor [s], and the last result."""
-    times = []
-    for _ in range(repeats):
-        start = process_time()
-        result = task()
-        times.append(process_time() - start)
-    return min(times), result
-
-
 @row("structured 1024^2 smooth, x pyamg's solve", MORE, 8, 15, structured.smooth, (1024, 1024))
 @row("structured 96^3 smooth, x pyamg's solve", MORE, 6, 12, structured.smooth, (96, 96, 96))
 @row("structured inclusions 1e6 512^2, x pyamg's solve", MORE, 7, 15, scenes.inclusions, (512, 512))
 def solve(scene, shape):
     op = scene(shape)
-    matrix, _ = structured.unknowns(op.explicit().matrix)
+    matrix, _ = structured.unknowns(op.matrix)
     inv, b = dp.inverse(op, "structured"), np.random.default_rng(0).standard_normal(shape)
     best = {}
     for name, theirs in (("rs", pyamg.ruge_stuben_solver(matrix, **structured.SMOOTH)), ("sa", smoothed(matrix))):
@@ -108,7 +99,7 @@ def with_setup(shape):
     D, G, rng = dp.divergence(grid), dp.gradient(grid, dp.dirichlet), np.random.default_rng(0)
     ours, b = dp.elliptic_solver(D, G, "structured"), rng.standard_normal(shape)
     ks = [rng.uniform(0.5, 1.5, grid.faces.size) for _ in range(4)]
-    matrix = structured.unknowns((-D @ dp.diagonal(grid.faces, ks[0]) @ G).explicit().matrix)[0]
+    matrix = structured.unknowns((-D @ dp.diagonal(grid.faces, ks[0]) @ G).matrix)[0]
     theirs = [
         least(lambda make=make: structured.peer(make(matrix), b.ravel()), 1)[0]
         for make in (partial(pyamg.ruge_stuben_solver, **structured.SMOOTH), smoothed)

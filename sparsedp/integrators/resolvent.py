@@ -23,7 +23,7 @@ from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose import build
 from sparsedp.solvers.record import SolveLog
 from sparsedp.solvers.system import System
-from sparsedp.tape import Rule, cast, dtype_of
+from sparsedp.tape import Rule, of_argument
 
 __all__ = ["Resolvent"]
 
@@ -97,7 +97,7 @@ class Resolvent:
                 other = (self._free if transposed else self._adjoint)(z, g)
                 x, y = (other, ans) if transposed else (ans, other)
                 slopes = {0: lambda: anp.sum(y * self.op(x)), 1: lambda: other}
-                return tuple(_like(slopes[num](), (z, b)[num]) for num in nums)
+                return tuple(of_argument(slopes[num](), (z, b)[num]) for num in nums)
 
             return pull
 
@@ -125,8 +125,3 @@ class Resolvent:
         return (
             "no set-up yet" if last is None else f"{len(self._kept)} of {self._kept.most} set-ups kept, last:\n{last}"
         )
-
-
-def _like(cotangent, value):
-    """The cotangent of a real argument of a complex solve is the real part."""
-    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent
