@@ -21,9 +21,8 @@ FIXED = {float, int, bool, str, slice, type(None), type(Ellipsis), np.float64}
 
 # Functions whose pullbacks need no numbers of their constants, and those that call `constant_args`.
 sparing: set = set()
-copies: WeakValueDictionary = (
-    WeakValueDictionary()
-)  # (id of the owner, shape, strides) of an array -> the last copy of it
+# (id of the owner, shape, strides) of an array -> the last copy of it
+copies: WeakValueDictionary = WeakValueDictionary()
 
 
 def constant_args(args, nums):
