@@ -50,7 +50,7 @@ for n in (finest // 2, finest):
     }
     gradients = {label: dp.value_and_grad(partial(loss, solve)) for label, solve in solvers.items()}
     exact = gradients["chosen by itself, implicit"](source)[1]  # a direct solve
-    rounds = [[seconds(partial(f, source)) for f in gradients.values()] for _ in range(6)]
+    rounds = [[seconds(partial(f, source)) for f in gradients.values()] for _ in range(10)]
     for (label, f), times in zip(gradients.items(), zip(*rounds)):
         error = np.linalg.norm(f(source)[1] - exact) / np.linalg.norm(exact)
         print(f"{label:29}  {n:4}^2  {1e3 * min(times):9.2f}  {peak(partial(f, source)):11.2f}  {error:.0e}")

@@ -15,6 +15,7 @@ import numpy as np
 
 from sparsedp.errors import ConvergenceError
 from sparsedp.fields import is_whole
+from sparsedp.kernels.reference import SHORT
 from sparsedp.operator import Operator
 from sparsedp.solvers.contract import Engine, norm
 from sparsedp.solvers.nullspace import ROUNDING
@@ -124,7 +125,9 @@ class Krylov(Engine):
             return q
 
         def measure(r):
-            return norm(r) if transposed else norm(r / weights)
+            if transposed or np.isscalar(weights):
+                return norm(r) / (1.0 if transposed else weights)
+            return norm(r / weights)
 
         def tested(residual, x):
             return accepted(residual, lambda: weights * x if transposed else x)
@@ -138,7 +141,7 @@ class Krylov(Engine):
     def _for_symmetric(self, factor):
         space = self.system.null_space
         if self.precondition is None:
-            return np.copy
+            return lambda r: r
         if self.of_symmetric:
             return lambda r: space.project(self.precondition(r, False))
         return lambda r: space.project(self.precondition(r / factor, False))
@@ -216,8 +219,8 @@ def _preconditioner(system, given):
 
 
 def dot(x, y):
-    """Inner product without BLAS: its threads would stall compiled kernels."""
-    return float(np.einsum("i,i->", x, y))
+    """Inner product; without BLAS where that would start threads, which stall compiled kernels."""
+    return float(x.dot(y) if x.size <= SHORT else np.einsum("i,i->", x, y))
 
 
 class Best:
@@ -247,7 +250,7 @@ def conjugate_gradients(apply, b, precondition, measure, accepted, maxiter, wind
     b : array
         Overwritten: it becomes the residual.
     precondition : callable
-        z ~ S^-1 r as a fresh array, symmetric and positive.
+        z ~ S^-1 r, a fresh array or r itself, symmetric and positive.
     measure : callable
         Norm of the true residual from the residual of S.
     accepted : callable
