@@ -1,7 +1,6 @@
 """Matrix: a linear map given by its entries."""
 
 import numpy as np
-from scipy.sparse._sparsetools import csr_matvec
 
 from sparsedp.ledger import active, count
 from sparsedp.structure.base import Structure, compact
@@ -29,13 +28,8 @@ class Matrix(Structure):
         self.dtype = self.matrix.dtype
 
     def apply(self, x, out):
-        m = self.matrix
-        if x.dtype == self.dtype == out.dtype:
-            # SciPy's own product spends four times as long on checks as on a small row.
-            out.fill(0)
-            csr_matvec(*self.shape, m.indptr, m.indices, m.data, x, out)
-        else:
-            np.copyto(out, m @ x.astype(np.result_type(x.dtype, np.float64)), casting="same_kind")
+        wide = x.astype(np.result_type(x.dtype, np.float64), copy=False)  # SciPy has no product in half precision
+        np.copyto(out, self.matrix @ wide, casting="same_kind")
 
     def transpose(self):
         return Matrix(self.matrix.T.tocsr())
