@@ -268,7 +268,9 @@ class Solver(Remade):
                 r, residual = system.null_space.projected(r, transposed)
             word = self._word(run, residual, goal, length, data)
         for _ in range(ROUNDS if not word else 0):
-            step, used, trouble = self._correction(r, r is b, residual, goal, transposed)
+            # A correction need not go below what rounding leaves of the whole; an engine sees the correction alone.
+            floor = 0.0 if x is None else system.rounding(x, data, transposed)
+            step, used, trouble = self._correction(r, r is b, residual, max(goal, floor), transposed)
             run.iterations += used
             trial = step if x is None else np.add(x, step, out=step)
             trial = system.null_space.project(trial, transposed, into=trial)

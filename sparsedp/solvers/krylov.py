@@ -122,7 +122,8 @@ class Krylov(Engine):
         def apply(p):
             q = system.product(p)
             q *= factor
-            return q
+            # What rounding leaves along the null space no step can take back: residuals would end on it.
+            return system.null_space.project(q, True, into=q)
 
         def measure(r):
             if transposed or np.isscalar(weights):
