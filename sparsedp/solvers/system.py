@@ -94,12 +94,12 @@ class System:
 
     @cached_property
     def faces(self):
-        """The stencil, where the operator is made of differences over faces and no entries are needed; else None."""
+        """The stencil of all cells, where the operator is one and no entries are needed to see that; else None."""
         if self.grid is None or self.grid.dim == 1:
             return None
-        from sparsedp.solvers.multigrid.lines import faces_of
+        from sparsedp.solvers.multigrid.stencil import faces_of
 
-        return faces_of(self.op.structure, self.grid)
+        return faces_of(self.op, self.grid)
 
     @cached_property
     def complex(self):

@@ -1,7 +1,7 @@
 """Structured multigrid: on the grid itself, compiled, for symmetric 5- and 7-point operators that no transform solves.
 
 - `engine`: what the contract calls: conjugate gradients with the cycle as preconditioner.
-- `stencil`, `lines`: an operator as a stencil, from its entries or from the factors of its differences.
+- `stencil`: an operator as a stencil, read off its products.
 - `layout`: in which order a level keeps its numbers.
 - `interpolation`, `levels`: the set-up, and the cycle.
 - `loops`: the compiled functions.

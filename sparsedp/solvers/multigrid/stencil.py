@@ -1,4 +1,4 @@
-"""Stencil: a symmetric 5- or 7-point matrix on the cells of a grid; read off the entries of an operator."""
+"""Stencil: a symmetric 5- or 7-point matrix on the cells of a grid; read off the products of an operator."""
 
 from typing import Any, NamedTuple
 
@@ -6,7 +6,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-__all__ = ["CLEAN", "Stencil", "Unfit", "cleaned", "components", "forward", "stencil_of"]
+from sparsedp.structure.explicit import Matrix
+
+__all__ = ["Stencil", "Unfit", "components", "faces_of", "stencil_of"]
 
 CLEAN = 16 * np.finfo(float).eps  # what is left of a diagonal is 0 below this share of the links at it
 AGREES = 1e-12  # relative difference to the operator on a random field that is taken for rounding
@@ -79,60 +81,61 @@ def components(stencil):
     return (None, 1) if count == 1 else (labels, count)
 
 
-def cleaned(extra, total):
-    """Set to 0 what is rounding, compared with the magnitudes that it is the sum of."""
-    return np.where(np.abs(extra) <= CLEAN * total, 0.0, extra)
-
-
-def forward(faces, axis, periodic):
-    """A field on the faces across an axis -> for each cell that of the face to the next one; 0 for a wall."""
-    faces = np.roll(faces, -1, axis) if periodic else np.delete(faces, 0, axis)
-    if not periodic or faces.shape[axis] == 1:  # a cell is not linked to itself
-        np.moveaxis(faces, axis, 0)[-1:] = 0.0
-    return faces
-
-
 def stencil_of(system):
     """System -> Stencil; raises Unfit with the reason in words."""
-    grid, structure = system.grid, system.op.structure
+    grid = system.grid
     if grid is None:
         raise Unfit("it does not act on the cells of a grid")
     if grid.dim == 1:
         raise Unfit("the grid is 1-D")
     if system.faces is not None:
         return system.faces
-    if not structure.has_entries or system.complex:
+    if not system.op.structure.has_entries or system.complex:
         raise Unfit("it is not made of differences over single faces")
-    active = np.ones(grid.shape, bool) if system.active is None else system.active.reshape(grid.shape)
-    stencil = _of_entries(system, system.entries, active).checked()
-    x, volumes = active * np.random.default_rng(0).uniform(0.5, 1.5, grid.shape), grid.volumes
-    wanted = volumes * system.product(x.reshape(-1)).reshape(grid.shape)
-    size = 1.5 * volumes * system.sums[False].reshape(grid.shape)
-    if np.any(np.abs(stencil.apply(x) / stencil.scale - wanted)[active] > AGREES * size[active]):
-        raise Unfit("it is not a symmetric 5- or 7-point stencil")
-    return stencil
+    active = True if system.active is None else system.active.reshape(grid.shape)
+    return _probed(system.product, grid, active)
 
 
-def _of_entries(system, matrix, active):
-    """The stencil of volumes times a matrix, of any sign, from the diagonals on which neighbours are."""
-    grid, volumes, size = system.grid, system.grid.volumes, system.size
-    links, used, pitch = [], np.count_nonzero(matrix.diagonal()), size
+def faces_of(op, grid):
+    """The Stencil of an operator that takes less to apply than to assemble; else, or if it is none, None."""
+    structure = op.structure
+    if structure.separable or isinstance(structure, Matrix) or not structure.has_entries or op.dtype.kind == "c":
+        return None
+    try:
+        return _probed(op._flat.apply, grid, True)
+    except Unfit:
+        return None
+
+
+def _probed(product, grid, active):
+    """Product with a matrix, cells that are unknowns -> Stencil, read off the images of a few fields of 0 and 1.
+
+    Along an axis, the image of every fourth plane shows on its two sides the links to it, and nothing else. Plane 0
+    has a field of its own, for it may be next to the last one. What has been read must then explain the image of a
+    random field: the matrix is symmetric and has no other entries.
+    """
+
+    def image(x):
+        return active * (grid.volumes * product(x.reshape(-1)).reshape(grid.shape))
+
+    links, magnitude = [], np.zeros(grid.shape)  # of a row without its extra
     for axis, (n, flag) in enumerate(zip(grid.shape, grid.periodic)):
-        pitch //= n
-        ends = np.arange(n).reshape([-1 if a == axis else 1 for a in range(grid.dim)]) == n - 1
-        total = np.zeros(grid.shape)
-        # the distance of the next cell, and of the first one from the last; of two cells it is the same one
-        for far, place in ((pitch, ~ends), *([((1 - n) * pitch, ends)] if flag and n > 2 else [])):
-            for sign in (1, -1):
-                entries = np.zeros(size)
-                start = max(0, -far)
-                diagonal = matrix.diagonal(sign * far)
-                entries[start : start + diagonal.size] = diagonal
-                here = np.where(place, entries.reshape(grid.shape), 0.0)
-                used += np.count_nonzero(here)
-                total += here if sign > 0 else 0.0
-        links.append(np.where(active & np.roll(active, -1, axis), -volumes * total, 0.0))
-    if used != np.count_nonzero(matrix.data):
-        raise Unfit("a row reaches beyond the neighbours")
-    rows = volumes * system.product(np.ones(size)).reshape(grid.shape)
-    return Stencil(grid, links, cleaned(rows, volumes * system.sums[False].reshape(grid.shape)))
+        link = np.zeros(grid.shape)
+        to_next = np.moveaxis(link, axis, 0)
+        for planes in np.arange(n)[:1], np.arange(2, n, 4), np.arange(4, n, 4):
+            x = np.zeros(grid.shape)
+            np.moveaxis(x, axis, 0)[planes] = 1.0
+            y, inner = np.moveaxis(image(x), axis, 0), planes[planes < n - 1]
+            if np.any(y[planes[planes >= 4] - 2]):
+                raise Unfit("a row reaches beyond the neighbours")
+            to_next[planes - 1], to_next[inner] = -y[planes - 1], -y[inner + 1]
+        if not flag or n <= 2:  # a wall; or the one neighbour is linked already, or is the cell itself
+            to_next[-1:] = 0.0
+        magnitude += 2.0 * (np.abs(link) + np.roll(np.abs(link), 1, axis))
+        links.append(link)
+    rows = image(np.ones(grid.shape))
+    stencil = Stencil(grid, links, np.where(np.abs(rows) <= CLEAN * magnitude, 0.0, rows))
+    x = np.random.default_rng(0).uniform(0.5, 1.5, grid.shape)
+    if not np.all(np.abs(stencil.apply(x) - image(x)) <= AGREES * (magnitude + np.abs(rows))):
+        raise Unfit("it is not a symmetric 5- or 7-point stencil")
+    return stencil.checked()
