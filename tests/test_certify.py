@@ -9,9 +9,8 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.ledger import recording, thread
-from sparsedp.solvers.contract import Engine, Solver
-from sparsedp.solvers.record import SolveLog
 from sparsedp.solvers.solution import Inverse
+from sparsedp.solvers.solve import Engine, SolveLog, Solver
 from sparsedp.solvers.system import System
 
 GRID = dp.Grid((20, 20), size=1.0)

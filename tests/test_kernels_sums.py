@@ -6,7 +6,7 @@ import pytest
 from sparsedp import kernels
 from sparsedp.kernels import team
 from sparsedp.kernels.layout import Tridiagonal
-from sparsedp.solvers.axes import Sweep
+from sparsedp.solvers.separable import Sweep
 
 NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
 SIZES = (0, 1, 4097, 40_000)

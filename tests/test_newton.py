@@ -11,8 +11,8 @@ import sparsedp as dp
 from sparsedp.derivative import pullback, pushforward, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.ledger import recording
-from sparsedp.solvers.record import STATUS_WORDS
 from sparsedp.solvers.roots import implicit
+from sparsedp.solvers.solve import STATUS_WORDS
 
 
 def square(x, p):

@@ -204,8 +204,8 @@ BUGS = {
     ),
     "a function of an operator that is not transposed": Bug(
         "solvers",
-        "x.astype(float), self.transposed)",
-        "x.astype(float), False)",
+        "part.astype(float), self.transposed)",
+        "part.astype(float), False)",
         "tests/test_spectral.py",
     ),
     "the wrong sign in the derivative of a shift": Bug(

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.solvers.contract import Engine, Solver
-from sparsedp.solvers.record import SolveLog
 from sparsedp.solvers.solution import Inverse
+from sparsedp.solvers.solve import Engine, SolveLog, Solver
 from sparsedp.solvers.system import System
 
 ITERATIVE = ("multigrid", "krylov")

@@ -9,8 +9,7 @@ import scipy.linalg
 
 import sparsedp as dp
 from sparsedp.derivative import value_and_grad
-from sparsedp.solvers.axes import diagonalise
-from sparsedp.solvers.separable import spectrum
+from sparsedp.solvers.separable import diagonalise, spectrum
 
 SIDES = [
     dp.neumann,

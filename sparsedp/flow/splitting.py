@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from sparsedp.fields import check_finite, place
-from sparsedp.solvers.record import Run
 from sparsedp.solvers.scaling import in_range, largest, norm, shifted
+from sparsedp.solvers.solve import Run
 from sparsedp.structure.base import Structure
 
 __all__ = ["Potential", "Projected"]

@@ -21,7 +21,7 @@ from sparsedp.ledger import tell
 from sparsedp.operators.boundary import identity
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose import build
-from sparsedp.solvers.record import SolveLog
+from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
 from sparsedp.tape import Rule, of_argument
 

@@ -9,20 +9,19 @@ from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, spent
 from sparsedp.operators.given import check_operator
 from sparsedp.solvers.amg import multigrid_engine
-from sparsedp.solvers.contract import EmptySystem, Solver
 from sparsedp.solvers.direct import DenseLU, DenseSystem, Direct
 from sparsedp.solvers.krylov import krylov_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
-from sparsedp.solvers.record import SolveLog, failure
 from sparsedp.solvers.separable import separable_engine, spectrum
 from sparsedp.solvers.solution import Inverse
+from sparsedp.solvers.solve import EmptySystem, SolveLog, Solver, failure
 from sparsedp.solvers.system import System
 from sparsedp.space import fits
 from sparsedp.tree import copied
 
 __all__ = ["METHODS", "build", "build_dense", "check_settings", "inverse"]
 
-# word -> function (system, **options) -> engine; see contract.py. Options are keyword-only.
+# word -> function (system, **options) -> engine; see solve.py. Options are keyword-only.
 METHODS = {
     "separable": separable_engine,
     "direct": Direct,

@@ -16,10 +16,9 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from sparsedp.errors import ConvergenceError
-from sparsedp.solvers.contract import Engine
 from sparsedp.solvers.nullspace import NullSpace
-from sparsedp.solvers.record import failure
 from sparsedp.solvers.scaling import in_range, length
+from sparsedp.solvers.solve import Engine, failure
 from sparsedp.solvers.system import System
 from sparsedp.structure.base import probes, rows_of
 

@@ -17,9 +17,8 @@ from sparsedp.errors import ConvergenceError
 from sparsedp.fields import is_whole
 from sparsedp.kernels.reference import SHORT
 from sparsedp.operator import Operator
-from sparsedp.solvers.contract import Engine, norm
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.record import failure
+from sparsedp.solvers.solve import Engine, failure, norm
 from sparsedp.structure.base import probes
 from sparsedp.tape import plain
 

@@ -1,7 +1,7 @@
 """Newton's method with a line search on flat unknowns, judged in a way that no scaling of the residual changes.
 
 With F and J at the last iterate, b = J x - F is the right-hand side of the linearised system J y = b. As
-for linear systems (see contract.py), x is accepted when
+for linear systems (see solve.py), x is accepted when
 
     |F| <= rtol |b|,    or    |F| <= 8 eps (|J| |x| + |b|)    (converged_at_roundoff).
 

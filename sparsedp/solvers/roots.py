@@ -29,7 +29,7 @@ from sparsedp.solvers.choose import check_settings
 from sparsedp.solvers.equation import Equation, Layout, vary
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Newton
-from sparsedp.solvers.record import Run, SolveLog
+from sparsedp.solvers.solve import Run, SolveLog
 from sparsedp.tape import Rule, plain
 from sparsedp.tree import copied
 

@@ -3,22 +3,28 @@
     A = sum over axes of (1 x F_a x 1) + shift,    F_a = S_a^-1 Q_a diag(e_a) Q_a^-1 S_a
     f(A) = (product of S_a^-1 Q_a) diag f(sum e_a + shift) (product of Q_a^-1 S_a)
 
-so one diagonalisation gives the inverse (1 / e, 0 for the null space), powers and exponentials. The inverse
+so one diagonalisation gives the inverse (1 / e, 0 for the null space), powers and exponentials. S_a is diagonal (on a
+stretched grid the square root of the cell widths) and Q_a orthogonal: a sine or cosine transform where the axis is
+uniform, else eigenvectors; or the discrete Fourier transform. The inverse
 needs no transform along the first axis where elimination along it is as accurate and takes less time:
 T + e for each sum e of the eigenvalues of the other axes, T the factor of the first (see `Sweep`).
+Sources: Lynch, Rice, Thomas, Numer. Math. 6 (1964), direct solution by tensor products;
+Strang, SIAM Review 41 (1999), the discrete cosine transform; Hockney, J. ACM 12 (1965), transforms along one
+axis and elimination along the other; Grassmann, Taksar, Heyman, Operations Research 33 (1985), pivots without
+subtractions; Bracewell, J. Opt. Soc. Am. 73 (1983), the real form of the Fourier transform.
 """
 
 from math import prod
 
 import numpy as np
 import scipy.fft as fft
+import scipy.linalg
 
 from sparsedp import kernels
 from sparsedp.errors import NonFiniteError
 from sparsedp.fields import is_number
 from sparsedp.operator import Operator
-from sparsedp.solvers.axes import Axis, diagonalise, sweep
-from sparsedp.solvers.contract import Engine
+from sparsedp.solvers.solve import Engine
 from sparsedp.structure.base import Structure
 
 __all__ = ["Separable", "SpectralFunction", "Spectrum", "exponential", "power", "separable_engine", "spectrum"]
@@ -26,7 +32,153 @@ __all__ = ["Separable", "SpectralFunction", "Spectrum", "exponential", "power", 
 WORTH_THREADS = 131072  # unknowns below which a second thread costs more than it brings
 WIDE_COMPILED, WIDE_PLAIN = 16, 1024  # modes from which elimination along the first axis beats transforms
 SHORT, WORK = 64, 2**18  # points of an axis, and its points times all unknowns, up to which a transform is a matrix
-ZERO = 4 * np.finfo(float).eps  # a sum of eigenvalues below this share of the largest one is 0
+EPS = np.finfo(float).eps
+ZERO = 4 * EPS  # a sum of eigenvalues below this share of the largest one is 0
+ROUNDING = 16 * EPS  # entries that should be equal may differ by this share
+TINY = 1e-40  # share of a link below which what is left of it in a filled row is dropped: it costs time only
+WIDEST = 1e4  # largest ratio of scalings that keeps the digits of the eigenvectors
+
+TRANSFORMS = {"dct": (fft.dct, fft.idct), "dst": (fft.dst, fft.idst)}  # to the coefficients, and back
+# What the walls do to a wave at its lower and upper end -> its transform, and the shift of the frequencies.
+WAVES = {
+    ("neumann", "neumann"): ("dct-2", 0.0),
+    ("dirichlet", "dirichlet"): ("dst-2", 1.0),
+    ("neumann", "dirichlet"): ("dct-4", 0.5),
+    ("dirichlet", "neumann"): ("dst-4", 0.5),
+}
+
+
+# ---------------------------------------------------------------- one axis
+
+
+class Axis:
+    """One axis of a separable operator in its eigenvectors.
+
+    Parameters
+    ----------
+    kind : str
+        "identity", "dct-2", "dst-2", "dct-4", "dst-4", "fourier" or "eigenvectors".
+    eigenvalues : array, shape (n,)
+    matrices : (Q^-1 S, S^-1 Q), optional
+        Where they are written out.
+    """
+
+    def __init__(self, kind, eigenvalues, matrices=None):
+        self.kind, self.eigenvalues, self.matrices = kind, eigenvalues, matrices
+
+    def dense(self):
+        """The same axis, its transform written as a matrix: on a short axis one product is less than one call."""
+        n = self.eigenvalues.size
+        if self.kind in ("identity", "eigenvectors"):
+            return self
+        if self.kind == "fourier":  # the real form of it: both modes of a pair have the same eigenvalue
+            angle = 2 * np.pi / n * (np.outer(np.arange(n), np.arange(n)) % n)
+            vectors = (np.cos(angle) + np.sin(angle)) / np.sqrt(n)
+        else:
+            vectors = self.turned(1, np.eye(n), 0, False, None, False)
+        return Axis(self.kind, self.eigenvalues, (vectors.T, vectors))
+
+    def turned(self, back, x, axis, transposed, workers, overwrite):
+        """Field along `axis` -> coefficients, or `back`; a Fourier axis is left as it is.
+
+        `overwrite`: whether the memory of x may be used.
+        """
+        if self.matrices is not None:
+            matrix, n = self.matrices[1 - back].T if transposed else self.matrices[back], x.shape[axis]
+            if axis == x.ndim - 1:
+                return (x.reshape(-1, n) @ matrix.T).reshape(x.shape)
+            flat = x.reshape(n, -1) if axis == 0 else x.reshape(-1, n, prod(x.shape[axis + 1 :]))
+            return np.matmul(matrix, flat).reshape(x.shape)
+        if self.kind in ("identity", "fourier"):
+            return x
+        transform, number = TRANSFORMS[self.kind[:3]][back], int(self.kind[-1])
+        return transform(x, number, axis=axis, norm="ortho", overwrite_x=overwrite, workers=workers)
+
+
+def diagonalise(factor):
+    """Square 1-D factor -> Axis, or None when it cannot be diagonalised with all its digits.
+
+    Parameters
+    ----------
+    factor : Factor
+
+    Returns
+    -------
+    Axis or None
+    """
+    if factor.shape[0] == 1:
+        return Axis("identity", np.array([factor.matrix[0, 0]]))
+    return (factor.tridiagonal and _by_transform(factor.tridiagonal)) or _by_eigenvectors(factor)
+
+
+def _by_transform(bands):
+    """A sine, cosine or Fourier transform, if the entries are those of a uniform axis."""
+    n = bands.centre.size
+    if n < 3:
+        return None
+    lower, upper, side, middle = bands.lower, bands.upper, bands.lower[1], bands.centre[n // 2]
+    inner = np.concatenate([lower[1:] - side, upper[:-1] - side, bands.centre[1:-1] - middle])
+    if side == 0 or np.any(np.abs(inner) > ROUNDING * np.abs(side)):
+        return None
+    angle = np.arange(n)
+    ends = tuple(_end(bands.centre[i] - middle, side, link) for i, link in ((0, lower[0]), (-1, upper[-1])))
+    if ends == ("linked", "linked"):
+        return Axis("fourier", _cosines(middle, side, 2 * angle / n))
+    if ends not in WAVES:
+        return None
+    kind, shift = WAVES[ends]
+    return Axis(kind, _cosines(middle, side, (angle + shift) / n))
+
+
+def _cosines(middle, side, turns):
+    """middle + 2 side cos(pi turns), written so that no digits cancel where middle = -2 side."""
+    return (middle + 2 * side) - 4 * side * np.sin(0.5 * np.pi * turns) ** 2
+
+
+def _end(extra, side, link):
+    """What the wall adds to the diagonal: side mirrors the neighbour, -side mirrors it with its sign changed."""
+    if link != 0:
+        return "linked" if abs(link - side) + abs(extra) <= ROUNDING * abs(side) else None
+    for kind, wanted in (("neumann", side), ("dirichlet", -side)):
+        if abs(extra - wanted) <= ROUNDING * abs(side):
+            return kind
+    return None
+
+
+def _by_eigenvectors(factor):
+    """The eigenvectors of a factor that is symmetric, after scaling its rows where it has three points a row."""
+    dense = factor.matrix.toarray()
+    scaling = np.ones(len(dense)) if factor.tridiagonal is None else _scaling(factor.matrix)
+    if scaling is None:
+        return None
+    dense = dense * scaling[:, None] / scaling
+    if not np.allclose(dense, dense.T, rtol=1e-13, atol=1e-14 * np.max(np.abs(dense))):
+        return None  # or the link around a periodic axis does not fit the weights
+    dense = 0.5 * (dense + dense.T)
+    if len(dense) <= 2 or np.any(np.triu(dense, 2)):
+        values, vectors = scipy.linalg.eigh(dense, driver="evd")
+    else:
+        values, vectors = scipy.linalg.eigh_tridiagonal(np.diag(dense), np.diag(dense, 1))
+    rows, sizes = factor.matrix.sum(axis=1), abs(factor.matrix).sum(axis=1)
+    if np.all(np.abs(rows) <= 8 * EPS * sizes):  # constants have the eigenvalue 0, where round-off gives 1e-10
+        values[np.argmin(np.abs(values))] = 0.0
+    return Axis("eigenvectors", values, (vectors.T * scaling, (1 / scaling)[:, None] * vectors))
+
+
+def _scaling(matrix):
+    """Square roots of the weights w with w[i] F[i, i+1] = w[i+1] F[i+1, i], or None."""
+    up, down = matrix.diagonal(1), matrix.diagonal(-1)
+    linked = up != 0
+    if np.any(linked != (down != 0)) or np.any(up * down < 0):
+        return None
+    ratio = np.where(linked, up / np.where(linked, down, 1.0), 1.0)
+    weights = np.cumprod(np.concatenate([[1.0], ratio]))
+    if not np.all(np.isfinite(weights)) or weights.max() > WIDEST**2 * weights.min():
+        return None
+    return np.sqrt(weights / weights.max())
+
+
+# ---------------------------------------------------------------- all axes
 
 
 class Spectrum:
@@ -44,7 +196,7 @@ class Spectrum:
         short = [n <= SHORT and n * prod(shape) <= WORK for n in shape]
         axes = tuple(axis.dense() if few else axis for axis, few in zip(axes, short, strict=True))
         self.shape, self.axes, self.shift = shape, axes, shift
-        self.fourier = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier" and axis.vectors is None)
+        self.fourier = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier" and axis.matrices is None)
         total = np.full((1,) * len(shape), float(shift))
         for a, axis in enumerate(axes):
             if a == 0 and len(axes) > 1 and not np.any(axis.eigenvalues):
@@ -52,14 +204,11 @@ class Spectrum:
             values = axis.eigenvalues[: shape[a] // 2 + 1] if self.fourier[-1:] == (a,) else axis.eigenvalues
             total = total + values.reshape([-1 if b == a else 1 for b in range(len(shape))])
         largest = sum(np.max(np.abs(axis.eigenvalues)) for axis in axes) + abs(shift)
-        total[np.abs(total) <= ZERO * largest * self._uncertain] = 0.0
+        # Eigenvalues that were computed, not written down, are only known to some rounding.
+        uncertain = 1.0 if any(axis.kind == "eigenvectors" for axis in axes) else 0.25
+        total[np.abs(total) <= ZERO * largest * uncertain] = 0.0
         self.eigenvalues = total
         self.workers = kernels.threads() if prod(shape) >= WORTH_THREADS else 1
-
-    @property
-    def _uncertain(self):
-        """Eigenvalues that were computed, not written down, are only known to some rounding."""
-        return 1.0 if any(axis.kind == "eigenvectors" for axis in self.axes) else 0.25
 
     def apply(self, weights, x, transposed=False):
         """f(A) x for the given values of f on the eigenvalues, as a fresh array."""
@@ -69,13 +218,12 @@ class Spectrum:
 
     def forward(self, x, transposed):
         """Flat field -> its coefficients, as a fresh array."""
-        x, fresh = x.reshape(self.shape), False
+        x = y = x.reshape(self.shape)
         for a, axis in enumerate(self.axes):
-            if a not in self.fourier and axis.kind != "identity":  # Fourier axes are transformed together
-                x, fresh = axis.forward(x, a, transposed, self.workers, fresh), True
-        if self.fourier:
-            return fft.rfftn(x, axes=self.fourier, workers=self.workers)
-        return x if fresh else x.copy()
+            y = axis.turned(0, y, a, transposed, self.workers, y is not x)
+        if self.fourier:  # these axes are transformed together
+            return fft.rfftn(y, axes=self.fourier, workers=self.workers)
+        return y.copy() if y is x else y
 
     def backward(self, y, transposed):
         """Coefficients -> flat field. May overwrite y."""
@@ -83,7 +231,7 @@ class Spectrum:
             lengths = [self.shape[a] for a in self.fourier]
             y = fft.irfftn(y, s=lengths, axes=self.fourier, overwrite_x=True, workers=self.workers)
         for a in reversed(range(len(self.axes))):
-            y = self.axes[a].backward(y, a, transposed, self.workers)
+            y = self.axes[a].turned(1, y, a, transposed, self.workers, True)
         return y.reshape(-1)
 
     def inverse_weights(self):
@@ -114,6 +262,108 @@ def spectrum(structure):
     for a, line in structure.lines.items():
         axes[a] = diagonalise(line)
     return None if None in axes else Spectrum(shape, tuple(axes), structure.shift)
+
+
+# ---------------------------------------------------------------- elimination along the first axis
+
+
+class Sweep:
+    """(T + mode) x = b for all modes at once, T a three-point factor along the first axis: elimination.
+
+    Rows are eliminated from the first to the last. On a periodic axis the last unknown is linked to the
+    first, so that the last column and the last row fill up. With off-diagonal entries of one sign and
+    rows that sum to the other, no pivot takes a subtraction: every digit of a small sum is kept. The
+    transpose has the same pivots.
+
+    Parameters
+    ----------
+    bands : Tridiagonal
+    excess : array, shape (n,)
+        What the rows sum to, times `sign`; >= 0.
+    modes : array, shape (m,)
+        Numbers on the diagonal, times `sign`; >= 0.
+    sign : 1.0 or -1.0
+        Sign of the diagonal.
+    """
+
+    def __init__(self, bands, excess, modes, sign):
+        n = bands.centre.size
+        self.lower, self.upper = bands.lower, bands.upper
+        lower, upper = np.abs(bands.lower), np.abs(bands.upper)
+        self.inverses = np.empty((n, modes.size))  # of the pivots; 0 where the system is singular
+        self.column = self.row = np.empty((0, modes.size))
+        if lower[0] == 0 and upper[-1] == 0:
+            rest = 0.0
+            for i in range(n):
+                rest = excess[i] + modes + (lower[i] * rest * self.inverses[i - 1] if i else 0.0)
+                _invert(upper[i] + rest, self.inverses[i])
+        else:
+            self.column, self.row = np.empty((2, n, modes.size))
+            self._fill(lower, upper, excess, modes)
+            if np.array_equal(self.column, self.row):
+                self.row = self.column
+        rows = np.arange(1, len(self.row) - 1)[:, None]  # of the last but one, the link is never dropped
+        self.ends = np.max(rows * ((self.column != 0) | (self.row != 0))[:-2], axis=0, initial=0)
+        self.inverses *= sign
+        for filled in {id(fill): fill for fill in (self.column, self.row)}.values():
+            filled *= -sign
+
+    def _fill(self, lower, upper, excess, modes):
+        """Pivots of a periodic axis, and the magnitudes of the filled last column and row."""
+        n = len(excess)
+        column, row = np.full((2, modes.size), [[lower[0]], [upper[-1]]])
+        rest, last = excess[0] + modes, excess[-1] + modes
+        for i in range(n - 1):
+            onwards = upper[i]
+            if i == n - 2:
+                column, row, onwards = column + upper[i], row + lower[-1], 0.0
+            inverse = _invert(onwards + column + rest, self.inverses[i])
+            self.column[i], self.row[i] = column, row
+            last = last + row * inverse * rest
+            row = _dropped(row * inverse * onwards, upper[-1])
+            column = _dropped(lower[i + 1] * inverse * column, lower[0])
+            rest = excess[i + 1] + modes + lower[i + 1] * inverse * rest
+        self.column[-1] = self.row[-1] = 0.0
+        _invert(last, self.inverses[-1])
+
+    def solve(self, x, transposed):
+        """x, shape (n, m), is overwritten with the solution."""
+        if transposed:
+            lower, upper = np.roll(self.upper, 1), np.roll(self.lower, -1)
+            kernels.sweep(x, lower, upper, self.inverses, self.row, self.column, self.ends)
+        else:
+            kernels.sweep(x, self.lower, self.upper, self.inverses, self.column, self.row, self.ends)
+
+
+def _invert(pivots, out):
+    out[...] = 0.0
+    return np.divide(1.0, pivots, out=out, where=pivots != 0)
+
+
+def _dropped(fill, link):
+    fill[fill < TINY * link] = 0.0
+    return fill
+
+
+def sweep(factor, modes):
+    """Square 1-D factor, numbers that are added to its diagonal -> Sweep, or None when it might lose digits.
+
+    Needed are three points a row, off-diagonal entries of one sign, and rows that sum to the other one.
+    """
+    bands = factor.tridiagonal
+    if bands is None or bands.centre.size < 3 or not np.any(bands.centre):
+        return None
+    sign = float(np.sign(bands.centre[np.argmax(np.abs(bands.centre))]))
+    links = np.abs(bands.lower) + np.abs(bands.upper)
+    excess = sign * bands.centre - links
+    excess[np.abs(excess) <= ROUNDING * links] = 0.0
+    against = np.concatenate([sign * bands.lower, sign * bands.upper])
+    if np.any(against > 0) or np.any(excess < 0) or np.any(sign * modes < 0):
+        return None
+    return Sweep(bands, excess, sign * modes, sign)
+
+
+# ---------------------------------------------------------------- the engine
 
 
 class Separable(Engine):
@@ -186,14 +436,9 @@ class SpectralFunction(Structure):
         self.shape = (size, size)
 
     def apply(self, x, out):
-        if x.dtype.kind == "c":
-            real, imaginary = (self._real(np.ascontiguousarray(part)) for part in (x.real, x.imag))
-            np.copyto(out, real + 1j * imaginary, casting="same_kind")
-        else:
-            np.copyto(out, self._real(x), casting="same_kind")
-
-    def _real(self, x):
-        return self.found.apply(self.weights, x.astype(float), self.transposed)
+        parts = (x.real, x.imag) if x.dtype.kind == "c" else (x,)
+        y, *imaginary = (self.found.apply(self.weights, part.astype(float), self.transposed) for part in parts)
+        np.copyto(out, y + 1j * imaginary[0] if imaginary else y, casting="same_kind")
 
     def transpose(self):
         return SpectralFunction(self.found, self.weights, not self.transposed)
@@ -234,11 +479,7 @@ def exponential(op, time=1.0):
     >>> print(np.round(spread(np.array([1.0, 3.0])), 6))
     [2. 2.]
     """
-    found = _spectrum(op, "exponential")
-    if not is_number(time):
-        raise TypeError(f"exponential needs one real number as time, got {time!r}; write for example 0.1")
-    if not np.isfinite(time):
-        raise NonFiniteError(f"exponential needs a finite time, got {time}")
+    found = _spectrum(op, "exponential", "time", time, 0.1)
     with np.errstate(over="ignore"):
         weights = np.exp(time * found.eigenvalues)
     if not np.all(np.isfinite(weights)):
@@ -277,11 +518,7 @@ def power(op, exponent):
     >>> print(np.round(root(root(np.array([1.0, 2.0, 4.0]))), 6))
     [-1. -1.  2.]
     """
-    found = _spectrum(op, "power")
-    if not is_number(exponent):
-        raise TypeError(f"power needs one real number as exponent, got {exponent!r}; write for example 0.5")
-    if not np.isfinite(exponent):
-        raise NonFiniteError(f"power needs a finite exponent, got {exponent}")
+    found = _spectrum(op, "power", "exponent", exponent, 0.5)
     values = found.eigenvalues
     if exponent != int(exponent) and np.any(values < 0):
         raise ValueError(f"{op.name} has eigenvalues down to {values.min():.1e}; a fractional power needs them >= 0")
@@ -293,8 +530,13 @@ def power(op, exponent):
     return Operator(SpectralFunction(found, weights), op.domain, op.codomain, f"({op.name})^{exponent:g}")
 
 
-def _spectrum(op, name):
+def _spectrum(op, name, what, number, example):
+    """The Spectrum of an operator, of which the function `name` with this number is wanted."""
     found = spectrum(op.structure) if op.separable else None
     if found is None:
         raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}")
+    if not is_number(number):
+        raise TypeError(f"{name} needs one real number as {what}, got {number!r}; write for example {example}")
+    if not np.isfinite(number):
+        raise NonFiniteError(f"{name} needs a finite {what}, got {number}")
     return found

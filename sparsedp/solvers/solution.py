@@ -9,7 +9,7 @@ import numpy as np
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import field_array
 from sparsedp.operator import Operator
-from sparsedp.solvers.contract import Solver
+from sparsedp.solvers.solve import Solver
 from sparsedp.structure.base import Structure, result_dtype
 from sparsedp.tape import Rule, isbox
 

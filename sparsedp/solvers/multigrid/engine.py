@@ -11,9 +11,9 @@ import threading
 import numpy as np
 
 from sparsedp import kernels
-from sparsedp.solvers.contract import Engine, norm
 from sparsedp.solvers.multigrid.stencil import Unfit, components, stencil_of
 from sparsedp.solvers.nullspace import NullSpace
+from sparsedp.solvers.solve import Engine, norm
 
 __all__ = ["Structured", "structured_engine", "structured_if_suited"]
 
