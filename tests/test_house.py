@@ -82,7 +82,7 @@ LONGER = {"solver_in_the_loop.py": 125}  # two solvers, a network and a study
 BUDGETS = {
     "": 214_400,
     "advection": 16_200,
-    "check": 19_800,
+    "check": 19_400,
     "flow": 9_000,
     "integrators": 14_400,
     "kernels": 16_900,

@@ -4,14 +4,12 @@ import math
 import warnings
 from contextlib import suppress
 
-import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.check.culprit import culprit_of
 from sparsedp.check.judge import (
     FIELDS,
     PROVED,
-    Judgement,
     at_kinks,
     curvature,
     examined,
@@ -22,13 +20,14 @@ from sparsedp.check.judge import (
 from sparsedp.check.progress import shown
 from sparsedp.check.summary import Result, table
 from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, default_steps, generator
-from sparsedp.derivative import pullback, value_and_grad
+from sparsedp.derivative import value_and_grad
+from sparsedp.direction import hvp
 from sparsedp.fields import check_function, is_whole
-from sparsedp.tree import flatten
 
 __all__ = ["Audit", "gradient"]
 
 FEWEST_STEPS = 8
+RANDOM = 3  # random directions
 SHIFT = 7, 2.0**-6  # seed and length of the step to the point where a kinked loss is looked at again
 LOOSE = 1e-8  # a tolerance of solves above this may explain any gap that no call is to blame for
 QUICK = ("random 1", "gradient")  # the directions of a quick audit
@@ -39,7 +38,7 @@ APART = 1e-10  # of the derivative: what rounding leaves of a complex step
 TINY_STEP = 2.0**-100  # of a complex step, in units of x: its square is lost beside x
 
 
-def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None, quick=False):
+def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, quick=False):
     """Audit the gradient of a loss at x: does it agree with what the loss does?
 
     Parameters
@@ -110,8 +109,7 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None, quick=F
 
     Examples
     --------
-    >>> import autograd.numpy as anp
-    >>> x = np.array([1.0, 2.0])
+    >>>     >>> x = np.array([1.0, 2.0])
     >>> gradient(lambda u: anp.sum(u**3), x).verdict
     'agrees'
     >>> gradient(lambda u: np.sum(u**3), x, gradient=lambda u: 3.003 * u**2).verdict
@@ -127,36 +125,28 @@ def gradient(loss, x, gradient=None, steps=None, directions=3, rng=None, quick=F
     chosen, names = chosen or default_steps(point.eps), QUICK if quick else None
     lines = len(point.directions(point.vector, count, generator(0), names))
     with shown(3 + POINTS * min(lines, 2) + 2 * len(chosen) * lines) as tick:
-        return _audit(Trials(loss, tick), point, gradient, chosen, steps is None, count, generator(rng), names)
+        return _audit(Trials(loss, point, tick), gradient, chosen, steps is None, count, generator(rng), names)
 
 
-def _audit(trials, point, gradient, steps, extend, count, rng, quick, beside=False):
-    """The audit at one point; `quick`: names of its directions, or None for all; `beside`: that beside kinks."""
-    loss, taped, judged, hessian = trials.loss, gradient is None, [], None
+def _audit(trials, gradient, steps, extend, count, rng, quick):
+    """The audit; `quick`: names of its directions, or None for all."""
+    loss, point, taped, hessian, culprit = trials.loss, trials.point, gradient is None, None, None
     slope = (lambda tree: value_and_grad(loss)(tree)[1]) if taped else gradient
-    base = trials.base(point)
-    vector, doubts = _own_gradient(point, trials, base, slope)
-    notes = []
-    if math.isfinite(base) and np.all(np.isfinite(vector)):
-        judged = examined(trials, point, base, vector, point.directions(vector, count, rng, quick), steps, extend)
-        random = judged[:count]
-        if callable(slope):
-            for one in judged:
-                explained(one, slope)
-            if not beside and at_kinks(judged):
-                _look_beside(trials, point, gradient, count, judged)
-        if taped and random:
-            doubts.append(_modes(forward_mode(loss, random), trials.tolerance))
-        if not quick:
-            doubts += _complex_step(loss, point, random, base)
-        if taped and random and not quick and judged[0].word in PROVED:
-            hessian, note = _hessian(loss, point, judged[0], extend)
-            notes.append(note)
-        if trials.value(point.tree()) != base:
-            doubts.append(("unsound", "the loss gives another value after the audit: it keeps a state"))
+    judged, doubts = _looked_at(trials, slope, steps, extend, count, rng, quick)
+    if at_kinks(judged) and callable(slope):
+        _look_beside(trials, slope, judged)
+    random = judged[:count]
+    if taped and random:
+        doubts.append(_modes(forward_mode(loss, random), trials.tolerance))
+    if not quick:
+        doubts += _complex_step(loss, point, random, trials.base)
+    if taped and random and not quick and judged[0].word in PROVED:
+        hessian, note = _hessian(loss, point, judged[0], extend)
+        doubts.append(("note", note))
+    if judged and trials.value(point.tree()) != trials.base:
+        doubts.append(("unsound", "the loss gives another value after the audit: it keeps a state"))
     outcome, reason = verdict(judged, doubts)
-    notes = [reason for word, reason in doubts if word == "note"] + notes
-    culprit = None
+    notes = [note for word, note in doubts if word == "note"]
     if outcome == "disagrees" and taped:
         culprit, why = culprit_of(loss, point)
         notes.append(f"culprit: {why}")
@@ -174,7 +164,7 @@ def _audit(trials, point, gradient, steps, extend, count, rng, quick, beside=Fal
         digits=min(digits, default=None),
         culprit=culprit,
         hessian=hessian,
-        value=base,
+        value=trials.base,
         evaluations=trials.count,
         size=point.size,
         notes=tuple(notes),
@@ -182,37 +172,43 @@ def _audit(trials, point, gradient, steps, extend, count, rng, quick, beside=Fal
     )
 
 
-def _own_gradient(point, trials, base, slope):
-    """Vector of the gradient, and the doubts that come before any difference."""
-    doubts = []
-    if not math.isfinite(base):
-        doubts.append(("unsound", f"the loss is {base} at x"))
-    elif trials.value(point.tree()) != base:
+def _looked_at(trials, slope, steps, extend, count, rng, names=None):
+    """Judgements along all directions (none where loss or gradient is not finite), and the doubts before them."""
+    point, doubts = trials.point, []
+    trials.start()
+    if not math.isfinite(trials.base):
+        doubts.append(("unsound", f"the loss is {trials.base} at x"))
+    elif trials.value(point.tree()) != trials.base:
         doubts.append(("unsound", "two evaluations of the loss differ: it is not deterministic"))
-    if not callable(slope):
-        return point.gradient(slope), doubts
     with np.errstate(all="ignore"):
-        vector, again = (point.gradient(slope(point.tree())) for _ in range(2))
-    if not np.array_equal(vector, again, equal_nan=True):
+        found = [point.gradient(slope(point.tree()) if callable(slope) else slope) for _ in range(2)]
+    vector = trials.gradient = found[0]
+    if not np.array_equal(*found, equal_nan=True):
         doubts.append(("unsound", "two evaluations of the gradient differ: it is not deterministic"))
     if 0 < np.max(np.abs(vector * point.units), initial=0.0) < UNDERFLOW:
         doubts.append(("unsound", f"the loss changes by less than {UNDERFLOW:g}: it underflows, scale it"))
     for name, values in zip(point.names, point.arrays(vector), strict=True):
         if not np.all(np.isfinite(values)):
             doubts.append(("broken", f"the gradient of {name} holds NaN or infinity"))
-    return vector, doubts
+    if not (math.isfinite(trials.base) and np.all(np.isfinite(vector))):
+        return [], doubts
+    judged = examined(trials, point.directions(vector, count, rng, names), steps, extend)
+    for one in judged if callable(slope) else ():
+        explained(one, slope)
+    return judged, doubts
 
 
-def _look_beside(trials, point, gradient, count, judged):
+def _look_beside(trials, slope, judged):
     """At several kinks at once a derivative may lie outside the one-sided ones and follow a convention all the same.
 
     What is wrong beside the kinks as well is wrong.
     """
+    point = trials.point
     away = point.directions(point.vector, 1, generator(SHIFT[0]))[0][1]
     with suppress(*REFUSALS):
-        other, again = Point(point.tree(point.vector + SHIFT[1] * away)), Trials(trials.loss, trials.tick)
-        steps = default_steps(other.eps)
-        if _audit(again, other, gradient, steps, True, count, generator(None), None, True).verdict != "disagrees":
+        other = Trials(trials.loss, Point(point.tree(point.vector + SHIFT[1] * away)), trials.tick)
+        found = _looked_at(other, slope, default_steps(point.eps), True, RANDOM, generator(None))
+        if verdict(*found)[0] != "disagrees":
             for one in judged:
                 if one.word in ("outside", "disagrees"):
                     one.word, one.note = "kink", "several kinks; beside them nothing speaks against the gradient"
@@ -256,22 +252,17 @@ def _complex_step(loss, point, judged, base):
 
 
 def _hessian(loss, point, one, extend):
-    """d . H d by reverse mode over reverse mode -> (word or None, note).
+    """d . H d -> (word or None, note).
 
     The gradient has its verdict without it: a pullback that uses a value it captured has a right gradient and a
     wrong Hessian.
     """
     if point.complex:
         return None, "Hessian product: not looked at, x is complex"
-    direction = point.arrays(one.line.direction)
-
-    def slope(tree):
-        leaves = flatten(value_and_grad(loss)(tree)[1])[0]
-        return sum(anp.sum(leaves[place] * d) for place, d in zip(point.places, direction, strict=True))
-
+    along = one.line.direction
     try:
         with np.errstate(all="ignore"):
-            product = point.gradient(pullback(slope, point.tree())[1](1.0)) @ one.line.direction
+            product = point.gradient(hvp(loss, point.tree(), point.tree(along))) @ along
     except Exception as error:  # a rule, ours or not, may lack a second derivative and say so in any way
         return None, f"Hessian product: not available ({type(error).__name__})"
     word, reason = curvature(one, float(product), extend)
@@ -306,16 +297,6 @@ class Audit(Result):
         How often the loss was evaluated.
     """
 
-    verdict: str
-    reason: str
-    digits: int | None
-    culprit: str | None
-    hessian: str | None
-    lines: tuple[Judgement, ...]
-    value: float
-    evaluations: int
-    size: int
-    notes: tuple[str, ...]
     _word = "an audit"
 
     @property

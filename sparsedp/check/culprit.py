@@ -105,16 +105,16 @@ def _wrong_rule(node, rng):
     def loss(values):
         return anp.sum(anp.real(g * node.again(values)))
 
-    trials = Trials(loss)
-    base = trials.base(point)
-    if not np.isfinite(base):
+    trials = Trials(loss, point)
+    trials.start()
+    if not np.isfinite(trials.base):
         return ""
-    gradient = point.gradient(value_and_grad(loss)(point.tree())[1])
-    if not np.all(np.isfinite(gradient)):
+    trials.gradient = point.gradient(value_and_grad(loss)(point.tree())[1])
+    if not np.all(np.isfinite(trials.gradient)):
         return "its VJP gives NaN or infinity"
     # In each argument alone, and the largest entry: a loss of many entries hides single ones.
-    directions = [pair for pair in point.directions(gradient, DIRECTIONS, rng) if pair[0] not in SKIPPED]
-    judged = examined(trials, point, base, gradient, directions, default_steps(point.eps), True)
+    directions = [pair for pair in point.directions(trials.gradient, DIRECTIONS, rng) if pair[0] not in SKIPPED]
+    judged = examined(trials, directions, default_steps(point.eps), True)
     for one in judged:
         if one.word == "disagrees":
             return f"its VJP is {one.note}" if one.note.startswith("off") else one.note

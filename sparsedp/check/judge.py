@@ -345,12 +345,12 @@ def orders(t, remainder, usable, most=MOST):
 # ------------------------------------------------------------ all directions
 
 
-def examined(trials, point, base, gradient, directions, steps, extend):
-    """Point, gradient and directions, pairs of name and displacement -> one Judgement for each.
+def examined(trials, directions, steps, extend):
+    """Trials and directions, pairs of name and displacement -> one Judgement for each.
 
     The noise belongs to the loss, not to a direction: the larger one along the first and the last counts for all.
     """
-    lines = [Line(name, direction, point, gradient, trials, base) for name, direction in directions]
+    lines = [Line(name, direction, trials) for name, direction in directions]
     noise = max(map(noise_of, [*lines[:1], *lines[1:][-1:]]), default=0.0)
     for line in lines:
         line.noise = noise

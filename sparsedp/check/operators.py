@@ -15,7 +15,8 @@ import numpy as np
 from sparsedp.check.properties import facts_of
 from sparsedp.check.summary import Row, Summary
 from sparsedp.check.sweep import generator
-from sparsedp.derivative import pullback, pushforward, value_and_grad
+from sparsedp.derivative import pullback, pushforward
+from sparsedp.direction import hvp
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.operators.given import check_operator
 from sparsedp.structure.base import Scaled, result_dtype
@@ -30,6 +31,7 @@ DTYPES = ("float64", "complex128", "float32", "complex64")
 LARGEST = 2**21  # unknowns above which no matrix is built for a check
 MOST_COLUMNS = 512  # columns that are found one application at a time
 POWERS = 8  # products of a power iteration
+LARGEST_SIZES = {"float32": 1e25, "float64": 1e290}  # of operators whose squares fit into a dtype, too
 PLAIN = 1e-100, 1e100  # sizes of operators whose square can be held
 ORDINARY = 1e-30, 1e30  # sizes of operators that take fields near the ends of the range of floats
 
@@ -42,13 +44,13 @@ def field(rng, shape, dtype):
     return np.asarray(values, dtype)
 
 
-def row(name, measure, optional=False):
-    """Row of what ``measure()`` returns: a figure, a list of mistakes, or the reason why the property does not apply.
+def row(name, measure, *args, optional=False):
+    """Row of what ``measure(*args)`` returns: a figure, a list of mistakes, or the reason why it does not apply.
 
     An error fails, or skips a row that is optional: operators from outside may raise anything.
     """
     try:
-        found = measure()
+        found = measure(*args)
     except Exception as error:
         note = f"{type(error).__name__}: {error}"
         return Row(name, None, None, None, f"refused, {note}") if optional else Row(name, None, LIMIT, False, note)
@@ -109,23 +111,24 @@ class Probe:
         """A row for each dtype: how far the two sides of an identity are apart, at worst over the seeds."""
         rows: list[Row] = []
         for dtype in map(np.dtype, dtypes):
-            low, high = (1e-25, 1e25) if np.finfo(dtype).eps > 1e-10 else (1e-290, 1e290)  # squares fit, too
-            unfit = ""
-            if 0 < self.size <= low or self.size >= high:
-                unfit = f"entries of size {self.size:.1e} do not fit into {dtype}"
-            worst = lambda dtype=dtype, unfit=unfit: unfit or np.max([self.gap(name, dtype) for _ in range(self.seeds)])
             # A clean refusal of complex fields is fine where real fields work.
             optional = dtype.kind == "c" and self.real and rows[0].ok is True
-            rows.append(row(f"{name}, {dtype}", worst, optional))
+            rows.append(row(f"{name}, {dtype}", self.gap, name, dtype, optional=optional))
         return rows
 
     def gap(self, name, dtype):
-        """Distance of the two sides of an identity, entry by entry, in units of rounding; 0 where they are the same."""
-        left, right, bound = IDENTITIES[name](self, self.domain(dtype), self.domain(dtype), self.codomain(dtype))
-        gaps = np.abs(left - right).reshape(-1, max(np.size(bound), 1))
-        with np.errstate(all="ignore"):
-            shares = gaps / (bound * unit(self.op.structure, result_dtype(self.op.structure, dtype)))
-        return float(np.max(np.where(gaps == 0, 0.0, shares), initial=0.0))
+        """Distance of the two sides of an identity in units of rounding, at worst over entries and seeds."""
+        largest = LARGEST_SIZES[np.finfo(dtype).dtype.name]
+        if 0 < self.size <= 1 / largest or self.size >= largest:
+            return f"entries of size {self.size:.1e} do not fit into {dtype}"
+        worst, rounding = 0.0, unit(self.op.structure, result_dtype(self.op.structure, dtype))
+        for _ in range(self.seeds):
+            left, right, bound = IDENTITIES[name](self, self.domain(dtype), self.domain(dtype), self.codomain(dtype))
+            gaps = np.abs(left - right).reshape(-1, max(np.size(bound), 1))
+            with np.errstate(all="ignore"):
+                shares = np.where(gaps == 0, 0.0, gaps / (bound * rounding))
+            worst = np.maximum(worst, np.max(shares, initial=0.0))  # NaN stays NaN
+        return worst
 
     def bound(self, u, transposed=False):
         """What rounding is relative to in A u: |A| |u|, entry by entry.
@@ -162,12 +165,6 @@ class Probe:
         return size
 
 
-def _hessian_product(op, u, v):
-    """That of Re sum(op(u)^2) / 2 along v, reverse over reverse."""
-    gradient = value_and_grad(lambda x: anp.sum(anp.real(op(x) ** 2)) / 2)
-    return pullback(lambda x: anp.sum(gradient(x)[1] * v), u)[1](1.0)
-
-
 def _dot(a, b):
     """Summed in double precision: the sums are not what is tested."""
     return np.sum(a * b.astype(np.result_type(b, float)))
@@ -184,7 +181,7 @@ IDENTITIES: dict[str, Any] = {
     "VJP": lambda p, u, v, g: (pullback(p.op, u)[1](g), p.transposed(g, u.dtype.kind != "c"), p.bound(g, True)),
     "transpose": lambda p, u, v, g: (_dot(p.op.apply(u), g), _dot(u, p.op.T.apply(g)), p.size * norm(u) * norm(g)),
     "second order": lambda p, u, v, g: (
-        _hessian_product(p.op, u, v),
+        hvp(lambda x: anp.sum(anp.real(p.op(x) ** 2)) / 2, u, v),
         p.transposed(p.op.apply(v), True),
         p.size * p.size * norm(v),
     ),
@@ -312,13 +309,14 @@ def twin(op, seeds=3, rng=None):
 def _form_rows(probe):
     """Rows: both products in three dtypes, entry by entry, and the entries of the transpose."""
     op, listed = probe.op, probe.matrix is not None
-    rows = [row("forms", lambda: _forms(op.structure, listed))]
-    rows += probe.rows("forward", DTYPES[:3]) if listed else []
+    rows = [row("forms", _forms, op.structure, listed)]
+    if not listed:
+        return rows
     transposed = row("transposed", lambda: op.T.apply(np.zeros(op.codomain.shape)) is None)
-    if listed and transposed.ok:
-        rows += probe.rows("transposed", DTYPES[:3])
-        rows.append(row("transpose, entry by entry", lambda: _entries(probe)))
-    return rows if transposed.ok or not listed else [*rows, transposed]  # what a foreign function raises has its row
+    rows += probe.rows("forward", DTYPES[:3])
+    if not transposed.ok:
+        return [*rows, transposed]  # what a foreign function raises has its row
+    return [*rows, *probe.rows("transposed", DTYPES[:3]), row("transpose, entry by entry", _entries, probe)]
 
 
 def _forms(structure, listed):
@@ -345,11 +343,11 @@ def fault_of(op, rng):
     probe = Probe(op, 1, rng)
     kinds = DTYPES[:1] if probe.real else DTYPES[1:2]
     rows = probe.rows("linearity", kinds) + probe.rows("transpose", kinds)
-    failed = [(inf if one.figure is None else one.figure, one) for one in rows if one.ok is False]
+    failed = [one for one in rows if one.ok is False]
     if not failed:
         return ""
-    figure, worst = max(failed, key=lambda pair: pair[0])
-    how = worst.note or f"is off by about {figure * unit(probe.op.structure, float):.0e}"
+    worst = max(failed, key=lambda one: inf if one.figure is None else one.figure)
+    how = worst.note or f"is off by about {worst.figure * unit(probe.op.structure, float):.0e}"
     return f"its {worst.name.split(',')[0]} {how}"
 
 
@@ -433,10 +431,10 @@ def _equal(a, b):
     return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=True)
 
 
-def _scaling(size, op, u):
+def _scaling(probe, op, u):
     """A field times 2^900 or 2^-900 gives the same digits: largest difference, relative, in roundings."""
-    if not ORDINARY[0] < size < ORDINARY[1]:
-        return f"entries of size {size:.1e} leave the range of floats then"
+    if not ORDINARY[0] < probe.size < ORDINARY[1]:
+        return f"entries of size {probe.size:.1e} leave the range of floats then"
     wanted = op.apply(u)
     gaps = [np.max(np.abs(op.apply(u * 2.0**p) * 2.0**-p - wanted), initial=0.0) for p in (900, -900)]
     return max(gaps) and max(gaps) / (np.finfo(float).eps * np.max(np.abs(wanted)))
@@ -489,8 +487,9 @@ def operator(op, seeds=3, rng=None):
         try:
             probe = Probe(op, seeds, rng)
         except Exception as error:  # a foreign function may raise anything
-            row = Row("application", None, LIMIT, False, f"{type(error).__name__}: {error}")
-            return OperatorSummary(op, None, [row])
+            return OperatorSummary(
+                op, None, [Row("application", None, LIMIT, False, f"{type(error).__name__}: {error}")]
+            )
         return OperatorSummary(op, probe, _rows(probe))
 
 
@@ -498,10 +497,10 @@ def _rows(probe):
     kinds = DTYPES[: 1 if probe.real else 2]
     rows = [one for name in ("linearity", "JVP", "VJP") for one in probe.rows(name, kinds)]
     if PLAIN[0] < probe.size < PLAIN[1]:
-        rows.append(row("second order", lambda: probe.gap("second order", np.dtype(float))))
+        rows.append(row("second order", probe.gap, "second order", np.dtype(float)))
     rows += probe.rows("transpose", DTYPES)
     rows += [one._replace(name=f"twin, {one.name}") for one in _form_rows(probe)]
-    return rows + [row(name, lambda test=test: test(probe)) for name, test in ARGUMENTS.items()]
+    return rows + [row(name, test, probe) for name, test in ARGUMENTS.items()]
 
 
 ARGUMENTS: dict[str, Any] = {
@@ -510,8 +509,8 @@ ARGUMENTS: dict[str, Any] = {
     "memory layouts": _layouts,
     "input unmodified, result fresh": _freshness,
     "same bits twice": _repeats,
-    "scaling by 2^+-900": lambda probe: _scaling(probe.size, probe.op, probe.domain()),
-    "scaling by 2^+-900, transposed": lambda probe: _scaling(probe.size, probe.op.T, probe.codomain()),
+    "scaling by 2^+-900": lambda probe: _scaling(probe, probe.op, probe.domain()),
+    "scaling by 2^+-900, transposed": lambda probe: _scaling(probe, probe.op.T, probe.codomain()),
 }
 
 
@@ -533,10 +532,6 @@ class OperatorSummary(Summary):
         and the largest stable step of u' = A u by explicit Euler. Found when they are asked for; what cannot
         be found at a fair price is left out.
     """
-
-    op: Any
-    size: float | None
-    nnz: int | None
 
     def __init__(self, op, probe, rows):
         listed = isinstance(op.structure, Matrix) or (probe and probe.matrix is not None and op.structure.has_entries)
@@ -560,28 +555,20 @@ class OperatorSummary(Summary):
         op, facts = self.op, self.facts
         entries = "entries not listed" if self.nnz is None else f"{self.nnz} entries"
         times = [f"{1e6 * seconds:.3g} us {form}" for form, seconds in facts.get("seconds", {}).items()]
-        short = [f"{name} {_word(facts[name])}" for name in SHORT if facts.get(name) is not None]
+        rest = [
+            f"{name} {_word(value)}" for name, value in facts.items() if name not in ELSEWHERE and value is not None
+        ]
         lines = [
             f"{op.form}, {op.dtype}, {entries}",
             times and f"one application: {', '.join(times)}",
-            ", ".join(short),
+            ", ".join(rest),
+            *(f"{name}: {facts[name]}" for name in LONG if name in facts),
         ]
-        lines += [f"{name}: {facts[name]}" for name in LONG if name in facts]
         return [*super()._head(), *(f"  {line}" for line in lines if line)]
 
 
-SHORT = (
-    "bytes",
-    "size",
-    "row sums",
-    "symmetric",
-    "definite",
-    "M-matrix",
-    "null space",
-    "spectral radius",
-    "stable step",
-)
-LONG = "integration by parts", "order", "acts as"
+LONG = "integration by parts", "order", "acts as"  # facts with a line of their own
+ELSEWHERE = (*LONG, "domain", "codomain", "form", "dtype", "nnz", "seconds")
 
 
 def _word(value):

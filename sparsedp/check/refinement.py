@@ -1,7 +1,6 @@
 """Order of accuracy: how the error falls when the grid is refined."""
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -77,14 +76,6 @@ class Refinement(Result):
     reason : str
         Why the verdict is what it is.
     """
-
-    sizes: tuple[int, ...]
-    errors: tuple[float, ...]
-    orders: tuple[float, ...]
-    order: float
-    expected: Any
-    verdict: str
-    reason: str
 
     def __float__(self):
         return self.order

@@ -1,19 +1,26 @@
 """What checks and instruments give: frozen values that print themselves, and their columns of text."""
 
 import math
-from typing import Any, NamedTuple
+import re
+from typing import NamedTuple
 
 __all__ = ["Result", "Row", "Summary", "table"]
 
 
 class Result:
-    """What an instrument gives: frozen, as plain data, as text; true unless it has a verdict other than "agrees"."""
+    """What an instrument gives: frozen, as plain data, as text; true unless it has a verdict other than "agrees".
+
+    The attributes are the values it is made with; the docstring of each kind lists them, and nothing else does.
+    """
 
     _word = ""  # what it is called; default: its class
     _plain: tuple = ()  # names of the attributes that are plain data; default: all that were given
 
     def __init__(self, **values):
         self.__dict__.update(values)
+
+    def __getattr__(self, name):  # also tells type checkers that there are attributes which no class body names
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
     def __setattr__(self, name, value):
         raise AttributeError(f"{self._word or f'a {type(self).__name__.lower()}'} is frozen; {name} cannot be set")
@@ -62,11 +69,6 @@ class Summary(Result):
         Inconclusive where nothing could be tested.
     """
 
-    title: str
-    rows: tuple[Row, ...]
-    limit: float
-    failed: tuple[str, ...]
-    verdict: str
     _word = "a finding"
     _plain = ("title", "verdict", "limit", "worst")
 
@@ -99,35 +101,26 @@ class Summary(Result):
 FORMS = "{}", "{:.3g}", "<= {:g}", "{}", "{}"  # of the cells of a row
 
 
-def table(lines: Any, head=None, indent="  "):
-    """Rows of strings -> text in columns: the first column to the left, numbers to the right.
+def table(lines, head=None):
+    """Rows of cells -> text in columns: words to the left, numbers to the right.
 
     Parameters
     ----------
-    lines : sequence of equally long tuples of str
-    head : tuple of str, optional
-    indent : str
+    lines : sequence of equally long sequences
+    head : sequence of str, optional
 
     Returns
     -------
     str
     """
-    lines = [tuple(map(str, line)) for line in lines]
-    columns = list(zip(*([head] if head else []), *lines, strict=True))
-    if not columns:
-        return indent + "nothing to show"
-    numeric = [all(map(_number, column[bool(head) :])) for column in columns]
-    aligned = [
-        [cell.rjust(width) if right else cell.ljust(width) for cell in column]
-        for column, right in zip(columns, numeric, strict=True)
-        for width in [max(map(len, column))]
-    ]
-    return "\n".join((indent + "  ".join(cells)).rstrip() for cells in zip(*aligned, strict=True))
+    rows = [tuple(map(str, line)) for line in (*([head] if head else []), *lines)]
+    if not rows:
+        return "  nothing to show"
+    columns = []
+    for column in zip(*rows, strict=True):
+        side, width = ">" if all(map(NUMBER, column[bool(head) :])) else "<", max(map(len, column))
+        columns.append([f"{cell:{side}{width}}" for cell in column])
+    return "\n".join(f"  {'  '.join(cells)}".rstrip() for cells in zip(*columns, strict=True))
 
 
-def _number(text):
-    try:
-        float(text or "0")
-    except ValueError:
-        return text in ("-", "exact")
-    return True
+NUMBER = re.compile(r"[-+]?(\d[\d.]*(e[-+]\d+)?|nan|inf|exact)?").fullmatch  # what is set to the right of a column

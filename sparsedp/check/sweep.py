@@ -5,6 +5,7 @@ along a direction is a plain dot product. The noise of the loss comes from a tab
 values. The loss itself only ever sees fresh copies of its own tree.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -67,13 +68,13 @@ class Point:
             raise DerivativeError("a gradient is checked at floating values, and x holds none; write x.astype(float)")
         self.values = [np.array(self._leaves[place]) for place in self.places]
         paths = list(_paths(x))
-        self.names = [paths[place] or "x" for place in self.places]
+        self.names = [paths[place] for place in self.places]
         for name, values in zip(self.names, self.values, strict=True):
             if not np.all(np.isfinite(values)):
                 raise NonFiniteError(f"a gradient is checked at finite values, and {name} holds NaN or infinity")
         self.vector = joined(self.values)
-        self.complex = any(values.dtype.kind == "c" for values in self.values)
-        self._ends = np.cumsum([values.size * (1 + (values.dtype.kind == "c")) for values in self.values])[:-1]
+        self.complex = any(map(np.iscomplexobj, self.values))
+        self._ends = np.cumsum([joined([values]).size for values in self.values])[:-1]
         self.units = np.concatenate([np.full(part.size, _rms(part) or 1.0) for part in self._parts(self.vector)])
         self.size = sum(values.size for values in self.values)
         self.eps = max(float(np.finfo(values.dtype).eps) for values in self.values)
@@ -85,7 +86,7 @@ class Point:
     def arrays(self, vector):
         """Arrays of the shapes and dtypes of the floating leaves; this rounds."""
         parts = zip(self._parts(vector), self.values, strict=True)
-        return [part.view(_wide(x)).astype(x.dtype).reshape(x.shape) for part, x in parts]
+        return [part.view(np.result_type(x, float)).astype(x.dtype).reshape(x.shape) for part, x in parts]
 
     def tree(self, other=None):
         """The tree with other floating leaves, arrays or a vector; always fresh copies."""
@@ -104,7 +105,7 @@ class Point:
         for name, x, g in zip(self.names, self.values, arrays, strict=True):
             if g.shape != x.shape:
                 raise DerivativeError(f"the gradient of {name} has shape {g.shape} where {x.shape} is needed")
-        return joined([g.astype(_wide(x)) for g, x in zip(arrays, self.values, strict=True)])
+        return joined([g.astype(np.result_type(x, float)) for g, x in zip(arrays, self.values, strict=True)])
 
     def directions(self, gradient, count, rng, wanted=None):
         """Names and displacements: random ones, and structured ones that see what random ones average away.
@@ -121,14 +122,14 @@ class Point:
             if np.any(alone):
                 found[f"random in {name}"] = alone
         slopes = self.units * np.where(np.isfinite(gradient), gradient, 0.0)
-        largest = np.max(np.abs(slopes))
+        largest = np.argmax(np.abs(slopes))
         if self.size > 1:
             found["constant"] = self.units
-        if (
-            self.size > 1 and largest > 0
-        ):  # along the gradient, as the units measure it, no entry moves more than 4 units
-            found["gradient"] = self.units * (slopes / largest) / max(_rms(slopes / largest), 0.25)
-            found["largest entry"] = self.units * (np.arange(slopes.size) == np.argmax(np.abs(slopes)))
+        if self.size > 1 and slopes[largest]:
+            # Along the gradient, as the units measure it, no entry moves more than 4 units.
+            shares = slopes / abs(slopes[largest])
+            found["gradient"] = self.units * shares / max(_rms(shares), 0.25)
+            found["largest entry"] = self.units * (np.arange(slopes.size) == largest)
         return [pair for pair in found.items() if wanted is None or pair[0] in wanted]
 
     def _random(self, rng):
@@ -141,15 +142,11 @@ class Point:
 
 def joined(arrays):
     """Arrays -> one vector of doubles, complex numbers as pairs."""
-    return np.concatenate([np.ravel(values).astype(_wide(values)).view(float) for values in arrays])
+    return np.concatenate([np.ravel(x).astype(np.result_type(x, float)).view(float) for x in arrays])
 
 
 def _rms(vector):
     return norm(vector) / np.sqrt(max(vector.size, 1))
-
-
-def _wide(values):
-    return np.complex128 if values.dtype.kind == "c" else np.float64
 
 
 def _paths(tree, prefix=""):
@@ -162,17 +159,22 @@ def _paths(tree, prefix=""):
         for place, branch in enumerate(tree):
             yield from _paths(branch, f"{prefix}.{names[place]}" if names else f"{prefix}[{place}]")
     else:
-        yield f"x{prefix}" if prefix else ""
+        yield f"x{prefix}"
 
 
 # ------------------------------------------------------------ losses
 
 
 class Trials:
-    """A loss with its count of evaluations. Away from x it may refuse; then there is a note and no value.
+    """A loss at a point with the gradient under test. Away from the point it may refuse: a note, and no value.
 
     Attributes
     ----------
+    base : float
+        The loss at the point; whoever makes the trials sets it and the gradient.
+    gradient : vector
+    count : int
+        Evaluations.
     solved : bool
         Whether the loss takes a solve of this library at the point.
     tolerance : float
@@ -181,8 +183,9 @@ class Trials:
         Rounding of the coarsest dtype that the loss has returned.
     """
 
-    def __init__(self, loss, tick=lambda: None):
-        self.loss, self.tick = loss, tick  # `tick` is called at each evaluation
+    def __init__(self, loss, point, tick=lambda: None, base=np.nan, gradient=None):
+        self.loss, self.point, self.tick = loss, point, tick  # `tick` is called at each evaluation
+        self.base, self.gradient = base, gradient
         self.count, self.solved, self.tolerance = 0, False, 0.0
         self.eps = float(np.finfo(float).eps)
 
@@ -202,25 +205,16 @@ class Trials:
             self.eps = max(self.eps, float(np.finfo(value.dtype).eps))
         return float(value)
 
-    def base(self, point):
-        """The loss at the point. Solves are looked at in one more run: recording is no part of what is judged."""
+    def start(self):
+        """Find the loss at the point. Solves are seen in one more run: recording is no part of what is judged."""
         before = thread.solves
-        value = self.value(point.tree())
+        self.base = self.value(self.point.tree())
         self.solved = thread.solves > before
         if self.solved:
             with recording() as calls, np.errstate(all="ignore"):
-                self.loss(point.tree())
+                self.loss(self.point.tree())
             loose = [solver.system.rtol for _, solver in solvers_of(calls) if solver.engine.iterative]
             self.tolerance = max(loose, default=0.0)
-        return value
-
-    def attempt(self, tree):
-        """(value, note): NaN and the reason where there is no finite value."""
-        try:
-            value = self.value(tree)
-        except REFUSALS as error:
-            return np.nan, f"{type(error).__name__}: {error}"
-        return (value, "") if np.isfinite(value) else (np.nan, "the loss overflows")
 
 
 def solvers_of(calls):
@@ -257,11 +251,7 @@ class Line:
     name : str
     direction : vector
         Displacement for step 1.
-    point : Point
-    gradient : vector
     trials : Trials
-    base : float
-        The loss at the point.
 
     Attributes
     ----------
@@ -269,10 +259,10 @@ class Line:
         Noise of the loss in units of its rounding, where a table of differences has shown it; else 0.
     """
 
-    def __init__(self, name, direction, point, gradient, trials, base):
-        self.name, self.direction, self.base = name, direction, base
-        self.point, self.gradient, self.trials = point, gradient, trials
-        self.slope, self.typical = float(gradient @ direction), norm(gradient * direction)
+    def __init__(self, name, direction, trials):
+        self.name, self.direction, self.trials = name, direction, trials
+        self.point, self.base, self.gradient = trials.point, trials.base, trials.gradient
+        self.slope, self.typical = float(self.gradient @ direction), norm(self.gradient * direction)
         self.levels, self.noise = [], 0.0
 
     def end(self, step):
@@ -282,13 +272,16 @@ class Line:
         change = float(self.gradient @ away)
         if not abs(norm(away) / (abs(step) * norm(self.direction)) - 1) < 0.1:
             return np.nan, change, "the step is lost in the rounding of x"
-        value, note = self.trials.attempt(self.point.tree(arrays))
-        return value, change, note
+        try:
+            value = self.trials.value(self.point.tree(arrays))
+        except REFUSALS as error:
+            return np.nan, change, f"{type(error).__name__}: {error}"
+        return value, change, "" if np.isfinite(value) else "the loss overflows"
 
     def sweep(self, steps):
         """Evaluate the loss at x + t d and x - t d for every new t of `steps`."""
-        new = [self.level(step) for step in steps if step not in {level.step for level in self.levels}]
-        self.levels = sorted([*self.levels, *new], key=lambda level: -level.step)
+        known = {level.step: level for level in self.levels}
+        self.levels = [known.get(step) or self.level(step) for step in sorted({*known, *steps}, reverse=True)]
 
     def level(self, step):
         """The losses at x + t d and x - t d."""
@@ -327,18 +320,13 @@ def noise_of(line):
     """
     distance = FIRST * max(1.0, line.point.eps / np.finfo(float).eps) ** 0.5
     for _ in range(MOST):
-        ends = [line.end(place * distance) for place in range(1, POINTS + 1)]  # on one side: a kink at x is no noise
-        if any(note for _, _, note in ends):
+        # On one side: a kink at x is no noise.
+        values, changes, notes = zip(*(line.end(place * distance) for place in range(1, POINTS + 1)), strict=True)
+        if any(notes):
             return 0.0
-        values, changes = np.array([end[:2] for end in ends]).T
         if np.count_nonzero(np.diff(values)) > POINTS // 2:
-            size = max(np.max(np.abs(values)), abs(line.base), np.finfo(float).tiny)
-            return _deviation(values - line.base - changes) / (line.trials.eps * size)
+            size = max(*map(abs, values), abs(line.base), np.finfo(float).tiny)
+            rests = np.array(values) - line.base - changes
+            return norm(np.diff(rests, ORDER)) / math.sqrt((POINTS - ORDER) * VARIANCE) / (line.trials.eps * size)
         distance *= GROWTH
     return 0.0
-
-
-def _deviation(rests):
-    """Standard deviation of independent errors, by their fourth differences."""
-    largest = float(np.max(np.abs(rests)))
-    return largest * float(np.sqrt(np.mean(np.diff(rests / largest, ORDER) ** 2) / VARIANCE)) if largest > 0 else 0.0

@@ -258,14 +258,6 @@ class Certificate(Result):
     advice : str
     """
 
-    value: float
-    gradient: Any
-    corrected_value: float
-    corrected_gradient: Any
-    gradient_error: float
-    causes: dict
-    solves: list
-    advice: str
     _plain = ("value", "corrected_value", "value_error", "gradient_error", "causes", "solves", "advice")
 
     @property

@@ -130,15 +130,6 @@ class Plan(Result):
         Forward with taping, backward.
     """
 
-    value: float
-    counts: dict
-    totals: dict
-    left_out: list
-    rows: list
-    tape_nodes: int
-    tape_bytes: int
-    recomputation: float
-    seconds: tuple
     _plain = ("value", "totals", "left_out", "rows", "tape_nodes", "tape_bytes", "recomputation")
 
     def to_dict(self):

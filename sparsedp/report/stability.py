@@ -107,12 +107,6 @@ class StabilityMap(Result):
         Time step and viscosity of the scene.
     """
 
-    names: tuple
-    time_steps: np.ndarray
-    viscosities: np.ndarray
-    factors: np.ndarray
-    here: tuple
-
     def to_dict(self):
         """The map as plain lists; None where the step is refused."""
         factors = [[None if np.isnan(factor) else factor for factor in row] for row in self.factors.tolist()]

@@ -284,7 +284,7 @@ def _against_differences(scene, other, out):
     if not np.any(gradient):
         return PASSED, 0.0, "gradient 0"
     name, direction = point.directions(gradient, 1, generator(SEED), ("random 1", "gradient"))[-1]
-    line = Line(name, direction, point, gradient, Trials(scene.sheltered), out.value)
+    line = Line(name, direction, Trials(scene.sheltered, point, base=out.value, gradient=gradient))
     wanted = abs(line.slope)
     if wanted <= UNSEEN * abs(out.value):
         return PASSED, 0.0, "the gradient is smaller than differences can see"

@@ -1,7 +1,6 @@
 """stress: a scene driven through stiff and extreme cases, one word for each."""
 
 import textwrap
-from typing import Any
 
 from sparsedp.fields import check_function
 from sparsedp.report import plots
@@ -101,9 +100,6 @@ class Stress(Result):
     map : StabilityMap or None
     """
 
-    rows: list
-    left_out: list
-    map: Any
     _plain = ("counts", "rows", "left_out")
 
     @property

@@ -313,10 +313,6 @@ class Rows(Result):
         Runs that were not made, with the reason.
     """
 
-    scene: str
-    rows: list
-    left_out: list
-
     @property
     def stem(self):
         """What the files of `save` are called."""
