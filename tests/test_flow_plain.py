@@ -1,10 +1,11 @@
-"""The plain forms of flow_step, which rollout runs without the tape, against the step on the tape."""
+"""Scenes of flow_step in a rollout, against the same steps in a loop."""
 
 import autograd.numpy as anp
 import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp.derivative import pullback
 from sparsedp.ledger import recording
 from sparsedp.tree import leaves
 
@@ -62,24 +63,21 @@ def test_rollout_and_loop(name):
             state = step(state, params)
         return state
 
-    taped = lambda state, params: step(state, params)  # a function has no plain forms
     known, wanted = dp.value_and_grad(lambda x: loss(x, loop))((state, params))
-    for way in (step, taped):
-        value, slopes = dp.value_and_grad(lambda x: loss(x, lambda *s: dp.rollout(way, *s, 3)))((state, params))
-        assert value == pytest.approx(known, rel=1e-12)
-        for one, other in zip(leaves(slopes), leaves(wanted), strict=True):
-            assert one is other is None or np.linalg.norm(one - other) <= 1e-10 * (np.linalg.norm(other) + 1e-3)
+    value, slopes = dp.value_and_grad(lambda x: loss(x, lambda *s: dp.rollout(step, *s, 3)))((state, params))
+    assert value == known
+    for one, other in zip(leaves(slopes), leaves(wanted), strict=True):
+        assert one is other is None or np.linalg.norm(one - other) <= 1e-10 * (np.linalg.norm(other) + 1e-3)
 
 
-def test_by_hand_and_without_params():
-    """The plain backward form without `into`; a step keeps single precision; one solve each way."""
+def test_one_solve_each_way_and_single_precision():
     step, state, params = scene(**SCENES["forced"])
+    flat = lambda x: anp.concatenate([anp.ravel(part) for part in step(*x).values()])
     with recording() as calls:
-        new = step.forward(state, params)
-        back, slopes = step.backward(state, params, new)
+        new, pull = pullback(flat, (state, params))
+        back, slopes = pull(new)
     assert calls["pressure solve", "solve"] == calls["pressure solve", "adjoint"] == 1
-    assert calls["projection", "forward"] == calls["projection", "vjp"] == 1
-    again, _ = step.backward(state, params, step.forward(state, params))  # recordings change no bit
+    again, _ = pullback(flat, (state, params))[1](new)  # recordings change no bit
     assert sorted(slopes) == sorted(params) and np.array_equal(back["v"], again["v"])
     step, state, _ = scene(**SCENES["explicit"], dtype=np.float32)
     single = dp.rollout(step, state, None, 2)

@@ -1,7 +1,6 @@
 """Nonlinear implicit steps: what one Jacobian serves for, on which grid it stands, and that nothing else changes."""
 
 from functools import cache
-from threading import Thread
 
 import autograd.numpy as anp
 import numpy as np
@@ -107,21 +106,8 @@ def test_the_end_of_a_step_is_not_solved_for_again(method):
     np.testing.assert_array_equal(only, state)
 
 
-def test_a_known_end_is_that_of_its_own_thread():
-    """While one thread goes back through a step, another one may use the same step."""
-    step = dp.stepper("backward_euler", lambda u, p: -p * u**3, 0.1)
-    u, found = np.array([1.0, 2.0, 3.0]), []
-    wanted = step(u, 1.0)
-    with step.scheme.ending(np.zeros(3)):
-        thread = Thread(target=lambda: found.append(step(u, 1.0)))
-        thread.start(), thread.join()
-        assert not np.any(step(u, 1.0))  # the end that is known, once
-        np.testing.assert_array_equal(step(u, 1.0), wanted)
-    np.testing.assert_array_equal(found, [wanted])
-
-
 def test_loops_of_trees_and_single_precision():
-    """A tree as state and float32 fields: the end of a step is solved for again, with the same result."""
+    """A tree as state and float32 fields."""
     step = dp.stepper("backward_euler", lambda u, p: {"a": u["s"], "s": -p * anp.sin(u["a"])}, 0.1)
     run = lambda x: dp.rollout(step, {"a": x[0], "s": 0.0}, x[1], 4)["a"]
     once = lambda x: step(step(step(step({"a": x[0], "s": 0.0}, x[1]), x[1]), x[1]), x[1])["a"]

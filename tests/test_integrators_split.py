@@ -110,44 +110,38 @@ def test_derivatives_of_functions():
         assert value_and_grad(loss)(x)[1][0] == pytest.approx(central, rel=1e-3)
 
 
-# ---- steps with their own pullback, for loops without a tape -------------------------------------------------------
+# ---- linear steps, against the dense matrix, in loops --------------------------------------------------------------
+
+METHODS = ["euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2", "imex", "etdrk4"]
 
 
-@pytest.mark.parametrize("method", ["euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson"])
-@pytest.mark.parametrize("nu", [0.7, 0.0])
-def test_plain_pullback(method, nu):
-    check_plain_pullback(method, nu)
-
-
-@pytest.mark.parametrize("method", ["tr_bdf2", "imex", "etdrk4"])
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("nu", [0.7, 0.0, None])
-def test_plain_pullback_of_stages(method, nu):
-    check_plain_pullback(method, nu)
-
-
-def check_plain_pullback(method, nu):
-    """On a stretched axis, where the operator is not symmetric."""
+def test_derivatives_of_linear_steps(method, nu):
+    """On a stretched axis, where the operator is not symmetric: transpose, tangent, slope in nu, and a rollout."""
     grid = dp.Grid(8, spacing=[np.linspace(1, 2, 8)])
     step = dp.stepper(method, dp.laplacian(grid, {"x": (dp.dirichlet, dp.neumann)}), 0.1)
     u, g = np.random.default_rng(1).standard_normal((2, 8))
     new, pull = pullback(lambda x: step(*x), (u, nu))
     of_u, of_nu = pull(g)
-    assert np.array_equal(step.forward(u, nu), new)
-    for known in (None, new):
-        back, slope = step.backward(u, nu, g, new=known)
-        assert back == pytest.approx(of_u, rel=1e-13, abs=1e-15)
-        assert slope == (None if nu is None else pytest.approx(of_nu, rel=1e-12))
-    tangent = step.tangent(u, nu, np.cos(u), None if nu is None else 0.3)
+    dense = np.array([step(unit, nu) for unit in np.eye(8)]).T
+    assert new == pytest.approx(dense @ u, rel=1e-13, abs=1e-15)
+    assert of_u == pytest.approx(dense.T @ g, rel=1e-13, abs=1e-15)
+    tangent = dp.jvp(lambda x: step(*x), (u, nu), (np.cos(u), None if nu is None else 0.3))[1]
     assert np.sum(tangent * g) == pytest.approx(np.sum(of_u * np.cos(u)) + 0.3 * (of_nu or 0), rel=1e-12)
+    if nu:
+        central = (step(u, nu + 1e-5) - step(u, nu - 1e-5)) / 2e-5
+        assert of_nu == pytest.approx(np.sum(g * central), rel=1e-8)
+    value, slopes = value_and_grad(lambda x: anp.sum(g * dp.rollout(step, *x, 1)))((u, nu))
+    assert value == np.sum(g * new) and np.array_equal(slopes[0], of_u) and slopes[1] == of_nu
 
 
 def test_backward_is_one_transposed_solve():
     step = dp.stepper("backward_euler", L, 0.1)
-    new = step.forward(X, 0.5)
+    _, pull = pullback(lambda x: step(*x), (X, 0.5))
     with recording() as calls:
-        step.backward(X, 0.5, X, new=new)
-        step.backward(X, None, X)
-    assert calls["stepper(backward_euler)", "adjoint"] == 2 and not calls["stepper(backward_euler)", "solve"]
+        pull(X)
+    assert calls["stepper(backward_euler)", "adjoint"] == 1 and not calls["stepper(backward_euler)", "solve"]
 
 
 # ---- chaos: Kuramoto and Sivashinsky -------------------------------------------------------------------------------

@@ -1,22 +1,17 @@
 """What is explicit in a step of flow: the force, less what is carried away, and explicit viscosity.
 
-    a(v) = force(v) - div(v v) + nu (L v + B)
-
-The parts carry their derivatives without the tape; what the user wrote, the force and a viscosity of params,
-is put on a small tape of its own.
+a(v) = force(v) - div(v v) + nu (L v + B)
 """
 
 from typing import Any
 
 import numpy as np
 
-from sparsedp.derivative import pullback
 from sparsedp.errors import ShapeError, UnstableStepError
 from sparsedp.fields import is_number, rounded_down
-from sparsedp.tape import dtype_of, is_variable, plain
-from sparsedp.tree import flatten, leaves
+from sparsedp.tape import dtype_of, plain
 
-__all__ = ["Acceleration", "Viscous", "total"]
+__all__ = ["Acceleration", "Viscous"]
 
 ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
 
@@ -65,13 +60,6 @@ class Viscous:
     def __call__(self, v, params):
         return self.number(params) * self._bend(v)
 
-    def backward(self, v, params, g):
-        """Cotangents of v and params, plain."""
-        if not (callable(self.viscosity) and any(map(is_variable, leaves(params)))):
-            return self.number(params) * self.laplacian.T(g), None
-        number, pull = pullback(self.number, params)
-        return number * self.laplacian.T(g), pull(np.sum(g * self._bend(v)))
-
 
 class Acceleration:
     """The sum of those parts that a scene has; the others are None.
@@ -106,26 +94,3 @@ class Acceleration:
         if self.force is not None:
             a = a + self._pushed(v, params)
         return a if self.viscous is None else a + self.viscous(v, params)
-
-    def backward(self, v, params, g):
-        """Cotangents of v and params, plain: of params one tree for each part that uses them."""
-        back: Any = 0.0
-        slopes: list = []
-        if self.convect is not None:
-            back = sum(self.convect.vjp((0, 1), None, v, v)(-g))
-        if self.force is not None:
-            of_v, slope = pullback(lambda both: self._pushed(*both), (v, params))[1](g)
-            back, slopes = back + of_v, [*slopes, slope]
-        if self.viscous is not None:
-            of_v, slope = self.viscous.backward(v, params, g)
-            back, slopes = back + of_v, [*slopes, slope]
-        return back, slopes
-
-
-def total(trees):
-    """The sum of trees of cotangents, leaf by leaf; None is none, and the sum of none."""
-    found = [tree for tree in trees if tree is not None]
-    if len(found) < 2:
-        return found[0] if found else None
-    (one, rebuild), others = flatten(found[0]), leaves(found[1])
-    return rebuild([a if b is None else b if a is None else a + b for a, b in zip(one, others, strict=True)])

@@ -13,14 +13,10 @@ Source: Chorin, Math. Comp. 22 (1968); the mesh of Harlow and Welch, Phys. Fluid
 
 from functools import cached_property
 
-import numpy as np
-
 from sparsedp.conditions import no_slip
-from sparsedp.fields import field_array
 from sparsedp.flow.setup import Setup
 from sparsedp.flow.splitting import Potential, Projected
 from sparsedp.grid import check_grid
-from sparsedp.ledger import active, count
 from sparsedp.operator import Operator
 from sparsedp.solvers.choose import check_settings
 from sparsedp.tree import copied
@@ -110,24 +106,6 @@ class Projection(Operator):
         """Operator faces -> cells: the p with P(v) = v + G(p) on the faces where the flow is free [velocity length]."""
         setup = self.structure.setup
         return Operator(Potential(setup), setup.grid.faces, setup.grid.cells, "pressure")
-
-    def parts(self, v):
-        """Face field -> (P(v), pressure(v)), by one solve; plain, of float64."""
-        setup, found = self.structure.setup, np.empty(self.domain.shape)
-        if active:
-            count(self.name, "forward")
-        p = self.structure.splitting(field_array(self, v), found)
-        p = self.structure.splitting.levelled(p) * 2.0**setup.exponent
-        return found, p.reshape(setup.grid.shape)
-
-    def merged(self, of_v, of_p):
-        """The transpose of `parts`: cotangents of its two results -> that of v, by one solve."""
-        found, scale = np.empty(self.domain.shape), 2.0**self.structure.setup.exponent
-        if active:
-            count(self.name, "vjp")
-        source = scale * field_array(self.pressure.T, of_p).reshape(-1)
-        self.T.structure.splitting(field_array(self, of_v), found, source)
-        return found
 
     def __str__(self):
         return str(self.structure.setup.inverse)

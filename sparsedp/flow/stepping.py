@@ -16,7 +16,7 @@ from sparsedp.conditions import no_slip
 from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_function, is_number
-from sparsedp.flow.acceleration import Acceleration, Viscous, total
+from sparsedp.flow.acceleration import Acceleration, Viscous
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
 from sparsedp.operators.boundary import identity, mask
@@ -85,7 +85,7 @@ def flow_step(
     A step of explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth); a longer one is refused.
     Convection is explicit and no step is refused for it: where there is little viscosity, keep dt times the sum over
     axes of the largest |v| / h below 0.5. A longer step grows until the velocity overflows.
-    Cost: one pressure solve, and one solve for implicit viscosity; the same again backward. `rollout` needs no tape.
+    Cost: one pressure solve, and one solve for implicit viscosity; the same again backward.
     Source: van Kan, SIAM J. Sci. Stat. Comput. 7 (1986).
 
     Examples
@@ -158,10 +158,6 @@ class FlowStep(Remade):
         return {"v": v, "p": np.zeros(self.grid.shape), "a": self.acceleration(v, params)}
 
     def __call__(self, state, params=None):
-        return self._advanced(state, params, self._parted)
-
-    def _advanced(self, state, params, parted):
-        """The next state; `parted`: v* -> v_next and q."""
         if not isinstance(state, dict) or state.keys() != {"v", "p", "a"}:
             raise ShapeError("flow_step takes a dict of v, p and a as its state; make it with step.start")
         v, p, dt = state["v"], state["p"], self.dt
@@ -170,43 +166,8 @@ class FlowStep(Remade):
         if self.relax is not None:
             half = self.laplacian(v) if self.walls is None else self.laplacian(v) + 2.0 * self.walls  # of v and of v*
             ahead = self.relax(ahead + (0.5 * dt * self.viscosity) * half)
-        v, q = parted(ahead)
-        return {"v": v, "p": p - q / dt, "a": a}
-
-    def _parted(self, ahead):
         q = self.pressure(ahead)
-        return self.kept(ahead) + self.slope(q), q
-
-    # ------------------------------------------------------------ without the tape, for rollout
-
-    def forward(self, state, params):
-        """The next state, of plain values: that of a call, to rounding."""
-        return self._advanced(state, params, self._parted_plain)
-
-    def _parted_plain(self, ahead):
-        """The same in fewer passes, and in other bits: a call has those of a step on the tape, which are compared."""
-        at_once = not isbox(ahead) and ahead.dtype == np.float64
-        return self.project.parts(ahead) if at_once else self._parted(ahead)
-
-    def backward(self, state, params, g):
-        """Cotangents of a state and of params from that of the next state, plain.
-
-        The transpose of each line of the step, from the last to the first.
-        """
-        z = self._merged(g["v"], g["p"] / -self.dt)
-        v = z
-        if self.relax is not None:
-            z = self.relax.T(z)
-            v = z + (0.5 * self.dt * self.viscosity) * self.laplacian.T(z)
-        of_v, of_params = self.acceleration.backward(state["v"], params, g["a"] + 1.5 * self.dt * z)
-        back = {"v": v + of_v, "p": g["p"] - self.dt * self.slope.T(z), "a": -0.5 * self.dt * z}
-        return back, total(of_params)
-
-    def _merged(self, of_v, of_q):
-        """The transpose of `_parted`."""
-        if of_v.dtype != np.float64:
-            return self.kept.T(of_v) + self.pressure.T(of_q + self.slope.T(of_v))
-        return self.project.merged(of_v, of_q)
+        return {"v": self.kept(ahead) + self.slope(q), "p": p - q / dt, "a": a}
 
     def __repr__(self):
         parts = {

@@ -4,10 +4,8 @@ import numpy as np
 
 from sparsedp.fields import is_number
 from sparsedp.integrators.adaptive import Adaptive
-from sparsedp.integrators.explicit import EXPLICIT, Explicit
-from sparsedp.integrators.fast import LinearStep
+from sparsedp.integrators.explicit import EXPLICIT, Explicit, Polynomial
 from sparsedp.integrators.implicit_steps import IMPLICIT, Linear, Nonlinear
-from sparsedp.integrators.known_ends import NonlinearStep
 from sparsedp.integrators.problem import posed, positive
 from sparsedp.integrators.split_steps import SPLIT, Exponential, Imex
 from sparsedp.integrators.stability import Limit
@@ -148,9 +146,7 @@ def stepper(
         scheme = Adaptive(scheme, float(tolerance), floor, f"stepper({method})")
     elif method in EXPLICIT and problem.op is not None and unstable == "raise":
         limit = Limit(problem.op, EXPLICIT[method].reach, method)
-    bare = problem.whole and source is None and tolerance is None and isinstance(dt, float)
-    kind = LinearStep if bare else NonlinearStep if _ends_known(scheme, problem) else Step
-    return kind(method, problem, dt, scheme, limit, made)
+    return Step(method, problem, dt, scheme, limit, made)
 
 
 def _is_floor(leaf):
@@ -162,14 +158,10 @@ def _remade(method, rate, dt, given):
     return stepper(method, rate, dt, **given)
 
 
-def _ends_known(scheme, problem):
-    """Whether the new state is the root of one stage, and nothing else."""
-    return isinstance(scheme, Nonlinear) and scheme.name != "tr_bdf2" and not problem.timed
-
-
 def _scheme(method, problem, jacobian, settings, maxiter, options, kept):
     if method in EXPLICIT:
-        return Explicit(problem, method)
+        bare = problem.linear and problem.source is None
+        return Polynomial(problem, method) if bare else Explicit(problem, method)
     if method in SPLIT and problem.op is None:
         raise TypeError(f"{method} needs the stiff linear term: write linear=L or linear=(L, coefficient)")
     if method == "etdrk4":

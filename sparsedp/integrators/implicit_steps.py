@@ -8,8 +8,6 @@ b = u + (y - u) / (g (2 - g)): both stages have the same factor 1 - d z L.
 Sources: Bank et al., IEEE Trans. Electron Devices 32 (1985); Hosea and Shampine, Appl. Numer. Math. 20 (1996).
 """
 
-from contextlib import nullcontext
-
 import numpy as np
 import scipy.sparse as sp
 
@@ -126,11 +124,6 @@ class Nonlinear(Stage):
         """The state after a step h. Its stages share a Jacobian while that is good enough; none outlives the step."""
         with self.root.series():
             return self.advance(self, u, params, t, h)
-
-    def ending(self, new):
-        """A step of one stage inside ends at `new`, which need not be solved for; None, or a rounded array: it is."""
-        exact = type(new) is np.ndarray and new.dtype == np.float64
-        return self.root.answered(new) if exact else nullcontext()
 
     def solve(self, guess, b, params, t, h):
         """x of x = b + h f(x, t)."""

@@ -136,7 +136,6 @@ class Root(Remade):
         self.name = f"implicit({getattr(residual, '__name__', type(residual).__name__)})"
         self.info, self._settings = SolveLog(), settings
         self._series: dict = {}  # by thread, inside `series`: size -> Jacobian of the last solve
-        self._answers: dict = {}  # by thread, inside `answered`: the root
         self._jacobians = Jacobians(self.name, jacobian, sparsity, dict(rtol=rtol, maxiter=None, **settings))
         self._solution = Rule(self.name, self._newton, self._vjp, self._jvp)
         self._linear = [
@@ -158,15 +157,6 @@ class Root(Remade):
         finally:
             del self._series[get_ident()]
 
-    @contextmanager
-    def answered(self, x):
-        """The next solve of this thread has the root x, which the caller knows."""
-        self._answers[get_ident()] = x
-        try:
-            yield
-        finally:
-            self._answers.pop(get_ident(), None)
-
     def __call__(self, guess, *params):
         """Solve residual(x, *params) = 0 from a guess.
 
@@ -186,10 +176,6 @@ class Root(Remade):
     # ------------------------------------------------------------ the root as a rule of the parameters
 
     def _newton(self, equation, guess, *leaves):
-        known = self._answers.pop(get_ident(), None)
-        if known is not None:
-            equation.left = 0, 0.0  # not looked at
-            return known.reshape(-1).copy()
         solved = thread.observers[-1].root if recordings and thread.observers else Root.solved
         x = solved(self, equation, guess, leaves)
         if recordings:
