@@ -58,7 +58,7 @@ def prolongation(level):
     from sparsedp.solvers.multigrid.interpolation import Transfer, interpolated
 
     layout, coarse = level.layout, level.layout.coarse()
-    transfer = Transfer(layout, coarse, interpolated(level), 1)
+    transfer = Transfer(layout, coarse, interpolated(level))
 
     def interpolated_field(values):
         field = coarse.zeros()

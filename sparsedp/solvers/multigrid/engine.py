@@ -130,40 +130,31 @@ class Structured(Engine):
 
         grid, self.scale, self.maxiter, self.loops = stencil.grid, stencil.scale, maxiter or MAXITER, loops
         threads = kernels.threads() if grid.cells.size >= SERIAL else 1
-        self.layout = layout = Layout(grid.shape, grid.periodic)
+        self.layout = layout = Layout(grid.shape, grid.periodic, threads)
         links, extra, flags = layout.zeros(grid.dim), layout.zeros(), layout.zeros(dtype=bool)
         for field, values in zip((*links, extra, flags), (*stencil.links, stencil.extra, free)):
             layout.cells(field)[...] = values.reshape(grid.shape)
         steps = [tuple(step) for step in np.eye(grid.dim, dtype=int).tolist()]
-        self.level = level = Level(layout, steps, links, extra, layout.wrap(flags), dtype, threads)
+        self.level = level = Level(layout, steps, links, extra, flags, dtype)
         self.fine, self.weak_share, self.hierarchy = hierarchy(level)
         self.hierarchy += ", cycle in double precision" if dtype == np.float64 else ""
-        volumes = grid.volumes
-        scale, root = layout.cells(level.scale), layout.cells(level.root)
+        volumes, scale, root = grid.volumes, layout.cells(level.scale), layout.cells(level.root)
         self.factors = scale * volumes, scale  # what a right-hand side of A, and of its transpose, is multiplied with
         gauges = root / volumes, root  # how a scaled residual measures in the user's cells, but for a number
-        self.tops = tuple((float(gauge.max(initial=0.0)) or 1.0) / abs(self.scale) for gauge in gauges)
+        self.tops = tuple(float(gauge.max(initial=0.0)) or 1.0 for gauge in gauges)
         self.norm = 2.0 * float(np.max(gauges[0] * root, initial=0.0)) / abs(self.scale)
         self.gauges = layout.zeros(2, dtype=dtype)
         for field, gauge, top in zip(self.gauges, gauges, self.tops):
-            layout.cells(field)[...] = gauge / (top * abs(self.scale))
-        self.vectors = layout.zeros(3)  # x, r, q
-        self.directions = layout.zeros(2, dtype=dtype)
+            layout.cells(field)[...] = gauge / top
+        self.vectors, self.direction = layout.zeros(3), layout.zeros(dtype=dtype)
         self.sums = np.zeros(layout.shape[0])
         self.lock = threading.Lock()
-
-    def run(self, loop, *arguments):
-        """A loop on all planes, in the precision of the cycle."""
-        loop = loop.single if self.level.dtype == np.float32 else loop
-        flat = (array.reshape(-1) if np.ndim(array) > 1 else array for array in arguments)
-        loop.run(self.layout.shape[0], self.sums.size * self.layout.sizes[0], self.level.threads, *flat)
 
     def solve(self, b, goal, transposed):
         with self.lock:
             run = _Run(self, b, goal, transposed)
             word, used = run.iterate()
-            solution = run.solution()
-            return solution, used, word
+            return run.solution(), used, word
 
 
 class _Run:
@@ -173,18 +164,17 @@ class _Run:
     """
 
     def __init__(self, engine, b, goal, transposed):
-        self.engine, self.layout, self.transposed = engine, engine.layout, transposed
-        self.data, self.gauge, self.top = norm(b), engine.gauges[int(transposed)], engine.tops[transposed]
-        self.unit = 2.0 ** (np.frexp(self.data)[1] - np.frexp(self.top)[1])
-        self.goal = SURE * goal / (self.unit * self.top)
+        self.engine, self.data, self.gauge = engine, norm(b), engine.gauges[int(transposed)]
+        before, self.after = engine.factors[transposed], engine.factors[not transposed]
+        top = engine.tops[transposed] / abs(engine.scale)
+        self.unit = 2.0 ** (np.frexp(self.data)[1] - np.frexp(top)[1])
+        self.measure = self.unit * top  # of a residual that is 1 by the gauge
+        self.goal = SURE * goal / self.measure
         self.x, self.r, self.q = engine.vectors
-        self.p, self.old = engine.directions
-        for vector in (self.x, self.r, self.q, self.p, self.old):
-            vector[...] = 0.0
-        field = self.layout.cells(self.r)
-        field[...] = b.reshape(self.layout.shape)
-        field *= engine.factors[transposed]
-        field *= engine.scale / self.unit
+        self.p, self.cells = engine.direction, engine.layout.cells
+        engine.vectors[...] = self.p[...] = 0.0
+        self.cells(self.r)[...] = before * b.reshape(before.shape)
+        self.r *= engine.scale / self.unit
         self.step(0.0)
 
     def iterate(self):
@@ -212,40 +202,29 @@ class _Run:
             return "nonfinite_output"
         return "" if rho == 0.0 or residual <= 100 * self.rounding() else "stagnated"
 
-    # ------------------------------------------------------------ passes
-
     def precondition(self):
         """z = M r -> r . z."""
         self.engine.fine.cycle()
         return float(self.engine.fine.sums.sum())
 
     def direct(self, beta):
-        """The next direction p and its image q -> p . q. x catches up with the last step."""
-        engine = self.engine
-        self.p, self.old = self.old, self.p
-        advance = engine.loops.advance
-        engine.run(advance, self.x, self.p, self.old, engine.fine.x, self.layout.sizes, self.alpha, beta)
-        engine.level.apply(self.p, self.q, engine.sums)
-        return float(engine.sums.sum())
+        """The next direction p and its image q -> p . q."""
+        engine, layout = self.engine, self.engine.layout
+        layout.run(engine.loops.direct, self.p, engine.fine.x, layout.sizes, beta)
+        engine.level.apply(self.p, self.q)
+        return float(engine.level.sums.sum())
 
     def step(self, alpha):
-        """r -= alpha q -> its size."""
-        self.alpha, engine, sums = alpha, self.engine, self.engine.sums
-        update = engine.loops.update
-        engine.run(update, self.r, self.q, engine.fine.b, self.gauge, self.layout.sizes, sums, alpha)
-        return float(np.sqrt(sums.sum()))
+        """x += alpha p, r -= alpha q -> the size of r."""
+        engine, layout, light = self.engine, self.engine.layout, self.engine.fine.b
+        vectors = self.x, self.p, self.r, self.q, light, self.gauge
+        layout.run(engine.loops.update, *vectors, layout.sizes, engine.sums, alpha)
+        return float(np.sqrt(engine.sums.sum()))
 
     def rounding(self):
         """Size of a residual that rounding explains, as the contract will see it."""
-        engine, gauge = self.engine, self.engine.gauges[int(not self.transposed)]
-        x = self.x + self.alpha * self.p
-        x = np.divide(x, gauge, out=np.zeros_like(x), where=gauge > 0)
-        solution = norm(x.reshape(-1)) * self.unit / engine.tops[not self.transposed]
-        return ROUNDING * (engine.norm * solution + self.data) / (self.unit * self.top)
+        return ROUNDING * (self.engine.norm * norm(self.solution()) + self.data) / self.measure
 
     def solution(self):
         """x as a flat field."""
-        self.x += self.alpha * self.p
-        engine, field = self.engine, self.layout.cells(self.x)
-        field *= engine.factors[not self.transposed]
-        return (field * self.unit).reshape(-1)
+        return (self.cells(self.x) * self.after * self.unit).reshape(-1)

@@ -25,26 +25,21 @@ class Transfer:
     fine, coarse : Layout
     weights : array
         For each of the steps around a coarse cell a field of coarse cells: their weights on the fine cells there.
-    threads : int
     """
 
-    def __init__(self, fine, coarse, weights, threads):
-        self.fine, self.coarse, self.threads = fine, coarse, threads
-        self.weights = weights.reshape(3, -1, 3, weights[0].size)  # the loops have three axes
-
-    def _run(self, loop, layout, source, out):
-        loop = loop.single if out.dtype == np.float32 else loop
-        arrays = self.weights, source.reshape(-1), out.reshape(-1), self.fine.sizes, self.coarse.sizes
-        loop.run(layout.shape[0], self.fine.sizes[0] * self.fine.shape[0], self.threads, *arrays)
-        return out
+    def __init__(self, fine, coarse, weights):
+        self.fine, self.coarse, self.weights = fine, coarse, weights
+        self.pitches = np.array(steps_around(fine.dim)) @ fine.pitch
 
     def restrict(self, r, out):
         """out = P^T r; r has its ghost cells filled."""
-        return self._run(loops.restrict, self.coarse, r, out)
+        self.coarse.run(loops.restrict, self.weights, r, out, self.pitches, self.fine.sizes, self.coarse.sizes)
+        return out
 
     def prolong(self, e, x):
         """x += P e; e has its ghost cells filled."""
-        return self._run(loops.prolong, self.fine, e, x)
+        self.fine.run(loops.prolong, self.weights, e, x, self.fine.sizes, self.coarse.sizes)
+        return x
 
 
 def interpolated(level):

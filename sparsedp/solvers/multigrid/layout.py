@@ -26,6 +26,8 @@ class Layout:
     ----------
     shape : tuple of 2 or 3
     periodic : tuple of bool
+    threads : int
+        Of the loops.
 
     Attributes
     ----------
@@ -36,8 +38,8 @@ class Layout:
         where the first begins; cells of a line; which axes are periodic. In 2-D a plane is one line.
     """
 
-    def __init__(self, shape, periodic):
-        self.shape, self.periodic, self.dim = tuple(shape), tuple(periodic), len(shape)
+    def __init__(self, shape, periodic, threads=1):
+        self.shape, self.periodic, self.dim, self.threads = tuple(shape), tuple(periodic), len(shape), threads
         self.before = (GHOST,) + (1,) * (self.dim - 1)  # ghost cells of each axis
         self.padded = tuple(n + 2 * ghosts for n, ghosts in zip(self.shape, self.before))
         plane, width = int(np.prod(self.padded[1:])), self.padded[-1]
@@ -58,7 +60,7 @@ class Layout:
 
     def coarse(self):
         """The layout of the cells with even indices."""
-        return Layout([(n + 1) // 2 for n in self.shape], self.periodic)
+        return Layout([(n + 1) // 2 for n in self.shape], self.periodic, self.threads)
 
     def wrap(self, fields):
         """Fill the ghost cells of fields along periodic axes. The fields themselves."""
@@ -68,3 +70,9 @@ class Layout:
                 lines[:ghosts] = lines[ghosts + np.arange(-ghosts, 0) % n]
                 lines[ghosts + n :] = lines[ghosts + np.arange(ghosts) % n]
         return fields
+
+    def run(self, loop, *arguments):
+        """A loop over all planes, in single precision if one of its arrays is. Fields are long rows to it."""
+        loop = loop.single if any(getattr(given, "dtype", None) == np.float32 for given in arguments) else loop
+        rows = (a.reshape(*a.shape[: -self.dim], -1) if np.ndim(a) >= self.dim else a for a in arguments)
+        loop.run(self.shape[0], max(map(np.size, arguments)), self.threads, *rows)

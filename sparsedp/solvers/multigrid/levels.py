@@ -39,7 +39,6 @@ class Level:
         Cells of singular components, which nothing holds.
     dtype : float32 or float64
         Type of the cycle.
-    threads : int
 
     Attributes
     ----------
@@ -49,40 +48,37 @@ class Level:
         Root of the diagonal, and one over it; 0 where there is no unknown.
     coupling : array
         The links of the matrix scaled to a unit diagonal, in double precision.
+    sums : array
+        What the last product gave for each plane.
     bound : float
         Of the eigenvalues with a unit diagonal: each row has a disc of Gershgorin.
     weak_share : float
         Share of the cells that are held much weaker along one axis than along another; of few cells 0.
     """
 
-    def __init__(self, layout, steps, links, extra, free, dtype, threads):
-        self.layout, self.steps, self.dtype, self.threads = layout, steps, dtype, threads
-        self.links, self.free, self.extra = layout.wrap(links), free, np.where(free, 0.0, extra)
+    def __init__(self, layout, steps, links, extra, free, dtype):
+        self.layout, self.steps, self.dtype, self.sums = layout, steps, dtype, np.zeros(layout.shape[0])
+        self.links, self.free, self.extra = map(layout.wrap, (links, free, np.where(free, 0.0, extra)))
         self.pitches = np.array(steps) @ layout.pitch
         self.around, cells = dict(zip(steps, self.links)), layout.cells
         for step, link in zip(steps, self.links):
             back, other = tuple(-d for d in step), layout.zeros()
             cells(other)[...] = cells(link, back)
             self.around[back] = layout.wrap(other)
-        held = [cells(sum(a for step, a in self.around.items() if step[axis])) for axis in range(layout.dim)]
-        weak = np.min(held, axis=0) < WEAK * np.max(held, axis=0)
+        held = [sum(a for step, a in self.around.items() if step[axis]) for axis in range(layout.dim)]
+        weak = cells(np.min(held, axis=0) < WEAK * np.max(held, axis=0))
         self.weak_share = np.count_nonzero(weak) / weak.size if weak.size >= EXAMINED else 0.0
-        self.root, self.scale = layout.zeros(2)
-        cells(self.root)[...] = np.sqrt(np.maximum(cells(sum(self.around.values(), self.extra)), 0.0))
-        np.divide(1.0, self.root, out=self.scale, where=self.root > 0.0)
-        layout.wrap(self.root), layout.wrap(self.scale)
-        self.bound = 1.0 + float(np.max(cells(sum(map(abs, self.around.values())) * self.scale**2)))
-        coupling = layout.zeros(len(steps))
-        for out, link, step in zip(coupling, self.links, steps):
-            cells(out)[...] = cells(link) * cells(self.scale) * cells(self.scale, step)
-        self.coupling = layout.wrap(coupling).reshape(len(steps), -1)
+        self.root = np.sqrt(np.maximum(sum(self.around.values(), self.extra), 0.0))
+        self.scale = np.divide(1.0, self.root, out=layout.zeros(), where=self.root > 0.0)
+        self.bound = 1.0 + float(np.max(sum(map(abs, self.around.values())) * self.scale**2))
+        self.coupling = layout.zeros(len(steps))
+        for out, link, step in zip(cells(self.coupling), self.links, steps):
+            out[...] = cells(link) * cells(self.scale) * cells(self.scale, step)
+        layout.wrap(self.coupling)
 
-    def apply(self, x, out, sums=None):
+    def apply(self, x, out):
         """out = A x with a unit diagonal, in double precision; x has its ghost cells filled. x . out to sums."""
-        sums = np.zeros(self.layout.shape[0]) if sums is None else sums
-        image = loops.image.single if x.dtype == np.float32 else loops.image
-        arrays = self.coupling, x.reshape(-1), out.reshape(-1)
-        image.run(self.layout.shape[0], x.size, self.threads, *arrays, self.pitches, self.layout.sizes, sums)
+        self.layout.run(loops.image, self.coupling, x, out, self.pitches, self.layout.sizes, self.sums)
         return self.layout.wrap(out)
 
     def operator(self):
@@ -120,15 +116,15 @@ class Level:
         coarse.cells(nothing)[...] = (free > 0) & ~(tied > 0)
         for weight, step in zip(coarse.cells(weights), steps):
             weight *= layout.cells(self.root, step, 2)
-        transfer = Transfer(layout, coarse, coarse.wrap(weights), self.threads)
+        transfer = Transfer(layout, coarse, coarse.wrap(weights))
         # the image of the constant: of what P misses of it only, so that nothing is added up that cancels
         missing = self.root - transfer.prolong(np.ones(coarse.padded), layout.zeros())
         missing[np.abs(missing) <= CARRIED * self.root] = 0.0
         y = self.scale * self.extra - self.apply(layout.wrap(missing), layout.zeros())
         extra = transfer.restrict(layout.wrap(y), coarse.zeros())
         _without_negative(coarse, forward, links, nothing & (np.abs(extra) > ROUNDING * np.abs(links).sum(axis=0)))
-        level = Level(coarse, forward, links, extra, coarse.wrap(nothing), self.dtype, self.threads)
-        return level, Transfer(layout, coarse, (weights * level.scale).astype(self.dtype), self.threads)
+        level = Level(coarse, forward, links, extra, nothing, self.dtype)
+        return level, Transfer(layout, coarse, (weights * level.scale).astype(self.dtype))
 
     def _galerkin(self, coarse, weights):
         """The steps and links of P^T A P: for each pair of coarse cells the entries of fine cells around them."""
@@ -172,21 +168,19 @@ class Smoothed:
     below: Any
 
     def __init__(self, level):
-        self.layout, self.threads, self.pitches = level.layout, level.threads, level.pitches
+        self.layout, self.pitches = level.layout, level.pitches
         self.coupling = level.coupling.astype(level.dtype, copy=False)
         self.b, self.x, self.r = self.layout.zeros(3, dtype=level.dtype)
         self.sums = np.zeros(self.layout.shape[0])
         middle, radius = (level.largest() / 2.0) * (1.0 + np.array([1.0, -1.0]) / SMOOTHED)
         one, two = 1.0 / (middle + np.array([1.0, -1.0]) * np.sqrt(0.5) * radius)
         # x = two steps of damped Jacobi from zero, of which the first is a number times b; then its residual
-        self.down = np.array([(0.0, one + two - one * two, one * two), (-1.0, 1.0, 1.0)], level.dtype)
-        self.up = np.array([(1.0 - one, one, one), (1.0 - two, two, two)], level.dtype)
+        self.down = np.array([0.0, one + two - one * two, one * two, -1.0, 1.0, 1.0], level.dtype)
+        self.up = np.array([1.0 - one, one, one, 1.0 - two, two, two], level.dtype)
 
     def _smooth(self, x, between, out, factors):
-        smooth = loops.smooth.single if out.dtype == np.float32 else loops.smooth
-        arrays = (field.reshape(-1) for field in (x, self.b, between, out))
-        tables = factors, self.pitches, self.layout.sizes, self.sums
-        smooth.run(self.layout.shape[0], out.size, self.threads, self.coupling, *arrays, *tables)
+        fields, tables = (x, self.b, between, out), (factors, self.pitches, self.layout.sizes, self.sums)
+        self.layout.run(loops.smooth, self.coupling, *fields, *tables)
 
     def cycle(self):
         """x = what a V-cycle makes of b; b . x to sums."""

@@ -12,7 +12,7 @@ from numba import njit
 from sparsedp.kernels.team import kernel
 from sparsedp.solvers.multigrid.layout import GHOST
 
-__all__ = ["advance", "image", "prolong", "restrict", "smooth", "update"]
+__all__ = ["direct", "image", "prolong", "restrict", "smooth", "update"]
 
 TILE, WINDOW = 2048, 16384  # cells that are worked on together: what is written is in cache for what follows
 FAST = {"reassoc", "contract", "nsz"}  # a sum may be taken in any order; NaN and infinity stay what they are
@@ -33,28 +33,33 @@ def clear(out):
 
 
 @inner
-def add_two(out, a, x, b, y):
+def add(out, a, x, b, y):
     """out += a x + b y."""
     for k in range(out.size):
         out[k] += a[k] * x[k] + b[k] * y[k]
 
 
 @inner
-def add(out, a, x):
-    """out += a x."""
+def add_both(out, a, x, b, y, c, z, d, w):
+    """out += a x + b y + c z + d w."""
     for k in range(out.size):
-        out[k] += a[k] * x[k]
+        out[k] += (a[k] * x[k] + b[k] * y[k]) + (c[k] * z[k] + d[k] * w[k])
 
 
 @inner
 def neighbours(out, c, at, x, place, steps):
     """out = c x. Where its cells begin: `at` in c, `place` in x."""
-    n = out.size
+    n, odd = out.size, steps.size % 2
     clear(out)
-    for m in range(steps.size):
+    for m in range(odd):
         d = steps[m]
         forward, backward = c[m, at : at + n], c[m, at - d : at - d + n]
-        add_two(out, forward, x[place + d : place + d + n], backward, x[place - d : place - d + n])
+        add(out, forward, x[place + d : place + d + n], backward, x[place - d : place - d + n])
+    for m in range(odd, steps.size, 2):  # two at a time: the sums are read and written half as often
+        d, e = steps[m], steps[m + 1]
+        first, second, third, fourth = x[place + d :], x[place - d :], x[place + e :], x[place - e :]
+        forward, backward = c[m, at : at + n], c[m, at - d : at - d + n]
+        add_both(out, forward, first, backward, second, c[m + 1, at : at + n], third, c[m + 1, at - e :], fourth)
 
 
 @inner
@@ -119,26 +124,27 @@ def image(c, x, out, steps, sizes, sums, start, stop):
     add_up(sums, x, out, start, stop, sizes)
 
 
-@kernel("write1 ~write1 ~read1 ~read1 index1 real real")
-def advance(x, new, old, z, sizes, alpha, beta, start, stop):
-    """x += alpha old; new = z + beta old."""
+@kernel("~write1 ~read1 index1 real")
+def direct(p, z, sizes, beta, start, stop):
+    """p = z + beta p."""
     at, end = (GHOST + start) * sizes[0], (GHOST + stop) * sizes[0]
-    solution, row, past, given = x[at:end], new[at:end], old[at:end], z[at:end]
-    for k in range(end - at):
-        solution[k] += alpha * past[k]
-        row[k] = given[k] + beta * past[k]
-    fill(new, start, stop, sizes)
+    row, given = p[at:end], z[at:end]
+    for k in range(row.size):
+        row[k] = given[k] + beta * row[k]
+    fill(p, start, stop, sizes)
 
 
-@kernel("write1 read1 ~write1 ~read1 index1 write1 real", fastmath=FAST)
-def update(r, q, light, gauge, sizes, sums, alpha, start, stop):
-    """r -= alpha q, and the same in the precision of the cycle; the sum of (gauge r)^2 to sums."""
+@kernel("write1 ~read1 write1 read1 ~write1 ~read1 index1 write1 real", fastmath=FAST)
+def update(x, p, r, q, light, gauge, sizes, sums, alpha, start, stop):
+    """x += alpha p; r -= alpha q, and the same in the precision of the cycle; the sum of (gauge r)^2 to sums."""
     plane = sizes[0]
     for g in range(start, stop):
         at, total = (GHOST + g) * plane, 0.0
+        solution, direction = x[at : at + plane], p[at : at + plane]
         row, change = r[at : at + plane], q[at : at + plane]
         short, weight = light[at : at + plane], gauge[at : at + plane]
         for k in range(plane):
+            solution[k] += alpha * direction[k]
             value = row[k] - alpha * change[k]
             row[k] = value
             short[k] = value
@@ -161,9 +167,9 @@ def combined(out, there, n, c, at, x, place, b, steps, own, rest, share):
             row[i] = own * given[i] + rest * right[i] + share * row[i]
 
 
-@kernel("~read2 ~read1 ~read1 ~write1 ~write1 ~read2 index1 index1 write1")
+@kernel("~read2 ~read1 ~read1 ~write1 ~write1 ~read1 index1 index1 write1")
 def smooth(c, x, b, between, out, factors, steps, sizes, sums, start, stop):
-    """y = f x + g b + h c x, out = f y + g b + h c y with the two rows (f, g, h) of factors; b . out to sums.
+    """y = f x + g b + h c x, out = f y + g b + h c y with f, g, h twice in factors; b . out to sums.
 
     y is made one plane ahead, in a window that begins two planes before `first`, and kept if `between` has room.
     """
@@ -176,59 +182,55 @@ def smooth(c, x, b, between, out, factors, steps, sizes, sums, start, stop):
             begin = first + 1
             copy(y[plane : 3 * plane], y[(step + 1) * plane :])
         at, there, planes = (GHOST + begin) * plane, (begin - first + 2) * plane, last + 1 - begin
-        f, g, h = factors[0]
+        f, g, h = factors[:3]
         combined(y, there, planes * plane, c, at, x, at, b, steps, f, g, h)
         ghosts(y, there, planes, sizes)
         at, n = (GHOST + first) * plane, (last - first) * plane
         if between.size:
             copy(between[at : at + n], y[2 * plane :])
-        f, g, h = factors[1]
+        f, g, h = factors[3:]
         combined(out, at, n, c, at, y, 2 * plane, b, steps, f, g, h)
         add_up(sums, b, out, first, last, sizes)
     fill(out, start, stop, sizes)
 
 
-@kernel("~read4 ~read1 ~write1 index1 index1")
-def restrict(weights, r, out, fine, coarse, start, stop):
-    """out = the weighted sum of the fine cells around each coarse one.
-
-    Weights, by the steps along three axes (in 2-D there is none along the second), are fields of the coarse cells.
-    """
-    n, across = coarse[5], weights.shape[1] // 2
+@kernel("~read2 ~read1 ~write1 index1 index1 index1")
+def restrict(weights, r, out, steps, fine, coarse, start, stop):
+    """out = the weighted sum of the fine cells around each coarse one, which are that many steps away."""
+    n = coarse[5]
     for g in range(start, stop):
         for j in range(coarse[3]):
             at = (GHOST + g) * coarse[0] + coarse[4] + j * coarse[1] + 1
+            place = (GHOST + 2 * g) * fine[0] + fine[4] + 2 * j * fine[1] + 1
             row = out[at : at + n]
             clear(row)
-            for a in range(-1, 2):
-                for b in range(-across, across + 1):
-                    place = (GHOST + 2 * g + a) * fine[0] + fine[4] + (2 * j + b) * fine[1]
-                    for c in range(3):
-                        weight, values = weights[a + 1, b + across, c, at : at + n], r[place + c :]
-                        for k in range(n):
-                            row[k] += weight[k] * values[2 * k]
+            for m in range(steps.size):
+                weight, values = weights[m, at : at + n], r[place + steps[m] :]
+                for k in range(n):
+                    row[k] += weight[k] * values[2 * k]
     fill(out, start, stop, coarse)
 
 
-@kernel("~read4 ~read1 ~write1 index1 index1")
+@inner
+def spread(out, a, b, c, here, there):
+    """The transpose: each cell, and the one after it, to the cells of a finer line."""
+    for k in range(here.size):
+        out[2 * k] += b[k] * here[k]
+        out[2 * k + 1] += c[k] * here[k] + a[k] * there[k]
+
+
+@kernel("~read2 ~read1 ~write1 index1 index1")
 def prolong(weights, e, x, fine, coarse, start, stop):
     """x += the transpose of `restrict`. Between two coarse lines, or planes, a line takes from both."""
-    n, half, across = fine[5], coarse[5], weights.shape[1] // 2
-    even, odd = np.zeros(half, x.dtype), np.zeros(half, x.dtype)  # the cells of a line
+    half, rows = coarse[5], weights.shape[0] // 3
     for g in range(start, stop):
         for j in range(fine[3]):
-            clear(even)
-            clear(odd)
+            first = (GHOST + g) * fine[0] + fine[4] + j * fine[1] + 1
+            line = x[first : first + 2 * half]  # the last may be a ghost cell
             for a in range(g // 2, (g + 1) // 2 + 1):
                 for b in range(j // 2, (j + 1) // 2 + 1):
                     at = (GHOST + a) * coarse[0] + coarse[4] + b * coarse[1] + 1
-                    below, same, above = weights[g - 2 * a + 1, j - 2 * b + across]
-                    add(even, same[at : at + half], e[at : at + half])
-                    forward, backward = above[at : at + half], below[at + 1 : at + 1 + half]
-                    add_two(odd, forward, e[at : at + half], backward, e[at + 1 : at + 1 + half])
-            at = (GHOST + g) * fine[0] + fine[4] + j * fine[1] + 1
-            line = x[at : at + n + 1]  # the last may be a ghost cell
-            for k in range(half):
-                line[2 * k] += even[k]
-                line[2 * k + 1] += odd[k]
+                    m = (g - 2 * a + 1) * rows + (j - 2 * b + rows // 9) * 3
+                    same, above, below = weights[m + 1, at:], weights[m + 2, at:], weights[m, at + 1 :]
+                    spread(line, below, same, above, e[at : at + half], e[at + 1 :])
     fill(x, start, stop, fine)
