@@ -11,7 +11,7 @@ import numpy as np
 
 __all__ = ["empty"]
 
-LARGE = 1 << 22  # bytes: what is smaller, the C library itself keeps when it is freed, and hands out again as fast
+LARGE = 1 << 18  # bytes: what is smaller, the C library itself keeps when it is freed, and hands out again as fast
 SPARE = 1 << 30  # most bytes that wait for later results: a field of 256^3 cells and its faces take half of that
 
 

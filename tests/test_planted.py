@@ -248,8 +248,8 @@ BUGS = {
     ),
     "a departure point as far as the whole step at half of it": Bug(
         "advection",
-        "interpolant.trajectory(w, 0.5 * step)",
-        "interpolant.trajectory(w, step)",
+        "half_way = Trajectory(closed, w, 0.5 * step)",
+        "half_way = Trajectory(closed, w, step)",
         "tests/test_transport_lagrange.py",
     ),
     "a MacCormack step that adds all that it misses": Bug(

@@ -1,4 +1,4 @@
-"""With which velocity a point looks back to its departure point.
+"""From the velocity at the points to their departure points.
 
 With s = dt / spacing the departure point of point i is, in index coordinates,
 
@@ -7,61 +7,57 @@ With s = dt / spacing the departure point of point i is, in index coordinates,
 
 For euler the cotangent of m is that of w. For midpoint, with I the interpolation at i - (s / 2) w,
 
-    g_w = I^T g_m + (gradient of I w in w) g_m,    g_dt += (the second term) . w / dt.
+    g_w = I^T g_m + (gradient of I w in w) g_m.
+
+Everything depends on s w alone: the derivative in dt is that in w along w / dt.
 """
 
 import numpy as np
 
-from sparsedp.advection.interpolant import Interpolant, Pass
+from sparsedp.advection.interpolant import Pass
 
-__all__ = ["Euler", "Midpoint"]
+__all__ = ["Trajectory"]
 
 NONE = np.empty(0)
 
 
-class Euler:
-    """Departure points i - s w."""
+class Trajectory:
+    """Where the points of a component come from in a signed step along w, their velocities (axis, point).
 
-    def velocity(self, number, w, step):
-        """Velocity w at the points of component `number` -> the one used all along the step, m."""
-        return w
+    Parameters
+    ----------
+    component : Interpolant
+    w : array
+    step : float
+    closed : Interpolant, optional
+        Of the velocity half way (midpoint); None: points keep their own velocity (euler).
 
-    def vjp(self, number, w, step, g):
-        """Cotangent of m -> that of w; the part of it that comes from the departure points half way, or None."""
-        return g, None
+    Attributes
+    ----------
+    displacement : array, array
+        (axis, point), and a scale for each axis: the departure point is point - scale * displacement.
+    sides :
+        See `index_coordinates`.
+    """
 
-    def jvp(self, number, w, trajectory, dw, ddt):
-        """Tangents of w and, relative, of the step -> that of step m, over the step."""
-        return dw + ddt * w
+    def __init__(self, component, w, step, closed=None):
+        self.component, self.rows = component, []
+        if closed is not None:
+            half_way = Trajectory(closed, w, 0.5 * step)
+            self.rows = [Pass(half_way, row, NONE) for row in w]
+            w = np.stack([row.value() for row in self.rows])
+        *self.displacement, self.sides = component.coordinates.displacement(w, step)
 
-
-class Midpoint:
-    """Departure points i - s m, m being the velocity half way."""
-
-    def __init__(self, setting):
-        numbers = range(len(setting.space.parts))
-        self.interpolants = [Interpolant(setting, number, "linear", closed=True) for number in numbers]
-
-    def _half_way(self, number, w, step):
-        """For each component of w the pass to the departure points half way."""
-        interpolant = self.interpolants[number]
-        half = interpolant.trajectory(w, 0.5 * step)
-        return [Pass(interpolant, half, row, NONE) for row in w]
-
-    def velocity(self, number, w, step):
-        """See Euler."""
-        return np.stack([row.value() for row in self._half_way(number, w, step)])
-
-    def vjp(self, number, w, step, g):
-        """See Euler."""
-        direct, (bent, change) = np.empty_like(w), np.zeros((2, *w.shape))
-        for row, part, target in zip(self._half_way(number, w, step), g, direct, strict=True):
+    def vjp(self, g):
+        """Cotangent of the velocity used all along the step -> that of w, in its place."""
+        if not self.rows:
+            return
+        given, bent, change = g.copy(), np.zeros_like(g), np.empty_like(g)
+        for row, part, target in zip(self.rows, given, g, strict=True):
             row.vjp(part, (target, NONE), change)
             bent += change
-        return direct + bent, bent
+        g += bent
 
-    def jvp(self, number, w, trajectory, dw, ddt):
-        """See Euler."""
-        rows, dhalf = self._half_way(number, w, trajectory.step), dw + ddt * w
-        moved = [row.jvp(part, NONE, dhalf) for row, part in zip(rows, dw, strict=True)]
-        return np.stack(moved) + ddt * trajectory.velocity
+    def jvp(self, dw):
+        """Tangent of w -> that of the velocity used all along the step."""
+        return np.stack([row.jvp(dv, NONE, dw) for row, dv in zip(self.rows, dw, strict=True)]) if self.rows else dw

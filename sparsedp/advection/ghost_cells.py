@@ -10,45 +10,34 @@ from math import prod
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.conditions import neumann
+from sparsedp.advection.law import wall_space
+from sparsedp.conditions import dirichlet
 from sparsedp.kernels.departure import PAD
 from sparsedp.operators.stencils import cell_beside
 
-__all__ = ["filling", "sample_sources"]
+__all__ = ["filling", "ghost_origins"]
 
 
-def sample_sources(shape, sides, wall, closed):
-    """Where the field with ghost cells comes from: numbers of points, and after them of inflow values.
+def ghost_origins(setting, number, closed):
+    """The ghost cells of component `number`, and the sample that each repeats, as numbers of samples.
 
-    Parameters
-    ----------
-    shape : tuple
-        Of the field.
-    sides : sequence
-        For each axis the conditions of its two walls; None where it is periodic.
-    wall : int
-        The first inflow value of this field.
-    closed : bool
-        Go on with the nearest point at all walls.
+    After the samples of the field with its ghost cells stand the inflow values. `closed`: none of them is used.
     """
-    found = np.arange(prod(shape)).reshape(shape)
-    wall += found.size
+    shape, sides, walls = setting.space.parts[number], setting.sides, wall_space(setting)
+    places = [np.arange(-PAD, n + PAD) for n in shape]
+    nearest = [p.clip(0, n - 1) if pair else p % n for p, n, pair in zip(places, shape, sides, strict=True)]
+    samples = np.arange(prod(map(len, places))).reshape([*map(len, places)])
+    origins = samples[np.ix_(*(PAD + p for p in nearest))]
+    wall = number * sum(2 for pair in sides if pair)
     for axis, pair in enumerate(sides):
-        plate, beyond = tuple(1 if a == axis else n for a, n in enumerate(shape)), []
-        for side, condition in enumerate(pair or ()):
-            layer = np.take(found, [-side], axis)
-            if not closed and condition != neumann:
-                layer = wall + np.arange(prod(plate)).reshape(plate)
-                for earlier in range(axis):
-                    layer = _extended(layer, earlier, "wrap" if sides[earlier] is None else "edge")
-            wall += prod(plate)
-            beyond.append(np.repeat(layer, PAD, axis))
-        found = np.concatenate([beyond[0], found, beyond[1]], axis) if pair else _extended(found, axis, "wrap")
-    return found.ravel()
-
-
-def _extended(numbers, axis, mode):
-    return np.pad(numbers, [(PAD, PAD) if a == axis else (0, 0) for a in range(numbers.ndim)], mode)
+        for beyond, condition in zip((slice(PAD), slice(-PAD, None)), pair or ()):
+            if condition == dirichlet and not closed:
+                values = samples.size + np.arange(*walls.offsets[wall : wall + 2]).reshape(walls.parts[wall])
+                along = [*nearest[:axis], [0], *nearest[axis + 1 :]]
+                origins[(slice(None),) * axis + (beyond,)] = values[np.ix_(*along)]
+            wall += 1
+    ghosts = np.flatnonzero(origins != samples)
+    return ghosts, origins.ravel()[ghosts]
 
 
 def filling(grid, solid):

@@ -14,46 +14,46 @@ Beyond a wall the points go on at the distance of the width of the last cell.
 
 import numpy as np
 
-__all__ = ["Stretched", "Uniform"]
+from sparsedp import results
+
+__all__ = ["Coordinates"]
 
 LAYERS = 4  # points beyond each end
 STEEPEST = 5.0  # ratio of neighbouring distances up to which a Catmull-Rom curve is monotone
-NEWTON = 50  # steps at most; about four are needed
+NEWTON = 50  # steps at most; about five are needed
+BLOCK = 1 << 13  # points at a time: what is made on the way stays in the cache
+EPS = np.finfo(float).eps
 
 
-class Uniform:
-    """Cells of equal width along each axis."""
-
-    def __init__(self, grid):
-        self.rates = np.array([1.0 / float(h[0]) for h in grid.widths])
-
-    def displacement(self, m, step):
-        """Velocities (axis, point), signed step -> d, its scale, and the derivative of d in m above and below: 1."""
-        return m, self.rates * step, None
-
-
-class Stretched:
-    """Cells of any width, for component `number` of the field."""
+class Coordinates:
+    """Index coordinates of component `number` of a field."""
 
     def __init__(self, setting, number, interpolation):
-        grid, self.shape = setting.grid, setting.space.parts[number]
-        self.lines = []
-        for axis, h in enumerate(grid.widths):
-            nodes = np.concatenate([[0.0], np.cumsum(h)])
-            period = nodes[-1] if grid.periodic[axis] else None
-            if setting.of == "faces" and number == axis:
-                positions = nodes if period is None else nodes[:-1]
-            else:
-                positions = nodes[:-1] + 0.5 * h
-            self.lines.append(Line(positions, h, period, setting.scheme if interpolation == "cubic" else None))
+        grid, self.shape, self.lines = setting.grid, setting.space.parts[number], []
+        self.rates = np.array([1.0 / float(h[0]) for h in grid.widths])
+        for axis, h in enumerate(() if all(grid.uniform) else grid.widths):
+            on_faces, periodic = setting.of == "faces" and number == axis, grid.periodic[axis]
+            gaps = h if on_faces else 0.5 * (h + np.roll(h, -1))[: h.size - (not periodic)]
+            ends = dict(mode="wrap") if periodic else dict(constant_values=(h[0], h[-1]))
+            gaps = np.pad(gaps, LAYERS, **ends)
+            if interpolation == "cubic":
+                _check_monotone(setting.scheme, gaps)
+            self.lines.append(Line(gaps, h.size if periodic else None, interpolation == "cubic"))
 
     def displacement(self, m, step):
-        """See Uniform."""
-        d, above, below = np.empty((3, *m.shape))
-        for axis, (line, index) in enumerate(zip(self.lines, np.indices(self.shape).reshape(m.shape), strict=True)):
-            q, up, down = line.index(line.positions[index] - step * m[axis])
-            d[axis], above[axis], below[axis] = index - q, step * up, step * down
-        return d, np.ones(len(m)), (above, below)
+        """Velocities (axis, point), signed step -> d, its scale, the derivative of d in m.
+
+        On cells of equal width that is 1: (). Else one, or two where it may jump: above and below.
+        """
+        if not self.lines:
+            return m, self.rates * step, ()
+        found = results.empty((2 if self.lines[0].cubic else 3, *m.shape), float)
+        for start in range(0, m.shape[1], BLOCK):
+            some = np.arange(start, min(start + BLOCK, m.shape[1]))
+            for axis, (line, points) in enumerate(zip(self.lines, np.unravel_index(some, self.shape), strict=True)):
+                q, *slopes = line.index(line.knots[LAYERS + points] - step * m[axis, some])
+                found[:, axis, some] = points - q, *(step * slope for slope in slopes)
+        return found[0], np.ones(len(m)), found[1:]
 
 
 class Line:
@@ -61,42 +61,33 @@ class Line:
 
     Parameters
     ----------
-    positions : array
-    widths : array
-        Of the cells; those at the ends are the distances further out.
-    period : float or None
-    scheme : str or None
-        The scheme that asks for the cubic curve of Catmull and Rom through the points; None: straight lines.
+    gaps : array
+        Distances between the points, LAYERS beyond each end included.
+    turn : int or None
+        Points in a period.
+    cubic : bool
+        Whether the position between the points is the curve of Catmull and Rom; else straight lines.
     """
 
-    def __init__(self, positions, widths, period, scheme):
-        self.positions, self.period = positions, period
-        if period is None:
-            far = np.arange(1, LAYERS + 1)
-            before, after = positions[0] - far[::-1] * widths[0], positions[-1] + far * widths[-1]
-            self.knots = np.concatenate([before, positions, after])
-        else:
-            turn = np.arange(-LAYERS, positions.size + LAYERS)
-            self.knots = positions[turn % positions.size] + period * (turn // positions.size)
-        self.gaps = np.diff(self.knots)
-        self.first = self.last = self.gaps  # slopes of the position at both ends of a gap
-        if scheme is not None:
-            _check_monotone(scheme, self.gaps)
-            tangents = np.gradient(self.knots)
-            self.first, self.last = tangents[:-1], tangents[1:]
+    def __init__(self, gaps, turn, cubic):
+        self.knots, self.gaps, self.turn, self.cubic = np.concatenate([[0.0], np.cumsum(gaps)]), gaps, turn, cubic
+        self.tangents = np.gradient(self.knots)  # slopes of the cubic at the points
 
     def index(self, x):
-        """Places -> index coordinates, and their slopes in x above and below."""
-        turns = 0.0
-        if self.period is None:
-            x = np.clip(x, self.knots[0], self.knots[-1])
+        """Places -> index coordinates, and their slopes in x: one, or two where it may jump, above and below."""
+        if self.turn is None:
+            x, turns = np.clip(x, self.knots[0], self.knots[-1]), 0
         else:
-            turns = np.floor((x - self.positions[0]) / self.period)
-            x = x - turns * self.period
-        cell = np.clip(np.searchsorted(self.knots, x, "right") - 1, 0, self.gaps.size - 1)
-        part, above = _inverse(x - self.knots[cell], self.gaps[cell], self.first[cell], self.last[cell])
-        below = np.where(part == 0, 1.0 / self.last[np.maximum(cell - 1, 0)], above)
-        return cell - LAYERS + part + turns * self.positions.size, above, below
+            start, end = self.knots[[LAYERS, LAYERS + self.turn]]
+            turns = np.floor((x - start) / (end - start))
+            x, turns = x - turns * (end - start), turns * self.turn
+        gap = np.minimum(np.searchsorted(self.knots, x, "right") - 1, self.gaps.size - 1)
+        aim, width, number = x - self.knots[gap], self.gaps[gap], gap - LAYERS + turns
+        if self.cubic:
+            part, slope = _inverse(aim, width, self.tangents[gap], self.tangents[gap + 1])
+            return number + part, slope
+        below = np.where(aim == 0, self.gaps[np.maximum(gap - 1, 0)], width)
+        return number + aim / width, 1.0 / width, 1.0 / below
 
 
 def _check_monotone(scheme, gaps):
@@ -111,19 +102,16 @@ def _check_monotone(scheme, gaps):
 def _inverse(aim, gap, first, last):
     """t where the cubic with the ends 0, gap and the slopes first, last is aim, and the slope of t there.
 
-    Newton's method on a cubic that grows with t; bisection where a step leads out of the bracket.
+    Newton's method on a cubic that grows with t. It starts where the cubic is straight, and from there on it is bent to
+    one side only: the steps overshoot once at most, so that the ends of the gap are all the bounds they need.
     """
     square, cube = 3 * gap - 2 * first - last, first + last - 2 * gap
-    slope = lambda t: (3 * cube * t + 2 * square) * t + first
-    t, low, high = aim / gap, np.zeros_like(aim), np.ones_like(aim)
+    slope = lambda t: np.maximum((3 * cube * t + 2 * square) * t + first, EPS * gap)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.fmin(np.fmax(-square / (3 * cube), 0.0), 1.0)  # 0 also where the cubic is a straight line
     for _ in range(NEWTON):
-        miss = ((cube * t + square) * t + first) * t - aim
-        low, high = np.where(miss <= 0, t, low), np.where(miss >= 0, t, high)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            new = t - miss / slope(t)
-        new = np.where((new >= low) & (new <= high), new, 0.5 * (low + high))
-        done = np.all(np.abs(new - t) <= 4 * np.finfo(float).eps)
-        t = new
-        if done:
+        before = t
+        t = np.clip(t - (((cube * t + square) * t + first) * t - aim) / slope(t), 0.0, 1.0)
+        if np.all(np.abs(t - before) <= 4 * EPS):
             break
     return t, 1.0 / slope(t)

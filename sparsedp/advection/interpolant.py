@@ -1,32 +1,21 @@
 """One component of a field between its points: padded, interpolated at departure points, and back."""
 
 from functools import cached_property
-from math import prod
-from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.advection.ghost_cells import filling, sample_sources
-from sparsedp.advection.index_coordinates import Stretched, Uniform
+from sparsedp import results
+from sparsedp.advection.ghost_cells import filling, ghost_origins
+from sparsedp.advection.index_coordinates import Coordinates
 from sparsedp.kernels import departure
 from sparsedp.kernels.departure import PAD
 
-__all__ = ["Interpolant", "Pass", "Trajectory"]
-
-
-class Trajectory(NamedTuple):
-    """Where the points of a component go in a signed step."""
-
-    velocity: Any  # (axis, point), used all along the step
-    step: float
-    displacement: Any  # (axis, point): the departure point is, in index coordinates, point - scale * displacement
-    scale: Any  # one number for each axis
-    slopes: Any  # derivative of the displacement in the velocity, above and below; None: 1
+__all__ = ["Interpolant", "Pass"]
 
 
 class Interpolant:
-    """Component `number` of a field: linear or cubic; `closed`: walls repeat the nearest value, nothing flows in.
+    """Component `number` of a field: linear or cubic; `closed`: linear, and walls repeat the nearest value.
 
     Attributes
     ----------
@@ -34,19 +23,14 @@ class Interpolant:
         Where the component stands in the flat field.
     """
 
-    def __init__(self, setting, number, interpolation, closed=False):
-        shapes, grid, sides = setting.space.parts, setting.grid, setting.sides
-        self.setting, self.closed = setting, closed
-        self.span = slice(*setting.space.offsets[number : number + 2])
-        wall = sum(2 * prod(s) // n for s in shapes[:number] for n, pair in zip(s, sides, strict=True) if pair)
-        self.points = departure.Points.of(shapes[number], grid.periodic, interpolation)
+    def __init__(self, setting, number, closed=False):
+        interpolation = "linear" if closed else setting.interpolation
+        self.setting, self.span = setting, slice(*setting.space.offsets[number : number + 2])
+        self.points = departure.Points.of(setting.space.parts[number], setting.grid.periodic, interpolation)
         self.inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
-        self.sources = sample_sources(shapes[number], sides, wall, closed)
-        outside = np.flatnonzero(np.pad(np.zeros(shapes[number], bool), PAD, constant_values=True))
-        inflow = self.sources[outside] >= self.points.size
-        self.copies, self.plates = outside[~inflow], outside[inflow]
-        self.copied, self.entering = self.sources[self.copies], self.sources[self.plates] - self.points.size
-        self.coordinates = Uniform(grid) if all(grid.uniform) else Stretched(setting, number, interpolation)
+        self.ghosts, self.origins = ghost_origins(setting, number, closed)
+        self.coordinates = Coordinates(setting, number, interpolation)
+        self.filled = not closed and setting.of == "cells" and setting.solid is not None
 
     @cached_property
     def fill(self):
@@ -54,104 +38,90 @@ class Interpolant:
 
         Faces that touch a solid keep their value and lend it to others.
         """
-        if self.setting.of == "faces" or self.setting.solid is None or self.closed:
+        if not self.filled:
             return None
         forward = filling(self.setting.grid, self.setting.solid)
         return forward, sp.csr_array(forward.T)
 
-    def trajectory(self, velocity, step):
-        """Velocities (axis, point), signed step -> Trajectory."""
-        return Trajectory(velocity, step, *self.coordinates.displacement(velocity, step))
-
-    def pad(self, u, inflow, room=np.empty):
-        """Component, inflow values -> samples: the field with its ghost cells."""
-        u, samples = u if self.fill is None else self.fill[0] @ u, room(self.points.samples)
-        samples.reshape(self.points.padded)[self.inside] = u.reshape(self.points.shape)
-        samples[self.copies] = u[self.copied]
-        samples[self.plates] = inflow[self.entering]
+    def pad(self, u, inflow):
+        """Component, inflow values -> samples: the field with its ghost cells, and after them the inflow values."""
+        cells = self.points.samples
+        samples = results.empty((cells + inflow.size,), float)
+        samples[:cells].reshape(self.points.padded)[self.inside] = u.reshape(self.points.shape)
+        samples[cells:] = inflow
+        samples[self.ghosts] = samples[self.origins]
         return samples
 
     def pad_vjp(self, samples, of_u, of_inflow):
-        """Cotangent of samples -> written to of_u, added to of_inflow."""
-        of_u.reshape(self.points.shape)[...] = samples.reshape(self.points.padded)[self.inside]
-        np.add.at(of_u, self.copied, samples[self.copies])
-        np.add.at(of_inflow, self.entering, samples[self.plates])
+        """Cotangent of samples, which is used up -> written to of_u, added to of_inflow."""
+        cells = self.points.samples
+        np.add.at(samples, self.origins, samples[self.ghosts])
+        of_u.reshape(self.points.shape)[...] = samples[:cells].reshape(self.points.padded)[self.inside]
+        of_inflow += samples[cells:]
+
+    def matrix(self, trajectory, walls):
+        """The values of a `Pass` as a csr_array in the component, without its inflow values, `walls` in number."""
+        n, cells = self.points.size, self.points.samples
+        sources = self.pad(np.arange(n), np.full(walls, n))[:cells].astype(int)
+        copies = sp.csr_array((np.ones(cells), sources, np.arange(cells + 1)), (cells, n + 1))[:, :n]
         if self.fill is not None:
-            of_u[:] = self.fill[1] @ of_u
-
-    def gradient(self, samples, trajectory, g, out):
-        """g times the derivative of `gather` in the velocity of the trajectory -> out (axis, point)."""
-        _, _, d, scale, slopes = trajectory
-        departure.gradient(self.points, samples, d, scale, g, out)
-        if slopes is None:
-            return out
-        above, below = slopes
-        kinks = above != below
-        if not kinks.any():
-            return np.multiply(out, above, out=out)
-        nudge = np.where(kinks, 32 * np.finfo(float).eps * max(self.points.shape), 0.0)
-        upper, lower = (
-            departure.gradient(self.points, samples, d + way * nudge, scale, g, np.empty_like(out)) for way in (-1, 1)
-        )
-        return np.multiply(0.5, above * upper + below * lower, out=out)
-
-    def matrix(self, trajectory):
-        """`gather` after `pad` as a csr_array in the component, without inflow."""
-        n = self.points.size
-        found = sp.csr_array((n, n))
-        for index, weight in departure.entries(self.points, trajectory.displacement, trajectory.scale):
-            columns = self.sources[index]
-            weight = np.where(columns < n, weight, 0.0)
-            found = found + sp.csr_array((weight, np.minimum(columns, n - 1), np.arange(n + 1)), (n, n))
-        return found if self.fill is None else found @ self.fill[0]
+            copies = copies @ self.fill[0]
+        entries = departure.entries(self.points, *trajectory.displacement)
+        return sum(sp.csr_array((weight, index, np.arange(n + 1)), (n, cells)) for index, weight in entries) @ copies
 
 
 class Pass:
-    """A component between its points, at the departure points of a trajectory, and the derivatives of that.
+    """A component of a field at the departure points of a trajectory, and the derivatives of that."""
 
-    Parameters
-    ----------
-    interpolant : Interpolant
-    trajectory : Trajectory
-    u, inflow : array
-    room : function
-        Size -> array.
-    """
-
-    def __init__(self, interpolant, trajectory, u, inflow, room=np.empty):
-        self.interpolant, self.trajectory, self.given, self.room = interpolant, trajectory, (u, inflow), room
-        self.places = trajectory.displacement, trajectory.scale
+    def __init__(self, trajectory, u, inflow):
+        self.trajectory, self.component, self.given = trajectory, trajectory.component, (u, inflow)
+        self.points, self.displacement = self.component.points, trajectory.displacement
 
     @cached_property
     def samples(self):
         """The component with its ghost cells."""
-        return self.interpolant.pad(*self.given, self.room)
+        (u, inflow), fill = self.given, self.component.fill
+        return self.component.pad(u if fill is None else fill[0] @ u, inflow)
 
     def value(self, out=None, bounds=departure.NO_BOUNDS):
         """Values at the departure points; least and greatest sample of the cells around them -> bounds."""
-        points = self.interpolant.points
-        out = self.room(points.size) if out is None else out
-        return departure.gather(points, self.samples, *self.places, out, bounds)
+        out = results.empty((self.points.size,), float) if out is None else out
+        return departure.gather(self.points, self.samples, *self.displacement, out, bounds)
 
-    def vjp(self, g, into, speed, clamped=None):
+    def vjp(self, g, into, of_w, clamped=None):
         """Cotangent of the values -> that of u is written, that of inflow added to the pair `into`.
 
-        That of the velocity is written to `speed`; None leaves a part out. `clamped`: samples, and their cotangents.
+        That of the velocity is written to `of_w`; None leaves a part out. `clamped`: samples, and their cotangents.
         """
         if into is not None:
-            points = self.interpolant.points
-            samples = self.room(points.samples)
+            samples = results.empty((self.points.samples + into[1].size,), float)
             samples[:] = 0.0
             if clamped is not None:
                 np.add.at(samples, *clamped)
-            self.interpolant.pad_vjp(departure.scatter(points, *self.places, g, samples), *into)
-        if speed is not None:
-            self.interpolant.gradient(self.samples, self.trajectory, g, speed)
+            self.component.pad_vjp(departure.scatter(self.points, *self.displacement, g, samples), *into)
+            if self.component.fill is not None:
+                into[0][:] = self.component.fill[1] @ into[0]
+        if of_w is not None:
+            self.trajectory.vjp(self.slopes(g, of_w))
 
-    def jvp(self, du, dinflow, dm):
+    def slopes(self, g, out):
+        """g times the derivative of the values in the velocity all along the trajectory -> out (axis, point)."""
+        (displacement, scale), sides = self.displacement, self.trajectory.sides
+        if not len(sides):
+            return departure.gradient(self.points, self.samples, displacement, scale, g, out)
+        nudge = 32 * np.finfo(float).eps * max(self.points.shape) * (sides[0] != sides[-1])  # to the side that is meant
+        each = (
+            slope
+            * departure.gradient(
+                self.points, self.samples, displacement + shift, scale, g, results.empty(out.shape, float)
+            )
+            for slope, shift in zip(sides, (-nudge, nudge))
+        )
+        return np.divide(sum(each), len(sides), out=out)
+
+    def jvp(self, du, dinflow, dw):
         """Tangents of u, of inflow and of the velocity (or None) -> that of the values."""
-        total = Pass(self.interpolant, self.trajectory, du, dinflow).value()
-        if dm is None:
+        total = Pass(self.trajectory, du, dinflow).value()
+        if dw is None:
             return total
-        slopes = self.interpolant.gradient(self.samples, self.trajectory, np.ones(total.size), np.empty(dm.shape))
-        return total + np.sum(slopes * dm, axis=0)
+        return total + np.sum(self.slopes(np.ones(total.size), np.empty(dw.shape)) * self.trajectory.jvp(dw), axis=0)

@@ -14,6 +14,8 @@ Source: A. Selle, R. Fedkiw, B. Kim, Y. Liu, J. Rossignac, J. Scientific Computi
 
 import numpy as np
 
+from sparsedp import results
+from sparsedp.advection.interpolant import Pass
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.kernels import departure
 
@@ -29,64 +31,57 @@ class MacCormack(SemiLagrangian):
     linear = False
     signs = (1, -1)
 
-    def __init__(self, setting):
-        super().__init__(setting)
-        self.clamped = setting.clamp
-
-    def _stages(self, part):
+    def _stages(self, trajectories, u, inflow):
         """Both passes, the value before it is clamped, least and greatest sample of u (if they count)."""
-        n, first = part.u.size, part.look()
-        bounds = part.room(2 * n).reshape(2, n) if self.clamped else departure.NO_BOUNDS
+        back, ahead = trajectories
+        first = Pass(back, u, inflow)
+        bounds = results.empty((2, u.size), float) if self.setting.clamp else departure.NO_BOUNDS
         f = first.value(bounds=bounds)
-        second = part.look(1, f)
+        second = Pass(ahead, f, inflow)
         new = second.value()
-        for start in range(0, n, BLOCK):
+        for start in range(0, u.size, BLOCK):
             some = slice(start, start + BLOCK)
-            new[some] = f[some] + 0.5 * (part.u[some] - new[some])
+            new[some] = f[some] + 0.5 * (u[some] - new[some])
         return first, second, new, bounds
 
-    def _clamps(self, part, first, new, bounds):
+    def _clamps(self, first, new, bounds):
         """Points where the clamp acts: which, the share of the value that stays, samples and shares of the bounds."""
         some = np.flatnonzero((new <= bounds[0]) | (new >= bounds[1]))
         (low, high), value = bounds[:, some], new[some]
-        below, above = _step(low, value), _step(value, high)
-        points, (displacement, scale) = part.component.points, first.places
-        index, least, greatest = departure.bound_shares(points, first.samples, displacement, scale, some)
+        below, above = np.heaviside(low - value, 0.5), np.heaviside(value - high, 0.5)
+        index, least, greatest = departure.bound_shares(first.points, first.samples, *first.displacement, some)
         return some, 1.0 - below - above, index, least * below + greatest * above
 
-    def advect(self, part, out):
+    def advect(self, trajectories, u, inflow, out):
         """See the base class."""
-        *_, new, bounds = self._stages(part)
-        np.clip(new, *(bounds if self.clamped else (-np.inf, np.inf)), out=out)
+        *_, new, bounds = self._stages(trajectories, u, inflow)
+        np.clip(new, *(bounds if self.setting.clamp else (-np.inf, np.inf)), out=out)
 
-    def advect_vjp(self, part, g, into, speeds):
+    def advect_vjp(self, trajectories, u, inflow, g, into, of_w):
         """See the base class."""
-        (first, second, new, bounds), clamped = self._stages(part), None
-        own, of_f = part.room(g.size), part.room(g.size)
-        of_inflow = into[1] if into else part.inflow.copy()
+        (first, second, new, bounds), clamped = self._stages(trajectories, u, inflow), None
+        own, of_f = results.empty(g.shape, float), results.empty(g.shape, float)
         own[:] = g
-        if self.clamped:
-            some, free, index, shares = self._clamps(part, first, new, bounds)
+        if self.setting.clamp:
+            some, free, index, shares = self._clamps(first, new, bounds)
             own[some] *= free
             clamped = index, shares * g[some]
-        of_b = np.multiply(-0.5, own, out=new)
-        second.vjp(of_b, (of_f, of_inflow), speeds[1])
+        of_b, ahead = np.multiply(-0.5, own, out=new), None if of_w is None else results.empty(of_w.shape, float)
+        second.vjp(of_b, (of_f, into[1] if into else np.zeros(inflow.size)), ahead)
         of_f += own
-        first.vjp(of_f, into, speeds[0], clamped)
+        first.vjp(of_f, into, of_w, clamped)
         if into is not None:
             np.subtract(into[0], of_b, out=into[0])
+        if ahead is not None:
+            of_w += ahead
 
-    def advect_jvp(self, part, du, dinflow, dm):
+    def advect_jvp(self, trajectories, u, inflow, du, dinflow, dw):
         """See the base class."""
-        first, second, new, bounds = self._stages(part)
-        df = first.jvp(du, dinflow, dm[0])
-        total = df + 0.5 * (du - second.jvp(df, dinflow, dm[1]))
-        if self.clamped:
-            some, free, index, shares = self._clamps(part, first, new, bounds)
-            total[some] = free * total[some] + np.sum(shares * part.component.pad(du, dinflow)[index], axis=0)
+        first, second, new, bounds = self._stages(trajectories, u, inflow)
+        df = first.jvp(du, dinflow, dw)
+        total = df + 0.5 * (du - second.jvp(df, dinflow, dw))
+        if self.setting.clamp:
+            some, free, index, shares = self._clamps(first, new, bounds)
+            samples = Pass(first.trajectory, du, dinflow).samples
+            total[some] = free * total[some] + np.sum(shares * samples[index], axis=0)
         return total
-
-
-def _step(a, b):
-    """1, 1/2, 0 where a > b, a = b, a < b."""
-    return 0.5 * (a > b) + 0.5 * (a >= b)
