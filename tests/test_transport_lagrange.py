@@ -157,14 +157,15 @@ def test_loops_against_the_matrix_and_nothing_is_read_beside_the_samples(shape, 
     ]:
         value, slope = _dense(points, w, scale), [_dense(points, w, scale, axis) for axis in axes]
         close = dict(rtol=1e-13, atol=1e-13)
-        np.testing.assert_allclose(departure.gather(points, samples, w, scale, np.empty(n)), value @ samples, **close)
+        found = departure.interpolate(points, samples, w, scale, np.empty(n))
+        np.testing.assert_allclose(found, value @ samples, **close)
         back = departure.scatter(points, w, scale, g, np.zeros(points.samples))
         np.testing.assert_allclose(back, value.T @ g, **close)
-        steep = departure.gradient(points, samples, w, scale, g, np.empty(w.shape))
+        steep = departure.interpolate(points, samples, w, scale, np.empty(w.shape), g)
         for axis in axes:
             np.testing.assert_allclose(steep[axis], -scale[axis] * g * (slope[axis] @ samples), **close)
         low, high = bounds = np.empty((2, n))
-        departure.gather(points, samples, w, scale, np.empty(n), bounds)
+        departure.interpolate(points, samples, w, scale, np.empty(n), bounds=bounds)
         assert np.isfinite([low, high]).all() and (low <= high).all()
         corners, *shares = departure.bound_shares(points, samples, w, scale, np.arange(n))
         for share, bound in zip(shares, (low, high)):

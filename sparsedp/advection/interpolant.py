@@ -86,7 +86,7 @@ class Pass:
     def value(self, out=None, bounds=departure.NO_BOUNDS):
         """Values at the departure points; least and greatest sample of the cells around them -> bounds."""
         out = results.empty((self.points.size,), float) if out is None else out
-        return departure.gather(self.points, self.samples, *self.displacement, out, bounds)
+        return departure.interpolate(self.points, self.samples, *self.displacement, out, bounds=bounds)
 
     def vjp(self, g, into, of_w, clamped=None):
         """Cotangent of the values -> that of u is written, that of inflow added to the pair `into`.
@@ -108,16 +108,13 @@ class Pass:
         """g times the derivative of the values in the velocity all along the trajectory -> out (axis, point)."""
         (displacement, scale), sides = self.displacement, self.trajectory.sides
         if not len(sides):
-            return departure.gradient(self.points, self.samples, displacement, scale, g, out)
+            return departure.interpolate(self.points, self.samples, displacement, scale, out, g)
         nudge = 32 * np.finfo(float).eps * max(self.points.shape) * (sides[0] != sides[-1])  # to the side that is meant
-        each = (
-            slope
-            * departure.gradient(
-                self.points, self.samples, displacement + shift, scale, g, results.empty(out.shape, float)
-            )
-            for slope, shift in zip(sides, (-nudge, nudge))
-        )
-        return np.divide(sum(each), len(sides), out=out)
+        total = 0.0
+        for slope, shift in zip(sides, (-nudge, nudge)):
+            found = results.empty(out.shape, float)
+            total += slope * departure.interpolate(self.points, self.samples, displacement + shift, scale, found, g)
+        return np.divide(total, len(sides), out=out)
 
     def jvp(self, du, dinflow, dw):
         """Tangents of u, of inflow and of the velocity (or None) -> that of the values."""

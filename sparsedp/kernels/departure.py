@@ -17,7 +17,7 @@ import numpy as np
 
 from sparsedp import kernels
 
-__all__ = ["NO_BOUNDS", "PAD", "TILE", "Points", "bound_shares", "entries", "gather", "gradient", "scatter"]
+__all__ = ["NO_BOUNDS", "PAD", "TILE", "Points", "bound_shares", "entries", "interpolate", "scatter"]
 
 PAD = 3  # what cubic interpolation reads beyond the clamped departure points
 TILE = 256  # points; up to 24 rows of 2 KB are in use at a time, which fits the L1 cache with what is read
@@ -46,23 +46,23 @@ class Points(NamedTuple):
     padded: tuple  # the shape with ghost cells
     size: int  # number of points
     samples: int  # number of points and ghost cells
-    # for each axis: points, stride, samples before the first stencil, ends of the places, last cell, periodic
-    axes: Any
-    reach: Any  # for each of three axes: stride, and which of the four samples count, from and to
+    axes: Any  # for each of three axes: points, stride, periodic, which of the four samples count, from and to
     weights: Any  # a table of the value and one of the slope
 
     @classmethod
     def of(cls, shape, periodic, interpolation):
         """Shape, whether each axis is periodic, linear or cubic -> Points."""
-        padded = tuple(n + 2 * PAD for n in shape)
-        axes, reach = [], [(0, 1, 2)] * (3 - len(shape))
-        beyond, used = (1.5, (1, 3)) if interpolation == "linear" else (2.0, (0, 4))
-        for axis, (n, wraps) in enumerate(zip(shape, periodic, strict=True)):
-            stride, ends = prod(padded[axis + 1 :]), (0, n) if wraps else (-beyond, n - 1 + beyond)
-            axes.append((n, stride, PAD - 1, *ends, n, wraps))
-            reach.append((stride, *used))
-        tables = np.array(axes, float), np.array(reach), np.array(WEIGHTS[interpolation], float)
-        return cls(tuple(shape), padded, prod(shape), prod(padded), *tables)
+        padded, used = tuple(n + 2 * PAD for n in shape), (1, 3) if interpolation == "linear" else (0, 4)
+        strides = [prod(padded[axis + 1 :]) for axis in range(len(shape))]
+        axes = [(n, stride, wraps, *used) for n, stride, wraps in zip(shape, strides, periodic, strict=True)]
+        axes = [(1, 0, 0, 1, 2)] * (3 - len(shape)) + axes
+        weights = np.array(WEIGHTS[interpolation], float)
+        return cls(tuple(shape), padded, prod(shape), prod(padded), np.array(axes), weights)
+
+    @property
+    def strides(self):
+        """Of the axes that there are."""
+        return self.axes[-len(self.shape) :, 1]
 
 
 def _run(name, points, threads, *args):
@@ -70,62 +70,59 @@ def _run(name, points, threads, *args):
     return kernels.run("interpolation", name, -(-points.size // TILE), points.size << len(points.shape), threads, *args)
 
 
-def _depart(points, w, scale, some=None):
+def _cells(points, w, scale, some=slice(None)):
     """Departure points (of some points) -> first samples of their stencils, fractions of a cell (axis, point)."""
-    some = np.arange(points.size) if some is None else some
-    n, stride, before, low, high, last, periodic = points.axes.T[:, :, None]
-    place = np.unravel_index(some, points.shape) - scale[:, None] * w[:, some]
+    n, stride, periodic = points.axes[-len(w) :, :3].T[:, :, None]
+    place = np.unravel_index(np.arange(points.size)[some], points.shape) - scale[:, None] * w[:, some]
     with np.errstate(invalid="ignore"):
-        place = np.where(periodic != 0, place - n * np.floor(place / n), place)
-        place = np.minimum(np.where(place >= low, place, low), high)  # NaN goes to the lower end
-    cell = np.minimum(np.floor(place), last)
-    return np.sum(stride * (cell + before), axis=0), place - cell
+        place = np.where(periodic, place - n * np.floor(place / n), place)
+        place = np.minimum(np.where(place >= 1 - PAD, place, 1 - PAD), n + PAD - 2)  # NaN goes to the lower end
+    cell = np.minimum(np.floor(place), n).astype(int)
+    return np.sum(stride * (cell + PAD - 1), axis=0), place - cell
 
 
 def entries(points, w, scale, along=None):
     """Columns of W, the value (along an axis: the slope), as pairs: for each point a sample and its weight."""
-    (first, fractions), rows = _depart(points, w, scale), []
+    (first, fractions), rows = _cells(points, w, scale), []
     for axis, t in enumerate(fractions):
         a, b, c, d, at_point = points.weights[int(axis == along)].T[:, :, None]
         rows.append(np.where(t != 0, ((d * t + c) * t + b) * t + a, at_point))
     for steps in product(*([m for m in range(4) if row[m].any()] for row in rows)):
-        weight = prod(row[m] for m, row in zip(steps, rows, strict=True))
-        yield (first + points.axes[:, 1] @ steps).astype(np.int64), weight
+        yield first + points.strides @ steps, prod(row[m] for m, row in zip(steps, rows, strict=True))
 
 
-def gather(points, samples, w, scale, out, bounds=NO_BOUNDS):
-    """Interpolated values at the departure points, W samples -> out; least and greatest sample of their cells."""
-    args = samples, w, scale, points.axes, points.reach, points.weights[:1], NONE, out[None], bounds
-    if not _run("interpolate", points, kernels.threads(), *args):
-        out[:] = sum(weight * samples[index] for index, weight in entries(points, w, scale))
-        if bounds.size:
-            cells = samples[_corners(points, w, scale)]
-            bounds[:] = np.min(cells, axis=0), np.max(cells, axis=0)
+def interpolate(points, samples, w, scale, out, g=None, bounds=NO_BOUNDS):
+    """Interpolated values at the departure points, W samples -> out; least and greatest sample of their cells.
+
+    With g, its product with the derivative of them in w -> out (axis, point).
+    """
+    rows, tables = (out[None], points.weights[:1]) if g is None else (out, points.weights)
+    args = samples, w, scale, points.axes, tables, NONE if g is None else g, rows, bounds
+    if _run("interpolate", points, kernels.threads(), *args):
+        return out
+    for axis, row in enumerate(rows):
+        row[:] = sum(
+            weight * samples[index] for index, weight in entries(points, w, scale, None if g is None else axis)
+        )
+        row *= 1.0 if g is None else -scale[axis] * g
+    if bounds.size:
+        cells = samples[_corners(points, w, scale)]
+        bounds[:] = np.min(cells, axis=0), np.max(cells, axis=0)
     return out
 
 
 def scatter(points, w, scale, g, samples):
-    """The transpose of `gather`: samples += W^T g. Points share samples, so one thread does it."""
-    if not _run("scatter", points, 1, w, scale, points.axes, points.reach, points.weights[:1], g, samples):
+    """The transpose of the values of `interpolate`: samples += W^T g. Points share samples, so one thread does it."""
+    if not _run("scatter", points, 1, w, scale, points.axes, points.weights[:1], g, samples):
         for index, weight in entries(points, w, scale):
-            samples += np.bincount(index, weight * g, samples.size)
+            np.add.at(samples, index, weight * g)
     return samples
 
 
-def gradient(points, samples, w, scale, g, out):
-    """g times the derivative of `gather` in w -> out (axis, point)."""
-    args = samples, w, scale, points.axes, points.reach, points.weights, g, out, NO_BOUNDS
-    if not _run("interpolate", points, kernels.threads(), *args):
-        for axis, row in enumerate(out):
-            slope = sum(weight * samples[index] for index, weight in entries(points, w, scale, axis))
-            row[:] = -scale[axis] * g * slope
-    return out
-
-
-def _corners(points, w, scale, some=None):
+def _corners(points, w, scale, some=slice(None)):
     """Samples of the cells of departure points, one row for each corner."""
-    steps = np.array(list(product((1, 2), repeat=len(points.shape)))) @ points.axes[:, 1]
-    return (steps[:, None] + _depart(points, w, scale, some)[0]).astype(np.int64)
+    steps = np.array(list(product((1, 2), repeat=len(w)))) @ points.strides
+    return steps[:, None] + _cells(points, w, scale, some)[0]
 
 
 def bound_shares(points, samples, w, scale, some):

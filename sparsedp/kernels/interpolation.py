@@ -1,7 +1,7 @@
 """Compiled loops of semi-Lagrangian transport: interpolation at departure points, its slope and its transpose.
 
 The departure point of the point (i, j, k) is (i, j, k) - scale w, in index coordinates. A field is known with ghost
-cells around it, as the flat array `samples`; `axes`, `reach` and `tables` are those of `departure.Points`.
+cells around it, as the flat array `samples`; `axes` and `tables` are those of `departure.Points`.
 
 The loops work on TILE points at a time, counted by `start` and `stop`: what belongs to a tile stays in the L1 cache,
 and every inner loop runs over it, for one axis or one sample of the stencil. So the same loops serve 1-D to 3-D, linear
@@ -11,7 +11,7 @@ and cubic interpolation. Indices are unsigned, for a signed one would be tested 
 import numpy as np
 from numba import njit
 
-from sparsedp.kernels.departure import TILE
+from sparsedp.kernels.departure import PAD, TILE
 from sparsedp.kernels.team import kernel
 
 __all__ = ["interpolate", "scatter"]
@@ -24,35 +24,36 @@ def _room():
 
 
 @njit(error_model="numpy")
-def _stencils(w, scale, axes, reach, tables, left, right, room):
+def _stencils(w, scale, axes, tables, left, right, room):
     """Departure points of the points left:right -> first sample of each stencil, weights of the samples by axis.
 
     There are always three axes: the weights of those that the field does not have stay 1. `begin` says which of the
     four samples is the first that counts: for slopes at the points it is the one before the cell.
     """
-    many, dim, (first, weights, begin, rows) = right - left, len(axes), room
+    many, dim, (first, weights, begin, rows) = right - left, len(w), room
     number, rest, fraction = rows[0, :many], rows[1, :many], rows[2, :many]
     for j in range(number.size):
         rest[j] = left + j
         number[j] = 0.0
     for axis in range(dim - 1, -1, -1):
-        n, stride, before, low, high, last, periodic = axes[axis]
+        line = axis + 3 - dim
+        n, stride, periodic, start, _ = axes[line]
         displacement, s, inverse, at_points = w[axis, left:right], scale[axis], 1.0 / n, 0
+        low, high = 1.0 - PAD, n + PAD - 2.0
         for j in range(number.size):  # the index along this axis is a remainder; the half makes it exact
             above = np.floor((rest[j] + 0.5) * inverse)
             p = rest[j] - above * n - s * displacement[j]
             rest[j] = above
-            if periodic != 0.0:
+            if periodic:
                 p -= n * np.floor(p * inverse)
             p = p if p >= low else low  # NaN too
             p = p if p <= high else high
             cell = np.floor(p)
-            cell = cell if cell <= last else last
+            cell = cell if cell <= n else n
             fraction[j] = p - cell
-            number[j] += stride * (cell + before)
+            number[j] += stride * (cell + (PAD - 1))
             at_points += p == cell
-        line = axis + 3 - dim
-        begin[line] = 0 if at_points and len(tables) > 1 else reach[line, 1]
+        begin[line] = 0 if at_points and len(tables) > 1 else start
         for kind in range(len(tables)):
             for m in range(begin[line], 4 - begin[line]):
                 weight, (a, b, c, d, at_point) = weights[kind, line, m, :many], tables[kind, m]
@@ -63,26 +64,26 @@ def _stencils(w, scale, axes, reach, tables, left, right, room):
         first[j] = np.uint64(number[j])
 
 
-@kernel("read1 read2 read1 read2 index2 read3 read1 write2 write2")
-def interpolate(samples, w, scale, axes, reach, tables, g, out, bounds, start, stop):
+@kernel("read1 read2 read1 index2 read3 read1 write2 write2")
+def interpolate(samples, w, scale, axes, tables, g, out, bounds, start, stop):
     """out = W samples, and the least and greatest sample of the cell of each departure point, where there is room.
 
     `tables` has the weights of the value. With those of the slope too, out[axis] = -scale g times the slope of the
     interpolant along the axis: the derivative of g . (W samples) in w.
     """
-    room, dim, slopes = _room(), len(axes), len(tables) > 1
+    room, dim, slopes = _room(), len(w), len(tables) > 1
     first, weights, begin, rows = room
     value, slope, _ = rows
     for left in range(start * TILE, min(stop * TILE, w.shape[1]), TILE):
         right = min(left + TILE, w.shape[1])
-        _stencils(w, scale, axes, reach, tables, left, right, room)
+        _stencils(w, scale, axes, tables, left, right, room)
         many = right - left
         out[:, left:right] = 0.0
         bounds[0, left:right], bounds[1, left:right] = np.inf, -np.inf
-        for i in range(begin[0], reach[0, 2]):
-            for k in range(begin[1], reach[1, 2]):
+        for i in range(begin[0], axes[0, 4]):
+            for k in range(begin[1], axes[1, 4]):
                 rows[:2] = 0.0
-                near = samples[i * reach[0, 0] + k * reach[1, 0] :]
+                near = samples[i * axes[0, 1] + k * axes[1, 1] :]
                 for m in range(begin[2], 4 - begin[2], 2):  # in pairs: half the passes over the sums
                     line, (a, b), (c, d) = near[m:], weights[0, 2, m : m + 2], weights[1, 2, m : m + 2]
                     for j in range(many):
@@ -108,20 +109,20 @@ def interpolate(samples, w, scale, axes, reach, tables, g, out, bounds, start, s
                     result[j] *= factor * given[j]
 
 
-@kernel("read2 read1 read2 index2 read3 read1 write1")
-def scatter(w, scale, axes, reach, tables, g, samples, start, stop):
+@kernel("read2 read1 index2 read3 read1 write1")
+def scatter(w, scale, axes, tables, g, samples, start, stop):
     """samples += W^T g: for one thread, as points share samples."""
     room = first, weights, begin, rows = _room()
     for left in range(start * TILE, min(stop * TILE, w.shape[1]), TILE):
         right = min(left + TILE, w.shape[1])
-        _stencils(w, scale, axes, reach, tables, left, right, room)
+        _stencils(w, scale, axes, tables, left, right, room)
         given, share = g[left:right], rows[0]
-        for i in range(begin[0], reach[0, 2]):
-            for k in range(begin[1], reach[1, 2]):
+        for i in range(begin[0], axes[0, 4]):
+            for k in range(begin[1], axes[1, 4]):
                 a, b = weights[0, 0, i], weights[0, 1, k]
                 for j in range(given.size):
                     share[j] = a[j] * b[j] * given[j]
-                for m in range(begin[2], reach[2, 2]):
-                    line, weight = samples[i * reach[0, 0] + k * reach[1, 0] + m :], weights[0, 2, m]
+                for m in range(begin[2], axes[2, 4]):
+                    line, weight = samples[i * axes[0, 1] + k * axes[1, 1] + m :], weights[0, 2, m]
                     for j in range(given.size):
                         line[first[j]] += weight[j] * share[j]
