@@ -124,19 +124,16 @@ def transport(
     if not isinstance(grid, Grid):
         raise TypeError(f"transport takes a Grid, got {type(grid).__name__}; write dp.Grid((64, 64), size=1.0)")
     _check_word("scheme", scheme, tuple(LAWS))
-    places = {"velocity": velocity, "of": of}
-    options = {
-        "interpolation": interpolation, "form": form, "backtrace": backtrace, "clamp": clamp, "unstable": unstable
-    }  # fmt: skip
-    for name, word in {**places, **options}.items():
+    words = dict(velocity=velocity, of=of, interpolation=interpolation, form=form, backtrace=backtrace, clamp=clamp)
+    words["unstable"] = unstable
+    for name, word in words.items():
         _check_word(name, word, CHOICES[name])
-    for name, word in options.items():
-        if word != CHOICES[name][0] and name not in LAWS[scheme].options:
+        if word != CHOICES[name][0] and name not in ("velocity", "of", *LAWS[scheme].options):
             raise ValueError(f"transport {scheme} does not use {name}; leave it out")
     if "form" in LAWS[scheme].options and form is None:
-        options["form"] = "flux" if velocity == "faces" else "advective"
+        words["form"] = "flux" if velocity == "faces" else "advective"
     solid = None if solid is None else check_solid(grid, solid).copy()
-    return Transport(Setting(grid, scheme, _sides(grid, boundary), solid=solid, **places, **options))
+    return Transport(Setting(grid, scheme, _sides(grid, boundary), solid=solid, **words))
 
 
 def _check_word(name, word, known):
@@ -215,7 +212,7 @@ class Transport(Remade):
                [0.5, 0.5, 0. ],
                [0. , 0.5, 0.5]])
         """
-        name, setting = f"transport {self.setting.scheme}", self.setting
+        name = self.law.name
         if not self.law.linear:
             raise ValueError(
                 f"{name} is not linear in u and has no matrix; write scheme='upwind', or call move(u, v, dt)"
@@ -225,7 +222,7 @@ class Transport(Remade):
                 f"{name}.operator needs constant v and dt, got traced ones; call move(u, v, dt) instead"
             )
         check_step(name, dt)
-        flat = flat_numbers(name, "v", v, setting.velocity_shapes)
+        flat = flat_numbers(name, "v", v, self.law.velocity_shapes)
         return Operator(Matrix(self.law.matrix(flat, float(dt))), self.space, self.space, name)
 
     def __getattr__(self, name):

@@ -30,18 +30,10 @@ class Interpolant:
         self.inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
         self.ghosts, self.origins = ghost_origins(setting, number, closed)
         self.coordinates = Coordinates(setting, number, interpolation)
-        self.filled = not closed and setting.of == "cells" and setting.solid is not None
-
-    @cached_property
-    def fill(self):
-        """The map that fills solid cells, and its transpose; None where there is nothing to fill.
-
-        Faces that touch a solid keep their value and lend it to others.
-        """
-        if not self.filled:
-            return None
-        forward = filling(self.setting.grid, self.setting.solid)
-        return forward, sp.csr_array(forward.T)
+        self.fill = None  # the map that fills solid cells, and its transpose
+        if setting.of == "cells" and setting.solid is not None and not closed:  # faces lend their value to others
+            forward = filling(setting.grid, setting.solid)
+            self.fill = forward, sp.csr_array(forward.T)
 
     def pad(self, u, inflow):
         """Component, inflow values -> samples: the field with its ghost cells, and after them the inflow values."""
@@ -59,29 +51,19 @@ class Interpolant:
         of_u.reshape(self.points.shape)[...] = samples[:cells].reshape(self.points.padded)[self.inside]
         of_inflow += samples[cells:]
 
-    def matrix(self, trajectory, walls):
-        """The values of a `Pass` as a csr_array in the component, without its inflow values, `walls` in number."""
-        n, cells = self.points.size, self.points.samples
-        sources = self.pad(np.arange(n), np.full(walls, n))[:cells].astype(int)
-        copies = sp.csr_array((np.ones(cells), sources, np.arange(cells + 1)), (cells, n + 1))[:, :n]
-        if self.fill is not None:
-            copies = copies @ self.fill[0]
-        entries = departure.entries(self.points, *trajectory.displacement)
-        return sum(sp.csr_array((weight, index, np.arange(n + 1)), (n, cells)) for index, weight in entries) @ copies
-
 
 class Pass:
     """A component of a field at the departure points of a trajectory, and the derivatives of that."""
 
     def __init__(self, trajectory, u, inflow):
-        self.trajectory, self.component, self.given = trajectory, trajectory.component, (u, inflow)
+        self.trajectory, self.component, self.u, self.inflow = trajectory, trajectory.component, u, inflow
         self.points, self.displacement = self.component.points, trajectory.displacement
 
     @cached_property
     def samples(self):
         """The component with its ghost cells."""
-        (u, inflow), fill = self.given, self.component.fill
-        return self.component.pad(u if fill is None else fill[0] @ u, inflow)
+        fill = self.component.fill
+        return self.component.pad(self.u if fill is None else fill[0] @ self.u, self.inflow)
 
     def value(self, out=None, bounds=departure.NO_BOUNDS):
         """Values at the departure points; least and greatest sample of the cells around them -> bounds."""
@@ -94,7 +76,7 @@ class Pass:
         That of the velocity is written to `of_w`; None leaves a part out. `clamped`: samples, and their cotangents.
         """
         if into is not None:
-            samples = results.empty((self.points.samples + into[1].size,), float)
+            samples = results.empty((self.points.samples + self.inflow.size,), float)
             samples[:] = 0.0
             if clamped is not None:
                 np.add.at(samples, *clamped)
@@ -122,3 +104,12 @@ class Pass:
         if dw is None:
             return total
         return total + np.sum(self.slopes(np.ones(total.size), np.empty(dw.shape)) * self.trajectory.jvp(dw), axis=0)
+
+    def matrix(self):
+        """The values as a csr_array in u, without what flows in."""
+        n, cells, fill = self.points.size, self.points.samples, self.component.fill
+        sources = self.component.pad(np.arange(n), np.full(self.inflow.size, n))[:cells].astype(int)
+        copies = sp.csr_array((np.ones(cells), sources, np.arange(cells + 1)), (cells, n + 1))[:, :n]
+        entries = departure.entries(self.points, *self.displacement)
+        moved = sum(sp.csr_array((weight, index, np.arange(n + 1)), (n, cells)) for index, weight in entries) @ copies
+        return moved if fill is None else moved @ fill[0]

@@ -98,14 +98,14 @@ class Law:
 
 def component_shapes(setting):
     """Shape of every component of the moved field."""
-    return (setting.grid.shape,) if setting.of == "cells" else setting.grid.faces.parts
+    return setting.space.parts
 
 
 def wall_space(setting):
     """Space of the inflow values: one number for each place of the field that touches a wall."""
     parts = [
         tuple(1 if a == axis else n for a, n in enumerate(shape))
-        for shape in component_shapes(setting)
+        for shape in setting.space.parts
         for axis, sides in enumerate(setting.sides)
         for _ in sides or ()
     ]

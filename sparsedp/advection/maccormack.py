@@ -24,64 +24,63 @@ __all__ = ["MacCormack"]
 BLOCK = 1 << 14  # points that NumPy works on at a time: what is made on the way stays in the cache
 
 
-class MacCormack(SemiLagrangian):
-    """See the head of the file."""
+class Corrected:
+    """Two passes of a component, back in time and ahead again, and what becomes of them; used like a `Pass`, once."""
 
-    options = ("interpolation", "backtrace", "clamp")
-    linear = False
-    signs = (1, -1)
-
-    def _stages(self, trajectories, u, inflow):
-        """Both passes, the value before it is clamped, least and greatest sample of u (if they count)."""
-        back, ahead = trajectories
-        first = Pass(back, u, inflow)
-        bounds = results.empty((2, u.size), float) if self.setting.clamp else departure.NO_BOUNDS
-        f = first.value(bounds=bounds)
-        second = Pass(ahead, f, inflow)
-        new = second.value()
+    def __init__(self, back, ahead, u, inflow):
+        self.first, self.clamp = Pass(back, u, inflow), back.component.setting.clamp
+        self.bounds = results.empty((2, u.size), float) if self.clamp else departure.NO_BOUNDS
+        f = self.first.value(bounds=self.bounds)
+        self.second = Pass(ahead, f, inflow)
+        self.new = self.second.value()  # before it is clamped
         for start in range(0, u.size, BLOCK):
             some = slice(start, start + BLOCK)
-            new[some] = f[some] + 0.5 * (u[some] - new[some])
-        return first, second, new, bounds
+            self.new[some] = f[some] + 0.5 * (u[some] - self.new[some])
 
-    def _clamps(self, first, new, bounds):
+    def _clamps(self):
         """Points where the clamp acts: which, the share of the value that stays, samples and shares of the bounds."""
-        some = np.flatnonzero((new <= bounds[0]) | (new >= bounds[1]))
-        (low, high), value = bounds[:, some], new[some]
+        first, new = self.first, self.new
+        some = np.flatnonzero((new <= self.bounds[0]) | (new >= self.bounds[1]))
+        (low, high), value = self.bounds[:, some], new[some]
         below, above = np.heaviside(low - value, 0.5), np.heaviside(value - high, 0.5)
         index, least, greatest = departure.bound_shares(first.points, first.samples, *first.displacement, some)
         return some, 1.0 - below - above, index, least * below + greatest * above
 
-    def advect(self, trajectories, u, inflow, out):
-        """See the base class."""
-        *_, new, bounds = self._stages(trajectories, u, inflow)
-        np.clip(new, *(bounds if self.setting.clamp else (-np.inf, np.inf)), out=out)
+    def value(self, out):
+        """See `Pass`."""
+        np.clip(self.new, *(self.bounds if self.clamp else (-np.inf, np.inf)), out=out)
 
-    def advect_vjp(self, trajectories, u, inflow, g, into, of_w):
-        """See the base class."""
-        (first, second, new, bounds), clamped = self._stages(trajectories, u, inflow), None
-        own, of_f = results.empty(g.shape, float), results.empty(g.shape, float)
+    def vjp(self, g, into, of_w):
+        """See `Pass`."""
+        own, of_f, clamped = results.empty(g.shape, float), results.empty(g.shape, float), None
         own[:] = g
-        if self.setting.clamp:
-            some, free, index, shares = self._clamps(first, new, bounds)
+        if self.clamp:
+            some, free, index, shares = self._clamps()
             own[some] *= free
             clamped = index, shares * g[some]
-        of_b, ahead = np.multiply(-0.5, own, out=new), None if of_w is None else results.empty(of_w.shape, float)
-        second.vjp(of_b, (of_f, into[1] if into else np.zeros(inflow.size)), ahead)
+        of_b, ahead = np.multiply(-0.5, own, out=self.new), None if of_w is None else results.empty(of_w.shape, float)
+        self.second.vjp(of_b, (of_f, into[1] if into else np.zeros_like(self.first.inflow)), ahead)
         of_f += own
-        first.vjp(of_f, into, of_w, clamped)
+        self.first.vjp(of_f, into, of_w, clamped)
         if into is not None:
             np.subtract(into[0], of_b, out=into[0])
         if ahead is not None:
             of_w += ahead
 
-    def advect_jvp(self, trajectories, u, inflow, du, dinflow, dw):
-        """See the base class."""
-        first, second, new, bounds = self._stages(trajectories, u, inflow)
-        df = first.jvp(du, dinflow, dw)
-        total = df + 0.5 * (du - second.jvp(df, dinflow, dw))
-        if self.setting.clamp:
-            some, free, index, shares = self._clamps(first, new, bounds)
-            samples = Pass(first.trajectory, du, dinflow).samples
+    def jvp(self, du, dinflow, dw):
+        """See `Pass`."""
+        df = self.first.jvp(du, dinflow, dw)
+        total = df + 0.5 * (du - self.second.jvp(df, dinflow, dw))
+        if self.clamp:
+            some, free, index, shares = self._clamps()
+            samples = Pass(self.first.trajectory, du, dinflow).samples
             total[some] = free * total[some] + np.sum(shares * samples[index], axis=0)
         return total
+
+
+class MacCormack(SemiLagrangian):
+    """See the head of the file."""
+
+    options = ("interpolation", "backtrace", "clamp")
+    linear = False
+    signs, passage = (1, -1), Corrected

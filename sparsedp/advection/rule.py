@@ -13,7 +13,6 @@ __all__ = ["rule_of"]
 
 def rule_of(law):
     """Law -> Rule of (u, v, dt, inflow)."""
-    name = f"transport {law.setting.scheme}"
 
     def forward(u, v, dt, inflow):
         return result_like(u, law.forward(*prepare(law, u, v, dt, inflow)), law.setting.space.shape)
@@ -44,7 +43,7 @@ def rule_of(law):
         _check_slope(law, "the tangent", found, tangents)
         return unflatten(ans, found)
 
-    return Rule(name, forward, vjp, jvp)
+    return Rule(law.name, forward, vjp, jvp)
 
 
 def _check_slope(law, what, slope, given):
@@ -52,7 +51,7 @@ def _check_slope(law, what, slope, given):
     slope = plain(slope)
     if surely_finite(slope) or not all(np.all(np.isfinite(plain(value))) for value in given):
         return
-    check_finite(f"transport {law.setting.scheme}", np.asarray(slope), f"cannot represent {what}")
+    check_finite(law.name, np.asarray(slope), f"cannot represent {what}")
 
 
 def _turned(law, nums, flat):
@@ -60,12 +59,12 @@ def _turned(law, nums, flat):
 
     A linear scheme has every derivative in u and inflow as long as v and dt are constant.
     """
-    name, plain_flat = f"transport {law.setting.scheme}", tuple(map(plain, flat))
+    plain_flat = tuple(map(plain, flat))
     if not (law.linear and set(nums) <= {FIELD, INFLOW}) or isbox(flat[1]) or isbox(flat[2]):
-        raise DerivativeError(f"{name} has first derivatives only; for second ones write scheme='upwind'")
+        raise DerivativeError(f"{law.name} has first derivatives only; for second ones write scheme='upwind'")
 
     def rules(num):
         pull = lambda g: law.pull((num,), np.asarray(g), *plain_flat)[0]
-        return linear(f"{name}.T", pull, lambda tangent: law.push({num: tangent}, *plain_flat))
+        return linear(f"{law.name}.T", pull, lambda tangent: law.push({num: tangent}, *plain_flat))
 
     return map(rules, nums)

@@ -14,6 +14,8 @@ Source: A. Staniforth, J. Cote, Monthly Weather Review 119 (1991) 2206-2223;
 R. Keys, IEEE Trans. Acoustics, Speech and Signal Processing 29 (1981) 1153-1160.
 """
 
+from typing import Any
+
 import numpy as np
 import scipy.sparse as sp
 
@@ -35,6 +37,7 @@ class SemiLagrangian(Law):
     options: tuple[str, ...] = ("interpolation", "backtrace")
     linear = True
     signs: tuple[int, ...] = (1,)  # of the steps along which points look: backwards in time
+    passage: Any = Pass  # made of the trajectories of a component, one for each sign, the component, inflow values
 
     def __init__(self, setting):
         super().__init__(setting)
@@ -48,25 +51,6 @@ class SemiLagrangian(Law):
         if solid is not None:
             self.solid = solid.ravel() if setting.of == "cells" else np.logical_or(*solid_faces(setting.grid, solid))
 
-    # ------------------------------------------------------------ one component, which `maccormack` does in its own way
-
-    def advect(self, trajectories, u, inflow, out):
-        """Component, inflow values -> the advected component, in `out`."""
-        Pass(*trajectories, u, inflow).value(out)
-
-    def advect_vjp(self, trajectories, u, inflow, g, into, of_w):
-        """Cotangent of the advected component -> that of u is written, that of inflow added to the pair `into`.
-
-        That of the velocity at the points is written to `of_w`; None leaves a part out.
-        """
-        Pass(*trajectories, u, inflow).vjp(g, into, of_w)
-
-    def advect_jvp(self, trajectories, u, inflow, du, dinflow, dw):
-        """Tangents of u, of inflow and of the velocity at the points (or None) -> tangent."""
-        return Pass(*trajectories, u, inflow).jvp(du, dinflow, dw)
-
-    # ------------------------------------------------------------ the whole field
-
     def _velocities(self, v):
         """Velocity as it is given -> for each component an array (axis, point)."""
         return self._by_component(v if self.to_points is None else self.to_points.apply(v))
@@ -75,10 +59,11 @@ class SemiLagrangian(Law):
         dim = self.setting.grid.dim
         return [v[dim * c.span.start : dim * c.span.stop].reshape(dim, -1) for c in self.components]
 
-    def _trajectories(self, v, dt):
-        """For each component where it stands in the field, and its trajectories, one for each sign."""
+    def _passes(self, u, v, dt, inflow):
+        """For each component where it stands in the field, and its pass to the departure points."""
         for component, closed, w in zip(self.components, self.half_way, self._velocities(v), strict=True):
-            yield component.span, [Trajectory(component, w, dt * sign, closed) for sign in self.signs]
+            trajectories = [Trajectory(component, w, dt * sign, closed) for sign in self.signs]
+            yield component.span, self.passage(*trajectories, u[component.span], inflow)
 
     def _keep_solid(self, moved, u):
         """What is in a solid stays: written to the moved field."""
@@ -91,19 +76,18 @@ class SemiLagrangian(Law):
         if not all(map(surely_finite, (u, v, inflow))):
             check_numbers(self.setting, u, v, inflow)  # names the first one; the trajectories would hide it
         out = results.empty(u.shape, float)
-        for span, trajectories in self._trajectories(v, dt):
-            self.advect(trajectories, u[span], inflow, out[span])
+        for span, passage in self._passes(u, v, dt, inflow):
+            passage.value(out[span])
         return self._keep_solid(out, u)
 
     def pull(self, nums, g, u, v, dt, inflow):
         """Cotangent of the advected field -> those of the arguments `nums`."""
         field, speed, g = FIELD in nums or INFLOW in nums, VELOCITY in nums or STEP in nums, np.ascontiguousarray(g)
         moved = g if self.solid is None else np.where(self.solid, 0.0, g)
-        of_u, of_inflow = results.empty(u.shape, float) if field else g, np.zeros(inflow.size)
+        of_u, of_inflow = results.empty((u.size if field else 0,), float), np.zeros(inflow.size)
         of_w = results.empty((u.size * self.setting.grid.dim if speed else 0,), float)
-        for (span, trajectories), change in zip(self._trajectories(v, dt), self._by_component(of_w), strict=True):
-            into = (of_u[span], of_inflow) if field else None
-            self.advect_vjp(trajectories, u[span], inflow, moved[span], into, change if speed else None)
+        for (span, passage), change in zip(self._passes(u, v, dt, inflow), self._by_component(of_w), strict=True):
+            passage.vjp(moved[span], (of_u[span], of_inflow) if field else None, change if speed else None)
         if field and self.solid is not None:
             of_u += g - moved
         found = {FIELD: of_u, INFLOW: of_inflow}
@@ -118,17 +102,15 @@ class SemiLagrangian(Law):
             np.ascontiguousarray(tangents.get(num, np.zeros(np.shape(x)))) for num, x in enumerate((u, v, dt, inflow))
         )
         out, moves = np.empty(u.size), VELOCITY in tangents or STEP in tangents
-        for (span, trajectories), dw in zip(
-            self._trajectories(v, dt), self._velocities(dv + ddt / dt * v), strict=True
-        ):
-            out[span] = self.advect_jvp(trajectories, u[span], inflow, du[span], dinflow, dw if moves else None)
+        changes = self._velocities(dv + ddt / dt * v)
+        for (span, passage), dw in zip(self._passes(u, v, dt, inflow), changes, strict=True):
+            out[span] = passage.jvp(du[span], dinflow, dw if moves else None)
         return self._keep_solid(out, du)
 
     def matrix(self, v, dt):
         """The step as a csr_array in u."""
-        walls = self.walls.size
-        blocks = [way.component.matrix(way, walls) for _, (way,) in self._trajectories(v, dt)]
-        moved = sp.csr_array(sp.block_diag(blocks, format="csr"))
+        nothing = np.zeros(self.setting.space.size), v, dt, np.zeros(self.walls.size)
+        moved = sp.csr_array(sp.block_diag([passage.matrix() for _, passage in self._passes(*nothing)], format="csr"))
         if self.solid is None:
             return moved
         return sp.csr_array(sp.diags_array(1.0 * ~self.solid) @ moved + sp.diags_array(1.0 * self.solid))
