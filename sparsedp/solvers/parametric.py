@@ -17,7 +17,6 @@ places of the pattern are ever touched.
 """
 
 from functools import cached_property
-from math import prod
 from typing import Any
 
 import autograd.numpy as anp
@@ -40,7 +39,7 @@ from sparsedp.structure.lazy import Chain, Diagonal
 from sparsedp.tape import Rule, isbox, of_argument, plain
 from sparsedp.tree import copied
 
-__all__ = ["Assembly", "Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]
+__all__ = ["Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]
 
 
 class ParametricSolver(Remade):
@@ -226,11 +225,7 @@ class EllipticSolver(ParametricSolver):
             # A constant coefficient keeps the operator a sum of 1-D factors.
             op = -k[0] * self._product + shift * identity(self.G.domain)
             return Operator(op.structure, self.G.domain, self.D.codomain, name)
-        return Operator(Elliptic(self._assembly, k, shift), self.G.domain, self.D.codomain, name)
-
-    @cached_property
-    def _assembly(self):
-        return Assembly(self.D, self.G)
+        return Operator(Elliptic(self.D, self.G, k, shift), self.G.domain, self.D.codomain, name)
 
     @cached_property
     def _product(self):
@@ -253,23 +248,23 @@ class Elliptic(Structure):
 
     Parameters
     ----------
-    assembly : Assembly
-        D and G.
+    D, G : Operator
+        They keep their matrices, where entries are asked for: each new k only scales rows of that of G.
     k : array, shape (faces,)
     shift : float
     """
 
-    def __init__(self, assembly, k, shift, transposed=False):
-        self.assembly, self.k, self.shift = assembly, k.reshape(-1), shift
+    def __init__(self, D, G, k, shift, transposed=False):
+        self.D, self.G, self.k, self.shift = D, G, k.reshape(-1), shift
         self.transposed = transposed
-        self.shape = (prod(assembly.D.codomain.shape),) * 2
-        self.dtype = np.result_type(assembly.D.dtype, assembly.G.dtype)
-        self.has_entries = assembly.has_entries
+        self.shape = (D.shape[0],) * 2
+        self.dtype = np.result_type(D.dtype, G.dtype)
+        self.has_entries = D.structure.has_entries and G.structure.has_entries
 
     @cached_property
     def _product(self):
         """D diag(k) G, which acts in one pass where D and G are differences of a grid."""
-        product = Chain([self.assembly.D.structure, Diagonal(self.k), self.assembly.G.structure])
+        product = Chain([self.D.structure, Diagonal(self.k), self.G.structure])
         return product.transpose() if self.transposed else product
 
     def apply(self, x, out):
@@ -277,49 +272,17 @@ class Elliptic(Structure):
         np.copyto(out, self.shift * wide - self._product.product(wide), casting="same_kind")
 
     def magnitude(self):
-        first, second = self.assembly.magnitudes[self.transposed]
-        return lambda x: abs(self.shift) * x + second(self.k * first(x))
+        product = self._product.magnitude()
+        return lambda x: abs(self.shift) * x + product(x)
 
     def transpose(self):
-        return Elliptic(self.assembly, self.k, self.shift, not self.transposed)
-
-    @cached_property
-    def _entries(self):
-        matrix = self.assembly.matrix(self.k, self.shift)
-        return matrix.T.tocsr() if self.transposed else matrix
+        return Elliptic(self.D, self.G, self.k, self.shift, not self.transposed)
 
     def explicit(self):
-        return self._entries
-
-
-class Assembly:
-    """What does not depend on k: D, G, and bounds of their magnitudes.
-
-    Parameters
-    ----------
-    D, G : Operator
-    """
-
-    def __init__(self, D, G):
-        self.D, self.G = D, G
-        self.has_entries = D.structure.has_entries and G.structure.has_entries
-
-    @cached_property
-    def magnitudes(self):
-        """x -> |G| x, |D| x, and those of the transposes in the order in which they act."""
-        D, G = self.D.structure, self.G.structure
-        plain, turned = (G, D), (D.transpose(), G.transpose())
-        return tuple(tuple(structure.magnitude() for structure in pair) for pair in (plain, turned))
-
-    @cached_property
-    def _entries(self):
-        return self.D.structure.explicit(), self.G.structure.explicit()
-
-    def matrix(self, k, shift):
-        """csr_array of shift - D diag(k) G."""
-        D, G = self._entries
-        slopes = sp.csr_array((G.data * k[rows_of(G)], G.indices, G.indptr), shape=G.shape)
-        return compact(shift * sp.eye_array(D.shape[0], format="csr") - D @ slopes)
+        D, G = self.D.matrix, self.G.matrix
+        slopes = sp.csr_array((G.data * self.k[rows_of(G)], G.indices, G.indptr), shape=G.shape)
+        matrix = compact(self.shift * sp.eye_array(D.shape[0], format="csr") - D @ slopes)
+        return matrix.T.tocsr() if self.transposed else matrix
 
 
 # ---------------------------------------------------------------- the entries of a matrix
