@@ -63,22 +63,24 @@ def find_pattern(products, rows, columns):
     if _sampled_full(products[0], rows, columns, rng):
         return None
     width = 1 << max(0, int(columns - 1).bit_length() - FIRST.bit_length() + 1)
-    blocks = -(-columns // width)
-    block, row = (pairs.ravel() for pairs in np.indices((blocks, rows)))
-    spent, colours = 0, np.arange(blocks)
+    row, block = np.indices((rows, -(-columns // width))).reshape(2, -1)
+    spent, colours = 0, np.arange(-(-columns // width))
     while True:
         spent += int(colours.max(initial=-1)) + 1
         if spent > max(columns // 2, 2 * FIRST):
-            return _column_by_column(products, rows, columns, rng) if columns <= ONE_BY_ONE else None
+            if columns > ONE_BY_ONE:
+                return None
+            row, column = np.nonzero(_touched(products, np.arange(columns), rows, rng).T)
+            return pattern_of(row, column, (rows, columns))
         touched = _touched(products, np.repeat(colours, width)[:columns], rows, rng)
         keep = touched[colours[block], row]
-        block, row = block[keep], row[keep]
+        row, block = row[keep], block[keep]
         if width == 1:
             return pattern_of(row, block, (rows, columns))
         width //= 2
-        block, row = np.concatenate([2 * block, 2 * block + 1]), np.concatenate([row, row])
+        row, block = np.tile(row, 2), np.concatenate([2 * block, 2 * block + 1])
         inside = block * width < columns
-        block, row = block[inside], row[inside]
+        row, block = row[inside], block[inside]
         colours = colour(pattern_of(row, block, (rows, -(-columns // width))))
 
 
@@ -92,11 +94,6 @@ def _sampled_full(product, rows, columns, rng):
         unit[column] = 1.0
         counts.append(np.count_nonzero(product(unit)))
     return min(counts) > rows / 4
-
-
-def _column_by_column(products, rows, columns, rng):
-    column, row = np.nonzero(_touched(products, np.arange(columns), rows, rng))
-    return pattern_of(row, column, (rows, columns))
 
 
 def _touched(products, colours, rows, rng):
@@ -144,50 +141,32 @@ def stencil_pattern(products, shape):
     csr_array or None
         None when the fields are small, or a cell touches too many.
     """
-    places = [axis for axis, n in enumerate(shape) if n > SHORT]
-    kinds = [axis for axis, n in enumerate(shape) if n <= SHORT]
-    lengths, counts = [shape[axis] for axis in places], [shape[axis] for axis in kinds]
-    if not places or not products or np.prod(shape) < SMALLEST or np.prod(counts) > SHORT:
+    index, lengths = np.indices(shape).reshape(len(shape), -1), np.array(shape)[:, None]
+    far = lengths > SHORT  # axes that count places; the others count kinds
+    if not far.any() or not products or index.shape[1] < SMALLEST or np.prod(lengths[~far]) > SHORT:
         return None
-    index = np.arange(np.prod(shape)).reshape(shape).transpose(kinds + places).reshape(-1, *lengths)
-    rng = np.random.default_rng(0)
-    touched = [_touched_by_cell(products, index, kind, rng) for kind in range(len(index))]
-    if any(found is None for found in touched):
-        return None
-    wraps = np.any([around for _, around in touched], axis=0)
-    columns, rows = zip(
-        *(_moved(index, kind, move, wraps) for kind, (moves, _) in enumerate(touched) for move in moves)
-    )
-    return pattern_of(np.concatenate(rows), np.concatenate(columns), (index.size, index.size))
-
-
-def _touched_by_cell(products, index, kind, rng):
-    """What three cells of a kind touch: {(kind, steps along the places)}, and along which axes one went round."""
-    lengths, moves, around = np.array(index.shape[1:]), set(), np.zeros(index.ndim - 1, dtype=bool)
-    where = np.empty((index.size, index.ndim), dtype=int)
-    where[index.reshape(-1)] = np.stack(np.unravel_index(np.arange(index.size), index.shape), axis=1)
-    for product, cell in combinations(products, (0 * lengths, lengths // 2, lengths - 1)):
-        v = np.zeros(index.size)
-        v[index[(kind, *cell)]] = rng.uniform(0.5, 1.5) * rng.choice((-1.0, 1.0))
-        hit = where[np.flatnonzero(product(v))]
-        if len(hit) > WIDEST:
+    moves, wraps, rng = set(), np.zeros(far.shape, dtype=bool), np.random.default_rng(0)
+    kinds = [np.array(kind)[:, None] for kind in np.ndindex(*np.where(far, 1, lengths)[:, 0])]
+    for kind, product, place in combinations(kinds, products, (0 * lengths, lengths // 2, lengths - 1)):
+        cell, v = np.where(far, place, kind), np.zeros(index.shape[1])
+        v[np.ravel_multi_index(cell, shape)] = rng.uniform(0.5, 1.5) * rng.choice((-1.0, 1.0))
+        touched = index[:, np.flatnonzero(product(v))]
+        if touched.shape[1] > WIDEST:
             return None
-        steps = (hit[:, 1:] - cell + lengths // 2) % lengths - lengths // 2  # the short way
-        around |= np.any(steps != hit[:, 1:] - cell, axis=0)
-        moves |= set(map(tuple, np.column_stack([hit[:, :1], steps]).tolist()))
-    return sorted(moves), around
-
-
-def _moved(index, kind, move, wraps):
-    """Columns and rows of one step from every cell; steps over an edge count where the field goes round."""
-    other, *steps = move
-    rows = np.roll(index[other], [-step for step in steps], tuple(range(len(steps))))
-    inside = np.ones(rows.shape, dtype=bool)
-    for axis, (step, round_) in enumerate(zip(steps, wraps)):
-        to = np.arange(rows.shape[axis]) + step
-        fits = round_ | ((to >= 0) & (to < rows.shape[axis]))
-        inside &= fits.reshape([-1 if a == axis else 1 for a in range(rows.ndim)])
-    return index[kind][inside], rows[inside]
+        around = np.where(far, lengths // 2, 0)
+        steps = np.where(far, (touched - cell + around) % lengths - around, touched - cell)  # the short way
+        wraps |= np.any(steps != touched - cell, axis=1, keepdims=True)
+        moves |= {(*kind[:, 0].tolist(), *step) for step in steps.T.tolist()}
+    places = [np.empty((2, 0), dtype=int)]
+    for move in sorted(moves):
+        kind, step = np.reshape(move, (2, -1, 1))
+        column = np.flatnonzero(np.all(far | (index == kind), axis=0))
+        to = index[:, column] + step
+        to = np.where(wraps, to % lengths, to)  # steps over an edge count where the field goes round
+        inside = np.all((to >= 0) & (to < lengths), axis=0)
+        places.append(np.stack([np.ravel_multi_index(to[:, inside], shape), column[inside]]))
+    row, column = np.hstack(places)
+    return pattern_of(row, column, (index.shape[1],) * 2)
 
 
 # ---------------------------------------------------------------- colours
@@ -265,33 +244,24 @@ def colour(pattern, shape=None):
     links = sp.csr_array(pattern.astype(np.int32))
     links = sp.csr_array(links.T @ links + sp.eye_array(size, dtype=np.int32))  # every column is linked to itself
     found = _lattice(links, (size,), least)
-    if shape is not None and len(shape) > 1 and np.prod(shape) == size and (found is None or found.max() >= least):
-        found = _fewer(found, _lattice(links, shape, least))
-    if found is None or found.max() >= (least if size <= SMALL else 2 * least):
-        found = _fewer(found, _one_by_one(links))
+    if shape is not None and len(shape) > 1 and np.prod(shape) == size and found.max() >= least:
+        found = min(found, _lattice(links, shape, least), key=np.max)
+    if found.max() >= (least if size <= SMALL else 2 * least):
+        found = min(found, _one_by_one(links), key=np.max)
     return found
 
 
-def _fewer(one, other):
-    if one is None or other is None:
-        return other if one is None else one
-    return one if one.max() <= other.max() else other
-
-
 def _lattice(links, shape, least):
-    """(a . i) mod c with the smallest c that works, or None."""
-    differences = _differences(links, shape)
-    if differences is None:
-        return None
-    index = np.stack(np.unravel_index(np.arange(links.shape[0]), shape))
-    for count in range(least, 3 * least + 8):
+    """(a . i) mod c with the smallest c that works, or a colour for each column."""
+    size, differences = links.shape[0], _differences(links, shape)
+    for count in range(least, 3 * least + 8) if differences is not None else ():
         many = min(count ** (len(shape) - 1), MOST_TRIALS // max(differences.shape[1], 1))
         tried = islice(combinations(range(count), repeat=len(shape) - 1), many)
         vectors = np.array([(*a[::-1], 1) for a in tried])
         valid = np.all((vectors @ differences) % count != 0, axis=1)
         if valid.any():
-            return (vectors[np.argmax(valid)] @ index) % count
-    return None
+            return (vectors[np.argmax(valid)] @ np.stack(np.unravel_index(np.arange(size), shape))) % count
+    return np.arange(size)
 
 
 def _differences(links, shape):
