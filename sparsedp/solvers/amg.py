@@ -141,8 +141,8 @@ class Level(NamedTuple):
     """A matrix with the way down to the next level (None on the coarsest)."""
 
     A: Any
-    P: Any
-    R: Any
+    P: Any = None
+    R: Any = None
 
 
 class Hierarchy:
@@ -175,16 +175,13 @@ class Hierarchy:
         self._smooth(level.A, x, b, self.after)
         return x
 
-    def _smooth(self, A, x, b, sweeps):
-        for sweep in sweeps:
-            self._gauss_seidel(A, x, b, sweep)
-
     @staticmethod
-    def _gauss_seidel(A, x, b, sweep):
+    def _smooth(A, x, b, sweeps):
         from pyamg import amg_core
 
-        ends = (0, x.size, 1) if sweep == "forward" else (x.size - 1, -1, -1)
-        amg_core.gauss_seidel(A.indptr, A.indices, A.data, x, b, *ends)
+        for sweep in sweeps:  # of Gauss and Seidel
+            ends = (0, x.size, 1) if sweep == "forward" else (x.size - 1, -1, -1)
+            amg_core.gauss_seidel(A.indptr, A.indices, A.data, x, b, *ends)
 
     @property
     def words(self):
@@ -218,15 +215,17 @@ def _without_residues(built):
     A region that nothing holds ends, levels down, in one unknown whose row is 0 but for rounding: a sweep or the
     coarsest solve would divide by it. Empty rows are left out by both.
     """
-    reference, levels = abs(built[0].A) @ np.ones(built[0].A.shape[0]), []
-    for number, level in enumerate(built):
-        A, last = csr_array(level.A), number == len(built) - 1
-        residue = abs(A) @ np.ones(A.shape[0]) <= RESIDUE * reference
+    levels: list = []
+    reference = np.zeros(0)
+    for level in built:
+        A = csr_array(level.A)
+        sizes = abs(A) @ np.ones(A.shape[0])
+        reference = abs(levels[-1].R) @ reference if levels else sizes
+        residue = sizes <= RESIDUE * reference
         if residue.any():
             A = csr_array(A.multiply(~residue[:, None]).multiply(~residue))
             A.eliminate_zeros()
-        levels.append(Level(A, None if last else csr_array(level.P), None if last else csr_array(level.R)))
-        reference = reference if last else abs(level.R) @ reference
+        levels.append(Level(A, *(() if level is built[-1] else (csr_array(level.P), csr_array(level.R)))))
     return levels
 
 
@@ -243,15 +242,14 @@ def geometric_levels(matrix, grid, levels, coarsest):
         Unknowns from which on no next level is made.
     """
     widths: list = list(grid.widths)
-    built: list = []
+    built, matrix = [], _short(matrix)
     while len(built) < levels - 1 and matrix.shape[0] > coarsest:
         lines = [_interpolation(h, periodic) for h, periodic in zip(widths, grid.periodic, strict=True)]
-        P = csr_array(reduce(lambda a, b: kron(a, b, format="csr"), lines))
-        R = csr_array(P.T)
-        built.append((matrix, P, R))
-        matrix = _short(R @ matrix @ P)
+        P = _short(reduce(lambda a, b: kron(a, b, format="csr"), lines))
+        built.append(Level(matrix, P, _short(P.T)))
+        matrix = _short(built[-1].R @ matrix @ P)
         widths = [np.add.reduceat(h, np.arange(0, h.size, 2)) for h in widths]
-    return [*(Level(*map(_short, level)) for level in built), Level(_short(matrix), None, None)]
+    return [*built, Level(matrix)]
 
 
 def _interpolation(widths, periodic):
