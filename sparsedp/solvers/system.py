@@ -156,8 +156,8 @@ class System:
         """The first unknown whose row has no entries, or None."""
         if self.faces is not None and self.faces.connected:
             return None
-        sums = self.sums[False] if self.active is None else self.magnitude(self.active.astype(float))
-        empty = sums == 0 if self.active is None else (sums == 0) & self.active
+        unknown = self._masked(np.ones(self.size))
+        empty = (self.magnitude(unknown) == 0) & (unknown > 0)
         return int(np.argmax(empty)) if empty.any() else None
 
     @cached_property
@@ -170,7 +170,9 @@ class System:
         if self.active is None and structure.separable:
             labels, count = structure.components()
         elif structure.has_entries:
-            labels, count = _linked(self.entries, self.active)
+            matrix = self.matrix  # without zeros, and without links to what is not an unknown
+            links = sp.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
+            count, labels = connected_components(links, directed=False)
         return (None, 1) if count == 1 else (labels, count)
 
     @cached_property
@@ -300,20 +302,6 @@ def _rescaled(grid):
     """The grid with its lengths divided by powers of two, so that volumes are near 1, and so are their squares."""
     widths = [np.ldexp(h, -int(np.frexp(np.max(h, initial=0.0))[1])) for h in grid.widths]
     return Grid(grid.shape, spacing=widths, periodic=grid.periodic)
-
-
-def _linked(matrix, active):
-    """Matrix -> (labels, count): which unknowns are linked by entries that are not 0.
-
-    What is not active is linked to nothing (None: all are).
-    """
-    links = matrix.tocoo()
-    keep = links.data != 0
-    if active is not None:
-        keep &= active[links.row] & active[links.col]
-    pattern = sp.csr_array((np.ones(np.count_nonzero(keep)), (links.row[keep], links.col[keep])), shape=matrix.shape)
-    count, labels = connected_components(pattern, directed=False)
-    return labels, count
 
 
 def _pinned(matrix, flags):
