@@ -8,7 +8,7 @@ SciPy changes the pivots of LAPACK while a solve runs, and back: every solve get
 thread may be solving with the same factors.
 """
 
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg as la
@@ -49,7 +49,8 @@ class Direct(Engine):
     def __init__(self, system):
         matrix = system.regular_matrix
         self._anchors = system.null_space.anchors()
-        lower, upper = _bandwidths(matrix)
+        offsets = matrix.indices - rows_of(matrix)
+        lower, upper = -int(offsets.min(initial=0)), int(offsets.max(initial=0))
         if system.size <= DENSE_UP_TO:
             self._solve, words = _dense(matrix.toarray())[0], "dense LU"
         elif max(lower, upper) <= BAND_UP_TO:
@@ -151,17 +152,10 @@ def _dense(matrix, size=None):
     return (lambda b, transposed: getrs(factors, pivots.copy(), b, trans=int(transposed))[0]), condition
 
 
-def _bandwidths(matrix):
-    row = rows_of(matrix)
-    offsets = matrix.indices - row
-    return -int(offsets.min(initial=0)), int(offsets.max(initial=0))
-
-
 def _banded(matrix, lower, upper):
     size = matrix.shape[0]
     bands = np.zeros((2 * lower + upper + 1, size), matrix.dtype)  # `lower` extra rows for the pivots
-    row = rows_of(matrix)
-    bands[lower + upper + row - matrix.indices, matrix.indices] = matrix.data
+    bands[lower + upper + rows_of(matrix) - matrix.indices, matrix.indices] = matrix.data
     factor, solve = la.lapack.get_lapack_funcs(("gbtrf", "gbtrs"), dtype=matrix.dtype)
     factors, pivots, _ = factor(bands, lower, upper)
     return (
@@ -176,13 +170,9 @@ def _sparse(matrix, system):
     try:
         factors = splu(csc_array(matrix), **(options if symmetric else {}))
     except RuntimeError:  # exactly singular
-        return partial(_never, matrix.dtype), "sparse LU"
+        return (lambda b, transposed: np.full(b.shape, np.nan, matrix.dtype)), "sparse LU"
     except MemoryError:
         message = f"sparse LU of {system.given} does not fit into memory; write method='multigrid'"
         raise ConvergenceError(message, info=failure("setup_failed")) from None
     words = f"sparse LU, {factors.nnz} entries in the factors"
     return (lambda b, transposed: factors.solve(b, trans="T" if transposed else "N")), words
-
-
-def _never(dtype, b, transposed):
-    return np.full(b.shape, np.nan, dtype)
