@@ -192,8 +192,8 @@ BUGS = {
     # ---- solvers
     "an adjoint solve with the operator itself": Bug(
         "solvers",
-        "partial(system.product, transposed=transposed)",
-        "partial(system.product, transposed=False)",
+        "partial(self.system.product, transposed=transposed)",
+        "partial(self.system.product, transposed=False)",
         "tests/test_solvers.py tests/test_solvers_methods.py",
     ),
     "a transposed cycle with the sweeps of the forward one": Bug(

@@ -3,22 +3,22 @@
 Conjugate gradients run on S = sign * diag(w) * A, symmetric and positive, with w the volumes on
 stretched grids. Then A x = b is S x = sign w b, and A^T y = g is S z = sign g with y = w z.
 
-The iterations, on plain flat arrays, are stopped by the caller's test. Both keep the best iterate, and name what went
-wrong with a status word ("" when nothing did).
+Both keep the best iterate, and name what went wrong with a status word ("" when nothing did).
 """
 
 from functools import partial
+from itertools import count
 from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import ConvergenceError
 from sparsedp.fields import is_whole
 from sparsedp.kernels.reference import SHORT
 from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.solve import Engine, failure, norm
+from sparsedp.solvers.scaling import inverted, norm
+from sparsedp.solvers.solve import Engine
 from sparsedp.structure.base import probes
 from sparsedp.tape import plain
 
@@ -105,88 +105,120 @@ class Krylov(Engine):
         goal = 0.9 * goal if self.refines else 0.0  # some room for the true residual
         data, size = norm(b), self.system.norm(transposed)
 
-        def accepted(residual, solution):
+        def accepted(residual, x):
             if residual <= goal:
                 return True
-            x = solution()
             near = self.refines and residual <= ROUNDING * (size * norm(x) + data)
             return near and residual <= self.system.rounding(x, data, transposed)
 
-        return (self._conjugate_gradients if self.symmetric else self._gmres)(b, goal, accepted, transposed)
+        if self.symmetric:
+            return self._conjugate_gradients(b, accepted, transposed)
+        return self._gmres(b, goal, accepted, transposed)
 
-    def _conjugate_gradients(self, b, goal, accepted, transposed):
-        system, sign, weights = self.system, self.sign, self.system.weights
-        factor = sign * weights
-
-        def apply(p):
+    def _conjugate_gradients(self, b, accepted, transposed):
+        """Preconditioned conjugate gradients from 0, until accepted(|b - A x|, x)."""
+        system, weights = self.system, self.system.weights
+        factor, gauged = self.sign * weights, not transposed and not np.isscalar(weights)
+        r = self.sign * b if transposed else factor * b
+        x, scratch, best, found = np.zeros_like(r), np.empty_like(r), np.zeros_like(r), 0
+        first = least = norm(r / weights if gauged else r)
+        z = self._corrected(r, factor)
+        p, rz, word = z.copy(), dot(r, z), "max_iterations"
+        for number in range(1, self.maxiter + 1):
             q = system.product(p)
             q *= factor
             # What rounding leaves along the null space no step can take back: residuals would end on it.
-            return system.null_space.project(q, True, into=q)
+            q = system.null_space.project(q, True, into=q)
+            pq = dot(p, q)
+            if not (pq > 0 and rz > 0):
+                number, word = number - 1, _without_descent(pq, rz, p, q, r, z)
+                break
+            x += np.multiply(p, rz / pq, out=scratch)
+            r -= np.multiply(q, rz / pq, out=scratch)
+            residual = norm(r / weights if gauged else r)
+            if accepted(residual, weights * x if transposed else x):
+                best, word = x, ""
+                break
+            if not np.isfinite(residual) or residual > DIVERGED * first:
+                word = "diverged"
+                break
+            if residual < least:
+                np.copyto(best, x)
+                least, found = residual, number
+            if number - found >= self.window:
+                word = "stagnated"
+                break
+            z = self._corrected(r, factor)
+            rz, before = dot(r, z), rz
+            p *= rz / before
+            p += z
+        else:
+            best = best if self.refines else x  # of a fixed number of iterations, the last iterate
+        return (weights * best if transposed else best), number, word
 
-        def measure(r):
-            if transposed or np.isscalar(weights):
-                return norm(r) / (1.0 if transposed else weights)
-            return norm(r / weights)
-
-        def tested(residual, x):
-            return accepted(residual, lambda: weights * x if transposed else x)
-
-        b = sign * b if transposed else factor * b
-        x, used, word = conjugate_gradients(
-            apply, b, self._for_symmetric(factor), measure, tested, self.maxiter, self.window, self.refines
-        )
-        return (weights * x if transposed else x), used, word
-
-    def _for_symmetric(self, factor):
-        space = self.system.null_space
+    def _corrected(self, r, factor):
+        """z ~ S^-1 r, a fresh array or r itself."""
         if self.precondition is None:
-            return lambda r: r
-        if self.of_symmetric:
-            return lambda r: space.project(self.precondition(r, False))
-        return lambda r: space.project(self.precondition(r / factor, False))
+            return r
+        return self.system.null_space.project(self.precondition(r if self.of_symmetric else r / factor, False))
 
     def _gmres(self, b, goal, accepted, transposed):
-        system = self.system
+        """Restarted GMRES from 0, preconditioned from the right: its residuals are those of A.
+
+        A cycle ends at the residual `goal`; accepted(|b - A x|, x) is asked at the end of each.
+        Source: Saad and Schultz, SIAM J. Sci. Stat. Comput. 7, 1986.
+        """
+        system, apply = self.system, partial(self.system.product, transposed=transposed)
 
         def precondition(r):
             z = r.copy() if self.precondition is None else self.precondition(r, transposed)
             return system.null_space.project(z, transposed)
 
-        def tested(residual, x):
-            return accepted(residual, lambda: x)
+        x, r, used = np.zeros_like(b), b, 0
+        residual, basis = np.sqrt(dot(r, r)), np.empty((self.restart + 1, b.size))
+        while True:
+            steps = min(self.restart, self.maxiter - used)
+            change, steps = _gmres_cycle(apply, r, residual, precondition, goal, basis, steps)
+            used += steps
+            trial = x + precondition(change)
+            r = b - apply(trial)
+            before, residual = residual, np.sqrt(dot(r, r))
+            if not residual < before:
+                return x, used, "stagnated" if np.isfinite(residual) else "diverged"
+            x = trial
+            if accepted(residual, x):
+                return x, used, ""
+            if used >= self.maxiter:
+                return x, used, "max_iterations"
+            if residual > 0.999 * before:
+                return x, used, "stagnated"
 
-        apply = partial(system.product, transposed=transposed)
-        return gmres(apply, b, precondition, goal, tested, self.maxiter, self.restart)
-
-    def unroll(self, b, start, transposed, run):
-        """Conjugate gradients on the tape, in the inner product in which the operator is symmetric."""
+    def unroll(self, b, start, transposed):
+        """As `solve`, on the tape: conjugate gradients in the inner product in which the operator is symmetric."""
         system = self.system
         op = system.given.T if transposed else system.given
         weights = np.broadcast_to(system.weights, system.size).reshape(op.domain.shape)
         weights = 1.0 / weights if transposed else weights
         x = anp.zeros(op.domain.shape) if start is None else start
-        r = b - op(x) if start is not None else b * 1.0
+        r = b * 1.0 if start is None else b - op(x)
         p, rr = r, anp.sum(weights * r * r)
-        data = norm(np.ravel(np.asarray(plain(b), dtype=float)))
+        data = _plain_norm(b)
         goal = system.rtol * data
-        for number in range(self.maxiter + 1):
-            residual = norm(np.ravel(np.asarray(plain(r), dtype=float)))
-            if residual == 0 or number == self.iterations or (self.iterations is None and residual <= goal):
-                run.iterations = number
-                run.status = "max_iterations" if residual > goal else "converged" if data else "exact_zero_rhs"
-                return x
+        for number in count():
+            residual = _plain_norm(r)
+            if residual == 0 or number == self.maxiter or (self.refines and residual <= goal):
+                word = "max_iterations" if residual > goal else "converged" if data else "exact_zero_rhs"
+                return x, number, word
             q = op(p)
             step = rr / anp.sum(weights * p * q)
             x, r = x + step * p, r - step * q
             rr, before = anp.sum(weights * r * r), rr
             p = r + (rr / before) * p
-        raise ConvergenceError(
-            f"unrolled {self.method} on {op}: relative residual {residual * system.rtol / goal:.1e} "
-            f"after {self.maxiter} iterations, wanted {system.rtol:g}",
-            info=failure("max_iterations"),
-            best=plain(x),
-        )
+
+
+def _plain_norm(x):
+    """Norm of a field, traced or not."""
+    return norm(np.ravel(np.asarray(plain(x), dtype=float)))
 
 
 def _probed_sign(system):
@@ -202,7 +234,7 @@ def _preconditioner(system, given):
     if given is None:
         return None
     if isinstance(given, str) and given == "jacobi" and system.sign:
-        inverse = np.where(system.diagonal == 0, 0.0, 1.0 / np.where(system.diagonal == 0, 1.0, system.diagonal))
+        inverse = inverted(system.diagonal)
         return lambda r, transposed: r * inverse
     if isinstance(given, Operator):
         scale = 2.0**system.exponent
@@ -223,120 +255,12 @@ def dot(x, y):
     return float(x.dot(y) if x.size <= SHORT else np.einsum("i,i->", x, y))
 
 
-class Best:
-    """The best iterate so far, and how long ago it was found."""
-
-    def __init__(self, x, residual, window):
-        self.x, self.residual, self.window = x.copy(), residual, window
-        self.first, self.found = residual, 0
-
-    def trouble(self, x, residual, number):
-        """Note an iterate; a status word when the iteration should end."""
-        if not np.isfinite(residual) or residual > DIVERGED * self.first:
-            return "diverged"
-        if residual < self.residual:
-            np.copyto(self.x, x)
-            self.residual, self.found = residual, number
-        return "stagnated" if number - self.found >= self.window else ""
-
-
-def conjugate_gradients(apply, b, precondition, measure, accepted, maxiter, window, best_of=True):
-    """Preconditioned conjugate gradients for S x = b from 0; S symmetric and positive (semi-)definite.
-
-    Parameters
-    ----------
-    apply : callable
-        S p, as a fresh array.
-    b : array
-        Overwritten: it becomes the residual.
-    precondition : callable
-        z ~ S^-1 r, a fresh array or r itself, symmetric and positive.
-    measure : callable
-        Norm of the true residual from the residual of S.
-    accepted : callable
-        accepted(residual norm, x) -> bool.
-    maxiter, window : int
-        Most iterations; most iterations without a better iterate.
-    best_of : bool
-        Whether `maxiter` iterations give the best iterate, or the last one.
-
-    Returns
-    -------
-    (x, iterations, word)
-    """
-    r, x = b, np.zeros_like(b)
-    best = Best(x, measure(r), window)
-    z = precondition(r)
-    p, rz = z.copy(), dot(r, z)
-    scratch = np.empty_like(b)
-    for number in range(1, maxiter + 1):
-        q = apply(p)
-        pq = dot(p, q)
-        if not (pq > 0 and rz > 0):
-            return best.x, number - 1, _without_descent(pq, rz, p, q, r, z)
-        x += np.multiply(p, rz / pq, out=scratch)
-        r -= np.multiply(q, rz / pq, out=scratch)
-        residual = measure(r)
-        if accepted(residual, x):
-            return x, number, ""
-        trouble = best.trouble(x, residual, number)
-        if trouble:
-            return best.x, number, trouble
-        z = precondition(r)
-        rz, before = dot(r, z), rz
-        p *= rz / before
-        p += z
-    return best.x if best_of else x, maxiter, "max_iterations"
-
-
 def _without_descent(pq, rz, p, q, r, z):
     """Why p.Sp or r.z is not positive: rounding, or an operator that is not definite."""
     if not np.isfinite(pq) or not np.isfinite(rz):
         return "diverged"
     noise = 1e-13 * np.sqrt(dot(p, p) * dot(q, q)), 1e-13 * np.sqrt(dot(r, r) * dot(z, z))
     return "stagnated" if abs(pq) <= noise[0] or abs(rz) <= noise[1] else "indefinite_operator"
-
-
-def gmres(apply, b, precondition, goal, accepted, maxiter, restart):
-    """Restarted GMRES for A x = b from 0, preconditioned from the right: its residuals are those of A.
-
-    Parameters
-    ----------
-    apply, precondition : callables
-        A p and z ~ A^-1 r, as fresh arrays.
-    b : array
-    goal : float
-        Residual norm at which a cycle ends.
-    accepted : callable
-        accepted(residual norm, x) -> bool, asked at the end of each cycle.
-    maxiter, restart : int
-
-    Returns
-    -------
-    (x, iterations, word)
-
-    Notes
-    -----
-    Source: Saad and Schultz, SIAM J. Sci. Stat. Comput. 7, 1986.
-    """
-    x, r, used = np.zeros_like(b), b, 0
-    residual = np.sqrt(dot(r, r))
-    basis = np.empty((restart + 1, b.size))
-    while True:
-        change, steps = _gmres_cycle(apply, r, residual, precondition, goal, basis, min(restart, maxiter - used))
-        used += steps
-        trial = x + precondition(change)
-        r = b - apply(trial)
-        before, residual = residual, np.sqrt(dot(r, r))
-        if not residual < before:
-            return x, used, "stagnated" if np.isfinite(residual) else "diverged"
-        x = trial
-        if accepted(residual, x):
-            return x, used, ""
-        if used >= maxiter:
-            return x, used, "max_iterations"
-        if residual > 0.999 * before:
-            return x, used, "stagnated"
 
 
 def _gmres_cycle(apply, r, residual, precondition, goal, basis, steps):

@@ -12,9 +12,9 @@ from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 
 from sparsedp import kernels
-from sparsedp.solvers.scaling import measured, norm
+from sparsedp.solvers.scaling import norm
 
-__all__ = ["NullSpace", "assembled", "find_null_space"]
+__all__ = ["NullSpace", "find_null_space"]
 
 EPS = np.finfo(float).eps
 ROUNDING = 8 * EPS  # a row whose entries sum to less than this share of their magnitudes sums to 0
@@ -51,10 +51,13 @@ class NullSpace:
             return self._sums(values.real) + 1j * self._sums(values.imag)
         return np.bincount(self.labels + 1, values, self.count + 1)[1:]
 
-    def sums(self, b, transposed=False, total=None):
-        """l.b on each component; `total` is the sum of b, if it is known."""
+    def sums(self, b, transposed=False):
+        """l.b on each component."""
         side = self._sides[not transposed]
-        return np.array([side * (b.sum() if total is None else total)]) if np.isscalar(side) else self._dots(side, b)
+        if not np.isscalar(side):
+            return self._dots(side, b)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
+            return np.array([side * (b.sum() if b.dtype.kind == "c" else kernels.totals(b)[0])])
 
     def project(self, b, transposed=False, into=None):
         """Take out, component by component, the part along the null space. The same map for b and x.
@@ -67,8 +70,7 @@ class NullSpace:
         """What `project` gives, and its norm. `sums`: what `sums(b)` gave, when it is known."""
         right = self._sides[transposed]
         real = b.dtype == np.float64 == self.right.dtype
-        if sums is None:
-            sums = self.sums(b, transposed, measured(b)[1] if real else None)
+        sums = self.sums(b, transposed) if sums is None else sums
         shares = sums / self._products
         if np.isscalar(right) and real:
             into = np.empty_like(b) if into is None else into
@@ -134,11 +136,15 @@ def find_null_space(system):
     for number in np.flatnonzero(has_right != has_left):
         cells = np.flatnonzero(labels == number)
         block = system.entries[cells][:, cells]
-        if has_right[number]:
-            left[cells] = _computed(block.T)
-        else:
-            right[cells] = _computed(block)
-    return assembled(labels, right, left, has_right | has_left)
+        side, block = (left, block.T) if has_right[number] else (right, block)
+        side[cells] = _computed(block)
+    singular = has_right | has_left
+    many = int(np.count_nonzero(singular))
+    labels = np.append(np.where(singular, np.cumsum(singular) - 1, -1), -1)[labels]
+    space = NullSpace(None if not many or np.all(labels == 0) else labels, right, left, many)
+    if many and np.any(np.abs(space._products) <= 1e-10 * space._lengths[0] * space._lengths[1]):
+        raise ArithmeticError("the right and the left null vector are orthogonal")
+    return space
 
 
 def _candidates(system, labels, count, transposed):
@@ -174,14 +180,3 @@ def _computed(matrix):
     if not np.max(np.abs(matrix @ vector)) <= 1e-10 * norm:
         raise ArithmeticError("the null vector of the other side was not found")
     return vector / vector[np.argmax(np.abs(vector))]  # of one sign where it can be, and positive then
-
-
-def assembled(labels, right, left, singular):
-    """Labels of all components, r and l on them, which of them are singular -> NullSpace of those."""
-    count = int(np.count_nonzero(singular))
-    if labels is not None and count:
-        labels = np.append(np.where(singular, np.cumsum(singular) - 1, -1), -1)[labels]
-    space = NullSpace(None if not count or np.all(labels == 0) else labels, right, left, count)
-    if count and np.any(np.abs(space._products) <= 1e-10 * space._lengths[0] * space._lengths[1]):
-        raise ArithmeticError("the right and the left null vector are orthogonal")
-    return space

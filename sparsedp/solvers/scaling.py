@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp import kernels
 
-__all__ = ["in_range", "largest", "length", "measured", "norm", "remainder", "shifted"]
+__all__ = ["in_range", "inverted", "largest", "length", "norm", "remainder", "shifted"]
 
 SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve computes leaves the range of floats
 
@@ -26,15 +26,6 @@ def length(x):
         return size
     exponent = int(np.frexp(largest(x))[1])
     return float(np.ldexp(norm(shifted(x, -exponent)), exponent))
-
-
-def measured(x):
-    """2-norm and sum of a flat array, in one pass; of a complex one the sum is None."""
-    if x.dtype.kind == "c":
-        return norm(x), None
-    with np.errstate(over="ignore", invalid="ignore"):
-        total, squares = kernels.totals(x)
-    return float(np.sqrt(squares)), total
 
 
 def remainder(b, out, x):
@@ -65,3 +56,10 @@ def shifted(x, exponent):
         return shifted(x.view(float), exponent).view(complex)
     with np.errstate(over="ignore", under="ignore"):  # what overflows is found by the caller
         return x * 2.0**exponent if -1000 < exponent < 1000 else np.ldexp(x, exponent)
+
+
+def inverted(values, out=None):
+    """1 / values, and 0 where they are 0: the generalised inverse of a diagonal."""
+    out = np.empty_like(values) if out is None else out
+    out[...] = 0.0
+    return np.divide(1.0, values, out=out, where=values != 0)

@@ -24,6 +24,7 @@ from sparsedp import kernels
 from sparsedp.errors import NonFiniteError
 from sparsedp.fields import is_number
 from sparsedp.operator import Operator
+from sparsedp.solvers.scaling import inverted
 from sparsedp.solvers.solve import Engine
 from sparsedp.structure.base import Structure
 
@@ -234,11 +235,6 @@ class Spectrum:
             y = self.axes[a].turned(1, y, a, transposed, self.workers, True)
         return y.reshape(-1)
 
-    def inverse_weights(self):
-        """1 / eigenvalues, and 0 for the null space."""
-        zero = self.eigenvalues == 0
-        return np.where(zero, 0.0, 1.0 / np.where(zero, 1.0, self.eigenvalues))
-
     @property
     def words(self):
         """One line: what each axis is."""
@@ -296,7 +292,7 @@ class Sweep:
             rest = 0.0
             for i in range(n):
                 rest = excess[i] + modes + (lower[i] * rest * self.inverses[i - 1] if i else 0.0)
-                _invert(upper[i] + rest, self.inverses[i])
+                inverted(upper[i] + rest, self.inverses[i])
         else:
             self.column, self.row = np.empty((2, n, modes.size))
             self._fill(lower, upper, excess, modes)
@@ -317,14 +313,14 @@ class Sweep:
             onwards = upper[i]
             if i == n - 2:
                 column, row, onwards = column + upper[i], row + lower[-1], 0.0
-            inverse = _invert(onwards + column + rest, self.inverses[i])
+            inverse = inverted(onwards + column + rest, self.inverses[i])
             self.column[i], self.row[i] = column, row
             last = last + row * inverse * rest
             row = _dropped(row * inverse * onwards, upper[-1])
             column = _dropped(lower[i + 1] * inverse * column, lower[0])
             rest = excess[i + 1] + modes + lower[i + 1] * inverse * rest
         self.column[-1] = self.row[-1] = 0.0
-        _invert(last, self.inverses[-1])
+        inverted(last, self.inverses[-1])
 
     def solve(self, x, transposed):
         """x, shape (n, m), is overwritten with the solution."""
@@ -333,11 +329,6 @@ class Sweep:
             kernels.sweep(x, lower, upper, self.inverses, self.row, self.column, self.ends)
         else:
             kernels.sweep(x, self.lower, self.upper, self.inverses, self.column, self.row, self.ends)
-
-
-def _invert(pivots, out):
-    out[...] = 0.0
-    return np.divide(1.0, pivots, out=out, where=pivots != 0)
 
 
 def _dropped(fill, link):
@@ -378,7 +369,7 @@ class Separable(Engine):
 
     def __init__(self, found, elimination=None):
         self.spectrum, self.elimination = found, elimination
-        self.weights = found.inverse_weights() if elimination is None else None
+        self.weights = inverted(found.eigenvalues) if elimination is None else None
         self.hierarchy = found.words
         if elimination is not None:
             self.hierarchy = f"elimination({found.shape[0]}) x {found.words.split(' x ', 1)[1]}"

@@ -29,12 +29,12 @@ need not be exact: the contract refines with further calls on the residual. Attr
     hierarchical     True: its set-up is a multigrid hierarchy
     overwrites       False: `b` is left as it is, so that the contract need not copy it
     refines          False: one call, no refinement and no error (fixed numbers of iterations)
-    unrolled         True: inv(b) is engine.unroll(b, start, transposed, run), differentiated as it runs
+    unrolled         True: inv(b) is engine.unroll(b, start, transposed)[0], differentiated as it runs
 
 Its builder is a function (system, **options) -> engine; `system` is a System (system.py).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import perf_counter
 
 import numpy as np
@@ -43,7 +43,7 @@ from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
 from sparsedp.fields import check_finite, place
 from sparsedp.ledger import count, thread, timed
 from sparsedp.recipe import Remade
-from sparsedp.solvers.scaling import in_range, largest, measured, norm, shifted
+from sparsedp.solvers.scaling import in_range, largest, norm, shifted
 from sparsedp.tape import plain
 
 __all__ = ["STATUS_WORDS", "Engine", "Run", "SolveInfo", "SolveLog", "Solver", "failure"]
@@ -157,17 +157,14 @@ class Solver(Remade):
 
     def unroll(self, b, start, transposed):
         """The engine's iterations on the tape. The record is that of the solve: its derivatives are no solves."""
-        run = Run(transposed)
-        try:
-            x = self.engine.unroll(b, start, transposed, run)
-        except ConvergenceError as error:
-            self.log.note(error.info, transposed)
-            raise
+        run = Run(transposed, rtol=self.system.rtol)
+        x, run.iterations, run.status = self.engine.unroll(b, start, transposed)
         data, solution = (np.array(plain(value), dtype=float).reshape(-1) for value in (b, x))
-        solution = shifted(solution, self.system.exponent)
-        _, rest, length = self.system.residual(solution, data, transposed)
+        _, rest, length = self.system.residual(shifted(solution, self.system.exponent), data, transposed)
         run.measure(rest, norm(data), self.system.norm(transposed) * length)
         self.log.note(run.info(), transposed)
+        if run.status == "max_iterations" and self.engine.refines:
+            self._refuse(run, plain(x), "unrolled ")
         return x
 
     def _in_parts(self, b, transposed, checked, start):
@@ -182,7 +179,7 @@ class Solver(Remade):
 
     def _scaled(self, b, run, start):
         """The solve with data and solution in the middle of the range of floats."""
-        (size, total), exponent = self._measured(b), 0
+        size, exponent = norm(b), 0
         if not in_range(size):
             top = largest(b)
             if not np.isfinite(top):
@@ -194,11 +191,11 @@ class Solver(Remade):
                 return np.zeros_like(b)
             exponent = int(np.frexp(top)[1])
             b = shifted(b, -exponent)
-            size, total = self._measured(b)
+            size = norm(b)
         exponent -= self.system.exponent
         if start is not None:
             start = shifted(start, -exponent).astype(b.dtype)
-        x = self._compatible(b, size, total, run, start)
+        x = self._compatible(b, size, run, start)
         if not exponent:
             return x
         x = shifted(x, exponent)
@@ -207,20 +204,16 @@ class Solver(Remade):
             raise NonFiniteError(f"the solution of {self.name} is beyond 1.8e308; scale the right-hand side down")
         return x
 
-    def _measured(self, b):
-        """Norm of the data, and their sum where a null space asks for it (else None)."""
-        return measured(b) if self.system.null_space.count else (norm(b), None)
-
     # ------------------------------------------------------------ null space
 
-    def _compatible(self, b, raw, total, run, start):
-        """Project, refuse what must be refused, solve. `raw`, `total`: norm and sum of b."""
+    def _compatible(self, b, raw, run, start):
+        """Project, refuse what must be refused, solve. `raw`: norm of b."""
         space, size, refuses = self.system.null_space, raw, run.checked and self.nullspace == "raise"
         if self.system.active is not None:
             b = self._on_unknowns(b, raw, run, refuses)
-            size, total = self._measured(b)
+            size = norm(b)
         if space.count:
-            sums = space.sums(b, run.transposed, total)
+            sums = space.sums(b, run.transposed)
             defect, worst = space.defect(b, sums, size, run.rtol * raw, run.transposed)
             run.defect = max(run.defect, defect)
             if refuses and defect > COMPATIBLE:
@@ -237,26 +230,29 @@ class Solver(Remade):
         outside = np.where(self.system.active, 0.0, b)
         run.defect = norm(outside) / raw if raw else 0.0
         if refuses and run.defect > 8 * EPS:
-            run.status = "incompatible_rhs"
-            cell = place(int(np.argmax(np.abs(outside))), self.system.op.codomain.shape)
-            raise IncompatibleError(
-                f"{self.name}: the right-hand side must be 0 where there is no unknown (solid or isolated cells, "
-                f"coefficient 0), but is not in cell {cell}; set it to 0 or write nullspace='project'",
-                info=run.info(),
+            self._incompatible(
+                run,
+                ": the right-hand side must be 0 where there is no unknown (solid or isolated cells, "
+                f"coefficient 0), but is not in cell {self._cell(np.argmax(np.abs(outside)))}; set it to 0",
             )
         return np.where(self.system.active, b, 0.0)
 
     def _refuse_defect(self, run, defect, worst):
-        run.status = "incompatible_rhs"
         space = self.system.null_space
         cells = space.cells(worst)
-        first = place(int(cells[0]), self.system.op.codomain.shape)
-        raise IncompatibleError(
-            f"{self.name} is singular and the right-hand side is not in its range: on component {worst + 1} of "
-            f"{space.count} ({cells.size} cells from {first}) the defect is {defect:.1e}, allowed is {COMPATIBLE:g}; "
-            "subtract the weighted mean or write nullspace='project'",
-            info=run.info(),
+        self._incompatible(
+            run,
+            f" is singular and the right-hand side is not in its range: on component {worst + 1} of {space.count} "
+            f"({cells.size} cells from {self._cell(cells[0])}) the defect is {defect:.1e}, allowed is {COMPATIBLE:g}; "
+            "subtract the weighted mean",
         )
+
+    def _cell(self, number):
+        return place(int(number), self.system.op.codomain.shape)
+
+    def _incompatible(self, run, reason):
+        run.status = "incompatible_rhs"
+        raise IncompatibleError(f"{self.name}{reason} or write nullspace='project'", info=run.info())
 
     # ------------------------------------------------------------ accuracy
 
@@ -293,10 +289,14 @@ class Solver(Remade):
         run.measure(residual, data, system.norm(transposed) * length)
         if word or not self.engine.refines:
             return x
-        op = system.given.T if transposed else system.given
+        self._refuse(run, x, why=f" ({run.status})")
+
+    def _refuse(self, run, x, how="", why=""):
+        """Raise: x does not meet the tolerance."""
+        op = self.system.given.T if run.transposed else self.system.given
         raise ConvergenceError(
-            f"{self.engine.method} on {op}: relative residual {run.residual:.1e} after {run.iterations} "
-            f"{self.engine.unit}, wanted {run.rtol:g} ({run.status})",
+            f"{how}{self.engine.method} on {op}: relative residual {run.residual:.1e} after {run.iterations} "
+            f"{self.engine.unit}, wanted {run.rtol:g}{why}",
             info=run.info(),
             best=x.reshape(op.domain.shape),
         )
@@ -396,19 +396,19 @@ class SolveLog:
         setattr(self, "adjoint" if transposed else "forward", info)
 
 
+@dataclass(slots=True)
 class Run:
     """The figures of a solve while it runs, and what was asked of it."""
 
-    __slots__ = (
-        "backward_error", "checked", "clock", "defect", "iterations", "residual", "rtol", "status", "transposed",
-    )  # fmt: skip
-
-    def __init__(self, transposed=False, checked=False, rtol=0.0):
-        self.transposed, self.checked, self.rtol = transposed, checked, rtol
-        self.status = ""
-        self.iterations = 0
-        self.residual = self.backward_error = self.defect = 0.0
-        self.clock = perf_counter()
+    transposed: bool = False
+    checked: bool = False
+    rtol: float = 0.0
+    status: str = ""
+    iterations: int = 0
+    residual: float = 0.0
+    backward_error: float = 0.0
+    defect: float = 0.0
+    clock: float = field(default_factory=perf_counter)
 
     def measure(self, residual, data, terms):
         """Note the norm of the residual, relative to that of the data, and to the sum of both terms of it."""
@@ -417,16 +417,13 @@ class Run:
 
     def info(self):
         """Freeze the figures."""
-        residual, backward_error, defect = map(float, (self.residual, self.backward_error, self.defect))
-        seconds = perf_counter() - self.clock
-        return SolveInfo(self.status, int(self.iterations), residual, backward_error, defect, seconds)
+        figures = map(float, (self.residual, self.backward_error, self.defect, perf_counter() - self.clock))
+        return SolveInfo(self.status, int(self.iterations), *figures)
 
 
 def failure(status):
     """The record of a set-up that failed."""
-    run = Run()
-    run.status = status
-    return run.info()
+    return Run(status=status).info()
 
 
 def merged(one, other):
