@@ -34,8 +34,8 @@ from sparsedp.solvers.choose import build, check_settings
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.sparsity import pattern_like
 from sparsedp.space import Space, fits
-from sparsedp.structure.base import Structure, compact, rows_of
-from sparsedp.structure.lazy import Chain, Diagonal
+from sparsedp.structure.base import Scaled, compact, rows_of
+from sparsedp.structure.lazy import Chain, Diagonal, Sum
 from sparsedp.tape import Rule, isbox, of_argument, plain
 from sparsedp.tree import copied
 
@@ -243,8 +243,8 @@ def _check_shift(shift):
     check_finite("shift", shift)
 
 
-class Elliptic(Structure):
-    """shift - D diag(k) G as a structure: applied without a matrix.
+class Elliptic(Sum):
+    """shift - D diag(k) G: a sum that acts in one pass where D and G are differences of a grid.
 
     Parameters
     ----------
@@ -257,26 +257,14 @@ class Elliptic(Structure):
     def __init__(self, D, G, k, shift, transposed=False):
         self.D, self.G, self.k, self.shift = D, G, k.reshape(-1), shift
         self.transposed = transposed
-        self.shape = (D.shape[0],) * 2
-        self.dtype = np.result_type(D.dtype, G.dtype)
-        self.has_entries = D.structure.has_entries and G.structure.has_entries
-
-    @cached_property
-    def _product(self):
-        """D diag(k) G, which acts in one pass where D and G are differences of a grid."""
-        product = Chain([self.D.structure, Diagonal(self.k), self.G.structure])
-        return product.transpose() if self.transposed else product
-
-    def apply(self, x, out):
-        wide = x.astype(np.result_type(x.dtype, np.float64), copy=False)
-        np.copyto(out, self.shift * wide - self._product.product(wide), casting="same_kind")
-
-    def magnitude(self):
-        product = self._product.magnitude()
-        return lambda x: abs(self.shift) * x + product(x)
+        product = Chain([D.structure, Diagonal(self.k), G.structure]).scaled(-1.0)
+        super().__init__([Diagonal(np.full(D.shape[0], shift)), product.transpose() if transposed else product])
 
     def transpose(self):
         return Elliptic(self.D, self.G, self.k, self.shift, not self.transposed)
+
+    def scaled(self, factor):
+        return Scaled(self, factor)  # so that the entries are the same bits, scaled
 
     def explicit(self):
         D, G = self.D.matrix, self.G.matrix
