@@ -133,7 +133,7 @@ class Scripted(Engine):
 def scripted(error, word="", rtol=1e-10, **options):
     op = -dp.laplacian(dp.Grid(101, size=1.0), dp.dirichlet)
     engine = Scripted(op, error, word, **options)
-    return Inverse(Solver(System(op, rtol), engine, "raise", SolveLog(), "inverse", None), "a test"), engine
+    return Inverse(Solver(System(op, rtol), engine, "raise", SolveLog(), "inverse", None)), engine
 
 
 def test_an_inexact_method_is_refined():

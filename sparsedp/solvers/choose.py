@@ -131,7 +131,7 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
     made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
     solver = Solver(system, engine, nullspace, log or SolveLog(), name, made, reason)
     _note_setup(solver, clock)
-    return Inverse(solver, reason)
+    return Inverse(solver)
 
 
 def build_dense(matrix, make, rtol, nullspace, name):

@@ -52,7 +52,7 @@ class Linearisation:
         self.product, self.terms = solver.system.applied, solver.system.terms  # J x; a size of the terms of that
 
     def __str__(self):
-        return str(Inverse(self.solver, self.solver.reason))
+        return str(Inverse(self.solver))
 
     @property
     def singular(self):
@@ -107,14 +107,16 @@ class Jacobians:
         self.sparsity: Any = None if sparsity is None else pattern_like(sparsity)
         self.by_rows = None  # True: the residual has no JVP
         self.way = ""
-        self._spaces: dict = {}  # size -> the cells that the unknowns were found to lie on
-        self._patterns: dict = {}  # size -> Coloured, or None when only products will do
+        # size -> (Coloured, or None when only products will do; the cells that the unknowns were found to lie on)
+        self._patterns: dict = {}
         self._points, self._matrices = Cache(), Cache()
         self._alone = RLock()  # held by the thread that looks for a pattern
 
     def __str__(self):
-        counts = {size: "" if c is None else f", {c.count} products" for size, c in self._patterns.items()}
-        lines = [f"  {size} unknowns{many}" for size, many in counts.items()]
+        lines = [
+            f"  {size} unknowns" + ("" if coloured is None else f", {coloured.count} products")
+            for size, (coloured, _) in self._patterns.items()
+        ]
         return "\n".join([*lines, str(self._points.last) if len(self._points) else "  not set up yet"])
 
     # ------------------------------------------------------------ set-ups
@@ -197,12 +199,11 @@ class Jacobians:
             given = self.given(equation.layout.split(x), *equation.params(leaves))
             return self._solver(self._as_operator(given, equation.size, name)), False
         with self._alone:
-            coloured = self._coloured(equation, x, leaves)
+            coloured, space = self._coloured(equation, x, leaves)
         if coloured is None:
             forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
             return self._solver(from_functions(forward, backward, equation.size, equation.size, name)), True
         matrix = coloured.matrix(self._product(equation, x, leaves, coloured.by_rows))
-        space = self._spaces.get(equation.size)
         # A field of another shape may have as many unknowns.
         suits = space is not None and equation.layout.shapes[0] == space.shape and _is_symmetric(matrix, space)
         make = partial(from_matrix, matrix, *(space if suits else equation.size,) * 2, name)
@@ -236,8 +237,8 @@ class Jacobians:
     # ------------------------------------------------------------ the pattern
 
     def _coloured(self, equation, x, leaves):
-        """The coloured pattern for this many unknowns; None: only products will do."""
-        size, method, pattern = equation.size, self.settings["method"], self.sparsity
+        """The coloured pattern for this many unknowns (None: only products will do), and the cells that they lie on."""
+        size, method, pattern, space = equation.size, self.settings["method"], self.sparsity, None
         if size in self._patterns:
             return self._patterns[size]
         if self.by_rows is None:
@@ -252,24 +253,23 @@ class Jacobians:
             pattern, self.way = dense_pattern(size, size), "assembled, all entries"
         else:
             pattern, self.way = self._search(equation, x, leaves), "assembled on a pattern found by probing"
-            self._spaces[size] = cells_met(equation, x, leaves)
+            space = cells_met(equation, x, leaves)
             if pattern is None and method == "auto" and size > FULL_AT_MOST:
                 self.way = f"products only: {size} unknowns and a Jacobian that is not sparse"
             elif pattern is None:
                 pattern, self.way = dense_pattern(size, size), "assembled, all entries: it is not sparse"
-        self._colour(pattern, equation, x, leaves)
-        return self._patterns[size]
+        return self._colour(pattern, space, equation, x, leaves)
 
-    def _colour(self, pattern, equation, x, leaves):
-        shapes = equation.layout.shapes
-        shape = shapes[0] if len(shapes) == 1 else None
-        # One tape serves all products with J^T; each with J takes a run of its own.
-        symmetric = pattern is not None and _is_own_transpose(pattern)
-        symmetric = symmetric and _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
-        coloured = None if pattern is None else Coloured(pattern, shape, True if self.by_rows or symmetric else None)
-        if not symmetric:
-            self._spaces.pop(equation.size, None)
-        self._patterns[equation.size] = coloured
+    def _colour(self, pattern, space, equation, x, leaves):
+        coloured, shapes = None, equation.layout.shapes
+        if pattern is not None:
+            # One tape serves all products with J^T; each with J takes a run of its own.
+            symmetric = _is_own_transpose(pattern) and _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
+            by_rows = True if self.by_rows or symmetric else None
+            coloured = Coloured(pattern, shapes[0] if len(shapes) == 1 else None, by_rows)
+            space = space if symmetric else None
+        self._patterns[equation.size] = coloured, space
+        return coloured, space
 
     def _search(self, equation, x, leaves):
         """The pattern of J near x and at two opposite random points, by columns or by rows."""
@@ -283,7 +283,8 @@ class Jacobians:
 
     def _enlarge(self, equation, x, leaves, row):
         """Add the entries that J has at x. When there are none, its products are not linear."""
-        old = self._patterns[equation.size].pattern
+        coloured, space = self._patterns[equation.size]
+        old = coloured.pattern
         product = self._product(equation, x, leaves, bool(self.by_rows), "pattern")
         found = find_pattern([product], x.size, x.size)
         found = dense_pattern(*old.shape) if found is None else found.T.tocsr() if self.by_rows else found
@@ -291,7 +292,7 @@ class Jacobians:
         if total.nnz == old.nnz:
             raise DerivativeError(f"the derivative of {self.name} is not linear in its direction in row {row}")
         total.data[:] = 1.0
-        self._colour(total, equation, x, leaves)
+        self._colour(total, space, equation, x, leaves)
 
 
 def _key(equation, x, leaves):

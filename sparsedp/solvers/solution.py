@@ -62,31 +62,32 @@ class Inverse(Operator):
     Parameters
     ----------
     solver : Solver
-    reason : str
-        Why this method, in words.
     transposed, checked : bool
     """
 
     structure: Solution
     solver: Solver
-    reason: str
 
-    def __init__(self, solver, reason, transposed=False, checked=True):
+    def __init__(self, solver, transposed=False, checked=True):
         op = solver.system.given
         domain, codomain = (op.domain, op.codomain) if transposed else (op.codomain, op.domain)
         name = f"{solver.name}.T" if transposed else solver.name
         super().__init__(Solution(solver, transposed, checked), domain, codomain, name, "matrix-free")
         self.__dict__["solver"] = solver
-        self.__dict__["reason"] = reason
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
-        return Inverse, (self.solver, self.reason, self.structure.transposed, self.structure.checked)
+        return Inverse, (self.solver, self.structure.transposed, self.structure.checked)
 
     @property
     def info(self):
         """SolveLog, shared with the transpose: .forward, .adjoint, .setup_seconds, .hierarchy."""
         return self.solver.log
+
+    @property
+    def reason(self):
+        """Why this method, in words."""
+        return self.solver.reason
 
     @property
     def method(self):
@@ -95,7 +96,7 @@ class Inverse(Operator):
 
     def _make_transpose(self):
         structure = self.structure
-        turned = Inverse(self.solver, self.reason, not structure.transposed, checked=False)
+        turned = Inverse(self.solver, not structure.transposed, checked=False)
         if not structure.checked:  # the transpose of a transpose is the twin that never refuses
             turned.__dict__["_origin"] = weakref.ref(self)
         self.__dict__["_transposed"] = turned
@@ -108,7 +109,7 @@ class Inverse(Operator):
 
     @cached_property
     def _unchecked(self):
-        return Inverse(self.solver, self.reason, self.structure.transposed, checked=False)
+        return Inverse(self.solver, self.structure.transposed, checked=False)
 
     # ------------------------------------------------------------ application
 
