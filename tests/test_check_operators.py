@@ -7,6 +7,8 @@ import pytest
 import scipy.sparse as sp
 
 import sparsedp as dp
+from sparsedp.check.operators import layouts
+from sparsedp.derivative import pullback
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
 from sparsedp.structure.base import Structure
@@ -57,6 +59,26 @@ def test_right_operators_pass(name):
     assert card.worst <= 10
     assert dp.check.transpose(RIGHT[name])
     assert dp.check.twin(RIGHT[name]).verdict == "agrees"
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_how_numbers_lie_in_memory_does_not_matter(name):
+    """The bits of the contiguous copy in every layout and in a batch; whole numbers are float64, without a gradient."""
+    op = RIGHT[name]
+    u = np.sin(np.arange(float(op.domain.size))).reshape(op.domain.shape)
+    wanted = op(u)
+    for other in layouts(u).values():
+        assert np.array_equal(op(other), wanted)
+    for one, other in zip(op(np.stack([u, 2.0 * u])), (u, 2.0 * u)):
+        assert np.array_equal(one, op(other))
+    for kind in (int, bool):
+        whole = op((u > 0).astype(kind))
+        assert np.array_equal(whole, op((u > 0).astype(float))) and whole.dtype == wanted.dtype
+        with pytest.raises(dp.errors.DerivativeError):
+            pullback(op, (u > 0).astype(kind))
+    for shape in ((*u.shape, 2), (u.size + 1,)):
+        with pytest.raises(dp.errors.ShapeError):
+            op(np.zeros(shape))
 
 
 def test_a_new_operator_in_five_lines():

@@ -187,7 +187,7 @@ def _looked_at(trials, slope, steps, extend, count, rng, names=None):
         doubts.append(("unsound", "two evaluations of the gradient differ: it is not deterministic"))
     if 0 < np.max(np.abs(vector * point.units), initial=0.0) < UNDERFLOW:
         doubts.append(("unsound", f"the loss changes by less than {UNDERFLOW:g}: it underflows, scale it"))
-    for name, values in zip(point.names, point.arrays(vector), strict=True):
+    for name, values in zip(point.names, point.arrays(vector)):
         if not np.all(np.isfinite(values)):
             doubts.append(("broken", f"the gradient of {name} holds NaN or infinity"))
     if not (math.isfinite(trials.base) and np.all(np.isfinite(vector))):
@@ -238,7 +238,7 @@ def _complex_step(loss, point, judged, base):
     """
     gaps = []
     for one in [] if point.complex else judged:
-        arrays = zip(point.arrays(point.vector), point.arrays(one.line.direction), strict=True)
+        arrays = zip(point.arrays(point.vector), point.arrays(one.line.direction))
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # a discarded imaginary part shows in the figure

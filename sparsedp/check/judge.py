@@ -279,7 +279,7 @@ class Judgement:
         for series in (values, (ratio * values[1:] - values[:-1]) / (ratio - 1)):
             jumps, start = np.abs(np.diff(series)), values.size - series.size + 1
             bars = np.maximum(jumps[:-1], jumps[1:]) + 2 * (noise / self.t)[start:-1]
-            found += zip(series[1:-1], bars, range(start, values.size - 1), strict=True)
+            found += zip(series[1:-1], bars, range(start, values.size - 1))
         return sorted(found, key=lambda estimate: estimate[1])
 
     def _compare(self):

@@ -271,7 +271,7 @@ def _terms(moments, op):
     text = ""
     for (component, power), moment in moments.items():
         name = f"u{component + 1:.0f}" if len(op.domain.parts) > 1 else "u"
-        slopes = "".join(axis * p for axis, p in zip(op.domain.grid.axes, power, strict=True))
+        slopes = "".join(axis * p for axis, p in zip(op.domain.grid.axes, power))
         size = "" if abs(abs(moment) - 1) < MOMENT else f"{abs(moment):.4g} "
         text += f" {'-' if moment < 0 else '+'} {size}{name}{'_' * bool(slopes)}{slopes}"
     return text[3:] if text.startswith(" +") else f"-{text[3:]}"

@@ -82,7 +82,7 @@ class Refinement(Result):
 
     def __str__(self):
         orders = ["", *(f"{slope:.2f}" for slope in self.orders)]
-        lines = [(n, f"{error:.3e}", slope) for n, error, slope in zip(self.sizes, self.errors, orders, strict=True)]
+        lines = [(n, f"{error:.3e}", slope) for n, error, slope in zip(self.sizes, self.errors, orders)]
         head = f"order {self.order:.2f} over the last three sizes: {self.verdict} ({self.reason})"
         return head + "\n" + table(lines, ("n", "error", "order"))
 

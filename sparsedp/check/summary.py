@@ -94,7 +94,7 @@ class Summary(Result):
     def __str__(self):
         words = {True: "ok", False: "FAILS", None: "-"}
         rows = [(row.name, row.figure, row.limit, words[row.ok], row.note) for row in self.rows]
-        cells = [["" if x is None else form.format(x) for form, x in zip(FORMS, row, strict=True)] for row in rows]
+        cells = [["" if x is None else form.format(x) for form, x in zip(FORMS, row)] for row in rows]
         return "\n".join([*self._head(), table(cells)])
 
 
@@ -120,7 +120,7 @@ def table(lines, head=None):
     for column in zip(*rows, strict=True):
         side, width = ">" if all(map(NUMBER, column[bool(head) :])) else "<", max(map(len, column))
         columns.append([f"{cell:{side}{width}}" for cell in column])
-    return "\n".join(f"  {'  '.join(cells)}".rstrip() for cells in zip(*columns, strict=True))
+    return "\n".join(f"  {'  '.join(cells)}".rstrip() for cells in zip(*columns))
 
 
 NUMBER = re.compile(r"[-+]?(\d[\d.]*(e[-+]\d+)?|nan|inf|exact)?").fullmatch  # what is set to the right of a column

@@ -69,7 +69,7 @@ class Point:
         self.values = [np.array(self._leaves[place]) for place in self.places]
         paths = list(_paths(x))
         self.names = [paths[place] for place in self.places]
-        for name, values in zip(self.names, self.values, strict=True):
+        for name, values in zip(self.names, self.values):
             if not np.all(np.isfinite(values)):
                 raise NonFiniteError(f"a gradient is checked at finite values, and {name} holds NaN or infinity")
         self.vector = joined(self.values)
@@ -85,15 +85,15 @@ class Point:
 
     def arrays(self, vector):
         """Arrays of the shapes and dtypes of the floating leaves; this rounds."""
-        parts = zip(self._parts(vector), self.values, strict=True)
+        parts = zip(self._parts(vector), self.values)
         return [part.view(np.result_type(x, float)).astype(x.dtype).reshape(x.shape) for part, x in parts]
 
     def tree(self, other=None):
-        """The tree with other floating leaves, arrays or a vector; always fresh copies."""
-        arrays = self.values if other is None else self.arrays(other) if isinstance(other, np.ndarray) else other
+        """The tree with other floating leaves, a vector or a list of arrays; all but those arrays are fresh."""
+        arrays = other if isinstance(other, list) else self.arrays(self.vector if other is None else other)
         leaves = copied(self._leaves)
-        for place, value in zip(self.places, arrays, strict=True):  # numbers stay numbers
-            leaves[place] = np.array(value) if isinstance(leaves[place], np.ndarray) else value[()]
+        for place, value in zip(self.places, arrays):  # numbers stay numbers
+            leaves[place] = value if isinstance(leaves[place], np.ndarray) else np.asarray(value)[()]
         return self._rebuild(leaves)
 
     def gradient(self, tree):
@@ -102,10 +102,10 @@ class Point:
         if len(leaves) != len(self._leaves):
             raise DerivativeError(f"the gradient has {len(leaves)} leaves where x has {len(self._leaves)}")
         arrays = [np.conj(leaves[place]) for place in self.places]
-        for name, x, g in zip(self.names, self.values, arrays, strict=True):
+        for name, x, g in zip(self.names, self.values, arrays):
             if g.shape != x.shape:
                 raise DerivativeError(f"the gradient of {name} has shape {g.shape} where {x.shape} is needed")
-        return joined([g.astype(np.result_type(x, float)) for g, x in zip(arrays, self.values, strict=True)])
+        return joined([g.astype(np.result_type(x, float)) for g, x in zip(arrays, self.values)])
 
     def directions(self, gradient, count, rng, wanted=None):
         """Names and displacements: random ones, and structured ones that see what random ones average away.
@@ -321,7 +321,7 @@ def noise_of(line):
     distance = FIRST * max(1.0, line.point.eps / np.finfo(float).eps) ** 0.5
     for _ in range(MOST):
         # On one side: a kink at x is no noise.
-        values, changes, notes = zip(*(line.end(place * distance) for place in range(1, POINTS + 1)), strict=True)
+        values, changes, notes = zip(*(line.end(place * distance) for place in range(1, POINTS + 1)))
         if any(notes):
             return 0.0
         if np.count_nonzero(np.diff(values)) > POINTS // 2:

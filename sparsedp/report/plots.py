@@ -230,7 +230,7 @@ def curves(lines, ax, xlabel, ylabel, title=None):
     -------
     matplotlib Axes
     """
-    best = unbeaten([point for x, y in lines.values() for point in zip(x, y, strict=True)])
+    best = unbeaten([point for x, y in lines.values() for point in zip(x, y)])
     ax.plot(*np.reshape(best, (-1, 2)).T, color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
     return _dressed(lines, ax, xlabel, ylabel, title)
 
@@ -321,7 +321,7 @@ def v_curve(audit, ax=None):
     lines: dict = {one.direction: ([], []) for one in audit.lines}
     for row in audit.rows:
         if not row["note"] and row["gap"]:  # 0 has no logarithm
-            for axis, value in zip(lines[row["direction"]], (row["step"], abs(row["gap"])), strict=True):
+            for axis, value in zip(lines[row["direction"]], (row["step"], abs(row["gap"]))):
                 axis.append(value)
     title = f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}"
     return _dressed(lines, _current(ax), "step", "|difference - gradient| / |derivative|", title)

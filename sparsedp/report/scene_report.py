@@ -79,7 +79,7 @@ def load(target):
         raise ValueError(f"{file} has no {start or ' or '.join(STARTS)!r}, the point; write {file}:{loss}:NAME")
     name = file.stem if loss == "loss" else f"{file.stem}-{loss}"
     options = [found.get(key, {}) for key in OPTIONS]
-    for key, given in zip(OPTIONS, options, strict=True):
+    for key, given in zip(OPTIONS, options):
         if not isinstance(given, dict):
             raise ValueError(f"{key} in {file} must be a dict of arguments, got {type(given).__name__}")
     return Source(name, _of_one(found[loss], found[names[0]]), found[names[0]], *options)
@@ -173,7 +173,7 @@ def write_report(source, folder, force=False):
     words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
     verdict = next(word for word in MEANING if word in words)
     page, left, lines = [f"# {source.name}: {verdict}", "", MEANING[verdict]], [], []
-    for chapter, result in zip(CHAPTERS, results, strict=True):
+    for chapter, result in zip(CHAPTERS, results):
         sentences = [f"{chapter.failed}, {result}"] if isinstance(result, str) else list(chapter.tell(result))
         if isinstance(result, Result):
             _save(folder, chapter, result)

@@ -12,7 +12,7 @@ import numpy as np
 
 from sparsedp.check.summary import Result, table
 from sparsedp.check.sweep import Point, joined
-from sparsedp.derivative import NO_JVP, pushforward
+from sparsedp.direction import jvp
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
 from sparsedp.tree import flatten, leaves, norm
@@ -22,7 +22,6 @@ __all__ = ["SEED", "STEADY", "Growth", "StabilityMap", "growth_of", "stability_m
 SEED = 20240229  # of random changes, here and in the stress cases
 STEPS, SETTLED = 40, 20  # steps in all, and those that are measured
 STEADY = 1.0 + 1e-3  # growth factors up to here do not count as growth
-SMALL = 1e-6  # change of the state, in units of itself, where a step has no tangent
 POINTS, DECADES = 9, 2.0  # of the map along each axis; on either side of the values of the scene
 
 
@@ -74,24 +73,15 @@ def _measured(advance, state):
     logarithms, flips = [], []
     for _ in range(STEPS):
         before = change / (norm(change) or 1.0)
-        state, change = _pushed(advance, Point(state), before)
+        point = Point(state)
+        state, moved = jvp(advance, point.tree(), point.tree(before))
+        change = joined([np.asarray(leaf) for leaf in leaves(moved) if leaf is not None])
         size = norm(change)
         if size == 0 or not np.isfinite(size):
             return Growth(float(size), flips=size > 0)
         logarithms.append(np.log(size))
         flips.append(before @ change < 0)
     return Growth(float(np.exp(np.mean(logarithms[-SETTLED:]))), bool(np.mean(flips[-SETTLED:]) > 0.5))
-
-
-def _pushed(advance, point, change):
-    """(next state, change of it) for a change of the state."""
-    try:
-        after, moved = pushforward(advance, point.tree(), point.tree(change))
-        return after, joined([np.asarray(leaf) for leaf in leaves(moved) if leaf is not None])
-    except NO_JVP:  # a rule without a JVP
-        t = SMALL * (norm(point.vector) or 1.0)
-        after, other = advance(point.tree()), advance(point.tree(point.vector + t * change))
-        return after, (Point(other).vector - Point(after).vector) / t
 
 
 class StabilityMap(Result):
@@ -113,7 +103,7 @@ class StabilityMap(Result):
         return {"time_steps": self.time_steps.tolist(), "viscosities": self.viscosities.tolist(), "factors": factors}
 
     def __str__(self):
-        rows = [(f"{dt:.1e}", *map(_cell, row)) for dt, row in zip(self.time_steps, self.factors, strict=True)]
+        rows = [(f"{dt:.1e}", *map(_cell, row)) for dt, row in zip(self.time_steps, self.factors)]
         return table(rows, (" \\ ".join(self.names), *(f"{nu:.1e}" for nu in self.viscosities)))
 
 
@@ -124,15 +114,15 @@ def _cell(factor):
 def stability_map(scene):
     """Scene -> StabilityMap, or None where it has no loop, or no named time step and viscosity of one number each."""
     names = tuple(scene.named.values())
-    here = [scene.leaves.get(name, 0.0) for name in names]
-    alone = all(np.size(value) == 1 and np.min(value) > 0 for value in here)
+    here = [scene.leaves.get(name, np.zeros(1)) for name in names]
+    alone = all(value.size == 1 and value > 0 for value in here)
     if not alone or scene.growth is None or scene.growth.refusal:
         return None
-    here = [float(np.max(value)) for value in here]
-    dts, nus = (_values(value, scene.ranges.get(name)) for name, value in zip(names, here, strict=True))
+    here = [value.item() for value in here]
+    dts, nus = (_values(value, scene.ranges.get(name)) for name, value in zip(names, here))
 
     def factor(*pair):
-        other = {name: np.full_like(scene.leaves[name], value) for name, value in zip(names, pair, strict=True)}
+        other = {name: np.full_like(scene.leaves[name], value) for name, value in zip(names, pair)}
         growth = scene.growth_at(other)
         return np.nan if growth is None else growth.factor
 

@@ -56,7 +56,7 @@ class Scene:
     Attributes
     ----------
     leaves : dict
-        Name -> array or float: the floating leaves of x.
+        Name -> array: the floating leaves of x.
     ranges : dict
         Name -> (low, high).
     named : dict
@@ -67,12 +67,10 @@ class Scene:
     """
 
     def __init__(self, loss, x, ranges, step, time_step, viscosity):
-        self.loss, self.step = loss, step
-        point = Point(x)
-        self._found, self._rebuild = flatten(x)
-        names = [re.sub(r"^\['?([^\[\]']*)'?\]$", r"\1", name.removeprefix("x") or "x") for name in point.names]
-        self._places = dict(zip(names, point.places, strict=True))
-        self.leaves = {name: self._found[place] for name, place in self._places.items()}
+        self.loss, self.step, self.point = loss, step, Point(x)
+        paths = [name.removeprefix("x") or "x" for name in self.point.names]
+        names = [re.sub(r"^\['?([^\[\]']*)'?\]$", r"\1", path) for path in paths]
+        self.leaves = dict(zip(names, self.point.values))
         ranges = {names[0]: ranges} if isinstance(ranges, (tuple, list)) and len(names) == 1 else ranges or {}
         for name in (*ranges, time_step, viscosity):
             if name is not None and name not in names:
@@ -83,18 +81,14 @@ class Scene:
         self.ranges = {name: tuple(map(float, limits)) for name, limits in ranges.items()}
         self.named = {
             kind: given or next((word for word in words if word in names), None)
-            for (kind, words), given in zip(NAMES.items(), (time_step, viscosity), strict=True)
+            for (kind, words), given in zip(NAMES.items(), (time_step, viscosity))
         }
         self.base = self.run({})
         self.growth = self.growth_at({})
 
     def at(self, other):
-        """The tree x with other values of some parameters; always fresh copies."""
-        leaves = copied(self._found)
-        for name, value in other.items():
-            plain = isinstance(self.leaves[name], float) and np.asarray(value).dtype.kind == "f"
-            leaves[self._places[name]] = float(value) if plain else value
-        return self._rebuild(leaves)
+        """The tree x with other values of some parameters; the rest are fresh copies."""
+        return self.point.tree(list((copied(self.leaves) | other).values()))
 
     def run(self, other):
         """What the loss gives there."""
@@ -123,7 +117,7 @@ class Scene:
     @cached_property
     def steepest(self):
         """Name -> index of the entry with the largest derivative, of what the loss depends on."""
-        pairs = zip(self.leaves, map(np.abs, self.base.gradient), strict=False)  # no gradient where it is refused
+        pairs = zip(self.leaves, map(np.abs, self.base.gradient))  # no gradient where it is refused
         return {name: np.unravel_index(np.argmax(g), g.shape) for name, g in pairs if np.max(g, initial=0.0) > 0}
 
     @cached_property
@@ -131,11 +125,11 @@ class Scene:
         """Name -> d, where the loss is a monomial s^d in the scale s of a parameter."""
         degrees = {}
         for name, leaf in self.leaves.items():
-            outcomes = [self.run({name: s * leaf}) for s in (0.5, 1.0, 2.0)]
-            if all(out.finite and out.value for out in outcomes):
-                powers = np.diff([math.log2(abs(out.value)) for out in outcomes])
-                if np.sum(np.abs(powers - np.rint(powers[0]))) < 1e-12:
-                    degrees[name] = round(powers[0])
+            values = np.array([self.run({name: s * leaf}).value for s in (0.5, 1.0, 2.0)])  # NaN where it is refused
+            with np.errstate(all="ignore"):
+                powers = np.diff(np.log2(np.abs(values)))
+            if np.sum(np.abs(powers - np.rint(powers[0]))) < 1e-12:
+                degrees[name] = round(powers[0])
         return degrees
 
 

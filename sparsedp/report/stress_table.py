@@ -79,7 +79,7 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     chosen = GROUPS if only is None else only
     scene = Scene(loss, x, ranges, step, time_step, viscosity)
     judged = [(*names, *judge()) for *names, judge in cases(scene, chosen)]
-    rows = [dict(zip(COLUMNS, row, strict=True)) for row in judged if row[3]]
+    rows = [dict(zip(COLUMNS, row)) for row in judged if row[3]]
     skipped = [f"{row[2]}: {row[5]}" for row in judged if not row[3]]
     ran = {row["group"] for row in rows}
     skipped += [f"{group}: {GROUPS[group]}" for group in chosen if group not in ran and GROUPS[group]]

@@ -10,7 +10,6 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -110,27 +109,25 @@ def workprec(
         raise ValueError(f"workprec needs repeats >= 1, a whole number, got {repeats!r}; the default is 3")
     if not methods or not isinstance(methods, dict):
         raise ValueError("workprec needs at least one method; write {'name': {settings}}")
-    scene, over = scene or getattr(problem, "__name__", "scene"), over or {}
+    scene, over, rows = scene or getattr(problem, "__name__", "scene"), over or {}, []
     finished, skipped = _finished(Path(file)) if file else ({}, [])
     errors = partial(_errors, problem, reference, compare or relative_distance, {})
-    rows = []
     for (method, own), *values in itertools.product(methods.items(), *over.values()):
-        shared = dict(zip(over, values, strict=True))
+        shared = dict(zip(over, values))
         settings = shared | own
         reason = skip and skip(str(method), settings)
         if reason:
             skipped.append(f"{method} with {_words(settings)}: {reason}")
             continue
         key = scene, str(method), _text_of(settings), str(seed)
-        row = finished.get(key)
-        if row is None:
+        if key not in finished:
             figures, *result = measured_row(problem, settings, repeats)
             figures |= errors({name: settings[name] for name in over}, *result)
-            figures |= {**dict(zip(KEY, key, strict=True)), "versions": versions()}
-            row = {name: figures.get(name, np.nan) for name in COLUMNS}
+            figures |= {**dict(zip(KEY, key)), "versions": versions()}
+            finished[key] = {name: figures.get(name, np.nan) for name in COLUMNS}
             if file:
-                _append(Path(file), row)
-        rows.append(row)
+                _append(Path(file), finished[key])
+        rows.append(finished[key])
     return Rows(scene=scene, rows=rows, left_out=skipped)
 
 
@@ -166,12 +163,12 @@ def measured_row(problem, settings, repeats):
     try:
         setup, given = timed(partial(problem, **settings))
         loss, x, facts = _task(given)
-        run = _runs(loss, x)[-1]
-        calls, status, first = _warm(run)
+        runs = [loss] if x is None else [partial(loss, x), partial(value_and_grad(loss), x)]
+        calls, status, first = _warm(runs[-1])
         row = {"status": status, "seconds_setup": setup + total(first, "setup")}
         row |= {name: total(calls, kind) for name, kind in COUNTS.items()}
-        value, gradient = _times(_runs(loss, x), row, repeats)
-        row["peak_bytes"] = _peak(run)
+        value, gradient = _times(runs, row, repeats)
+        row["peak_bytes"] = _peak(runs[-1])
         answer = _answer(value, x, facts)
     except FAILURES as error:
         return {"status": _failure(error)}, None, None
@@ -188,11 +185,6 @@ def _task(given):
             f"a problem gives (loss, x) or (loss, x, facts), got {type(given).__name__}; write return loss, x"
         )
     return (*given, {})[:3]
-
-
-def _runs(loss, x):
-    """[function that gives the value or answer, function that gives it with the gradient where there is one]."""
-    return [loss] if x is None else [partial(loss, x), partial(value_and_grad(loss), x)]
 
 
 def _answer(value, x, facts):
@@ -216,11 +208,11 @@ def _warm(run):
     for _ in range(MOST_WARM_UPS):
         with recording() as calls:
             now, _ = timed(run)
-        first = calls.seconds if first is None else first
+        first = first or calls
         if before <= SETTLED * now + SHORT:  # it does not fall any more
-            return calls, "ok", first
+            return calls, "ok", first.seconds
         before = now
-    return calls, "not_warm", first
+    return calls, "not_warm", first.seconds
 
 
 def _times(runs, row, repeats):
@@ -228,8 +220,8 @@ def _times(runs, row, repeats):
 
     NaN when the caches never got warm. The time of the gradient is that of both less the least of the value.
     """
-    least, result = 0.0, (None, None)
-    for name, run in zip(("seconds_forward", "seconds_backward"), runs, strict=False):
+    least = 0.0
+    for name, run in zip(("seconds_forward", "seconds_backward"), runs):
         pairs = [timed(run) for _ in range(repeats)]
         seconds = [max(spent - least, 0.0) if row["status"] == "ok" else math.nan for spent, _ in pairs]
         least, result = min(seconds), pairs[-1][1]
@@ -240,8 +232,7 @@ def _times(runs, row, repeats):
 def _peak(run):
     """Bytes that a run holds at most, beyond what there was before, as Python's allocator sees it."""
     running = tracemalloc.is_tracing()
-    if not running:
-        tracemalloc.start()
+    tracemalloc.start()  # nothing where it runs
     try:
         tracemalloc.reset_peak()
         before = tracemalloc.get_traced_memory()[0]
@@ -284,17 +275,15 @@ def _reference(problem, given, compare, shared):
         loss, x, facts = _task(problem(**{**shared, **settings}))
         value, gradient = (loss(), None) if x is None else value_and_grad(loss)(x)
         results.append((_answer(value, x, facts), gradient))
-    pairs = [(a, b) for a, b in zip(*results[-2:], strict=True) if a is not None] if len(results) > 1 else []
-    return *results[-1], max((compare(a, b) for a, b in pairs), default=math.nan)
+    gaps = [compare(a, b) for a, b in zip(*results[-2:]) if a is not None] if len(results) > 1 else []
+    return *results[-1], max(gaps, default=math.nan)
 
 
 def relative_distance(one, other):
     """Euclidean distance relative to the second."""
-    for a, b in zip(leaves(one), leaves(other), strict=True):
-        if np.shape(a) != np.shape(b):
-            raise ValueError(
-                f"workprec cannot compare shape {np.shape(a)} with {np.shape(b)}; give compare=function(found, wanted)"
-            )
+    for a, b in zip(map(np.shape, leaves(one)), map(np.shape, leaves(other)), strict=True):
+        if a != b:
+            raise ValueError(f"workprec cannot compare shape {a} with {b}; give compare=function(found, wanted)")
     return distance(one, other) / (norm(other) or 1.0)
 
 
@@ -342,13 +331,11 @@ class Rows(Result):
 
     def markdown(self):
         """The table in Markdown, with what was left out; a star marks the Pareto set of the gradient."""
-        best = [id(row) for row in [*self.pareto(), *self.pareto("forward_error")]]
         rows, names = self._shown()
-        stars = ["*" if id(row) in best else "" for row in self.rows]
-        table = markdown_table([{**row, "best": star} for row, star in zip(rows, stars, strict=True)], [*names, "best"])
         star = "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."
         errors = [row["reference_error"] for row in self.rows if not math.isnan(row["reference_error"])]
         stated = [f"\nError of the reference: {max(errors):.1e}."] if errors else []
+        table = markdown_table(rows, [*names, "best"])
         return "\n".join([f"### {self.scene}", "", *table, "", star, *stated, "", *left_out(self.left_out), ""])
 
     def _shown(self):
@@ -360,7 +347,9 @@ class Rows(Result):
             if name not in COLUMNS and row[name] != first.setdefault(row["method"], row)[name]
         )  # fmt: skip
         used = [name for name in SHOWN if any(text_of(row[name]) for row in rows)]
-        return rows, [*used[:1], *apart, *used[1:]]
+        best = [*self.pareto(), *self.pareto("forward_error")]
+        marked = [row | {"best": "*" * (own in best)} for row, own in zip(rows, self.rows)]
+        return marked, [*used[:1], *apart, *used[1:]]
 
     def csv(self):
         """All columns as CSV."""
@@ -426,8 +415,8 @@ def _finished(path):
     same = [row for row in rows if row["versions"] == versions()]
     other = len(rows) - len(same)
     left = [f"{other} rows of {path.name} from other versions: run again"] if other else []
-    typed: list[Any] = [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in same]
-    return {tuple(row[name] for name in KEY): row for row in typed}, left
+    typed = [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in same]
+    return {tuple(map(row.get, KEY)): row for row in typed}, left
 
 
 def _number(text):

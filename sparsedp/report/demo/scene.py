@@ -91,5 +91,5 @@ def survey(grid, logk):
 
 def lattice(counts, size):
     """Points in regular rows over the box, shape (m, 2)."""
-    lines = [(np.arange(n) + 0.5) / n * extent for n, extent in zip(counts, size, strict=True)]
+    lines = [(np.arange(n) + 0.5) / n * extent for n, extent in zip(counts, size)]
     return np.stack([full.ravel() for full in np.meshgrid(*lines, indexing="ij")], axis=1)

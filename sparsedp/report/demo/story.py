@@ -102,7 +102,7 @@ def recover(study, grid, loss, check):
     print(f"  {', '.join(f'{many} {name}' for name, many in counts.items())}\n")
     gap = max((abs(line.gap) / line.scale for line in check.lines if line.scale > 0), default=np.nan)
     row = {"grid": " x ".join(map(str, grid.shape)), "unknowns": best.x.size, "iterations": len(trace), **counts}
-    row |= dict(zip(("seconds", "misfit", "error"), trace[-1], strict=True), gradient_error=gap)
+    row |= dict(zip(("seconds", "misfit", "error"), trace[-1]), gradient_error=gap)
     return Recovery(grid, best.x, trace, row)
 
 
@@ -133,18 +133,18 @@ def tell(study, folder, force):
     print(INTRODUCTION.format(s=study, d=study.data, noise=100 * NOISE), flush=True)
     losses = [objective(Ground(grid, study.data.wells, study.data.sensors), study.data) for grid in study.grids]
     checks = []
-    for grid, loss in zip(study.grids, losses, strict=True):
+    for grid, loss in zip(study.grids, losses):
         x, y = grid.centres()  # a ground that is nowhere special
         checks.append(dp.check.gradient(loss, 0.5 * np.sin(5 * x + 1) * np.cos(4 * y), directions=1))
     print(f"Is the gradient right? On {study.grids[-1]}:", checks[-1], sep="\n")
     print(f"On the coarser grids: {', '.join(check.verdict for check in checks[:-1])}\n")
-    found = [recover(study, *parts) for parts in zip(study.grids, losses, checks, strict=True)]
+    found = [recover(study, *parts) for parts in zip(study.grids, losses, checks)]
     print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
     print(text_table([one.row for one in found], SHOWN), end="\n\n")
     write_arrays(folder, force, [one.row for one in found], found[-1].found)
     try:
         draw = partial(_map, study, "Hidden ground", study.truth), partial(_map, study, "Recovered", found[-1].found)
-        for name, picture in zip(PICTURES, (*draw, partial(_convergence, found)), strict=True):
+        for name, picture in zip(PICTURES, (*draw, partial(_convergence, found))):
             _write(folder / name, force, partial(plots.save, picture(plots.figure().add_subplot()).figure))
     except ImportError as error:
         print(f"No pictures: {error}")

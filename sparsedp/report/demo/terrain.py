@@ -89,7 +89,7 @@ def remap(source, grid):
     >>> remap(dp.Grid(4, size=1.0), dp.Grid(2, size=1.0))(np.array([1.0, 2.0, 3.0, 4.0]))
     array([1.5, 3.5])
     """
-    ratio = max(n / m for n, m in zip(source.shape, grid.shape, strict=True))
+    ratio = max(n / m for n, m in zip(source.shape, grid.shape))
     parts = int(np.clip(np.ceil(ratio), 1, FINEST))
     fine = dp.Grid(tuple(parts * m for m in grid.shape), size=grid.size)
     points = np.stack([centre.ravel() for centre in fine.centres()], axis=1)
