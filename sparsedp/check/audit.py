@@ -138,8 +138,8 @@ def _audit(trials, gradient, steps, extend, count, rng, quick):
     random = judged[:count]
     if taped and random:
         doubts.append(_modes(forward_mode(loss, random), trials.tolerance))
-    if not quick:
-        doubts += _complex_step(loss, point, random, trials.base)
+    if random and not quick and not point.complex:
+        doubts += _complex_step(loss, point, judged[0], trials.base)
     if taped and random and not quick and judged[0].word in PROVED:
         hessian, note = _hessian(loss, point, judged[0], extend)
         doubts.append(("note", note))
@@ -231,24 +231,21 @@ def _modes(found, tolerance):
 
 
 @np.errstate(all="ignore")
-def _complex_step(loss, point, judged, base):
+def _complex_step(loss, point, one, base):
     """Im f(x + i t d) / t beside g . d: exact to rounding where the code is analytic, and else no note.
 
     Source: W. Squire and G. Trapp, SIAM Review 40, 1998.
     """
-    gaps = []
-    for one in [] if point.complex else judged:
-        arrays = zip(point.arrays(point.vector), point.arrays(one.line.direction))
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # a discarded imaginary part shows in the figure
-                value = complex(loss(point.tree([x + 1j * TINY_STEP * d for x, d in arrays])))
-        except Exception:  # a loss of real numbers may refuse complex ones in any way
-            return []
-        if value.imag == 0 or not abs(value.real - base) <= 1e-9 * abs(base):
-            return []
-        gaps.append(abs(value.imag / TINY_STEP - one.slope) / one.scale)
-    return [("note", f"complex step: agrees to {max(gaps):.0e}")] if gaps and max(gaps) <= APART else []
+    away = zip(point.values, point.arrays(one.line.direction))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a discarded imaginary part shows in the figure
+            value = complex(loss(point.tree([x + 1j * TINY_STEP * d for x, d in away])))
+    except Exception:  # a loss of real numbers may refuse complex ones in any way
+        return []
+    gap = abs(value.imag / TINY_STEP - one.slope) / one.scale
+    analytic = value.imag != 0 and abs(value.real - base) <= 1e-9 * abs(base) and gap <= APART
+    return [("note", f"complex step: agrees to {gap:.0e}")] if analytic else []
 
 
 def _hessian(loss, point, one, extend):
@@ -309,7 +306,6 @@ class Audit(Result):
                 "difference": level.difference,
                 "slope": level.slope,
                 "gap": _share(level.difference - level.slope, one.scale),
-                "one_sided": _share((level.plus + level.minus - 2 * one.line.base) / level.step, one.scale),
             }
             for one in self.lines
             for level in one.line.levels

@@ -17,12 +17,11 @@ Source: the extrapolation is that of C. J. F. Ridders, Advances in Engineering S
 
 import math
 from contextlib import suppress
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from sparsedp.check.sweep import REFUSALS, Line, joined, noise_of
+from sparsedp.check.sweep import REFUSALS, Line, noise_of
 from sparsedp.derivative import NO_JVP, pushforward
 
 __all__ = ["FIELDS", "PROVED", "Judgement", "at_kinks", "curvature", "examined", "explained", "forward_mode", "verdict"]
@@ -351,7 +350,7 @@ def examined(trials, directions, steps, extend):
     The noise belongs to the loss, not to a direction: the larger one along the first and the last counts for all.
     """
     lines = [Line(name, direction, trials) for name, direction in directions]
-    noise = max(map(noise_of, [*lines[:1], *lines[1:][-1:]]), default=0.0)
+    noise = max(map(noise_of, lines[:1] + lines[1:][-1:]), default=0.0)
     for line in lines:
         line.noise = noise
     return [measured(line, steps, extend, line is lines[0]) for line in lines]
@@ -371,14 +370,12 @@ def forward_mode(loss, judged):
     gaps, allowed = [0.0], MODES
     for one in judged:
         line, point = one.line, one.line.point
-        tangent = point.arrays(line.direction)
         try:
             with np.errstate(all="ignore"):
-                slope = float(pushforward(loss, point.tree(), point.tree(tangent))[1])
+                slope = float(pushforward(loss, point.tree(), point.tree(line.direction))[1])
         except NO_JVP:
             return None
-        wanted = float(line.gradient @ joined(tangent))
-        gaps.append(0.0 if slope == wanted else abs(slope - wanted) / max(one.scale, abs(wanted), line.typical))
+        gaps.append(abs(slope - one.slope) / one.scale if slope != one.slope else 0.0)
         allowed = max(allowed, 300 * point.eps, SOLVED * (one.jitter > ROUNDING or line.trials.solved))
     return float(np.max(gaps)), allowed
 
@@ -455,11 +452,11 @@ def explained(found, gradient):
 # ------------------------------------------------------------ Hessian products
 
 HESSIANS: tuple[tuple[str, Any, str], ...] = (
-    ("agrees", lambda e: not e.used, "is noise"),
-    ("inconclusive", lambda e: e.used < FEWEST, "stands out of the noise on {e.used} steps, 3 are needed"),
-    ("agrees", lambda e: e.rate >= THIRD, "of order {e.rate:.2f}"),
-    ("inconclusive", lambda e: e.rate > WRONG or e.jumps, "of order {e.rate:.2f}: not three times differentiable"),
-    ("disagrees", lambda e: True, "of order {e.rate:.2f}: it is off by {e.off:.1e}"),
+    ("agrees", lambda e: not e.used3, "is noise"),
+    ("inconclusive", lambda e: e.used3 < FEWEST, "stands out of the noise on {e.used3} steps, 3 are needed"),
+    ("agrees", lambda e: e.rate3 >= THIRD, "of order {e.rate3:.2f}"),
+    ("inconclusive", lambda e: e.rate3 > WRONG or e.jumps, "of order {e.rate3:.2f}: not three times differentiable"),
+    ("disagrees", lambda e: True, "of order {e.rate3:.2f}: it is off by {e.off:.1e}"),
 )
 
 
@@ -472,13 +469,13 @@ def curvature(found, bend, extend):
     e = Judgement(found.line)
     rests = e.rests - e.t**2 / 2 * bend
     usable = both(rests) >= CLEAR * (e.noise + e.t * (found.size + e.floor))
-    used, rates = orders(e.t, both(rests), usable, FEWEST)  # coarse ones are no limit t -> 0
-    if extend and 0 < used < FEWEST:
+    found.used3, rates = orders(e.t, both(rests), usable, FEWEST)  # coarse ones are no limit t -> 0
+    if extend and 0 < found.used3 < FEWEST:
         found.line.sweep(HALVES)
         return curvature(found, bend, False)
-    found.bend, found.rate3 = bend, min(rates, default=np.nan) if used else np.inf
-    last = np.max(np.flatnonzero(usable), initial=0)
-    odd, even = abs(rests[0, last] - rests[1, last]), abs(rests[0, last] + rests[1, last])
-    off = even / e.t[last] ** 2 / np.float64(abs(bend))
-    word, text = first(HESSIANS, SimpleNamespace(used=used, rate=found.rate3, jumps=odd > ODD * even, off=off))
+    found.bend, found.rate3 = bend, min(rates, default=np.nan) if found.used3 else np.inf
+    ahead, behind = rests[:, np.max(np.flatnonzero(usable), initial=0)]
+    found.jumps = abs(ahead - behind) > ODD * abs(ahead + behind)
+    found.off = abs(ahead + behind) / min(e.t[usable], default=e.t[0]) ** 2 / abs(bend)
+    word, text = first(HESSIANS, found)
     return word, f"d.Hd = {bend:.9g} along {found.direction}, third Taylor remainder {text}"

@@ -49,15 +49,23 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
     if expected is not None and np.ndim(expected) == 0:
         expected = expected - 0.1, expected + 0.1
     errors = tuple(float(error_at(n)) for n in sizes)
-    slopes = tuple(_slope(sizes[i : i + 2], errors[i : i + 2]) for i in range(len(sizes) - 1))
-    found, verdict, reason = _slope(sizes[-3:], errors[-3:]), "inconclusive", "no order was expected"
+    rise = np.log([error if 0 < error < math.inf else math.nan for error in errors])
+    run = -np.log(sizes)
+    slopes, away = np.diff(rise) / np.diff(run), run[-3:] - np.mean(run[-3:])
+    found, verdict, reason = float(away @ rise[-3:] / (away @ away)), "inconclusive", "no order was expected"
     if math.isnan(found):
         reason = "an error is 0 or not finite: no slope"
     elif expected is not None:
         verdict = "agrees" if expected[0] <= found <= expected[1] else "disagrees"
         reason = f"expected {expected[0]:g} to {expected[1]:g}"
     return Refinement(
-        sizes=sizes, errors=errors, orders=slopes, order=found, expected=expected, verdict=verdict, reason=reason
+        sizes=sizes,
+        errors=errors,
+        orders=tuple(slopes.tolist()),
+        order=found,
+        expected=expected,
+        verdict=verdict,
+        reason=reason,
     )
 
 
@@ -85,9 +93,3 @@ class Refinement(Result):
         lines = [(n, f"{error:.3e}", slope) for n, error, slope in zip(self.sizes, self.errors, orders)]
         head = f"order {self.order:.2f} over the last three sizes: {self.verdict} ({self.reason})"
         return head + "\n" + table(lines, ("n", "error", "order"))
-
-
-def _slope(sizes, errors):
-    if not all(error > 0 and math.isfinite(error) for error in errors):
-        return math.nan
-    return float(-np.polyfit(np.log(sizes), np.log(errors), 1)[0])

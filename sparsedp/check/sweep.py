@@ -25,6 +25,7 @@ __all__ = [
     "generator",
     "joined",
     "noise_of",
+    "rms",
     "solvers_of",
 ]
 
@@ -75,7 +76,7 @@ class Point:
         self.vector = joined(self.values)
         self.complex = any(map(np.iscomplexobj, self.values))
         self._ends = np.cumsum([joined([values]).size for values in self.values])[:-1]
-        self.units = np.concatenate([np.full(part.size, _rms(part) or 1.0) for part in self._parts(self.vector)])
+        self.units = np.concatenate([np.full(part.size, rms(part) or 1.0) for part in self._parts(self.vector)])
         self.size = sum(values.size for values in self.values)
         self.eps = max(float(np.finfo(values.dtype).eps) for values in self.values)
 
@@ -128,7 +129,7 @@ class Point:
         if self.size > 1 and slopes[largest]:
             # Along the gradient, as the units measure it, no entry moves more than 4 units.
             shares = slopes / abs(slopes[largest])
-            found["gradient"] = self.units * shares / max(_rms(shares), 0.25)
+            found["gradient"] = self.units * shares / max(rms(shares), 0.25)
             found["largest entry"] = self.units * (np.arange(slopes.size) == largest)
         return [pair for pair in found.items() if wanted is None or pair[0] in wanted]
 
@@ -136,7 +137,7 @@ class Point:
         """Random displacement, of root mean square 1 in each leaf."""
         values = rng.standard_normal(self.vector.size)
         for part in self._parts(values):
-            part /= _rms(part) or 1.0
+            part /= rms(part) or 1.0
         return self.units * values
 
 
@@ -145,7 +146,8 @@ def joined(arrays):
     return np.concatenate([np.ravel(x).astype(np.result_type(x, float)).view(float) for x in arrays])
 
 
-def _rms(vector):
+def rms(vector):
+    """Root mean square."""
     return norm(vector) / np.sqrt(max(vector.size, 1))
 
 

@@ -37,8 +37,7 @@ ROUNDING = 1e-14  # of the value
 
 def distance(one, other):
     """Euclidean distance of two trees; None counts for nothing."""
-    pairs = zip(leaves(one), leaves(other), strict=True)
-    return norm([np.asarray(a) - np.asarray(b) for a, b in pairs if a is not None])
+    return norm([np.subtract(a, b) for a, b in zip(leaves(one), leaves(other), strict=True) if a is not None])
 
 
 # ---------------------------------------------------------------- recorded solves
@@ -89,9 +88,10 @@ class RecordedSolves(dict):
         """The solution of one linear solve, flat. The solver calls this in place of its own `solved`."""
         product = (solver.system.given.T if transposed else solver.system.given)._flat.apply
         key, x = self._earlier(solver.name, "adjoint" if transposed else "forward", b.size)
-        if x is None:
-            fresh = self.fresh  # its own tolerance where none is given
-            x = solver.approximate(b, fresh, transposed) if fresh else solver.solved(b, transposed, checked, start)
+        if x is None and self.fresh:
+            x = solver.approximate(b, self.fresh, transposed)
+        elif x is None:
+            x = solver.solved(b, transposed, checked, start)
         elif self.share is not None:
             x = x + solver.approximate(b - product(x) - self._left(key), self.share, transposed)
         rtol, iterative = solver.system.rtol, solver.engine.iterative
@@ -187,16 +187,15 @@ def certify(loss, x, target=TARGET):
     size = norm(gradient) or 1.0
 
     def corrected(correct):
-        again = RecordedSolves(solves, correct)
-        return *again.run(gradient_of, x), again
+        return RecordedSolves(solves, correct).run(gradient_of, x)[1]
 
-    _, slope, left = corrected(lambda key: True)
-    half = corrected(lambda key: key[1] == "adjoint")[1]
+    left = RecordedSolves(solves)
+    slope, half = left.run(gradient_of, x)[1], corrected(lambda key: key[1] == "adjoint")
     causes = {"forward solves": distance(slope, half) / size, "adjoint solves": distance(half, gradient) / size}
     error, rows = distance(slope, gradient) / size, []
     names = dict.fromkeys(map(_solver, solves))
     for name in names:
-        own = slope if len(names) == 1 else corrected(lambda key, name=name: _solver(key) == name)[1]
+        own = slope if len(names) == 1 else corrected(lambda key, name=name: _solver(key) == name)
         mine = {key: solve for key, solve in solves.items() if _solver(key) == name}
         rows.append(_row(name, distance(own, gradient) / size, mine))
     best = RecordedSolves(left).run(loss, x)  # once more: a value tells its own error, and that of the correction

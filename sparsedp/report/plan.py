@@ -11,7 +11,6 @@ from sparsedp.fields import check_function
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
 from sparsedp.report.table import Result, text_table
-from sparsedp.structure.explicit import Matrix
 from sparsedp.tape import is_variable
 from sparsedp.tree import leaves
 
@@ -77,7 +76,6 @@ def explain(loss, x, gradient=True):
     (1, 1, 64)
     """
     check_function("explain", loss, "lambda x: np.sum(x**2)")
-    loaded = set(sys.modules)
     nodes: list = []
     turn: list = []  # what is known when the forward pass ends
     clock = perf_counter()
@@ -97,7 +95,7 @@ def explain(loss, x, gradient=True):
     steps = sum(calls[name, "forward"] for name, kind in list(calls) if kind == "recomputed")
     return Plan(
         value=float(value), counts=calls, totals=totals, rows=_rows(calls), tape_nodes=many,
-        left_out=[*_gradient(x, gradient), *_skipped(calls, forward, gradient), *_extras(loaded)],
+        left_out=[*_gradient(x, gradient), *_skipped(calls, forward, gradient), *_extras()],
         tape_bytes=size + total(calls, "bytes"), seconds=(seconds, end - resumed),
         recomputation=1.0 + totals["steps recomputed"] / steps if steps else 1.0,
     )  # fmt: skip
@@ -225,8 +223,6 @@ def _matrices(calls, name, operators):
     if not calls[name, "assembled"] and any(op.form == "matrix-free" for op in operators):
         known = all(op.structure.has_entries for op in operators)
         yield f"matrix of {name}: not assembled, {'applied' if known else 'known only'} without one"
-    if any(isinstance(op.structure, Matrix) for op in operators):
-        yield f"assembly of {name}: it was given as a matrix"
     if any(op.structure.is_identity for op in operators):
         yield f"arithmetic of {name}: an identity, {calls[name, 'forward']} copies"
 
@@ -234,26 +230,19 @@ def _matrices(calls, name, operators):
 def _solves(calls):
     """What the solvers did not build or solve."""
     solvers = solvers_of(calls)
-    found: dict[str, bool] = {}
-    for name, solver in solvers:
-        found |= {
-            f"multigrid hierarchy for {name}: not built, {solver.engine.method} needs none":
-                not solver.engine.hierarchical,
-            f"set-up of {name}: made before, {calls[name, 'reused']} solves reuse it": not calls[name, "setup"],
-            f"adjoint solve of {name}: nothing asks for it": calls[name, "solve"] > 0 == calls[name, "adjoint"],
-        }  # fmt: skip
-    sentences = [sentence for sentence, holds in found.items() if holds]
     if not solvers:
         yield "solves: none, so no hierarchy, no factors, no set-up"
-    elif not sentences and not total(calls, "hierarchy"):
-        yield "multigrid hierarchies: none built in this run"
-    yield from sentences
+    for name, engine in {(name, one.engine.method): (name, one.engine) for name, one in solvers}.values():
+        if not engine.hierarchical:
+            yield f"multigrid hierarchy for {name}: not built, {engine.method} needs none"
+        if not calls[name, "setup"]:
+            yield f"set-up of {name}: made before, {calls[name, 'reused']} solves reuse it"
+        if calls[name, "solve"] > 0 == calls[name, "adjoint"]:
+            yield f"adjoint solve of {name}: nothing asks for it"
 
 
-def _extras(loaded):
-    """Extras that this process has not loaded, and those that the run loaded."""
+def _extras():
+    """Extras that this process has not loaded."""
     for name, use in EXTRAS.items():
         if name not in sys.modules:
             yield f"not imported: {name} ({use}){'' if find_spec(name) else ', which is not installed'}"
-        elif name not in loaded:
-            yield f"{name} ({use}) was imported by this run, and not before"

@@ -121,12 +121,15 @@ def animate(grid, frames, path, title=None, limits=None, cmap="viridis", rate=12
         raise ValueError("animate needs at least one frame, got none; run with keep='all'")
     limits = limits or _range(np.concatenate([_scalar(grid, frame)[0].ravel() for frame in frames]))
     picture, images = figure(), []
+    from PIL import Image  # comes with matplotlib
+
     _matplotlib("backends.backend_agg").FigureCanvasAgg(picture)
     for frame in frames:
         picture.clear()
         plot(grid, frame, ax=picture.add_subplot(), title=title, limits=limits, cmap=cmap)
         picture.canvas.draw()
-        images.append(_image(np.asarray(picture.canvas.buffer_rgba())))
+        pixels = np.asarray(picture.canvas.buffer_rgba())
+        images.append(Image.fromarray(pixels[..., :3].copy()).quantize(256))
     first, *rest = images
     film = partial(first.save, format="GIF", save_all=True, append_images=rest, duration=round(1000 / rate), loop=0)
     film(path) if hasattr(path, "write") else write_file(path, film)
@@ -144,16 +147,9 @@ def _scalar(grid, u, at=None):
         return u, fitting[0], []
     parts = []
     for a, part in enumerate(grid.split(u)):
-        whole = np.concatenate([part, part.take([0], a)], a) if grid.periodic[a] else part
-        parts.append(0.5 * (np.delete(whole, -1, a) + np.delete(whole, 0, a)))
+        means = 0.5 * (part + np.roll(part, -1, a))
+        parts.append(means.take(range(grid.shape[a]), a))  # the last face of a bounded axis has no other beyond it
     return np.sqrt(sum(part**2 for part in parts)), "cells", parts
-
-
-def _image(pixels):
-    """Pixels -> picture in 256 colours. Pillow comes with matplotlib."""
-    from PIL import Image
-
-    return Image.fromarray(pixels[..., :3].copy()).quantize(256)
 
 
 def _range(u):
@@ -351,9 +347,9 @@ def stability_chart(growth, ax):
 # ---------------------------------------------------------------- figures and files
 
 
-def figure(width=5.5, height=4.4):
-    """Size [inch] -> empty figure that belongs to no window."""
-    return _matplotlib("figure").Figure(figsize=(width, height), layout="constrained")
+def figure():
+    """An empty figure that belongs to no window."""
+    return _matplotlib("figure").Figure(figsize=(5.5, 4.4), layout="constrained")
 
 
 def _current(ax):
@@ -384,7 +380,7 @@ def sample_file(name):
 def read_picture(path):
     """Picture file -> grey values, shape (rows, columns), rows from the top."""
     colours = _matplotlib("image").imread(path).astype(float)
-    return colours if colours.ndim == 2 else colours[:, :, : min(3, colours.shape[2])].mean(axis=2)
+    return colours if colours.ndim == 2 else colours[:, :, :3].mean(axis=2)
 
 
 def _matplotlib(part=None):

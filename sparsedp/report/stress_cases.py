@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sparsedp.check.operators import layouts
-from sparsedp.check.sweep import Line, Point, Trials, generator, joined
+from sparsedp.check.sweep import Line, Point, Trials, generator, joined, rms
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
@@ -291,17 +291,11 @@ def _against_differences(scene, other, out):
             return PASSED, gap, ""
     best, _, third, *_ = sorted(gaps)
     noise = 10 * EPS * abs(out.value) / (max(DIFFERENCES) * wanted)  # of the coarsest difference
-    return next((word, best if math.isfinite(best) else math.nan, note) for holds, word, note in (
-        (not math.isfinite(best), DEGRADED, "no difference could be taken beside it"),
-        (out.flagged, DEGRADED, "the gradient grows without bound on its way back"),
-        (best <= BAD or noise > BAD, DEGRADED, "gradient against differences"),
-        (third - best <= 0.1 * best, FAILED, "the differences settle on another gradient"),
-        (True, DEGRADED, "the differences do not settle: a kink, noise or a steep change"),
-    ) if holds)  # fmt: skip
-
-
-def _rms(leaf):
-    return norm(leaf) / math.sqrt(max(np.size(leaf), 1))
+    if out.flagged:
+        return DEGRADED, best, "the gradient grows without bound on its way back"
+    if best > BAD >= noise and third - best <= 0.1 * best:
+        return FAILED, best, "the differences settle on another gradient"
+    return DEGRADED, best, "the differences do not settle on the gradient: a kink, noise or a steep change"
 
 
 # ---------------------------------------------------------------- cases: (scene, name, x) -> case, other x, judge
@@ -310,7 +304,7 @@ def _rms(leaf):
 def as_given(scene):
     """The scene as a whole: what stands for a value are the other values of all parameters."""
     rng = np.random.default_rng(SEED)
-    moved = [(name, x, rng.choice([-1.0, 1.0], np.shape(x))) for name, x in scene.leaves.items()]
+    moved = [(name, x, rng.choice([-1.0, 1.0], x.shape)) for name, x in scene.leaves.items()]
     yield "value and gradient", {}, finite
     yield "two runs", {}, near
     amplified = partial(near, note="rounding is amplified by {:.0e}", unit=ROUNDING, **DIGITS)
@@ -329,8 +323,8 @@ def legal_range(scene, name, x):
         spread = np.geomspace if low > 0 and high > 10 * low else np.linspace
         values = {f"all {value:.3g}": value for value in spread(low, high, 5)}
         values |= {"below its range": 2 * low - high, "above its range": 2 * high - low}
-        if np.size(x) > 1:
-            odd = np.arange(np.size(x)).reshape(np.shape(x)) % 2
+        if x.size > 1:
+            odd = np.arange(x.size).reshape(x.shape) % 2
             values[f"jumps {low:.3g} to {high:.3g}"] = np.where(odd, high, low)
             values["random in its range"] = _random(x, low, high)
         for case, value in values.items():
@@ -345,7 +339,7 @@ def zeros_and_signs(scene, name, x):
 
 
 def jumps(scene, name, x):
-    if np.size(x) > 1 and np.all(x > 0) and name not in scene.ranges:
+    if x.size > 1 and np.all(x > 0) and name not in scene.ranges:
         half = np.arange(x.size).reshape(x.shape) < x.size // 2
         yield "jump of 1e8", x * np.where(half, 1e-4, 1e4), finite
         yield "random over 8 decades", x * 10.0 ** _random(x, -4, 4), finite
@@ -353,11 +347,11 @@ def jumps(scene, name, x):
 
 def constants_added(scene, name, x):
     """Incompatible data of a singular system are projected or refused, never amplified."""
-    if np.size(x) > 1 and np.any(x):
+    if x.size > 1 and np.any(x):
         amplified = partial(near, note="amplified by {:.0e}: is a null space left in?")
-        yield "plus 1e-14 of itself", x + 1e-14 * _rms(x), partial(amplified, unit=1e-14, **DIGITS)
-        yield "plus 1e-07 of itself", x + 1e-7 * _rms(x), partial(amplified, good=1e-3, bad=0.1, unit=1e-7)
-        yield "plus 1 of itself", x + _rms(x), finite
+        yield "plus 1e-14 of itself", x + 1e-14 * rms(x), partial(amplified, unit=1e-14, **DIGITS)
+        yield "plus 1e-07 of itself", x + 1e-7 * rms(x), partial(amplified, good=1e-3, bad=0.1, unit=1e-7)
+        yield "plus 1 of itself", x + rms(x), finite
 
 
 def not_finite(scene, name, x):
@@ -368,7 +362,7 @@ def not_finite(scene, name, x):
 
 
 def kinds_of_arrays(scene, name, x):
-    if isinstance(x, np.ndarray) and x.ndim:
+    if x.ndim:
         for case, same in layouts(x).items():
             yield case, same, near
         yield "float32", x.astype(np.float32), partial(near, good=1e-4, bad=1e-2)
@@ -377,7 +371,7 @@ def kinds_of_arrays(scene, name, x):
 
 
 def all_integers(scene):
-    yield "all integers", {name: np.asarray(x).astype(int) for name, x in scene.leaves.items()}, refused
+    yield "all integers", {name: x.astype(int) for name, x in scene.leaves.items()}, refused
 
 
 def factors(scene, name, x):
@@ -395,7 +389,7 @@ def wrong_signs(scene, name, x):
 
 
 def _random(x, low, high):
-    return np.random.default_rng(SEED).uniform(low, high, np.shape(x))
+    return np.random.default_rng(SEED).uniform(low, high, x.shape)
 
 
 class Group(NamedTuple):
