@@ -316,13 +316,16 @@ def value_and_grad(loss, argnum=0):
     def evaluate(*args):
         if len(args) <= argnum:
             raise TypeError(f"the gradient in argument {argnum} of the loss needs it, got {len(args)} arguments")
-        value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
-        if np.shape(plain(value)) != ():
-            raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(plain(value))}; sum it")
-        if dtype_of(value).kind == "c":
-            raise DerivativeError(
-                "the loss must be real, got a complex number; take its real part or its absolute value"
-            )
-        return value if isbox(value) else float(value), pull(1.0)
+        with growing():  # until the tape is gone: a search for cyclic garbage in between would walk all of it
+            value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
+            if np.shape(plain(value)) != ():
+                raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(plain(value))}; sum it")
+            if dtype_of(value).kind == "c":
+                raise DerivativeError(
+                    "the loss must be real, got a complex number; take its real part or its absolute value"
+                )
+            gradient = pull(1.0)
+            del pull
+        return value if isbox(value) else float(value), gradient
 
     return Made(evaluate, value_and_grad, loss, argnum)

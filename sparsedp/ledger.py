@@ -33,8 +33,6 @@ class Thread(local):
         Since the thread began, forward and adjoint: counted always, for one addition a solve.
     grown : int
         Warnings of cotangents that grew, since the thread began; what warnings do is one for all threads.
-    scale : Scale or None
-        What the nodes of tapes are counted by while a time loop keeps them.
     inner : list of float
         For each timed call that is under way, the seconds of the calls inside it.
     """
@@ -45,7 +43,6 @@ class Thread(local):
         self.loops: list[Any] = []
         self.witnesses: list[Any] = []
         self.inner: list[float] = []
-        self.scale: Any = None
         self.solves = self.grown = 0
 
 

@@ -18,7 +18,7 @@ from sparsedp.constants import constant_args, sparing
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, tell, timed
 from sparsedp.recipe import Remade
-from sparsedp.shortcuts import direct
+from sparsedp.shortcuts import NUMBERS, direct
 from sparsedp.tree import leaves
 
 __all__ = [
@@ -200,11 +200,9 @@ def _checked(name, values, cotangents, g):
 
 def fit(name, value, cotangent, g):
     """Check a derivative of `value` that was computed from `g`, and give it the dtype of `value`."""
-    if type(cotangent) is type(value) is np.ndarray and (cotangent.shape, cotangent.dtype) == (
-        value.shape,
-        value.dtype,
-    ):
-        return cotangent
+    if type(cotangent) is type(value) and type(value) in NUMBERS:
+        if cotangent.shape == value.shape and cotangent.dtype == value.dtype:
+            return cotangent
     cotangent = np.asarray(cotangent) if isinstance(cotangent, list) else cotangent
     shape, wanted = np.shape(plain(cotangent)), np.shape(plain(value))
     if shape != wanted:

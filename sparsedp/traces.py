@@ -18,12 +18,14 @@ from sparsedp.tree import flatten
 
 __all__ = [
     "ReverseNode",
+    "accumulate",
     "backward",
+    "boxed",
     "forward_root",
     "growing",
     "in_reverse",
-    "inside",
     "new_box",
+    "new_trace",
     "reverse_root",
     "split_box",
     "trace",
@@ -32,14 +34,22 @@ __all__ = [
 
 
 class ReverseNode(VJPNode):
-    """A call on a reverse-mode trace. Its pullback sees the constants of the call as they are now."""
+    """A call on a reverse-mode trace. Its pullback sees the constants of the call as they are now.
 
-    __slots__ = ()
+    `recorder`: takes down every call that depends on a root, see `trajectory.recorder`; or None.
+    """
+
+    __slots__ = ("recorder",)
     parents: Any
     vjp: Any
 
+    def initialize_root(self, recorder=None):
+        """Begin a trace."""
+        self.parents, self.vjp, self.recorder = (), None, recorder
+
     def __init__(self, value, fun, args, options, nums, parents):
         self.parents = parents
+        recorder = self.recorder = parents[0].recorder
         if len(nums) < len(args) and fun not in sparing:
             args = constant_args(args, nums)
         if options:
@@ -47,8 +57,10 @@ class ReverseNode(VJPNode):
         self.vjp = None if options else arithmetic(fun, value, args, nums)
         if self.vjp is None:
             super().__init__(value, fun, args, options, nums, parents)
-        if thread.scale is not None:
-            thread.scale.add(value, args, nums)
+        if recorder is not None:
+            recorder.nodes.append(self)
+            if recorder.weighs:
+                recorder.weigh(value, args, nums)
 
 
 class ForwardNode(JVPNode):
@@ -70,9 +82,9 @@ untraced[ReverseNode], untraced[ForwardNode] = untraced[VJPNode], untraced[JVPNo
 forward_root = ForwardNode.new_root  # a fresh start of a forward-mode trace, with its tangent
 
 
-def reverse_root():
-    """A fresh start of a reverse-mode trace."""
-    return (thread.witnesses[-1] if thread.witnesses else ReverseNode).new_root()
+def reverse_root(recorder=None):
+    """A fresh start of a reverse-mode trace; its calls are told to the recorder, see `ReverseNode`."""
+    return (thread.witnesses[-1] if thread.witnesses else ReverseNode).new_root(recorder)
 
 
 _numbers = count(trace_stack.top + 1)
@@ -113,10 +125,9 @@ def growing():
                 gc.set_threshold(*before)
 
 
-def inside(fun):
-    """Run fun(number) inside a trace of its own; return the result and the number of the trace."""
-    number = next(_numbers)
-    return fun(number), number
+def new_trace():
+    """The number of a trace that begins: larger than those of the traces it is nested in."""
+    return next(_numbers)
 
 
 def in_reverse(value):
@@ -131,8 +142,13 @@ def in_reverse(value):
 def trace(fun, tree, roots):
     """Run fun(tree) with one box for every root; return the tree of results and the trace number."""
     found, rebuild = flatten(tree)
-    pairs = list(zip(found, roots, strict=True))
-    return inside(lambda number: fun(rebuild([x if root is None else new_box(x, number, root) for x, root in pairs])))
+    number = new_trace()
+    return fun(rebuild(boxed(found, roots, number))), number
+
+
+def boxed(values, roots, number):
+    """Values -> the same, those with a root on the trace of this number."""
+    return [x if root is None else new_box(x, number, root) for x, root in zip(values, roots, strict=True)]
 
 
 def split_box(value, number):
@@ -142,19 +158,25 @@ def split_box(value, number):
 
 def backward(end, g):
     """Accumulate cotangents from the node `end` to the roots; return {root: cotangent}."""
-    cotangents, found = {end: (g, False)}, {}
-    for node in toposort(end):
-        g = cotangents.pop(node)[0]
-        if not node.parents:
-            found[node] = g
+    cotangents = {end: (g, False)}
+    accumulate(cotangents, toposort(end))
+    return {root: g for root, (g, _) in cotangents.items()}
+
+
+def accumulate(cotangents, nodes):
+    """Hand cotangents on through nodes, each after those that use it.
+
+    `cotangents`: {node: (sum so far, whether it may be written to)}, in the end those of roots, and of nodes elsewhere.
+    """
+    for node in nodes:
+        if node not in cotangents or not node.parents:
             continue
-        for parent, back in zip(node.parents, node.vjp(g), strict=True):
+        for parent, back in zip(node.parents, node.vjp(cotangents.pop(node)[0]), strict=True):
             known = cotangents.get(parent)
             if known is None and type(back) in NUMBERS:
                 cotangents[parent] = back, False
             else:
                 cotangents[parent] = added(known, back) or add_outgrads(known, _sparse(back))
-    return found
 
 
 def _sparse(back):

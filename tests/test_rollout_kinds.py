@@ -285,7 +285,8 @@ def test_jvp_needs_no_kept_state():
     assert runs[-1].kept == 0
 
 
-def test_nothing_is_left_behind():
+@pytest.mark.parametrize("memory", [136, None])
+def test_nothing_is_left_behind(memory):
     """Without the cycle collector, everything is gone once the gradient is there."""
 
     class Step:
@@ -293,7 +294,7 @@ def test_nothing_is_left_behind():
             return u * p
 
     def gradient(step):
-        return dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, 1.1, 5, memory=136)))(U)
+        return dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, 1.1, 5, memory=memory)))(U)
 
     step = Step()
     watch = weakref.ref(step)

@@ -1,13 +1,18 @@
 """The backward pass over all steps of a run."""
 
-from sparsedp.errors import DerivativeError
+import numpy as np
+
 from sparsedp.ledger import active, count
-from sparsedp.trajectory.layout import fingerprint, owned
+from sparsedp.tape import fit
+from sparsedp.traces import accumulate
+from sparsedp.trajectory.layout import fingerprint, owned, refuse_lost
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import LIMIT, Growth
 from sparsedp.trajectory.schedule import stride
 
 __all__ = ["BackwardPass"]
+
+NONE = None, False  # no cotangent so far
 
 
 class BackwardPass:
@@ -17,35 +22,45 @@ class BackwardPass:
     ----------
     run : Run
     steps : Steps
-    wanted : frozenset of int
-        The arguments that want a cotangent.
+    kept : list of State
+        The last one included.
+    tapes : list of StepTape
+        Of the steps from the first one on.
     """
 
-    def __init__(self, run, steps, wanted):
-        self.run, self.steps, self.want_state = run, steps, run.wants(0, wanted)
-        self.stack, self.final, self.before, self.after, self.pieces = run.take_kept(wanted)
+    def __init__(self, run, steps, kept, tapes):
+        self.run, self.steps, self.kept, self.tapes = run, steps, kept, tapes
         self.recomputed = 0
+        self.cotangents: dict = {}  # of params: root -> (sum so far, whether it may be written to)
+        pairs = zip(steps.x, steps.wants_input, strict=True)
+        self.inputs: list = [np.zeros_like(block) if root else None for block, root in pairs]
 
     def back(self, g):
-        """Cotangents of the outputs -> cotangents of the first state; the rest is added up in `steps`."""
-        run = self.run
-        growth, many = Growth(run.n, run.truncate), len(self.stack)
+        """Cotangents of the outputs -> those of all arguments, None where there is none."""
+        run, steps, tapes = self.run, self.steps, self.tapes
+        growth, many = Growth(run.n, run.truncate), len(self.kept) - 1
         source = run.keep.source(run.n, g)
-        total = source(run.n, *self.final)
-        if run.slots is not None:
-            self.final = ()  # not needed any more
+        state = self.kept.pop()
+        total = source(*state)
         growth.see(run.n, total)
-        i = run.n
-        for k in shown_steps(run.progress, range(run.n - 1, -1, -1), "backward"):
-            if k >= i:
-                continue  # part of a piece that has been gone through
+        for i in shown_steps(run.progress, range(run.n - 1, -1, -1), "backward"):
             if total is None and not run.keep.along:
                 break  # cut by truncation
-            i, total = self._through(i, total)
+            end = None if i < len(tapes) else fingerprint(*state[1:])  # what is on a tape is not run again
+            state = self._state_at(i)
+            if total is not None:
+                if end is None:
+                    tape = tapes.pop()
+                else:
+                    tape, after = steps.taped(state, run.wants(i, steps.trace.wanted))
+                    run.compare(fingerprint(*after[1:]), end)
+                    del after
+                total = self._pull(tape, state, total)
+                del tape
             if i % growth.every == 0:
                 growth.see(i, total)
-            if run.keep.along and (i > 0 or self.want_state):
-                total = _sum(total, source(i, *self.state[1:]))
+            if run.keep.along and (i > 0 or run.wants(0, steps.trace.wanted)):
+                total = _sum(total, source(*state))
         if active:
             count("rollout.step", "vjp", run.n)
             count("rollout.step", "recomputed", self.recomputed)
@@ -53,74 +68,51 @@ class BackwardPass:
             run.record(growth.record(many, self.recomputed))
         elif growth.grown() > LIMIT:
             growth.record(many, self.recomputed)
-        return total
+        given = zip(steps.p, (self.cotangents.get(root, NONE)[0] for root in steps.roots), strict=True)
+        return [*(total or [None] * len(run.state.places)), *(_fitted(back, p) for p, back in given), *self.inputs]
 
-    def _through(self, i, total):
-        """Back from state i through one piece: the number of the state it starts from, and its cotangents."""
-        run = self.run
-        piece = self.pieces.pop() if self.pieces and self.pieces[-1].stop == i else None
-        first = piece.first if piece else i - 1
-        self.state = first, *self._state_at(first)
-        before, kept = self.before.pop(i, None), bool(self.pieces) and self.pieces[-1].stop == first
-        mark = fingerprint(*self.state[1:]) if before or not kept else None  # what is on a tape is not run again
-        if before:
-            run.compare(mark, before)
-        if total is not None:
-            if piece is None:
-                wants = run.wants(first, ()) if first else self.want_state
-                piece, values, statics = self.steps.taped(*self.state, wants)
-                run.compare(fingerprint(values, statics), self.after)
-                del values
-            total = self._pulled(piece, total)
-        self.after = mark
-        return first, total
-
-    def _pulled(self, piece, total):
-        """Through a piece; where that fails, step by step, so that `guarded` can name the step."""
-        try:
-            return self.steps.pull(piece, self.state[1], total)
-        except DerivativeError:
-            raise
-        except Exception:
-            if piece.stop - piece.first == 1:
-                raise
-            states = [self.state[1:]]
-            for i in range(piece.first, piece.stop - 1):
-                values, statics = self.steps.forward(i, *states[-1])
-                states.append((list(map(owned, values)), statics))
-            for i in range(piece.stop - 1, piece.first - 1, -1):
-                values, statics = states.pop()
-                one, _, _ = self.steps.taped(i, values, statics, True)
-                total = self.steps.pull(one, values, total)
-            raise
+    def _pull(self, tape, state, g):
+        """Cotangents of the state after a step -> those of the state before, None if those are not wanted."""
+        cotangents, self.steps.last = self.cotangents, state
+        for node, back in zip(tape.ends, g, strict=True):
+            if node is not None and back is not None:
+                known = cotangents.get(node)
+                cotangents[node] = (back if known is None else known[0] + back), False
+        accumulate(cotangents, reversed(tape.nodes))
+        for total, root in zip(self.inputs, tape.inputs, strict=True):
+            if root in cotangents:
+                total[state.i] = cotangents.pop(root)[0]
+        backs = []
+        for value, root in zip(state.values, tape.state, strict=True):
+            backs.append(_fitted(cotangents.pop(root, NONE)[0], value))
+        for root, (back, own) in cotangents.items():
+            if root not in self.steps.roots:
+                refuse_lost("the step")  # in a call of another step
+            if not own and type(back) is np.ndarray:
+                cotangents[root] = back.copy(), True
+        return backs if any(tape.state) else None
 
     def _state_at(self, i):
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""
-        run, stack = self.run, self.stack
-        if run.slots is None:
-            return stack[i][1:]
-        while stack[-1][0] > i:  # those of a piece are gone through at once
-            stack.pop()
-        start, values, statics = stack[-1]
-        while start < i:
-            free = run.slots - len(stack) + 1
-            stop = start + (stride(i + 1 - start, free) if free > 1 else i - start)
-            values, statics = self._again(start, stop, values, statics)
-            start = stop
-            if start < i:
-                stack.append((start, values, statics))
-        if stack[-1][0] == i:
-            stack.pop()
-        return values, statics
+        run, kept = self.run, self.kept
+        state = kept.pop()
+        while state.i < i:
+            kept.append(state)
+            free = max(run.slots - len(kept) + 1, 1)
+            state = self._again(state, state.i + stride(i + 1 - state.i, free))
+        return state
 
-    def _again(self, start, stop, values, statics):
+    def _again(self, state, stop):
         """Run from a kept state on."""
-        self.recomputed += stop - start
-        for k in range(start, stop):
-            if k == stop - 1 > start:
-                self.before[stop] = fingerprint(values, statics)
-            values, statics = self.steps.forward(k, values, statics)
-        return list(map(owned, values)), statics  # the last one may be an array that the step uses again
+        self.recomputed += stop - state.i
+        while state.i < stop:
+            state = self.steps.forward(state)
+        return state._replace(values=list(map(owned, state.values)))  # perhaps arrays that the step uses again
+
+
+def _fitted(back, value):
+    """A cotangent in the dtype of its value; None where there is none."""
+    return None if back is None else fit("the step", value, back, back)
 
 
 def _sum(total, entering):

@@ -5,9 +5,9 @@ import numpy as np
 from sparsedp.derivative import zero_like
 from sparsedp.direction import push
 from sparsedp.tape import is_variable
+from sparsedp.trajectory.carried import carries
 from sparsedp.trajectory.keep import Each, marked
 from sparsedp.trajectory.layout import Layout
-from sparsedp.trajectory.steps import carries
 from sparsedp.tree import leaves
 
 __all__ = ["dual"]
@@ -30,10 +30,10 @@ def dual(run, args, moving):
     p = [number for number in moving if first <= number < second]
     x = [number for number in moving if number >= second]
     step = DualStep(run, [number - first for number in p], [number - second for number in x])
-    state = Layout(step.joined(run.state, range(first)), "the dual state")
-    params = Layout(step.joined(run.params, step.p), "params")
-    inputs = None if run.inputs is None else Layout(step.joined(run.inputs, step.x), "inputs")
-    twin = type(run)(step, state, params, inputs, run.n, _keep(run.keep, state, step), run.budget, run.truncate)
+    names = "the dual state", "params", "inputs"
+    parts = zip(run.layouts, (range(first), step.p, step.x), names, strict=False)
+    layouts = [Layout(step.joined(layout, places), name) for layout, places, name in parts]
+    twin = type(run)(step, layouts, run.n, _keep(run.keep, layouts[0], step), run.budget, run.truncate)
     twin.origin = run
     twin.silenced = (*run.silenced, *range(first, 2 * first))
     twin.place_of = {k: k + first * (k >= first) + len(p) * (k >= second) for k in range(len(args))}
@@ -84,10 +84,9 @@ class DualStep:
 
     def __call__(self, *pairs):
         run = self.run
-        layouts = [run.state, run.params, run.inputs][: len(pairs)]
         chosen = [range(len(run.state.places)), self.p, self.x]
         directions = []
-        for layout, (_, tangents), places in zip(layouts, pairs, chosen, strict=False):
+        for layout, (_, tangents), places in zip(run.layouts, pairs, chosen, strict=False):
             spread = [None] * len(layout.places)
             for place, tangent in zip(places, tangents, strict=True):
                 spread[place] = tangent

@@ -109,21 +109,21 @@ def rollout(
     """
     check_function("rollout", step, "lambda state, params: ...")
     n = _number_of_steps(n)
-    forms = Layout(state, "state"), Layout(params, "params"), None if inputs is None else Layout(inputs, "inputs")
+    given = {"state": state, "params": params} | ({} if inputs is None else {"inputs": inputs})
+    forms = [Layout(tree, name) for name, tree in given.items()]
     _check_inputs(inputs, n)
     example = "lambda state, params: ..." if inputs is None else "lambda state, params, input: ..."
     check_takes("rollout", step, 2 if inputs is None else 3, example)
-    args = _variables(state, forms[0]) + _variables(params, forms[1])
-    args += [] if inputs is None else _variables(inputs, forms[2])
+    args = [value for tree, form in zip(given.values(), forms, strict=True) for value in _variables(tree, form)]
     traced = [k for k, arg in enumerate(args) if isbox(arg)]
     if traced:  # what is kept on the way forward must be what the way back sees
         args = constant_args(args, traced)
     wanted = [any(map(isbox, leaves(tree))) for tree in (params, inputs)]
-    beside = sum((1 + flag) * form.nbytes for form, flag in zip(forms[1:], wanted) if form)  # a copy, a gradient
+    beside = sum((1 + flag) * form.nbytes for form, flag in zip(forms[1:], wanted))  # a copy, a gradient
     slots = None if memory is None else slots_within(memory, forms[0].nbytes, n, beside)
     if truncate is not None and not is_whole(truncate, 1):
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
-    run = Run(step, *forms, n, _kind(keep, forms[0]), slots, truncate, bool(traced), progress, record)
+    run = Run(step, forms, n, _kind(keep, forms[0]), slots, truncate, bool(traced), progress, record)
     _check_values(run, args)
     pulled = any(map(in_reverse, args))  # a forward derivative has no use for tapes
     if pulled and (slots is None or slots >= n):
@@ -181,15 +181,13 @@ def _kind(keep, layout):
 
 
 def _check_values(run, args):
-    layouts = run.state, run.params, run.inputs
-    for layout, values in zip(layouts, run.split(args), strict=True):
-        if layout is not None:
-            layout.check_finite([plain(value) for value in values], "rollout")
-            for name, value in zip(layout.names, values, strict=True):
-                if dtype_of(value).kind not in "fc":
-                    raise DerivativeError(
-                        f"{name} of rollout is traced but holds {dtype_of(value)}; derivatives need floating numbers"
-                    )
+    for layout, values in zip(run.layouts, run.split(args), strict=False):
+        layout.check_finite([plain(value) for value in values], "rollout")
+        for name, value in zip(layout.names, values, strict=True):
+            if dtype_of(value).kind not in "fc":
+                raise DerivativeError(
+                    f"{name} of rollout is traced but holds {dtype_of(value)}; derivatives need floating numbers"
+                )
     if run.store and not run.state.places:
         kinds = ", ".join(sorted({str(dtype_of(leaf)) for leaf in run.state.statics if leaf is not None}))
         raise DerivativeError(

@@ -56,12 +56,12 @@ class _LastCollector:
     def __init__(self, keep):
         self._keep = keep
 
-    def see(self, i, values, statics):
-        self._values, self._statics = values, statics
-        return values
+    def see(self, state):
+        self._state = state
+        return state
 
     def finish(self, stored):
-        return tuple(owned(value) for value in self._values[self._keep.shown]), self._statics
+        return tuple(owned(value) for value in self._state.values[self._keep.shown]), self._state.statics
 
 
 class All:
@@ -101,14 +101,14 @@ class _AllCollector:
         self._statics: list = []
         self.shared = keep.whole
 
-    def see(self, i, values, statics):
-        self._statics.append(statics)
-        for block, value in zip(self._blocks, values[self._shown], strict=True):
-            block[i] = value
+    def see(self, state):
+        self._statics.append(state.statics)
+        for block, value in zip(self._blocks, state.values[self._shown], strict=True):
+            block[state.i] = value
         if not self.shared:
-            return values
-        rows = [block[i] for block in self._blocks]
-        return [row if type(row) is np.ndarray else value for row, value in zip(rows, values, strict=True)]
+            return state
+        rows = zip((block[state.i] for block in self._blocks), state.values, strict=True)
+        return state._replace(values=[row if type(row) is np.ndarray else value for row, value in rows])
 
     def finish(self, stored):
         if stored:  # the way back uses these very arrays
@@ -195,9 +195,10 @@ class _EachCollector:
         self._stacks: dict = {}
         self._trees: list = []
 
-    def see(self, i, values, statics):
-        layout = self._keep.layout
-        found, rebuild = flatten(self._keep.function(i, layout.build([frozen(v) for v in values], statics)))
+    def see(self, state):
+        i, values, statics = state
+        given = self._keep.layout.build([frozen(v) for v in values], statics)
+        found, rebuild = flatten(self._keep.function(i, given))
         for leaf in found:
             refuse_mask("keep returned a masked array", leaf)
         places = [self._store(leaf) if is_variable(leaf) else None for leaf in found]
@@ -205,7 +206,7 @@ class _EachCollector:
             self._keep.compare(i, [marked(leaf) for leaf, place in zip(found, places, strict=True) if place])
         found = constant([None if place else leaf for leaf, place in zip(found, places, strict=True)])
         self._trees.append((flatten(rebuild(found))[1], found, places))
-        return values
+        return state
 
     def _store(self, leaf):
         if isbox(leaf):

@@ -2,6 +2,7 @@
 
 from functools import cached_property
 from math import prod
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten
 
-__all__ = ["NOTHING", "Layout", "dense", "fingerprint", "owned", "refuse_mask"]
+__all__ = ["NOTHING", "Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask"]
 
 
 NOTHING = (None,)  # the leaves beside one variable
@@ -50,28 +51,28 @@ class Layout:
 
     def __init__(self, tree, root):
         self.root, self.bare = root, is_variable(tree) and not isinstance(tree, np.ma.MaskedArray)
-        found, rebuild = ([tree], None) if self.bare else flatten(tree)
-        self.labels = [root] if self.bare else _labels(tree, root)
+        found, rebuild = flatten(tree)
+        self.labels = _labels(tree, root)
         for label, leaf in zip(self.labels, found, strict=True):
-            if not self.bare:
-                refuse_mask(f"rollout takes plain arrays, got a masked array as {label}", leaf)
-        moving = [is_variable(leaf) for leaf in found]
-        self.places = [place for place, moves in enumerate(moving) if moves]
-        self.statics = (
-            NOTHING
-            if self.bare
-            else tuple(None if m else constant(leaf) for leaf, m in zip(found, moving, strict=True))
-        )
-        if rebuild is not None:
-            # Rebuilt without the variables: what is kept must not hold a trace or a large array.
-            self._template = rebuild(self.statics)
-            self._rebuild = flatten(self._template)[1]
-        self.open = not self.bare and _is_open(tree)
-        self.names = [self.labels[place] for place in self.places]
+            refuse_mask(f"rollout takes plain arrays, got a masked array as {label}", leaf)
+        self.places = [place for place, leaf in enumerate(found) if is_variable(leaf)]
         variables = [plain(found[place]) for place in self.places]
+        self.statics = NOTHING if self.bare else self._others(found)
+        # Rebuilt without the variables: what is kept must not hold a trace or a large array.
+        self._template = rebuild(self.statics)
+        self._rebuild = flatten(self._template)[1]
+        self.open = _is_open(tree)
+        self.names = [self.labels[place] for place in self.places]
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
         self.shapes = [np.shape(leaf) for leaf in variables]
         self.dtypes = [dtype_of(leaf) for leaf in variables]
+
+    def _others(self, found):
+        """All leaves, None in place of the variables, as constants."""
+        others = list(found)
+        for place in self.places:
+            others[place] = None
+        return tuple(map(constant, others))
 
     @cached_property
     def nbytes(self):
@@ -104,66 +105,55 @@ class Layout:
         ShapeError
             If the form differs; `when` says who made the tree.
         """
-        if self.bare:
-            if isinstance(tree, (tuple, list, dict)):
-                raise ShapeError(_changed(self.root, "one array", _kind(tree), when))
-            refuse_mask(f"{when} made a masked array of {self.root}", tree)
+        if self.bare and not isinstance(tree, (tuple, list, dict)):
             return [tree], NOTHING
         found: list = []
-        self._collect(self._template, tree, self.root, when, found)
+        self._collect(self._template, tree, (), when, found)
         variables = [found[place] for place in self.places]
-        for place in self.places:
-            found[place] = None
-        if any(map(is_variable, found)):
-            place = next(place for place, leaf in enumerate(found) if is_variable(leaf))
-            raise ShapeError(
-                f"{self.root} must keep its form: {when} made a floating value of {_brief(self.statics[place])}; "
-                "start with a floating value, for example state.astype(float)"
-            )
-        return variables, tuple(found)
+        if len(variables) == len(found):
+            return variables, self.statics
+        others = self._others(found)
+        for leaf, static in zip(others, self.statics, strict=True):
+            refuse_mask(f"{when} made a masked array of {self.root}", leaf)
+            if is_variable(leaf):
+                raise ShapeError(
+                    f"{self.root} must keep its form: {when} made a floating value of {_brief(static)}; "
+                    "start with a floating value, for example state.astype(float)"
+                )
+        return variables, others
 
-    def _collect(self, wanted, tree, name, when, found):
-        if isinstance(wanted, dict):
-            if not isinstance(tree, dict) or tree.keys() != wanted.keys():
-                raise ShapeError(_changed(name, _kind(wanted), _kind(tree), when))
-            for key, branch in wanted.items():
-                self._collect(branch, tree[key], f"{name}[{key!r}]", when, found)
-        elif isinstance(wanted, (tuple, list)):
-            if not isinstance(tree, (tuple, list)) or len(tree) != len(wanted):
-                raise ShapeError(_changed(name, _kind(wanted), _kind(tree), when))
-            for number, branch in enumerate(wanted):
-                self._collect(branch, tree[number], f"{name}[{number}]", when, found)
+    def _collect(self, wanted: Any, tree: Any, path, when, found):
+        """The leaves of a tree, at a path of keys; refused where it branches otherwise than `wanted`."""
+        kind = dict if isinstance(wanted, dict) else (tuple, list)
+        if isinstance(wanted, kind):
+            same = isinstance(tree, kind) and len(tree) == len(wanted)
+            if not same or (kind is dict and tree.keys() != wanted.keys()):
+                raise ShapeError(_changed(_at(self.root, path), _kind(wanted), _kind(tree), when))
+            for key in wanted if kind is dict else range(len(wanted)):
+                self._collect(wanted[key], tree[key], (*path, key), when, found)
         elif isinstance(tree, (tuple, list, dict)):
-            raise ShapeError(_changed(name, "one leaf", _kind(tree), when))
+            leaf = "one array" if self.bare else "one leaf"
+            raise ShapeError(_changed(_at(self.root, path), leaf, _kind(tree), when))
         else:
-            refuse_mask(f"{when} made a masked array of {name}", tree)
             found.append(tree)
-
-    def is_one(self, value):
-        """Whether a result is the one array that the form asks for, contiguous: the common case, told fast."""
-        return (
-            type(value) is np.ndarray
-            and value.shape == self.shapes[0]
-            and value.dtype == self.dtypes[0]
-            and value.flags.c_contiguous
-        )
 
     def check(self, values, when):
         """Values of the variables after a step -> the same, contiguous; refuse another shape or dtype."""
-        return [
-            value
-            if type(value) is np.ndarray and value.shape == shape and value.dtype == dtype and value.flags.c_contiguous
-            else self._settled(number, value, when)
-            for number, (value, shape, dtype) in enumerate(zip(values, self.shapes, self.dtypes, strict=True))
-        ]
+        for number, value in enumerate(values):
+            if not (
+                type(value) is np.ndarray
+                and value.shape == self.shapes[number]
+                and value.dtype == self.dtypes[number]
+                and value.flags.c_contiguous
+            ):
+                values[number] = self._settled(number, value, when)
+        return values
 
     def _settled(self, number, value, when):
         name, shape, dtype = self.names[number], self.shapes[number], self.dtypes[number]
         if isbox(value):
-            raise DerivativeError(
-                f"{when} uses a traced value that is not one of its arguments, and its derivative would be lost; "
-                "pass it in params or make it a part of the state"
-            )
+            refuse_lost(when)
+        refuse_mask(f"{when} made a masked array of {name}", value)
         if not isinstance(value, (np.ndarray, np.generic, float, complex)):
             raise ShapeError(_changed(name, "one array", _kind(value), when))
         if np.shape(value) != shape:
@@ -213,6 +203,14 @@ def refuse_mask(what, leaf):
         raise TypeError(f"{what}; fill it first, and hand the mask along as an array of its own")
 
 
+def refuse_lost(what):
+    """A trace that leads elsewhere is not gone back through."""
+    raise DerivativeError(
+        f"{what} uses a traced value that is not one of its arguments, and its derivative would be lost; "
+        "pass it in params or make it a part of the state"
+    )
+
+
 def fingerprint(values, statics=NOTHING):
     """Variables and other leaves of a state -> 64 bits for each variable, and for each whole number and word."""
     marks = [_bits(value) for value in values]
@@ -236,13 +234,17 @@ def _bits(value):
     return hash((flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes(), flat[end:].tobytes()))
 
 
-def _labels(tree, name):
+def _labels(tree, root, path=()):
     """Names of all leaves, from left to right."""
-    if isinstance(tree, dict):
-        return [label for key, branch in tree.items() for label in _labels(branch, f"{name}[{key!r}]")]
-    if isinstance(tree, (tuple, list)):
-        return [label for number, branch in enumerate(tree) for label in _labels(branch, f"{name}[{number}]")]
-    return [name]
+    if not isinstance(tree, (dict, tuple, list)):
+        return [_at(root, path)]
+    keys = tree if isinstance(tree, dict) else range(len(tree))
+    return [label for key in keys for label in _labels(tree[key], root, (*path, key))]
+
+
+def _at(root, path):
+    """The name of what lies at a path of keys."""
+    return root + "".join(f"[{key!r}]" for key in path)
 
 
 def _kind(tree):

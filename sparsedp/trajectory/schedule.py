@@ -19,7 +19,17 @@ from typing import NamedTuple
 
 from sparsedp.fields import is_number
 
-__all__ = ["Plan", "advances", "budget_within_reach", "plan", "recomputed", "room_within", "slots_within", "stride"]
+__all__ = [
+    "Plan",
+    "advances",
+    "budget_within_reach",
+    "checkpoints",
+    "plan",
+    "recomputed",
+    "room_within",
+    "slots_within",
+    "stride",
+]
 
 UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
 WORKING = 4  # states at work beside the kept ones: the present, its cotangent and the one before, the result
@@ -67,6 +77,15 @@ def stride(n, s):
         return n - 1  # nothing is kept: on to the last state
     r = repetitions(n, s)
     return min(beta(s, r - 1), n - beta(s - 1, r - 1))
+
+
+def checkpoints(n, s):
+    """Indices of the states to keep on the way forward, when s states may be kept; None: all."""
+    i, kept = 0, 0
+    while i < n:
+        yield i
+        kept += 1
+        i += 1 if s is None or n - i == 1 else stride(n - i, s - kept + 1)
 
 
 def slots_within(memory, state_bytes, n, beside=0):
