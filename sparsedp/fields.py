@@ -92,6 +92,8 @@ def check_finite(name, values, needs="must be finite", where=None):
 
 def surely_finite(value):
     """One pass without a temporary array; False also when a finite sum is too large."""
+    if type(value) is np.float64:
+        return isfinite(value)
     if type(value) is np.ndarray and value.size <= SHORT and value.dtype == FLOAT and value.flags.c_contiguous:
         flat = value.reshape(-1)
         if isfinite(np.vdot(flat, flat)):  # one cheap call; a square may overflow where the value does not
