@@ -248,8 +248,8 @@ BUGS = {
     ),
     "a departure point as far as the whole step at half of it": Bug(
         "advection",
-        "half_way = Trajectory(closed, w, 0.5 * step)",
-        "half_way = Trajectory(closed, w, step)",
+        "Trajectory(component.half_way, w, 0.5 * step)",
+        "Trajectory(component.half_way, w, step)",
         "tests/test_transport_lagrange.py",
     ),
     "a MacCormack step that adds all that it misses": Bug(

@@ -29,8 +29,6 @@ class Trajectory:
     component : Interpolant
     w : array
     step : float
-    closed : Interpolant, optional
-        Of the velocity half way (midpoint); None: points keep their own velocity (euler).
 
     Attributes
     ----------
@@ -40,13 +38,14 @@ class Trajectory:
         See `index_coordinates`.
     """
 
-    def __init__(self, component, w, step, closed=None):
+    def __init__(self, component, w, step):
         self.component, self.rows = component, []
-        if closed is not None:
-            half_way = Trajectory(closed, w, 0.5 * step)
+        if component.half_way is not None:
+            half_way = Trajectory(component.half_way, w, 0.5 * step)
             self.rows = [Pass(half_way, row, NONE) for row in w]
             w = np.stack([row.value() for row in self.rows])
-        *self.displacement, self.sides = component.coordinates.displacement(w, step)
+        displacement, scale, self.sides = component.coordinates.displacement(w, step)
+        self.displacement = displacement, scale
 
     def vjp(self, g):
         """Cotangent of the velocity used all along the step -> that of w, in its place."""

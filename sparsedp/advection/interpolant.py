@@ -21,6 +21,8 @@ class Interpolant:
     ----------
     span : slice
         Where the component stands in the flat field.
+    half_way : Interpolant or None
+        Of the velocity half way to a departure point; None: points keep their own velocity (euler).
     """
 
     def __init__(self, setting, number, closed=False):
@@ -30,6 +32,8 @@ class Interpolant:
         self.inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
         self.ghosts, self.origins = ghost_origins(setting, number, closed)
         self.coordinates = Coordinates(setting, number, interpolation)
+        midpoint = setting.backtrace == "midpoint" and not closed
+        self.half_way = Interpolant(setting, number, closed=True) if midpoint else None
         self.fill = None  # the map that fills solid cells, and its transpose
         if setting.of == "cells" and setting.solid is not None and not closed:  # faces lend their value to others
             forward = filling(setting.grid, setting.solid)
@@ -107,9 +111,9 @@ class Pass:
 
     def matrix(self):
         """The values as a csr_array in u, without what flows in."""
-        n, cells, fill = self.points.size, self.points.samples, self.component.fill
-        sources = self.component.pad(np.arange(n), np.full(self.inflow.size, n))[:cells].astype(int)
-        copies = sp.csr_array((np.ones(cells), sources, np.arange(cells + 1)), (cells, n + 1))[:, :n]
+        n, fill = self.points.size, self.component.fill
+        sources = self.component.pad(np.arange(n), np.full(self.inflow.size, n)).astype(int)  # n: inflow
         entries = departure.entries(self.points, *self.displacement)
-        moved = sum(sp.csr_array((weight, index, np.arange(n + 1)), (n, cells)) for index, weight in entries) @ copies
+        columns = (sp.csr_array((weight, sources[index], np.arange(n + 1)), (n, n + 1)) for index, weight in entries)
+        moved = sum(columns)[:, :n]
         return moved if fill is None else moved @ fill[0]

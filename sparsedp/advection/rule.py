@@ -27,7 +27,7 @@ def rule_of(law):
             else:
                 found = law.pull(nums, g, *flat)
             for num, back in zip(nums, () if type(found) is Finite else found):
-                _check_slope(law, "the gradient in " + LETTERS.get(num, "dt"), back, (g,))
+                _check_slope(law, "the gradient in " + LETTERS[num], back, (g,))
             return tuple([unflatten(args[num], back) for num, back in zip(nums, found, strict=True)])
 
         return pull

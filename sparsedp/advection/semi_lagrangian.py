@@ -41,11 +41,8 @@ class SemiLagrangian(Law):
 
     def __init__(self, setting):
         super().__init__(setting)
-        numbers, solid = range(len(setting.space.parts)), setting.solid
-        self.components = [Interpolant(setting, number) for number in numbers]
-        self.half_way = [
-            Interpolant(setting, n, closed=True) if setting.backtrace == "midpoint" else None for n in numbers
-        ]
+        parts, solid = setting.space.parts, setting.solid
+        self.components = [Interpolant(setting, number) for number in range(len(parts))]
         self.to_points = velocity_at_points(setting)
         self.solid = None  # points that keep their value
         if solid is not None:
@@ -61,8 +58,8 @@ class SemiLagrangian(Law):
 
     def _passes(self, u, v, dt, inflow):
         """For each component where it stands in the field, and its pass to the departure points."""
-        for component, closed, w in zip(self.components, self.half_way, self._velocities(v), strict=True):
-            trajectories = [Trajectory(component, w, dt * sign, closed) for sign in self.signs]
+        for component, w in zip(self.components, self._velocities(v), strict=True):
+            trajectories = [Trajectory(component, w, dt * sign) for sign in self.signs]
             yield component.span, self.passage(*trajectories, u[component.span], inflow)
 
     def _keep_solid(self, moved, u):

@@ -3,7 +3,7 @@
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.advection.law import FIELD, STEP, VELOCITY, Law
+from sparsedp.advection.law import FIELD, Law
 from sparsedp.advection.stability import check_numbers
 
 __all__ = ["Still"]
@@ -20,9 +20,8 @@ class Still(Law):
         return u + 0.0
 
     def pull(self, nums, g, u, v, dt, inflow):
-        nothing = {VELOCITY: np.zeros(np.shape(v)), STEP: 0.0}
-        found = {FIELD: g + 0.0, **nothing}
-        return tuple(found.get(num, np.zeros(np.shape(inflow))) for num in nums)
+        found = g + 0.0, np.zeros(np.shape(v)), 0.0, np.zeros(np.shape(inflow))
+        return tuple(found[num] for num in nums)
 
     def push(self, tangents, u, v, dt, inflow):
         return tangents.get(FIELD, np.zeros(np.shape(u))) + 0.0

@@ -3,7 +3,7 @@
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY
+from sparsedp.advection.law import INFLOW, STEP
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_finite, is_number
 from sparsedp.tape import cast, dtype_of, isbox, plain
@@ -11,7 +11,7 @@ from sparsedp.tape import cast, dtype_of, isbox, plain
 __all__ = ["LETTERS", "check_step", "flat_numbers", "prepare", "raised", "result_like", "unflatten"]
 
 FLOAT = np.dtype(float)
-LETTERS = {FIELD: "u", VELOCITY: "v", INFLOW: "inflow"}
+LETTERS = "u", "v", "dt", "inflow"
 
 
 def prepare(law, u, v, dt, inflow):
