@@ -43,6 +43,8 @@ def main(arguments=None):
         if place is None:
             sys.stdout = open(os.devnull, "w")  # or Python tries once more at its end, and changes the exit code
         return refuse(f"{place or 'the output'} cannot be written: {why or error}; make room, or write elsewhere")
+    except ValueError as error:  # the scene, its loss or the folder: what is wrong with it
+        return refuse(error)
 
 
 class Parser(argparse.ArgumentParser):
@@ -76,12 +78,9 @@ def run_check(options):
     from sparsedp.check.audit import gradient
     from sparsedp.report.scene_report import audited, load
 
-    try:
-        source = load(options.scene)
-        with audited(options.scene):
-            audit = gradient(source.loss, source.x, quick=options.quick)
-    except ValueError as error:
-        return refuse(error)
+    source = load(options.scene)
+    with audited(options.scene):
+        audit = gradient(source.loss, source.x, quick=options.quick)
     print(audit)
     return CODES[audit.verdict]
 
@@ -90,11 +89,7 @@ def run_report(options):
     """Options of the command `report` -> exit code."""
     from sparsedp.report.scene_report import load, write_report
 
-    try:
-        source = load(options.scene)
-        verdict, lines = write_report(source, options.out, options.force)
-    except ValueError as error:
-        return refuse(error)
+    verdict, lines = write_report(load(options.scene), options.out, options.force)
     print(*lines, f"{verdict}; see {options.out / 'report.md'}", sep="\n")
     return CODES[verdict]
 

@@ -181,9 +181,9 @@ def _looked_at(trials, slope, steps, extend, count, rng, names=None):
     elif trials.value(point.tree()) != trials.base:
         doubts.append(("unsound", "two evaluations of the loss differ: it is not deterministic"))
     with np.errstate(all="ignore"):
-        found = [point.gradient(slope(point.tree()) if callable(slope) else slope) for _ in range(2)]
-    vector = trials.gradient = found[0]
-    if not np.array_equal(*found, equal_nan=True):
+        vector, again = (point.gradient(slope(point.tree()) if callable(slope) else slope) for _ in range(2))
+    trials.gradient = vector
+    if not np.array_equal(vector, again, equal_nan=True):
         doubts.append(("unsound", "two evaluations of the gradient differ: it is not deterministic"))
     if 0 < np.max(np.abs(vector * point.units), initial=0.0) < UNDERFLOW:
         doubts.append(("unsound", f"the loss changes by less than {UNDERFLOW:g}: it underflows, scale it"))

@@ -79,7 +79,7 @@ FIELDS = "direction word difference slope gap bar scale step rate1 rate2 digits 
 
 
 # Evidence -> word and reason: the first row that holds. Where few levels are usable, only the first four can.
-WORDS: tuple[tuple[str, Any, str], ...] = (
+WORDS = (
     ("constant", lambda e: e.silent and e.slope == 0, "the loss does not change along this direction"),
     (
         "disagrees",
@@ -255,7 +255,7 @@ class Judgement:
         self.agreed = max(float(np.clip(PER_NOISE * trials.eps * self.jitter, least, NOISY)), 300 * spread)
         ranked = self._estimates(self.m, 2, self.noise)
         bends = self._estimates(self.kinks, 1, 2 * self.noise)
-        found: list[Any] = []
+        found = []
         for gap, bar, index in ranked:
             # A derivative is a limit, not a passing plateau: all finer levels agree with it.
             passing = np.any((np.abs(self.m - gap) > bar + 6 * self.noise / self.t)[index + 1 :])
@@ -274,7 +274,7 @@ class Judgement:
     def _estimates(self, values, power, noise):
         """Estimates of v0 in values(t) = v0 + c t^power, best first: (estimate, bar, index of its finest level)."""
         ratio = (self.t[:-1] / self.t[1:]) ** power
-        found: list[Any] = []
+        found: list = []
         for series in (values, (ratio * values[1:] - values[:-1]) / (ratio - 1)):
             jumps, start = np.abs(np.diff(series)), values.size - series.size + 1
             bars = np.maximum(jumps[:-1], jumps[1:]) + 2 * (noise / self.t)[start:-1]
@@ -451,7 +451,7 @@ def explained(found, gradient):
 
 # ------------------------------------------------------------ Hessian products
 
-HESSIANS: tuple[tuple[str, Any, str], ...] = (
+HESSIANS = (
     ("agrees", lambda e: not e.used3, "is noise"),
     ("inconclusive", lambda e: e.used3 < FEWEST, "stands out of the noise on {e.used3} steps, 3 are needed"),
     ("agrees", lambda e: e.rate3 >= THIRD, "of order {e.rate3:.2f}"),

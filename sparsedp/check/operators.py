@@ -82,21 +82,15 @@ class Probe:
         stricter, never laxer.
     """
 
-    forms: tuple
-    matrix: Any
-    sizes: Any
-
     def __init__(self, op, seeds=1, rng=None):
         self.op, self.rng, self.seeds = op.tangent, generator(rng), max(seeds, 1)
         self.real = op.dtype.kind != "c"
         structure = self.op.structure
-        self.forms, self.matrix, self.sizes = (), None, None
-        if max(op.shape) <= (LARGEST if structure.has_entries else MOST_COLUMNS):
-            self.forms = self.op.explicit(), self.op.matrix_free()
-            self.matrix = self.forms[0].matrix
-            composed = isinstance(structure, (Chain, Sum, Scaled))
-            self.sizes = magnitude(structure) if composed else abs(self.matrix)
-        self.size = self._norm() if self.sizes is None else _size(self.sizes)
+        listed = max(op.shape) <= (LARGEST if structure.has_entries else MOST_COLUMNS)
+        self.forms = [self.op.explicit(), self.op.matrix_free()] if listed else []
+        self.matrix = self.forms[0].matrix if listed else None
+        self.sizes: Any = magnitude(structure, self.matrix) if listed else None
+        self.size = _size(self.sizes) if listed else self._norm()
 
     def domain(self, dtype=float):
         """Random field of the domain."""
@@ -170,7 +164,7 @@ def _dot(a, b):
 
 
 # Identities of a right operator: left side, right side, and what their rounding is relative to.
-IDENTITIES: dict[str, Any] = {
+IDENTITIES = {
     "linearity": lambda p, u, v, g: (
         p.op.apply(0.75 * u - v),
         0.75 * p.op.apply(u) - p.op.apply(v),
@@ -208,8 +202,8 @@ def unit(structure, dtype):
     return max(float(np.finfo(dtype).eps), float(getattr(system, "rtol", 0.0)), inner)
 
 
-def magnitude(structure):
-    """Structure -> sparse matrix of sizes: |A| entry by entry, |A| |B| for a product, |A| + |B| for a sum.
+def magnitude(structure, matrix=None):
+    """Structure (its matrix) -> sparse matrix of sizes: |A| entry by entry, |A| |B| for a product, |A| + |B| for a sum.
 
     The rounding error of an application is at most a few units times this matrix times |u|, also
     where entries of the product cancel.
@@ -219,7 +213,7 @@ def magnitude(structure):
     if isinstance(structure, (Chain, Sum)):
         combine = matmul if isinstance(structure, Chain) else add
         return reduce(combine, map(magnitude, structure.members))
-    return abs(structure.explicit())
+    return abs(structure.explicit() if matrix is None else matrix)
 
 
 def _size(sizes):
@@ -473,7 +467,7 @@ def _rows(probe):
     return rows + [row(name, test, probe) for name, test in ARGUMENTS.items()]
 
 
-ARGUMENTS: dict[str, Any] = {
+ARGUMENTS = {
     "dtypes": _dtypes,
     "input unmodified, result fresh": _freshness,
     "same bits twice": _repeats,

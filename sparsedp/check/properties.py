@@ -162,7 +162,7 @@ def _by_parts(op):
 
 
 # Spaces of an operator -> the rule, and what stands on the other side of it, with its sign turned.
-PARTNERS: dict[tuple, tuple] = {
+PARTNERS = {
     ("cells", "faces"): ("with the divergence of its grid", divergence),
     ("faces", "cells"): ("with the gradient of its grid", gradient),
 }

@@ -221,8 +221,7 @@ def _skipped(calls, forward, gradient):
 
 def _matrices(calls, name, operators):
     if not calls[name, "assembled"] and any(op.form == "matrix-free" for op in operators):
-        known = all(op.structure.has_entries for op in operators)
-        yield f"matrix of {name}: not assembled, {'applied' if known else 'known only'} without one"
+        yield f"matrix of {name}: not assembled, applied without one"
     if any(op.structure.is_identity for op in operators):
         yield f"arithmetic of {name}: an identity, {calls[name, 'forward']} copies"
 

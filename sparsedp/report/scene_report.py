@@ -74,15 +74,15 @@ def load(target):
     found = _run(file)
     if not callable(found.get(loss)):
         raise ValueError(f"{file} has no function {loss!r}; write {file}:NAME of the function to examine")
-    names = [start] if start else [name for name in STARTS if name in found]
-    if not names or names[0] not in found:
+    place = next((name for name in ([start] if start else STARTS) if name in found), None)
+    if place is None:
         raise ValueError(f"{file} has no {start or ' or '.join(STARTS)!r}, the point; write {file}:{loss}:NAME")
     name = file.stem if loss == "loss" else f"{file.stem}-{loss}"
     options = [found.get(key, {}) for key in OPTIONS]
     for key, given in zip(OPTIONS, options):
         if not isinstance(given, dict):
             raise ValueError(f"{key} in {file} must be a dict of arguments, got {type(given).__name__}")
-    return Source(name, _of_one(found[loss], found[names[0]]), found[names[0]], *options)
+    return Source(name, _of_one(found[loss], found[place]), found[place], *options)
 
 
 @contextlib.contextmanager

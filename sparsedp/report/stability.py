@@ -99,16 +99,14 @@ class StabilityMap(Result):
 
     def to_dict(self):
         """The map as plain lists; None where the step is refused."""
-        factors = [[None if np.isnan(factor) else factor for factor in row] for row in self.factors.tolist()]
-        return {"time_steps": self.time_steps.tolist(), "viscosities": self.viscosities.tolist(), "factors": factors}
+        factors = np.where(np.isnan(self.factors), None, self.factors)
+        lists = {"time_steps": self.time_steps, "viscosities": self.viscosities, "factors": factors}
+        return {name: values.tolist() for name, values in lists.items()}
 
     def __str__(self):
-        rows = [(f"{dt:.1e}", *map(_cell, row)) for dt, row in zip(self.time_steps, self.factors)]
+        cells = [["refused" if np.isnan(factor) else f"{factor:.3g}" for factor in row] for row in self.factors]
+        rows = [(f"{dt:.1e}", *row) for dt, row in zip(self.time_steps, cells)]
         return table(rows, (" \\ ".join(self.names), *(f"{nu:.1e}" for nu in self.viscosities)))
-
-
-def _cell(factor):
-    return "refused" if np.isnan(factor) else f"{factor:.3g}"
 
 
 def stability_map(scene):
@@ -124,7 +122,7 @@ def stability_map(scene):
     def factor(*pair):
         other = {name: np.full_like(scene.leaves[name], value) for name, value in zip(names, pair)}
         growth = scene.growth_at(other)
-        return np.nan if growth is None else growth.factor
+        return growth.factor if growth else np.nan
 
     factors = np.array([[factor(dt, nu) for nu in nus] for dt in dts])
     return StabilityMap(names=names, time_steps=dts, viscosities=nus, factors=factors, here=tuple(here))

@@ -17,7 +17,7 @@ from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.fields import check_function, is_whole
 from sparsedp.files import write_file
-from sparsedp.ledger import recording
+from sparsedp.ledger import Calls, recording
 from sparsedp.report import plots
 from sparsedp.report.certificate import distance
 from sparsedp.report.plan import total
@@ -204,7 +204,7 @@ def _warm(run):
 
     Gives the calls of the last run, whether it is warm, and the seconds of the calls of the first.
     """
-    before, first = math.inf, None
+    before, first = math.inf, Calls()
     for _ in range(MOST_WARM_UPS):
         with recording() as calls:
             now, _ = timed(run)
