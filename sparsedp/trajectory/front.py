@@ -135,7 +135,7 @@ def rollout(
         told(step, state, params, inputs, n)
     outputs = rollout_rule(run, *args)
     count = len(plain(outputs)) if isinstance(plain(outputs), tuple) else None
-    return run.keep.tree([outputs] if count is None else [outputs[k] for k in range(count)], run.outcome)
+    return run.keep.tree([outputs] if count is None else [outputs[k] for k in range(count)])
 
 
 def _number_of_steps(n):

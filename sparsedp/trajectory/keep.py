@@ -1,8 +1,10 @@
 """What a rollout hands out: the last state, all states, or what a function makes of each.
 
-Each kind collects arrays going forward (`collector`), builds the user's tree from them (`tree`), and going
-backward says which cotangent enters at which state (`source`).
+Each kind takes the states of a run as they come (`start`, `see`, `finish`), builds the user's tree from the arrays of
+the last run (`tree`), and going backward says which cotangent enters at which state (`source`).
 """
+
+from typing import Any
 
 import numpy as np
 
@@ -33,35 +35,31 @@ class Last:
 
     def __init__(self, layout, shown=slice(None)):
         self.layout, self.shown = layout, shown
+        self._last: Any = None
 
-    def collector(self, run):
-        """Start collecting."""
-        return _LastCollector(self)
+    def start(self, run):
+        """A run begins."""
 
-    def tree(self, outputs, statics):
+    def see(self, state):
+        """A state of the run -> the same, perhaps in other memory."""
+        self._last = state
+        return state
+
+    def finish(self, stored):
+        """The arrays to hand out."""
+        last, self._last = self._last, self._last.statics
+        return tuple(owned(value) for value in last.values[self.shown])
+
+    def tree(self, outputs):
         """Outputs of the rule -> what the user gets."""
         pairs = zip(outputs, self.layout.floats, strict=True)
-        return self.layout.build([float(v) if bare and not isbox(v) else v for v, bare in pairs], statics)
+        return self.layout.build([float(v) if bare and not isbox(v) else v for v, bare in pairs], self._last)
 
     def source(self, n, g):
         """Cotangents of the outputs -> function (index, variables, statics) -> cotangents of a state, or None."""
         entering = [None] * len(self.layout.places)
         entering[self.shown] = g
         return lambda i, values, statics: entering if i == n else None
-
-
-class _LastCollector:
-    shared = False  # whether the states seen are parts of the result
-
-    def __init__(self, keep):
-        self._keep = keep
-
-    def see(self, state):
-        self._state = state
-        return state
-
-    def finish(self, stored):
-        return tuple(owned(value) for value in self._state.values[self._keep.shown]), self._state.statics
 
 
 class All:
@@ -72,14 +70,35 @@ class All:
     def __init__(self, layout, shown=slice(None)):
         self.layout, self.shown = layout, shown
         self.whole = layout.places[shown] == layout.places
+        self._blocks: list = []
+        self._statics: list = []
 
-    def collector(self, run):
-        """Start collecting."""
-        return _AllCollector(self, run.n)
+    def start(self, run):
+        """A run begins."""
+        pairs = list(zip(self.layout.shapes, self.layout.dtypes, strict=True))[self.shown]
+        self._blocks = [np.empty((run.n + 1, *shape), dtype) for shape, dtype in pairs]
+        self._statics = []
 
-    def tree(self, outputs, statics):
+    def see(self, state):
+        """A state of the run -> the same; where all of it is handed out, in that memory."""
+        self._statics.append(state.statics)
+        for block, value in zip(self._blocks, state.values[self.shown], strict=True):
+            block[state.i] = value
+        if not self.whole:
+            return state
+        rows = zip((block[state.i] for block in self._blocks), state.values, strict=True)
+        return state._replace(values=[row if type(row) is np.ndarray else value for row, value in rows])
+
+    def finish(self, stored):
+        """The arrays to hand out."""
+        blocks, self._blocks = self._blocks, []
+        for block in blocks:
+            block.flags.writeable = not stored  # the way back uses these very arrays
+        return tuple(blocks)
+
+    def tree(self, outputs):
         """Outputs of the rule -> what the user gets."""
-        return self.layout.build(outputs, [_stacked(line) for line in zip(*statics, strict=True)])
+        return self.layout.build(outputs, [_stacked(line) for line in zip(*self._statics, strict=True)])
 
     def source(self, n, g):
         """Cotangents of the outputs -> function (index, variables, statics) -> cotangents of a state."""
@@ -93,30 +112,6 @@ class All:
         return at
 
 
-class _AllCollector:
-    def __init__(self, keep, n):
-        self._shown = keep.shown
-        pairs = list(zip(keep.layout.shapes, keep.layout.dtypes, strict=True))[keep.shown]
-        self._blocks = [np.empty((n + 1, *shape), dtype) for shape, dtype in pairs]
-        self._statics: list = []
-        self.shared = keep.whole
-
-    def see(self, state):
-        self._statics.append(state.statics)
-        for block, value in zip(self._blocks, state.values[self._shown], strict=True):
-            block[state.i] = value
-        if not self.shared:
-            return state
-        rows = zip((block[state.i] for block in self._blocks), state.values, strict=True)
-        return state._replace(values=[row if type(row) is np.ndarray else value for row, value in rows])
-
-    def finish(self, stored):
-        if stored:  # the way back uses these very arrays
-            for block in self._blocks:
-                block.flags.writeable = False
-        return tuple(self._blocks), self._statics
-
-
 def _stacked(line):
     """A leaf that is no variable, along the trajectory: numbers are stacked, the rest is taken once."""
     return np.stack(line) if isinstance(line[0], (bool, int, np.ndarray, np.generic)) else line[0]
@@ -125,16 +120,44 @@ def _stacked(line):
 class Each:
     """What function(index, state) makes of each state; floating results of one shape are kept in one stack."""
 
-    along, recycles, whole = True, False, False
+    along, whole = True, False
 
     def __init__(self, layout, function):
         self.layout, self.function = layout, function
+        self._stacks: dict = {}
+        self._trees: list = []
         self._groups: dict = {}
         self._marks: list = []  # of what the function returned, where it will be called again
+        self._compared = False
 
-    def collector(self, run):
-        """Start collecting."""
-        return _EachCollector(self, run.store)
+    def start(self, run):
+        """A run begins."""
+        self._stacks, self._trees, self._compared = {}, [], run.store
+
+    def see(self, state):
+        """A state of the run -> the same."""
+        given = self.layout.build([frozen(value) for value in state.values], state.statics)
+        found, rebuild = flatten(self.function(state.i, given))
+        for leaf in found:
+            refuse_mask("keep returned a masked array", leaf)
+        places = [self._store(leaf) if is_variable(leaf) else None for leaf in found]
+        if self._compared:
+            self.compare(state.i, [marked(leaf) for leaf, place in zip(found, places, strict=True) if place])
+        others = constant([None if place else leaf for leaf, place in zip(found, places, strict=True)])
+        self._trees.append((flatten(rebuild(others))[1], others, places))
+        return state
+
+    def _store(self, leaf):
+        """Where a floating result is kept: (number of the stack, place in it)."""
+        if isbox(leaf):
+            raise DerivativeError(
+                "keep uses a traced value that is not part of the state, and its derivative would be lost; "
+                "return what it needs of the state, and combine the two outside of rollout"
+            )
+        key = _sort(leaf)
+        stack = self._stacks.setdefault(key, [])
+        stack.append(owned(leaf))
+        return list(self._stacks).index(key), len(stack) - 1
 
     def compare(self, i, marks):
         """Refuse a function that returns something else for a state than it did before."""
@@ -145,11 +168,17 @@ class Each:
                 "keep returns something else when it is called again; it must depend on its arguments only"
             )
 
-    def tree(self, outputs, statics):
+    def finish(self, stored):
+        """The arrays to hand out: one for each shape and dtype."""
+        stacks, self._stacks = self._stacks, {}
+        self._groups = {key: number for number, key in enumerate(stacks)}
+        return tuple(np.stack(stack) for stack in stacks.values())
+
+    def tree(self, outputs):
         """Outputs of the rule -> the tuple of what the function returned."""
         return tuple(
             rebuild([outputs[place[0]][place[1]] if place else leaf for leaf, place in zip(found, places, strict=True)])
-            for rebuild, found, places in statics
+            for rebuild, found, places in self._trees
         )
 
     def source(self, n, g):
@@ -185,41 +214,3 @@ def marked(value):
     """Array or number, plain or traced -> its shape and dtype, and its bits."""
     value = np.asarray(plain(value))
     return value.shape, value.dtype.char, fingerprint([value])
-
-
-class _EachCollector:
-    shared = False
-
-    def __init__(self, keep, stored):
-        self._keep, self._stored = keep, stored
-        self._stacks: dict = {}
-        self._trees: list = []
-
-    def see(self, state):
-        i, values, statics = state
-        given = self._keep.layout.build([frozen(v) for v in values], statics)
-        found, rebuild = flatten(self._keep.function(i, given))
-        for leaf in found:
-            refuse_mask("keep returned a masked array", leaf)
-        places = [self._store(leaf) if is_variable(leaf) else None for leaf in found]
-        if self._stored:
-            self._keep.compare(i, [marked(leaf) for leaf, place in zip(found, places, strict=True) if place])
-        found = constant([None if place else leaf for leaf, place in zip(found, places, strict=True)])
-        self._trees.append((flatten(rebuild(found))[1], found, places))
-        return state
-
-    def _store(self, leaf):
-        if isbox(leaf):
-            raise DerivativeError(
-                "keep uses a traced value that is not part of the state, and its derivative would be lost; "
-                "return what it needs of the state, and combine the two outside of rollout"
-            )
-        numbers = {key: number for number, key in enumerate(self._stacks)}
-        key = _sort(leaf)
-        stack = self._stacks.setdefault(key, [])
-        stack.append(owned(leaf))
-        return numbers.get(key, len(numbers)), len(stack) - 1
-
-    def finish(self, stored):
-        self._keep._groups = {key: number for number, key in enumerate(self._stacks)}
-        return tuple(np.stack(stack) for stack in self._stacks.values()), self._trees

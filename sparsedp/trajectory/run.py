@@ -50,7 +50,6 @@ class Run:
         self.place_of: dict = {}  # in a dual run: number of an argument of the run -> its number here
         self.silenced: tuple = ()  # variables that are zero for the step after a cut: tangents
         self.origin: Run | None = None  # of a dual run: the one whose states it goes through again
-        self.outcome = None  # what the user's tree holds beside the variables
         self._kept: list = []  # states, the last one included; none where they have been handed over
         self._tapes: list = []  # of the steps from the first one on
         self._trace: Any = None  # of the tapes
@@ -79,40 +78,40 @@ class Run:
     def forward(self, args):
         """Run all steps; return the arrays to hand out."""
         trace = Trace.begun(len(args), self.traced)
-        steps, collector = Steps(self, args, trace), self.keep.collector(self)
+        steps = Steps(self, args, trace)
+        self.keep.start(self)
         with steps.guarded():
-            state, kept, tapes = self._advance(steps, collector, self._start(args))
+            state, kept, tapes = self._advance(steps, self._start(args))
         self._check_end(args, state)
         if self.origin:
             self.origin.agree(state)
         if self.store:
             end = fingerprint(*state[1:])
             self.compare(end, self._end or end)
-            last = state if collector.shared else state._replace(values=list(map(owned, state.values)))
+            last = state if self.keep.whole else state._replace(values=list(map(owned, state.values)))
             self._end, self._kept, self._tapes, self._trace = end, [*kept, last], tapes, trace
         if active:
             count("rollout.step", "forward", self.n)
             count("rollout", "bytes", len(kept) * self.state.nbytes)
         if self.record is not None:
             self.record(Record("forward", self.n, len(kept), 0))
-        outputs, self.outcome = collector.finish(self.store)
-        return outputs
+        return self.keep.finish(self.store)
 
     def _start(self, args):
         return State(0, self.split(args)[0], self.state.statics)
 
-    def _advance(self, steps, collector, state):
+    def _advance(self, steps, state):
         """(last state, the states kept, the tapes kept) after all steps from the first state."""
         kept: list = []
         tapes: list = []
         recorder = steps.trace.recorder
-        state, stops = collector.see(state), checkpoints(self.n if self.store else 0, self.slots)
+        state, stops = self.keep.see(state), checkpoints(self.n if self.store else 0, self.slots)
         stop = next(stops, None)
         origin = self.origin if self.origin and self.origin.keep.whole else None  # whose states are all at hand
         fit = 1 if self.store and self.room else 0  # how many tapes there is room for: the first one tells
         for i in shown_steps(self.progress, range(self.n), "forward"):
             if i == stop:
-                own = collector.shared or i <= len(tapes)  # nobody else has the result of a step on its tape
+                own = self.keep.whole or i <= len(tapes)  # nobody else has the result of a step on its tape
                 kept.append(state if own else state._replace(values=list(map(owned, state.values))))
                 stop = next(stops, None)
             if origin:
@@ -126,7 +125,7 @@ class Run:
                     tapes.append(tape)
             else:
                 state = steps.forward(state)
-            state = collector.see(state)
+            state = self.keep.see(state)
         return state, kept, tapes
 
     def _check_end(self, args, state):
