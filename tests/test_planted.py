@@ -267,8 +267,8 @@ BUGS = {
     ),
     "a divergence that is left at openings": Bug(
         "flow",
-        "tuple(condition.pressure for condition in pair) for axis, pair in pairs if pair",
-        "tuple(pair[0].pressure for condition in pair) for axis, pair in pairs if pair",
+        "tuple(condition.pressure for condition in pair) for axis, pair in pairs",
+        "tuple(pair[0].pressure for condition in pair) for axis, pair in pairs",
         "tests/test_projection.py",
     ),
     "a stage of the wrong weight": Bug(

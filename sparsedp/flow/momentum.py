@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.conditions import dirichlet, free_slip, no_slip, outflow, resolve
+from sparsedp.flow.setup import faces_that
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.stencils import along, differences, means, one_sided, slopes, wall_slopes
@@ -211,12 +212,7 @@ def _conditions(pair):
 
 def _free(grid, sides, solid):
     """Faces whose velocity is found: not on closed walls or inflows, and not at an obstacle."""
-    keep = [np.ones(part, dtype=bool) for part in grid.faces.parts]
-    for axis, pair in enumerate(sides):
-        for side, condition in zip((0, -1), pair or (), strict=False):
-            np.moveaxis(keep[axis], axis, 0)[side] = condition == outflow
-    flat = np.concatenate([part.ravel() for part in keep])
-    return flat if solid is None else flat & ~np.logical_or(*solid_faces(grid, check_solid(grid, solid)))
+    return faces_that(grid, sides, solid, lambda condition: condition == outflow)
 
 
 def _second(grid, c, a, sides):

@@ -1,7 +1,6 @@
 """projection: the divergence-free part of a face field, as one Operator.
 
-With K the mask of the faces that are not closed, D the divergence, G the gradient of the pressure
-(0 on closed and on given faces) and A = -D G,
+With K, D, G and A = -D G as in setup.py,
 
     P v = K v + G p,          A p = D K v,          so that D P v = D K v - A p = 0,
     P^T g = K (g + D^T q),    A^T q = G^T g,        so that G^T P^T g = 0.
@@ -13,12 +12,14 @@ Source: Chorin, Math. Comp. 22 (1968); the mesh of Harlow and Welch, Phys. Fluid
 
 from functools import cached_property
 
+import numpy as np
+
 from sparsedp.conditions import no_slip
 from sparsedp.flow.setup import Setup
-from sparsedp.flow.splitting import Potential, Projected
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.solvers.choose import check_settings
+from sparsedp.structure.base import Structure
 from sparsedp.tree import copied
 
 __all__ = ["Projection", "projection"]
@@ -78,6 +79,54 @@ def projection(grid, solid=None, boundary=no_slip, method="auto", rtol=1e-10, ma
     return Projection(Setup(grid, solid, boundary, settings))
 
 
+class Projected(Structure):
+    """P or P^T on flat face fields. It solves in double precision, and rounds once."""
+
+    has_entries = False
+
+    def __init__(self, setup, transposed=False):
+        self.setup, self.transposed = setup, transposed
+        self.shape = self.sizes[::-1] if transposed else self.sizes
+
+    @property
+    def sizes(self):
+        """Of the result and of the argument of the map, not transposed."""
+        return (self.setup.grid.faces.size,) * 2
+
+    def transpose(self):
+        return type(self)(self.setup, not self.transposed)
+
+    def apply(self, x, out):
+        if x.dtype.kind == "c":
+            self.apply(np.ascontiguousarray(x.real), out.real)
+            self.apply(np.ascontiguousarray(x.imag), out.imag)
+        elif x.dtype == out.dtype == np.float64 and out.flags.c_contiguous:
+            self.solve(x, out)
+        else:
+            self.solve(x.astype(np.float64), wide := np.empty(out.size))
+            np.copyto(out, wide, casting="same_kind")
+
+    def solve(self, x, out):
+        """The map of flat float64 arrays."""
+        self.setup.split(x, out, self.transposed)
+
+
+class Potential(Projected):
+    """Face field -> the p with P v = v + G p, one of average 0 where only its slope is known; or the transpose."""
+
+    @property
+    def sizes(self):
+        return self.setup.grid.cells.size, self.setup.grid.faces.size
+
+    def solve(self, x, out):
+        scale = 2.0**self.setup.exponent
+        if self.transposed:
+            self.setup.split(np.zeros(out.size), out, True, scale * x)
+        else:
+            p = self.setup.split(x, np.empty(x.size))
+            np.multiply(scale, self.setup.inverse.solver.system.null_space.project(p), out=out)
+
+
 class Projection(Operator):
     """The Operator that `projection` makes, with its pressure and its records."""
 
@@ -94,7 +143,7 @@ class Projection(Operator):
     @property
     def info(self):
         """SolveLog of the pressure solves: .forward, .adjoint, .setup_seconds."""
-        return self.structure.setup.inverse.info
+        return self.structure.setup.info
 
     @property
     def method(self):

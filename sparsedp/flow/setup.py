@@ -1,21 +1,33 @@
-"""What a projection is made of, set up once: closed faces, divergence, gradient, and the inverse of -D G."""
+"""What a projection is made of, set up once, and the solve itself: forward and transposed.
+
+With K the mask of the faces that are not closed, D the divergence, G the gradient of the pressure
+(0 on closed and on given faces), A = -D G, and a source s on cells that may be added,
+
+    A p   = D K x + s,      w = K x + G p,
+    A^T q = G^T g + s,      z = K (g + D^T q).
+
+The second line is the transpose of the first: cotangents g of w and s of p give z, that of x, by one solve.
+"""
 
 from functools import cached_property
 
 import numpy as np
 
+from sparsedp import kernels
 from sparsedp.conditions import inflow, no_slip, resolve
-from sparsedp.flow.passes import Passes
+from sparsedp.errors import NonFiniteError
+from sparsedp.fields import check_finite, place
+from sparsedp.flow.passes import Passes, Products
 from sparsedp.grid import Grid
+from sparsedp.kernels import projection
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.recipe import Remade
 from sparsedp.solvers.choose import build
-from sparsedp.solvers.scaling import largest
+from sparsedp.solvers.scaling import in_range, largest, norm, shifted
 
-__all__ = ["Setup"]
+__all__ = ["Setup", "faces_that"]
 
-EPS = np.finfo(float).eps
 FEW = 1024  # cells below which transforms are tried even where `inverse` would factor
 
 
@@ -31,52 +43,104 @@ class Setup(Remade):
         self.solid = None if solid is None else check_solid(grid, solid).copy()
         named = {axis: pair for axis, pair in zip(grid.axes, self.sides, strict=True) if pair}
         self.made = grid, self.solid, named, settings  # nothing that the caller may change
+        # Conditions of the pressure: 0 at an outflow, no slope elsewhere.
+        pairs = named.items()
+        self.pressure_conditions = {axis: tuple(condition.pressure for condition in pair) for axis, pair in pairs}
+        self.open = faces_that(grid, self.sides, self.solid, lambda condition: not condition.closed)
         self.exponent = int(np.frexp(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))[1])
         near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
-        self.D = divergence(near)
-        self.G = gradient(near, self.pressure_conditions, self.solid)
-        self.closed = np.flatnonzero(~self.open)
-        self.inverse = _inverse(-self.D @ self.G, *settings)
-        self.solver = self.inverse.solver
+        D, G = divergence(near), gradient(near, self.pressure_conditions, self.solid)
+        self.inverse = _inverse(-D @ G, *settings)
         self._refuse_lost_inflow()
-        forward = self.D.structure, self.G.structure
-        self.firsts, self.seconds = zip(
-            forward,
-            forward if self.symmetric else (self.G.structure.transpose(), self.D.structure.transpose()),
-            strict=True,
-        )
-        self.reach = tuple(largest(first.magnitude()(np.ones(grid.faces.size))) for first in self.firsts)
-        fast = self.solver.engine.method == "separable" and self.grid.cells.size > 0
-        self.passes = self._make_passes() if fast else None
+        forward = D.structure, G.structure
+        maps = (forward,) if self.symmetric else (forward, (forward[1].transpose(), forward[0].transpose()))
+        ones = np.ones(grid.faces.size)
+        self._reach = [largest(first.magnitude()(ones)) for first, _ in maps]
+        self.products = [Products(*pair, self.open.astype(float)) for pair in maps]
+        self.passes = (
+            self._compiled() or self.products
+        )  # of the forward solve, and of the adjoint one where it is another
+
+    @property
+    def info(self):
+        """SolveLog of the pressure solves."""
+        return self.inverse.info
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
         return Setup, self.made
 
-    def _make_passes(self):
-        """The forward pair of passes, and the transposed one; None where they are not what the operators do."""
-        free = []
-        for axis, pair in enumerate(self.sides):
-            line = np.ones(self.grid.node_count(axis), dtype=bool)
-            if pair:
-                line[[0, -1]] = [not condition.closed for condition in pair]
-            free.append(line)
-        directions = (False,) if self.symmetric else (False, True)
-        found = [Passes(self.grid, self.D, self.G, free, transposed) for transposed in directions]
-        return (found[0], found[-1]) if all(map(self._agree, found, self.firsts, self.seconds)) else None
+    @property
+    def _exact(self):
+        return self.inverse.method == "separable" and self.grid.cells.size > 0
 
-    def _agree(self, passes, first, second):
-        """Whether passes act as the operators D and G do, to rounding.
+    def _compiled(self):
+        """The passes as loops; None where they are not what the operators do."""
+        if not (self._exact and kernels.compiled() and projection.net_flow.compiled):
+            return None
+        found = [Passes(self.grid, products) for products in self.products]
+        return found if all(map(Passes.agrees, found, self.products)) else None
 
-        Linear maps that agree on random fields agree everywhere: the residual of a solve, which the passes take, is
-        then that of the operators themselves.
-        """
-        generator = np.random.default_rng(0)
-        x, p = generator.random(self.grid.faces.size), generator.random(self.grid.cells.size)
-        inner, flow, whole = self.open * x, np.empty(p.size), np.empty(x.size)
-        passes.net_flow(x, flow)
-        passes.push(x, p, whole)
-        return _equal(flow, first.product(inner)) and _equal(whole, inner + self.open * second.product(p))
+    def split(self, x, out, transposed=False, source=None):
+        """Flat face field, and source on cells -> p (q); w (z) is written into `out`."""
+        if source is not None:
+            source = self.inverse.solver.system.null_space.project(source, transposed)
+            source = -source if transposed and self.symmetric else source  # the lines are one then, with q = -p
+        p = self._split(x, out, transposed, source)
+        if self.still and source is None:  # P; the transposed pressure alone makes something of a source
+            out[:] = 0.0
+        return p
+
+    def _split(self, x, out, transposed, source):
+        turned, solver = transposed and not self.symmetric, self.inverse.solver
+        passes, reach, b = self.passes[turned], self._reach[turned], np.empty(self.grid.cells.size)
+
+        def net_flow(v):
+            """Right-hand side, of which the norm is returned, and that of all terms in it."""
+            flow, size = passes.net_flow(v, b)
+            if source is None:
+                return flow, reach * size
+            np.add(b, source, out=b)
+            return norm(b), reach * size + norm(source)
+
+        def residual(p):
+            """The net flow of the result is what the solve left: the contract need not look for it."""
+            passes.push(x, p, out)
+            return net_flow(out)[0]
+
+        data, terms = net_flow(x)
+        if in_range(terms):
+            p = solver.judged(b, data, terms, residual, transposed, turned) if self._exact else None
+            if p is not None:
+                return p
+            net_flow(x)
+        elif exponent := _exponent(x, source):
+            source = None if source is None else shifted(source, -exponent)
+            p = self._split(shifted(x, -exponent), out, transposed, source)
+            out[:] = shifted(out, exponent)
+            return shifted(p, exponent)
+        try:
+            before = self.info.forward
+            p = solver.solve(b, turned, checked=False)
+        except NonFiniteError:
+            self._refuse(x, source, transposed)
+            raise
+        if transposed and self.symmetric:
+            self.info.adjoint, self.info.forward = self.info.forward, before
+        passes.push(x, p, out)
+        return p
+
+    def _refuse(self, x, source, transposed):
+        """Name the argument that is not finite."""
+        space = self.grid.faces
+
+        def where(index):
+            axis = int(np.searchsorted(space.offsets, index, side="right")) - 1
+            return f"{self.grid.axes[axis]}-face {place(index - space.offsets[axis], space.parts[axis])}"
+
+        check_finite(f"{'the cotangent of' if transposed else 'the velocity in'} projection", x, where=where)
+        if source is not None:
+            check_finite("the cotangent of pressure", source.reshape(self.grid.shape))
 
     @cached_property
     def still(self):
@@ -85,39 +149,19 @@ class Setup(Remade):
         return shut and sum(n > 1 for n in self.grid.shape) <= 1
 
     @cached_property
-    def open(self):
-        """Which faces are not closed."""
-        found = []
-        for axis, part in enumerate(self.grid.faces.parts):
-            keep = np.ones(part, dtype=bool)
-            for side, condition in zip((0, -1), self.sides[axis] or (), strict=False):
-                np.moveaxis(keep, axis, 0)[side] = not condition.closed
-            found.append(keep.ravel())
-        flat = np.concatenate(found)
-        if self.solid is not None:
-            below, above = solid_faces(self.grid, self.solid)
-            flat &= ~(below | above)
-        return flat
-
-    @property
-    def pressure_conditions(self):
-        """Conditions of the pressure: 0 at an outflow, no slope elsewhere."""
-        pairs = zip(self.grid.axes, self.sides, strict=True)
-        return {axis: tuple(condition.pressure for condition in pair) for axis, pair in pairs if pair}
-
-    @cached_property
     def symmetric(self):
         """Whether P is its own transpose."""
         return all(self.grid.uniform) and all(condition.closed for pair in self.sides if pair for condition in pair)
 
     def _refuse_lost_inflow(self):
         """What enters must be able to leave, in every region apart."""
-        labels = self.solver.system.null_space.labels if self.solver.system.size else None
-        closed = np.zeros(self.grid.shape, dtype=bool)
-        if self.solver.system.size and self.solver.system.null_space.count:
-            closed = np.ones(self.grid.shape, dtype=bool) if labels is None else (labels >= 0).reshape(self.grid.shape)
-        if self.solver.system.active is not None:  # a cell with no free face at all
-            closed |= ~self.solver.system.active.reshape(self.grid.shape)
+        system, shape = self.inverse.solver.system, self.grid.shape
+        labels = system.null_space.labels if system.size else None
+        closed = np.zeros(shape, dtype=bool)
+        if system.size and system.null_space.count:
+            closed = np.ones(shape, dtype=bool) if labels is None else (labels >= 0).reshape(shape)
+        if system.active is not None:  # a cell with no free face at all
+            closed |= ~system.active.reshape(shape)
         if self.solid is not None:
             closed &= ~self.solid
         for axis, pair in enumerate(self.sides):
@@ -129,7 +173,7 @@ class Setup(Remade):
 
 
 def _inverse(op, method, rtol, maxiter, options):
-    """The inverse for the pressure. Transforms are preferred on small grids too: they skip the contract's passes."""
+    """The inverse for the pressure. Transforms are preferred on small grids too: the passes go with them."""
     settings = rtol, maxiter, "project", options, "pressure solve"
     if method == "auto" and op.domain.size < FEW and op.separable:
         try:
@@ -139,6 +183,17 @@ def _inverse(op, method, rtol, maxiter, options):
     return build(op, method, *settings)
 
 
-def _equal(found, wanted):
-    """Whether two results of the same few products are the same but for rounding."""
-    return largest(found - wanted) <= 256 * EPS * (1.0 + largest(wanted))
+def _exponent(x, source):
+    """The power of two by which data beyond the middle of the range of floats are scaled; 0: by none."""
+    top = max(largest(x), 0.0 if source is None else largest(source))
+    return 0 if in_range(top) or not 0 < top < np.inf else int(np.frexp(top)[1])
+
+
+def faces_that(grid, sides, solid, open_side):
+    """Flat face mask: inside, and on the sides whose condition is open; not beside an obstacle."""
+    found = [np.ones(part, dtype=bool) for part in grid.faces.parts]
+    for axis, pair in enumerate(sides):
+        for side, condition in zip((0, -1), pair or (), strict=False):
+            np.moveaxis(found[axis], axis, 0)[side] = open_side(condition)
+    flat = np.concatenate([part.ravel() for part in found])
+    return flat if solid is None else flat & ~np.logical_or(*solid_faces(grid, check_solid(grid, solid)))

@@ -141,19 +141,24 @@ class Solver(Remade):
                 count(self.name, "iterations", run.iterations)
                 count(self.name, "skipped", int(run.status == "exact_zero_rhs"))
 
-    def accepts(self, run, residual, data, terms):
-        """Whether a solution that was found elsewhere is one: by its true residual, which the finder knows.
+    def judged(self, b, data, terms, residual, adjoint, transposed):
+        """Flat x by one call of the engine, where ``residual(x)``, its true residual, is known to the caller.
 
-        `residual`, `data`, `terms`: norms of the residual, of the data, and of all that the residual is the sum of.
+        `data`, `terms`: norms of b, and of all that the residual is the sum of. `adjoint`: whether it is an adjoint
+        solve, by the transpose or not. None where the residual is not accepted: then `solve` refines, or raises.
         """
-        run.status = self.system.accepts(residual, self.system.rtol * data, terms)
-        if run.status:
-            run.measure(residual, data, max(terms - data, 0.0))
-            thread.solves += 1
-            if thread.calls:
-                count(self.name, "adjoint" if run.transposed else "solve")
-            self.log.note(run.info(), run.transposed)
-        return bool(run.status)
+        run = Run(adjoint)
+        x = self.engine.solve(b, 0.0, transposed)[0]
+        left = residual(x)
+        run.status = self.system.accepts(left, self.system.rtol * data, terms)
+        if not run.status:
+            return None
+        run.measure(left, data, max(terms - data, 0.0))
+        thread.solves += 1
+        if thread.calls:
+            count(self.name, "adjoint" if adjoint else "solve")
+        self.log.note(run.info(), adjoint)
+        return x
 
     def unroll(self, b, start, transposed):
         """The engine's iterations on the tape. The record is that of the solve: its derivatives are no solves."""
