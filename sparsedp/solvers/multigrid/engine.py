@@ -147,7 +147,6 @@ class Structured(Engine):
         for field, gauge, top in zip(self.gauges, gauges, self.tops):
             layout.cells(field)[...] = gauge / top
         self.vectors, self.direction = layout.zeros(3), layout.zeros(dtype=dtype)
-        self.sums = np.zeros(layout.shape[0])
         self.lock = threading.Lock()
 
     def solve(self, b, goal, transposed):
@@ -171,9 +170,9 @@ class _Run:
         self.measure = self.unit * top  # of a residual that is 1 by the gauge
         self.goal = SURE * goal / self.measure
         self.x, self.r, self.q = engine.vectors
-        self.p, self.cells = engine.direction, engine.layout.cells
+        self.p, self.sums, self.cells = engine.direction, engine.level.sums, engine.layout.cells
         engine.vectors[...] = self.p[...] = 0.0
-        self.cells(self.r)[...] = before * b.reshape(before.shape)
+        np.multiply(before, b.reshape(before.shape), out=self.cells(self.r))
         self.r *= engine.scale / self.unit
         self.step(0.0)
 
@@ -181,7 +180,7 @@ class _Run:
         """Until the residual is small enough -> (word, number of iterations)."""
         rho, best, since, last = 1.0, np.inf, 0, np.inf
         for used in range(1, self.engine.maxiter + 1):
-            rho, old = self.precondition(), rho
+            rho, old = self.engine.fine.cycle(), rho
             curvature = self.direct(rho / old if used > 1 else 0.0)
             if not (rho > 0.0 and 0.0 < curvature < np.inf):
                 return self.stuck(rho, curvature, last), used
@@ -202,24 +201,19 @@ class _Run:
             return "nonfinite_output"
         return "" if rho == 0.0 or residual <= 100 * self.rounding() else "stagnated"
 
-    def precondition(self):
-        """z = M r -> r . z."""
-        self.engine.fine.cycle()
-        return float(self.engine.fine.sums.sum())
-
     def direct(self, beta):
         """The next direction p and its image q -> p . q."""
         engine, layout = self.engine, self.engine.layout
         layout.run(engine.loops.direct, self.p, engine.fine.x, layout.sizes, beta)
         engine.level.apply(self.p, self.q)
-        return float(engine.level.sums.sum())
+        return float(self.sums.sum())
 
     def step(self, alpha):
         """x += alpha p, r -= alpha q -> the size of r."""
         engine, layout, light = self.engine, self.engine.layout, self.engine.fine.b
         vectors = self.x, self.p, self.r, self.q, light, self.gauge
-        layout.run(engine.loops.update, *vectors, layout.sizes, engine.sums, alpha)
-        return float(np.sqrt(engine.sums.sum()))
+        layout.run(engine.loops.update, *vectors, layout.sizes, self.sums, alpha)
+        return float(np.sqrt(self.sums.sum()))
 
     def rounding(self):
         """Size of a residual that rounding explains, as the contract will see it."""
@@ -227,4 +221,6 @@ class _Run:
 
     def solution(self):
         """x as a flat field."""
-        return (self.cells(self.x) * self.after * self.unit).reshape(-1)
+        values = self.cells(self.x) * self.after
+        values *= self.unit
+        return values.reshape(-1)

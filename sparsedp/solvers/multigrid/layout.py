@@ -71,8 +71,8 @@ class Layout:
                 lines[ghosts + n :] = lines[ghosts + np.arange(ghosts) % n]
         return fields
 
-    def run(self, loop, *arguments):
-        """A loop over all planes, in single precision if one of its arrays is. Fields are long rows to it."""
-        loop = loop.single if any(getattr(given, "dtype", None) == np.float32 for given in arguments) else loop
-        rows = (a.reshape(*a.shape[: -self.dim], -1) if np.ndim(a) >= self.dim else a for a in arguments)
-        loop.run(self.shape[0], max(map(np.size, arguments)), self.threads, *rows)
+    def run(self, loop, *given):
+        """A loop over all planes, in the precision of its second array. Fields are long rows to it."""
+        loop = loop.single if given[1].dtype == np.float32 else loop
+        rows = (a.reshape(*a.shape[: -self.dim], -1) if getattr(a, "ndim", 0) >= self.dim else a for a in given)
+        loop.run(self.shape[0], given[0].size, self.threads, *rows)

@@ -178,19 +178,20 @@ class Smoothed:
         self.down = np.array([0.0, one + two - one * two, one * two, -1.0, 1.0, 1.0], level.dtype)
         self.up = np.array([1.0 - one, one, one, 1.0 - two, two, two], level.dtype)
 
-    def _smooth(self, x, between, out, factors):
-        fields, tables = (x, self.b, between, out), (factors, self.pitches, self.layout.sizes, self.sums)
-        self.layout.run(loops.smooth, self.coupling, *fields, *tables)
+    def _smooth(self, x, between, factors, sums):
+        fields = x, self.b, between, self.r
+        self.layout.run(loops.smooth, self.coupling, *fields, factors, self.pitches, self.layout.sizes, sums)
 
     def cycle(self):
-        """x = what a V-cycle makes of b; b . x to sums."""
-        self._smooth(self.b, self.x, self.r, self.down)
+        """x = what a V-cycle makes of b -> b . x."""
+        self._smooth(self.b, self.x, self.down, self.sums[:0])
         self.layout.wrap(self.x)
         self.transfer.restrict(self.r, self.below.b)
         self.below.cycle()
         self.transfer.prolong(self.below.x, self.x)
-        self._smooth(self.x, self.x[:0], self.r, self.up)
+        self._smooth(self.x, self.x[:0], self.up, self.sums)
         self.x, self.r = self.r, self.x
+        return float(self.sums.sum())
 
 
 class Coarsest:

@@ -169,7 +169,7 @@ def combined(out, there, n, c, at, x, place, b, steps, own, rest, share):
 
 @kernel("~read2 ~read1 ~read1 ~write1 ~write1 ~read1 index1 index1 write1")
 def smooth(c, x, b, between, out, factors, steps, sizes, sums, start, stop):
-    """y = f x + g b + h c x, out = f y + g b + h c y with f, g, h twice in factors; b . out to sums.
+    """y = f x + g b + h c x, out = f y + g b + h c y with f, g, h twice in factors; b . out to sums if there are any.
 
     y is made one plane ahead, in a window that begins two planes before `first`, and kept if `between` has room.
     """
@@ -190,8 +190,16 @@ def smooth(c, x, b, between, out, factors, steps, sizes, sums, start, stop):
             copy(between[at : at + n], y[2 * plane :])
         f, g, h = factors[3:]
         combined(out, at, n, c, at, y, 2 * plane, b, steps, f, g, h)
-        add_up(sums, b, out, first, last, sizes)
+        if sums.size:
+            add_up(sums, b, out, first, last, sizes)
     fill(out, start, stop, sizes)
+
+
+@inner
+def collect(out, a, b, c, x):
+    """To each cell what three cells of a finer line give."""
+    for k in range(out.size):
+        out[k] += a[k] * x[2 * k] + b[k] * x[2 * k + 1] + c[k] * x[2 * k + 2]
 
 
 @kernel("~read2 ~read1 ~write1 index1 index1 index1")
@@ -204,10 +212,8 @@ def restrict(weights, r, out, steps, fine, coarse, start, stop):
             place = (GHOST + 2 * g) * fine[0] + fine[4] + 2 * j * fine[1] + 1
             row = out[at : at + n]
             clear(row)
-            for m in range(steps.size):
-                weight, values = weights[m, at : at + n], r[place + steps[m] :]
-                for k in range(n):
-                    row[k] += weight[k] * values[2 * k]
+            for m in range(0, steps.size, 3):  # those of a fine line
+                collect(row, weights[m, at:], weights[m + 1, at:], weights[m + 2, at:], r[place + steps[m] :])
     fill(out, start, stop, coarse)
 
 

@@ -114,9 +114,10 @@ def _probed(product, grid, active):
     has a field of its own, for it may be next to the last one. What has been read must then explain the image of a
     random field: the matrix is symmetric and has no other entries.
     """
+    weights = active * grid.volumes
 
     def image(x):
-        return active * (grid.volumes * product(x.reshape(-1)).reshape(grid.shape))
+        return weights * product(x.reshape(-1)).reshape(grid.shape)
 
     links, magnitude = [], np.zeros(grid.shape)  # of a row without its extra
     for axis, (n, flag) in enumerate(zip(grid.shape, grid.periodic)):
