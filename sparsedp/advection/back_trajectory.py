@@ -32,10 +32,8 @@ class Trajectory:
 
     Attributes
     ----------
-    displacement : array, array
-        (axis, point), and a scale for each axis: the departure point is point - scale * displacement.
-    sides :
-        See `index_coordinates`.
+    displacement, scale, sides
+        The departure point is point - scale * displacement; see `index_coordinates`.
     """
 
     def __init__(self, component, w, step):
@@ -44,8 +42,7 @@ class Trajectory:
             half_way = Trajectory(component.half_way, w, 0.5 * step)
             self.rows = [Pass(half_way, row, NONE) for row in w]
             w = np.stack([row.value() for row in self.rows])
-        displacement, scale, self.sides = component.coordinates.displacement(w, step)
-        self.displacement = displacement, scale
+        self.displacement, self.scale, self.sides = component.coordinates.displacement(w, step)
 
     def vjp(self, g):
         """Cotangent of the velocity used all along the step -> that of w, in its place."""

@@ -61,7 +61,7 @@ class Pass:
 
     def __init__(self, trajectory, u, inflow):
         self.trajectory, self.component, self.u, self.inflow = trajectory, trajectory.component, u, inflow
-        self.points, self.displacement = self.component.points, trajectory.displacement
+        self.points, self.departure = self.component.points, (trajectory.displacement, trajectory.scale)
 
     @cached_property
     def samples(self):
@@ -72,7 +72,7 @@ class Pass:
     def value(self, out=None, bounds=departure.NO_BOUNDS):
         """Values at the departure points; least and greatest sample of the cells around them -> bounds."""
         out = results.empty((self.points.size,), float) if out is None else out
-        return departure.interpolate(self.points, self.samples, *self.displacement, out, bounds=bounds)
+        return departure.interpolate(self.points, self.samples, *self.departure, out, bounds=bounds)
 
     def vjp(self, g, into, of_w, clamped=None):
         """Cotangent of the values -> that of u is written, that of inflow added to the pair `into`.
@@ -84,7 +84,7 @@ class Pass:
             samples[:] = 0.0
             if clamped is not None:
                 np.add.at(samples, *clamped)
-            self.component.pad_vjp(departure.scatter(self.points, *self.displacement, g, samples), *into)
+            self.component.pad_vjp(departure.scatter(self.points, *self.departure, g, samples), *into)
             if self.component.fill is not None:
                 into[0][:] = self.component.fill[1] @ into[0]
         if of_w is not None:
@@ -92,7 +92,7 @@ class Pass:
 
     def slopes(self, g, out):
         """g times the derivative of the values in the velocity all along the trajectory -> out (axis, point)."""
-        (displacement, scale), sides = self.displacement, self.trajectory.sides
+        (displacement, scale), sides = self.departure, self.trajectory.sides
         if not len(sides):
             return departure.interpolate(self.points, self.samples, displacement, scale, out, g)
         nudge = 32 * np.finfo(float).eps * max(self.points.shape) * (sides[0] != sides[-1])  # to the side that is meant
@@ -113,7 +113,7 @@ class Pass:
         """The values as a csr_array in u, without what flows in."""
         n, fill = self.points.size, self.component.fill
         sources = self.component.pad(np.arange(n), np.full(self.inflow.size, n)).astype(int)  # n: inflow
-        entries = departure.entries(self.points, *self.displacement)
+        entries = departure.entries(self.points, *self.departure)
         columns = (sp.csr_array((weight, sources[index], np.arange(n + 1)), (n, n + 1)) for index, weight in entries)
         moved = sum(columns)[:, :n]
         return moved if fill is None else moved @ fill[0]

@@ -43,7 +43,7 @@ class Corrected:
         some = np.flatnonzero((new <= self.bounds[0]) | (new >= self.bounds[1]))
         (low, high), value = self.bounds[:, some], new[some]
         below, above = np.heaviside(low - value, 0.5), np.heaviside(value - high, 0.5)
-        index, least, greatest = departure.bound_shares(first.points, first.samples, *first.displacement, some)
+        index, least, greatest = departure.bound_shares(first.points, first.samples, *first.departure, some)
         return some, 1.0 - below - above, index, least * below + greatest * above
 
     def value(self, out):
