@@ -5,7 +5,6 @@ if that stood one spacing away from the last point; a periodic axis wraps. Where
 """
 
 from functools import reduce
-from math import prod
 
 import numpy as np
 import scipy.sparse as sp
@@ -18,15 +17,16 @@ from sparsedp.operators.stencils import cell_beside
 __all__ = ["filling", "ghost_origins"]
 
 
-def ghost_origins(setting, number, closed):
+def ghost_origins(setting, number, points, closed):
     """The ghost cells of component `number`, and the sample that each repeats, as numbers of samples.
 
     After the samples of the field with its ghost cells stand the inflow values. `closed`: none of them is used.
     """
-    shape, sides, walls = setting.space.parts[number], setting.sides, wall_space(setting)
-    places = [np.arange(-PAD, n + PAD) for n in shape]
-    nearest = [p.clip(0, n - 1) if pair else p % n for p, n, pair in zip(places, shape, sides, strict=True)]
-    samples = np.arange(prod(map(len, places))).reshape([*map(len, places)])
+    sides, walls, samples = setting.sides, wall_space(setting), np.arange(points.samples).reshape(points.padded)
+    nearest = []
+    for n, pair in zip(points.shape, sides, strict=True):
+        place = np.arange(-PAD, n + PAD)
+        nearest.append(place.clip(0, n - 1) if pair else place % n)
     origins = samples[np.ix_(*(PAD + p for p in nearest))]
     wall = number * sum(2 for pair in sides if pair)
     for axis, pair in enumerate(sides):

@@ -30,7 +30,7 @@ class Interpolant:
         self.setting, self.span = setting, slice(*setting.space.offsets[number : number + 2])
         self.points = departure.Points.of(setting.space.parts[number], setting.grid.periodic, interpolation)
         self.inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
-        self.ghosts, self.origins = ghost_origins(setting, number, closed)
+        self.ghosts, self.origins = ghost_origins(setting, number, self.points, closed)
         self.coordinates = Coordinates(setting, number, interpolation)
         midpoint = setting.backtrace == "midpoint" and not closed
         self.half_way = Interpolant(setting, number, closed=True) if midpoint else None

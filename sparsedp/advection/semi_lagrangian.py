@@ -4,10 +4,11 @@ With E the field with ghost cells, m the velocity with which point i looks back 
 
     u'_i     = sum over k of W_ik E_k,     W_ik = product over the axes of weights at i - s m_i
     g_E      = W^T g,                      folded back onto u and inflow
-    g_m      = -s g_i (gradient of the interpolant at i - s m_i),    g_dt = sum of g_m . m / dt
-    tangent  = W dE + g_m(g = 1) . dm + (g_m(g = 1) . m) ddt / dt,
+    g_m      = -s g_i (gradient of the interpolant at i - s m_i)
+    tangent  = W dE + g_m(g = 1) . dm,
 
-then on to the velocity as it is given, see `back_trajectory`. Linear weights have kinks at the points: there the
+then on to the velocity v as it is given, see `back_trajectory`. A step depends on v dt alone: g_dt = g_v . v / dt, and
+ddt counts as the tangent v ddt / dt of v. Linear weights have kinks at the points: there the
 slope is the mean of both sides. Cubic ones are those of Catmull and Rom (cubic convolution, Keys 1981): order 3
 a step, so order 2 and more at a fixed ratio of dt to spacing, exact for quadratics away from walls.
 Source: A. Staniforth, J. Cote, Monthly Weather Review 119 (1991) 2206-2223;
