@@ -242,7 +242,8 @@ def geometric_levels(matrix, grid, levels, coarsest):
         Unknowns from which on no next level is made.
     """
     widths: list = list(grid.widths)
-    built, matrix = [], _short(matrix)
+    built: list = []
+    matrix = _short(matrix)
     while len(built) < levels - 1 and matrix.shape[0] > coarsest:
         lines = [_interpolation(h, periodic) for h, periodic in zip(widths, grid.periodic, strict=True)]
         P = _short(reduce(lambda a, b: kron(a, b, format="csr"), lines))

@@ -9,10 +9,10 @@ from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, spent
 from sparsedp.operators.given import check_operator
 from sparsedp.solvers.amg import multigrid_engine
-from sparsedp.solvers.direct import DenseLU, DenseSystem, Direct
+from sparsedp.solvers.direct import DenseSystem, dense_engine, direct_engine
 from sparsedp.solvers.krylov import krylov_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
-from sparsedp.solvers.separable import separable_engine, spectrum
+from sparsedp.solvers.separable import separable_engine, spectrum, transforming
 from sparsedp.solvers.solution import Inverse
 from sparsedp.solvers.solve import EmptySystem, SolveLog, Solver, failure
 from sparsedp.solvers.system import System
@@ -24,7 +24,7 @@ __all__ = ["METHODS", "build", "build_dense", "check_settings", "inverse"]
 # word -> function (system, **options) -> engine; see solve.py. Options are keyword-only.
 METHODS = {
     "separable": separable_engine,
-    "direct": Direct,
+    "direct": direct_engine,
     "structured": structured_engine,
     "multigrid": multigrid_engine,
     "krylov": krylov_engine,
@@ -126,7 +126,7 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
     _check_options(word, options)
     if system.complex and word != "direct":
         raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct'")
-    engine = _engine(system, word, options) if engine is None or options else engine
+    engine = _engine(system, word, options, engine)
     name = name or f"inverse({op.name})"
     made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
     solver = Solver(system, engine, nullspace, log or SolveLog(), name, made, reason)
@@ -137,8 +137,8 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
 def build_dense(matrix, make, rtol, nullspace, name):
     """Small 2-D array, and ``make()`` that gives the Operator -> Solver; None where the array may be singular."""
     clock = perf_counter()
-    engine = DenseLU(system := DenseSystem(matrix, make, rtol))
-    if not engine.well_conditioned:
+    engine = dense_engine(system := DenseSystem(matrix, make, rtol))
+    if engine is None:
         return None
     solver = Solver(system, engine, nullspace, SolveLog(), name, None, "a small full matrix")
     _note_setup(solver, clock)
@@ -176,7 +176,8 @@ def _check_options(word, options):
             raise TypeError(f"method {word} takes the options {', '.join(known) or '(none)'}, got {name!r}")
 
 
-def _engine(system, word, options):
+def _engine(system, word, options, suited=None):
+    """The engine of a method; `suited`: the one without options, where it was made to see whether it suits."""
     if system.unknowns == 0:
         return EmptySystem()
     if system.empty_row is not None:
@@ -186,7 +187,7 @@ def _engine(system, word, options):
             info=failure("empty_row"),
         )
     try:
-        engine = METHODS[word](system, **options)
+        engine = METHODS[word](system, **options) if suited is None or options else suited
         return engine if system.null_space is not None else None
     except ArithmeticError as error:
         message = f"{system.given} is singular and cannot be projected: {error}; add a shift"
@@ -204,9 +205,10 @@ def _chosen(system, solves):
         return "direct", "complex entries", None
     if not system.op.structure.has_entries:
         return "krylov", "only products with the operator are known", None
-    if _transforms(system, dimension):
+    engine = _transforms(system, dimension)
+    if engine is not None:
         reason = f"{size} unknowns in {dimension}-D, a sum of 1-D factors: transforms solve it exactly"
-        return "separable", reason, None
+        return "separable", reason, engine
     where = f"{size} unknowns in {dimension}-D" if dimension else f"{size} unknowns without a grid"
     limit = DIRECT_BELOW_STRUCTURED[solves].get(dimension, 0)
     engine, unsuited = (None, "") if size <= limit else structured_if_suited(system)
@@ -226,14 +228,13 @@ def _chosen(system, solves):
 
 
 def _transforms(system, dimension):
-    """Whether the operator is a sum of 1-D factors, and transforms along them are cheap."""
+    """The engine of a sum of 1-D factors, where transforms along them are cheap, else None."""
     structure = system.op.structure
-    if dimension < 2 or system.size < SEPARABLE_FROM or not structure.separable:
-        return False
-    found = spectrum(structure) if system.active is None else None
-    return found is not None and all(
-        axis.kind != "eigenvectors" or axis.eigenvalues.size <= LONGEST_EIGENVECTORS for axis in found.axes
-    )
+    if dimension < 2 or system.size < SEPARABLE_FROM or not structure.separable or system.active is not None:
+        return None
+    found = spectrum(structure)
+    dense = [] if found is None else [axis.eigenvalues.size for axis in found.axes if axis.kind == "eigenvectors"]
+    return None if found is None or max(dense, default=0) > LONGEST_EIGENVECTORS else transforming(structure, found)
 
 
 def _even(system):

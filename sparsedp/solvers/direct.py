@@ -22,7 +22,7 @@ from sparsedp.solvers.solve import Engine, failure
 from sparsedp.solvers.system import System
 from sparsedp.structure.base import probes, rows_of
 
-__all__ = ["DENSE_UP_TO", "DenseLU", "DenseSystem", "Direct"]
+__all__ = ["DENSE_UP_TO", "DenseSystem", "dense_engine", "direct_engine"]
 
 DENSE_UP_TO = 64
 BAND_UP_TO = 8  # half bandwidth up to which banded LU is used
@@ -35,53 +35,63 @@ class Direct(Engine):
 
     Parameters
     ----------
-    system : System
+    solve : callable
+        solve(b, transposed)
+    words : str
+        What the factors are.
+    anchors : int array
+        Unknowns that are pinned.
+    """
+
+    method = "direct"
+    overwrites = False
+
+    def __init__(self, solve, words, anchors=()):
+        self._solve, self.hierarchy, self._anchors = solve, words, anchors
+
+    def solve(self, b, goal, transposed):
+        """One pair of triangular solves."""
+        if len(self._anchors):
+            b = b.copy()
+            b[self._anchors] = 0.0
+        return self._solve(b, transposed), 0, ""
+
+
+def direct_engine(system):
+    """System -> Direct.
 
     Raises
     ------
     ConvergenceError
         With status setup_failed, when the matrix cannot be inverted and its null space is not known.
     """
+    matrix = system.regular_matrix
+    offsets = matrix.indices - rows_of(matrix)
+    lower, upper = -int(offsets.min(initial=0)), int(offsets.max(initial=0))
+    if system.size <= DENSE_UP_TO:
+        solve, words = _dense(matrix.toarray())[0], "dense LU"
+    elif max(lower, upper) <= BAND_UP_TO:
+        solve, words = _banded(matrix, lower, upper)
+    else:
+        solve, words = _sparse(matrix, system)
+    _refuse_singular(system, matrix, solve)
+    words = f"{words}, {system.size} rows, {matrix.nnz} entries"
+    return Direct(solve, words, system.null_space.anchors())
 
-    method = "direct"
-    overwrites = False
 
-    def __init__(self, system):
-        matrix = system.regular_matrix
-        self._anchors = system.null_space.anchors()
-        offsets = matrix.indices - rows_of(matrix)
-        lower, upper = -int(offsets.min(initial=0)), int(offsets.max(initial=0))
-        if system.size <= DENSE_UP_TO:
-            self._solve, words = _dense(matrix.toarray())[0], "dense LU"
-        elif max(lower, upper) <= BAND_UP_TO:
-            self._solve, words = _banded(matrix, lower, upper)
-        else:
-            self._solve, words = _sparse(matrix, system)
-        self.hierarchy = f"{words}, {system.size} rows, {matrix.nnz} entries"
-        self._refuse_singular(system, matrix)
-
-    def solve(self, b, goal, transposed):
-        """One pair of triangular solves."""
-        if self._anchors.size:
-            b = b.copy()
-            b[self._anchors] = 0.0
-        return self._solve(b, transposed), 0, ""
-
-    def _refuse_singular(self, system, matrix):
-        """Solutions for row sums times random signs are of order |A^-1| |A|: huge when A is singular."""
-        if not system.size:
-            return
-        sums = abs(matrix) @ np.ones(system.size)
-        with np.errstate(all="ignore"):
-            growth = max(
-                np.max(np.abs(self._solve((sums * probe).astype(matrix.dtype), False))) for probe in probes(system.size)
-            )
-        if not growth < MOST_GROWTH:
-            raise ConvergenceError(
-                f"{system.given} is singular and its null space is neither constant nor that of the volumes, or its "
-                "condition number is beyond 1e14; add a shift, or remove the rows that depend on others",
-                info=failure("setup_failed"),
-            )
+def _refuse_singular(system, matrix, solve):
+    """Solutions for row sums times random signs are of order |A^-1| |A|: huge when A is singular."""
+    if not system.size:
+        return
+    sums = abs(matrix) @ np.ones(system.size)
+    with np.errstate(all="ignore"):
+        growth = max(np.max(np.abs(solve((sums * probe).astype(matrix.dtype), False))) for probe in probes(system.size))
+    if not growth < MOST_GROWTH:
+        raise ConvergenceError(
+            f"{system.given} is singular and its null space is neither constant nor that of the volumes, or its "
+            "condition number is beyond 1e14; add a shift, or remove the rows that depend on others",
+            info=failure("setup_failed"),
+        )
 
 
 class DenseSystem(System):
@@ -102,6 +112,7 @@ class DenseSystem(System):
         self.dense, self._make = matrix, make
         self.size, self.rtol, self.maxiter = len(matrix), rtol, None
         self.sizes = np.abs(matrix)
+        self._magnitudes = self.sizes.dot, self.sizes.T.dot
         self.norms = float(self.sizes.sum(1).max(initial=0.0)), float(self.sizes.sum(0).max(initial=0.0))
 
     @cached_property
@@ -119,29 +130,15 @@ class DenseSystem(System):
 
     applied = product
 
-    def magnitude(self, x, transposed=False):
-        return (self.sizes.T if transposed else self.sizes) @ x
-
     def terms(self, x):
         return length(self.sizes @ np.abs(x))
 
 
-class DenseLU(Engine):
-    """The engine of a DenseSystem. `well_conditioned`: whether it may be used."""
-
-    method = "direct"
-    overwrites = False
-
-    def __init__(self, system):
-        self.hierarchy = f"dense LU, {system.size} rows"
-        size = system.norm(False)
-        self.well_conditioned = in_range(size)
-        if self.well_conditioned:
-            self._solve, condition = _dense(system.dense, size)
-            self.well_conditioned = condition > LEAST_CONDITION
-
-    def solve(self, b, goal, transposed):
-        return self._solve(b, transposed), 0, ""
+def dense_engine(system):
+    """DenseSystem -> Direct, or None where the matrix may be a singular one."""
+    size = system.norm(False)
+    solve, condition = _dense(system.dense, size) if in_range(size) else (None, 0.0)
+    return Direct(solve, f"dense LU, {system.size} rows") if condition > LEAST_CONDITION else None
 
 
 def _dense(matrix, size=None):

@@ -40,8 +40,8 @@ class Layout:
         kinds = [np.asarray(leaf).dtype for leaf in found]
         self.dtypes = [kind if kind.kind == "f" else np.dtype(float) for kind in kinds]
         self.scalar = isinstance(guess, (int, float)) and not isinstance(guess, np.generic)
-        self.ends = np.cumsum([np.size(leaf) for leaf in found]).tolist()
-        self.size = self.ends[-1] if found else 0
+        ends = np.cumsum([0, *(np.size(leaf) for leaf in found)]).tolist()
+        self.slices, self.size = list(map(slice, ends, ends[1:])), ends[-1]
 
     def flat(self, guess):
         """The numbers of the guess, without a trace, as one fresh float64 array."""
@@ -52,18 +52,14 @@ class Layout:
         """Flat unknowns, traced or not -> the tree of unknowns."""
         if len(self.shapes) == 1:
             return self.rebuild([anp.reshape(x, self.shapes[0])])
-        starts = [0, *self.ends]
-        return self.rebuild(anp.reshape(x[a:b], shape) for a, b, shape in zip(starts, self.ends, self.shapes))
+        return self.rebuild(anp.reshape(x[part], shape) for part, shape in zip(self.slices, self.shapes))
 
     def rounded(self, x):
         """The tree of unknowns in the dtypes of the guess; copies, for the rules go on using x."""
         if self.scalar and not isbox(x):
             return float(x[0])
-        starts = [0, *self.ends]
-        parts = zip(starts, self.ends, self.shapes, self.dtypes)
-        if not isbox(x):
-            return self.rebuild(x[a:b].astype(kind).reshape(shape) for a, b, shape, kind in parts)
-        return self.rebuild(_part(self.size, *part)(x) for part in parts)
+        take = _part if isbox(x) else _taken
+        return self.rebuild(take(x, *part) for part in zip(self.slices, self.shapes, self.dtypes))
 
 
 def _check_unknown(leaf, name):
@@ -75,18 +71,19 @@ def _check_unknown(leaf, name):
         raise TypeError(f"{name} takes a guess of numbers, got {type(leaf).__name__}")
 
 
-def _part(size, start, stop, shape, kind):
-    """The linear rule from the flat unknowns to one of the tree."""
+def _taken(x, part, shape, kind):
+    return x[part].astype(kind).reshape(shape)
 
-    def take(x):
-        return x[start:stop].astype(kind).reshape(shape)
+
+def _part(x, part, shape, kind):
+    """The same by a linear rule, for the tape."""
 
     def put(g):
-        x = np.zeros(size)
-        x[start:stop] = np.reshape(g, -1)
-        return x
+        back = np.zeros(np.size(plain(x)))
+        back[part] = np.reshape(g, -1)
+        return back
 
-    return linear("unknowns", take, put)[0]
+    return linear("unknowns", lambda x: _taken(x, part, shape, kind), put)[0](x)
 
 
 class Equation:

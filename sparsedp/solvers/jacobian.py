@@ -264,7 +264,7 @@ class Jacobians:
         coloured, shapes = None, equation.layout.shapes
         if pattern is not None:
             # One tape serves all products with J^T; each with J takes a run of its own.
-            symmetric = _is_own_transpose(pattern) and _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
+            symmetric = (pattern - pattern.T).nnz == 0 and _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
             by_rows = True if self.by_rows or symmetric else None
             coloured = Coloured(pattern, shapes[0] if len(shapes) == 1 else None, by_rows)
             space = space if symmetric else None
@@ -275,21 +275,22 @@ class Jacobians:
         """The pattern of J near x and at two opposite random points, by columns or by rows."""
         points = [point for point in _points(x) if _is_valid(equation, point, leaves)] or [x]
         for transposed in (True,) if self.by_rows else (False, True):
-            products = [self._product(equation, point, leaves, transposed, "pattern") for point in points]
-            found = find_pattern(products, x.size, x.size)
+            found = self._probed(equation, points, leaves, transposed)
             if found is not None:
-                return found.T.tocsr() if transposed else found
+                return found
         return None
+
+    def _probed(self, equation, points, leaves, transposed):
+        products = [self._product(equation, point, leaves, transposed, "pattern") for point in points]
+        found = find_pattern(products, equation.size, equation.size)
+        return found.T.tocsr() if transposed and found is not None else found
 
     def _enlarge(self, equation, x, leaves, row):
         """Add the entries that J has at x. When there are none, its products are not linear."""
         coloured, space = self._patterns[equation.size]
-        old = coloured.pattern
-        product = self._product(equation, x, leaves, bool(self.by_rows), "pattern")
-        found = find_pattern([product], x.size, x.size)
-        found = dense_pattern(*old.shape) if found is None else found.T.tocsr() if self.by_rows else found
-        total = sp.csr_array(old + found)
-        if total.nnz == old.nnz:
+        found = self._probed(equation, [x], leaves, self.by_rows)
+        total = sp.csr_array(coloured.pattern + (dense_pattern(x.size, x.size) if found is None else found))
+        if total.nnz == coloured.pattern.nnz:
             raise DerivativeError(f"the derivative of {self.name} is not linear in its direction in row {row}")
         total.data[:] = 1.0
         self._colour(total, space, equation, x, leaves)
@@ -297,13 +298,6 @@ class Jacobians:
 
 def _key(equation, x, leaves):
     return (x, *leaves, *equation.statics, *equation.layout.shapes)
-
-
-def _is_own_transpose(pattern):
-    """Whether a pattern is its own transpose."""
-    turned = pattern.T.tocsr()
-    turned.sort_indices()
-    return np.array_equal(turned.indptr, pattern.indptr) and np.array_equal(turned.indices, pattern.indices)
 
 
 def _points(x):

@@ -78,7 +78,10 @@ class Newton:
         self.size = length(self.F)
         word, forcing = "" if self.F.any() else "converged", LOOSEST
         if not word:
-            self._begin(start)
+            if start is None:
+                self._linearise()
+            else:
+                self.J, self.stale = start, True
             word = self._accepted(0.0 if self.steps else 1.0)
         while not word:
             before = self.size
@@ -94,12 +97,6 @@ class Newton:
                 word = self._rounding(step) or self._fail("stagnated")
         self.run.status = word
         return self.x
-
-    def _begin(self, start):
-        if start is None:
-            self._linearise()
-        else:
-            self.J, self.stale = start, True
 
     def _after(self, ratio, forcing):
         """The status word after a step that left the share `ratio`, and how closely the next one is solved for."""

@@ -28,7 +28,16 @@ from sparsedp.solvers.scaling import inverted
 from sparsedp.solvers.solve import Engine
 from sparsedp.structure.base import Structure
 
-__all__ = ["Separable", "SpectralFunction", "Spectrum", "exponential", "power", "separable_engine", "spectrum"]
+__all__ = [
+    "Separable",
+    "SpectralFunction",
+    "Spectrum",
+    "exponential",
+    "power",
+    "separable_engine",
+    "spectrum",
+    "transforming",
+]
 
 WORTH_THREADS = 131072  # unknowns below which a second thread costs more than it brings
 WIDE_COMPILED, WIDE_PLAIN = 16, 1024  # modes from which elimination along the first axis beats transforms
@@ -383,15 +392,15 @@ class Separable(Engine):
         return self.spectrum.backward(y, transposed), 0, ""
 
 
-def _swept(structure, found):
-    """The engine that spares the transforms along the first axis, or None when they are as good."""
+def transforming(structure, found):
+    """Kronecker sum and its Spectrum -> Separable, without transforms along the first axis unless they are as good."""
     first, modes = found.shape[0], found.eigenvalues[0].size
     if 0 not in structure.lines or first < 3 or modes < (WIDE_COMPILED if kernels.compiled() else WIDE_PLAIN):
-        return None
+        return Separable(found)
     rest = Spectrum(found.shape, (Axis("identity", np.zeros(first)), *found.axes[1:]), found.shift)
     sums = rest.eigenvalues[0].reshape(-1)
     elimination = sweep(structure.lines[0], np.repeat(sums, 2) if rest.fourier else sums)  # real and imaginary parts
-    return None if elimination is None else Separable(rest, elimination)
+    return Separable(found) if elimination is None else Separable(rest, elimination)
 
 
 def separable_engine(system):
@@ -410,7 +419,7 @@ def separable_engine(system):
     found = spectrum(structure) if structure.separable and system.active is None else None
     if found is None:
         raise ValueError(f"separable needs a sum of 1-D factors that can be diagonalised, got {system.given}")
-    return _swept(structure, found) or Separable(found)
+    return transforming(structure, found)
 
 
 # ---------------------------------------------------------------- functions of a separable operator
@@ -473,9 +482,8 @@ def exponential(op, time=1.0):
     found = _spectrum(op, "exponential", "time", time, 0.1)
     with np.errstate(over="ignore"):
         weights = np.exp(time * found.eigenvalues)
-    if not np.all(np.isfinite(weights)):
-        raise NonFiniteError(f"exp({time:g} * {op.name}) is beyond 1.8e308; take a shorter time or the other sign")
-    return Operator(SpectralFunction(found, weights), op.domain, op.codomain, f"exp({time:g} * {op.name})")
+    name = f"exp({time:g} * {op.name})"
+    return _function(op, found, weights, name, f"{name} is beyond 1.8e308; take a shorter time or the other sign")
 
 
 def power(op, exponent):
@@ -516,9 +524,8 @@ def power(op, exponent):
     zero = values == 0
     with np.errstate(over="ignore"):
         weights = np.where(zero, 1.0 if exponent == 0 else 0.0, np.where(zero, 1.0, values) ** float(exponent))
-    if not np.all(np.isfinite(weights)):
-        raise NonFiniteError(f"{op.name} to the power {exponent:g} is beyond 1.8e308; rescale the operator")
-    return Operator(SpectralFunction(found, weights), op.domain, op.codomain, f"({op.name})^{exponent:g}")
+    refusal = f"{op.name} to the power {exponent:g} is beyond 1.8e308; rescale the operator"
+    return _function(op, found, weights, f"({op.name})^{exponent:g}", refusal)
 
 
 def _spectrum(op, name, what, number, example):
@@ -531,3 +538,10 @@ def _spectrum(op, name, what, number, example):
     if not np.isfinite(number):
         raise NonFiniteError(f"{name} needs a finite {what}, got {number}")
     return found
+
+
+def _function(op, found, weights, name, refusal):
+    """The Operator with these weights in place of the eigenvalues; refused when they are beyond the range of floats."""
+    if not np.all(np.isfinite(weights)):
+        raise NonFiniteError(refusal)
+    return Operator(SpectralFunction(found, weights), op.domain, op.codomain, name)
