@@ -81,7 +81,7 @@ def test_the_same_bits_with_one_thread_and_two(rng):
 def test_a_parametric_operator_acts_in_one_pass(rng):
     """shift - D diag(k) G, as `elliptic_solver` applies it, forward and transposed."""
     grid = dp.Grid((6, 5), spacing=[rng.uniform(0.5, 2, n) for n in (6, 5)])
-    op = Elliptic(dp.divergence(grid), dp.gradient(grid, dp.robin(1, 2)), rng.uniform(0.1, 9, grid.faces.size), 0.7)
+    op = Elliptic(-dp.divergence(grid), dp.gradient(grid, dp.robin(1, 2)), rng.uniform(0.1, 9, grid.faces.size), 0.7)
     for structure in (op, op.transpose()):
         assert structure.members[1]._fused is not None
         x, matrix = rng.standard_normal(grid.cells.size), structure.explicit()

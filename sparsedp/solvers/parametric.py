@@ -225,7 +225,11 @@ class EllipticSolver(ParametricSolver):
             # A constant coefficient keeps the operator a sum of 1-D factors.
             op = -k[0] * self._product + shift * identity(self.G.domain)
             return Operator(op.structure, self.G.domain, self.D.codomain, name)
-        return Operator(Elliptic(self.D, self.G, k, shift), self.G.domain, self.D.codomain, name)
+        return Operator(Elliptic(self._minus, self.G, k, shift), self.G.domain, self.D.codomain, name)
+
+    @cached_property
+    def _minus(self):
+        return -self.D
 
     @cached_property
     def _product(self):
@@ -244,12 +248,12 @@ def _check_shift(shift):
 
 
 class Elliptic(Sum):
-    """shift - D diag(k) G: a sum that acts in one pass where D and G are differences of a grid.
+    """shift + D diag(k) G: a sum that acts in one pass where D and G are differences of a grid.
 
     Parameters
     ----------
     D, G : Operator
-        They keep their matrices, where entries are asked for: each new k only scales rows of that of G.
+        They keep what does not depend on k: transposes, magnitudes, and matrices where entries are asked for.
     k : array, shape (faces,)
     shift : float
     """
@@ -257,8 +261,9 @@ class Elliptic(Sum):
     def __init__(self, D, G, k, shift, transposed=False):
         self.D, self.G, self.k, self.shift = D, G, k.reshape(-1), shift
         self.transposed = transposed
-        product = Chain([D.structure, Diagonal(self.k), G.structure]).scaled(-1.0)
-        super().__init__([Diagonal(np.full(D.shape[0], shift)), product.transpose() if transposed else product])
+        left, right = (G.T, D.T) if transposed else (D, G)
+        product = Chain([left.structure, Diagonal(self.k), right.structure])
+        super().__init__([Diagonal(np.full(D.shape[0], shift)), product])
 
     def transpose(self):
         return Elliptic(self.D, self.G, self.k, self.shift, not self.transposed)
@@ -269,7 +274,7 @@ class Elliptic(Sum):
     def explicit(self):
         D, G = self.D.matrix, self.G.matrix
         slopes = sp.csr_array((G.data * self.k[rows_of(G)], G.indices, G.indptr), shape=G.shape)
-        matrix = compact(self.shift * sp.eye_array(D.shape[0], format="csr") - D @ slopes)
+        matrix = compact(self.shift * sp.eye_array(D.shape[0], format="csr") + D @ slopes)
         return matrix.T.tocsr() if self.transposed else matrix
 
 

@@ -146,7 +146,11 @@ class Kronecker(Structure):
         return Kronecker(self.out_parts, self.in_parts, blocks)
 
     def magnitude(self):
-        return self._each(_absolute).product
+        return self._absolute.product
+
+    @cached_property
+    def _absolute(self):
+        return self._each(_absolute)
 
     # ------------------------------------------------------------ forms
 
