@@ -88,12 +88,12 @@ def multigrid_engine(
         )
     if hierarchy not in ("algebraic", "geometric"):
         raise ValueError(f"hierarchy must be 'algebraic' or 'geometric', got {hierarchy!r}")
-    if hierarchy == "geometric" and (system.op.domain.grid is None or system.op.domain.kind != "cells"):
+    grid = system.op.domain.grid if hierarchy == "geometric" else None
+    if hierarchy == "geometric" and (grid is None or system.op.domain.kind != "cells"):
         raise ValueError(
             f"a geometric hierarchy needs an operator on the cells of a grid, {system.given} is not; "
             "write hierarchy='algebraic'"
         )
-    grid = system.op.domain.grid if hierarchy == "geometric" else None
     return Multigrid(system, CYCLES[cycle], float(strength), tuple(map(tuple, sweeps)), int(levels), grid)
 
 

@@ -26,7 +26,7 @@ from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import check_finite
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.scaling import in_range, length
+from sparsedp.solvers.scaling import far_exponent, length
 
 __all__ = ["Newton"]
 
@@ -198,7 +198,7 @@ class Newton:
 
     @property
     def _unit(self):
-        return 0 if in_range(self.size) else -int(np.frexp(np.max(np.abs(self.F), initial=0.0))[1])
+        return -far_exponent(self.F, self.size)
 
     def _rounding(self, step):
         """The status word when what is left of F is rounding, else ""."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp import kernels
 
-__all__ = ["in_range", "inverted", "largest", "length", "norm", "remainder", "shifted"]
+__all__ = ["far_exponent", "in_range", "inverted", "largest", "length", "norm", "remainder", "shifted"]
 
 SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve computes leaves the range of floats
 
@@ -22,10 +22,8 @@ def norm(x):
 def length(x):
     """2-norm of a flat real array of any magnitude."""
     size = norm(x)
-    if in_range(size):
-        return size
-    exponent = int(np.frexp(largest(x))[1])
-    return float(np.ldexp(norm(shifted(x, -exponent)), exponent))
+    exponent = far_exponent(x, size)
+    return float(np.ldexp(norm(shifted(x, -exponent)), exponent)) if exponent else size
 
 
 def remainder(b, out, x):
@@ -41,6 +39,11 @@ def remainder(b, out, x):
 def in_range(size):
     """Whether a norm is finite, not 0, and far from both ends of the range of floats."""
     return SMALL < size < LARGE
+
+
+def far_exponent(x, size):
+    """The power of two by which x of this norm leaves the middle of the range of floats; 0 inside."""
+    return 0 if in_range(size) else int(np.frexp(largest(x))[1])
 
 
 def largest(x):

@@ -43,7 +43,7 @@ from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
 from sparsedp.fields import check_finite, place
 from sparsedp.ledger import count, thread, timed
 from sparsedp.recipe import Remade
-from sparsedp.solvers.scaling import in_range, largest, norm, shifted
+from sparsedp.solvers.scaling import far_exponent, in_range, largest, norm, shifted
 from sparsedp.tape import plain
 
 __all__ = ["STATUS_WORDS", "Engine", "Run", "SolveInfo", "SolveLog", "Solver", "failure"]
@@ -314,7 +314,7 @@ class Solver(Remade):
 
     def _correction(self, r, is_data, residual, goal, transposed):
         """One call of the engine, on a residual in the middle of the range of floats."""
-        exponent = 0 if in_range(residual) else int(np.frexp(largest(r))[1])
+        exponent = far_exponent(r, residual)
         if exponent:
             r, goal = shifted(r, -exponent), float(np.ldexp(goal, -exponent))
         elif is_data and self.engine.overwrites:
