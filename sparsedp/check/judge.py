@@ -17,7 +17,6 @@ Source: the extrapolation is that of C. J. F. Ridders, Advances in Engineering S
 
 import math
 from contextlib import suppress
-from typing import Any
 
 import numpy as np
 
@@ -214,9 +213,7 @@ class Judgement:
 
     gap = size = jitter = step = rate1 = rate2 = bend = rate3 = math.nan
     bar, digits = math.inf, 0.0
-    close: Any = False
-    wrong: Any = False
-    zero: Any = False
+    close = wrong = zero = False
 
     @np.errstate(all="ignore")  # losses near the limits of the floating point numbers are judged like others
     def __init__(self, line):
@@ -244,7 +241,7 @@ class Judgement:
         self.rounding = eps * np.maximum(np.max(np.abs(sides), axis=0), max(base, TINY))
         # What the finest levels vary by, in roundings of the loss. Rounding does that, or a solver inside.
         varied = np.abs(np.diff(self.m)) * self.t[1:] / self.rounding[1:]
-        self.jitter = max(float(np.max(varied[1 - FINEST :])), 2 * line.noise)
+        self.jitter = max(float(np.max(varied[1 - FINEST :])), 2 * line.trials.noise)
         self.noise = max(2.0, self.jitter) * self.rounding
         self.curvature = float(np.median(np.abs(self.kinks / self.t)[:3]))
 
@@ -264,10 +261,9 @@ class Judgement:
             scale = max(self.scale, abs(self.slope + gap))
             split = abs(jump) * (abs(jump) > max(FAR * error, self.agreed * scale))
             found.append((passing, bool(split) or bar > RESOLVED * scale, gap, bar, index, scale, split, error))
-        # Of equal ones the first, with the smallest bar; of passing ones the last.
+        # Away from kinks the first, with the smallest bar; of passing ones the last.
         lasting = [one for one in found if not one[0]] or found[-1:]
-        best = next((one for one in lasting if not one[1]), lasting[0])
-        self.gap, bar, index, self.scale, self.split, self.uncertain = best[2:]
+        _, _, self.gap, bar, index, self.scale, self.split, self.uncertain = min(lasting, key=lambda one: one[1])
         floor = 8 * spread * self.curvature + 4 * spread * self.line.typical
         self.bar, self.step, self.size, self.floor = bar + floor, float(self.t[index]), abs(self.gap), floor
 
@@ -290,7 +286,7 @@ class Judgement:
         base = abs(self.line.base)
         self.left = max(LEFT * base, LOOSE * trials.tolerance * max(base, scale)) * trials.solved
         self.resolved = bar <= RESOLVED * scale
-        self.close = self.resolved and size <= max(min(NEAR * bar, RESOLVED * scale - bar), self.agreed * scale)
+        self.close = bool(self.resolved and size <= max(min(NEAR * bar, RESOLVED * scale - bar), self.agreed * scale))
         vanished = scale + bar <= max(VANISHED, self.agreed) * self.curvature
         self.zero = not self.resolved and size <= NEAR * bar and vanished
         self.loudness = self.jitter * trials.eps
@@ -313,7 +309,7 @@ class Judgement:
         change, rest = both(self.changes), both(self.rests)
         usable = (rest, rest >= clear + CLEAR * t * gap), (even, even >= clear)
         found = [orders(t, size, some & place) for place in (near, t > 0) for size, some in usable]
-        self.used2, rates = next((one for one in found if one[0] >= FEWEST), max(found, key=lambda one: one[0]))
+        self.used2, rates = max(found, key=lambda one: min(one[0], FEWEST))  # the first of those with enough
         self.rate2 = min(rates, default=np.nan) if self.used2 else np.inf
         seen, climbs = near & (change >= clear), climb >= LINEAR * even
         self.used1, rates = orders(t, change, seen & climbs)
@@ -350,9 +346,7 @@ def examined(trials, directions, steps, extend):
     The noise belongs to the loss, not to a direction: the larger one along the first and the last counts for all.
     """
     lines = [Line(name, direction, trials) for name, direction in directions]
-    noise = max(map(noise_of, lines[:1] + lines[1:][-1:]), default=0.0)
-    for line in lines:
-        line.noise = noise
+    trials.noise = max(map(noise_of, lines[:1] + lines[1:][-1:]), default=0.0)
     return [measured(line, steps, extend, line is lines[0]) for line in lines]
 
 

@@ -207,9 +207,9 @@ def _stencil(op):
 def _row(op, component):
     """(order, words) of the row in the middle of one component."""
     moments = _moments(op, *_weights(op, component))
-    low, *more = sorted(moments) or [0]
     if not moments:
         raise _UnknownError("its row in the middle is 0 on polynomials")
+    low, *more = sorted(moments)
     words = _terms(moments[low], op)
     if not more:
         return np.inf, words
@@ -223,9 +223,8 @@ def _row(op, component):
 def _weights(op, component):
     """(place, weights) of the row in the middle of one component."""
     part = op.codomain.parts[component]
-    before = sum(int(np.prod(other)) for other in op.codomain.parts[:component])
     for share in INSIDE:  # a row may be closed by a solid
-        place = before + np.ravel_multi_index([int(share * n) for n in part], part)
+        place = op.codomain.offsets[component] + np.ravel_multi_index([int(share * n) for n in part], part)
         unit = (np.arange(op.codomain.size) == place).astype(float)
         try:
             weights = op.T.apply(unit.reshape(op.codomain.shape)).reshape(-1)

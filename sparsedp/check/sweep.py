@@ -175,6 +175,8 @@ class Trials:
     base : float
         The loss at the point; whoever makes the trials sets it and the gradient.
     gradient : vector
+    noise : float
+        Noise of the loss in units of its rounding, where a table of differences has shown it; else 0.
     count : int
         Evaluations.
     solved : bool
@@ -188,7 +190,7 @@ class Trials:
     def __init__(self, loss, point, tick=lambda: None, base=np.nan, gradient=None):
         self.loss, self.point, self.tick = loss, point, tick  # `tick` is called at each evaluation
         self.base, self.gradient = base, gradient
-        self.count, self.solved, self.tolerance = 0, False, 0.0
+        self.count, self.solved, self.tolerance, self.noise = 0, False, 0.0, 0.0
         self.eps = float(np.finfo(float).eps)
 
     def value(self, tree):
@@ -254,18 +256,13 @@ class Line:
     direction : vector
         Displacement for step 1.
     trials : Trials
-
-    Attributes
-    ----------
-    noise : float
-        Noise of the loss in units of its rounding, where a table of differences has shown it; else 0.
     """
 
     def __init__(self, name, direction, trials):
         self.name, self.direction, self.trials = name, direction, trials
         self.point, self.base, self.gradient = trials.point, trials.base, trials.gradient
         self.slope, self.typical = float(self.gradient @ direction), norm(self.gradient * direction)
-        self.levels, self.noise = [], 0.0
+        self.levels = []
 
     def end(self, step):
         """(loss at x + step d, what the gradient expects it to change by, why there is no loss)."""

@@ -137,14 +137,13 @@ def animate(grid, frames, path, title=None, limits=None, cmap="viridis", rate=12
 
 def _scalar(grid, u, at=None):
     """(the numbers that a map shows, where they live, components): of a face field its magnitude, at the centres."""
-    fitting = [
-        kind for kind in ("cells", "faces", "nodes") if u.shape == getattr(grid, kind).shape and at in (None, kind)
-    ]
-    if not fitting:
+    kinds = (at,) if at else ("cells", "faces", "nodes")
+    kind = next((kind for kind in kinds if u.shape == getattr(grid, kind).shape), None)
+    if kind is None:
         where = at or "cells, faces or nodes"
         raise ShapeError(f"plot takes a field on the {where} of {grid}, got an array of shape {u.shape}")
-    if fitting[0] != "faces" or grid.dim == 1:
-        return u, fitting[0], []
+    if kind != "faces" or grid.dim == 1:
+        return u, kind, []
     parts = []
     for a, part in enumerate(grid.split(u)):
         means = 0.5 * (part + np.roll(part, -1, a))
@@ -168,10 +167,9 @@ def _line(grid, u, kind, ax, label):
 
 def _mesh(grid, kind, u, axes, ax, **options):
     """One map of a 2-D array over two axes of the grid -> image."""
+    lines = [grid.coordinates(a, "nodes") for a in axes]
     if kind == "cells":  # the mesh of pcolormesh is the corners of the cells
         lines = [np.append(0.0, np.cumsum(grid.widths[a])) + grid.origin[a] for a in axes]
-    else:
-        lines = [grid.coordinates(a, "nodes") for a in axes]
     ax.set(aspect="equal", xlabel=grid.axes[axes[0]], ylabel=grid.axes[axes[1]])
     # pcolormesh wants rows along y, so the array is turned here and nowhere else.
     return ax.pcolormesh(*lines, u.T, **options)

@@ -82,8 +82,8 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     rows = [dict(zip(COLUMNS, row)) for row in judged if row[3]]
     skipped = [f"{row[2]}: {row[5]}" for row in judged if not row[3]]
     ran = {row["group"] for row in rows}
-    skipped += [f"{group}: {GROUPS[group]}" for group in chosen if group not in ran and GROUPS[group]]
-    skipped += [f"{group}: not asked for" for group in GROUPS if group not in chosen]
+    reasons = {group: GROUPS[group] if group in chosen else "not asked for" for group in GROUPS if group not in ran}
+    skipped += [f"{group}: {reason}" for group, reason in reasons.items()]
     growth = stability_map(scene) if "time step and viscosity" in chosen else None
     return Stress(rows=rows, left_out=[*skipped, *ELSEWHERE], map=growth)
 

@@ -5,7 +5,7 @@ What the reader sees is printed; pictures, the table and the recovered field are
 
 import os
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,7 +75,6 @@ class Recovery(NamedTuple):
     relative, 1 for the flat start.
     """
 
-    grid: Any
     found: np.ndarray
     trace: list
     row: dict  # of the table
@@ -103,7 +102,7 @@ def recover(study, grid, loss, check):
     gap = max((abs(line.gap) / line.scale for line in check.lines if line.scale > 0), default=np.nan)
     row = {"grid": " x ".join(map(str, grid.shape)), "unknowns": best.x.size, "iterations": len(trace), **counts}
     row |= dict(zip(("seconds", "misfit", "error"), trace[-1]), gradient_error=gap)
-    return Recovery(grid, best.x, trace, row)
+    return Recovery(best.x, trace, row)
 
 
 # ---------------------------------------------------------------- what the reader sees
