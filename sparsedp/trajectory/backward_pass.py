@@ -1,5 +1,8 @@
 """The backward pass over all steps of a run."""
 
+from bisect import bisect
+from operator import length_hint
+
 import numpy as np
 
 from sparsedp.ledger import active, count
@@ -24,7 +27,7 @@ class BackwardPass:
     steps : Steps
     kept : list of State
         The last one included.
-    tapes : list of StepTape
+    tapes : list of Tape
         Of the steps from the first one on.
     """
 
@@ -46,17 +49,18 @@ class BackwardPass:
         for i in shown_steps(run.progress, range(run.n - 1, -1, -1), "backward"):
             if total is None and not run.keep.along:
                 break  # cut by truncation
-            end = None if i < len(tapes) else fingerprint(*state[1:])  # what is on a tape is not run again
+            if tapes and tapes[-1].first < i < tapes[-1].stop:
+                continue  # the steps of a tape are gone through at once
+            tape = tapes.pop() if tapes and tapes[-1].first == i else None
+            end = None if tape else fingerprint(*state[1:])  # what is on a tape is not run again
             state = self._state_at(i)
             if total is not None:
-                if end is None:
-                    tape = tapes.pop()
-                else:
-                    tape, after = steps.taped(state, run.wants(i, steps.trace.wanted))
+                if tape is None:
+                    tape, after = steps.taped(state, run.wants(i, steps.trace.wanted))[:2]
                     run.compare(fingerprint(*after[1:]), end)
                     del after
                 total = self._pull(tape, state, total)
-                del tape
+            del tape
             if i % growth.every == 0:
                 growth.see(i, total)
             if run.keep.along and (i > 0 or run.wants(0, steps.trace.wanted)):
@@ -72,16 +76,20 @@ class BackwardPass:
         return [*(total or [None] * len(run.state.places)), *(_fitted(back, p) for p, back in given), *self.inputs]
 
     def _pull(self, tape, state, g):
-        """Cotangents of the state after a step -> those of the state before, None if those are not wanted."""
-        cotangents, self.steps.last = self.cotangents, state
+        """Cotangents of the state after a tape -> those of the state before, None if those are not wanted."""
+        cotangents, calls = self.cotangents, reversed(tape.nodes)
         for node, back in zip(tape.ends, g, strict=True):
             if node is not None and back is not None:
                 known = cotangents.get(node)
                 cotangents[node] = (back if known is None else known[0] + back), False
-        accumulate(cotangents, reversed(tape.nodes))
-        for total, root in zip(self.inputs, tape.inputs, strict=True):
-            if root in cotangents:
-                total[state.i] = cotangents.pop(root)[0]
+        try:
+            accumulate(cotangents, calls)
+        finally:  # in which step it stopped
+            self.steps.last = state._replace(i=state.i + max(bisect(tape.starts, length_hint(calls)) - 1, 0))
+        for i, roots in enumerate(tape.inputs, state.i):
+            for total, root in zip(self.inputs, roots, strict=True):
+                if root in cotangents:
+                    total[i] = cotangents.pop(root)[0]
         backs = []
         for value, root in zip(state.values, tape.state, strict=True):
             backs.append(_fitted(cotangents.pop(root, NONE)[0], value))
@@ -96,6 +104,8 @@ class BackwardPass:
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""
         run, kept = self.run, self.kept
         state = kept.pop()
+        while state.i > i:
+            state = kept.pop()
         while state.i < i:
             kept.append(state)
             free = max(run.slots - len(kept) + 1, 1)

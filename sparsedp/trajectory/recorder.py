@@ -1,4 +1,4 @@
-"""The tape of one step: its calls in their order, made on the way forward while the tapes fit, or on the backward pass.
+"""Tapes of steps: their calls in order, made on the way forward while the tapes fit, or on the backward pass.
 
 The calls of one trace are recorded as they come, so the backward pass goes through them from the last to the first and
 need not sort a graph: the bits of a gradient do not depend on which tapes were kept. Params have one root for all
@@ -11,7 +11,7 @@ import numpy as np
 
 from sparsedp.traces import new_trace, reverse_root
 
-__all__ = ["Recorder", "State", "StepTape", "Trace"]
+__all__ = ["Recorder", "State", "Tape", "Trace"]
 
 CALL = 800  # bytes of a node, its closures and tuples: 350 to 1200 were measured
 
@@ -24,23 +24,36 @@ class State(NamedTuple):
     statics: tuple
 
 
-class StepTape(NamedTuple):
-    """One step.
+class Tape(NamedTuple):
+    """One step, or several of which each begins with the very values that the one before ends with.
 
     Attributes
     ----------
-    state, inputs : list
-        The roots of its arguments, None where a constant is.
+    first : int
+        Number of the first step.
+    state : list
+        The roots of its state, None where a constant is.
+    inputs : list of lists
+        For each step the roots of its inputs.
     nodes : list
-        Its calls.
+        All calls.
+    starts : list of int
+        How many calls there are before each step.
     ends : list
-        The nodes of its result, None where that does not depend on anything traced.
+        The nodes of the last state, None where that does not depend on anything traced.
     """
 
+    first: int
     state: list
     inputs: list
     nodes: list
+    starts: list
     ends: list
+
+    @property
+    def stop(self):
+        """Number of the state it leads to."""
+        return self.first + len(self.starts)
 
 
 class Trace(NamedTuple):

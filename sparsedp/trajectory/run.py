@@ -11,7 +11,7 @@ from sparsedp.trajectory.backward_pass import BackwardPass
 from sparsedp.trajectory.carried import carries
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.trajectory.progress import shown_steps
-from sparsedp.trajectory.record import Record
+from sparsedp.trajectory.record import Record, looked_at
 from sparsedp.trajectory.recorder import State, Trace
 from sparsedp.trajectory.schedule import checkpoints
 from sparsedp.trajectory.steps import Steps
@@ -108,20 +108,24 @@ class Run:
         state, stops = self.keep.see(state), checkpoints(self.n if self.store else 0, self.slots)
         stop = next(stops, None)
         origin = self.origin if self.origin and self.origin.keep.whole else None  # whose states are all at hand
+        many, traced = looked_at(self.n), None
         fit = 1 if self.store and self.room else 0  # how many tapes there is room for: the first one tells
         for i in shown_steps(self.progress, range(self.n), "forward"):
             if i == stop:
-                own = self.keep.whole or i <= len(tapes)  # nobody else has the result of a step on its tape
+                own = self.keep.whole or i <= fit  # nobody else has the result of a step on its tape
                 kept.append(state if own else state._replace(values=list(map(owned, state.values))))
                 stop = next(stops, None)
             if origin:
                 origin.agree(state)
             if i < fit:
                 recorder.weighs = i == 0
-                tape, state = steps.taped(state, self.wants(i, self.traced))
+                if i < 2 or i % many == 0 or self.keep.along or self.is_cut(i):
+                    traced = None  # the cotangent of this state is asked for
+                known = tapes[-1] if traced else None
+                tape, state, traced = steps.taped(state, self.wants(i, self.traced), known, traced)
                 if i == 0:
                     fit = self.room // max(recorder.bytes - self.state.nbytes, 1)
-                if i < fit:
+                if i < fit and tape is not known:
                     tapes.append(tape)
             else:
                 state = steps.forward(state)

@@ -1,6 +1,7 @@
 """The steps of a run, on plain values or on a tape."""
 
 from contextlib import contextmanager
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from sparsedp.fields import frozen
 from sparsedp.traces import boxed, new_box, reverse_root, split_box
 from sparsedp.trajectory.carried import Carried, carries
 from sparsedp.trajectory.layout import owned
-from sparsedp.trajectory.recorder import State, StepTape
+from sparsedp.trajectory.recorder import State, Tape
 from sparsedp.tree import copied, flatten, leaves
 
 __all__ = ["Steps"]
@@ -51,6 +52,7 @@ class Steps:
         given = [frozen(value) for value in self.p]
         self.params = run.params.build(given)
         self._traced_params = run.params.build(boxed(given, self.roots, trace.number))
+        self._precise = all(dtype.char == "d" for dtype in run.state.dtypes)  # no cotangent is rounded between steps
         self.last: State | None = None  # the state that the step under way begins with
 
     def forward(self, state):
@@ -59,26 +61,36 @@ class Steps:
         values, statics = self._called(state, given, self.params, self.run.rows(state.i, self.x))
         return State(state.i + 1, self.run.state.check(values, "the step"), statics)
 
-    def taped(self, state, want_state):
-        """The same on a tape: (StepTape, the state after this one)."""
+    def taped(self, state, want_state, tape=None, given=None):
+        """The same on a tape: (Tape, the state after this one, its traced variables).
+
+        The last where the next step may begin with them, to the same bits as with roots of its own, else None. Handed
+        in as `given`, with the tape that they are on, they make one tape of both steps.
+        """
         _, number, recorder, _ = self.trace
-        given, roots = started(self._silenced(state), number, recorder, want_state)
+        if given is None:
+            given, roots = started(self._silenced(state), number, recorder, want_state)
+            tape = Tape(state.i, roots, [], [], [], [])
         rows, inputs = self.run.rows(state.i, self.x), self.wants_input
         if rows:
             inputs = [root and reverse_root(recorder) for root in inputs]
             rows = boxed(rows, inputs, number)
+        tape.starts.append(len(tape.nodes))
+        tape.inputs.append(inputs)
         try:
             found, statics = self._called(state, given, self._traced_params, rows)
         finally:
-            nodes = recorder.taken()
-        ends = []
-        for k, value in enumerate(found):
-            found[k], node = split_box(value, number)
-            ends.append(node)
-        values = self.run.state.check(found, "the step")
-        if None in ends:  # perhaps an array that the step uses again
-            values = [value if node else owned(value) for value, node in zip(values, ends, strict=True)]
-        return StepTape(roots, inputs, nodes, ends), State(state.i + 1, values, statics)
+            tape.nodes.extend(recorder.taken())
+        given, tape.ends[:] = [], []
+        for value in found:
+            value, node = split_box(value, number)
+            given.append(value)
+            tape.ends.append(node)
+        values = self.run.state.check(given.copy(), "the step")
+        links = self._precise and all(map(is_, given, values)) and _are_new(tape.ends)
+        if None in tape.ends:  # perhaps an array that the step uses again
+            values = [value if node else owned(value) for value, node in zip(values, tape.ends, strict=True)]
+        return tape, State(state.i + 1, values, statics), found if links else None
 
     def _silenced(self, state):
         """The variables of a state: a dual run has no tangents where the derivative is cut."""
@@ -152,6 +164,11 @@ def _check_entries(parts, given):
         found = leaves(part)
         if len(found) != len(before) or any(a is not b for a, b in zip(found, before, strict=True)):
             raise ValueError(f"the step changes the entries of {name}; {_REMEDY[name]}")
+
+
+def _are_new(nodes):
+    """Whether all results come from calls, each from another one."""
+    return None not in nodes and all(node.parents for node in nodes) and len(set(nodes)) == len(nodes)
 
 
 def started(values, number, recorder, wanted):
