@@ -2,7 +2,6 @@
 
 from functools import cached_property
 from math import prod
-from typing import Any
 
 import numpy as np
 
@@ -12,10 +11,9 @@ from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten
 
-__all__ = ["NOTHING", "Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask"]
+__all__ = ["Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask"]
 
 
-NOTHING = (None,)  # the leaves beside one variable
 FOLD = 509  # words to a line of a fingerprint: a prime, so that a field that was shifted has another one
 
 
@@ -57,7 +55,7 @@ class Layout:
             refuse_mask(f"rollout takes plain arrays, got a masked array as {label}", leaf)
         self.places = [place for place, leaf in enumerate(found) if is_variable(leaf)]
         variables = [plain(found[place]) for place in self.places]
-        self.statics = NOTHING if self.bare else self._others(found)
+        self.statics = self._others(found)
         # Rebuilt without the variables: what is kept must not hold a trace or a large array.
         self._template = rebuild(self.statics)
         self._rebuild = flatten(self._template)[1]
@@ -69,10 +67,7 @@ class Layout:
 
     def _others(self, found):
         """All leaves, None in place of the variables, as constants."""
-        others = list(found)
-        for place in self.places:
-            others[place] = None
-        return tuple(map(constant, others))
+        return tuple(map(constant, self._filled(found, [None] * len(self.places))))
 
     @cached_property
     def nbytes(self):
@@ -83,16 +78,15 @@ class Layout:
         """Variables and the other leaves -> the tree."""
         if self.bare:
             return variables[0]
-        found = list(self.statics if statics is None else statics)
-        for place, value in zip(self.places, variables, strict=True):
-            found[place] = value
-        return self._rebuild(found)
+        return self._rebuild(self._filled(self.statics if statics is None else statics, variables))
 
     def spread(self, values):
         """One value for each variable -> one for each leaf, None for the others."""
-        if self.bare:
-            return list(values)
-        found = [None] * len(self.statics)
+        return self._filled([None] * len(self.statics), values)
+
+    def _filled(self, leaves, values):
+        """All leaves, those of the variables replaced."""
+        found = list(leaves)
         for place, value in zip(self.places, values, strict=True):
             found[place] = value
         return found
@@ -106,7 +100,7 @@ class Layout:
             If the form differs; `when` says who made the tree.
         """
         if self.bare and not isinstance(tree, (tuple, list, dict)):
-            return [tree], NOTHING
+            return [tree], self.statics
         found: list = []
         self._collect(self._template, tree, (), when, found)
         variables = [found[place] for place in self.places]
@@ -122,20 +116,17 @@ class Layout:
                 )
         return variables, others
 
-    def _collect(self, wanted: Any, tree: Any, path, when, found):
+    def _collect(self, wanted, tree, path, when, found):
         """The leaves of a tree, at a path of keys; refused where it branches otherwise than `wanted`."""
-        kind = dict if isinstance(wanted, dict) else (tuple, list)
-        if isinstance(wanted, kind):
-            same = isinstance(tree, kind) and len(tree) == len(wanted)
-            if not same or (kind is dict and tree.keys() != wanted.keys()):
-                raise ShapeError(_changed(_at(self.root, path), _kind(wanted), _kind(tree), when))
-            for key in wanted if kind is dict else range(len(wanted)):
-                self._collect(wanted[key], tree[key], (*path, key), when, found)
-        elif isinstance(tree, (tuple, list, dict)):
-            leaf = "one array" if self.bare else "one leaf"
-            raise ShapeError(_changed(_at(self.root, path), leaf, _kind(tree), when))
-        else:
+        keys = _keys(wanted)
+        if _keys(tree) != keys:
+            form = _kind(wanted) if keys is not None else "one array" if self.bare else "one leaf"
+            raise ShapeError(_changed(_at(self.root, path), form, _kind(tree), when))
+        if keys is None:
             found.append(tree)
+            return
+        for key in keys:
+            self._collect(wanted[key], tree[key], (*path, key), when, found)
 
     def check(self, values, when):
         """Values of the variables after a step -> the same, contiguous; refuse another shape or dtype."""
@@ -211,11 +202,9 @@ def refuse_lost(what):
     )
 
 
-def fingerprint(values, statics=NOTHING):
+def fingerprint(values, statics=()):
     """Variables and other leaves of a state -> 64 bits for each variable, and for each whole number and word."""
     marks = [_bits(value) for value in values]
-    if statics is NOTHING:
-        return marks
     for leaf in statics:
         if isinstance(leaf, (int, str)):
             marks.append(hash(leaf))
@@ -234,11 +223,18 @@ def _bits(value):
     return hash((flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes(), flat[end:].tobytes()))
 
 
+def _keys(tree):
+    """The keys of the branches; None of a leaf."""
+    if isinstance(tree, dict):
+        return tree.keys()
+    return range(len(tree)) if isinstance(tree, (tuple, list)) else None
+
+
 def _labels(tree, root, path=()):
     """Names of all leaves, from left to right."""
-    if not isinstance(tree, (dict, tuple, list)):
+    keys = _keys(tree)
+    if keys is None:
         return [_at(root, path)]
-    keys = tree if isinstance(tree, dict) else range(len(tree))
     return [label for key in keys for label in _labels(tree[key], root, (*path, key))]
 
 

@@ -65,7 +65,7 @@ class Run:
 
     def rows(self, i, x):
         """The variables of all inputs -> those of step i."""
-        return [frozen(block[i]) for block in x] if x else x
+        return [frozen(block[i]) for block in x]
 
     def input_at(self, i, rows):
         """The inputs of step i, of its variables."""
