@@ -24,7 +24,6 @@ __all__ = [
     "forward_root",
     "growing",
     "in_reverse",
-    "new_box",
     "new_trace",
     "reverse_root",
     "split_box",

@@ -8,7 +8,7 @@ import numpy as np
 from sparsedp.ledger import active, count
 from sparsedp.tape import fit
 from sparsedp.traces import accumulate
-from sparsedp.trajectory.layout import fingerprint, owned, refuse_lost
+from sparsedp.trajectory.layout import fingerprint, refuse_lost
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import LIMIT, Growth
 from sparsedp.trajectory.schedule import stride
@@ -117,7 +117,7 @@ class BackwardPass:
         self.recomputed += stop - state.i
         while state.i < stop:
             state = self.steps.forward(state)
-        return state._replace(values=list(map(owned, state.values)))  # perhaps arrays that the step uses again
+        return state.owned()
 
 
 def _fitted(back, value):

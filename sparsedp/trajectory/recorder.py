@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.traces import new_trace, reverse_root
+from sparsedp.trajectory.layout import owned
 
 __all__ = ["Recorder", "State", "Tape", "Trace"]
 
@@ -22,6 +23,10 @@ class State(NamedTuple):
     i: int
     values: list
     statics: tuple
+
+    def owned(self):
+        """The same in memory of its own: a step may use the arrays again that it has returned."""
+        return self._replace(values=list(map(owned, self.values)))
 
 
 class Tape(NamedTuple):

@@ -9,7 +9,7 @@ from sparsedp.fields import frozen, place, surely_finite
 from sparsedp.ledger import active, count
 from sparsedp.trajectory.backward_pass import BackwardPass
 from sparsedp.trajectory.carried import carries
-from sparsedp.trajectory.layout import fingerprint, owned
+from sparsedp.trajectory.layout import fingerprint
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import Record, looked_at
 from sparsedp.trajectory.recorder import State, Trace
@@ -88,7 +88,7 @@ class Run:
         if self.store:
             end = fingerprint(*state[1:])
             self.compare(end, self._end or end)
-            last = state if self.keep.whole else state._replace(values=list(map(owned, state.values)))
+            last = state if self.keep.whole else state.owned()
             self._end, self._kept, self._tapes, self._trace = end, [*kept, last], tapes, trace
         if active:
             count("rollout.step", "forward", self.n)
@@ -113,7 +113,7 @@ class Run:
         for i in shown_steps(self.progress, range(self.n), "forward"):
             if i == stop:
                 own = self.keep.whole or i <= fit  # nobody else has the result of a step on its tape
-                kept.append(state if own else state._replace(values=list(map(owned, state.values))))
+                kept.append(state if own else state.owned())
                 stop = next(stops, None)
             if origin:
                 origin.agree(state)

@@ -9,7 +9,7 @@ import numpy as np
 from sparsedp.derivative import zero_like
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
-from sparsedp.traces import boxed, new_box, reverse_root, split_box
+from sparsedp.traces import boxed, reverse_root, split_box
 from sparsedp.trajectory.carried import Carried, carries
 from sparsedp.trajectory.layout import owned
 from sparsedp.trajectory.recorder import State, Tape
@@ -57,8 +57,8 @@ class Steps:
 
     def forward(self, state):
         """The state after this one."""
-        given = [frozen(value) for value in self._silenced(state)]
-        values, statics = self._called(state, given, self.params, self.run.rows(state.i, self.x))
+        rows = self.run.rows(state.i, self.x)
+        values, statics = self._called(state, self._given(state), self.params, rows)
         return State(state.i + 1, self.run.state.check(values, "the step"), statics)
 
     def taped(self, state, want_state, tape=None, given=None):
@@ -69,12 +69,11 @@ class Steps:
         """
         _, number, recorder, _ = self.trace
         if given is None:
-            given, roots = started(self._silenced(state), number, recorder, want_state)
-            tape = Tape(state.i, roots, [], [], [], [])
-        rows, inputs = self.run.rows(state.i, self.x), self.wants_input
-        if rows:
-            inputs = [root and reverse_root(recorder) for root in inputs]
-            rows = boxed(rows, inputs, number)
+            values = self._given(state)
+            roots = [reverse_root(recorder) if want_state else None for _ in values]
+            given, tape = boxed(values, roots, number), Tape(state.i, roots, [], [], [], [])
+        inputs = [root and reverse_root(recorder) for root in self.wants_input]
+        rows = boxed(self.run.rows(state.i, self.x), inputs, number)
         tape.starts.append(len(tape.nodes))
         tape.inputs.append(inputs)
         try:
@@ -92,12 +91,12 @@ class Steps:
             values = [value if node else owned(value) for value, node in zip(values, tape.ends, strict=True)]
         return tape, State(state.i + 1, values, statics), found if links else None
 
-    def _silenced(self, state):
-        """The variables of a state: a dual run has no tangents where the derivative is cut."""
-        silenced = self.run.silenced
-        if not silenced or not self.run.is_cut(state.i):
-            return state.values
-        return [zero_like(value) if number in silenced else value for number, value in enumerate(state.values)]
+    def _given(self, state):
+        """The variables that a step gets: a dual run has no tangents where the derivative is cut."""
+        values, silenced = state.values, self.run.silenced
+        if silenced and self.run.is_cut(state.i):
+            values = [zero_like(value) if number in silenced else value for number, value in enumerate(values)]
+        return list(map(frozen, values))
 
     def _called(self, state, values, params, rows):
         """The step on variables that may be traced -> those of the next state, and its statics."""
@@ -169,14 +168,3 @@ def _check_entries(parts, given):
 def _are_new(nodes):
     """Whether all results come from calls, each from another one."""
     return None not in nodes and all(node.parents for node in nodes) and len(set(nodes)) == len(nodes)
-
-
-def started(values, number, recorder, wanted):
-    """Values -> the same on a trace, if that is wanted, and their roots."""
-    given, roots = [], []
-    for value in values:
-        root = reverse_root(recorder) if wanted else None
-        value = frozen(value)
-        given.append(new_box(value, number, root) if wanted else value)
-        roots.append(root)
-    return given, roots
