@@ -84,7 +84,7 @@ BUDGETS = {
     "advection": 15_100,
     "check": 18_600,
     "flow": 7_300,
-    "integrators": 12_900,
+    "integrators": 12_800,
     "kernels": 16_700,
     "network": 2_700,
     "operators": 5_800,
@@ -93,7 +93,7 @@ BUDGETS = {
     "solvers": 42_700,
     "solvers/multigrid": 10_000,
     "structure": 8_000,
-    "trajectory": 13_500,
+    "trajectory": 13_600,
 }
 EXTRAS = ("numba", "matplotlib", "tqdm")  # foreign libraries that need not be there
 LAZY = ("pyamg", "numba", "matplotlib", "tqdm", "scipy", "autograd", "numpy")  # not touched by `import sparsedp`

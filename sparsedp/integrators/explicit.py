@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import autograd.numpy as anp
 
-from sparsedp.integrators.combination import combine
+from sparsedp.integrators.problem import combine
 from sparsedp.tape import Rule, of_argument
 
 __all__ = ["EXPLICIT", "Explicit", "Polynomial"]

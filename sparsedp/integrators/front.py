@@ -5,16 +5,16 @@ import numpy as np
 from sparsedp.fields import is_number
 from sparsedp.integrators.adaptive import Adaptive
 from sparsedp.integrators.explicit import EXPLICIT, Explicit, Polynomial
-from sparsedp.integrators.implicit_steps import IMPLICIT, Linear, Nonlinear
+from sparsedp.integrators.exponential import Exponential
+from sparsedp.integrators.implicit import IMPLICIT, Imex, Linear, Nonlinear
 from sparsedp.integrators.problem import posed, positive
-from sparsedp.integrators.split_steps import SPLIT, Exponential, Imex
-from sparsedp.integrators.stability import Limit
-from sparsedp.integrators.steps import Step
+from sparsedp.integrators.steps import Limit, Step
 from sparsedp.solvers.choose import check_settings
 from sparsedp.tree import copied, leaves
 
 __all__ = ["METHODS", "stepper"]
 
+SPLIT = ("imex", "etdrk4")
 METHODS = (*EXPLICIT, *IMPLICIT, *SPLIT)
 KEPT = {False: 2, True: 12}  # set-ups of linear steps, without and with error control
 
@@ -111,7 +111,7 @@ def stepper(
     order (crank_nicolson: below 10 tolerance). Derivatives that are small because terms cancel may be refused, too.
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
     takes about five times the steps of its value: twice as long as without the judgement.
-    Source: implicit_steps.py and explicit.py name the papers.
+    Source: implicit.py, exponential.py and explicit.py name the papers.
 
     Examples
     --------

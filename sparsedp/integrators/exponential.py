@@ -9,6 +9,11 @@ so a sum f of them has a derivative of the same form, and with y = f(z L) b
 Near 0 the formula in the middle loses all digits: there the Taylor series of the highest one is summed and
 the others follow downwards, phi_k = x phi_{k+1} + 1/k!. Sources: Cox and Matthews, J. Comput. Phys. 176
 (2002); Kassam and Trefethen, SIAM J. Sci. Comput. 26 (2005), who name the trouble.
+
+etdrk4 is order 4, and exact where N is constant and s a polynomial of degree 3. A source counts in every stage by the
+integral of exp((h - x) c L) s(t + x), with s through four points.
+Source: Cox and Matthews, J. Comput. Phys. 176 (2002), formulas 26 to 29; Hochbruck and Ostermann,
+Acta Numerica 19 (2010), section 2.2, exponential quadrature.
 """
 
 from math import factorial
@@ -18,10 +23,11 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.integrators.problem import later
 from sparsedp.solvers.separable import SpectralFunction, spectrum
 from sparsedp.tape import Rule, cast, dtype_of, isbox
 
-__all__ = ["Function", "Functions", "phi"]
+__all__ = ["Exponential", "Function", "Functions", "phi"]
 
 NEAR, TERMS = 3.0, 36  # the series is summed up to |x| = 3, where its terms after the 36th are below rounding
 KEPT = 64  # tables of weights, for a few z
@@ -206,3 +212,55 @@ def _diagonalised(op, name):
 def _real(cotangent, value):
     """The cotangent of a real number from complex fields is the real part."""
     return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent
+
+
+WHOLE, HALF, MEAN = Function((1.0,)), Function((1.0,), 0.5), Function((0.0, 0.5), 0.5)
+BEGIN, MIDDLE, END = (
+    Function((0.0, 1.0, -3.0, 4.0)),
+    Function((0.0, 0.0, 2.0, -4.0)),
+    Function((0.0, 0.0, -1.0, 4.0)),
+)
+NODES = (0.0, 0.5 - 0.1 * 5**0.5, 0.5 + 0.1 * 5**0.5, 1.0)  # of Lobatto, as shares of a step
+
+
+def quadrature(nodes, start, stop):
+    """Weights of s(t + node h) in h times the integral of exp((stop - x) z L) s(t + x h) over start < x < stop.
+
+    Of the Lagrange polynomials of the nodes; that of x^k over 0 < x < 1 is k! phi_{k+1}(z L).
+    """
+    part = np.polynomial.Polynomial([start, stop - start])
+    found = []
+    for values in np.eye(len(nodes)):
+        line = np.polynomial.Polynomial(np.linalg.solve(np.vander(nodes, increasing=True), values))(part)
+        weights = (float((stop - start) * factorial(k) * a) for k, a in enumerate(line.coef))
+        found.append(Function((0.0, *weights), stop - start))
+    return tuple(found)
+
+
+class Exponential:
+    """Exponential time differencing, Runge-Kutta of order 4."""
+
+    order, dyadic = 4, True
+
+    def __init__(self, problem):
+        self.problem = problem
+        self.functions = Functions(problem.op, "stepper(etdrk4)")
+        self.nodes = () if problem.source is None else NODES if problem.moving else NODES[:1]
+        self.parts = [quadrature(self.nodes, *ends) for ends in ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0))]
+
+    def __call__(self, u, params, t, h):
+        z, f = h * self.problem.coefficient(params), self.functions
+        s = [h * self.problem.given(params, later(t, node * h)) for node in self.nodes]
+        whole, first, second = self.parts
+        if self.problem.rate is None:
+            return f((WHOLE, *whole), z, u, *s)
+
+        def n(v, share):
+            return h * self.problem.explicit(v, params, later(t, share * h))
+
+        n0 = n(u, 0.0)
+        a = f((HALF, MEAN, *first), z, u, n0, *s)
+        n1 = n(a, 0.5)
+        n2 = n(f((HALF, MEAN, *first), z, u, n1, *s), 0.5)
+        n3 = n(f((HALF, MEAN, *second), z, a, 2.0 * n2 - n0, *s), 1.0)
+        return f((WHOLE, BEGIN, MIDDLE, END, *whole), z, u, n0, n1 + n2, n3, *s)
