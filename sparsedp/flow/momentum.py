@@ -218,11 +218,8 @@ def _free(grid, sides, solid):
 def _second(grid, c, a, sides):
     """Second differences of component c along axis a."""
     if a == c:
-        n, m = grid.shape[a], grid.node_count(a)
-        cell, d = np.arange(n), 1 / grid.spacings(a)
-        low = (cell, cell, d[:n])  # what cell i gives to its lower face, and takes from its upper one
-        high = ((cell + 1) % max(m, 1), cell, -d[(cell + 1) % max(m, 1)])
-        return Factor.from_diagonals((m, n), low, high) @ differences(grid, a)
+        back = _from_centres(grid, c)
+        return (back if grid.periodic[c] else Factor(back.matrix[:, 1:-1])) @ differences(grid, a)
     return differences(grid, a) @ slopes(grid, a, _conditions(sides[a]))
 
 

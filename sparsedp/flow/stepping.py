@@ -3,8 +3,9 @@
     v* = v + dt (3/2 a(v) - 1/2 a(v_before) - G p) + dt nu (L (v + v*) / 2 + B)
     q  = pressure(v*),    v_next = v* + G q,    p_next = p - q / dt
 
-with a(v) = force(v) - div(v v): Adams-Bashforth for what is explicit, the trapezoidal rule for an
-implicit viscosity, and a pressure that is corrected, not found anew (incremental).
+with a(v) = force(v) - div(v v), and + nu (L v + B) in place of the last term where viscosity is explicit:
+Adams-Bashforth for what is explicit, the trapezoidal rule for an implicit viscosity, and a pressure that is corrected,
+not found anew (incremental).
 Source: van Kan, SIAM J. Sci. Stat. Comput. 7 (1986), second order pressure correction.
 """
 
@@ -14,18 +15,19 @@ import numpy as np
 
 from sparsedp.conditions import no_slip
 from sparsedp.constants import constant
-from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_function, is_number
-from sparsedp.flow.acceleration import Acceleration, Viscous
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
+from sparsedp.fields import check_function, is_number, rounded_down
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
 from sparsedp.operators.boundary import identity, mask
 from sparsedp.operators.difference import gradient
 from sparsedp.recipe import Remade
 from sparsedp.solvers.choose import inverse
-from sparsedp.tape import isbox, plain
+from sparsedp.tape import dtype_of, isbox, plain
 
 __all__ = ["FlowStep", "flow_step"]
+
+ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
 
 
 def flow_step(
@@ -128,7 +130,7 @@ class FlowStep(Remade):
     """A step of incompressible flow, made by `flow_step`. What the scene does not need is None."""
 
     def __init__(self, grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary):
-        self.grid, self.dt, self.viscosity = grid, dt, viscosity
+        self.grid, self.dt, self.viscosity, self.force = grid, dt, viscosity, force
         self.project = projection(grid, solid, boundary)
         _, solid, boundary, _ = self.project.structure.setup.made  # copies, as of the walls: the caller may change them
         walls = constant(walls)
@@ -144,9 +146,11 @@ class FlowStep(Remade):
         self.relax: Any = None
         if implicit and viscosity:
             self.relax = inverse(identity(grid.faces) - (0.5 * dt * viscosity) * self.laplacian)
-        explicit = viscosity and self.relax is None
-        self.viscous: Any = Viscous(self.laplacian, self.walls, viscosity, dt) if explicit else None
-        self.acceleration = Acceleration(grid.faces, self.convect, force, self.viscous)
+        elif viscosity:
+            rows = self.laplacian.structure.magnitude()(np.ones(grid.faces.size))
+            self._steepest = float(np.max(rows, initial=0.0))  # no eigenvalue is beyond the largest sum of a row
+            if not callable(viscosity):
+                self._check_stable(viscosity)
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
@@ -169,12 +173,53 @@ class FlowStep(Remade):
         q = self.pressure(ahead)
         return {"v": self.kept(ahead) + self.slope(q), "p": p - q / dt, "a": a}
 
+    def acceleration(self, v, params):
+        """a(v): what is explicit, of those parts that the scene has."""
+        a = 0.0 * v if self.convect is None else -self.convect(v, v)
+        if self.force is not None:
+            a = a + self._pushed(v, params)
+        if self.laplacian is not None and self.relax is None:
+            bend = self.laplacian(v) if self.walls is None else self.laplacian(v) + self.walls
+            a = a + self._number(params) * bend
+        return a
+
+    def _pushed(self, v, params):
+        """The force; a number is the same on all faces."""
+        force = self.force(v, params)
+        if np.shape(plain(force)) == ():
+            return force * np.ones(v.shape, dtype_of(v))
+        if np.shape(plain(force)) != v.shape:
+            raise ShapeError(
+                f"flow_step takes a force on {self.grid.faces}, got an array of shape {np.shape(plain(force))}; join "
+                "its components with grid.join"
+            )
+        return force
+
+    def _number(self, params):
+        """The explicit viscosity."""
+        if not callable(self.viscosity):
+            return self.viscosity
+        found = self.viscosity(params)
+        if not is_number(plain(found)) or not 0 <= plain(found) < np.inf:
+            raise ValueError(f"the viscosity in flow_step must be a finite number >= 0, got {plain(found)}")
+        self._check_stable(float(plain(found)))
+        return found
+
+    def _check_stable(self, viscosity):
+        """Adams-Bashforth is stable for dt nu |lambda| <= 1."""
+        rate = viscosity * self._steepest
+        if self.dt * rate > 1 + ROUNDING:
+            raise UnstableStepError(
+                f"flow_step is unstable for viscosity = {viscosity:.6g} with dt = {self.dt:.12g}: the largest "
+                f"stable dt is {rounded_down(1 / rate)}; take smaller steps or write implicit=True"
+            )
+
     def __repr__(self):
         parts = {
             "convection": self.convect,
             "viscosity": self.laplacian,
             "implicit": self.relax,
-            "force": self.acceleration.force,
+            "force": self.force,
             "moving walls": self.walls,
         }
         words = [word for word, part in parts.items() if part is not None]
