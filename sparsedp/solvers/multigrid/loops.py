@@ -57,9 +57,17 @@ def neighbours(out, c, at, x, place, steps):
         add(out, forward, x[place + d : place + d + n], backward, x[place - d : place - d + n])
     for m in range(odd, steps.size, 2):  # two at a time: the sums are read and written half as often
         d, e = steps[m], steps[m + 1]
-        first, second, third, fourth = x[place + d :], x[place - d :], x[place + e :], x[place - e :]
-        forward, backward = c[m, at : at + n], c[m, at - d : at - d + n]
-        add_both(out, forward, first, backward, second, c[m + 1, at : at + n], third, c[m + 1, at - e :], fourth)
+        add_both(
+            out,
+            c[m, at:],
+            x[place + d :],
+            c[m, at - d :],
+            x[place - d :],
+            c[m + 1, at:],
+            x[place + e :],
+            c[m + 1, at - e :],
+            x[place - e :],
+        )
 
 
 @inner

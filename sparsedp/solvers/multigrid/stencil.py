@@ -110,9 +110,9 @@ def faces_of(op, grid):
 def _probed(product, grid, active):
     """Product with a matrix, cells that are unknowns -> Stencil, read off the images of a few fields of 0 and 1.
 
-    Along an axis, the image of every fourth plane shows on its two sides the links to it, and nothing else. Plane 0
-    has a field of its own, for it may be next to the last one. What has been read must then explain the image of a
-    random field: the matrix is symmetric and has no other entries.
+    Along an axis, the image of every fourth plane shows on its two sides the links to it, and nothing else. On a
+    periodic axis plane 0 has a field of its own, for it is next to the last one. What has been read must then explain
+    the image of a random field: the matrix is symmetric and has no other entries.
     """
     weights = active * grid.volumes
 
@@ -123,7 +123,8 @@ def _probed(product, grid, active):
     for axis, (n, flag) in enumerate(zip(grid.shape, grid.periodic)):
         link = np.zeros(grid.shape)
         to_next = np.moveaxis(link, axis, 0)
-        for planes in np.arange(n)[:1], np.arange(2, n, 4), np.arange(4, n, 4):
+        end = 1 if flag else n  # of the planes in one field with plane 0
+        for planes in filter(np.size, (np.arange(0, end, 4), np.arange(2, n, 4), np.arange(end + 3, n, 4))):
             x = np.zeros(grid.shape)
             np.moveaxis(x, axis, 0)[planes] = 1.0
             y, inner = np.moveaxis(image(x), axis, 0), planes[planes < n - 1]
