@@ -103,7 +103,7 @@ class Jacobians:
     """
 
     def __init__(self, name, jacobian, sparsity, settings):
-        self.name, self.given, self.settings = name, jacobian, settings
+        self.name, self.given, self.settings = name, jacobian, dict(settings, name=f"{name}.jacobian")
         self.sparsity: Any = None if sparsity is None else pattern_like(sparsity)
         self.by_rows = None  # True: the residual has no JVP
         self.way = ""
@@ -137,11 +137,11 @@ class Jacobians:
         if op.form == "explicit":
             return self._solver_of(op.matrix, lambda: op)
         products = {} if op.structure.has_entries else dict(method="krylov")
-        return build(op, **self.settings | products, name=f"{self.name}.jacobian", solves="few").solver
+        return build(op, **self.settings | products, solves="few").solver
 
     def _solver_of(self, matrix, make):
         """The Solver of an assembled Jacobian, of which ``make()`` is the Operator: found again or set up."""
-        settings, solver = dict(self.settings, name=f"{self.name}.jacobian"), None
+        settings, solver = self.settings, None
         key = matrix.indptr, matrix.indices, matrix.data
         known = self._matrices.find(key)
         if known is not None:
@@ -193,7 +193,7 @@ class Jacobians:
 
     def _made(self, equation, x, leaves):
         """(the Solver of the Jacobian, whether it is the derivative itself for certain)."""
-        name = f"{self.name}.jacobian"
+        name = self.settings["name"]
         if self.given is not None:
             self.way = "given"
             given = self.given(equation.layout.split(x), *equation.params(leaves))
@@ -289,10 +289,9 @@ class Jacobians:
         """Add the entries that J has at x. When there are none, its products are not linear."""
         coloured, space = self._patterns[equation.size]
         found = self._probed(equation, [x], leaves, self.by_rows)
-        total = sp.csr_array(coloured.pattern + (dense_pattern(x.size, x.size) if found is None else found))
+        total = pattern_like(coloured.pattern + (dense_pattern(x.size, x.size) if found is None else found))
         if total.nnz == coloured.pattern.nnz:
             raise DerivativeError(f"the derivative of {self.name} is not linear in its direction in row {row}")
-        total.data[:] = 1.0
         self._colour(total, space, equation, x, leaves)
 
 
