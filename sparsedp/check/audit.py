@@ -109,7 +109,8 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
 
     Examples
     --------
-    >>>     >>> x = np.array([1.0, 2.0])
+    >>> import autograd.numpy as anp
+    >>> x = np.array([1.0, 2.0])
     >>> gradient(lambda u: anp.sum(u**3), x).verdict
     'agrees'
     >>> gradient(lambda u: np.sum(u**3), x, gradient=lambda u: 3.003 * u**2).verdict

@@ -24,14 +24,13 @@ SKIPPED = "constant", "gradient"
 NOBODY = "every call on the tape is right at the values it met; a value may bypass the tape"
 
 
-def culprit_of(loss, point, rng=None):
+def culprit_of(loss, point):
     """Loss and point -> (name of the first call on the tape whose own derivative is at fault or None, sentence).
 
     Parameters
     ----------
     loss : callable
     point : Point
-    rng : None, int or numpy Generator
 
     Returns
     -------
@@ -39,7 +38,7 @@ def culprit_of(loss, point, rng=None):
         In the order of the calls. A call that others are made inside of (a time loop, a root) is named
         only when none of those is at fault.
     """
-    rng = generator(rng)
+    rng = generator(None)
     cleared: set[int] = set()  # Operators that were found right
     with np.errstate(all="ignore"):
         with witnessed() as nodes:

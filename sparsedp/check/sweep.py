@@ -45,7 +45,7 @@ def default_steps(eps):
     Powers of two, so that x + step * d loses as few digits as it can. Single precision leaves fewer
     decades, so they lie closer.
     """
-    return tuple(2.0**-k for k in range(2, 31, 3)) if eps < 1e-10 else tuple(2.0**-k for k in range(-2, 27, 2))
+    return tuple(2.0**-k for k in (range(2, 31, 3) if eps < 1e-10 else range(-2, 27, 2)))
 
 
 # ------------------------------------------------------------ points and directions
@@ -75,7 +75,7 @@ class Point:
                 raise NonFiniteError(f"a gradient is checked at finite values, and {name} holds NaN or infinity")
         self.vector = joined(self.values)
         self.complex = any(map(np.iscomplexobj, self.values))
-        self._ends = np.cumsum([joined([values]).size for values in self.values])[:-1]
+        self._ends = np.cumsum([values.size * (1 + np.iscomplexobj(values)) for values in self.values])[:-1]
         self.units = np.concatenate([np.full(part.size, rms(part) or 1.0) for part in self._parts(self.vector)])
         self.size = sum(values.size for values in self.values)
         self.eps = max(float(np.finfo(values.dtype).eps) for values in self.values)
@@ -91,8 +91,8 @@ class Point:
 
     def tree(self, other=None):
         """The tree with other floating leaves, a vector or a list of arrays; all but those arrays are fresh."""
-        arrays = other if isinstance(other, list) else self.arrays(self.vector if other is None else other)
         leaves = copied(self._leaves)
+        arrays = other if isinstance(other, list) else () if other is None else self.arrays(other)
         for place, value in zip(self.places, arrays):  # numbers stay numbers
             leaves[place] = value if isinstance(leaves[place], np.ndarray) else np.asarray(value)[()]
         return self._rebuild(leaves)

@@ -169,13 +169,11 @@ def _rows(calls):
 
 def _how(calls, name):
     """Form or method, and why."""
-    words = [f"{word} ({n} times)" if n > 1 else word for word, n in calls.told.get((name, "method"), {}).items()]
+    words = list(calls.told.get((name, "method"), ()))
     for actor in calls.actors.get(name, {}).values():
         engine = getattr(actor, "engine", None)
         if engine is not None:
-            kind = "iterative" if engine.iterative else "direct"
-            method = engine.method if engine.method == kind else f"{engine.method} ({kind})"
-            words.append(f"{method}: {actor.reason}")
+            words.append(f"{engine.method}: {actor.reason}")
         elif _applied(actor):
             words.append(actor.form)
     return "; ".join(dict.fromkeys(words)) or "rule"

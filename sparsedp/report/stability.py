@@ -74,7 +74,7 @@ def _measured(advance, state):
     for _ in range(STEPS):
         before = change / (norm(change) or 1.0)
         point = Point(state)
-        state, moved = jvp(advance, point.tree(), point.tree(before))
+        state, moved = jvp(advance, state, point.tree(before))
         change = joined([np.asarray(leaf) for leaf in leaves(moved) if leaf is not None])
         size = norm(change)
         if size == 0 or not np.isfinite(size):
