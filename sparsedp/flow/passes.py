@@ -55,29 +55,33 @@ class Passes:
     """
 
     def __init__(self, grid, products):
-        self.cells, self.parts = (1,) * (3 - grid.dim) + grid.shape, []
-        for place, faces in enumerate(grid.faces.split(products.kept), 3 - grid.dim):
-            axis, (start, stop) = place - 3 + grid.dim, grid.faces.offsets[place - 3 + grid.dim :][:2]
+        missing = 3 - grid.dim  # axes beside those of the grid, without faces
+        self.cells = (1,) * missing + grid.shape
+        self.parts = [(slice(0), (0, 0, 0))] * missing
+        self.inward, self.outward = ([np.zeros((rows, 0))] * missing for rows in (2, 3))
+        for place, faces in enumerate(grid.faces.split(products.kept), missing):
+            axis = place - missing
             line = np.moveaxis(faces, axis, -1).reshape(-1, faces.shape[axis])[0]
             shape = tuple(line.size if a == place else n for a, n in enumerate(self.cells))
             n, m = grid.shape[axis], line.size
             lines = _line(products.first, (0, axis), (n, m)), _line(products.second, (axis, 0), (m, n))
-            self.parts.append((slice(start, stop), shape, *_coefficients(*lines, line)))
-        nothing = slice(0), (0, 0, 0), np.zeros((2, 0)), np.zeros((3, 0))
-        self.parts = [nothing] * (3 - grid.dim) + self.parts
+            self.parts.append((slice(*grid.faces.offsets[axis : axis + 2]), shape))
+            for kept, found in zip((self.inward, self.outward), _coefficients(*lines, line), strict=True):
+                kept.append(found)
+
+    def _components(self, x):
+        return [x[part].reshape(shape) for part, shape in self.parts]
 
     def net_flow(self, x, b):
         """b = D K x; the norms of b and of x."""
-        components = [x[part].reshape(shape) for part, shape, _, _ in self.parts]
-        lines = [line for _, _, line, _ in self.parts]
-        flow, size = projection.net_flow.compiled(x, *components, *lines, b.reshape(self.cells), 0, self.cells[0])
+        components, cells = self._components(x), b.reshape(self.cells)
+        flow, size = projection.net_flow.compiled(x, *components, *self.inward, cells, 0, self.cells[0])
         return sqrt(flow), sqrt(size)
 
     def push(self, x, p, out):
         """out = K (x + G p)."""
-        given, result = ([array[part].reshape(shape) for part, shape, _, _ in self.parts] for array in (x, out))
-        lines = [line for *_, line in self.parts]
-        projection.push.compiled(*given, p.reshape(self.cells), *lines, *result, 0, 1)
+        given, found = self._components(x), self._components(out)
+        projection.push.compiled(*given, p.reshape(self.cells), *self.outward, *found, 0, 1)
 
     def agrees(self, products):
         """Whether they are those passes, to rounding.

@@ -30,7 +30,7 @@ import numpy as np
 
 from sparsedp.constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
-from sparsedp.integrators.problem import combine, untraced
+from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.tape import Rule, cast, dtype_of, is_variable, isbox, linear, plain
 from sparsedp.tree import flatten, leaves
 
@@ -69,13 +69,13 @@ class Variation:
         spans = [(done * h, 0.5 * share * h) for share, done, _, _ in path]
         sections = []
         for (_, _, *states), (start, half) in zip(path, spans, strict=True):
-            times = (None, None) if t is None else (t + start, t + start + half)
+            times = later(t, start), later(later(t, start), half)
             sections.append([self._section(state, at, half) for state, at in zip(states, times, strict=True)])
         self.rows = [[row for row, _ in both] for both in sections]
         speeds = np.array([both[0][1] for both in sections])
         rest = h - np.array([start for start, _ in spans])
-        later = np.maximum.accumulate(speeds[::-1])[::-1]
-        self.turn = int(np.argmin(later + 1 / rest))  # from this step on the shift is given back
+        fastest = np.maximum.accumulate(speeds[::-1])[::-1]  # from each step on
+        self.turn = int(np.argmin(fastest + 1 / rest))  # from this step on the shift is given back
         self.rest = float(rest[self.turn])
 
     def _section(self, u, t, half):
@@ -119,10 +119,10 @@ class Variation:
             if number == self.turn:
                 back = shift / self.rest
             bend = self._bend(number, 0, u, back, half)
-            at = t if t is None else t + done * h + shift
+            at = later(later(t, done * h), shift)
             middle = _at(scheme(u, params, at, half + bend), known[1])
             other = self._bend(number, 1, middle, back, half)
-            fine = scheme(middle, params, at if t is None else at + half + bend, half + other)
+            fine = scheme(middle, params, later(later(at, half), bend), half + other)
             whole = scheme(u, params, at, half + bend + (half + other))
             u, shift = _at(joined(fine, whole, weight - share), new), shift + bend + other
         return u
@@ -285,7 +285,7 @@ class Adaptive:
         for trial in range(1, MOST + 1):
             left = 1.0 - done
             length = self._allowed(length, left)
-            middle, new, error = self._trial(u, params, t if t is None else t + done * h, length, h)
+            middle, new, error = self._trial(u, params, later(t, done * h), length, h)
             change = SAFETY * max(error, 1e-10) ** (-1 / (self.order + 1))
             if error <= 1:
                 if path is not None:
@@ -340,7 +340,7 @@ class Adaptive:
         try:
             with np.errstate(all="ignore"):  # a step that is too long is refused, whatever it gave
                 middle = self.scheme(u, params, t, half)
-                fine = self.scheme(middle, params, t if t is None else t + half, half)
+                fine = self.scheme(middle, params, later(t, half), half)
                 whole = self.scheme(u, params, t, half + half)
                 error = self._error(u, fine, whole)
                 new = self.joined(fine, whole, self.weight)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import autograd.numpy as anp
 
-from sparsedp.integrators.problem import combine
+from sparsedp.integrators.problem import combine, later
 from sparsedp.tape import Rule, of_argument
 
 __all__ = ["EXPLICIT", "Explicit", "Polynomial"]
@@ -60,8 +60,7 @@ class Explicit:
         """The state after a step h."""
         rates = [self.problem(u, params, t)]
         for row in self.table.stages:
-            at = t if t is None else t + sum(row) * h
-            rates.append(self.problem(_ahead(u, h, row, rates), params, at))
+            rates.append(self.problem(_ahead(u, h, row, rates), params, later(t, sum(row) * h)))
         return _ahead(u, h, self.table.weights, rates)
 
 
@@ -84,11 +83,12 @@ class Polynomial:
 
     def __init__(self, problem, name):
         self.problem, self.name, self.order = problem, name, EXPLICIT[name].order
-        self._step = self._rule(self.order, False)
+        orders = range(1, self.order + 1)
+        self._rules = {(terms, flag): self._rule(terms, flag) for terms in orders for flag in (False, True)}
 
     def __call__(self, u, params, t, h):
         """The state after a step h."""
-        return self._step(h * self.problem.coefficient(params), u)
+        return self._rules[self.order, False](h * self.problem.coefficient(params), u)
 
     def _rule(self, terms, transposed):
         """T of L, or of L^T, as a rule in (z, u)."""
@@ -103,20 +103,20 @@ class Polynomial:
             return total
 
         def slope(z, u):
-            return self._rule(terms - 1, transposed)(z, L(u)) if terms > 1 else L(u)
+            return self._rules[terms - 1, transposed](z, L(u)) if terms > 1 else L(u)
 
         def vjp(nums, ans, z, u):
             def pull(g):
                 found = {
                     0: lambda: anp.sum(g * slope(z, u)),
-                    1: lambda: self._rule(terms, not transposed)(z, g),
+                    1: lambda: self._rules[terms, not transposed](z, g),
                 }
                 return tuple(of_argument(found[num](), (z, u)[num]) for num in nums)
 
             return pull
 
         def jvp(nums, tangents, ans, z, u):
-            change = {0: lambda t: t * slope(z, u), 1: lambda t: self._rule(terms, transposed)(z, t)}
+            change = {0: lambda t: t * slope(z, u), 1: lambda t: self._rules[terms, transposed](z, t)}
             return sum(change[num](t) for num, t in zip(nums, tangents, strict=True))
 
         return Rule(f"stepper({self.name}){'.T' * transposed}", forward, vjp, jvp)

@@ -1,11 +1,9 @@
 """Step: what `stepper` returns, a function of state and params for time loops; and how large an explicit one may be."""
 
-from math import isfinite
-
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
-from sparsedp.fields import check_finite, rounded_down
+from sparsedp.fields import check_finite, rounded_down, surely_finite
 from sparsedp.integrators.problem import like, positive
 from sparsedp.recipe import Remade
 from sparsedp.solvers.separable import spectrum
@@ -89,14 +87,13 @@ class Step(Remade):
         except NonFiniteError:  # a solver on the way may have met it: name the argument
             self._blame(state, params)
             raise
-        new = self.checked(new, state, params, h)
-        return (new, t + h) if self.problem.timed else new
-
-    def checked(self, new, state, params, h):
-        """The new state, refused when it is not finite."""
         if not all(map(_finite, leaves(new))):
-            self._refuse(state, params, h)
-        return new
+            self._blame(state, params)
+            raise NonFiniteError(
+                f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
+                "take smaller steps or an implicit method"
+            )
+        return (new, t + h) if self.problem.timed else new
 
     def _parts(self, state):
         if not self.problem.timed:
@@ -105,14 +102,6 @@ class Step(Remade):
             given = type(state).__name__
             raise TypeError(f"the rate of {self.name} takes a time, so its state is the pair (u, t), got {given}")
         return state
-
-    def _refuse(self, state, params, h):
-        """Say where NaN or infinity came from."""
-        self._blame(state, params)
-        raise NonFiniteError(
-            f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
-            "take smaller steps or an implicit method"
-        )
 
     def _blame(self, state, params):
         """Refuse arguments that are not finite."""
@@ -131,9 +120,7 @@ class Step(Remade):
 def _finite(leaf):
     """Whether all numbers are finite; their sum tells in one pass, unless it overflows."""
     value = plain(leaf)
-    if type(value) is np.ndarray and value.dtype == np.float64 and isfinite(np.add.reduce(value, axis=None)):
-        return True
-    return not is_variable(value) or bool(np.isfinite(np.sum(value)) or np.all(np.isfinite(value)))
+    return not is_variable(value) or surely_finite(value) or bool(np.all(np.isfinite(value)))
 
 
 ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
