@@ -319,3 +319,12 @@ def test_a_hundred_thousand_steps(memory):
     value, slopes = dp.value_and_grad(loss)((u, v))
     assert value == pytest.approx(256.0, rel=1e-10) and np.max(np.abs(slopes[0] - 1.0)) < 1e-10
     assert runs[-1].steps == n and np.all(np.isfinite(slopes[1]))
+
+
+def test_steps_that_solve_run_once_where_no_budget_is_given():
+    """Their tapes are kept beyond those of other steps: here 60 of more than 130 kB each."""
+    grid = dp.Grid((128, 128), size=1.0)
+    step, u = dp.stepper("crank_nicolson", dp.laplacian(grid, dp.dirichlet), 1e-4), np.sin(3 * grid.centres()[0])
+    with recording() as calls:
+        dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, None, 60) ** 2))(u)
+    assert calls["stepper(crank_nicolson)", "solve"] == 60

@@ -19,7 +19,9 @@ from sparsedp.tree import leaves
 
 __all__ = ["rollout"]
 
-SMALL = 2**22  # bytes that tapes of steps may take, beside the states on them, where no budget is given
+# Bytes that tapes of steps may take, beside the states on them, where no budget is given; and those of steps that solve
+# systems, where running a step again costs more than memory.
+SMALL, SOLVED = 2**22, 2**28
 
 
 def rollout(
@@ -42,7 +44,8 @@ def rollout(
     memory : None, number of bytes, or text such as "200 MB"
         What the rollout may take. None keeps every state. Else as many are kept as fit beside params, inputs
         and their gradients, and the others are run again from those, as rarely as possible. Where all fit, what
-        is left goes to the tapes of the steps (4 MB with None): such a step runs once, not twice. Not counted:
+        is left goes to the tapes of the steps (with None 4 MB, 256 MB if they solve systems): such a step runs once,
+        not twice. Not counted:
         what one step needs by itself, and what `keep` hands out; with keep="all" no state is run again.
     keep : "last", "all" or callable
         What is handed out: the last state; all n + 1, each array with a new first axis; or the tuple of what
@@ -127,7 +130,8 @@ def rollout(
     _check_values(run, args)
     pulled = any(map(in_reverse, args))  # a forward derivative has no use for tapes
     if pulled and (slots is None or slots >= n):
-        run.room = SMALL if memory is None else max(room_within(memory, forms[0].nbytes, n, beside), 0)
+        rooms = (SMALL, SOLVED) if memory is None else (max(room_within(memory, forms[0].nbytes, n, beside), 0),) * 2
+        run.room, run.room_of_solves = rooms
         run.traced = frozenset(traced)
     if run.store and run.slots:
         _warn_of_repeats(memory, forms[0].nbytes, n, beside)

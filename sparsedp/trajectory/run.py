@@ -6,7 +6,7 @@ import numpy as np
 
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.fields import frozen, place, surely_finite
-from sparsedp.ledger import active, count
+from sparsedp.ledger import active, count, thread
 from sparsedp.trajectory.backward_pass import BackwardPass
 from sparsedp.trajectory.carried import carries
 from sparsedp.trajectory.layout import fingerprint
@@ -46,6 +46,7 @@ class Run:
         self.budget, self.slots = slots, None if keep.whole else slots
         self.progress, self.record = progress, record
         self.room: float = 0  # bytes for tapes that are kept from the way forward
+        self.room_of_solves: float = 0  # the same where a step solves systems
         self.traced: frozenset = frozenset()  # the arguments that those tapes lead to
         self.place_of: dict = {}  # in a dual run: number of an argument of the run -> its number here
         self.silenced: tuple = ()  # variables that are zero for the step after a cut: tangents
@@ -110,6 +111,7 @@ class Run:
         origin = self.origin if self.origin and self.origin.keep.whole else None  # whose states are all at hand
         many, traced = looked_at(self.n), None
         fit = 1 if self.store and self.room else 0  # how many tapes there is room for: the first one tells
+        solves = thread.solves
         for i in shown_steps(self.progress, range(self.n), "forward"):
             if i == stop:
                 own = self.keep.whole or i <= fit  # nobody else has the result of a step on its tape
@@ -124,7 +126,8 @@ class Run:
                 known = tapes[-1] if traced else None
                 tape, state, traced = steps.taped(state, self.wants(i, self.traced), known, traced)
                 if i == 0:
-                    fit = self.room // max(recorder.bytes - self.state.nbytes, 1)
+                    room = self.room if thread.solves == solves else self.room_of_solves
+                    fit = room // max(recorder.bytes - self.state.nbytes, 1)
                 if i < fit and tape is not known:
                     tapes.append(tape)
             else:
