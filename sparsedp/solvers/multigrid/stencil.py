@@ -99,7 +99,9 @@ def stencil_of(system):
 def faces_of(op, grid):
     """The Stencil of an operator that takes less to apply than to assemble; else, or if it is none, None."""
     structure = op.structure
-    if structure.separable or isinstance(structure, Matrix) or not structure.has_entries or op.dtype.kind == "c":
+    if not op.domain.size or structure.separable or isinstance(structure, Matrix):
+        return None
+    if not structure.has_entries or op.dtype.kind == "c":
         return None
     try:
         return _probed(op._flat.apply, grid, True)
