@@ -328,3 +328,12 @@ def test_steps_that_solve_run_once_where_no_budget_is_given():
     with recording() as calls:
         dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, None, 60) ** 2))(u)
     assert calls["stepper(crank_nicolson)", "solve"] == 60
+
+
+def test_constants_of_a_step_leave_its_tapes_where_they_are():
+    """The velocity, 4 MB, and the weights are the same for all steps: no tape holds more than the states do."""
+    grid = dp.Grid((512, 512), periodic=True)
+    move, u, v = dp.transport(grid), np.sin(grid.centres()[0]), 0.1 * np.ones(grid.faces.size)
+    with recording() as calls:
+        dp.value_and_grad(lambda u: anp.sum(dp.rollout(lambda u, v: move(u, v, 1.0), u, v, 5) ** 2))(u)
+    assert calls["transport upwind", "forward"] == 5

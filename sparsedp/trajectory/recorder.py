@@ -90,11 +90,12 @@ class Trace(NamedTuple):
 class Recorder:
     """Takes down the calls of a trace; and weighs them while `weighs` is true.
 
-    Counted are the results, and every array that goes in beside traced values; one that many calls use counts once.
+    Counted are the results (`bytes`), and apart from them every array that goes in beside traced values (`beside`); one
+    that many calls use counts once.
     """
 
     def __init__(self):
-        self.weighs, self.bytes = False, 0
+        self.weighs, self.bytes, self.beside = False, 0, 0
         self.nodes: list = []
         self._seen: set[int] = set()
 
@@ -109,7 +110,7 @@ class Recorder:
                 self._weigh(arg)
             elif isinstance(arg, np.ndarray) and id(arg) not in self._seen:
                 self._seen.add(id(arg))
-                self.bytes += arg.nbytes
+                self.beside += arg.nbytes
 
     def taken(self):
         """The calls since it was asked last: it forgets them, for they know it, and a circle is freed late."""

@@ -110,7 +110,7 @@ class Run:
         stop = next(stops, None)
         origin = self.origin if self.origin and self.origin.keep.whole else None  # whose states are all at hand
         many, traced = looked_at(self.n), None
-        fit = 1 if self.store and self.room else 0  # how many tapes there is room for: the first one tells
+        fit = 2 if self.store and self.room else 0  # how many tapes there is room for: the first two tell
         solves = thread.solves
         for i in shown_steps(self.progress, range(self.n), "forward"):
             if i == stop:
@@ -120,14 +120,17 @@ class Run:
             if origin:
                 origin.agree(state)
             if i < fit:
-                recorder.weighs = i == 0
+                recorder.weighs, before = i < 2, (recorder.bytes, recorder.beside)
                 if i < 2 or i % many == 0 or self.keep.along or self.is_cut(i):
                     traced = None  # the cotangent of this state is asked for
                 known = tapes[-1] if traced else None
                 tape, state, traced = steps.taped(state, self.wants(i, self.traced), known, traced)
-                if i == 0:
+                if i < 2:  # what goes in besides may be constants, which all steps share: the second one tells
                     room = self.room if thread.solves == solves else self.room_of_solves
-                    fit = room // max(recorder.bytes - self.state.nbytes, 1)
+                    results, beside = recorder.bytes - before[0], recorder.beside - before[1]
+                    weight = results - self.state.nbytes + i * beside
+                    fit = min(room // max(weight, 1), self.n if i else 2)
+                    del tapes[int(fit) :]
                 if i < fit and tape is not known:
                     tapes.append(tape)
             else:
