@@ -65,3 +65,13 @@ def test_cotangents_beyond_the_root_of_the_range_pass_in_silence(method):
         warnings.simplefilter("error")
         high, plain = slopes(900), slopes(0)
     assert np.array_equal(high[0], np.ldexp(plain[0], 900)) and high[1] == np.ldexp(plain[1], 900)
+
+
+@pytest.mark.parametrize("method", ["euler", "heun", "ssprk3", "rk4"])
+def test_an_explicit_step_of_an_operator_rounds_traced_numbers_like_plain_ones(method):
+    """Under a budget the steps run plain first, and on a tape on the way back: to the same bits."""
+    u = np.sin(np.arange(6.0)).astype(np.float32)
+    step = dp.stepper(method, dp.laplacian(dp.Grid(6, size=1.0), dp.dirichlet), 0.01)
+    loss = lambda c, **options: anp.sum(dp.rollout(step, u, c, 7, **options) ** 2)
+    bits = {dp.value_and_grad(lambda c, m=memory: loss(c, memory=m))(0.3) for memory in (None, 200, 260, "1 MB")}
+    assert len(bits) == 1

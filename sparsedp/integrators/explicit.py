@@ -95,7 +95,7 @@ class Polynomial:
         L = self.problem.op.T if transposed else self.problem.op
 
         def forward(z, u):
-            total = u
+            z, total = float(z), u  # traced it is a NumPy scalar, which would round float32 otherwise
             for k in reversed(range(1, terms + 1)):  # Horner's rule
                 total = L.apply(total)
                 total *= z / k
