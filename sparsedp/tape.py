@@ -212,7 +212,7 @@ def fit(name, value, cotangent, g):
         return cotangent
     if kind.kind == "c" != precise.kind:
         raise DerivativeError(f"{name} returned a complex derivative of a real value; take its real part")
-    if kind.kind not in "fc" or np.finfo(kind).eps > max(np.finfo(dtype_of(x)).eps for x in (value, g)):
+    if kind.kind not in "fc" or np.finfo(kind).eps > max(np.finfo(dtype_of(x)).eps for x in leaves((value, plain(g)))):
         raise DerivativeError(f"{name} returned a derivative of dtype {kind} where {precise} is needed")
     return cast(cotangent, precise)
 

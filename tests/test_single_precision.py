@@ -75,3 +75,11 @@ def test_an_explicit_step_of_an_operator_rounds_traced_numbers_like_plain_ones(m
     loss = lambda c, **options: anp.sum(dp.rollout(step, u, c, 7, **options) ** 2)
     bits = {dp.value_and_grad(lambda c, m=memory: loss(c, memory=m))(0.3) for memory in (None, 200, 260, "1 MB")}
     assert len(bits) == 1
+
+
+def test_reverse_over_reverse_of_a_rollout_with_float32_beside_float64():
+    """The pullback has a result for each of two arguments, and their cotangents come together."""
+    loss = lambda x: anp.sum(dp.rollout(lambda u, p: u * p, x[0], x[1], 2) ** 2)  # p^4 |u|^2
+    back = dp.grad(lambda x: dp.grad(loss)(x)[1])((U, 0.5))
+    assert back[0].dtype == np.float32 and back[0] == pytest.approx(8 * 0.5**3 * U)
+    assert back[1] == pytest.approx(12 * 0.5**2 * 0.875)
