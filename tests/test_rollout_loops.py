@@ -184,6 +184,21 @@ def test_a_linked_step_that_keeps_a_traced_value_is_refused():
         dp.value_and_grad(lambda p: anp.sum(dp.rollout(step, WHERE, p, 12)))(0.3)
 
 
+def test_a_linked_step_with_a_rule_that_writes_into_the_state_is_refused():
+    def double(u):
+        u *= 2.0
+        return u.copy()
+
+    rule = dp.differentiable("double", double, lambda nums, ans, u: lambda g: (2.0 * g,))
+
+    def step(state, p):
+        u, i = state
+        return (anp.sin(rule(u) * u * p) if i == 3 else u + p * u), i + 1
+
+    with pytest.raises(ValueError, match=r"^the step changes state\[0\] in place; write u = u \+ du"):
+        dp.value_and_grad(lambda p: anp.sum(dp.rollout(step, (WHERE, 0), p, 4)[0]))(0.3)
+
+
 def test_a_linked_step_that_reuses_an_array_is_run_again():
     room = np.zeros(6)
 

@@ -1,7 +1,6 @@
 """The steps of a run, on plain values or on a tape."""
 
 from contextlib import contextmanager
-from operator import is_
 from typing import Any
 
 import numpy as np
@@ -80,16 +79,18 @@ class Steps:
             found, statics = self._called(state, given, self._traced_params, rows)
         finally:
             tape.nodes.extend(recorder.taken())
-        given, tape.ends[:] = [], []
+        values, tape.ends[:] = [], []
         for value in found:
             value, node = split_box(value, number)
-            given.append(value)
+            values.append(value)
             tape.ends.append(node)
-        values = self.run.state.check(given.copy(), "the step")
-        links = self._precise and all(map(is_, given, values)) and _are_new(tape.ends)
+        self.run.state.check(values, "the step")
+        links = self._precise and _are_new(tape.ends)
         if None in tape.ends:  # perhaps an array that the step uses again
             values = [value if node else owned(value) for value, node in zip(values, tape.ends, strict=True)]
-        return tape, State(state.i + 1, values, statics), found if links else None
+        # As read-only as the values of a root: a rule that writes into its argument would change this very state.
+        given = boxed(map(frozen, values), tape.ends, number) if links else None
+        return tape, State(state.i + 1, values, statics), given
 
     def _given(self, state):
         """The variables that a step gets: a dual run has no tangents where the derivative is cut."""
