@@ -253,3 +253,18 @@ def test_fingerprints_see_every_bit_and_every_place():
                     u.flat[place].imag * 1j if dtype == "c16" else 0
                 )
                 assert fingerprint([other]) != known
+
+
+@pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
+@pytest.mark.parametrize("memory", BUDGETS)
+def test_a_step_that_keeps_what_it_made_of_params_is_refused(memory):
+    """Run again on a tape, it would take the plain number for a constant: the same value, another derivative."""
+    known = {}
+
+    def step(u, p):
+        if not known:
+            known["scale"] = anp.exp(-p)
+        return u * known["scale"]
+
+    with pytest.raises(DerivativeError, match="uses a traced value that is not one of its arguments"):
+        dp.value_and_grad(lambda p: anp.sum(dp.rollout(step, U, p, N, memory=memory)))(0.3)

@@ -129,7 +129,7 @@ def rollout(
     run = Run(step, forms, n, _kind(keep, forms[0]), slots, truncate, bool(traced), progress, record)
     _check_values(run, args)
     pulled = any(map(in_reverse, args))  # a forward derivative has no use for tapes
-    if pulled and (slots is None or slots >= n):
+    if pulled:
         rooms = (SMALL, SOLVED) if memory is None else (max(room_within(memory, forms[0].nbytes, n, beside), 0),) * 2
         run.room, run.room_of_solves = rooms
         run.traced = frozenset(traced)
