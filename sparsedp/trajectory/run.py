@@ -110,7 +110,7 @@ class Run:
         stop = next(stops, None)
         origin = self.origin if self.origin and self.origin.keep.whole else None  # whose states are all at hand
         many, traced = looked_at(self.n), None
-        # How many tapes there is room for: the first two tell. The first one also shows traced values that the step keeps.
+        # How many tapes there is room for: the first two tell. The first shows traced values that the step keeps, too.
         fit = 2 if self.store and self.traced else 0
         solves = thread.solves
         for i in shown_steps(self.progress, range(self.n), "forward"):
