@@ -17,10 +17,10 @@ def carries(step):
         step.forward(state, params) -> state
         step.backward(state, params, g) -> (g_state, g_params)
 
-    both on plain trees. Linear steppers, nonlinear implicit ones of one stage, and flow_step do. Where `step.sparing`
-    is true, backward also takes `new`, the result of the step when it is one array, and `wanted`, whether params want
-    a cotangent. Where `step.solves` is true, it takes `met`: a function to be called with the result that it finds
-    again, which refuses another one than before.
+    both on plain trees. Steps of the library have one form only; these are for steps that users write: an adjoint of
+    their own, or a simulator that brings one. Where `step.sparing` is true, backward also takes `new`, the result of
+    the step when it is one array, and `wanted`, whether params want a cotangent. Where `step.solves` is true, it takes
+    `met`: a function to be called with the result that it finds again, which refuses another one than before.
     """
     return callable(getattr(step, "forward", None)) and callable(getattr(step, "backward", None))
 
