@@ -374,7 +374,7 @@ def test_updates_and_checks_of_operators():
     check(make, 2)
 
 
-@pytest.mark.filterwarnings("ignore")
+@pytest.mark.filterwarnings("ignore::sparsedp.errors.GrowthWarning")  # a filter that other threads leave where it is
 def test_stress_hears_of_growth_in_its_own_thread():
     def work(number):
         factor = 30.0 if number == 0 else 0.9
