@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp.fields import frozen
 from sparsedp.tape import Rule, isbox, plain
-from sparsedp.trajectory.layout import fingerprint, owned
+from sparsedp.trajectory.layout import owned
 
 __all__ = ["Carried", "carries"]
 
@@ -18,9 +18,7 @@ def carries(step):
         step.backward(state, params, g) -> (g_state, g_params)
 
     both on plain trees. Steps of the library have one form only; these are for steps that users write: an adjoint of
-    their own, or a simulator that brings one. Where `step.sparing` is true, backward also takes `new`, the result of
-    the step when it is one array, and `wanted`, whether params want a cotangent. Where `step.solves` is true, it takes
-    `met`: a function to be called with the result that it finds again, which refuses another one than before.
+    their own, or a simulator that brings one.
     """
     return callable(getattr(step, "forward", None)) and callable(getattr(step, "backward", None))
 
@@ -71,16 +69,10 @@ def _forward(call, *values):
 def _vjp(nums, ans, call, *values):
     run, many, wanted = call.run, call.many, max(nums) > call.many
     state, params = call.parts(values)
-    more = {}  # what is not used is not held
-    if getattr(run.step, "sparing", False):
-        more = {"new": plain(ans) if run.state.bare else None, "wanted": wanted}
-    if getattr(run.step, "solves", False):
-        ends = [plain(ans)] if many == 1 else plain(ans)
-        more["met"] = lambda result: run.compare(fingerprint(call.taken(result)[0]), fingerprint(ends))
 
     def pull(g):
         slopes = run.state.build([g] if many == 1 else [g[k] for k in range(many)])
-        of_state, of_params = run.step.backward(state, params, slopes, **more)
+        of_state, of_params = run.step.backward(state, params, slopes)
         what = "the backward form of the step"
         backs = call.taken(of_state, what)[0]
         if wanted:
