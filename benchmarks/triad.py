@@ -17,7 +17,7 @@ import scipy.sparse as sp
 
 from sparsedp import kernels
 from sparsedp.kernels import reference
-from sparsedp.kernels.layout import Tridiagonal
+from sparsedp.kernels.reference import Tridiagonal
 
 __all__ = ["best_times", "triad", "triad_bandwidth"]
 

@@ -13,10 +13,8 @@ from sparsedp.fields import check_out, field_array
 from sparsedp.ledger import active
 from sparsedp.recipe import Remade
 from sparsedp.space import Space, fits
-from sparsedp.structure import algebra
-from sparsedp.structure.base import Structure, result_dtype
-from sparsedp.structure.explicit import Matrix, assembled
-from sparsedp.structure.lazy import Diagonal
+from sparsedp.structure.base import Matrix, Structure, assembled, result_dtype
+from sparsedp.structure.lazy import Diagonal, compose, total
 from sparsedp.tape import apply_operator, isbox
 
 __all__ = ["Operator"]
@@ -187,7 +185,7 @@ class Operator(Remade):
         if not fits(self.domain, other.codomain):
             raise ShapeError(f"{self.name} takes {self.domain}, but {other.name} gives {other.codomain}")
         name = f"{_bracket(self.name)} @ {_bracket(other.name)}"
-        return Operator(algebra.compose(self.structure, other.structure), other.domain, self.codomain, name)
+        return Operator(compose(self.structure, other.structure), other.domain, self.codomain, name)
 
     @cached_property
     def _flat(self):
@@ -202,7 +200,7 @@ class Operator(Remade):
         if not (fits(self.domain, other.domain) and fits(self.codomain, other.codomain)):
             mine, theirs = f"{self.domain} to {self.codomain}", f"{other.domain} to {other.codomain}"
             raise ShapeError(f"{self.name} maps {mine}, but {other.name} maps {theirs}")
-        structure = algebra.total(self.structure, other.structure)
+        structure = total(self.structure, other.structure)
         return Operator(structure, self.domain, self.codomain, f"{self.name} + {other.name}")
 
     __radd__ = __add__  # for its advice: no sum of an operator and something else is defined

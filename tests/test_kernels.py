@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from sparsedp import kernels
 from sparsedp.kernels import team
-from sparsedp.kernels.layout import Rows, Tridiagonal
+from sparsedp.kernels.reference import Rows, Tridiagonal
 
 SHAPES = [(1, 1, 1), (1, 1, 2), (1, 1, 3), (1, 1, 700), (1, 2, 1), (1, 31, 37), (1, 64, 130), (2, 1, 3), (2, 2, 2)]
 SHAPES += [(3, 1, 17), (7, 5, 1), (5, 7, 11), (13, 8, 64), (20, 20, 20)]

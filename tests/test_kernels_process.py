@@ -41,7 +41,7 @@ SCRIPT = """
 import os, sys
 import numpy as np
 from sparsedp import kernels
-from sparsedp.kernels.layout import Tridiagonal
+from sparsedp.kernels.reference import Tridiagonal
 n = 200
 axis = Tridiagonal(np.r_[0, np.ones(n - 1)], -2 * np.ones(n), np.r_[np.ones(n - 1), 0])
 u, out = np.ones((1, n, n)), np.zeros((1, n, n))

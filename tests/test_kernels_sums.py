@@ -5,7 +5,7 @@ import pytest
 
 from sparsedp import kernels
 from sparsedp.kernels import team
-from sparsedp.kernels.layout import Tridiagonal
+from sparsedp.kernels.reference import Tridiagonal
 from sparsedp.solvers.separable import Sweep
 
 NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")

@@ -16,7 +16,7 @@ from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid
 from sparsedp.recipe import Remade
-from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.base import Matrix
 from sparsedp.tape import Rule, isbox
 
 __all__ = ["Transport", "transport"]

@@ -18,8 +18,7 @@ from sparsedp.derivative import pullback, pushforward
 from sparsedp.direction import hvp
 from sparsedp.errors import DerivativeError
 from sparsedp.operators.given import check_operator
-from sparsedp.structure.base import Scaled, result_dtype
-from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.base import Matrix, Scaled, result_dtype
 from sparsedp.structure.lazy import Chain, Sum
 from sparsedp.tree import norm
 

@@ -14,11 +14,10 @@ from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.stencils import along, differences, means, one_sided, slopes, wall_slopes
 from sparsedp.space import Space
-from sparsedp.structure.algebra import compose
-from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.base import Matrix
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker
-from sparsedp.structure.lazy import Mask
+from sparsedp.structure.lazy import Mask, compose
 from sparsedp.tape import Rule
 from sparsedp.tree import copied
 

@@ -13,7 +13,7 @@ import os
 import numpy as np
 
 from sparsedp.kernels import reference
-from sparsedp.kernels.layout import CHUNK, LOWERED, REMAINDER, TOTALS
+from sparsedp.kernels.reference import CHUNK, LOWERED, REMAINDER, TOTALS
 
 __all__ = [
     "along_axis",
@@ -126,7 +126,7 @@ def kronecker_sum(u, out, axes, shift):
     Examples
     --------
     >>> import numpy as np
-    >>> from sparsedp.kernels.layout import Tridiagonal
+    >>> from sparsedp.kernels.reference import Tridiagonal
     >>> line = Tridiagonal(np.array([0.0, 1, 1]), np.array([-2.0, -2, -2]), np.array([1.0, 1, 0]))
     >>> u, out = np.array([[[1.0, 2.0, 4.0]]]), np.zeros((1, 1, 3))
     >>> kronecker_sum(u, out, (None, None, line), 0.0)
@@ -157,7 +157,7 @@ def along_axis(u, out, rows, scale, accumulate):
     Examples
     --------
     >>> import numpy as np
-    >>> from sparsedp.kernels.layout import Rows
+    >>> from sparsedp.kernels.reference import Rows
     >>> whole, none = np.array([0, 2]), np.zeros(0, int)
     >>> difference = Rows(1, 2, whole, np.array([0, 1]), np.array([-1.0, 1.0]), none, none, none, np.zeros((0, 1)))
     >>> u, out = np.array([[[1.0, 2.0], [4.0, 8.0]]]), np.zeros((1, 1, 2))

@@ -4,7 +4,7 @@ Each chunk leaves its own sums, added up at the end: the bits do not depend on t
 the sums may be taken in any order, so that they fill the vector units.
 """
 
-from sparsedp.kernels.layout import CHUNK, LOWERED, TOTALS
+from sparsedp.kernels.reference import CHUNK, LOWERED, TOTALS
 from sparsedp.kernels.team import kernel
 
 __all__ = ["measure"]

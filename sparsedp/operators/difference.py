@@ -5,9 +5,8 @@ from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.stencils import along, differences, one_sided, pick, slopes
-from sparsedp.structure.algebra import compose, total
 from sparsedp.structure.kronecker import Kronecker
-from sparsedp.structure.lazy import Mask
+from sparsedp.structure.lazy import Mask, compose, total
 
 __all__ = ["curl", "divergence", "gradient", "laplacian", "upwind"]
 

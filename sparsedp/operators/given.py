@@ -9,7 +9,7 @@ from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.operator import Operator
 from sparsedp.space import Space
-from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.base import Matrix
 from sparsedp.structure.lazy import Functions
 
 __all__ = ["check_operator", "from_functions", "from_linear_operator", "from_matrix"]

@@ -14,7 +14,7 @@ from sparsedp.operators.interpolation import linear_weights
 from sparsedp.operators.stencils import along, means, single
 from sparsedp.space import Space
 from sparsedp.spacing import real_numbers
-from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.base import Matrix
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker
 

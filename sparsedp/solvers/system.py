@@ -12,8 +12,7 @@ from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import ROUNDING, find_null_space
 from sparsedp.solvers.scaling import length, remainder
 from sparsedp.space import Space
-from sparsedp.structure.base import probes, rows_of
-from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.base import Matrix, probes, rows_of
 from sparsedp.structure.kronecker import Kronecker
 
 __all__ = ["System"]

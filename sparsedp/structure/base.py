@@ -1,11 +1,22 @@
-"""Structure: the common part of everything that acts linearly on flat arrays."""
+"""Structure: what acts linearly on flat arrays. Its plainest kinds are a matrix and a multiple of another one."""
 
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.ledger import active, count
 from sparsedp.recipe import Uncached
 
-__all__ = ["INT32_LIMIT", "Scaled", "Structure", "compact", "probes", "result_dtype", "rows_of"]
+__all__ = [
+    "INT32_LIMIT",
+    "Matrix",
+    "Scaled",
+    "Structure",
+    "assembled",
+    "compact",
+    "probes",
+    "result_dtype",
+    "rows_of",
+]
 
 INT32_LIMIT = 2**31
 PROBES = 3  # random vectors with which a map without entries is examined
@@ -69,6 +80,39 @@ class Structure(Uncached):
         return out
 
 
+class Matrix(Structure):
+    """The explicit form: a csr_array with 32-bit indices, owned and never changed.
+
+    Parameters
+    ----------
+    matrix : sparse matrix or array
+        Copied when it is not already compact.
+    """
+
+    def __init__(self, matrix):
+        self.matrix = compact(matrix)
+        if self.matrix.dtype not in (np.float64, np.complex128):
+            wide = np.complex128 if self.matrix.dtype.kind == "c" else np.float64
+            self.matrix = self.matrix.astype(wide)
+        for part in (self.matrix.data, self.matrix.indices, self.matrix.indptr):
+            part.flags.writeable = False  # an Operator is constant: nobody may write into it
+        self.shape = self.matrix.shape
+        self.dtype = self.matrix.dtype
+
+    def apply(self, x, out):
+        wide = x.astype(np.result_type(x.dtype, np.float64), copy=False)  # SciPy has no product in half precision
+        np.copyto(out, self.matrix @ wide, casting="same_kind")
+
+    def transpose(self):
+        return Matrix(self.matrix.T.tocsr())
+
+    def explicit(self):
+        return self.matrix
+
+    def scaled(self, factor):
+        return Matrix(self.matrix * factor)
+
+
 class Scaled(Structure):
     """A number times a structure that cannot take the number in."""
 
@@ -119,6 +163,13 @@ def compact(matrix):
         matrix = sp.csr_array(arrays, shape=matrix.shape)
         matrix.has_canonical_format = True
     return matrix
+
+
+def assembled(structure, name):
+    """Structure -> its entries as a Matrix, counted under the name of the operator."""
+    if active:
+        count(name, "assembled")
+    return Matrix(structure.explicit())
 
 
 def probes(size):

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import NonFiniteError
-from sparsedp.kernels.layout import Rows, Tridiagonal
+from sparsedp.kernels.reference import Rows, Tridiagonal
 from sparsedp.recipe import Uncached
 from sparsedp.structure.base import rows_of
 
@@ -77,7 +77,7 @@ class Factor(Uncached):
 
     @cached_property
     def rows(self):
-        """The record that the kernels read (see kernels/layout.py)."""
+        """The record that the kernels read (see kernels/reference.py)."""
         m = self.matrix
         row = rows_of(m)
         offset = m.indices - row

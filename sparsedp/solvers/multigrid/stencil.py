@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sparsedp.structure.explicit import Matrix
+from sparsedp.structure.base import Matrix
 
 __all__ = ["Stencil", "Unfit", "components", "faces_of", "stencil_of"]
 
