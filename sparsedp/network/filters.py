@@ -13,7 +13,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.kernels.correlation import correlate, fold, pad, weigh
+from sparsedp.network.correlation import correlate, fold, pad, weigh
 from sparsedp.tape import Rule, plain
 
 __all__ = ["check_widths", "convolution"]
