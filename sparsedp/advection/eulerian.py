@@ -19,7 +19,6 @@ Comp. 67 (1998) 73-85.
 
 from functools import cached_property
 from math import isfinite
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,6 @@ from sparsedp import results
 from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Finite, Law
 from sparsedp.advection.loops import Loops, able
 from sparsedp.advection.reference import Reference
-from sparsedp.advection.scratch import Scratch
 from sparsedp.advection.stability import check_numbers, check_result, check_weights
 from sparsedp.fields import surely_finite
 from sparsedp.tape import isbox
@@ -42,7 +40,7 @@ class Eulerian(Law):
 
     def __init__(self, setting):
         super().__init__(setting)
-        self.reference, self.scratch = Reference(setting, self.walls), Scratch()
+        self.reference = Reference(setting, self.walls)
         self.scheme = self.reference.scheme
         self.linear = self.twice = self.scheme.limiter is None
 
@@ -59,14 +57,10 @@ class Eulerian(Law):
         return found
 
     def _forward(self, u, v, dt, inflow):
-        w, out, wrong, spare = self.reference.on_sides(v), results.empty(u.shape, float), 0.0, list[Any]()
-        x, lend = u, self.scratch.lender(spare)
-        for number, keep in enumerate(self.scheme.stages, 1):
-            new = lend(u.size) if number < len(self.scheme.stages) else out
-            slopes = self.loops.slopes(x, inflow, False, lend)
-            wrong += self.loops.stage(x, slopes, w, dt, inflow, u, keep, new)
-            x = new
-        self.scratch.give(*spare)
+        w, out, wrong = self.reference.on_sides(v), u, 0.0
+        for keep in self.scheme.stages:
+            x, out = out, results.empty(u.shape, float)
+            wrong += self.loops.stage(x, self.loops.slopes(x, inflow, False), w, dt, inflow, u, keep, out)
         if wrong or not isfinite(self._unseen(v, inflow)):
             self._check(u, v, dt, inflow, out)
         return out
@@ -100,24 +94,21 @@ class Eulerian(Law):
 
     def _pull(self, g, u, w, dt, inflow, gw, field):
         """Cotangents of u (field: where it is wanted) and inflow, that of w into gw; all finite?"""
-        spare: list = []
         known: list = []
-        lend = self.scratch.lender(spare)
         for keep in self.scheme.stages:
             x = u
             if known:
-                x = lend(u.size)
+                x = results.empty(u.shape, float)
                 self.loops.stage(*known[-1][:2], w, dt, inflow, u, known[-1][2], x)
-            known.append((x, self.loops.slopes(x, inflow, True, lend), keep))
+            known.append((x, self.loops.slopes(x, inflow, True), keep))
         ginflow, rest, wrong, fresh = np.zeros(inflow.size), None, 0.0, True
         while known:
             x, slopes, keep = known.pop()
             if keep:  # a share of the cotangent goes to the first field
                 rest, g = (keep * g if rest is None else rest + keep * g), (1.0 - keep) * g
-            gu = lend(u.size) if known else results.empty(u.shape, float) if field else NOTHING
+            gu = results.empty(u.shape, float) if known or field else NOTHING
             wrong += self.loops.pull(g, x, slopes, w, dt, inflow, gu, ginflow, gw, fresh)
             g, fresh = gu, False
-        self.scratch.give(*spare)
         if rest is not None and field:
             g += rest
         return g, ginflow, wrong == 0.0 and isfinite(ginflow.sum())

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp import kernels
+from sparsedp import kernels, results
 from sparsedp.advection.lattice import beside, lattices
 from sparsedp.kernels import fluxes
 
@@ -83,12 +83,12 @@ class Loops:
         lines = np.transpose([*(1.0 / length for length in (*own, *theirs)), *(axis.distances if self.limiter else ())])
         return lines if np.any(lines != lines[0]) else lines[:1]
 
-    def slopes(self, u, inflow, steep, lend):
+    def slopes(self, u, inflow, steep):
         """For each component the slopes and (steep) their derivatives in a and b; empty for a scheme of first order."""
         found = []
         for part in self.components:
             size = part.axes.shape[0] * (part.field.stop - part.field.start) if self.limiter else 0
-            arrays = lend(self.many * size), lend(2 * self.many * size if steep else 0)
+            arrays = [results.empty((self.many * many * size,), float) for many in (1, 2 * steep)]
             if self.limiter:
                 args = u[part.field], inflow[part.inflow], part.free, part.table, part.axes, self.many
                 part.run(self.limiter, *args, *arrays)

@@ -21,8 +21,6 @@ from sparsedp.kernels import departure
 
 __all__ = ["MacCormack"]
 
-BLOCK = 1 << 14  # points that NumPy works on at a time: what is made on the way stays in the cache
-
 
 class Corrected:
     """Two passes of a component, back in time and ahead again, and what becomes of them; used like a `Pass`, once."""
@@ -32,10 +30,10 @@ class Corrected:
         self.bounds = results.empty((2, u.size), float) if self.clamp else departure.NO_BOUNDS
         f = self.first.value(bounds=self.bounds)
         self.second = Pass(ahead, f, inflow)
-        self.new = self.second.value()  # before it is clamped
-        for start in range(0, u.size, BLOCK):
-            some = slice(start, start + BLOCK)
-            self.new[some] = f[some] + 0.5 * (u[some] - self.new[some])
+        self.new = self.second.value()  # what comes back, and then the new value before it is clamped
+        np.subtract(u, self.new, out=self.new)
+        self.new *= 0.5
+        self.new += f
 
     def _clamps(self):
         """Points where the clamp acts: which, the share of the value that stays, samples and shares of the bounds."""
