@@ -23,11 +23,10 @@ from math import isfinite
 import numpy as np
 
 from sparsedp import results
-from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Finite, Law
+from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
 from sparsedp.advection.loops import Loops, able
 from sparsedp.advection.reference import Reference
 from sparsedp.advection.stability import check_numbers, check_result, check_weights
-from sparsedp.fields import surely_finite
 from sparsedp.tape import isbox
 
 __all__ = ["Eulerian"]
@@ -81,19 +80,14 @@ class Eulerian(Law):
             return self.reference.pull(nums, g, u, v, dt, inflow)
         w, field = self.reference.on_sides(v), FIELD in nums or INFLOW in nums
         gw = results.empty(w.shape, float) if VELOCITY in nums or STEP in nums else NOTHING
-        of_field, of_inflow, good = self._pull(np.ascontiguousarray(g), u, w, dt, inflow, gw, field)
-        found = {FIELD: of_field, INFLOW: of_inflow}
-        if gw.size:
-            found[VELOCITY] = self.reference.of_sides(gw)
-            good &= found[VELOCITY] is gw or surely_finite(found[VELOCITY])
+        of_field, of_inflow = self._pull(np.ascontiguousarray(g), u, w, dt, inflow, gw, field)
+        found = {FIELD: of_field, INFLOW: of_inflow, VELOCITY: self.reference.of_sides(gw) if gw.size else None}
         if STEP in nums:  # a step is homogeneous in the velocity times dt
             found[STEP] = float(np.vdot(v, found[VELOCITY])) / dt
-            good &= isfinite(found[STEP])
-        backs = tuple(found[num] for num in nums)
-        return Finite(backs) if good else backs
+        return tuple(found[num] for num in nums)
 
     def _pull(self, g, u, w, dt, inflow, gw, field):
-        """Cotangents of u (field: where it is wanted) and inflow, that of w into gw; all finite?"""
+        """Cotangents of u (field: where it is wanted) and inflow; that of w goes into gw."""
         known: list = []
         for keep in self.scheme.stages:
             x = u
@@ -101,17 +95,17 @@ class Eulerian(Law):
                 x = results.empty(u.shape, float)
                 self.loops.stage(*known[-1][:2], w, dt, inflow, u, known[-1][2], x)
             known.append((x, self.loops.slopes(x, inflow, True), keep))
-        ginflow, rest, wrong, fresh = np.zeros(inflow.size), None, 0.0, True
+        ginflow, rest, fresh = np.zeros(inflow.size), None, True
         while known:
             x, slopes, keep = known.pop()
             if keep:  # a share of the cotangent goes to the first field
                 rest, g = (keep * g if rest is None else rest + keep * g), (1.0 - keep) * g
             gu = results.empty(u.shape, float) if known or field else NOTHING
-            wrong += self.loops.pull(g, x, slopes, w, dt, inflow, gu, ginflow, gw, fresh)
+            self.loops.pull(g, x, slopes, w, dt, inflow, gu, ginflow, gw, fresh)
             g, fresh = gu, False
         if rest is not None and field:
             g += rest
-        return g, ginflow, wrong == 0.0 and isfinite(ginflow.sum())
+        return g, ginflow
 
     def push(self, tangents, u, v, dt, inflow):
         return self.reference.push(tangents, u, v, dt, inflow)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from sparsedp.fields import place
 from sparsedp.space import Space
 
-__all__ = ["FIELD", "INFLOW", "STEP", "VELOCITY", "Finite", "Law", "Setting", "component_shapes"]
+__all__ = ["FIELD", "INFLOW", "STEP", "VELOCITY", "Law", "Setting", "component_shapes"]
 
 FIELD, VELOCITY, STEP, INFLOW = range(4)
 
@@ -49,20 +49,13 @@ class Setting(NamedTuple):
         return place(index, self.velocity_shapes[-1])
 
 
-class Finite(tuple):
-    """Cotangents that have been found to be finite on the way: nobody needs to look at them again."""
-
-    __slots__ = ()
-
-
 class Law:
     """Base of the schemes. A subclass sets the flags and has these methods:
 
     ``forward(u, v, dt, inflow)``
         The moved field.
     ``pull(nums, g, u, v, dt, inflow)``
-        Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed;
-        `Finite` when that is known.
+        Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed.
     ``push(tangents, u, v, dt, inflow)``
         {number of an argument: tangent} -> tangent of the result.
     ``matrix(v, dt)``

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.advection.law import FIELD, INFLOW, Finite
+from sparsedp.advection.law import FIELD, INFLOW
 from sparsedp.advection.values import LETTERS, prepare, raised, result_like, unflatten
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import check_finite, surely_finite
@@ -26,7 +26,7 @@ def rule_of(law):
                 found = tuple(back(g) for back, _ in _turned(law, nums, flat))
             else:
                 found = law.pull(nums, g, *flat)
-            for num, back in zip(nums, () if type(found) is Finite else found):
+            for num, back in zip(nums, found, strict=True):
                 _check_slope(law, "the gradient in " + LETTERS[num], back, (g,))
             return tuple([unflatten(args[num], back) for num, back in zip(nums, found, strict=True)])
 

@@ -26,7 +26,6 @@ __all__ = [
     "squares",
     "sweep",
     "threads",
-    "through_faces",
     "totals",
 ]
 
@@ -207,25 +206,6 @@ def sweep(x, lower, upper, inverses, column, row, ends):
     given = x, lower, upper, inverses, column, row, ends
     if not x.size or not run("elimination", "eliminate", x.shape[1], x.size, threads(), *given):
         reference.eliminate(*given)
-
-
-def through_faces(u, k, lines, out, closed):
-    """Field, three components on faces, their lines -> out = L diag(k) R u in one pass -> whether it works here.
-
-    See `sparsedp.structure.through` for the lines.
-
-    Parameters
-    ----------
-    u, out : float64 arrays, shape (n0, n1, n2)
-        C-contiguous, without overlap.
-    k : three float64 arrays
-        One for each axis; empty where the axis has one cell.
-    lines : three float64 arrays, shape (4, n_a + 1)
-    closed : bool
-        Whether faces with k = 0 carry 0, whatever the cells hold.
-    """
-    rows = u.shape[0] * u.shape[1]
-    return run("stencil", "through_faces", rows, u.size, threads(), u, *k, *lines, out, closed)
 
 
 def squares(x):

@@ -78,9 +78,11 @@ class ThroughFaces:
 
     def apply(self, x, out):
         """Write the product into `out` -> whether it could be done."""
-        return kernels.through_faces(
-            x.reshape(self.shape), self.parts, self.lines, out.reshape(self.shape), self.closed
+        fields, rows = (
+            (x.reshape(self.shape), *self.parts, *self.lines, out.reshape(self.shape)),
+            np.prod(self.shape[:2]),
         )
+        return kernels.run("stencil", "through_faces", rows, x.size, kernels.threads(), *fields, self.closed)
 
 
 def through_faces(left, middle, right):
