@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparsedp.spacing import AXES, real_numbers
+from sparsedp.grid import AXES, real_numbers
 
 __all__ = [
     "Condition", "FlowCondition", "check_condition", "dirichlet", "free_slip", "inflow", "neumann", "no_slip",

@@ -37,11 +37,10 @@ FLOORS = [
     ("traces", 1),
     ("tape", 1),
     ("kernels", 1),
-    ("spacing", 1),
     ("fields", 1),
     ("derivative", 2),
     ("space", 2),
-    ("conditions", 2),
+    ("conditions", 4),
     ("direction", 3),
     ("grid", 3),
     ("structure", 3),
@@ -80,7 +79,7 @@ LONGER = {"solver_in_the_loop.py": 125}  # two solvers, a network and a study
 # Nodes of the syntax tree that each room may have, docstrings left out; what a line says is free, what it does is not.
 # They may be lowered at any time, and raised only with a sentence on what that buys. "": the whole package.
 BUDGETS = {
-    "": 202_700,
+    "": 202_600,
     "advection": 14_600,
     "check": 18_600,
     "flow": 7_000,
@@ -197,11 +196,11 @@ def test_no_private_names_of_foreign_libraries():
 
 def test_floors_rule_sees_a_wrong_import():
     assert not may_import("sparsedp.tape", "sparsedp.grid")
-    assert not may_import("sparsedp.solvers.choose", "sparsedp.advection")
+    assert not may_import("sparsedp.solvers.inverse", "sparsedp.advection")
     assert not may_import("sparsedp.operator", "sparsedp")
-    assert not may_import("sparsedp.solvers.choose", "sparsedp.check")
+    assert not may_import("sparsedp.solvers.inverse", "sparsedp.check")
     assert not may_import("sparsedp.check.operators", "sparsedp.report.plots")
-    assert may_import("sparsedp.solvers.choose", "sparsedp.solvers.direct")
+    assert may_import("sparsedp.solvers.inverse", "sparsedp.solvers.direct")
     assert may_import("sparsedp.report.explain", "sparsedp.check.operators")
 
 

@@ -114,7 +114,7 @@ def test_the_cycle_is_symmetric_and_positive(shape, periodic, rng):
 
 @pytest.mark.parametrize("shape", [(5, 4), (5, 4, 3)])
 def test_every_neighbour_is_where_the_layout_says(shape, rng):
-    from sparsedp.solvers.multigrid.layout import Layout
+    from sparsedp.solvers.multigrid.loops import Layout
 
     for periodic in product((False, True), repeat=len(shape)):
         layout, values = Layout(shape, periodic), rng.standard_normal(shape)

@@ -15,10 +15,10 @@ from scipy.sparse.linalg import ArpackError, eigs, eigsh
 
 from sparsedp.check.nodes import bytes_of
 from sparsedp.errors import DerivativeError
+from sparsedp.grid import node_axes
 from sparsedp.operators.boundary import interior
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.space import fits
-from sparsedp.spacing import node_axes
 from sparsedp.structure.base import Structure
 
 __all__ = ["facts_of"]

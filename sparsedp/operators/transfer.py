@@ -8,12 +8,11 @@ import scipy.sparse as sp
 from sparsedp.conditions import neumann, resolve
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_finite, is_whole
-from sparsedp.grid import Grid, check_grid
+from sparsedp.grid import Grid, check_grid, real_numbers
 from sparsedp.operator import Operator
 from sparsedp.operators.interpolation import linear_weights
 from sparsedp.operators.stencils import along, means, single
 from sparsedp.space import Space
-from sparsedp.spacing import real_numbers
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker

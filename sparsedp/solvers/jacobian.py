@@ -18,9 +18,8 @@ from sparsedp.ledger import count
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_functions, from_matrix
 from sparsedp.solvers.cache import Cache
-from sparsedp.solvers.choose import build, build_dense
 from sparsedp.solvers.direct import DENSE_UP_TO
-from sparsedp.solvers.solution import Inverse
+from sparsedp.solvers.inverse import Inverse, build, build_dense
 from sparsedp.solvers.solve import failure
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like
 from sparsedp.tape import called, isbox

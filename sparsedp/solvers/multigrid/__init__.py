@@ -2,7 +2,6 @@
 
 - `engine`: what the contract calls: conjugate gradients with the cycle as preconditioner.
 - `stencil`: an operator as a stencil, read off its products.
-- `layout`: in which order a level keeps its numbers.
 - `interpolation`, `levels`: the set-up, and the cycle.
 - `loops`: the compiled functions.
 """

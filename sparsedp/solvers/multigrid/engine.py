@@ -125,8 +125,8 @@ class Structured(Engine):
 
     def __init__(self, stencil, free, maxiter=None, dtype=np.float32):
         from sparsedp.solvers.multigrid import loops
-        from sparsedp.solvers.multigrid.layout import Layout
         from sparsedp.solvers.multigrid.levels import Level, hierarchy
+        from sparsedp.solvers.multigrid.loops import Layout
 
         grid, self.scale, self.maxiter, self.loops = stencil.grid, stencil.scale, maxiter or MAXITER, loops
         threads = kernels.threads() if grid.cells.size >= SERIAL else 1

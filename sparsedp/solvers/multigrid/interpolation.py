@@ -10,7 +10,7 @@ Sci. Stat. Comput. 8 (1987) 673-685.
 import numpy as np
 
 from sparsedp.solvers.multigrid import loops
-from sparsedp.solvers.multigrid.layout import steps_around
+from sparsedp.solvers.multigrid.loops import steps_around
 
 __all__ = ["Transfer", "interpolated"]
 

@@ -9,7 +9,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from sparsedp.solvers.multigrid import loops
 from sparsedp.solvers.multigrid.interpolation import Transfer, interpolated
-from sparsedp.solvers.multigrid.layout import steps_around
+from sparsedp.solvers.multigrid.loops import steps_around
 
 __all__ = ["Level", "hierarchy"]
 
