@@ -25,7 +25,7 @@ _WINDOW = {
     "operators.transfer": "average component prolong restrict sample",
     "operators.harmonic": "harmonic_average",
     "operators.boundary": "diagonal identity interior lift mask",
-    "solvers.inverse": "inverse",
+    "solvers.inverses": "inverse",
     "solvers.parametric": "elliptic_solver matrix_solver",
     "solvers.roots": "implicit",
     "solvers.separable": "exponential power",

@@ -196,11 +196,11 @@ def test_no_private_names_of_foreign_libraries():
 
 def test_floors_rule_sees_a_wrong_import():
     assert not may_import("sparsedp.tape", "sparsedp.grid")
-    assert not may_import("sparsedp.solvers.inverse", "sparsedp.advection")
+    assert not may_import("sparsedp.solvers.inverses", "sparsedp.advection")
     assert not may_import("sparsedp.operator", "sparsedp")
-    assert not may_import("sparsedp.solvers.inverse", "sparsedp.check")
+    assert not may_import("sparsedp.solvers.inverses", "sparsedp.check")
     assert not may_import("sparsedp.check.operators", "sparsedp.report.plots")
-    assert may_import("sparsedp.solvers.inverse", "sparsedp.solvers.direct")
+    assert may_import("sparsedp.solvers.inverses", "sparsedp.solvers.direct")
     assert may_import("sparsedp.report.explain", "sparsedp.check.operators")
 
 

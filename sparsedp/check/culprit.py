@@ -14,7 +14,7 @@ from sparsedp.check.sweep import Point, Trials, default_steps, generator
 from sparsedp.derivative import pullback, value_and_grad
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
-from sparsedp.solvers.inverse import Inverse
+from sparsedp.solvers.inverses import Inverse
 
 __all__ = ["culprit_of"]
 

@@ -18,7 +18,7 @@ from sparsedp.conditions import no_slip
 from sparsedp.flow.setup import Setup
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
-from sparsedp.solvers.inverse import check_settings
+from sparsedp.solvers.inverses import check_settings
 from sparsedp.structure.base import Structure
 from sparsedp.tree import copied
 

@@ -23,7 +23,7 @@ from sparsedp.kernels import projection
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.recipe import Remade
-from sparsedp.solvers.inverse import build
+from sparsedp.solvers.inverses import build
 from sparsedp.solvers.scaling import in_range, largest, norm, shifted
 
 __all__ = ["Setup", "faces_that"]

@@ -22,7 +22,7 @@ from sparsedp.flow.pressure import projection
 from sparsedp.operators.boundary import identity, mask
 from sparsedp.operators.difference import gradient
 from sparsedp.recipe import Remade
-from sparsedp.solvers.inverse import inverse
+from sparsedp.solvers.inverses import inverse
 from sparsedp.tape import dtype_of, isbox, plain
 
 __all__ = ["FlowStep", "flow_step"]

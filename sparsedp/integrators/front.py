@@ -9,7 +9,7 @@ from sparsedp.integrators.exponential import Exponential
 from sparsedp.integrators.implicit import IMPLICIT, Imex, Linear, Nonlinear
 from sparsedp.integrators.problem import posed, positive
 from sparsedp.integrators.steps import Limit, Step
-from sparsedp.solvers.inverse import check_settings
+from sparsedp.solvers.inverses import check_settings
 from sparsedp.tree import copied, leaves
 
 __all__ = ["METHODS", "stepper"]

@@ -44,7 +44,7 @@ from sparsedp.ledger import tell
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
 from sparsedp.solvers.cache import Cache
-from sparsedp.solvers.inverse import build
+from sparsedp.solvers.inverses import build
 from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System

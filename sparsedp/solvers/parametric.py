@@ -30,7 +30,7 @@ from sparsedp.operators.boundary import identity
 from sparsedp.operators.given import from_matrix
 from sparsedp.recipe import Remade
 from sparsedp.solvers.cache import Cache
-from sparsedp.solvers.inverse import build, check_settings
+from sparsedp.solvers.inverses import build, check_settings
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.sparsity import pattern_like
 from sparsedp.space import Space, fits

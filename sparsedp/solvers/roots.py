@@ -26,7 +26,7 @@ from sparsedp.ledger import active as recordings
 from sparsedp.ledger import tell, thread
 from sparsedp.recipe import Remade
 from sparsedp.solvers.equation import Equation, Layout, vary
-from sparsedp.solvers.inverse import check_settings
+from sparsedp.solvers.inverses import check_settings
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Newton
 from sparsedp.solvers.solve import Run, SolveLog
