@@ -7,6 +7,7 @@ import re
 import struct
 import sys
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +72,15 @@ def with_nan(field):
 
 
 def png(width, height):
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", width, height) + bytes(40)
+    """A picture of that size, so it says, without what is in it."""
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)),
+        (b"IDAT", zlib.compress(b"")),
+        (b"IEND", b""),
+    )
+    sums = (struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks)
+    parts = [struct.pack(">I", len(data)) + kind + data + end for (kind, data), end in zip(chunks, sums)]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 def case(name, write, match):
@@ -100,23 +109,23 @@ BAD = [
     case(
         "a.npy",
         lambda path: np.save(path, np.array([[1, None], [2, 3]], dtype=object), allow_pickle=True),
-        match=r"a\.npy holds Python objects, which are never unpickled here; save it as floats",
+        match=r"a\.npy cannot be read \(.*objects.*\); save the field with numpy.save",
     ),
     case(
         "a.npy",
         raw(pickle.dumps(relief())),
-        match=r"a\.npy has no readable .npy header \(a pickle\?\); save the field with numpy.save",
+        match=r"a\.npy cannot be read \(.*\); save the field with numpy.save",
     ),
-    case("a.npy", raw(b""), match=r"a\.npy has no readable .npy header"),
-    case("a.npy", raw(header((9, 9))[:40]), match=r"a\.npy has no readable .npy header"),
-    case("a.npy", raw(header((-3, -3)) + bytes(800)), match=r"promises an array of shape \(-3, -3\), which cannot be"),
-    case("a.npy", raw(header((10**30, 2))), match=r"a\.npy promises an array of shape \(1000000.*, which cannot be"),
+    case("a.npy", raw(b""), match=r"a\.npy cannot be read"),
+    case("a.npy", raw(header((9, 9))[:40]), match=r"a\.npy cannot be read"),
+    case("a.npy", raw(header((-3, -3)) + bytes(800)), match=r"a\.npy cannot be read"),
+    case("a.npy", raw(header((10**30, 2))), match=r"a\.npy cannot be read"),
     case(
         "a.npy",
         raw(header((10**9, 10**6)) + bytes(800)),
-        match=r"a\.npy promises 8000000000000000 bytes of data in its header, but holds 800",
+        match=r"a\.npy cannot be read \(.*greater than file size",
     ),
-    case("a.npy", raw(header((20, 20)) + bytes(3199)), match=r"promises 3200 bytes .* but holds 3199"),
+    case("a.npy", raw(header((20, 20)) + bytes(3199)), match=r"a\.npy cannot be read \(.*greater than file size"),
     case("a.npy", sparse_file, match=r"a\.npy holds 101000000 values, at most 100000000 are taken; thin it out first"),
     case("a.npy", saved(relief() + 0j), match=r"a\.npy needs real numbers, got dtype complex128; save it as floats"),
     case("a.npy", saved(np.full((9, 9), "x")), match=r"a\.npy needs real numbers, got dtype <U1; save it as floats"),
@@ -130,13 +139,13 @@ BAD = [
         match=r"a\.npz needs exactly one 2-D array, got 2 among 3 arrays \(one, two\)",
     ),
     case("a.npz", zipped(line=np.zeros(9)), match=r"a\.npz needs exactly one 2-D array, got 0 among 1 arrays \(line\)"),
-    case("a.npz", member("notes.txt", b"none"), match=r"needs exactly one 2-D array, got 0 among 0 arrays \(nothing\)"),
-    case("a.npz", raw(b"PK\x03\x04 cut"), match=r"a\.npz is not a whole .npz archive; save the field with numpy.savez"),
-    case("a.npz", member("u.npy", header((9, 9), "|O")), match=r"a\.npz holds Python objects, which are never"),
-    case("a.npz", member("u.npy", header((10**5, 10**5)) + bytes(999)), match=r"promises 80000000000 bytes"),
-    case("a.npz", member("u.npy", b"\x80\x04K\x01."), match=r"a\.npz has no readable .npy header"),
-    case("a.png", raw(b"GIF89a" + bytes(40)), match=r"a\.png is not a PNG picture"),
-    case("a.png", raw(png(10**5, 10**5)), match=r"a\.png holds 10000000000 values, at most 100000000 are taken"),
+    case("a.npz", member("notes.txt", b"none"), match=r"exactly one 2-D array, got 0 among 1 arrays \(notes.txt\)"),
+    case("a.npz", raw(b"PK\x03\x04 cut"), match=r"a\.npz cannot be read \(.*\); save the field with numpy.save"),
+    case("a.npz", member("u.npy", header((9, 9), "|O")), match=r"a\.npz cannot be read \(Object arrays"),
+    case("a.npz", member("u.npy", header((10**5, 10**5)) + bytes(999)), match=r"a\.npz cannot be read"),
+    case("a.npz", member("u.npy", b"\x80\x04K\x01."), match=r"a\.npz (cannot be read|needs exactly one)"),
+    case("a.png", raw(b"GIF89a" + bytes(40)), match=r"a\.png cannot be read"),
+    case("a.png", raw(png(10**5, 10**5)), match=r"a\.png cannot be read \(Image size .* exceeds limit"),
 ]
 
 
@@ -215,8 +224,8 @@ def test_file_that_cannot_be_opened(tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(ValueError, match=r"a\.npy cannot be opened: Permission denied"):
+    monkeypatch.setattr(np, "load", refuse)
+    with pytest.raises(ValueError, match=r"a\.npy cannot be read \(Permission denied\)"):
         terrain.read_field(tmp_path / "a.npy")
 
 
@@ -229,13 +238,6 @@ def test_archive_that_lies_about_its_length(tmp_path):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"a\.npz"):
         terrain.read_field(path)
-
-
-def test_data_that_end_early(tmp_path):
-    """A directory of an archive may promise more than there is."""
-    content = header((9, 9)) + bytes(640)
-    with pytest.raises(ValueError, match=r"a\.npy ends before the data that its header promises"):
-        terrain.read_array(tmp_path / "a.npy", io.BytesIO(content), len(content) + 8)
 
 
 # ---- pictures ------------------------------------------------------------------------------------------------------
@@ -259,7 +261,7 @@ def test_broken_picture(tmp_path, image):
     image.imsave(tmp_path / "a.png", relief())
     content = (tmp_path / "a.png").read_bytes()
     (tmp_path / "a.png").write_bytes(content[:200])
-    with pytest.raises(ValueError, match=r"a\.png is not a whole PNG picture"):
+    with pytest.raises(ValueError, match=r"a\.png cannot be read"):
         terrain.read_field(tmp_path / "a.png")
 
 

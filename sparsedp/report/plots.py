@@ -377,8 +377,11 @@ def sample_file(name):
 
 def read_picture(path):
     """Picture file -> grey values, shape (rows, columns), rows from the top."""
-    colours = _matplotlib("image").imread(path).astype(float)
-    return colours if colours.ndim == 2 else colours[:, :, :3].mean(axis=2)
+    _matplotlib()
+    from PIL import Image  # comes with matplotlib, and refuses pictures that would fill the memory
+
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("F"))
 
 
 def _matplotlib(part=None):

@@ -1,12 +1,11 @@
 """The field that plays the hidden ground: real terrain, the reader's own file, or a generated one.
 
-Of a file nothing is unpickled, and no memory is asked for before it is known to hold what its header promises.
+Files are read by NumPy, which unpickles nothing.
 """
 
 import os
-import zipfile
-from math import prod
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,14 +13,13 @@ import sparsedp as dp
 from sparsedp.fields import check_finite
 from sparsedp.report import plots
 
-__all__ = ["Terrain", "hidden_ground", "load", "read_array", "read_field", "remap"]
+__all__ = ["Terrain", "hidden_ground", "load", "read_field", "remap"]
 
 SAMPLE = "jacksboro_fault_dem.npz"
 FINEST = 8  # points along an axis that are averaged into one cell
 STEEPEST = 3.5  # bound on |log k|: conductivities then span a factor of at most 1000
 MOST = 10**8  # values of a file; a field of the demo is a map, not an archive
 LEAST = 4  # values along an axis
-DEFLATE = 1100  # no zip member can grow by more than this factor
 
 
 class Terrain(NamedTuple):
@@ -155,18 +153,34 @@ def read_field(path):
     >>> read_field(path)[0]
     array([0.03125, 0.03125, 0.03125, 0.125  ])
     """
-    readers = {".npy": _npy, ".npz": _npz, ".png": _png}
+    # A .npy file is mapped into memory, for its header may promise more than it holds.
+    readers: dict[str, Any] = {".npy": partial(np.load, mmap_mode="r"), ".npz": _archive, ".png": plots.read_picture}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise ValueError(f"{path} is not a .npy, .npz or .png file; save the field with numpy.save")
     if not os.path.isfile(path):  # Path.is_file raises for a name that is too long
         raise FileNotFoundError(f"{path} is not there or is no plain file; give the path of a .npy, .npz or .png file")
     try:
-        with path.open("rb") as stream:
-            field = reader(path, stream)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be opened: {error.strerror}") from error
-    _check_shape(path, field.shape)
+        field = reader(path)
+    except ImportError:
+        raise
+    except Exception as error:  # foreign bytes fail in many ways, all with the same meaning
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"{path} cannot be read ({reason}); save the field with numpy.save") from error
+    if isinstance(field, dict):
+        maps = [name for name, array in field.items() if np.ndim(array) == 2]
+        if len(maps) != 1:
+            names = ", ".join(name[:24] for name in (maps or [*field])[:4]) or "nothing"
+            raise ValueError(f"{path} needs exactly one 2-D array, got {len(maps)} among {len(field)} arrays ({names})")
+        field = field[maps[0]]
+    if path.suffix.lower() == ".png":
+        field = field[::-1].T
+    if field.ndim != 2:
+        raise ValueError(f"{path} needs a 2-D array, got shape {field.shape}")
+    if field.size > MOST:
+        raise ValueError(f"{path} holds {field.size} values, at most {MOST} are taken; thin it out first")
+    if field.dtype.kind not in "biuf":
+        raise ValueError(f"{path} needs real numbers, got dtype {str(field.dtype)[:40]}; save it as floats")
     if min(field.shape) < LEAST:
         raise ValueError(f"{path} needs at least {LEAST} values along each axis, got shape {field.shape}")
     with np.errstate(over="ignore"):
@@ -178,70 +192,7 @@ def read_field(path):
     return np.ldexp(field, -np.frexp(largest)[1])  # by a power of two: nothing is rounded, nothing overflows
 
 
-def _npy(path, stream):
-    return read_array(path, stream, path.stat().st_size)
-
-
-def _npz(path, stream):
-    try:
-        with zipfile.ZipFile(stream) as archive:
-            members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
-            maps = [member for member in members if len(_header(path, archive.open(member))[0]) == 2]
-            if len(maps) == 1:
-                size = min(maps[0].file_size, DEFLATE * maps[0].compress_size)
-                return read_array(path, archive.open(maps[0]), size)
-    except ValueError:
-        raise
-    except Exception as error:  # a broken archive fails in many ways, all with the same meaning
-        raise ValueError(f"{path} is not a whole .npz archive; save the field with numpy.savez") from error
-    names = ", ".join(member.filename[:24].removesuffix(".npy") for member in (maps or members)[:4]) or "nothing"
-    raise ValueError(f"{path} needs exactly one 2-D array, got {len(maps)} among {len(members)} arrays ({names})")
-
-
-def read_array(path, stream, size):
-    """Open .npy stream of so many bytes, at most -> array."""
-    shape, fortran, dtype = _header(path, stream)
-    promised, held = prod(shape) * dtype.itemsize, max(size - stream.tell(), 0)
-    if promised > held:
-        raise ValueError(f"{path} promises {promised} bytes of data in its header, but holds {held}")
-    _check_shape(path, shape)
-    data = stream.read(promised)
-    if len(data) < promised:
-        raise ValueError(f"{path} ends before the data that its header promises")
-    return np.ndarray(shape, dtype, data, order="F" if fortran else "C")
-
-
-def _header(path, stream):
-    """(shape, whether in Fortran order, dtype) that a .npy header promises. Nothing behind the header is read."""
-    try:
-        form = np.lib.format
-        shape, fortran, dtype = getattr(form, "read_array_header_{}_{}".format(*form.read_magic(stream)))(stream)
-    except Exception as error:  # whatever goes wrong in foreign bytes means the same
-        raise ValueError(f"{path} has no readable .npy header (a pickle?); save the field with numpy.save") from error
-    if not all(0 <= n < 2**63 for n in shape):
-        raise ValueError(f"{path} promises an array of shape {str(shape)[:40]}, which cannot be")
-    if dtype.hasobject:
-        raise ValueError(f"{path} holds Python objects, which are never unpickled here; save it as floats")
-    if dtype.kind not in "biuf":
-        raise ValueError(f"{path} needs real numbers, got dtype {str(dtype)[:40]}; save it as floats")
-    return shape, fortran, dtype
-
-
-def _png(path, stream):
-    head = stream.read(24)
-    if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n":
-        raise ValueError(f"{path} is not a PNG picture")
-    _check_shape(path, [int.from_bytes(size, "big") for size in (head[16:20], head[20:])])
-    try:
-        return plots.read_picture(path)[::-1].T
-    except ImportError:
-        raise
-    except Exception as error:  # a broken picture fails in many ways, all with the same meaning
-        raise ValueError(f"{path} is not a whole PNG picture") from error
-
-
-def _check_shape(path, shape):
-    if prod(shape) > MOST:
-        raise ValueError(f"{path} holds {prod(shape)} values, at most {MOST} are taken; thin it out first")
-    if len(shape) != 2:
-        raise ValueError(f"{path} needs a 2-D array, got shape {shape}")
+def _archive(path):
+    """Path of a .npz file -> {name: array}."""
+    with np.load(path) as archive:
+        return {name: archive[name] for name in archive.files}
