@@ -50,29 +50,31 @@ class Loops:
 
     @cached_property
     def components(self):
-        found, starts = [], (0, 0, 0)
+        found, starts = [], [0, 0, 0]
         for lattice in lattices(self.setting):
             rows, cells, speed, wall = [], prod(lattice.shape), 0, 0
             tables: list = []
             for number, axis in enumerate(lattice.axes):
-                stride, points, sides = prod(lattice.shape[number + 1 :]), axis.widths.size, axis.sides
-                last, walls = number == len(lattice.axes) - 1, cells // points
-                extra = 0 if self.points else stride * (sides - points)
-                given = [not (axis.periodic or closed) for closed in axis.closed]
+                stride, points = prod(lattice.shape[number + 1 :]), axis.widths.size
+                walls, ends = cells // points, [fluxes.ROUND] * 2
+                extra = 0 if self.points else stride * (axis.sides - points)
+                if not axis.periodic:
+                    ends = [fluxes.ITSELF if shut else at for shut, at in zip(axis.closed, (wall, wall + walls))]
+                    wall += 2 * walls
                 lines = self._lines(axis)
-                rows.append([points, stride, last, axis.periodic, not self.points, False, speed, extra])
-                rows[-1] += [wall, wall + walls, *given, sum(len(table) for table in tables), len(lines) > 1]
+                rows.append([points, stride, not self.points, speed, extra, *ends])
+                rows[-1] += [sum(len(table) for table in tables), len(lines) > 1, False]
                 tables.append(lines)
                 speed += cells + extra * (walls // stride)
-                wall += 0 if axis.periodic else 2 * walls
-            ends = starts[0] + cells, starts[1] + wall, starts[2] + speed
-            free = np.zeros(0, bool) if lattice.solid is None else lattice.open.ravel()
+            stops = [starts[0] + cells, starts[1] + wall, starts[2] + speed]
+            shape = 2 * len(lattice.axes), -1 if lattice.solid is not None else 0
+            free = np.reshape([] if lattice.solid is None else lattice.open, shape).astype(bool)
             tiles = cells // lattice.shape[-1] * -(-lattice.shape[-1] // fluxes.TILE)
             table, axes = np.concatenate(tables).T.copy(), np.array(rows, np.int64)
             axes[:, fluxes.UNEVEN] = free.size or any(np.any(x[:, :4] != x[0, 0]) for x in tables)
-            field, inflow, speeds = map(slice, starts, ends)
+            field, inflow, speeds = map(slice, starts, stops)
             found.append(Component(field, inflow, speeds, free, table, axes, tiles))
-            starts = ends
+            starts = stops
         return found
 
     def _lines(self, axis):
@@ -87,18 +89,27 @@ class Loops:
         """For each component the slopes and (steep) their derivatives in a and b; empty for a scheme of first order."""
         found = []
         for part in self.components:
-            size = part.axes.shape[0] * (part.field.stop - part.field.start) if self.limiter else 0
-            arrays = [results.empty((self.many * many * size,), float) for many in (1, 2 * steep)]
+            axes, cells = len(part.axes), part.field.stop - part.field.start if self.limiter else 0
+            shapes = (axes, self.many, cells), (axes, self.many, 2, cells * steep)
+            arrays = [results.empty(shape, float) for shape in shapes]
             if self.limiter:
-                args = u[part.field], inflow[part.inflow], part.free, part.table, part.axes, self.many
-                part.run(self.limiter, *args, *arrays)
+                part.run(self.limiter, u[part.field], inflow[part.inflow], part.free, part.table, part.axes, *arrays)
             found.append(arrays)
         return found
 
     def _given(self, part, u, inflow, w, slopes, dt):
         """What the loops over fields and velocities begin with."""
-        numbers = u[part.field], inflow[part.inflow], w[part.speed], part.free, slopes
-        return *numbers, self.many, dt, part.table, part.axes, self.flux
+        return (
+            u[part.field],
+            inflow[part.inflow],
+            w[part.speed],
+            part.free,
+            slopes,
+            dt,
+            part.table,
+            part.axes,
+            self.flux,
+        )
 
     def stage(self, u, slopes, w, dt, inflow, u0, keep, out):
         """out = keep u0 + (1 - keep) (u + dt du/dt); how many points have too small a weight or an infinite value."""
@@ -120,4 +131,4 @@ class Loops:
             targets = gu[part.field], ginflow[part.inflow], gw[part.speed]
             part.run(fluxes.pull, g[part.field], *given, *targets, fresh, steep)
             if steep.size and gu.size:
-                part.run(fluxes.jumps, steep, self.many, part.free, part.axes, *targets[:2])
+                part.run(fluxes.jumps, steep, part.free, part.axes, *targets[:2])
