@@ -374,16 +374,16 @@ def cell_widths(shape, size, spacing):
     else:
         if len(shape) == 1 and isinstance(spacing, np.ndarray) and spacing.ndim == 1:
             spacing = [spacing]  # in 1-D an array is the widths themselves
-        entries = per_axis(1.0 if spacing is None else spacing, shape, "grid")
+        entries = per_axis(1.0 if spacing is None else spacing, shape, "spacing")
         widths = [_axis_widths(n, entry, axis) for n, entry, axis in zip(shape, entries, AXES, strict=False)]
     for line in widths:
-        _positive("grid", line)
+        _positive("spacing", line)
         line.flags.writeable = False
     return tuple(widths)
 
 
 def _axis_widths(n, entry, axis):
-    line = np.array(real_numbers(entry, "grid", "spacing=0.5"), dtype=float)
+    line = np.array(real_numbers(entry, "spacing", "spacing=0.5"), dtype=float)
     if line.ndim == 0:
         return np.full(n, float(line))
     if line.shape != (n,):
