@@ -1,11 +1,11 @@
-"""Fused sums and elimination along an axis: against NumPy and dense algebra, compiled and not."""
+"""Norms taken on the way, and elimination along an axis: against NumPy and dense algebra, compiled and not."""
 
 import numpy as np
 import pytest
 
 from sparsedp import kernels
-from sparsedp.kernels import team
 from sparsedp.kernels.reference import Tridiagonal
+from sparsedp.solvers.scaling import norm, remainder, subtracted
 from sparsedp.solvers.separable import Sweep
 
 NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
@@ -13,33 +13,25 @@ SIZES = (0, 1, 4097, 40_000)
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_sums_on_the_way(size, rng):
+def test_norms_on_the_way(size, rng):
     x, b = rng.standard_normal((2, size))
-    total, square = kernels.totals(x)
-    assert np.isclose(total, x.sum(), atol=1e-10) and np.isclose(square, x @ x) and kernels.squares(x) == square
     fresh, same = np.empty(size), x.copy()
-    assert np.isclose(kernels.lowered(x, 0.3, fresh), fresh @ fresh) and np.array_equal(fresh, x - 0.3)
-    assert np.isclose(kernels.lowered(same, 0.3, same), fresh @ fresh) and np.array_equal(same, fresh)
+    assert np.isclose(subtracted(x, 0.3, fresh), np.linalg.norm(fresh)) and np.array_equal(fresh, x - 0.3)
+    assert subtracted(same, 0.3, same) == norm(fresh) and np.array_equal(same, fresh)
     rest = fresh.copy()
-    assert np.allclose(kernels.remainder(b, rest, x), (x @ x, rest @ rest)) and np.array_equal(rest, b - fresh)
+    assert np.allclose(remainder(b, rest, x), (np.linalg.norm(b - fresh), np.linalg.norm(x)))
+    assert np.array_equal(rest, b - fresh)
+    z, rest = x + 1j * b, b + 1j * x
+    assert np.isclose(norm(z), np.linalg.norm(z))
+    assert np.allclose(remainder(z, rest, z), (np.linalg.norm(z - (b + 1j * x)), np.linalg.norm(z)))
 
 
 def test_what_is_not_finite_stays_so():
-    x = np.zeros(40_000)
-    x[20_000] = np.nan
-    assert np.isnan(kernels.squares(x))
-    x[20_000] = -np.inf
-    assert kernels.totals(x) == (-np.inf, np.inf)
-
-
-@NUMBA
-def test_compiled_sums_do_not_depend_on_the_threads(rng, monkeypatch):
-    monkeypatch.setattr(team, "SERIAL", 0)
-    x, found = rng.standard_normal(70_001), []
-    for threads in (1, None):
-        kernels.set_threads(threads)
-        found.append(kernels.totals(x))
-    assert found[0] == found[1] and np.allclose(found[0], (x.sum(), x @ x), rtol=1e-12)
+    for value in (np.nan, np.inf):
+        x = np.zeros(40_000)
+        x[20_000] = value
+        assert not np.isfinite(norm(x)) and not np.isfinite(subtracted(x, 1.0, x.copy()))
+    assert norm(np.full(9, 1e200)) == np.inf
 
 
 def bands(rng, n, periodic, uniform):

@@ -13,24 +13,16 @@ import os
 import numpy as np
 
 from sparsedp.kernels import reference
-from sparsedp.kernels.reference import CHUNK, LOWERED, REMAINDER, TOTALS
 
 __all__ = [
     "along_axis",
     "compiled",
     "kronecker_sum",
-    "lowered",
-    "remainder",
     "run",
     "set_threads",
-    "squares",
     "sweep",
     "threads",
-    "totals",
 ]
-
-FEW = 16384  # numbers that are not worth a compiled sum, and not the import of numba
-NONE = np.empty(0)
 
 
 @functools.cache
@@ -206,65 +198,3 @@ def sweep(x, lower, upper, inverses, column, row, ends):
     given = x, lower, upper, inverses, column, row, ends
     if not x.size or not run("elimination", "eliminate", x.shape[1], x.size, threads(), *given):
         reference.eliminate(*given)
-
-
-def squares(x):
-    """Flat float64 array -> the sum of its squares.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> print(squares(np.array([3.0, -4.0])))
-    25.0
-    """
-    return totals(x)[1] if x.size > FEW else reference.square(x)
-
-
-def totals(x):
-    """Flat float64 array -> its sum and the sum of its squares, in one pass.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> print(*totals(np.array([3.0, -4.0])))
-    -1.0 25.0
-    """
-    return _measure(TOTALS, NONE, x, 0.0, NONE)
-
-
-def lowered(x, number, out):
-    """out = x - number -> the sum of its squares. `out` may be `x`; all flat and float64.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> out = np.zeros(2)
-    >>> print(lowered(np.array([1.0, 3.0]), 2.0, out), out)
-    2.0 [-1.  1.]
-    """
-    if out is not x:
-        np.copyto(out, x)
-    return _measure(LOWERED, NONE, out, number, out)[1]
-
-
-def remainder(b, out, x):
-    """out = b - out -> the sum of the squares of x, and that of out. All flat and float64.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> out = np.array([1.0, 2.0])
-    >>> print(*remainder(np.array([4.0, 6.0]), out, np.array([2.0, 0.0])), out)
-    4.0 25.0 [3. 4.]
-    """
-    return _measure(REMAINDER, b, x, 0.0, out)
-
-
-def _measure(*given):
-    """Mode, b, x, number, out -> two sums; see `sparsedp.kernels.reductions`."""
-    x = given[2]
-    sums = np.empty((2, -(-x.size // CHUNK)))
-    if x.size > FEW and x.flags.c_contiguous:
-        if run("reductions", "measure", sums.shape[1], x.size, threads(), *given, sums):
-            return float(sums[0].sum()), float(sums[1].sum())
-    return reference.measure(*given)

@@ -6,24 +6,12 @@ import numpy as np
 import scipy.sparse as sp
 
 __all__ = [
-    "CHUNK",
-    "LOWERED",
-    "REMAINDER",
-    "TOTALS",
     "Rows",
     "Tridiagonal",
     "eliminate",
     "kronecker_sum",
-    "measure",
     "product_along",
-    "square",
 ]
-
-SHORT = 8192  # numbers that BLAS sums up on one thread
-
-
-CHUNK = 4096  # numbers whose sums are kept apart
-TOTALS, LOWERED, REMAINDER = range(3)  # what is done on the way over an array that is summed up
 
 
 class Rows(NamedTuple):
@@ -94,22 +82,3 @@ def eliminate(x, lower, upper, inverses, column, row, ends):
     for i in range(n - 2, -1, -1):
         others = upper[i] * x[i + 1] if i < n - 1 - cyclic else 0.0
         x[i] -= (others + column[i] * x[-1] if cyclic else others) * inverses[i]
-
-
-def measure(mode, b, x, number, out):
-    """Two sums. TOTALS: of x, x^2; LOWERED: out -= number, of out^2; REMAINDER: out = b - out, of x^2, out^2."""
-    with np.errstate(over="ignore"):  # the caller sees inf, or did not ask for the sum
-        if mode == LOWERED:
-            np.subtract(out, number, out=out)
-            return 0.0, square(out)
-        if mode == TOTALS:
-            return float(x.sum()), square(x)
-        np.subtract(b, out, out=out)
-        return square(x), square(out)
-
-
-def square(x):
-    """The sum of squares of a flat array."""
-    if x.size <= SHORT and x.flags.c_contiguous:
-        return float(x.dot(x))
-    return float(np.einsum("i,i", x, x))  # not by BLAS, whose threads stall those of the kernels

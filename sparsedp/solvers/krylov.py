@@ -14,10 +14,9 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.fields import is_whole
-from sparsedp.kernels.reference import SHORT
 from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.scaling import inverted, norm
+from sparsedp.solvers.scaling import BLOCK, inverted, norm
 from sparsedp.solvers.solve import Engine
 from sparsedp.structure.base import probes
 from sparsedp.tape import plain
@@ -252,7 +251,7 @@ def _preconditioner(system, given):
 
 def dot(x, y):
     """Inner product; without BLAS where that would start threads, which stall compiled kernels."""
-    return float(x.dot(y) if x.size <= SHORT else np.einsum("i,i->", x, y))
+    return float(x.dot(y) if x.size <= BLOCK else np.einsum("i,i->", x, y))
 
 
 def _without_descent(pq, rz, p, q, r, z):

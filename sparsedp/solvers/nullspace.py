@@ -11,8 +11,7 @@ import numpy as np
 from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 
-from sparsedp import kernels
-from sparsedp.solvers.scaling import norm
+from sparsedp.solvers.scaling import norm, subtracted
 
 __all__ = ["NullSpace", "find_null_space"]
 
@@ -57,7 +56,7 @@ class NullSpace:
         if not np.isscalar(side):
             return self._dots(side, b)
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
-            return np.array([side * (b.sum() if b.dtype.kind == "c" else kernels.totals(b)[0])])
+            return np.array([side * b.sum()])
 
     def project(self, b, transposed=False, into=None):
         """Take out, component by component, the part along the null space. The same map for b and x.
@@ -74,7 +73,7 @@ class NullSpace:
         shares = sums / self._products
         if np.isscalar(right) and real:
             into = np.empty_like(b) if into is None else into
-            return into, float(np.sqrt(kernels.lowered(b, right * shares[0], into)))
+            return into, subtracted(b, right * shares[0], into)
         part = right * (shares[0] if self.count == 1 else np.append(shares, 0.0)[self.labels])
         b = np.subtract(b, part, out=into)
         return b, norm(b)

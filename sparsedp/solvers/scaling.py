@@ -1,22 +1,45 @@
-"""Sizes of arrays and their scaling by powers of two, which is exact."""
+"""Sizes of arrays and their scaling by powers of two, which is exact.
+
+Sums of squares are taken block by block: what the first look at a block loads, the second finds in the cache, and BLAS
+does not wake its threads for so few numbers: they would stall those of compiled kernels.
+"""
 
 import numpy as np
 
-from sparsedp import kernels
+__all__ = [
+    "BLOCK",
+    "far_exponent",
+    "in_range",
+    "inverted",
+    "largest",
+    "length",
+    "norm",
+    "remainder",
+    "shifted",
+    "subtracted",
+]
 
-__all__ = ["far_exponent", "in_range", "inverted", "largest", "length", "norm", "remainder", "shifted"]
-
+BLOCK = 8192  # numbers that BLAS sums up on one thread
 SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve computes leaves the range of floats
 
 
+def _blocks(*arrays):
+    """The parts of flat arrays of the same size that belong together."""
+    for start in range(0, arrays[0].size, BLOCK):
+        yield [x[start : start + BLOCK] for x in arrays]
+
+
+def _square(x):
+    """Sum of the squares of the magnitudes."""
+    return np.vdot(x, x).real
+
+
 def norm(x):
-    """2-norm of a flat array in one pass, without threads of BLAS: they would stall compiled kernels.
+    """2-norm of a flat array in one pass.
 
     Squares may leave the range of floats (`tree.norm` does not let them); the caller asks `in_range`, and scales.
     """
-    x = x.view(float) if x.dtype.kind == "c" else x
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
-        return float(np.sqrt(kernels.squares(x)))
+    return float(np.sqrt(sum(_square(part) for (part,) in _blocks(x))))
 
 
 def length(x):
@@ -28,12 +51,22 @@ def length(x):
 
 def remainder(b, out, x):
     """out = b - out, in place -> its norm and that of x. All flat."""
-    if out.dtype.kind == "c":
-        np.subtract(b, out, out=out)
-        return norm(out), norm(x)
-    with np.errstate(over="ignore", invalid="ignore"):
-        solution, rest = kernels.remainder(b, out, x)
+    rest = solution = 0.0
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
+        for given, part, values in _blocks(b, out, x):
+            np.subtract(given, part, out=part)
+            rest, solution = rest + _square(part), solution + _square(values)
     return float(np.sqrt(rest)), float(np.sqrt(solution))
+
+
+def subtracted(x, number, out):
+    """out = x - number -> its norm. `out` may be `x`; both flat."""
+    total = 0.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        for given, part in _blocks(x, out):
+            np.subtract(given, number, out=part)
+            total += _square(part)
+    return float(np.sqrt(total))
 
 
 def in_range(size):
