@@ -32,10 +32,8 @@ class Component(NamedTuple):
     tiles: int
 
     def run(self, loop, *args):
-        """A loop over the tiles; how many numbers it finds wrong."""
-        wrong = np.empty(self.tiles)
-        loop.run(self.tiles, self.field.stop - self.field.start, kernels.threads(), *args, wrong)
-        return wrong.sum()
+        """A loop over the tiles."""
+        loop.run(self.tiles, self.field.stop - self.field.start, kernels.threads(), *args)
 
 
 class Loops:
@@ -113,12 +111,13 @@ class Loops:
 
     def stage(self, u, slopes, w, dt, inflow, u0, keep, out):
         """out = keep u0 + (1 - keep) (u + dt du/dt); how many points have too small a weight or an infinite value."""
-        wrong = 0.0
+        total = 0.0
         for part, (values, _) in zip(self.components, slopes, strict=True):
+            wrong = np.empty(part.tiles)
             given = self._given(part, u, inflow, w, values, dt)
-            rest = self.least, u0[part.field], keep, out[part.field]
-            wrong += part.run(fluxes.stage, *given, *rest)
-        return wrong
+            part.run(fluxes.stage, *given, self.least, u0[part.field], keep, out[part.field], wrong)
+            total += wrong.sum()
+        return total
 
     def pull(self, g, u, slopes, w, dt, inflow, gu, ginflow, gw, fresh):
         """The cotangent of u + dt du/dt -> that of u into gu, those of the rest added to theirs.

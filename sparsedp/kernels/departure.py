@@ -25,18 +25,12 @@ TILE = 256  # points; up to 24 rows of 2 KB are in use at a time, which fits the
 NONE, NO_BOUNDS = np.empty(0), np.empty((2, 0))
 
 # The weights of the four samples from the one before the cell on: coefficients of 1, t, t^2, t^3 in the fraction t of
-# the cell, and the weight at a point (t = 0): for the value and for the slope. A linear slope jumps at the points.
-_ZERO = (0.0,) * 5
+# the cell. At a point (t = 0) the second sample counts alone; the slope there is the mean of both sides.
 WEIGHTS = {
-    "linear": (
-        (_ZERO, (1, -1, 0, 0, 1), (0, 1, 0, 0, 0), _ZERO),
-        ((0, 0, 0, 0, -0.5), (-1, 0, 0, 0, 0), (1, 0, 0, 0, 0.5), _ZERO),
-    ),
-    "cubic": (
-        ((0, -0.5, 1, -0.5, 0), (1, 0, -2.5, 1.5, 1), (0, 0.5, 2, -1.5, 0), (0, 0, -0.5, 0.5, 0)),
-        ((-0.5, 2, -1.5, 0, -0.5), (0, -5, 4.5, 0, 0), (0.5, 4, -4.5, 0, 0.5), (0, -1, 1.5, 0, 0)),
-    ),
+    "linear": ((0, 0, 0, 0), (1, -1, 0, 0), (0, 1, 0, 0), (0, 0, 0, 0)),
+    "cubic": ((0, -0.5, 1, -0.5), (1, 0, -2.5, 1.5), (0, 0.5, 2, -1.5), (0, 0, -0.5, 0.5)),
 }
+AT_POINTS = ((0, 1, 0, 0), (-0.5, 0, 0.5, 0))
 
 
 class Points(NamedTuple):
@@ -47,7 +41,7 @@ class Points(NamedTuple):
     size: int  # number of points
     samples: int  # number of points and ghost cells
     axes: Any  # for each of three axes: points, stride, periodic, which of the four samples count, from and to
-    weights: Any  # a table of the value and one of the slope
+    weights: Any  # of the value and of the slope: for each sample the four coefficients, and the weight at a point
 
     @classmethod
     def of(cls, shape, periodic, interpolation):
@@ -56,7 +50,9 @@ class Points(NamedTuple):
         strides = [prod(padded[axis + 1 :]) for axis in range(len(shape))]
         axes = [(n, stride, wraps, *used) for n, stride, wraps in zip(shape, strides, periodic, strict=True)]
         axes = [(1, 0, 0, 1, 2)] * (3 - len(shape)) + axes
-        weights = np.array(WEIGHTS[interpolation], float)
+        value = np.array(WEIGHTS[interpolation], float)
+        slope = np.append(value[:, 1:] * (1, 2, 3), np.zeros((4, 1)), 1)
+        weights = np.concatenate([[value, slope], np.reshape(AT_POINTS, (2, 4, 1))], 2)
         return cls(tuple(shape), padded, prod(shape), prod(padded), np.array(axes), weights)
 
     @property

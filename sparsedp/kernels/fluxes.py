@@ -42,7 +42,7 @@ __all__ = [
 
 TILE = 512  # cells that are worked on at a time: what one loop leaves in a line, the next finds in the cache
 LINE = TILE + 72  # of lines that start a power of 2 apart the cache keeps few
-NONE, ONE, TWO, THREE = (uint64(k * LINE) for k in range(4))  # where lines start
+NONE, ONE, TWO = (uint64(k * LINE) for k in range(3))  # where lines start
 
 
 # Columns of `axes`, which has a row for each axis of a component: its cells; the distance of neighbours in the field;
@@ -175,15 +175,6 @@ def differences(steep, a, c, asked, line, size):
             steep[a, last, by, c + j] = line[j]
 
 
-def put(line, x, start, b, e):
-    """A line goes into x; how many of its numbers are infinite."""
-    bad = 0
-    for j in range(b, e):
-        x[start + j] = line[j]
-        bad += not abs(line[j]) < np.inf
-    return bad
-
-
 def share(flow):
     """How much of the value at a side is that of the cell beyond it, by the velocity into the cell; at rest half."""
     return 0.5 * (flow > 0.0) + 0.5 * (flow >= 0.0)
@@ -191,7 +182,7 @@ def share(flow):
 
 limiter = van_leer  # in the loop over slopes: stands for the function of the scheme it is compiled for
 USES: dict[str, Any] = {
-    f.__name__: f for f in (tile_of, pieces_of, place_of, side_of, sides_of, weigh, differences, put, share)
+    f.__name__: f for f in (tile_of, pieces_of, place_of, side_of, sides_of, weigh, differences, share)
 }
 # A product and a sum are one instruction: the same bits everywhere. What is called is put where it is called.
 OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "forceinline": True}
@@ -256,20 +247,20 @@ def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, ou
 
 
 @kernel(
-    "read1 read1 read1 read1 mask2 read3 real read2 index2 real write1 write1 write1 flag write4 write1",
+    "read1 read1 read1 read1 mask2 read3 real read2 index2 real write1 write1 write1 flag write4",
     uses=USES,
     **OPTIONS,
 )
-def pull(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, fresh, steep, wrong, start, stop):
+def pull(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, fresh, steep, start, stop):
     """The cotangent of u' -> those of u with constant slopes, of the inflow (added) and of w (added or, fresh, set).
 
     gu, gw: empty where they are not wanted. The cotangents of a and b are left in the last slopes of `steep`.
     """
-    memory, lines, uneven, rest = np.empty((4, LINE)), np.empty(4 * LINE), axes[0, UNEVEN], 1.0 - flux
+    memory, lines, uneven, rest = np.empty((4, LINE)), np.empty(2 * LINE), axes[0, UNEVEN], 1.0 - flux
     field, line, asked, given, many = memory[0], memory[1], memory[2:], lines if uneven else g, slopes.shape[1]
     for part in range(start, stop):
         first, length = tile_of(axes, part)
-        c, size, bad = uint64(first), uint64(length), 0
+        c, size = uint64(first), uint64(length)
         for j in range(size):
             field[j] = g[c + j]
         for a in range(len(axes)):
@@ -279,28 +270,25 @@ def pull(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, 
                 b, e, below, above = sides_of(axes, a, number, first, length, where)
                 if b == e:
                     continue
-                # where the cells, those below and those above have what they want of a flow of 1
-                x, y, i, k = c, c, below.beyond, above.beyond
-                if uneven:
-                    for row, begin in enumerate((c, c, i, k)):
-                        weigh(lines, uint64(row * LINE), g, begin, table, OWN + row, axes, a, where[0], free, c, b, e)
-                    x, y, i, k = NONE, ONE, TWO, THREE
-                m, h = below.speed, above.speed
-                o, far = (m, h) if on_sides else (cells + below.beyond, cells + above.beyond)
-                for j in range(b, e if gu.size else b):
-                    more = below.inner * max(-w[o + j], 0.0) * given[i + j]
-                    more += above.inner * max(w[far + j], 0.0) * given[k + j]
-                    less = (max(w[m + j], 0.0) - flux * w[m + j]) * given[x + j]
-                    field[j] += ratio * (more - less - (max(-w[h + j], 0.0) + flux * w[h + j]) * given[y + j])
                 for upper in range(2):
-                    one, m, o, x, i, sign = (above, h, far, y, k, -1.0) if upper else (below, m, o, x, i, 1.0)
-                    z, inner, into = one.beyond, one.inner, sign * ratio
+                    z, m, wall, inner, shown = above if upper else below
+                    # where the cells and those beyond have what they want of a flow of 1
+                    x, i, sign = c, z, 1.0 - 2.0 * upper
+                    if uneven:
+                        for row, begin in enumerate((c, z)):
+                            line_of, row_of = uint64(row * LINE), OWN + 2 * row + upper
+                            weigh(lines, line_of, g, begin, table, row_of, axes, a, where[0], free, c, b, e)
+                        x, i = NONE, ONE
+                    o, into = (m if on_sides else cells + z), sign * ratio
+                    for j in range(b, e if gu.size else b):
+                        more, flow = inner * max(-into * w[o + j], 0.0) * given[i + j], into * w[m + j]
+                        field[j] += more - (max(flow, 0.0) - flux * flow) * given[x + j]
                     for j in range(b, b if inner or not gu.size else e):
                         more = max(into * w[m + j], 0.0) * given[x + j]
-                        if one.shown:
+                        if shown:
                             field[j] += more
                         else:
-                            ginflow[one.wall + j] += more
+                            ginflow[wall + j] += more
                     for j in range(b, e if steep.size else b):
                         more = inner * max(-into * w[o + j], 0.0) * given[i + j]
                         asked[upper, j] = sign * (max(-into * w[m + j], 0.0) * given[x + j] - more)
@@ -309,34 +297,31 @@ def pull(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, 
                     back, added = on_sides * inner, not fresh or upper > on_sides
                     for j in range(b, e):  # the value at the side is that of the cell it comes from
                         near = share(sign * w[m + j])
-                        value = near * (one.shown * u[z + j]) + (1.0 - near) * u[c + j]
+                        value = near * (shown * u[z + j]) + (1.0 - near) * u[c + j]
                         mine, theirs = given[x + j], back * given[i + j]
                         line[j] = into * (mine * (value - rest * u[c + j]) - theirs * (value - rest * u[z + j]))
-                    for j in range(b, b if one.shown else e):
-                        line[j] += into * given[x + j] * (share(sign * w[m + j]) * inflow[one.wall + j])
+                    for j in range(b, b if shown else e):
+                        line[j] += into * given[x + j] * (share(sign * w[m + j]) * inflow[wall + j])
                     for j in range(b, e if slopes.size else b):
                         near = share(sign * w[m + j])
                         slope = near * inner * slopes[a, (1 - upper) % many, z + j]
                         slope -= (1.0 - near) * slopes[a, upper % many, c + j]
                         line[j] += ratio * (given[x + j] - back * given[i + j]) * slope
-                    for j in range(b, e if added else b):
-                        line[j] += gw[m + j]
-                    bad += put(line, gw, m, b, e)
+                    for j in range(b, e):
+                        gw[m + j] = line[j] + gw[m + j] if added else line[j]
             if steep.size:
                 differences(steep, a, c, asked, line, size)
-        wrong[part] = bad + put(field, gu, c, NONE, size if gu.size else NONE)
+        for j in range(size if gu.size else NONE):
+            gu[c + j] = field[j]
 
 
-@kernel("read4 mask2 index2 write1 write1 write1", uses=USES, **OPTIONS)
-def jumps(steep, free, axes, gu, ginflow, wrong, start, stop):
+@kernel("read4 mask2 index2 write1 write1", uses=USES, **OPTIONS)
+def jumps(steep, free, axes, gu, ginflow, start, stop):
     """The cotangents of a and b, the differences to the cells below and above, are added to those of u and inflow."""
-    memory, last = np.empty((2, LINE)), steep.shape[1] - 1
-    field, line = memory[0], memory[1]
+    line, last = np.empty(LINE), steep.shape[1] - 1
     for part in range(start, stop):
         first, length = tile_of(axes, part)
-        c, size = uint64(first), uint64(length)
-        for j in range(size):
-            field[j] = gu[c + j]
+        c = uint64(first)
         for a in range(len(axes)):
             where = place_of(axes, a, first)
             for number in range(2 * pieces_of(axes, a)):
@@ -348,13 +333,12 @@ def jumps(steep, free, axes, gu, ginflow, wrong, start, stop):
                 for j in range(b, e if free.size else b):
                     line[j] *= free[2 * a + upper, c + j]
                 for j in range(b, e if inner or not shown else b):
-                    field[j] += line[j]
+                    gu[c + j] += line[j]
                 for j in range(b, b if shown else e):
                     ginflow[wall + j] -= line[j]
-        wrong[part] = put(field, gu, c, NONE, size)
 
 
-def _slopes(u, inflow, free, table, axes, slopes, steep, wrong, start, stop):
+def _slopes(u, inflow, free, table, axes, slopes, steep, start, stop):
     """The slopes by `limiter` and, where steep is not empty, their derivatives."""
     memory, found, lines = np.empty((2, LINE)), np.empty((6, LINE)), np.ones(3 * LINE)
     many, every = slopes.shape[1], free[:, :0]
@@ -384,12 +368,11 @@ def _slopes(u, inflow, free, table, axes, slopes, steep, wrong, start, stop):
                 for j in range(size if steep.size else NONE):
                     steep[a, k % many, 0, c + j] = found[2 + 2 * k, j]
                     steep[a, k % many, 1, c + j] = found[3 + 2 * k, j]
-        wrong[part] = 0.0
 
 
 def slopes_of(name, function, **options):
     """The loop over the slopes of a scheme."""
-    words = "read1 read1 mask2 read2 index2 write3 write4 write1"
+    words = "read1 read1 mask2 read2 index2 write3 write4"
     return Kernel(_slopes, words, {**USES, "limiter": function}, f"slopes_{name}", **{**OPTIONS, **options})
 
 

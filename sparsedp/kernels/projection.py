@@ -24,14 +24,13 @@ def net_flow(x, x0, x1, x2, lines0, lines1, lines2, b, start, stop):
             for j in range(last):
                 row[j] = lower[j] * here[j] + upper[j] * ahead[j]
             row[last] = lower[last] * here[last] + upper[last] * here[(last + 1) % here.size]
-            if x1.size:
-                here, ahead, low, high = x1[i, k], x1[i, (k + 1) % x1.shape[1]], lines1[0, k], lines1[1, k]
-                for j in range(row.size):
-                    row[j] += low * here[j] + high * ahead[j]
-            if x0.size:
-                here, ahead, low, high = x0[i, k], x0[(i + 1) % x0.shape[0], k], lines0[0, i], lines0[1, i]
-                for j in range(row.size):
-                    row[j] += low * here[j] + high * ahead[j]
+            for faces, lines, place, after in ((x1, lines1, k, (0, 1)), (x0, lines0, i, (1, 0))):
+                if faces.size:
+                    n0, n1, here = faces.shape[0], faces.shape[1], faces[i, k]
+                    ahead = faces[(i + after[0]) % n0, (k + after[1]) % n1]
+                    low, high = lines[0, place], lines[1, place]
+                    for j in range(row.size):
+                        row[j] += low * here[j] + high * ahead[j]
             for j in range(row.size):
                 total += row[j] * row[j]
     for j in range(x.size):

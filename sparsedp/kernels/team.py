@@ -55,15 +55,12 @@ def _types(words, narrow):
     """Words such as "read3 write1 real int flag" -> types of numba; see `Kernel`."""
     from numba import types
 
-    found = {"int": types.int64, "real": types.float64, "flag": types.boolean}
-    kinds = {"": types.float64, "~": types.float32 if narrow else types.float64}
-    for dimensions in (1, 2, 3, 4):
-        for mark, kind in kinds.items():
-            found[f"{mark}read{dimensions}"] = types.Array(kind, dimensions, "C", readonly=True)
-            found[f"{mark}write{dimensions}"] = types.Array(kind, dimensions, "C")
-        found[f"index{dimensions}"] = types.Array(types.int64, dimensions, "C", readonly=True)
-        found[f"mask{dimensions}"] = types.Array(types.boolean, dimensions, "C", readonly=True)
-    return [found[word] for word in words.split()]
+    numbers = {"int": types.int64, "real": types.float64, "flag": types.boolean}
+    entries = {"read": types.float64, "write": types.float64, "index": types.int64, "mask": types.boolean}
+    for word in words.split():
+        kind, axes = word.strip("~")[:-1], word[-1]
+        entry = types.float32 if narrow and "~" in word else entries.get(kind)
+        yield numbers.get(word) or types.Array(entry, int(axes), "C", readonly=kind != "write")
 
 
 def kernel(words, **options):
