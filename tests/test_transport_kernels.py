@@ -36,7 +36,7 @@ def results(move, u, v, q):
     law, args = move.law, (u.ravel(), v.ravel(), 0.01, q)
     new = law.forward(*args)
     g = np.cos(np.arange(new.size))
-    tasks = ((0, 1, 2, 3), (0,), (1, 2), (2,), (3,))
+    tasks = ((0, 1, 3), (0,), (1,), (3,))
     return [new, *(np.ravel(x) for nums in tasks for x in law.pull(nums, g, *args))]
 
 
@@ -80,11 +80,10 @@ def test_the_reference_takes_over_where_nothing_can_be_compiled(monkeypatch):
 
 def test_parts_that_are_asked_alone_are_the_same():
     for move, u, v, q in scenes():
-        _, *all_four, field, velocity, dt, dt_alone, inflow = results(move, u, v, q)
-        np.testing.assert_array_equal(field, all_four[0])
-        np.testing.assert_array_equal(velocity, all_four[1])
-        np.testing.assert_allclose([dt, dt_alone], [all_four[2]] * 2, rtol=1e-12, atol=1e-13)
-        np.testing.assert_array_equal(inflow, all_four[3])
+        _, *all_three, field, velocity, inflow = results(move, u, v, q)
+        np.testing.assert_array_equal(field, all_three[0])
+        np.testing.assert_array_equal(velocity, all_three[1])
+        np.testing.assert_array_equal(inflow, all_three[2])
 
 
 def test_lines_that_are_short_everywhere():
@@ -129,11 +128,10 @@ def test_other_limiters(limiter, velocity, form, monkeypatch):
             for one, other in zip(found, results(*scene)):
                 np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)
         u, v, q = (x.ravel() for x in scene[1:])
-        along = {0: rng.normal(size=u.size), 1: rng.normal(size=v.size), 2: 0.3, 3: rng.normal(size=q.size)}
-        g = rng.normal(size=u.size)
-        back = law.pull((0, 1, 2, 3), g, u, v, 0.01, q)
+        along, g = {n: rng.normal(size=x.size) for n, x in ((0, u), (1, v), (3, q))}, rng.normal(size=u.size)
+        back = dict(zip(along, law.pull(tuple(along), g, u, v, 0.01, q)))
         ahead = law.push(along, u, v, 0.01, q)
-        np.testing.assert_allclose(g @ ahead, sum(np.sum(along[n] * back[n]) for n in along), rtol=1e-12)
+        np.testing.assert_allclose(g @ ahead, sum(along[n] @ back[n] for n in along), rtol=1e-12)
 
 
 @NUMBA

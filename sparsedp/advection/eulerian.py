@@ -23,10 +23,12 @@ from math import isfinite
 import numpy as np
 
 from sparsedp import results
-from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
+from sparsedp.advection.law import FIELD, INFLOW, VELOCITY, Law
 from sparsedp.advection.loops import Loops, able
 from sparsedp.advection.reference import Reference
-from sparsedp.advection.stability import check_numbers, check_result, check_weights
+from sparsedp.advection.stability import check_numbers, check_weights
+from sparsedp.fields import check_finite
+from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.tape import isbox
 
 __all__ = ["Eulerian"]
@@ -39,8 +41,8 @@ class Eulerian(Law):
 
     def __init__(self, setting):
         super().__init__(setting)
-        self.reference = Reference(setting, self.walls)
-        self.scheme = self.reference.scheme
+        self.scheme = SCHEMES[setting.scheme]
+        self.reference = Reference(self)
         self.linear = self.twice = self.scheme.limiter is None
 
     @cached_property
@@ -48,18 +50,15 @@ class Eulerian(Law):
         return Loops(self.reference)
 
     def forward(self, u, v, dt, inflow):
+        out, wrong = u, 0.0
         if able():
-            return self._forward(u, v, dt, inflow)
-        with np.errstate(all="ignore"):
-            found = self.reference.step(u, v, dt, inflow)
-        self._check(u, v, dt, inflow, found)
-        return found
-
-    def _forward(self, u, v, dt, inflow):
-        w, out, wrong = self.reference.on_sides(v), u, 0.0
-        for keep in self.scheme.stages:
-            x, out = out, results.empty(u.shape, float)
-            wrong += self.loops.stage(x, self.loops.slopes(x, inflow, False), w, dt, inflow, u, keep, out)
+            w = self.velocity(v)
+            for keep in self.scheme.stages:
+                x, out = out, results.empty(u.shape, float)
+                wrong += self.loops.stage(x, self.loops.slopes(x, inflow, False), w, dt, inflow, u, keep, out)
+        else:
+            with np.errstate(all="ignore"):
+                out, wrong = self.reference.step(u, v, dt, inflow), True
         if wrong or not isfinite(self._unseen(v, inflow)):
             self._check(u, v, dt, inflow, out)
         return out
@@ -68,7 +67,7 @@ class Eulerian(Law):
         """Name what a step has found wrong, and what it has not met."""
         check_numbers(self.setting, u, v, inflow)
         check_weights(self.setting, dt, self.reference.rate(v), self.scheme.most)
-        check_result(self.setting, out)
+        check_finite(self.name, out.reshape(self.setting.space.shape), "cannot represent the result")
 
     def _unseen(self, v, inflow):
         """Sum over what a step may leave out: inflow values at closed walls, velocities inside solids."""
@@ -78,12 +77,10 @@ class Eulerian(Law):
     def pull(self, nums, g, u, v, dt, inflow):
         if not able() or any(map(isbox, (g, u, v, dt, inflow))):
             return self.reference.pull(nums, g, u, v, dt, inflow)
-        w, field = self.reference.on_sides(v), FIELD in nums or INFLOW in nums
-        gw = results.empty(w.shape, float) if VELOCITY in nums or STEP in nums else NOTHING
+        w, field = self.velocity(v), FIELD in nums or INFLOW in nums
+        gw = results.empty(w.shape, float) if VELOCITY in nums else NOTHING
         of_field, of_inflow = self._pull(np.ascontiguousarray(g), u, w, dt, inflow, gw, field)
-        found = {FIELD: of_field, INFLOW: of_inflow, VELOCITY: self.reference.of_sides(gw) if gw.size else None}
-        if STEP in nums:  # a step is homogeneous in the velocity times dt
-            found[STEP] = float(np.vdot(v, found[VELOCITY])) / dt
+        found = {FIELD: of_field, INFLOW: of_inflow, VELOCITY: self.velocity_vjp(gw) if gw.size else None}
         return tuple(found[num] for num in nums)
 
     def _pull(self, g, u, w, dt, inflow, gw, field):

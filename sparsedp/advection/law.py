@@ -5,13 +5,18 @@ but for what it finds on the way: `u` of `space.size` numbers, `v` of the veloci
 `dt` a float > 0, `inflow` of `walls.size` numbers. Arguments are numbered 0 to 3 in that order.
 """
 
+from functools import cached_property
 from math import prod
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from sparsedp.advection.velocities import interpolation
 from sparsedp.fields import place
+from sparsedp.operators.boundary import solid_faces
 from sparsedp.space import Space
 
-__all__ = ["FIELD", "INFLOW", "STEP", "VELOCITY", "Law", "Setting", "component_shapes"]
+__all__ = ["FIELD", "INFLOW", "STEP", "VELOCITY", "Law", "Setting"]
 
 FIELD, VELOCITY, STEP, INFLOW = range(4)
 
@@ -37,6 +42,18 @@ class Setting(NamedTuple):
         return self.grid.cells if self.of == "cells" else self.grid.faces
 
     @property
+    def solid_points(self):
+        """Flat mask of the points of the field that are in a solid; None where there is none."""
+        if self.solid is None or self.of == "cells":
+            return None if self.solid is None else self.solid.ravel()
+        return np.logical_or(*solid_faces(self.grid, self.solid))
+
+    @property
+    def at_points(self):
+        """Whether the scheme needs the velocity at the points of the field; else on the sides of control volumes."""
+        return self.form is None or (self.form, self.velocity) == ("advective", "cells")
+
+    @property
     def velocity_shapes(self):
         """The shapes that a velocity may have."""
         shape = self.grid.shape
@@ -55,9 +72,10 @@ class Law:
     ``forward(u, v, dt, inflow)``
         The moved field.
     ``pull(nums, g, u, v, dt, inflow)``
-        Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed.
+        Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed. dt is not asked for:
+        a step depends on v dt alone, and `rule` derives it from v.
     ``push(tangents, u, v, dt, inflow)``
-        {number of an argument: tangent} -> tangent of the result.
+        {number of an argument: tangent} -> tangent of the result; dt as above.
     ``matrix(v, dt)``
         csr_array of the step in `u`, inflow 0; only where `linear`.
 
@@ -88,10 +106,18 @@ class Law:
         self.field_shapes, self.velocity_shapes = (setting.space.shape,), setting.velocity_shapes
         self.walls = wall_space(setting)
 
+    @cached_property
+    def between(self):
+        """Operator from the velocity as given to where the scheme needs it; None where that is the same."""
+        return interpolation(self.setting)
 
-def component_shapes(setting):
-    """Shape of every component of the moved field."""
-    return setting.space.parts
+    def velocity(self, v):
+        """Velocity as given -> that where the scheme needs it, axis by axis for each component; linear."""
+        return v if self.between is None else self.between.apply(v)
+
+    def velocity_vjp(self, g):
+        """Its transpose."""
+        return g if self.between is None else self.between.T.apply(g)
 
 
 def wall_space(setting):

@@ -13,16 +13,14 @@ A stage of a scheme with several is followed by a mean with the first field.
 """
 
 from functools import cached_property
-from math import prod
 
 import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.advection.lattice import beside, lattices
-from sparsedp.advection.velocities import interpolation
+from sparsedp.advection.lattice import components
 from sparsedp.derivative import pullback, pushforward
-from sparsedp.kernels.fluxes import SCHEMES
+from sparsedp.kernels.fluxes import OWN
 from sparsedp.tape import isbox, linear, plain
 
 __all__ = ["Reference"]
@@ -31,70 +29,50 @@ __all__ = ["Reference"]
 class Reference:
     """The formula in the head of this file, for plain and for traced flat arguments."""
 
-    def __init__(self, setting, walls):
-        self.setting, self.scheme, self.walls = setting, SCHEMES[setting.scheme], walls
-        self.points, self.limited = setting.velocity == "cells" and setting.form == "advective", self.scheme.limiter
-        self.flux = 1.0 if setting.form == "flux" else 0.0
+    def __init__(self, law):
+        self.setting, self.scheme, self.law = law.setting, law.scheme, law
+        self.limited = self.scheme.limiter
+        self.flux = 1.0 if self.setting.form == "flux" else 0.0
 
     @cached_property
-    def _between(self):
-        """From the velocity as given to that on sides (or points) and its transpose; None where they are the same."""
-        found = interpolation(self.setting)
-        return None if found is None else (found, sp.csr_array(found.T))
-
-    def on_sides(self, v):
-        """Velocity as given -> that on the sides of all components (or at their points), axis by axis."""
-        return v if self._between is None else self._between[0] @ v
-
-    def of_sides(self, gw):
-        """The cotangent of `on_sides` -> that of the velocity as given."""
-        return gw if self._between is None else self._between[1] @ gw
+    def components(self):
+        return components(self.setting, self.limited)
 
     @cached_property
-    def tables(self):
-        """For lower and upper sides (rows) of the points of all axes of all components: arrays, see `_table`."""
-        found, starts = [], {"point": 0, "wall": self.setting.space.size, "speed": 0, "row": 0}
-        for lattice in lattices(self.setting):
-            own = _numbers(starts, "point", lattice.shape)
-            found += [self._table(lattice, number, own, starts) for number in range(len(lattice.axes))]
-        return [np.concatenate([part.reshape(2, -1) for part in parts], 1) for parts in zip(*found, strict=True)]
-
-    def _table(self, lattice, number, own, starts):
-        """Of one axis: columns of points, of those beside them or walls, of slopes, of speeds; 1 / length; c and e."""
-        axis, many, walls, none = lattice.axes[number], list(lattice.shape), None, None
-        line = [2, *(-1 if a == number else 1 for a in range(own.ndim))]
-        if not axis.periodic:
-            ends = own.take([0], number), own.take([-1], number)
-            given = [_numbers(starts, "wall", end.shape) for end in ends]
-            walls = [end if closed else wall for end, closed, wall in zip(ends, axis.closed, given, strict=True)]
-            none = [np.full_like(end, -1) for end in ends]
-        many[number] = axis.widths.size if self.points else axis.sides
-        speeds = _numbers(starts, "speed", many)
-        at = np.arange(axis.widths.size) + [[0], [0 if self.points else 1]]
-        is_open = np.ones((2, *own.shape), bool) if lattice.solid is None else lattice.open[number]
-        z = np.where(is_open, beside(own, number, walls), own)
-        slope = np.where(is_open, beside(_numbers(starts, "row", own.shape), number, none), -1)
-        w = np.array([speeds.take(places, number, mode="wrap") for places in at])
-        lengths = axis.around if self.points and not self.limited else (axis.widths, axis.widths)
-        distance = np.broadcast_to(np.reshape(axis.distances, line), z.shape)
-        return np.array([own, own]), z, slope, w, is_open / np.reshape(lengths, line), distance
+    def _sides(self):
+        """For lower and upper sides (rows) of the points of all axes: where the points are, what is beyond the sides in
+        (field, inflow), whose slope acts there, the velocity, 1 / length, the distances c and e."""
+        found, rows = [], 0
+        for part in self.components:
+            for a in range(len(part.axes)):
+                own, sides = np.arange(part.field.start, part.field.stop), part.sides(a)
+                table = part.table[:, sides.column]
+                is_open = part.free[2 * a : 2 * a + 2] if part.free.size else np.ones((2, own.size), bool)
+                z = np.where(is_open, part.field.start + sides.beyond, own)
+                z = np.where(is_open & (sides.wall >= 0), self.setting.space.size + part.inflow.start + sides.wall, z)
+                slope = np.where(is_open & ~sides.at_wall, rows + sides.beyond, -1)
+                w, weights = part.speed.start + sides.speed, is_open * table[OWN : OWN + 2]
+                found.append((own[None], z, slope, w, weights, table[-2:]))
+                rows += own.size
+        return [np.concatenate(parts, 1) for parts in zip(*found, strict=True)]
 
     @cached_property
     def matrices(self):
         """From (field, inflow) to what is below and above, from the velocity to that over length, from points ..."""
-        own, z, slope, w, weight, _ = self.tables
-        n, rows = self.setting.space.size, np.arange(own.shape[1])
+        (own,), z, slope, w, weight, _ = self._sides
+        size, rows = self.setting.space.size, own.size
 
         def pick(columns, many, values):
             keep = (columns >= 0) & (values != 0)
-            return sp.csr_array((values[keep], (rows[keep], columns[keep].astype(np.int32))), (rows.size, many))
+            at = np.flatnonzero(keep), columns[keep].astype(np.int32)
+            return sp.csr_array((values[keep], at), (rows, many))
 
-        ones, speeds = np.ones(rows.size), [pick(w[side], 1 + w.max(), weight[side]) for side in range(2)]
+        ones, speeds = np.ones(rows), [pick(w[side], 1 + w.max(), weight[side]) for side in range(2)]
         return {
-            "own": pick(own[0], n, ones),
-            "z": [pick(side, n + self.walls.size, ones) for side in z],
-            "slope": [pick(side, rows.size, ones) for side in slope],
-            "speed": [x if self._between is None else sp.csr_array(x @ self._between[0]) for x in speeds],
+            "own": pick(own, size, ones),
+            "z": [pick(side, size + self.law.walls.size, ones) for side in z],
+            "slope": [pick(side, rows, ones) for side in slope],
+            "speed": [x if self.law.between is None else sp.csr_array(x @ self.law.between.matrix) for x in speeds],
         }
 
     @cached_property
@@ -126,7 +104,7 @@ class Reference:
     def _slopes(self, a, b):
         with np.errstate(all="ignore"):
             given = plain(a), plain(b)
-            ahead, behind, *slopes = self.limited(*given, *self.tables[-1])
+            ahead, behind, *slopes = self.limited(*given, *self._sides[-1])
         if isbox(a) or isbox(b):
             da, db = a - given[0], b - given[1]
             ahead, behind = ahead + slopes[0] * da + slopes[1] * db, behind + slopes[2] * da + slopes[3] * db
@@ -176,11 +154,4 @@ def _with(args, nums, some):
     found = list(args)
     for num, value in zip(nums, some, strict=True):
         found[num] = value
-    return found
-
-
-def _numbers(starts, name, shape):
-    """The next numbers of a kind, one for each place."""
-    found = starts[name] + np.arange(prod(shape)).reshape(shape)
-    starts[name] += found.size
     return found

@@ -1,8 +1,9 @@
 """A law -> one rule of the tape: cotangents of all requested arguments in one pass, tangents, second order."""
 
+import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.advection.law import FIELD, INFLOW
+from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY
 from sparsedp.advection.values import LETTERS, prepare, raised, result_like, unflatten
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import check_finite, surely_finite
@@ -25,7 +26,7 @@ def rule_of(law):
             if traced and not law.twice:
                 found = tuple(back(g) for back, _ in _turned(law, nums, flat))
             else:
-                found = law.pull(nums, g, *flat)
+                found = _pulled(law, nums, g, flat)
             for num, back in zip(nums, found, strict=True):
                 _check_slope(law, "the gradient in " + LETTERS[num], back, (g,))
             return tuple([unflatten(args[num], back) for num, back in zip(nums, found, strict=True)])
@@ -39,11 +40,22 @@ def rule_of(law):
             rules = zip(_turned(law, nums, flat), along.values(), strict=True)
             found = sum(ahead(tangent) for (_, ahead), tangent in rules)
         else:
+            if STEP in along:
+                along[VELOCITY] = along.get(VELOCITY, 0.0) + along.pop(STEP) / flat[STEP] * flat[VELOCITY]
             found = law.push(along, *flat)
         _check_slope(law, "the tangent", found, tangents)
         return unflatten(ans, found)
 
     return Rule(law.name, forward, vjp, jvp)
+
+
+def _pulled(law, nums, g, flat):
+    """Cotangents of the arguments `nums`. A step depends on the velocity times dt: that of dt follows from v's."""
+    asked = tuple({VELOCITY if num == STEP else num for num in nums})
+    found = dict(zip(asked, law.pull(asked, g, *flat), strict=True))
+    if STEP in nums:
+        found[STEP] = anp.dot(flat[VELOCITY], found[VELOCITY]) / flat[STEP]
+    return [found[num] for num in nums]
 
 
 def _check_slope(law, what, slope, given):

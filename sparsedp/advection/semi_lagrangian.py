@@ -23,11 +23,9 @@ import scipy.sparse as sp
 from sparsedp import results
 from sparsedp.advection.back_trajectory import Trajectory
 from sparsedp.advection.interpolant import Interpolant, Pass
-from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY, Law
+from sparsedp.advection.law import FIELD, INFLOW, VELOCITY, Law
 from sparsedp.advection.stability import check_numbers
-from sparsedp.advection.velocities import velocity_at_points
 from sparsedp.fields import surely_finite
-from sparsedp.operators.boundary import solid_faces
 
 __all__ = ["SemiLagrangian"]
 
@@ -42,16 +40,12 @@ class SemiLagrangian(Law):
 
     def __init__(self, setting):
         super().__init__(setting)
-        parts, solid = setting.space.parts, setting.solid
-        self.components = [Interpolant(setting, number) for number in range(len(parts))]
-        self.to_points = velocity_at_points(setting)
-        self.solid = None  # points that keep their value
-        if solid is not None:
-            self.solid = solid.ravel() if setting.of == "cells" else np.logical_or(*solid_faces(setting.grid, solid))
+        self.components = [Interpolant(setting, number) for number in range(len(setting.space.parts))]
+        self.solid = setting.solid_points  # they keep their value
 
     def _velocities(self, v):
         """Velocity as it is given -> for each component an array (axis, point)."""
-        return self._by_component(v if self.to_points is None else self.to_points.apply(v))
+        return self._by_component(self.velocity(v))
 
     def _by_component(self, v):
         dim = self.setting.grid.dim
@@ -80,7 +74,7 @@ class SemiLagrangian(Law):
 
     def pull(self, nums, g, u, v, dt, inflow):
         """Cotangent of the advected field -> those of the arguments `nums`."""
-        field, speed, g = FIELD in nums or INFLOW in nums, VELOCITY in nums or STEP in nums, np.ascontiguousarray(g)
+        field, speed, g = FIELD in nums or INFLOW in nums, VELOCITY in nums, np.ascontiguousarray(g)
         moved = g if self.solid is None else np.where(self.solid, 0.0, g)
         of_u, of_inflow = results.empty((u.size if field else 0,), float), np.zeros(inflow.size)
         of_w = results.empty((u.size * self.setting.grid.dim if speed else 0,), float)
@@ -89,20 +83,17 @@ class SemiLagrangian(Law):
         if field and self.solid is not None:
             of_u += g - moved
         found = {FIELD: of_u, INFLOW: of_inflow}
-        if speed:  # a step depends on the velocity times dt
-            found[VELOCITY] = of_w if self.to_points is None else self.to_points.T.apply(of_w)
-            found[STEP] = float(np.vdot(v, found[VELOCITY])) / dt
+        if speed:
+            found[VELOCITY] = self.velocity_vjp(of_w)
         return tuple(found[num] for num in nums)
 
     def push(self, tangents, u, v, dt, inflow):
         """{argument: tangent} -> tangent of the advected field."""
-        du, dv, ddt, dinflow = (
-            np.ascontiguousarray(tangents.get(num, np.zeros(np.shape(x)))) for num, x in enumerate((u, v, dt, inflow))
-        )
-        out, moves = np.empty(u.size), VELOCITY in tangents or STEP in tangents
-        changes = self._velocities(dv + ddt / dt * v)
-        for (span, passage), dw in zip(self._passes(u, v, dt, inflow), changes, strict=True):
-            out[span] = passage.jvp(du[span], dinflow, dw if moves else None)
+        given = {FIELD: u, VELOCITY: v, INFLOW: inflow}
+        du, dv, dinflow = (np.ascontiguousarray(tangents.get(num, np.zeros(x.size))) for num, x in given.items())
+        out = np.empty(u.size)
+        for (span, passage), dw in zip(self._passes(u, v, dt, inflow), self._velocities(dv), strict=True):
+            out[span] = passage.jvp(du[span], dinflow, dw if VELOCITY in tangents else None)
         return self._keep_solid(out, du)
 
     def matrix(self, v, dt):

@@ -6,7 +6,7 @@ from sparsedp.advection.lattice import place_words
 from sparsedp.errors import UnstableStepError
 from sparsedp.fields import check_finite, rounded_down
 
-__all__ = ["check_numbers", "check_result", "check_weights"]
+__all__ = ["ROUNDING", "check_numbers", "check_weights"]
 
 ROUNDING = 8 * np.finfo(float).eps  # CFL exactly 1 leaves a weight of about -1e-16
 
@@ -30,9 +30,3 @@ def check_weights(setting, dt, rate, share):
             f"points, most at {place_words(setting, worst)}; the largest stable dt is {largest}, "
             "or write unstable='allow'"
         )
-
-
-def check_result(setting, out):
-    """Refuse a result that overflows."""
-    needs = "cannot represent the result"
-    check_finite(f"transport {setting.scheme}", out.reshape(setting.space.shape), needs)

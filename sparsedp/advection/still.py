@@ -3,7 +3,7 @@
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.advection.law import FIELD, Law
+from sparsedp.advection.law import FIELD, INFLOW, VELOCITY, Law
 from sparsedp.advection.stability import check_numbers
 
 __all__ = ["Still"]
@@ -20,7 +20,7 @@ class Still(Law):
         return u + 0.0
 
     def pull(self, nums, g, u, v, dt, inflow):
-        found = g + 0.0, np.zeros(np.shape(v)), 0.0, np.zeros(np.shape(inflow))
+        found = {FIELD: g + 0.0, VELOCITY: np.zeros(np.shape(v)), INFLOW: np.zeros(np.shape(inflow))}
         return tuple(found[num] for num in nums)
 
     def push(self, tangents, u, v, dt, inflow):

@@ -15,25 +15,17 @@ from sparsedp.space import Space
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker, Term
 
-__all__ = ["interpolation", "velocity_at_points"]
-
-
-def velocity_at_points(setting):
-    """Setting -> Operator from the velocity as it is given to (component, axis, point); None when that is the same."""
-    if setting.velocity == setting.of and (setting.of == "cells" or setting.grid.dim == 1):
-        return None
-    return _operator(setting, _between)
+__all__ = ["interpolation"]
 
 
 def interpolation(setting):
-    """Setting -> csr_array from the velocity as it is given to that on the sides (or points) of control volumes, flat.
-
-    None where they are the same.
-    """
-    on_points = setting.velocity == "cells" and setting.form == "advective"
-    if setting.of == "cells" and (on_points or setting.velocity == "faces"):
+    """Setting -> Operator from the velocity as it is given to that where the scheme needs it, for each component of the
+    field axis by axis. None where that is the same."""
+    at_points = setting.at_points
+    alone = setting.of == "cells" or at_points and setting.grid.dim == 1
+    if alone and setting.velocity == (setting.of if at_points else "faces"):
         return None
-    return _operator(setting, _between if on_points else _onto_sides).matrix
+    return _operator(setting, _between if at_points else _onto_sides)
 
 
 def _operator(setting, line):
