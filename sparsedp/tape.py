@@ -11,6 +11,7 @@ from functools import partial, wraps
 
 import autograd.numpy as anp
 import numpy as np
+from autograd.core import VJPNode
 from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
 from autograd.tracer import box_types, getval, isbox, new_box
 
@@ -22,8 +23,8 @@ from sparsedp.shortcuts import NUMBERS, direct
 from sparsedp.tree import leaves
 
 __all__ = [
-    "Rule", "apply_operator", "called", "cast", "differentiable", "dtype_of", "fit", "is_variable", "isbox", "linear",
-    "of_argument", "plain",
+    "Rule", "apply_operator", "called", "cast", "differentiable", "dtype_of", "fit", "innermost", "is_variable",
+    "isbox", "linear", "of_argument", "plain", "through",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
@@ -150,6 +151,29 @@ _primitive = primitive(_run)
 _call = direct(_primitive, _run, box_types, new_box)
 
 
+def through(rule, *args):
+    """A call of a rule whose forward and VJP take values of outer traces, and hand their cotangents on.
+
+    Only the innermost trace, if it is a reverse-mode one, gets a node; all others go through those functions.
+    """
+    nums, values = innermost(args), list(args)
+    for num in nums:
+        values[num] = args[num]._value
+    ans = _run(rule, *values)
+    if not nums:
+        return ans
+    parents, places = tuple(args[num]._node for num in nums), tuple(num + 1 for num in nums)
+    node = type(parents[0])(ans, through, (rule, *values), {}, places, parents)
+    return new_box(ans, args[nums[0]]._trace, node)
+
+
+def innermost(values):
+    """Numbers of the values that are on the innermost trace of all, if that is a reverse-mode one."""
+    number = max((value._trace for value in values if isbox(value)), default=None)
+    nums = [num for num, value in enumerate(values) if isbox(value) and value._trace == number]
+    return nums if any(isinstance(values[num]._node, VJPNode) for num in nums) else []
+
+
 def _call_vjp(argnums, ans, args, kwargs):
     rule, nums = args[0], tuple([num - 1 for num in argnums])
     if rule.vjp is None:
@@ -188,6 +212,7 @@ def _call_jvp(argnums, tangents, ans, args, kwargs):
 
 
 defvjp_argnums(_primitive, _call_vjp)
+defvjp_argnums(through, _call_vjp)
 defjvp_argnums(_primitive, _call_jvp)
 
 
@@ -286,7 +311,7 @@ def _operator_jvp(argnums, tangents, ans, args, kwargs):
     return apply_operator(op.tangent, tangent) if isbox(tangent) else op.tangent.apply(tangent)
 
 
-sparing.update((_primitive, _operator))
+sparing.update((_primitive, _operator, through))
 defvjp_argnums(_operator, _operator_vjp)
 defjvp_argnums(_operator, _operator_jvp)
 
@@ -299,4 +324,4 @@ def is_variable(leaf):
 
 def called(fun, args):
     """The rule or Operator behind a node that called fun(*args); for autograd's own functions `fun`."""
-    return args[0] if fun in (_primitive, _operator) else fun
+    return args[0] if fun in (_primitive, _operator, through) else fun

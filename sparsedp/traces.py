@@ -23,11 +23,11 @@ __all__ = [
     "boxed",
     "forward_root",
     "growing",
-    "in_reverse",
     "new_trace",
     "reverse_root",
     "split_box",
     "trace",
+    "traces_of",
     "untraced",
 ]
 
@@ -129,13 +129,14 @@ def new_trace():
     return next(_numbers)
 
 
-def in_reverse(value):
-    """Whether a reverse-mode trace leads to a value, under other traces or not."""
-    while isbox(value):
-        if isinstance(value._node, VJPNode):
-            return True
-        value = value._value
-    return False
+def traces_of(values):
+    """The numbers of all traces that lead to some values."""
+    numbers = set()
+    for value in values:
+        while isbox(value):
+            numbers.add(value._trace)
+            value = value._value
+    return numbers
 
 
 def trace(fun, tree, roots):

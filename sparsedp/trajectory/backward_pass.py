@@ -1,12 +1,11 @@
 """The backward pass over all steps of a run."""
 
-from bisect import bisect
-from operator import length_hint
-
+import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.derivative import zero_like
 from sparsedp.ledger import active, count
-from sparsedp.tape import fit
+from sparsedp.tape import fit, isbox
 from sparsedp.traces import accumulate
 from sparsedp.trajectory.layout import fingerprint, refuse_lost
 from sparsedp.trajectory.progress import shown_steps
@@ -35,70 +34,65 @@ class BackwardPass:
         self.run, self.steps, self.kept, self.tapes = run, steps, kept, tapes
         self.recomputed = 0
         self.cotangents: dict = {}  # of params: root -> (sum so far, whether it may be written to)
-        pairs = zip(steps.x, steps.wants_input, strict=True)
-        self.inputs: list = [np.zeros_like(block) if root else None for block, root in pairs]
+        self.inputs: list = []
 
     def back(self, g):
         """Cotangents of the outputs -> those of all arguments, None where there is none."""
-        run, steps, tapes = self.run, self.steps, self.tapes
-        growth, many = Growth(run.n, run.truncate), len(self.kept) - 1
-        source = run.keep.source(run.n, g)
+        run, steps, tapes, n = self.run, self.steps, self.tapes, self.run.loop.n
+        zeros = [zero_like(block) if root else None for block, root in zip(steps.x, steps.input_roots, strict=True)]
+        traced = n and (steps.outer or any(map(isbox, g)))  # an array takes no traced values
+        self.inputs = [list(zero) if traced and zero is not None else zero for zero in zeros]
+        growth, many = Growth(n, run.loop.truncate), len(self.kept) - 1
+        source = run.keep.source(n, g)
         state = self.kept.pop()
         total = source(*state)
-        growth.see(run.n, total)
-        for i in shown_steps(run.progress, range(run.n - 1, -1, -1), "backward"):
+        growth.see(n, total)
+        for i in shown_steps(run.progress, range(n - 1, -1, -1), "backward"):
             if total is None and not run.keep.along:
                 break  # cut by truncation
-            if tapes and tapes[-1].first < i < tapes[-1].stop:
-                continue  # the steps of a tape are gone through at once
-            tape = tapes.pop() if tapes and tapes[-1].first == i else None
+            tape = tapes.pop() if i + 1 == len(tapes) else None
             end = None if tape else fingerprint(*state[1:])  # what is on a tape is not run again
             state = self._state_at(i)
             if total is not None:
                 if tape is None:
-                    tape, after = steps.taped(state, run.wants(i, steps.trace.wanted))[:2]
+                    tape, after = steps.taped(state)
                     run.compare(fingerprint(*after[1:]), end)
                     del after
                 total = self._pull(tape, state, total)
             del tape
             if i % growth.every == 0:
                 growth.see(i, total)
-            if run.keep.along and (i > 0 or run.wants(0, steps.trace.wanted)):
+            if run.keep.along and (i > 0 or run.loop.wants(0)):
                 total = _sum(total, source(*state))
         if active:
-            count("rollout.step", "vjp", run.n)
+            count("rollout.step", "vjp", n)
             count("rollout.step", "recomputed", self.recomputed)
         if run.record is not None:
             run.record(growth.record(many, self.recomputed))
         elif growth.grown() > LIMIT:
             growth.record(many, self.recomputed)
-        given = zip(steps.p, (self.cotangents.get(root, NONE)[0] for root in steps.roots), strict=True)
-        return [*(total or [None] * len(run.state.places)), *(_fitted(back, p) for p, back in given), *self.inputs]
+        params = [self.cotangents.get(root, NONE)[0] for root in steps.roots]
+        inputs = [anp.stack(block) if isinstance(block, list) else block for block in self.inputs]
+        return [*(total or [None] * len(run.loop.state.places)), *map(_fitted, params, steps.p), *inputs]
 
     def _pull(self, tape, state, g):
         """Cotangents of the state after a tape -> those of the state before, None if those are not wanted."""
-        cotangents, calls = self.cotangents, reversed(tape.nodes)
+        cotangents, self.steps.last = self.cotangents, state
         for node, back in zip(tape.ends, g, strict=True):
             if node is not None and back is not None:
                 known = cotangents.get(node)
                 cotangents[node] = (back if known is None else known[0] + back), False
-        try:
-            accumulate(cotangents, calls)
-        finally:  # in which step it stopped
-            self.steps.last = state._replace(i=state.i + max(bisect(tape.starts, length_hint(calls)) - 1, 0))
-        for i, roots in enumerate(tape.inputs, state.i):
-            for total, root in zip(self.inputs, roots, strict=True):
-                if root in cotangents:
-                    total[i] = cotangents.pop(root)[0]
-        backs = []
-        for value, root in zip(state.values, tape.state, strict=True):
-            backs.append(_fitted(cotangents.pop(root, NONE)[0], value))
+        accumulate(cotangents, reversed(tape.nodes))
+        for block, root in zip(self.inputs, tape.inputs, strict=True):
+            if root in cotangents:
+                block[state.i] = cotangents.pop(root)[0]
+        backs = [cotangents.pop(root, NONE)[0] for root in tape.state]
         for root, (back, own) in cotangents.items():
             if root not in self.steps.roots:
                 refuse_lost("the step")  # in a call of another step
             if not own and type(back) is np.ndarray:
                 cotangents[root] = back.copy(), True
-        return backs if any(tape.state) else None
+        return list(map(_fitted, backs, state.values)) if any(tape.state) else None
 
     def _state_at(self, i):
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""

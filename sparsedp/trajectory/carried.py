@@ -6,7 +6,7 @@ from sparsedp.fields import frozen
 from sparsedp.tape import Rule, isbox, plain
 from sparsedp.trajectory.layout import owned
 
-__all__ = ["Carried", "carries"]
+__all__ = ["carries", "in_plain_forms"]
 
 
 def carries(step):
@@ -23,65 +23,49 @@ def carries(step):
     return callable(getattr(step, "forward", None)) and callable(getattr(step, "backward", None))
 
 
-class Carried:
-    """Such a step of a run, as a function that may be traced."""
+def in_plain_forms(loop):
+    """The step of a loop that has plain forms of its own -> the same as a function that may be traced."""
+    step, state, params, many = loop.step, loop.state, loop.params, len(loop.state.places)
 
-    def __init__(self, run):
-        self.run = run
-
-    def __call__(self, state, params):
-        """The next state."""
-        values, statics = self.run.state.take(state, "the step")
-        given, constants = self.run.params.take(params, "the step")
-        if not any(map(isbox, values + given)):
-            return self.run.step.forward(state, params)
-        call = _Call(self.run, statics, constants)
-        new = _carried_step(call, *values, *given)
-        return self.run.state.build([new] if len(values) == 1 else [new[k] for k in range(len(values))], call.new)
-
-
-class _Call:
-    """What is not floating in one call, on plain values."""
-
-    def __init__(self, run, statics, constants):
-        self.run, self.statics, self.constants = run, statics, constants
-        self.many = len(run.state.places)
-        self.new: tuple = ()  # what is not floating in the next state
-
-    def parts(self, values):
-        """Variables -> state and params."""
-        run, values = self.run, [frozen(value) for value in values]
-        state = run.state.build(values[: self.many], self.statics)
-        return state, run.params.build(values[self.many :], self.constants)
-
-    def taken(self, tree, what="the step"):
+    def taken(tree, what):
         """A state that the step made -> its variables, and its other leaves."""
-        values, statics = self.run.state.take(tree, what)
-        return self.run.state.check(values, what), statics
+        values, statics = state.take(tree, what)
+        return state.check(values, what), statics
+
+    def call(tree, given):
+        (values, statics), (others, constants) = state.take(tree, "the step"), params.take(given, "the step")
+        values, after = [*values, *others], []
+        if not any(map(isbox, values)):
+            return step.forward(tree, given)
+
+        def parts(args):
+            args = list(map(frozen, args))
+            return state.build(args[:many], statics), params.build(args[many:], constants)
+
+        def forward(*args):
+            found, fixed = taken(step.forward(*parts(args)), "the step")
+            after.extend(fixed)
+            return _one(list(map(owned, found)))  # the step may use its arrays again
+
+        def vjp(nums, ans, *args):
+            def pull(g):
+                what = "the backward form of the step"
+                slopes = state.build([g] if many == 1 else [g[k] for k in range(many)])
+                of_state, of_params = step.backward(*parts(args), slopes)
+                backs = taken(of_state, what)[0]
+                if max(nums) >= many:
+                    rest = args[many:]
+                    found = [None] * len(rest) if of_params is None else params.take(of_params, what)[0]
+                    backs += [np.zeros_like(plain(p)) if b is None else b for b, p in zip(found, rest, strict=True)]
+                return tuple(backs[num] for num in nums)
+
+            return pull
+
+        new = Rule("the step", forward, vjp)(*values)
+        return state.build([new] if many == 1 else [new[k] for k in range(many)], after)
+
+    return call
 
 
-def _forward(call, *values):
-    found, call.new = call.taken(call.run.step.forward(*call.parts(values)))
-    found = [owned(value) for value in found]  # the step may use its arrays again
-    return found[0] if call.many == 1 else tuple(found)
-
-
-def _vjp(nums, ans, call, *values):
-    run, many, wanted = call.run, call.many, max(nums) > call.many
-    state, params = call.parts(values)
-
-    def pull(g):
-        slopes = run.state.build([g] if many == 1 else [g[k] for k in range(many)])
-        of_state, of_params = run.step.backward(state, params, slopes)
-        what = "the backward form of the step"
-        backs = call.taken(of_state, what)[0]
-        if wanted:
-            given = values[many:]
-            found = [None] * len(given) if of_params is None else run.params.take(of_params, what)[0]
-            backs += [np.zeros_like(plain(p)) if back is None else back for back, p in zip(found, given, strict=True)]
-        return tuple(backs[num - 1] for num in nums)
-
-    return pull
-
-
-_carried_step = Rule("the step", _forward, _vjp)
+def _one(values):
+    return values[0] if len(values) == 1 else tuple(values)

@@ -8,13 +8,12 @@ from sparsedp.constants import constant_args
 from sparsedp.errors import BudgetWarning, DerivativeError, ShapeError
 from sparsedp.fields import check_function, check_takes, is_whole
 from sparsedp.ledger import thread
-from sparsedp.tape import dtype_of, is_variable, isbox, plain
-from sparsedp.traces import in_reverse
+from sparsedp.tape import dtype_of, innermost, is_variable, isbox, plain, through
 from sparsedp.trajectory.keep import All, Each, Last
 from sparsedp.trajectory.layout import Layout, dense
-from sparsedp.trajectory.rules import rollout_rule
-from sparsedp.trajectory.run import Run
+from sparsedp.trajectory.run import Run, rollout_rule
 from sparsedp.trajectory.schedule import budget_within_reach, plan, room_within, slots_within
+from sparsedp.trajectory.steps import Loop
 from sparsedp.tree import leaves
 
 __all__ = ["rollout"]
@@ -89,7 +88,9 @@ def rollout(
     -----
     Cost: n steps forward; backward n steps on a tape of their own, unless it is kept, plus those run again:
     with s states kept and at most r runs over each step, n <= (s + r)! / (s! r!) steps go back. The gradient
-    has the same bits for every `memory`. A step with a backward form of its own is one node on the tape.
+    has the same bits for every `memory`. A derivative forward costs the memory of one step, that of a gradient (`hvp`)
+    twice the memory of the gradient; the gradient of a gradient has all calls of both on its tape. A step with a
+    backward form of its own is one node on the tape.
 
     The states gone back through are those of one run that ends, bit by bit, in what was handed out: a step on its
     tape must give the state after it, and states that are run again must lead to those kept. Large ones are compared
@@ -126,18 +127,15 @@ def rollout(
     slots = None if memory is None else slots_within(memory, forms[0].nbytes, n, beside)
     if truncate is not None and not is_whole(truncate, 1):
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
-    run = Run(step, forms, n, _kind(keep, forms[0]), slots, truncate, bool(traced), progress, record)
-    _check_values(run, args)
-    pulled = any(map(in_reverse, args))  # a forward derivative has no use for tapes
-    if pulled:
-        rooms = (SMALL, SOLVED) if memory is None else (max(room_within(memory, forms[0].nbytes, n, beside), 0),) * 2
-        run.room, run.room_of_solves = rooms
-        run.traced = frozenset(traced)
-    if run.store and run.slots:
+    rooms = (SMALL, SOLVED) if memory is None else (max(room_within(memory, forms[0].nbytes, n, beside), 0),) * 2
+    loop = Loop(step, forms, n, truncate, innermost(args))
+    run = Run(loop, _kind(keep, forms[0]), slots, rooms, progress, record)
+    _check_values(loop, args, bool(traced))
+    if loop.wanted and run.slots:
         _warn_of_repeats(memory, forms[0].nbytes, n, beside)
     for told in thread.loops:
         told(step, state, params, inputs, n)
-    outputs = rollout_rule(run, *args)
+    outputs = through(rollout_rule, run, *args)
     count = len(plain(outputs)) if isinstance(plain(outputs), tuple) else None
     return run.keep.tree([outputs] if count is None else [outputs[k] for k in range(count)])
 
@@ -184,16 +182,16 @@ def _kind(keep, layout):
     return All(layout) if keep == "all" else Last(layout)
 
 
-def _check_values(run, args):
-    for layout, values in zip(run.layouts, run.split(args), strict=False):
+def _check_values(loop, args, traced):
+    for layout, values in zip(loop.layouts, loop.split(args), strict=False):
         layout.check_finite([plain(value) for value in values], "rollout")
         for name, value in zip(layout.names, values, strict=True):
             if dtype_of(value).kind not in "fc":
                 raise DerivativeError(
                     f"{name} of rollout is traced but holds {dtype_of(value)}; derivatives need floating numbers"
                 )
-    if run.store and not run.state.places:
-        kinds = ", ".join(sorted({str(dtype_of(leaf)) for leaf in run.state.statics if leaf is not None}))
+    if traced and not loop.state.places:
+        kinds = ", ".join(sorted({str(dtype_of(leaf)) for leaf in loop.state.statics if leaf is not None}))
         raise DerivativeError(
             f"a gradient through rollout needs a state of floating numbers, got {kinds or 'nothing'}; "
             "write state.astype(float)"

@@ -6,6 +6,7 @@ the last run (`tree`), and going backward says which cotangent enters at which s
 
 from typing import Any
 
+import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import constant
@@ -13,11 +14,11 @@ from sparsedp.direction import pull_ends
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import frozen
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
-from sparsedp.traces import reverse_root, split_box, trace
+from sparsedp.traces import reverse_root, split_box, trace, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["All", "Each", "Last", "marked"]
+__all__ = ["All", "Each", "Last"]
 
 
 class Last:
@@ -26,29 +27,27 @@ class Last:
     Parameters
     ----------
     layout : Layout
-    shown : slice
-        Which of the variables are handed out.
     """
 
     along = False  # cotangents enter at the end only
     whole = False  # every state is handed out, and thereby kept
 
-    def __init__(self, layout, shown=slice(None)):
-        self.layout, self.shown = layout, shown
+    def __init__(self, layout):
+        self.layout = layout
         self._last: Any = None
 
-    def start(self, run):
-        """A run begins."""
+    def start(self, n, outer, stored):
+        """A run of n steps begins, on values of the traces `outer`; `stored` for a way back."""
 
     def see(self, state):
         """A state of the run -> the same, perhaps in other memory."""
         self._last = state
         return state
 
-    def finish(self, stored):
+    def finish(self):
         """The arrays to hand out."""
         last, self._last = self._last, self._last.statics
-        return tuple(owned(value) for value in last.values[self.shown])
+        return tuple(map(owned, last.values))
 
     def tree(self, outputs):
         """Outputs of the rule -> what the user gets."""
@@ -57,44 +56,46 @@ class Last:
 
     def source(self, n, g):
         """Cotangents of the outputs -> function (index, variables, statics) -> cotangents of a state, or None."""
-        entering = [None] * len(self.layout.places)
-        entering[self.shown] = g
-        return lambda i, values, statics: entering if i == n else None
+        return lambda i, values, statics: g if i == n else None
 
 
 class All:
     """All n + 1 states, stacked along a new first axis."""
 
-    along = True
+    along = whole = True
 
-    def __init__(self, layout, shown=slice(None)):
-        self.layout, self.shown = layout, shown
-        self.whole = layout.places[shown] == layout.places
+    def __init__(self, layout):
+        self.layout = layout
         self._blocks: list = []
         self._statics: list = []
+        self._stored = False
 
-    def start(self, run):
-        """A run begins."""
-        pairs = list(zip(self.layout.shapes, self.layout.dtypes, strict=True))[self.shown]
-        self._blocks = [np.empty((run.n + 1, *shape), dtype) for shape, dtype in pairs]
-        self._statics = []
+    def start(self, n, outer, stored):
+        """A run begins: one block for each variable, or a list where its states are traced."""
+        pairs = zip(self.layout.shapes, self.layout.dtypes, strict=True)
+        self._blocks = [[None] * (n + 1) if outer else np.empty((n + 1, *shape), dtype) for shape, dtype in pairs]
+        self._statics, self._stored = [], stored
 
     def see(self, state):
-        """A state of the run -> the same; where all of it is handed out, in that memory."""
+        """A state of the run -> the same in the memory that is handed out."""
         self._statics.append(state.statics)
-        for block, value in zip(self._blocks, state.values[self.shown], strict=True):
-            block[state.i] = value
-        if not self.whole:
-            return state
-        rows = zip((block[state.i] for block in self._blocks), state.values, strict=True)
-        return state._replace(values=[row if type(row) is np.ndarray else value for row, value in rows])
+        values = list(state.values)
+        for number, block in enumerate(self._blocks):
+            block[state.i] = values[number]
+            if np.ndim(values[number]):
+                values[number] = block[state.i]
+        return state._replace(values=values)
 
-    def finish(self, stored):
+    def finish(self):
         """The arrays to hand out."""
         blocks, self._blocks = self._blocks, []
-        for block in blocks:
-            block.flags.writeable = not stored  # the way back uses these very arrays
-        return tuple(blocks)
+        return tuple(self._whole(block) for block in blocks)
+
+    def _whole(self, block):
+        if isinstance(block, list):
+            return anp.stack(block)
+        block.flags.writeable = not self._stored  # the way back uses these very arrays
+        return block
 
     def tree(self, outputs):
         """Outputs of the rule -> what the user gets."""
@@ -102,14 +103,7 @@ class All:
 
     def source(self, n, g):
         """Cotangents of the outputs -> function (index, variables, statics) -> cotangents of a state."""
-        count, shown = len(self.layout.places), self.shown
-
-        def at(i, values, statics):
-            entering = [None] * count
-            entering[shown] = [block[i] for block in g]
-            return entering
-
-        return at
+        return lambda i, values, statics: [block[i] for block in g]
 
 
 def _stacked(line):
@@ -128,28 +122,28 @@ class Each:
         self._trees: list = []
         self._groups: dict = {}
         self._marks: list = []  # of what the function returned, where it will be called again
-        self._compared = False
+        self._outer, self._compared = set(), False
 
-    def start(self, run):
+    def start(self, n, outer, stored):
         """A run begins."""
-        self._stacks, self._trees, self._compared = {}, [], run.store
+        self._stacks, self._trees, self._outer, self._compared = {}, [], outer, stored
 
     def see(self, state):
         """A state of the run -> the same."""
         given = self.layout.build([frozen(value) for value in state.values], state.statics)
         found, rebuild = flatten(self.function(state.i, given))
         for leaf in found:
-            refuse_mask("keep returned a masked array", leaf)
+            refuse_mask("keep returned a masked array", plain(leaf))
         places = [self._store(leaf) if is_variable(leaf) else None for leaf in found]
         if self._compared:
-            self.compare(state.i, [marked(leaf) for leaf, place in zip(found, places, strict=True) if place])
+            self._compare(state.i, [_marked(leaf) for leaf, place in zip(found, places, strict=True) if place])
         others = constant([None if place else leaf for leaf, place in zip(found, places, strict=True)])
         self._trees.append((flatten(rebuild(others))[1], others, places))
         return state
 
     def _store(self, leaf):
         """Where a floating result is kept: (number of the stack, place in it)."""
-        if isbox(leaf):
+        if not traces_of([leaf]) <= self._outer:
             raise DerivativeError(
                 "keep uses a traced value that is not part of the state, and its derivative would be lost; "
                 "return what it needs of the state, and combine the two outside of rollout"
@@ -159,7 +153,7 @@ class Each:
         stack.append(owned(leaf))
         return list(self._stacks).index(key), len(stack) - 1
 
-    def compare(self, i, marks):
+    def _compare(self, i, marks):
         """Refuse a function that returns something else for a state than it did before."""
         if i == len(self._marks):
             self._marks.append(marks)
@@ -168,11 +162,11 @@ class Each:
                 "keep returns something else when it is called again; it must depend on its arguments only"
             )
 
-    def finish(self, stored):
+    def finish(self):
         """The arrays to hand out: one for each shape and dtype."""
         stacks, self._stacks = self._stacks, {}
         self._groups = {key: number for number, key in enumerate(stacks)}
-        return tuple(np.stack(stack) for stack in stacks.values())
+        return tuple((anp if any(map(isbox, stack)) else np).stack(stack) for stack in stacks.values())
 
     def tree(self, outputs):
         """Outputs of the rule -> the tuple of what the function returned."""
@@ -196,7 +190,7 @@ class Each:
         result, number = trace(lambda tree: self.function(i, tree), state, self.layout.spread(roots))
         nodes, slopes = [], []
         ends = [split_box(leaf, number) for leaf in leaves(result) if is_variable(leaf)]
-        self.compare(i, [marked(value) for value, _ in ends])
+        self._compare(i, [_marked(value) for value, _ in ends])
         for value, node in reversed(ends):
             group = self._groups[_sort(value)]
             counters[group] -= 1
@@ -210,7 +204,7 @@ def _sort(value):
     return np.shape(value), dtype_of(value).char
 
 
-def marked(value):
+def _marked(value):
     """Array or number, plain or traced -> its shape and dtype, and its bits."""
     value = np.asarray(plain(value))
     return value.shape, value.dtype.char, fingerprint([value])

@@ -8,7 +8,8 @@ import numpy as np
 from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, surely_finite
-from sparsedp.tape import dtype_of, is_variable, isbox, plain
+from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
+from sparsedp.traces import traces_of
 from sparsedp.tree import flatten
 
 __all__ = ["Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask"]
@@ -128,8 +129,11 @@ class Layout:
         for key in keys:
             self._collect(wanted[key], tree[key], (*path, key), when, found)
 
-    def check(self, values, when):
-        """Values of the variables after a step -> the same, contiguous; refuse another shape or dtype."""
+    def check(self, values, when, outer=frozenset()):
+        """Values of the variables after a step -> the same, contiguous; refuse another shape or dtype.
+
+        `outer`: the traces that they may be on.
+        """
         for number, value in enumerate(values):
             if not (
                 type(value) is np.ndarray
@@ -137,20 +141,20 @@ class Layout:
                 and value.dtype == self.dtypes[number]
                 and value.flags.c_contiguous
             ):
-                values[number] = self._settled(number, value, when)
+                values[number] = self._settled(number, value, when, outer)
         return values
 
-    def _settled(self, number, value, when):
+    def _settled(self, number, value, when, outer):
         name, shape, dtype = self.names[number], self.shapes[number], self.dtypes[number]
-        if isbox(value):
+        if not traces_of([value]) <= outer:
             refuse_lost(when)
-        refuse_mask(f"{when} made a masked array of {name}", value)
-        if not isinstance(value, (np.ndarray, np.generic, float, complex)):
+        refuse_mask(f"{when} made a masked array of {name}", plain(value))
+        if not isinstance(plain(value), (np.ndarray, np.generic, float, complex)):
             raise ShapeError(_changed(name, "one array", _kind(value), when))
         if np.shape(value) != shape:
             raise ShapeError(_changed(name, f"shape {shape}", f"shape {np.shape(value)}", when))
         if self.rounds and dtype_of(value) == np.result_type(dtype, np.float64):
-            value = np.asarray(value, dtype)
+            value = cast(value, dtype)
         if dtype_of(value).kind == "O":
             raise ShapeError(
                 f"{name} must keep its form: {when} made an array of objects; use autograd.numpy as np in it"
@@ -167,6 +171,7 @@ class Layout:
 
     def is_finite(self, values):
         """Whether all variables are finite."""
+        values = list(map(plain, values))
         return all(surely_finite(value) or bool(np.all(np.isfinite(value))) for value in values)
 
 
@@ -179,12 +184,16 @@ def _brief(value):
 
 
 def dense(value):
-    """Array or number -> contiguous array, or a NumPy scalar when it has no axes."""
+    """Array or number -> contiguous array, or a NumPy scalar when it has no axes; traced values as they are."""
+    if isbox(value):
+        return value
     return np.ascontiguousarray(value) if np.ndim(value) else np.asarray(value)[()]
 
 
 def owned(value):
-    """Array or number -> a contiguous copy of its own."""
+    """Array or number -> a contiguous copy of its own; traced values as they are: nobody writes into those."""
+    if isbox(value):
+        return value
     return np.array(value, order="C", subok=False) if np.ndim(value) else np.asarray(value)[()]
 
 
@@ -204,7 +213,7 @@ def refuse_lost(what):
 
 def fingerprint(values, statics=()):
     """Variables and other leaves of a state -> 64 bits for each variable, and for each whole number and word."""
-    marks = [_bits(value) for value in values]
+    marks = [_bits(plain(value)) for value in values]
     for leaf in statics:
         if isinstance(leaf, (int, str)):
             marks.append(hash(leaf))

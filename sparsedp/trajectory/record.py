@@ -12,6 +12,7 @@ import numpy as np
 
 from sparsedp.errors import GrowthWarning
 from sparsedp.ledger import thread
+from sparsedp.tape import plain
 
 __all__ = ["LIMIT", "Growth", "Record", "looked_at"]
 
@@ -75,7 +76,7 @@ class Growth:
         """The cotangent of state i, before anything enters there; asked where i is a multiple of `every`."""
         if g is None:
             return
-        norm = max((_largest(leaf) for leaf in g if leaf is not None), default=0.0)
+        norm = max((_largest(plain(leaf)) for leaf in g if leaf is not None), default=0.0)
         self.norms.append((i, norm))
 
     def _pieces(self):

@@ -1,22 +1,20 @@
-"""The steps of a run, on plain values or on a tape."""
+"""The steps of a rollout, on plain values or on a tape, and the way back through one of them."""
 
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp.derivative import zero_like
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
-from sparsedp.traces import boxed, reverse_root, split_box
-from sparsedp.trajectory.carried import Carried, carries
+from sparsedp.tape import plain
+from sparsedp.traces import boxed, new_trace, reverse_root, split_box, traces_of
 from sparsedp.trajectory.layout import owned
-from sparsedp.trajectory.recorder import State, Tape
 from sparsedp.tree import copied, flatten, leaves
 
-__all__ = ["Steps"]
+__all__ = ["Loop", "State", "Steps", "Tape"]
 
-
+CALL = 800  # bytes of a node, its closures and tuples: 350 to 1200 were measured
 _REMEDY = {
     "state": "return another dict or list",
     "params": "make what changes a part of the state",
@@ -24,93 +22,186 @@ _REMEDY = {
 }
 
 
-class Steps:
-    """The steps of a run.
+class State(NamedTuple):
+    """State i of a run: its variables, and its other leaves."""
 
-    Parameters
-    ----------
-    run : Run
-    args : tuple of plain arrays
-        Variables of state, params and inputs.
-    trace : Trace
+    i: int
+    values: list
+    statics: tuple
+
+    def owned(self):
+        """The same in memory of its own: a step may use the arrays again that it has returned."""
+        return self._replace(values=list(map(owned, self.values)))
+
+
+class Tape(NamedTuple):
+    """One step: its calls in order, so that the backward pass need not sort a graph.
 
     Attributes
     ----------
-    roots : list
-        Of params, the same for all steps; None where no cotangent is wanted.
-    wants_input : list
-        For each variable of inputs a root or None.
+    state : list
+        Nodes that its state begins with: roots, or those that the tape before ends with; None where a constant is.
+    inputs : list
+        The roots of its inputs.
+    nodes : list
+        All calls.
+    ends : list
+        The nodes of the state after it, None where that does not depend on anything traced.
     """
 
-    def __init__(self, run, args, trace):
-        self.run, self.trace = run, trace
-        self.step: Any = Carried(run) if run.inputs is None and carries(run.step) else run.step
-        self._open = any(layout.open for layout in run.layouts)
-        _, self.p, self.x = run.split(args)
-        _, self.roots, self.wants_input = run.split(trace.roots)
-        given = [frozen(value) for value in self.p]
-        self.params = run.params.build(given)
-        self._traced_params = run.params.build(boxed(given, self.roots, trace.number))
-        self._precise = all(dtype.char == "d" for dtype in run.state.dtypes)  # no cotangent is rounded between steps
-        self.last: State | None = None  # the state that the step under way begins with
+    state: list
+    inputs: list
+    nodes: list
+    ends: list
+
+    @property
+    def links(self):
+        """Whether the next tape may begin where this one ends: all results come from calls, each from another one."""
+        ends = self.ends
+        return None not in ends and all(node.parents for node in ends) and len(set(ends)) == len(ends)
+
+
+class Recorder:
+    """Takes down the calls of a trace; and weighs them while `weighs` is true.
+
+    Counted are the results (`bytes`), and apart from them every array that goes in beside traced values (`beside`); one
+    that many calls use counts once.
+    """
+
+    def __init__(self):
+        self.weighs, self.bytes, self.beside = False, 0, 0
+        self.nodes: list = []
+        self._seen: set[int] = set()
+
+    def weigh(self, value, args, nums):
+        """One call that depends on its arguments `nums`."""
+        self.bytes += CALL + getattr(value, "nbytes", 0)
+        for arg in leaves([arg for number, arg in enumerate(args) if number not in nums]):  # tuples are of indices
+            if isinstance(arg, np.ndarray) and id(arg) not in self._seen:
+                self._seen.add(id(arg))
+                self.beside += arg.nbytes
+
+    def taken(self):
+        """The calls since it was asked last: it forgets them, for they know it, and a circle is freed late."""
+        nodes, self.nodes = self.nodes, []
+        return nodes
+
+
+class Loop:
+    """What is fixed in a rollout, whoever runs it; the variables are passed in.
+
+    Parameters
+    ----------
+    step : callable
+    layouts : list of Layout
+        Of state, params and, where there are any, inputs.
+    n : int
+    truncate : int or None
+    wanted : list of int
+        The arguments that want a cotangent.
+    """
+
+    def __init__(self, step, layouts, n, truncate, wanted):
+        self.step, self.layouts, self.n, self.truncate, self.wanted = step, layouts, n, truncate, wanted
+        self.state, self.params, self.inputs = [*layouts, None][:3]
+        self.state.rounds = any(any(form.floats) for form in layouts)
+
+    def split(self, args):
+        """Variables of all arguments -> those of state, params and inputs."""
+        first = len(self.state.places)
+        second = first + len(self.params.places)
+        return list(args[:first]), list(args[first:second]), list(args[second:])
+
+    def wants(self, i):
+        """Whether step i hands a cotangent on to its state."""
+        return not self.is_cut(i) if i else any(number < len(self.state.places) for number in self.wanted)
+
+    def is_cut(self, i):
+        """Whether truncation makes state i a constant for the steps after it."""
+        return self.truncate is not None and 0 < i < self.n and (self.n - i) % self.truncate == 0
+
+
+class Steps:
+    """The steps of a loop with given arguments.
+
+    Parameters
+    ----------
+    loop : Loop
+    args : list of arrays
+        Variables of state, params and inputs; traced ones belong to outer traces, and every call is on those too.
+    step : callable
+        That of the loop, or another form of it.
+
+    Attributes
+    ----------
+    roots, input_roots : lists
+        Of params, the same for all steps, and one for each variable of inputs; None where no cotangent is wanted.
+    outer : set of int
+        The traces of the arguments.
+    last : State or None
+        That which the step under way begins with.
+    """
+
+    def __init__(self, loop, args, step):
+        self.loop, self.step, self.number, self.recorder = loop, step, new_trace(), Recorder()
+        self.outer, self.last = traces_of(args), None
+        self._open = any(layout.open for layout in loop.layouts)
+        _, self.p, self.x = loop.split(args)
+        roots = [reverse_root(self.recorder) if number in loop.wanted else None for number in range(len(args))]
+        _, self.roots, self.input_roots = loop.split(roots)
+        given = list(map(frozen, self.p))
+        self.params = loop.params.build(given)
+        self._traced_params = loop.params.build(boxed(given, self.roots, self.number))
 
     def forward(self, state):
         """The state after this one."""
-        rows = self.run.rows(state.i, self.x)
-        values, statics = self._called(state, self._given(state), self.params, rows)
-        return State(state.i + 1, self.run.state.check(values, "the step"), statics)
+        values, statics = self._called(state, self._given(state), self.params, self._rows(state.i))
+        return State(state.i + 1, self.loop.state.check(values, "the step", self.outer), statics)
 
-    def taped(self, state, want_state, tape=None, given=None):
-        """The same on a tape: (Tape, the state after this one, its traced variables).
-
-        The last where the next step may begin with them, to the same bits as with roots of its own, else None. Handed
-        in as `given`, with the tape that they are on, they make one tape of both steps.
-        """
-        _, number, recorder, _ = self.trace
-        if given is None:
-            values = self._given(state)
-            roots = [reverse_root(recorder) if want_state else None for _ in values]
-            given, tape = boxed(values, roots, number), Tape(state.i, roots, [], [], [], [])
-        inputs = [root and reverse_root(recorder) for root in self.wants_input]
-        rows = boxed(self.run.rows(state.i, self.x), inputs, number)
-        tape.starts.append(len(tape.nodes))
-        tape.inputs.append(inputs)
+    def taped(self, state, before=None):
+        """The same on a tape, linked to that of the step before if it can be: (Tape, the state after this one)."""
+        starts = before.ends if before and before.links else [reverse_root(self.recorder) for _ in state.values]
+        if not self.loop.wants(state.i):
+            starts = [None] * len(starts)
+        inputs = [root and reverse_root(self.recorder) for root in self.input_roots]
+        given = boxed(self._given(state), starts, self.number)
+        rows = boxed(self._rows(state.i), inputs, self.number)
         try:
             found, statics = self._called(state, given, self._traced_params, rows)
         finally:
-            tape.nodes.extend(recorder.taken())
-        values, tape.ends[:] = [], []
-        for value in found:
-            value, node = split_box(value, number)
-            values.append(value)
-            tape.ends.append(node)
-        self.run.state.check(values, "the step")
-        links = self._precise and _are_new(tape.ends)
-        if None in tape.ends:  # perhaps an array that the step uses again
-            values = [value if node else owned(value) for value, node in zip(values, tape.ends, strict=True)]
-        # As read-only as the values of a root: a rule that writes into its argument would change this very state.
-        given = boxed(map(frozen, values), tape.ends, number) if links else None
-        return tape, State(state.i + 1, values, statics), given
+            nodes = self.recorder.taken()
+        pairs = [split_box(value, self.number) for value in found]
+        ends = [node for _, node in pairs]
+        values = self.loop.state.check([value for value, _ in pairs], "the step", self.outer)
+        # What is on no tape may be an array that the step uses again.
+        values = [value if node else owned(value) for value, node in zip(values, ends, strict=True)]
+        return Tape(starts, inputs, nodes, ends), State(state.i + 1, values, statics)
 
     def _given(self, state):
-        """The variables that a step gets: a dual run has no tangents where the derivative is cut."""
-        values, silenced = state.values, self.run.silenced
-        if silenced and self.run.is_cut(state.i):
-            values = [zero_like(value) if number in silenced else value for number, value in enumerate(values)]
-        return list(map(frozen, values))
+        """The variables that a step gets: constants where the derivative is cut."""
+        return [frozen(plain(value) if self.loop.is_cut(state.i) else value) for value in state.values]
+
+    def _rows(self, i):
+        """The variables of inputs -> those of step i."""
+        return [frozen(block[i]) for block in self.x]
+
+    def _parts(self, state, values, params, rows):
+        """The arguments of a step, of their variables."""
+        parts, inputs = [self.loop.state.build(values, state.statics), params], self.loop.inputs
+        if inputs is not None:
+            rest = [leaf[state.i] if isinstance(leaf, np.ndarray) else leaf for leaf in inputs.statics]
+            parts.append(inputs.build(rows, rest))
+        return parts
 
     def _called(self, state, values, params, rows):
         """The step on variables that may be traced -> those of the next state, and its statics."""
-        run = self.run
         self.last = state
-        parts = [run.state.build(values, state.statics), params]
-        if run.inputs is not None:
-            parts.append(run.input_at(state.i, rows))
+        parts = self._parts(state, values, params, rows)
         given = [leaves(part) for part in parts] if self._open else None
         result = self.step(*parts)
         if given is not None:
             _check_entries(parts, given)
-        return run.state.take(result, "the step")
+        return self.loop.state.take(result, "the step")
 
     @contextmanager
     def guarded(self, way="in step"):
@@ -135,19 +226,16 @@ class Steps:
 
         Asked of plain values: a traced one stops a step with other words.
         """
-        run, state = self.run, self.last
+        state: Any = self.last
         if state is None:
             return None
-        parts = [run.state.build(state.values, state.statics), self.params]
-        if run.inputs is not None:
-            parts.append(run.input_at(state.i, run.rows(state.i, self.x)))
-        found, rebuild = flatten(parts)
-        for number, name in enumerate(label for layout in run.layouts for label in layout.labels):
+        found, rebuild = flatten(self._parts(state, state.values, self.params, self._rows(state.i)))
+        for number, name in enumerate(label for layout in self.loop.layouts for label in layout.labels):
             if isinstance(found[number], np.ndarray):
-                copies = copied(found)
+                copies = copied(list(map(plain, found)))
                 copies[number].flags.writeable = False
                 try:
-                    run.step(*rebuild(copies))
+                    self.loop.step(*rebuild(copies))
                 except Exception as error:
                     if _refuses_writing(error):
                         return f"the step changes {name}"
@@ -164,8 +252,3 @@ def _check_entries(parts, given):
         found = leaves(part)
         if len(found) != len(before) or any(a is not b for a, b in zip(found, before, strict=True)):
             raise ValueError(f"the step changes the entries of {name}; {_REMEDY[name]}")
-
-
-def _are_new(nodes):
-    """Whether all results come from calls, each from another one."""
-    return None not in nodes and all(node.parents for node in nodes) and len(set(nodes)) == len(nodes)
