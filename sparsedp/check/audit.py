@@ -8,7 +8,6 @@ import numpy as np
 
 from sparsedp.check.culprit import culprit_of
 from sparsedp.check.judge import (
-    FIELDS,
     PROVED,
     at_kinks,
     curvature,
@@ -212,7 +211,7 @@ def _look_beside(trials, slope, judged):
         if verdict(*found)[0] != "disagrees":
             for one in judged:
                 if one.word in ("outside", "disagrees"):
-                    one.word, one.note = "kink", "several kinks; beside them nothing speaks against the gradient"
+                    one.learn(word="kink", note="several kinks; beside them nothing speaks against the gradient")
 
 
 # ------------------------------------------------------------ other ways to a derivative
@@ -296,6 +295,7 @@ class Audit(Result):
     """
 
     _word = "an audit"
+    _plain = (*"verdict reason digits culprit hessian value evaluations size notes lines rows".split(),)
 
     @property
     def rows(self):
@@ -311,11 +311,6 @@ class Audit(Result):
             for one in self.lines
             for level in one.line.levels
         )
-
-    def to_dict(self):
-        """The audit as plain numbers, strings and lists."""
-        lines = [{name: getattr(one, name) for name in FIELDS} for one in self.lines]
-        return super().to_dict() | {"lines": lines, "rows": self.rows}
 
     def __str__(self):
         parts = [f"gradient at {self.size} values, loss {self.value:.6g}, {self.evaluations} evaluations"]

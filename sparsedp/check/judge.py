@@ -20,10 +20,11 @@ from contextlib import suppress
 
 import numpy as np
 
+from sparsedp.check.summary import Result
 from sparsedp.check.sweep import REFUSALS, Line, noise_of
 from sparsedp.derivative import NO_JVP, pushforward
 
-__all__ = ["FIELDS", "PROVED", "Judgement", "at_kinks", "curvature", "examined", "explained", "forward_mode", "verdict"]
+__all__ = ["PROVED", "Judgement", "at_kinks", "curvature", "examined", "explained", "forward_mode", "verdict"]
 
 RESOLVED = 1e-3  # an error bar above this share of the derivative proves nothing
 AGREED = 1e-8  # a gap below this share is agreement, whatever the bar
@@ -73,8 +74,6 @@ JUMP = 1e-4  # of such a step: within it a ripple is smooth
 NEARER = 0.01  # steps of the plateau: within this a smooth gradient does not bend
 
 PROVED = "agrees", "vanishes"
-# What a judgement tells as plain data.
-FIELDS = "direction word difference slope gap bar scale step rate1 rate2 digits jitter note bend rate3".split()
 
 
 # Evidence -> word and reason: the first row that holds. Where few levels are usable, only the first four can.
@@ -181,7 +180,7 @@ def _negligible(one, largest):
 # ------------------------------------------------------------ evidence
 
 
-class Judgement:
+class Judgement(Result):
     """What is proved along one direction, in a word, and the evidence for it.
 
     Attributes
@@ -211,111 +210,126 @@ class Judgement:
     line : Line
     """
 
+    _plain = (*"direction word difference slope gap bar scale step rate1 rate2 digits jitter note bend rate3".split(),)
     gap = size = jitter = step = rate1 = rate2 = bend = rate3 = math.nan
     bar, digits = math.inf, 0.0
     close = wrong = zero = False
 
-    @np.errstate(all="ignore")  # losses near the limits of the floating point numbers are judged like others
-    def __init__(self, line):
-        self.line, self.direction, self.slope, self.used = line, line.name, line.slope, len(line.usable)
-        self.scale, self.silent = np.float64(max(abs(line.slope), line.typical)), max(line.silent, default=0.0)
-        self.refusals = "; ".join(sorted({level.note for level in line.levels} - {""})) or "the sweep has too few steps"
-        if self.used >= LEVELS:
-            self._read(line)
-            self._measure()
-            self._compare()
-            self._order()
-        self.difference, self.resolution = self.slope + self.gap, self.bar / self.scale
-        self.word, self.note = first(WORDS, self)
+    __repr__ = object.__repr__
 
-    def _read(self, line):
-        """Gaps, remainders and noise on all levels, from coarse to fine."""
-        eps, base = line.trials.eps, abs(line.base)
-        levels = np.array([level[:5] for level in line.usable]).T
-        self.t, sides = levels[0], levels[1:3]
-        self.changes = sides - line.base
-        self.rests = self.changes - levels[3:]  # without the gradient, on both sides
-        self.m = (self.rests[0] - self.rests[1]) / (2 * self.t)
-        # The gap of the one-sided differences, with the part that comes from unequal displacements taken out.
-        self.kinks = (self.rests[0] + self.rests[1]) / self.t
-        self.rounding = eps * np.maximum(np.max(np.abs(sides), axis=0), max(base, TINY))
-        # What the finest levels vary by, in roundings of the loss. Rounding does that, or a solver inside.
-        varied = np.abs(np.diff(self.m)) * self.t[1:] / self.rounding[1:]
-        self.jitter = max(float(np.max(varied[1 - FINEST :])), 2 * line.trials.noise)
-        self.noise = max(2.0, self.jitter) * self.rounding
-        self.curvature = float(np.median(np.abs(self.kinks / self.t)[:3]))
+    def learn(self, **values):
+        """What is known later, by more than the levels."""
+        self.__dict__.update(values)
 
-    def _measure(self):
-        """The estimate with the smallest bar that no finer level contradicts, away from kinks if there is one."""
-        trials, spread = self.line.trials, self.line.point.eps
-        least = NOISY if trials.solved else AGREED
-        self.agreed = max(float(np.clip(PER_NOISE * trials.eps * self.jitter, least, NOISY)), 300 * spread)
-        ranked = self._estimates(self.m, 2, self.noise)
-        bends = self._estimates(self.kinks, 1, 2 * self.noise)
-        found = []
-        for gap, bar, index in ranked:
-            # A derivative is a limit, not a passing plateau: all finer levels agree with it.
-            passing = np.any((np.abs(self.m - gap) > bar + 6 * self.noise / self.t)[index + 1 :])
-            # The jump of the one-sided derivatives around the level, and its bar; 0 if it goes to 0.
-            jump, error = next((pair[:2] for pair in bends if abs(pair[2] - index) <= 1), (0.0, 0.0))
-            scale = max(self.scale, abs(self.slope + gap))
-            split = abs(jump) * (abs(jump) > max(FAR * error, self.agreed * scale))
-            found.append((passing, bool(split) or bar > RESOLVED * scale, gap, bar, index, scale, split, error))
-        # Away from kinks the first, with the smallest bar; of passing ones the last.
-        lasting = [one for one in found if not one[0]] or found[-1:]
-        _, _, self.gap, bar, index, self.scale, self.split, self.uncertain = min(lasting, key=lambda one: one[1])
-        floor = 8 * spread * self.curvature + 4 * spread * self.line.typical
-        self.bar, self.step, self.size, self.floor = bar + floor, float(self.t[index]), abs(self.gap), floor
 
-    def _estimates(self, values, power, noise):
-        """Estimates of v0 in values(t) = v0 + c t^power, best first: (estimate, bar, index of its finest level)."""
-        ratio = (self.t[:-1] / self.t[1:]) ** power
-        found: list = []
-        for series in (values, (ratio * values[1:] - values[:-1]) / (ratio - 1)):
-            jumps, start = np.abs(np.diff(series)), values.size - series.size + 1
-            bars = np.maximum(jumps[:-1], jumps[1:]) + 2 * (noise / self.t)[start:-1]
-            found += zip(series[1:-1], bars, range(start, values.size - 1))
-        return sorted(found, key=lambda estimate: estimate[1])
+@np.errstate(all="ignore")  # losses near the limits of the floating point numbers are judged like others
+def judgement(line):
+    """Line -> what its levels prove."""
+    notes = "; ".join(sorted({level.note for level in line.levels} - {""})) or "the sweep has too few steps"
+    known = {"line": line, "direction": line.name, "slope": line.slope, "used": len(line.usable), "refusals": notes}
+    known |= {"silent": max(line.silent, default=0.0), "scale": np.float64(max(abs(line.slope), line.typical))}
+    if len(line.usable) >= LEVELS:
+        known |= _read(line)
+        known |= _estimate(**known)
+        known |= _compared(**known)
+        known |= _taylor(**known)
+    found = Judgement(**known)
+    found.learn(difference=found.slope + found.gap, resolution=found.bar / found.scale)
+    word, note = first(WORDS, found)
+    found.learn(word=word, note=note)
+    return found
 
-    def _compare(self):
-        """How gap, bar, scale and noise compare."""
-        size, bar, scale, trials = self.size, self.bar, self.scale, self.line.trials
-        self.share, self.beyond = size / scale, (size - self.split / 2) * (self.split > 0)
-        far = bar * (FAR if self.jitter < ROUNDING else 3 * FAR)
-        self.wrong = size > max(far, self.agreed * scale, self.agreed * 1e-4 * self.curvature)
-        base = abs(self.line.base)
-        self.left = max(LEFT * base, LOOSE * trials.tolerance * max(base, scale)) * trials.solved
-        self.resolved = bar <= RESOLVED * scale
-        self.close = bool(self.resolved and size <= max(min(NEAR * bar, RESOLVED * scale - bar), self.agreed * scale))
-        vanished = scale + bar <= max(VANISHED, self.agreed) * self.curvature
-        self.zero = not self.resolved and size <= NEAR * bar and vanished
-        self.loudness = self.jitter * trials.eps
-        share = max(size, bar) / (self.curvature if self.zero else scale)
-        self.digits = float(np.clip(-np.log10(share), 0, 16))
 
-    def _order(self):
-        """Orders of the Taylor remainders, on levels near the plateau.
+def _read(line):
+    """Gaps, remainders and noise on all levels, from coarse to fine."""
+    levels = np.array([level[:5] for level in line.usable]).T
+    t, changes = levels[0], levels[1:3] - line.base
+    rests = changes - levels[3:]  # without the gradient, on both sides
+    m = (rests[0] - rests[1]) / (2 * t)
+    # The gap of the one-sided differences, with the part that comes from unequal displacements taken out.
+    kinks = (rests[0] + rests[1]) / t
+    rounding = line.trials.eps * np.max(np.abs(levels[1:3]), axis=0, initial=max(abs(line.base), TINY))
+    # What the finest levels vary by, in roundings of the loss. Rounding does that, or a solver inside.
+    varied = np.abs(np.diff(m)) * t[1:] / rounding[1:]
+    jitter = max(float(np.max(varied[1 - FINEST :])), 2 * line.trials.noise)
+    return {
+        "t": t, "changes": changes, "rests": rests, "m": m, "kinks": kinks, "rounding": rounding, "jitter": jitter,
+        "noise": max(2.0, jitter) * rounding, "curvature": float(np.median(np.abs(kinks / t)[:3])),
+    }  # fmt: skip
 
-        Usable for order 2: R2 >= CLEAR (noise + t |gap|). Where they are fewer than FEWEST, the even part of R2 is
-        judged, which no gap can hide, then the same on all levels; with no usable level at all the loss is linear to
-        its noise, and there is no order to judge. Usable for order 1: R1 >= CLEAR noise, and t |g . d| >= LINEAR
-        times the even part (f(x + t d) + f(x - t d)) / 2 - f. Where the slope is so small that f bends before it
-        climbs (near a minimum), order 1 cannot be 1: the direction is flat and order 1 is not judged. So it is where
-        neither the loss nor t g . d ever leaves the noise (the kernel of a Laplacian), if gap and bar are far below
-        the terms of g . d.
-        """
-        t, clear, gap = self.t, CLEAR * self.noise, self.size * (self.close or self.zero)
-        near, even, climb = t <= NEARBY * self.step, np.abs(self.kinks * t) / 2, abs(self.slope) * t
-        change, rest = both(self.changes), both(self.rests)
-        usable = (rest, rest >= clear + CLEAR * t * gap), (even, even >= clear)
-        found = [orders(t, size, some & place) for place in (near, t > 0) for size, some in usable]
-        self.used2, rates = max(found, key=lambda one: min(one[0], FEWEST))  # the first of those with enough
-        self.rate2 = min(rates, default=np.nan) if self.used2 else np.inf
-        seen, climbs = near & (change >= clear), climb >= LINEAR * even
-        self.used1, rates = orders(t, change, seen & climbs)
-        self.rate1 = max(rates, key=lambda rate: abs(rate - 1), default=np.nan)
-        still = self.bar + self.size <= VANISHED * self.scale and not np.any(seen | (climb >= clear))
-        self.flat = bool(still or np.any(seen & ~climbs))
+
+def _estimate(line, t, m, kinks, noise, jitter, scale, slope, curvature, **_):
+    """The estimate with the smallest bar that no finer level contradicts, away from kinks if there is one."""
+    spread, least = line.point.eps, NOISY if line.trials.solved else AGREED
+    agreed = max(float(np.clip(PER_NOISE * line.trials.eps * jitter, least, NOISY)), 300 * spread)
+    bends, found = _estimates(t, kinks, 1, 2 * noise), []
+    for gap, bar, index in _estimates(t, m, 2, noise):
+        # A derivative is a limit, not a passing plateau: all finer levels agree with it.
+        passing = np.any((np.abs(m - gap) > bar + 6 * noise / t)[index + 1 :])
+        # The jump of the one-sided derivatives around the level, and its bar; 0 if it goes to 0.
+        jump, error = next((pair[:2] for pair in bends if abs(pair[2] - index) <= 1), (0.0, 0.0))
+        size = max(scale, abs(slope + gap))
+        split = abs(jump) * (abs(jump) > max(FAR * error, agreed * size))
+        found.append((passing, bool(split) or bar > RESOLVED * size, gap, bar, t[index], size, split, error))
+    # Away from kinks the first, with the smallest bar; of passing ones the last.
+    lasting = [one for one in found if not one[0]] or found[-1:]
+    best = min(lasting, key=lambda one: one[1])[2:]
+    floor = 8 * spread * curvature + 4 * spread * line.typical
+    chosen = dict(zip(("gap", "bar", "step", "scale", "split", "uncertain"), best))
+    return chosen | {"bar": best[1] + floor, "step": float(best[2]), "floor": floor, "agreed": agreed}
+
+
+def _estimates(t, values, power, noise):
+    """Estimates of v0 in values(t) = v0 + c t^power, best first: (estimate, bar, index of its finest level)."""
+    ratio = (t[:-1] / t[1:]) ** power
+    found: list = []
+    for series in (values, (ratio * values[1:] - values[:-1]) / (ratio - 1)):
+        jumps, start = np.abs(np.diff(series)), values.size - series.size + 1
+        bars = np.maximum(jumps[:-1], jumps[1:]) + 2 * (noise / t)[start:-1]
+        found += zip(series[1:-1], bars, range(start, values.size - 1))
+    return sorted(found, key=lambda estimate: estimate[1])
+
+
+def _compared(line, gap, bar, scale, split, jitter, agreed, curvature, **_):
+    """How gap, bar, scale and noise compare."""
+    size, base, trials = abs(gap), abs(line.base), line.trials
+    far, resolved = bar * (FAR if jitter < ROUNDING else 3 * FAR), bar <= RESOLVED * scale
+    vanished = scale + bar <= max(VANISHED, agreed) * curvature
+    zero = not resolved and size <= NEAR * bar and vanished
+    return {
+        "size": size, "share": size / scale, "beyond": (size - split / 2) * (split > 0), "resolved": resolved,
+        "wrong": size > max(far, agreed * scale, agreed * 1e-4 * curvature),
+        "left": max(LEFT * base, LOOSE * trials.tolerance * max(base, scale)) * trials.solved,
+        "close": bool(resolved and size <= max(min(NEAR * bar, RESOLVED * scale - bar), agreed * scale)),
+        "zero": zero, "loudness": jitter * trials.eps,
+        "digits": float(np.clip(-np.log10(max(size, bar) / (curvature if zero else scale)), 0, 16)),
+    }  # fmt: skip
+
+
+def _taylor(t, changes, rests, kinks, noise, slope, size, bar, scale, step, close, zero, **_):
+    """Orders of the Taylor remainders, on levels near the plateau.
+
+    Usable for order 2: R2 >= CLEAR (noise + t |gap|). Where they are fewer than FEWEST, the even part of R2 is
+    judged, which no gap can hide, then the same on all levels; with no usable level at all the loss is linear to
+    its noise, and there is no order to judge. Usable for order 1: R1 >= CLEAR noise, and t |g . d| >= LINEAR
+    times the even part (f(x + t d) + f(x - t d)) / 2 - f. Where the slope is so small that f bends before it
+    climbs (near a minimum), order 1 cannot be 1: the direction is flat and order 1 is not judged. So it is where
+    neither the loss nor t g . d ever leaves the noise (the kernel of a Laplacian), if gap and bar are far below
+    the terms of g . d.
+    """
+    clear, near, even, climb = CLEAR * noise, t <= NEARBY * step, np.abs(kinks * t) / 2, abs(slope) * t
+    change, rest = both(changes), both(rests)
+    usable = (rest, rest >= clear + CLEAR * t * size * (close or zero)), (even, even >= clear)
+    found = [orders(t, values, some & place) for place in (near, t > 0) for values, some in usable]
+    used2, rates2 = max(found, key=lambda one: min(one[0], FEWEST))  # the first of those with enough
+    seen, climbs = near & (change >= clear), climb >= LINEAR * even
+    used1, rates1 = orders(t, change, seen & climbs)
+    still = bar + size <= VANISHED * scale and not np.any(seen | (climb >= clear))
+    return {
+        "used1": used1, "rate1": max(rates1, key=lambda rate: abs(rate - 1), default=np.nan),
+        "used2": used2, "rate2": min(rates2, default=np.nan) if used2 else np.inf,
+        "flat": bool(still or np.any(seen & ~climbs)),
+    }  # fmt: skip
 
 
 def first(rows, evidence):
@@ -392,16 +406,16 @@ def measured(line, steps, extend, close=False):
         Whether steps far below the plateau are looked at, where there is noise, though all agrees.
     """
     line.sweep(steps)
-    found = Judgement(line)
+    found = judgement(line)
     if extend and found.word in ("few", "rough") and found.step > 0:  # more levels between those there are
         line.sweep(found.step * BETWEEN)
-        found = Judgement(line)
+        found = judgement(line)
     if extend and found.word != "vanishes" and found.resolution > max(GOAL, 1e4 * line.point.eps):
         line.sweep(FINER * (not found.jitter <= ROUNDING) + COARSER * (not found.jitter > ROUNDING))
-        found = min(Judgement(line), found, key=lambda one: one.resolution)
+        found = min(judgement(line), found, key=lambda one: one.resolution)
     if extend and close and found.close and found.jitter > SMOOTH:
         line.sweep(RIPPLED)
-        _see_ripple(found, Judgement(line))
+        _see_ripple(found, judgement(line))
     return found
 
 
@@ -415,8 +429,8 @@ def _see_ripple(found, finer):
         gap, rounding = float(np.median(finer.m[run])), np.max(4 * finer.rounding[run] / finer.t[run])
         visible = max(NOISY * found.scale, FAR * found.bar, rounding / SEES)
         if abs(gap) > visible and np.max(np.abs(finer.m[run] - gap)) <= SEES * abs(gap):
-            found.word = "ripple"
-            found.note = f"a ripple: steps below {found.step:.0e} are off by {abs(gap) / found.scale:.1e}, others agree"
+            note = f"a ripple: steps below {found.step:.0e} are off by {abs(gap) / found.scale:.1e}, others agree"
+            found.learn(word="ripple", note=note)
 
 
 @np.errstate(all="ignore")
@@ -437,9 +451,10 @@ def explained(found, gradient):
         with suppress(*REFUSALS):
             size = bend(step) if step < NEARER * found.step else 0.0
             if size > SEES * found.size and size > 2 * bend(JUMP * step):  # at a kink it jumps, however near
-                found.word = "ripple"
-                found.note = f"the gradient bends by {size / found.scale:.1e} of itself within a step of {step:.0e}: "
-                found.note += "a ripple below the noise of the loss may explain the gap"
+                note = (
+                    f"the gradient bends by {size / found.scale:.1e} of itself within a step of {step:.0e}: a ripple "
+                )
+                found.learn(word="ripple", note=f"{note}below the noise of the loss may explain the gap")
                 return
 
 
@@ -460,16 +475,16 @@ def curvature(found, bend, extend):
 
     The order is read on the finest usable levels, those that stand out of noise, gap and the rounding of x.
     """
-    e = Judgement(found.line)
+    e = judgement(found.line)
     rests = e.rests - e.t**2 / 2 * bend
     usable = both(rests) >= CLEAR * (e.noise + e.t * (found.size + e.floor))
-    found.used3, rates = orders(e.t, both(rests), usable, FEWEST)  # coarse ones are no limit t -> 0
-    if extend and 0 < found.used3 < FEWEST:
+    used, rates = orders(e.t, both(rests), usable, FEWEST)  # coarse ones are no limit t -> 0
+    if extend and 0 < used < FEWEST:
         found.line.sweep(HALVES)
         return curvature(found, bend, False)
-    found.bend, found.rate3 = bend, min(rates, default=np.nan) if found.used3 else np.inf
     ahead, behind = rests[:, np.max(np.flatnonzero(usable), initial=0)]
-    found.jumps = abs(ahead - behind) > ODD * abs(ahead + behind)
-    found.off = abs(ahead + behind) / min(e.t[usable], default=e.t[0]) ** 2 / abs(bend)
+    off = abs(ahead + behind) / min(e.t[usable], default=e.t[0]) ** 2 / abs(bend)
+    found.learn(used3=used, bend=bend, rate3=min(rates, default=np.inf if not used else np.nan), off=off)
+    found.learn(jumps=abs(ahead - behind) > ODD * abs(ahead + behind))
     word, text = first(HESSIANS, found)
     return word, f"d.Hd = {bend:.9g} along {found.direction}, third Taylor remainder {text}"

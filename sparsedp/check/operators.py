@@ -3,9 +3,8 @@
 Figures are in units of rounding times the size of the operator; each check is a function of random fields, and a row.
 """
 
-from functools import cached_property, reduce
-from math import inf, sqrt
-from operator import add, matmul
+from functools import cached_property
+from math import inf, isnan, prod, sqrt
 from typing import Any
 
 import autograd.numpy as anp
@@ -18,8 +17,7 @@ from sparsedp.derivative import pullback, pushforward
 from sparsedp.direction import hvp
 from sparsedp.errors import DerivativeError
 from sparsedp.operators.given import check_operator
-from sparsedp.structure.base import Matrix, Scaled, result_dtype
-from sparsedp.structure.lazy import Chain, Sum
+from sparsedp.structure.base import Matrix, result_dtype
 from sparsedp.tree import norm
 
 __all__ = ["OperatorSummary", "fault_of", "field", "layouts", "operator", "transpose", "twin"]
@@ -56,7 +54,7 @@ def row(name, measure, *args, optional=False):
         return Row(name, None, None, None, found)
     if isinstance(found, list):
         return Row(name, float(len(found)), 0.0, not found, "; ".join(found))
-    return Row(name, float(found), LIMIT, bool(found <= LIMIT))
+    return Row(name, inf if isnan(found) else float(found), LIMIT, bool(found <= LIMIT))
 
 
 class Probe:
@@ -72,12 +70,16 @@ class Probe:
 
     Attributes
     ----------
+    listed : bool
+        Whether the entries can be listed at a fair price.
     forms : tuple of Operator
-        Explicit and matrix-free, where the entries can be listed at a fair price.
-    matrix, sizes : sparse matrix or None
-        The entries, and what their rounding errors are relative to.
+        Explicit and matrix-free, where they can.
+    matrix : sparse matrix
+        The entries, where they can.
+    bounds : tuple of functions
+        |u| -> what rounding in A u and in A^T u is relative to, entry by entry: |A| |u|. Empty without entries.
     size : float
-        sqrt(|A|_1 |A|_inf): from the entries, or a lower bound from products. A bound from below makes the tests
+        sqrt(|A|_1 |A|_inf), or a lower bound of the 2-norm from products. A bound from below makes the tests
         stricter, never laxer.
     """
 
@@ -85,11 +87,17 @@ class Probe:
         self.op, self.rng, self.seeds = op.tangent, generator(rng), max(seeds, 1)
         self.real = op.dtype.kind != "c"
         structure = self.op.structure
-        listed = max(op.shape) <= (LARGEST if structure.has_entries else MOST_COLUMNS)
-        self.forms = [self.op.explicit(), self.op.matrix_free()] if listed else []
-        self.matrix = self.forms[0].matrix if listed else None
-        self.sizes: Any = magnitude(structure, self.matrix) if listed else None
-        self.size = _size(self.sizes) if listed else self._norm()
+        self.listed = max(op.shape) <= (LARGEST if structure.has_entries else MOST_COLUMNS)
+        entries = self.listed and structure.has_entries
+        self.bounds: tuple = (structure.magnitude(), structure.transpose().magnitude()) if entries else ()
+        self.size = self._size() if entries else self._norm()
+        self.forms = (self.op.explicit(), self.op.matrix_free()) if self.listed else ()
+        self.matrix: Any = self.forms[0].matrix if self.listed else None
+
+    @cached_property
+    def turned(self):
+        """The entries of the transpose, from its own definition."""
+        return self.op.structure.transpose().explicit()
 
     def domain(self, dtype=float):
         """Random field of the domain."""
@@ -127,31 +135,28 @@ class Probe:
 
         Functions round relative to the whole result (transforms, solves): |A| |u| in norms.
         """
-        if self.matrix is None:
-            return self.size * norm(u)
-        sizes = self.sizes.T if transposed else self.sizes
-        whole = 0.0 if self.op.structure.has_entries else self.size * norm(u)
-        return whole + sizes @ np.abs(u).reshape(-1).astype(float)
+        if self.bounds:
+            return self.bounds[transposed](np.abs(u).reshape(-1).astype(float))
+        return self.size * norm(u)
 
     def transposed(self, g, real):
         """A^T g by the transposed matrix, or by `.T` when no matrix can be listed; its real part, of real fields."""
-        if self.matrix is None:
-            back = self.op.T.apply(g)
-        else:
-            back = (self.matrix.T @ g.reshape(-1)).reshape(self.op.domain.shape)
+        back = (self.matrix.T @ g.reshape(-1)).reshape(self.op.domain.shape) if self.listed else self.op.T.apply(g)
         return back.real if real else back
+
+    def _size(self):
+        """sqrt(|A|_1 |A|_inf)."""
+        sums = [bound(np.ones(n)) for bound, n in zip(self.bounds, self.op.shape[::-1])]
+        return prod(sqrt(np.max(sizes, initial=0.0)) for sizes in sums)
 
     def _norm(self):
         """The 2-norm, from below, by power iteration; only products of A itself count."""
-        op, size, x = self.op, 0.0, self.domain()
+        size, x = 0.0, self.domain()
         for _ in range(POWERS):
-            length = norm(x)
-            if not length > 0:
-                break
-            y = op.apply(x / length)
-            size = max(size, float(norm(y)))
+            y = self.op.apply(x / (norm(x) or 1.0))
+            size = max(size, norm(y))
             try:
-                x = op.T.apply(y)
+                x = self.op.T.apply(y)
             except DerivativeError:  # it has no transpose
                 x = self.domain()
         return size
@@ -184,7 +189,7 @@ IDENTITIES = {
     ),
     "transposed": lambda p, u, v, g: (
         p.matrix.T @ g.reshape(-1),
-        np.stack([form.T.apply(g).reshape(-1) for form in p.forms]),
+        np.stack([p.turned @ g.reshape(-1), *(form.T.apply(g).reshape(-1) for form in p.forms)]),
         p.bound(g, True),
     ),
 }
@@ -199,26 +204,6 @@ def unit(structure, dtype):
     inner = max((unit(member, dtype) for member in members if member is not None), default=0.0)
     system = getattr(getattr(structure, "solver", None), "system", structure)
     return max(float(np.finfo(dtype).eps), float(getattr(system, "rtol", 0.0)), inner)
-
-
-def magnitude(structure, matrix=None):
-    """Structure (its matrix) -> sparse matrix of sizes: |A| entry by entry, |A| |B| for a product, |A| + |B| for a sum.
-
-    The rounding error of an application is at most a few units times this matrix times |u|, also
-    where entries of the product cancel.
-    """
-    if isinstance(structure, Scaled):
-        return magnitude(structure.inner) * abs(structure.factor)
-    if isinstance(structure, (Chain, Sum)):
-        combine = matmul if isinstance(structure, Chain) else add
-        return reduce(combine, map(magnitude, structure.members))
-    return abs(structure.explicit() if matrix is None else matrix)
-
-
-def _size(sizes):
-    """sqrt(|A|_1 |A|_inf) of a matrix of sizes."""
-    one, infinite = (np.max(sizes.sum(axis=axis), initial=0.0) for axis in (0, 1))
-    return sqrt(one) * sqrt(infinite)
 
 
 # ------------------------------------------------------------ transpose
@@ -278,8 +263,8 @@ def twin(op, seeds=3, rng=None):
     -------
     Summary
         The difference of the two products, entry by entry, in units of eps |A| |u| (for products of
-        operators |A| |B| |u|), and the difference of the matrix of the transpose from the transposed
-        matrix. Each <= 10.
+        operators |A| |B| |u|), each <= 10. Beside the transposed products stands that of the matrix which the
+        transpose has of its own.
 
     Notes
     -----
@@ -299,16 +284,11 @@ def twin(op, seeds=3, rng=None):
 
 
 def _form_rows(probe):
-    """Rows: both products in three dtypes, entry by entry, and the entries of the transpose."""
-    op, listed = probe.op, probe.matrix is not None
-    rows = [row("forms", _forms, op.structure, listed)]
-    if not listed:
-        return rows
-    transposed = row("transposed", lambda: op.T.apply(np.zeros(op.codomain.shape)) is None)
-    rows += probe.rows("forward", DTYPES[:3])
-    if not transposed.ok:
-        return [*rows, transposed]  # what a foreign function raises has its row
-    return [*rows, *probe.rows("transposed", DTYPES[:3]), row("transpose, entry by entry", _entries, probe)]
+    """Rows: both products in three dtypes, entry by entry."""
+    rows = [row("forms", _forms, probe.op.structure, probe.listed)]
+    for name in ("forward", "transposed") if probe.listed else ():
+        rows += probe.rows(name, DTYPES[:3])
+    return rows
 
 
 def _forms(structure, listed):
@@ -317,17 +297,6 @@ def _forms(structure, listed):
     if structure.has_entries:
         return "both" if listed else "too large: the matrix was not built for this test"
     return f"one form: given by functions{'; compared with' if listed else ', and too large to list'} its columns"
-
-
-def _entries(probe):
-    """The matrix of the transpose, from its own definition, against the transposed matrix."""
-    structure, rounding = probe.op.structure, unit(probe.op.structure, float)
-    gap = abs(structure.transpose().explicit() - probe.matrix.T).tocsr()
-    gap.eliminate_zeros()
-    if not gap.nnz or not structure.has_entries:  # functions round relative to the whole
-        return gap.max() / (probe.size * rounding) if gap.nnz else 0.0
-    shares = gap.multiply(probe.sizes.T.tocsr().power(-1)).tocsr()
-    return shares.max() / rounding if shares.nnz == gap.nnz else inf  # an entry where there should be none
 
 
 def fault_of(op, rng):
@@ -428,7 +397,7 @@ def operator(op, seeds=3, rng=None):
     Notes
     -----
     Rows: linearity, transpose (scaled dot test in four dtypes), twin (explicit against matrix-free,
-    forward, transposed and entry by entry), JVP, VJP, second order, dtypes, fresh results, same bits twice, the
+    forward and transposed), JVP, VJP, second order, dtypes, fresh results, same bits twice, the
     same digits for a field times 2^+-900. Beside them stand facts without a verdict (`facts`): cost and bytes, row
     sums, spectrum, the largest stable step, what the operator is adjoint to, the derivative that it stands for and
     its order. Figures are in units of rounding; an inverse is judged by the tolerance of its solve, without its check
@@ -495,8 +464,7 @@ class OperatorSummary(Summary):
     """
 
     def __init__(self, op, probe, rows):
-        listed = isinstance(op.structure, Matrix) or (probe and probe.matrix is not None and op.structure.has_entries)
-        nnz = int(op.matrix.nnz) if listed else None
+        nnz = int(op.matrix.nnz) if probe and probe.bounds else None
         super().__init__(f"{op.name}: {op.domain} -> {op.codomain}", rows, op=op, size=probe and probe.size, nnz=nnz)
 
     @cached_property
@@ -510,29 +478,14 @@ class OperatorSummary(Summary):
 
     def to_dict(self):
         """The summary as plain numbers, strings and lists."""
-        return {**super().to_dict(), **self.facts}
+        return super().to_dict() | self.facts
 
     def _head(self):
-        op, facts = self.op, self.facts
-        entries = "entries not listed" if self.nnz is None else f"{self.nnz} entries"
-        times = [f"{1e6 * seconds:.3g} us {form}" for form, seconds in facts.get("seconds", {}).items()]
-        rest = [
-            f"{name} {_word(value)}" for name, value in facts.items() if name not in ELSEWHERE and value is not None
-        ]
-        lines = [
-            f"{op.form}, {op.dtype}, {entries}",
-            times and f"one application: {', '.join(times)}",
-            ", ".join(rest),
-            *(f"{name}: {facts[name]}" for name in LONG if name in facts),
-        ]
-        return [*super()._head(), *(f"  {line}" for line in lines if line)]
+        facts = (f"  {name}: {_words(value)}" for name, value in self.facts.items() if value is not None)
+        return [*super()._head(), *facts]
 
 
-LONG = "integration by parts", "order", "acts as"  # facts with a line of their own
-ELSEWHERE = (*LONG, "domain", "codomain", "form", "dtype", "nnz", "seconds")
-
-
-def _word(value):
-    if isinstance(value, bool):
-        return "yes" if value else "no"
+def _words(value):
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_words(one)}" for name, one in value.items())
     return f"{value:.4g}" if isinstance(value, float) else str(value)

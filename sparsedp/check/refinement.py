@@ -58,14 +58,9 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
     elif expected is not None:
         verdict = "agrees" if expected[0] <= found <= expected[1] else "disagrees"
         reason = f"expected {expected[0]:g} to {expected[1]:g}"
+    orders = tuple(slopes.tolist())
     return Refinement(
-        sizes=sizes,
-        errors=errors,
-        orders=tuple(slopes.tolist()),
-        order=found,
-        expected=expected,
-        verdict=verdict,
-        reason=reason,
+        sizes=sizes, errors=errors, orders=orders, order=found, expected=expected, verdict=verdict, reason=reason
     )
 
 
@@ -89,7 +84,6 @@ class Refinement(Result):
         return self.order
 
     def __str__(self):
-        orders = ["", *(f"{slope:.2f}" for slope in self.orders)]
-        lines = [(n, f"{error:.3e}", slope) for n, error, slope in zip(self.sizes, self.errors, orders)]
-        head = f"order {self.order:.2f} over the last three sizes: {self.verdict} ({self.reason})"
-        return head + "\n" + table(lines, ("n", "error", "order"))
+        orders = ("", *(f"{slope:.2f}" for slope in self.orders))
+        head = f"order {self.order:.2f} over the last three sizes: {self.verdict} ({self.reason})\n"
+        return head + table(zip(self.sizes, self.errors, orders), ("n", "error", "order"))

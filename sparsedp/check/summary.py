@@ -4,7 +4,9 @@ import math
 import re
 from typing import NamedTuple
 
-__all__ = ["Result", "Row", "Summary", "table"]
+import numpy as np
+
+__all__ = ["Result", "Row", "Summary", "table", "text_of"]
 
 
 class Result:
@@ -34,15 +36,25 @@ class Result:
         return self.ok
 
     def to_dict(self):
-        """The result as plain numbers, strings, lists and dicts."""
-        return {name: getattr(self, name) for name in self._plain or vars(self)}
+        """The result as plain numbers, strings, lists and dicts; None where an array holds NaN."""
+        return {name: _plain(getattr(self, name)) for name in self._plain or vars(self)}
 
     def __repr__(self):
         return str(self)
 
 
+def _plain(value):
+    if isinstance(value, Result):
+        return value.to_dict()
+    if isinstance(value, Row):
+        return value._asdict()
+    if isinstance(value, np.ndarray):
+        return np.where(np.isnan(value), np.array(None), value).tolist()
+    return [_plain(one) for one in value] if isinstance(value, (tuple, list)) else value
+
+
 class Row(NamedTuple):
-    """One property: its name, the measured figure, the largest figure allowed, and whether it holds.
+    """One property: its name, the measured figure (infinite for NaN), the largest one allowed, and whether it holds.
 
     `ok` is None when the property does not apply; `note` says why, or what went wrong.
     """
@@ -70,7 +82,7 @@ class Summary(Result):
     """
 
     _word = "a finding"
-    _plain = ("title", "verdict", "limit", "worst")
+    _plain = ("title", "verdict", "limit", "worst", "rows")
 
     def __init__(self, title, rows, limit=10.0, **values):
         failed = tuple(row.name for row in rows if row.ok is False)
@@ -79,13 +91,8 @@ class Summary(Result):
 
     @property
     def worst(self):
-        """Largest figure of the tested rows (NaN counts as infinite); 0 without any."""
-        figures = [row.figure for row in self.rows if row.figure is not None]
-        return max((math.inf if math.isnan(figure) else figure for figure in figures), default=0.0)
-
-    def to_dict(self):
-        """The summary as plain numbers, strings and lists."""
-        return super().to_dict() | {"rows": [row._asdict() for row in self.rows]}
+        """Largest figure of the tested rows; 0 without any."""
+        return max((row.figure for row in self.rows if row.figure is not None), default=0.0)
 
     def _head(self):
         """Lines above the rows."""
@@ -93,12 +100,16 @@ class Summary(Result):
 
     def __str__(self):
         words = {True: "ok", False: "FAILS", None: "-"}
-        rows = [(row.name, row.figure, row.limit, words[row.ok], row.note) for row in self.rows]
-        cells = [["" if x is None else form.format(x) for form, x in zip(FORMS, row)] for row in rows]
+        limits = ["" if row.limit is None else f"<= {row.limit:g}" for row in self.rows]
+        cells = [(*row[:2], limit, words[row.ok], row.note) for row, limit in zip(self.rows, limits)]
         return "\n".join([*self._head(), table(cells)])
 
 
-FORMS = "{}", "{:.3g}", "<= {:g}", "{}", "{}"  # of the cells of a row
+def text_of(value):
+    """A cell: two digits of a float, nothing for NaN and None."""
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.2g}"
+    return "" if value is None else str(value)
 
 
 def table(lines, head=None):
@@ -113,7 +124,7 @@ def table(lines, head=None):
     -------
     str
     """
-    rows = [tuple(map(str, line)) for line in (*([head] if head else []), *lines)]
+    rows = [list(map(text_of, line)) for line in (*([head] if head else []), *lines)]
     if not rows:
         return "  nothing to show"
     columns = []
