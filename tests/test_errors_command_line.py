@@ -109,7 +109,7 @@ def test_the_report(scene, tmp_path, capsys):
     page = (out / "report.md").read_text(encoding="utf-8")
     assert page.startswith("# poisson: agrees")
     assert "fastest at a gradient error of 1 %: direct" in page
-    assert "left out: multigrid hierarchy" in page and "stress left out 10^4 steps" in page
+    assert "left out: multigrid hierarchy" in page and "stress left out: 10^4 steps" in page
     assert "may stop at" in page
     assert "| 1 % | direct | cells=16, method=direct |" in page  # which method at 1 % error
     answers = page.index("## Which method for which error?"), page.index("## What was left out, and why")

@@ -298,6 +298,7 @@ class Audit(Result):
     _plain = (*"verdict reason digits culprit hessian value evaluations size notes lines rows".split(),)
 
     @property
+    @np.errstate(all="ignore")
     def rows(self):
         """One dict for each direction and step: the numbers of the table and of the V-curve."""
         return tuple(
@@ -306,7 +307,7 @@ class Audit(Result):
                 **level._asdict(),
                 "difference": level.difference,
                 "slope": level.slope,
-                "gap": _share(level.difference - level.slope, one.scale),
+                "gap": (level.difference - level.slope) / one.scale,
             }
             for one in self.lines
             for level in one.line.levels
@@ -327,17 +328,15 @@ class Audit(Result):
 
     def _curves(self):
         """|difference - g . d| relative to the derivative, over the steps (down) and directions (across)."""
-        cells = {(r["step"], r["direction"]): "-" if r["note"] else f"{abs(r['gap']):.0e}" for r in self.rows}
-        names = [one.direction for one in self.lines]
-        steps = sorted({step for step, _ in cells}, reverse=True)
-        lines = [(f"{step:.1e}", *(cells.get((step, name), "") for name in names)) for step in steps]
-        return table(lines, ("step", *names))
+        cells = {(r["step"], r["direction"]): "-" if r["note"] else abs(r["gap"]) for r in self.rows}
+        names, steps = [one.direction for one in self.lines], sorted({step for step, _ in cells}, reverse=True)
+        return table([(step, *(cells.get((step, name)) for name in names)) for step in steps], ("step", *names))
 
     def _table(self):
         """One line for each direction."""
         lines = [
-            (one.direction, f"{one.slope:.9g}", f"{one.difference:.9g}", f"{_share(abs(one.gap), one.scale):.0e}",
-             f"{one.resolution:.0e}", *map(_order, (one.rate1, one.rate2, one.rate3)), one.word, one.note)
+            (one.direction, f"{one.slope:.9g}", f"{one.difference:.9g}", one.share, one.resolution,
+             *map(_order, (one.rate1, one.rate2, one.rate3)), one.word, one.note)
             for one in self.lines
         ]  # fmt: skip
         head = ("direction", "g . d", "differences", "gap", "bar", "order 1", "order 2", "order 3", "", "")
@@ -346,7 +345,3 @@ class Audit(Result):
 
 def _order(rate):
     return "-" if math.isnan(rate) else "exact" if math.isinf(rate) else f"{rate:.2f}"
-
-
-def _share(value, scale):
-    return value / scale if scale > 0 else (0.0 if value == 0 else math.inf)

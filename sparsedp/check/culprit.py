@@ -57,8 +57,7 @@ def _examined(nodes):
     for node in nodes:
         inner.setdefault(id(node.inside), []).append(node)
         groups.setdefault(id(node.subject), []).append(node)
-    spread = [(calls, np.linspace(0, len(calls) - 1, min(MOST, len(calls)))) for calls in groups.values()]
-    chosen = {id(calls[round(place)]) for calls, places in spread for place in places}
+    chosen = {id(node) for calls in groups.values() for node in calls[:: -(-len(calls) // MOST)]}
 
     def ordered(outer):
         for node in inner.get(id(outer), ()):

@@ -211,7 +211,7 @@ class Judgement(Result):
     """
 
     _plain = (*"direction word difference slope gap bar scale step rate1 rate2 digits jitter note bend rate3".split(),)
-    gap = size = jitter = step = rate1 = rate2 = bend = rate3 = math.nan
+    gap = size = share = jitter = step = rate1 = rate2 = bend = rate3 = math.nan
     bar, digits = math.inf, 0.0
     close = wrong = zero = False
 

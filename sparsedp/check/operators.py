@@ -91,8 +91,8 @@ class Probe:
         entries = self.listed and structure.has_entries
         self.bounds: tuple = (structure.magnitude(), structure.transpose().magnitude()) if entries else ()
         self.size = self._size() if entries else self._norm()
-        self.forms = (self.op.explicit(), self.op.matrix_free()) if self.listed else ()
-        self.matrix: Any = self.forms[0].matrix if self.listed else None
+        self.forms: tuple = (self.op.explicit(), self.op.matrix_free()) if self.listed else ()
+        self.matrix: Any = next((form.matrix for form in self.forms), None)
 
     @cached_property
     def turned(self):
@@ -146,7 +146,7 @@ class Probe:
 
     def _size(self):
         """sqrt(|A|_1 |A|_inf)."""
-        sums = [bound(np.ones(n)) for bound, n in zip(self.bounds, self.op.shape[::-1])]
+        sums = [bound(np.ones(n)) for bound, n in zip(self.bounds, reversed(self.op.shape))]
         return prod(sqrt(np.max(sizes, initial=0.0)) for sizes in sums)
 
     def _norm(self):

@@ -1,12 +1,14 @@
 """What checks and instruments give: frozen values that print themselves, and their columns of text."""
 
+import csv
+import io
 import math
 import re
 from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Result", "Row", "Summary", "table", "text_of"]
+__all__ = ["Result", "Row", "Summary", "csv_text", "table", "text_of"]
 
 
 class Result:
@@ -16,6 +18,7 @@ class Result:
     """
 
     _word = ""  # what it is called; default: its class
+    _columns: tuple = ()  # of its table as CSV; default: those of the first row
     _plain: tuple = ()  # names of the attributes that are plain data; default: all that were given
 
     def __init__(self, **values):
@@ -38,6 +41,14 @@ class Result:
     def to_dict(self):
         """The result as plain numbers, strings, lists and dicts; None where an array holds NaN."""
         return {name: _plain(getattr(self, name)) for name in self._plain or vars(self)}
+
+    def markdown(self):
+        """The text in Markdown."""
+        return f"```text\n{self}\n```\n"
+
+    def csv(self):
+        """The rows as CSV."""
+        return csv_text(_plain(self.rows), self._columns)
 
     def __repr__(self):
         return str(self)
@@ -110,6 +121,15 @@ def text_of(value):
     if isinstance(value, float):
         return "" if math.isnan(value) else f"{value:.2g}"
     return "" if value is None else str(value)
+
+
+def csv_text(rows, names=()):
+    """Table -> CSV with a line of names; default: the keys of the first row."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, names or list(rows[0] if rows else ["nothing"]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
 
 
 def table(lines, head=None):

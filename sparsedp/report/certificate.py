@@ -20,7 +20,7 @@ from sparsedp.derivative import value_and_grad
 from sparsedp.fields import is_number
 from sparsedp.ledger import recording, thread
 from sparsedp.report.plan import total
-from sparsedp.report.table import Result, text_table
+from sparsedp.report.table import Table
 from sparsedp.tree import leaves, norm
 
 __all__ = ["Certificate", "Certified", "certified", "certify", "distance"]
@@ -239,7 +239,7 @@ def _advice(total, causes, solves, target):
     return f"the tolerances are as they should be {goal}"
 
 
-class Certificate(Result):
+class Certificate(Table):
     """The result of `certify`. Frozen.
 
     Attributes
@@ -269,13 +269,11 @@ class Certificate(Result):
         """Estimated error of the value, with its sign."""
         return self.corrected_value - self.value
 
-    def __str__(self):
+    def _parts(self):
         causes = ", ".join(f"{error:.1e} from {name}" for name, error in self.causes.items())
-        return (
-            f"value {self.value:.9g}, off by about {self.value_error:.1e}; corrected {self.corrected_value:.12g}\n"
-            f"gradient off by about {self.gradient_error:.1e} of itself: {causes}\n"
-            f"{text_table(self.solves, SHOWN)}\nadvice: {self.advice}"
-        )
+        value = f"value {self.value:.9g}, off by about {self.value_error:.1e}; corrected {self.corrected_value:.12g}"
+        gradient = f"gradient off by about {self.gradient_error:.1e} of itself: {causes}"
+        return [value, gradient], self.solves, SHOWN, [f"advice: {self.advice}"]
 
 
 # ---------------------------------------------------------------- adaptive tolerances for minimize

@@ -10,7 +10,7 @@ from sparsedp.derivative import value_and_grad
 from sparsedp.fields import check_function
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
-from sparsedp.report.table import Result, text_table
+from sparsedp.report.table import Table
 from sparsedp.tape import is_variable
 from sparsedp.tree import leaves
 
@@ -106,7 +106,7 @@ def total(calls, *kinds):
     return sum(many for (_, kind), many in calls.items() if kind in kinds)
 
 
-class Plan(Result):
+class Plan(Table):
     """The result of `explain`. Frozen.
 
     Attributes
@@ -128,27 +128,24 @@ class Plan(Result):
         Forward with taping, backward.
     """
 
-    _plain = ("value", "totals", "left_out", "rows", "tape_nodes", "tape_bytes", "recomputation")
+    _plain = ("value", "totals", "left_out", "rows", "tape_nodes", "tape_bytes", "recomputation", "seconds")
 
     def to_dict(self):
         """The plan as plain numbers, strings, lists and dicts; counts nested by name and kind."""
         counts: dict = {}
         for (name, kind), many in self.counts.items():
             counts.setdefault(name, {})[kind] = many
-        return super().to_dict() | {"counts": counts, "seconds": list(self.seconds)}
+        return super().to_dict() | {"counts": counts}
 
-    def __str__(self):
+    def _parts(self):
         forward, backward = self.seconds
         used = [kind for kind in COLUMNS if any(row[kind] for row in self.rows)]
-        rows = [{name: value or "" for name, value in row.items()} for row in self.rows]
-        return "\n".join([
+        rows = [{name: value or None for name, value in row.items()} for row in self.rows]
+        above = (
             f"value {self.value:.6g}: {forward:.2g} s forward, {backward:.2g} s backward; tape: {self.tape_nodes} "
-            f"calls that keep {self.tape_bytes} bytes, recomputation factor {self.recomputation:.2f}",
-            text_table(rows, ("name", *used, "seconds", "how")),
-            f"totals: {self.sums}",
-            "left out:",
-            *(f"  - {sentence}" for sentence in self.left_out),
-        ])  # fmt: skip
+            f"calls that keep {self.tape_bytes} bytes, recomputation factor {self.recomputation:.2f}"
+        )
+        return [above], rows, ("name", *used, "seconds", "how"), [f"totals: {self.sums}"]
 
     @property
     def sums(self):

@@ -20,8 +20,8 @@ from sparsedp.files import write_file
 from sparsedp.report import plots
 from sparsedp.report.certificate import certify
 from sparsedp.report.plan import explain
-from sparsedp.report.stress_table import Stress, stress
-from sparsedp.report.table import Result, csv_text, markdown_table, write_table
+from sparsedp.report.stress_table import stress
+from sparsedp.report.table import Result, markdown_table, write_table
 from sparsedp.report.work_precision import Rows, words_of, workprec
 
 __all__ = ["Source", "audited", "claim", "load", "write_report"]
@@ -29,9 +29,9 @@ __all__ = ["Source", "audited", "claim", "load", "write_report"]
 STARTS = ("start", "x")  # names of the point, the first that is there
 OPTIONS = ("workprec_options", "stress_options")  # dicts of arguments in the file
 PAGE = "report.md"
+NO_PROBLEM = "the file gives no workprec_options (problem, methods, over, reference)"
 GOAL = 0.01  # the error that the page recommends a method for, in a sentence
 GOALS = 0.1, GOAL, 1e-3, 1e-4, 1e-6  # and in a table
-LEFT = "left out"  # in every sentence about it
 MEANING = {  # the worst first: one that is wrong beats one that is open
     "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
     "inconclusive": "Nothing is proved: the reason stands below. This is no pass.",
@@ -86,8 +86,8 @@ def load(target):
 
 
 @contextlib.contextmanager
-def audited(name):
-    """In it a loss of the user's runs: what it prints goes to stderr, and what it raises, an exit too, is refused."""
+def refusing(sentence):
+    """In it code of the user's runs: it prints to stderr, and what it raises, an exit too, is refused."""
     try:
         with contextlib.redirect_stdout(sys.stderr):
             yield
@@ -95,19 +95,20 @@ def audited(name):
         raise
     except BaseException as error:
         cure = "" if isinstance(error, Exception) else "; it ended the program, let it return its value"
-        raise ValueError(f"{name} cannot be audited: {type(error).__name__}: {error}{cure}") from error
+        raise ValueError(f"{sentence(error)}{type(error).__name__}: {error}{cure}") from error
+
+
+def audited(name):
+    """A `with` block in which a loss of the user's runs."""
+    return refusing(lambda error: f"{name} cannot be audited: ")
 
 
 def _of_one(loss, x):
     """The loss as a function of one point: a point that is a tuple fills a loss of several arguments."""
-    if not isinstance(x, tuple) or hasattr(x, "_fields"):
-        return loss
     try:
         inspect.signature(loss).bind(None)
     except TypeError:
-        return lambda point: loss(*point)
-    except ValueError:  # a function of C without a signature
-        return loss
+        return (lambda point: loss(*point)) if isinstance(x, tuple) else loss
     return loss
 
 
@@ -117,21 +118,17 @@ def _run(file):
     before = sys.argv, sys.path
     sys.argv, sys.path = [str(file)], [str(file.resolve().parent), *sys.path]
     try:
-        with contextlib.redirect_stdout(sys.stderr):
+        with refusing(lambda error: f"{file} does not run: {_where(error, str(file))}"):
             return runpy.run_path(str(file), run_name=file.stem)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # the file is the user's: it may raise anything, or end the program
-        raise ValueError(f"{file} does not run: {_where(error, file)}{type(error).__name__}: {error}") from error
     finally:
         sys.argv, sys.path = before
 
 
 def _where(error, file):
     """The last line of the file itself that took part, in words."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)]
-    line = error.lineno if isinstance(error, SyntaxError) else frames[-1].lineno if frames else None
-    return "" if line is None else f"line {line}: "
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+    lines += [error.lineno] if isinstance(error, SyntaxError) else []
+    return f"line {lines[-1]}: " if lines else ""
 
 
 # ---------------------------------------------------------------- the report on it
@@ -172,16 +169,18 @@ def write_report(source, folder, force=False):
         results = [_attempt(chapter.run, source) for chapter in CHAPTERS]
     words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
     verdict = next(word for word in MEANING if word in words)
-    page, left, lines = [f"# {source.name}: {verdict}", "", MEANING[verdict]], [], []
+    page, left, lines, files = [f"# {source.name}: {verdict}", "", MEANING[verdict]], [], [], []
     for chapter, result in zip(CHAPTERS, results):
-        sentences = [f"{chapter.failed}, {result}"] if isinstance(result, str) else list(chapter.tell(result))
+        told, skipped = [f"{chapter.failed}, {result}"], []
         if isinstance(result, Result):
-            _save(folder, chapter, result)
-        lines += sentences
-        left += [f"- {one}" for one in sentences if LEFT in one]
-        page += ["", f"## {chapter.title}", "", *(f"- {one}" for one in sentences if LEFT not in one)]
+            told, subject = list(chapter.tell(result)), chapter.failed.partition(":")[0]
+            skipped = [f"{subject} left out: {sentence}" for sentence in getattr(result, "left_out", ())]
+            files += _save(folder, chapter, result)
+        lines += told + skipped
+        left += [f"- {sentence}" for sentence in skipped]
+        page += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in told)]
         page += ["", *_goals(result)] if isinstance(result, Rows) else []
-    page += ["", "## What was left out, and why", "", *left, "", *_details(folder)]
+    page += ["", "## What was left out, and why", "", *left, "", *_details(files)]
     write_file(folder / PAGE, "\n".join(page))
     return verdict, lines
 
@@ -195,12 +194,9 @@ def _attempt(run, source):
 
 
 def _save(folder, chapter, result):
-    if isinstance(result, Rows):  # it knows its name
-        result.save(folder)
-        return
-    text = result.markdown() if isinstance(result, Stress) else f"```text\n{result}\n```\n"
-    draw = result.plot if getattr(result, "map", None) else chapter.draw and partial(chapter.draw, result)
-    write_table(folder, chapter.stem, f"# {chapter.title}\n\n{text}", csv_text(result.rows), draw)
+    """Result -> names of its files."""
+    text, stem = f"# {chapter.title}\n\n{result.markdown()}", getattr(result, "stem", chapter.stem)
+    return [path.name for path in write_table(folder, stem, text, result.csv(), chapter.draw(result))]
 
 
 def _audit(audit):
@@ -211,16 +207,12 @@ def _audit(audit):
 
 
 def _workprec(table):
-    if table is None:
-        yield "error against run time: left out; the file gives no workprec_options (problem, methods, over, reference)"
-        return
-    words, row = table.judged.replace("_", " "), table.best(GOAL, table.judged)
+    words, row = f"a {table.judged.replace('_', ' ')} of", table.best(GOAL, table.judged)
     if row is None:
-        yield f"error against run time: no method reaches a {words} of {GOAL:g}, see {table.stem}.md"
+        yield f"error against run time: no method reaches {words} {GOAL:g}, see {table.stem}.md"
     else:
         spent = f"{row['method']} ({words_of(row)}), {table.seconds(row, table.judged):.1e} s"
-        yield f"fastest at a {words} of {100 * GOAL:g} %: {spent}"
-    yield from (f"error against run time left out {sentence}" for sentence in table.left_out)
+        yield f"fastest at {words} {100 * GOAL:g} %: {spent}"
 
 
 def _goals(table):
@@ -238,14 +230,12 @@ def _certificate(certificate):
 
 def _plan(plan):
     yield f"one gradient: {plan.sums}"
-    yield from (f"left out: {sentence}" for sentence in plan.left_out)
 
 
 def _stress(trial):
     yield trial.summary
     for row in trial.failures:
         yield ": ".join(["FAILED", f"{row['parameter']} {row['case']}".strip(), row["note"]])
-    yield from (f"stress left out {sentence}" for sentence in trial.left_out)
 
 
 class Chapter(NamedTuple):
@@ -253,28 +243,28 @@ class Chapter(NamedTuple):
 
     stem: str
     title: str
-    failed: str  # what is said when it fails
+    failed: str  # what is said when it fails; with what stands before the colon begins what it left out
     run: Any
     tell: Any
-    draw: Any = None
+    draw: Any = lambda result: None  # result -> what draws it on axes, or None
 
 
 # The audit comes first and the stress cases last: both have a say in the verdict.
 CHAPTERS = (
     Chapter("audit", "Is the gradient right?", "gradient: not audited",
-            lambda s: check.gradient(s.loss, s.x), _audit, plots.v_curve),
+            lambda s: check.gradient(s.loss, s.x), _audit, lambda audit: partial(plots.v_curve, audit)),
     Chapter("workprec", "Which method for which error?", "error against run time: not measured",
-            lambda s: workprec(**s.workprec) if s.workprec else None, _workprec),
+            lambda s: workprec(**s.workprec) if s.workprec else NO_PROBLEM, _workprec,
+            lambda rows: partial(rows.plot, error=rows.judged)),
     Chapter("certificate", "How exact is the gradient, and how exact need the solves be?", "certificate: not made",
             lambda s: certify(s.loss, s.x), _certificate),
     Chapter("plan", "What one gradient computes", "plan: not made", lambda s: explain(s.loss, s.x), _plan),
     Chapter("stress", "Stiff and extreme cases", "stress: not run",
-            lambda s: stress(s.loss, s.x, **s.stress), _stress),
+            lambda s: stress(s.loss, s.x, **s.stress), _stress, lambda trial: trial.plot if trial.map else None),
 )  # fmt: skip
 
 
-def _details(folder):
-    names = sorted({path.name for kind in ("md", "csv", "png") for path in folder.glob(f"*.{kind}")} - {PAGE})
-    links = ", ".join(f"[{name}]({name})" for name in names)
+def _details(names):
+    links = ", ".join(f"[{name}]({name})" for name in sorted(names))
     pictures = [f"![{name}]({name})" for name in names if name.endswith(".png")]
     return ["## Details", "", f"Tables and numbers: {links}", "", *pictures, ""]

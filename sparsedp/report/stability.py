@@ -97,11 +97,7 @@ class StabilityMap(Result):
         Time step and viscosity of the scene.
     """
 
-    def to_dict(self):
-        """The map as plain lists; None where the step is refused."""
-        factors = np.where(np.isnan(self.factors), None, self.factors)
-        lists = {"time_steps": self.time_steps, "viscosities": self.viscosities, "factors": factors}
-        return {name: values.tolist() for name, values in lists.items()}
+    _plain = ("time_steps", "viscosities", "factors")
 
     def __str__(self):
         cells = [["refused" if np.isnan(factor) else f"{factor:.3g}" for factor in row] for row in self.factors]

@@ -1,17 +1,14 @@
 """stress: a scene driven through stiff and extreme cases, one word for each."""
 
-import textwrap
-
 from sparsedp.fields import check_function
 from sparsedp.report import plots
 from sparsedp.report.stability import stability_map
 from sparsedp.report.stress_cases import FAILED, GROUPS, WORDS, Scene, cases
-from sparsedp.report.table import Result, csv_text, left_out, markdown_table, text_table
+from sparsedp.report.table import Table
 
 __all__ = ["Stress", "stress"]
 
 COLUMNS = ("group", "parameter", "case", "outcome", "figure", "note")
-WIDEST = 70  # letters of a note in a text
 ELSEWHERE = (
     "isolated regions, solid cells, 1 cell, prime sizes, anisotropic cells: a loss keeps its grid; stress each",
     "10^4 steps: a loss keeps its number of steps",
@@ -88,7 +85,7 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     return Stress(rows=rows, left_out=[*skipped, *ELSEWHERE], map=growth)
 
 
-class Stress(Result):
+class Stress(Table):
     """The result of `stress`.
 
     Attributes
@@ -100,7 +97,8 @@ class Stress(Result):
     map : StabilityMap or None
     """
 
-    _plain = ("counts", "rows", "left_out")
+    _plain = ("counts", "rows", "left_out", "map")
+    _columns = COLUMNS
 
     @property
     def counts(self):
@@ -117,19 +115,9 @@ class Stress(Result):
         """ "disagrees" when something FAILED, else "agrees"."""
         return "disagrees" if self.failures else "agrees"
 
-    def to_dict(self):
-        """Everything as plain numbers, strings, lists and dicts."""
-        return super().to_dict() | {"map": self.map and self.map.to_dict()}
-
-    def markdown(self):
-        """The table in Markdown, the map and what was left out."""
-        growth = ["", "Growth factor of a step:", "", "```text", str(self.map), "```"] if self.map else []
-        table = markdown_table(self.rows, COLUMNS)
-        return "\n".join([self.summary, "", *table, *growth, "", *left_out(self.left_out), ""])
-
-    def csv(self):
-        """The rows as CSV."""
-        return csv_text(self.rows, COLUMNS)
+    def _parts(self):
+        growth = ["growth factor of a step:", str(self.map)] if self.map else []
+        return ["stress"], self.rows, COLUMNS, [*growth, self.summary]
 
     def plot(self, ax=None):
         """Stability map -> picture: growth factor of a step, time step against viscosity.
@@ -155,8 +143,3 @@ class Stress(Result):
     def summary(self):
         """One line."""
         return "stress: " + ", ".join(f"{many} {word}" for word, many in self.counts.items())
-
-    def __str__(self):
-        growth = ["growth factor of a step:", str(self.map)] if self.map else []
-        rows = [{**row, "note": textwrap.shorten(row["note"], WIDEST, placeholder=" ...")} for row in self.rows]
-        return "\n".join([text_table(rows, COLUMNS), *growth, *left_out(self.left_out, "  "), self.summary])

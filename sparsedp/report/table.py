@@ -3,22 +3,40 @@
 A table is a list of rows (dicts) and the names of the columns that are shown.
 """
 
-import csv
-import io
-import math
-
-from sparsedp.check.summary import Result, table
+from sparsedp.check.summary import Result, csv_text, table, text_of
 from sparsedp.files import write_file
 from sparsedp.report import plots
 
-__all__ = ["Result", "csv_text", "left_out", "markdown_table", "text_of", "text_table", "write_table"]
+__all__ = ["Result", "Table", "csv_text", "markdown_table", "text_table", "write_table"]
 
 
-def text_of(value):
-    """A cell: two digits of a float, nothing for NaN."""
-    if not isinstance(value, float):
-        return str(value)
-    return "" if math.isnan(value) else f"{value:.2g}"
+class Table(Result):
+    """A result that is a table: as text, Markdown and CSV.
+
+    Attributes
+    ----------
+    rows : list of dict
+    left_out : list of str
+        What was left out, with the reason.
+    """
+
+    left_out: tuple | list = ()
+
+    def _parts(self):
+        """(lines above the table, its rows, the names of its columns, lines below it); the first line is its title."""
+        return [type(self).__name__], self.rows, self._columns, []
+
+    def __str__(self):
+        above, rows, names, below = self._parts()
+        skipped = (f"  left out: {sentence}" for sentence in self.left_out)
+        return "\n".join([*above, text_table(rows, names), *skipped, *below])
+
+    def markdown(self):
+        """The table in Markdown, with what stands above and below it and what was left out."""
+        (title, *above), rows, names, below = self._parts()
+        skipped = (f"- left out: {sentence}" for sentence in self.left_out)
+        lines = [f"### {title}", "", *above, "", *markdown_table(rows, names), "", "```text", *below, "```", ""]
+        return "\n".join([*lines, *skipped, ""])
 
 
 def text_table(rows, names):
@@ -34,21 +52,7 @@ def markdown_table(rows, names):
 
 
 def _cells(rows, names):
-    return [[text_of(row.get(name, "")) for name in names] for row in rows]
-
-
-def left_out(sentences, indent="- "):
-    """What an instrument left out, and why -> lines."""
-    return [f"{indent}left out: {sentence}" for sentence in sentences]
-
-
-def csv_text(rows, names=None):
-    """Table -> CSV with a line of names; default: the keys of the first row."""
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, names or list(rows[0] if rows else ["nothing"]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return stream.getvalue()
+    return [[text_of(row.get(name)) for name in names] for row in rows]
 
 
 def write_table(folder, stem, markdown, csv, draw=None):

@@ -13,6 +13,7 @@ from time import perf_counter
 
 import numpy as np
 
+from sparsedp.check.summary import text_of
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.fields import check_function, is_whole
@@ -21,7 +22,7 @@ from sparsedp.ledger import Calls, recording
 from sparsedp.report import plots
 from sparsedp.report.certificate import distance
 from sparsedp.report.plan import total
-from sparsedp.report.table import Result, csv_text, left_out, markdown_table, text_of, text_table, write_table
+from sparsedp.report.table import Table, csv_text, write_table
 from sparsedp.tree import leaves, norm
 
 __all__ = ["COLUMNS", "Rows", "measured_row", "relative_distance", "timed", "versions", "words_of", "workprec"]
@@ -290,7 +291,7 @@ def relative_distance(one, other):
 # ---------------------------------------------------------------- the table
 
 
-class Rows(Result):
+class Rows(Table):
     """Error against run time. Made by `workprec`.
 
     Attributes
@@ -301,6 +302,8 @@ class Rows(Result):
     left_out : list of str
         Runs that were not made, with the reason.
     """
+
+    _columns = COLUMNS
 
     @property
     def stem(self):
@@ -329,16 +332,7 @@ class Rows(Result):
         """The fastest row whose error is at most `error`, or None."""
         return next((row for row in self.pareto(which) if row[which] <= error), None)
 
-    def markdown(self):
-        """The table in Markdown, with what was left out; a star marks the Pareto set of the gradient."""
-        rows, names = self._shown()
-        star = "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."
-        errors = [row["reference_error"] for row in self.rows if not math.isnan(row["reference_error"])]
-        stated = [f"\nError of the reference: {max(errors):.1e}."] if errors else []
-        table = markdown_table(rows, [*names, "best"])
-        return "\n".join([f"### {self.scene}", "", *table, "", star, *stated, "", *left_out(self.left_out), ""])
-
-    def _shown(self):
+    def _parts(self):
         """The table for readers: what is known of the runs, and the settings that tell those of a method apart."""
         rows = [json.loads(row["settings"]) | row for row in self.rows]
         first: dict = {}
@@ -349,11 +343,11 @@ class Rows(Result):
         used = [name for name in SHOWN if any(text_of(row[name]) for row in rows)]
         best = [*self.pareto(), *self.pareto("forward_error")]
         marked = [row | {"best": "*" * (own in best)} for row, own in zip(rows, self.rows)]
-        return marked, [*used[:1], *apart, *used[1:]]
-
-    def csv(self):
-        """All columns as CSV."""
-        return csv_text(self.rows, COLUMNS)
+        star = "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."
+        errors = [row["reference_error"] for row in self.rows if not math.isnan(row["reference_error"])]
+        stated = [f"Error of the reference: {max(errors):.1e}."] if errors else []
+        names = [*used[:1], *apart, *used[1:], "best"]
+        return [f"{self.scene}: error against run time"], marked, names, [star, *stated]
 
     def plot(self, ax=None, error="gradient_error"):
         """Log-log picture: run time across, error up, one curve for each method, the Pareto set marked.
@@ -387,10 +381,6 @@ class Rows(Result):
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         return write_table(folder, self.stem, self.markdown(), self.csv(), partial(self.plot, error=self.judged))
-
-    def __str__(self):
-        table = text_table(*self._shown())
-        return "\n".join([f"{self.scene}: error against run time", table, *left_out(self.left_out, "  ")])
 
 
 # ---------------------------------------------------------------- a file that can be continued
