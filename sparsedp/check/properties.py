@@ -5,13 +5,13 @@ Facts for the summary of an operator, not verdicts.
 
 from functools import partial
 from itertools import product
-from math import factorial
 from timeit import repeat
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import ArpackError, eigs, eigsh
+from scipy.special import factorial
 
 from sparsedp.check.nodes import bytes_of
 from sparsedp.errors import DerivativeError
@@ -20,6 +20,7 @@ from sparsedp.operators.boundary import interior
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.space import fits
 from sparsedp.structure.base import Structure
+from sparsedp.tree import norm
 
 __all__ = ["facts_of"]
 
@@ -50,26 +51,24 @@ def facts_of(op, listed, right):
     right : bool
         Whether nothing is wrong with it: else its spectrum is left out.
     """
-    facts: dict[str, Any] = {}
+    facts: dict[str, Any] = {"seconds": _seconds(op.tangent, listed), "integration by parts": _by_parts(op.tangent)}
     if not hasattr(op, "solver"):  # factors and hierarchies of a solver are not the operator's
-        facts["bytes"] = bytes_of(op._matrix_structure if op.form == "explicit" else op.structure, OPENED)
-    facts["seconds"] = _seconds(op.tangent, listed)
+        facts["bytes"] = bytes_of(op._acting, OPENED)
     square = fits(op.domain, op.codomain)
     facts |= _signs(op.matrix, square) if listed else {}
-    facts["integration by parts"] = _by_parts(op.tangent)
     try:
         facts |= _stencil(op.tangent)
     except _UnknownError as reason:
         facts["order"] = f"not known: {reason}"
-    size = op.shape[0] if right and square and op.dtype.kind != "c" else 0
-    if 0 < size <= (LARGEST_SPECTRUM if listed else DENSE_UP_TO):
+    spectrum = right and square and op.dtype.kind != "c"
+    if spectrum and 0 < op.shape[0] <= (LARGEST_SPECTRUM if listed else DENSE_UP_TO):
         facts |= _spectrum(op.tangent, facts.get("symmetric", False))
     return facts
 
 
 def _seconds(op, listed):
     """Seconds of one application in each form that exists: dict, the least of several."""
-    u, seconds = np.random.default_rng(0).standard_normal(op.domain.shape), {}
+    u, seconds = np.ones(op.domain.shape), {}
     for one in (op.explicit(), op.matrix_free()) if listed else (op,):
         again = partial(one.apply, u, one.apply(u))  # the first application may compile
         seconds[one.form] = min(repeat(again, number=1, repeat=REPEATS))
@@ -81,23 +80,23 @@ def _seconds(op, listed):
 
 def _signs(A, square):
     """Row sums, symmetry and M-matrix, from the entries."""
-    sums, size = np.asarray(A.sum(axis=1)).reshape(-1), np.max(abs(A).sum(axis=1), initial=0.0)
-    still = np.all(np.abs(sums) <= ZERO * size)
+    sums, largest = A.sum(axis=1), ZERO * np.max(abs(A).sum(axis=1), initial=0.0)
+    still = np.all(np.abs(sums) <= largest)
     facts: dict[str, Any] = {"row sums": "0" if still else f"{sums.real.min():.3g} to {sums.real.max():.3g}"}
     if square:
-        facts["symmetric"] = bool(abs(A - A.T).max() <= SYMMETRIC * abs(A).max()) if A.nnz else True
-        facts["M-matrix"] = _m_matrix(A, sums, size) if A.dtype.kind != "c" else "no: complex"
+        facts["symmetric"] = not A.nnz or bool(abs(A - A.T).max() <= SYMMETRIC * abs(A).max())
+        facts["M-matrix"] = _m_matrix(A, sums, largest) if A.dtype.kind != "c" else "no: complex"
     return facts
 
 
-def _m_matrix(A, sums, size):
+def _m_matrix(A, sums, rounding):
     """Off-diagonal entries of one sign, diagonal of the other and weakly dominant: then A, or -A, has A^-1 >= 0."""
     diagonal = A.diagonal()
     sign = 1.0 if np.sum(diagonal) >= 0 else -1.0
-    wrong = int(np.sum((sign * (A - sp.diags_array(diagonal))).tocsr().data > ZERO * size))
+    wrong = np.count_nonzero((sign * (A - sp.diags_array(diagonal))).data > rounding)
     if wrong:
         return f"no: {wrong} entries beside the diagonal have its sign"
-    if np.any(sign * sums < -ZERO * size) or np.any(sign * diagonal < 0):
+    if np.any(sign * sums < -rounding) or np.any(sign * diagonal < 0):
         return "no: the diagonal is not dominant"
     return "yes" if sign > 0 else "yes, of -A"
 
@@ -123,7 +122,7 @@ def _spectrum(op, symmetric):
     kept = values[np.abs(values) > (ZERO if whole else OUTER) * radius]
     facts: dict[str, Any] = {"spectral radius": float(radius)}
     if whole:
-        facts["null space"] = int(values.size - kept.size)
+        facts["null space"] = values.size - kept.size
     if symmetric:
         kind = "semidefinite" if kept.size < values.size else "definite" if whole else "definite or semidefinite"
         side = "positive" if np.all(kept > 0) else "negative" if np.all(kept < 0) else ""
@@ -147,25 +146,19 @@ def _by_parts(op):
     one, other, rng = op.domain, op.codomain, np.random.default_rng(1)
     if one.grid is None or one.grid != other.grid or op.dtype.kind == "c":
         return "not known: it is between no two real fields of one grid"
-    rule, partner = PARTNERS.get((one.kind, other.kind), ("", None))
-    if one == other and node_axes(one.kind, 0, one.grid.dim) is not None:
-        rule, partner = "self-adjoint in the volumes of its grid", lambda grid: -op
-    if partner is None:
+    partners = {("cells", "faces"): divergence, ("faces", "cells"): gradient}
+    partner, rule = partners.get((one.kind, other.kind)), "self-adjoint in the volumes of its grid"
+    if partner:
+        rule = f"with the {partner.__name__} of its grid"
+    elif one != other or node_axes(one.kind, 0, one.grid.dim) is None:
         return f"not known: no rule for {one.kind} -> {other.kind}"
     u, v = (rng.standard_normal(space.shape) * _open(space) for space in (one, other))
     value = op.apply(u)
     v = v * (value != 0)
-    left, right = other.volumes * value * v, -one.volumes * u * partner(one.grid).apply(v)
-    scale = np.linalg.norm(left) * np.sqrt(left.size)
-    gap = abs(left.sum() - right.sum()) / scale if scale > 0 else 0.0
+    left, back = other.volumes * value * v, partner(one.grid).apply(v) if partner else -op.apply(v)
+    gap, scale = abs(left.sum() + np.sum(one.volumes * u * back)), norm(left) * np.sqrt(left.size)
+    gap = gap / (scale or 1.0)
     return f"{rule}, to {gap:.0e}" if gap <= HOLDS else f"not {rule} (off by {gap:.0e})"
-
-
-# Spaces of an operator -> the rule, and what stands on the other side of it, with its sign turned.
-PARTNERS = {
-    ("cells", "faces"): ("with the divergence of its grid", divergence),
-    ("faces", "cells"): ("with the gradient of its grid", gradient),
-}
 
 
 def _open(space):
@@ -196,21 +189,18 @@ def _stencil(op):
             raise _UnknownError(f"it needs {FEWEST} cells along each axis")
     if op.dtype.kind == "c":
         raise _UnknownError("it is complex")
-    rows = [_row(op, component) for component in range(len(op.codomain.parts))]
-    order = min(row[0] for row in rows)
-    return {
-        "order": int(order) if order < np.inf else "exact on polynomials",
-        "acts as": "; ".join(row[1] for row in rows),
-    }
+    orders, words = zip(*(_row(op, component) for component in range(len(op.codomain.parts))))
+    order = min(orders)
+    return {"order": int(order) if order < np.inf else "exact on polynomials", "acts as": "; ".join(words)}
 
 
 def _row(op, component):
     """(order, words) of the row in the middle of one component."""
     moments = _moments(op, *_weights(op, component))
-    if not moments:
+    low, *more = sorted(moments) or [0]
+    words = _terms(moments.get(low, {}), op)
+    if not words:
         raise _UnknownError("its row in the middle is 0 on polynomials")
-    low, *more = sorted(moments)
-    words = _terms(moments[low], op)
     if not more:
         return np.inf, words
     h = max(np.max(widths) for widths in op.domain.grid.widths)
@@ -252,14 +242,14 @@ def _moments(op, place, weights):
     """Degree -> {(component, powers): moment}, where it is more than rounding; powers of x first."""
     grid, used = op.domain.grid, weights != 0
     found: dict[int, dict] = {}
-    at = _positions(op.domain)[used]
-    away, weights = at[:, :-1] - _positions(op.codomain)[place, :-1], weights[used]
+    at, weights = _positions(op.domain)[used], weights[used]
+    away = at[:, :-1] - _positions(op.codomain)[place, :-1]
     away -= np.where(grid.periodic, grid.size * np.round(away / grid.size), 0.0)  # the short way round
     powers = [power for power in product(range(DEGREES), repeat=grid.dim) if sum(power) < DEGREES]
-    for component, power in product(np.unique(at[:, -1]), sorted(powers, reverse=True)):
-        degree, scale = sum(power), np.prod([factorial(p) for p in power])
-        moment = float(np.sum((weights * np.prod(away**power, axis=1))[at[:, -1] == component]) / scale)
-        reach = np.sum(np.abs(weights) * np.max(np.abs(away), axis=1) ** degree) / factorial(degree)
+    for component, power in product(np.unique(at[:, -1]), powers[::-1]):
+        degree, terms = sum(power), weights * np.prod(away**power / factorial(power), axis=1)
+        moment = float(terms @ (at[:, -1] == component))
+        reach = np.abs(weights) @ np.max(np.abs(away), axis=1) ** degree / factorial(degree)
         if abs(moment) > MOMENT * reach:
             found.setdefault(degree, {})[component, power] = moment
     return found
@@ -273,4 +263,4 @@ def _terms(moments, op):
         slopes = "".join(axis * p for axis, p in zip(op.domain.grid.axes, power))
         size = "" if abs(abs(moment) - 1) < MOMENT else f"{abs(moment):.4g} "
         text += f" {'-' if moment < 0 else '+'} {size}{name}{'_' * bool(slopes)}{slopes}"
-    return text[3:] if text.startswith(" +") else f"-{text[3:]}"
+    return text.removeprefix(" + ").replace(" - ", "-", text.startswith(" - "))
