@@ -1,4 +1,4 @@
-"""lbfgs inside bounds: its model beside dense matrices, its cost beside SciPy's, trials that are refused."""
+"""lbfgs inside bounds: its step beside dense matrices, its cost beside SciPy's, trials that are refused."""
 
 import autograd.numpy as anp
 import numpy as np
@@ -8,65 +8,46 @@ from scipy.optimize import minimize, rosen_der
 import sparsedp as dp
 from benchmarks.bounded import PROBLEMS, compared
 from sparsedp.errors import UnstableStepError
-from sparsedp.optimize.quadratic import Quadratic
+from sparsedp.optimize.quasi_newton import two_loops
 from sparsedp.tape import plain
 
 
-def memory(rng, n, k):
-    """Steps and changes with s.y > 0, and the B that the BFGS formula makes of them, one pair after the other."""
-    root = rng.standard_normal((n, n))
-    bent = root @ root.T / n + 0.1 * np.eye(n)
-    steps = rng.standard_normal((k, n))
-    changes = steps @ bent + 0.01 * rng.standard_normal((k, n))
-    assert np.all(np.sum(steps * changes, axis=1) > 0)
-    dense = np.eye(n) * (changes[-1] @ changes[-1]) / (steps[-1] @ changes[-1])
+@pytest.mark.parametrize("k", [1, 2, 7])
+def test_a_step_is_that_of_the_dense_formula(rng, k):
+    """The B that the BFGS formula makes of steps and changes with s.y > 0, one pair after the other."""
+    root = rng.standard_normal((12, 12))
+    steps = rng.standard_normal((k, 12))
+    changes = steps @ (root @ root.T / 12 + 0.1 * np.eye(12)) + 0.01 * rng.standard_normal((k, 12))
+    dense = np.eye(12) * (changes[-1] @ changes[-1]) / (steps[-1] @ changes[-1])
     for s, y in zip(steps, changes):
         dense = dense - np.outer(dense @ s, dense @ s) / (s @ dense @ s) + np.outer(y, y) / (s @ y)
-    return steps, changes, dense
-
-
-@pytest.mark.parametrize("k", [1, 2, 7])
-def test_a_free_step_is_that_of_the_dense_formula(rng, k):
-    steps, changes, dense = memory(rng, 12, k)
     g = rng.standard_normal(12)
-    step = Quadratic(steps, changes, 1.0).minimum(g, None, None, None)
-    assert np.allclose(step, -np.linalg.solve(dense, g), rtol=1e-9)
+    assert np.allclose(two_loops(g, steps, changes, 1.0), -np.linalg.solve(dense, g), rtol=1e-9)
 
 
-def test_without_a_memory_the_step_is_steepest_descent():
-    g, nothing = np.array([3.0, -4.0]), np.zeros((0, 2))
-    model = Quadratic(nothing, nothing, 2.0)
-    assert np.array_equal(model.minimum(g, None, None, None), -g / 2)
-    room = np.array([1.0, 1.0])
-    assert np.array_equal(model.minimum(g, -room, room, np.array([True, True])), [-1.0, 1.0])
+def test_pairs_without_curvature_and_no_memory_at_all():
+    g, s = np.array([3.0, -4.0]), np.array([[1.0, 0.0], [0.0, 1.0]])
+    assert np.array_equal(two_loops(g, s[:0], s[:0], 0.5), -g / 2)
+    assert np.array_equal(two_loops(g, s, -s, 0.5), -g / 2)
 
 
-@pytest.mark.parametrize("n, k", [(6, 3), (12, 7), (40, 5)])
-def test_the_path_stops_at_its_first_minimum_and_the_step_is_no_worse(rng, monkeypatch, n, k):
-    """By brute force; some entries at a bound, some far from it, and a few breakpoints at a time."""
-    monkeypatch.setattr("sparsedp.optimize.quadratic.BLOCK", 4)
-    for _ in range(40):
-        steps, changes, dense = memory(rng, n, k)
-        g = rng.standard_normal(n)
-        lower, upper = -rng.choice([0.0, 0.02, 0.3, np.inf], n), rng.choice([0.0, 0.02, 0.3, np.inf], n)
-        free = ~(((lower == 0) & (g > 0)) | ((upper == 0) & (g < 0)))
-        value = lambda d: g @ d + d @ dense @ d / 2
-        way = np.where(free, -g, 0.0)
-        at = lambda t: np.clip(t * way, lower, upper)
-        stops = np.where(way == 0, np.inf, np.where(way < 0, lower, upper) / np.where(way == 0, 1, way))
-        t = Quadratic(steps, changes, 1.0)._first_minimum(way, stops)
-        sooner = np.sort(np.concatenate([np.linspace(0, t, 1001), stops[stops < t]]))
-        assert np.all(np.diff([value(at(s)) for s in sooner]) <= 1e-12)
-        assert value(at(t * (1 + 1e-5))) >= value(at(t)) - 1e-12
-        step = Quadratic(steps, changes, 1.0).minimum(g, lower, upper, free)
-        assert np.all((lower <= step) & (step <= upper)) and (g @ step < 0 or not free.any())
-        held = ~free | (stops <= t)
-        bounds = np.where(free, np.where(way < 0, lower, upper), 0.0)  # t way may round to beside the bound it meets
-        assert np.array_equal(step[held], bounds[held])
-        inside = ~held & (lower < step) & (step < upper)
-        if np.array_equal(inside, ~held):  # nothing was cut off: the gradient of the model is 0 there
-            assert np.allclose((g + dense @ step)[inside], 0, atol=1e-8)
-            assert value(step) <= value(at(t)) + 1e-12
+@pytest.mark.parametrize("seed", range(12))
+def test_starts_on_bounds_and_close_to_them(seed):
+    """Quadratics of conditions up to 1e5, from where a step along the bounds is easily lost."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 60))
+    basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    matrix = (basis * np.geomspace(1, 10 ** rng.uniform(0, 5), n)) @ basis.T
+    linear, lower, upper = matrix @ rng.uniform(-2, 2, n), -rng.uniform(0.1, 1, n), rng.uniform(0.1, 1, n)
+    near = lower + 10.0 ** -rng.uniform(1, 14, n) * (upper - lower)
+    start = [lower, near, np.where(rng.random(n) < 0.5, lower + 1e-9, upper - 1e-9)][seed % 3]
+    loss = lambda x: 0.5 * anp.dot(x, anp.dot(matrix, x)) - anp.dot(linear, x)
+    best = dp.minimize(loss, start, bounds=(lower, upper), maxiter=3000)
+    known = minimize(
+        loss, start, jac=lambda x: matrix @ x - linear, bounds=list(zip(lower, upper)), method="L-BFGS-B",
+        options={"maxiter": 5000, "maxfun": 20000, "ftol": 1e-15, "gtol": 1e-10},
+    )  # fmt: skip
+    assert best.converged and best.value <= known.fun + 1e-9 * abs(known.fun)
 
 
 @pytest.mark.parametrize("problem", PROBLEMS, ids=lambda problem: problem.__name__)

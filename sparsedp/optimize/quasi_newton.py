@@ -5,14 +5,13 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import is_whole
-from sparsedp.optimize.quadratic import Quadratic
 from sparsedp.optimize.trials import Stuck, Trial, power_of_two
 from sparsedp.optimize.wolfe import line_search
 from sparsedp.tree import norm
 
-__all__ = ["Quasi", "QuasiState"]
+__all__ = ["Quasi", "QuasiState", "two_loops"]
 
-CURVED = 1e-12  # a step enters the memory when s.y is more than this share of |s| |y|
+CURVED = 1e-12  # a pair of step and change is used where s.y is more than this share of |s| |y|
 
 
 class QuasiState(NamedTuple):
@@ -44,9 +43,9 @@ class Quasi:
 
     Notes
     -----
-    Each step ends at the minimum of the quadratic model inside the bounds, on the face of the box that the model's
-    path of steepest descent leads to. Source: R. H. Byrd, P. Lu, J. Nocedal, C. Zhu, A limited memory algorithm for
-    bound constrained optimization, SIAM J. Sci. Comput. 16, 1995.
+    Where the gradient presses against a bound an entry stands still; the others take the step of a memory that has
+    seen them alone, and the line search bends it along the bounds. Source: D. P. Bertsekas, Projected Newton methods
+    for optimization problems with simple constraints, SIAM J. Control Optim. 20, 1982.
     """
 
     residuals, searches = False, True
@@ -60,9 +59,8 @@ class Quasi:
 
     def begin(self, first):
         """State at the start."""
-        length = power_of_two(_first_length(first))
         nothing = np.zeros((0, first.vector.size))
-        return QuasiState(first, nothing, nothing, length, power_of_two(norm(first.slope)))
+        return QuasiState(first, nothing, nothing, power_of_two(_first_length(first)), power_of_two(norm(first.slope)))
 
     def advance(self, state, trials):
         """One iteration; a line search that fails is tried once more without the memory.
@@ -73,42 +71,65 @@ class Quasi:
             When there is no lower point along the gradient either.
         """
         here = state.trial
-        for kept in (state, self._forgetful(state)):
+        promised = []
+        for kept in (state, state._replace(steps=state.steps[:0], changes=state.changes[:0])):
             step = _step(kept, trials.box)
-            promised = -float(np.dot(here.slope, step))
-            trial = line_search(here, step, trials, self.line_search, trials.box) if promised > 0 else None
+            promised.append(-float(np.dot(here.slope, step)))
+            trial = line_search(here, step, trials, self.line_search) if promised[-1] > 0 else None
             if trial is not None:
                 return self._remember(kept, trial)
             if not len(state.steps):
                 break
         # What the quasi-Newton step promises is lost in the rounding of the loss.
-        hopeless = abs(np.dot(_step(state, trials.box), here.slope / 2)) <= 100 * here.rounding
+        hopeless = abs(promised[0] / 2) <= 100 * here.rounding
         raise Stuck("rounding" if hopeless else "the line search found no lower point")
-
-    @staticmethod
-    def _forgetful(state):
-        return state._replace(steps=state.steps[:0], changes=state.changes[:0])
 
     def _remember(self, state, trial):
         step = (trial.vector - state.trial.vector) / state.length
         change = trial.slope / state.height - state.trial.slope / state.height
         state = state._replace(trial=trial)
-        if not np.dot(step, change) > CURVED * norm(step) * norm(change):
+        if not _curved(step, change):
             return state
-        steps = np.concatenate([state.steps, step[None]])[-self.memory :]
-        return state._replace(steps=steps, changes=np.concatenate([state.changes, change[None]])[-self.memory :])
+        steps, changes = (
+            np.concatenate([kept, new[None]])[-self.memory :]
+            for kept, new in ((state.steps, step), (state.changes, change))
+        )
+        return state._replace(steps=steps, changes=changes)
 
 
 def _step(state, box):
-    """From the point of a state to the minimum of its model."""
-    here, g = state.trial, state.trial.slope / state.height
-    bend = norm(g) * state.length / _first_length(here)  # without a memory the step is this long
-    lower, upper = (side / state.length for side in box.room(here.vector))
-    try:
-        model = Quadratic(state.steps, state.changes, bend)
-        return state.length * model.minimum(g, lower, upper, box.free_mask(here.vector, here.slope))
-    except np.linalg.LinAlgError:  # steps that depend on each other; the memory is given up
-        return np.zeros_like(g)
+    """From the point of a state to the minimum of its model in the entries that the bounds leave free."""
+    here = state.trial
+    free = box.free_mask(here.vector, here.slope)
+    free = slice(None) if free is None or free.all() else free
+    g = here.slope / state.height
+    shortest = _first_length(here) / state.length / (norm(g) or 1.0)
+    step = np.zeros_like(g)
+    step[free] = two_loops(g[free], state.steps[:, free], state.changes[:, free], shortest)
+    return state.length * step
+
+
+def two_loops(g, steps, changes, scale):
+    """-H g with the H of L-BFGS; `scale` is H without a memory.
+
+    Source: J. Nocedal, Updating quasi-Newton matrices with limited storage, Math. Comp. 35, 1980.
+    """
+    pairs = [(s, y, np.dot(s, y)) for s, y in zip(steps, changes) if _curved(s, y)]
+    step, shares = -g, []
+    for s, y, bend in reversed(pairs):
+        shares.append(np.dot(s, step) / bend)
+        step = step - shares[-1] * y
+    if pairs:
+        _, y, bend = pairs[-1]
+        scale = bend / np.dot(y, y)
+    step = scale * step
+    for s, y, bend in pairs:
+        step = step + (shares.pop() - np.dot(y, step) / bend) * s
+    return step
+
+
+def _curved(step, change):
+    return np.dot(step, change) > CURVED * norm(step) * norm(change)
 
 
 def _first_length(first):

@@ -88,7 +88,7 @@ class Trials:
             trial = self._evaluate(vector, below)
         except REFUSED as error:
             self.failures.append(Failure(type(error).__name__, str(error)))
-            return Trial(np.array(vector), np.inf, None)
+            return Trial(np.array(vector), np.inf, np.full_like(vector, np.nan))
         if self.batches.varied or trial.value < self.best.value:
             self.best = trial  # losses of two batches cannot be compared: the last point stands
         return trial
