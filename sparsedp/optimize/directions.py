@@ -8,12 +8,10 @@ direction times s^(-1/2). 1: Gauss-Newton, or Levenberg-Marquardt with damping.
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from sparsedp.fields import check_function, is_number
 from sparsedp.optimize.flat import Packing
 from sparsedp.optimize.linearised import Linearised
-from sparsedp.optimize.singular_values import decomposed
 
 __all__ = ["Direction", "Family", "update_direction"]
 
@@ -22,7 +20,7 @@ SETTLED = 1e-9  # relative change of the direction at which the bidiagonalisatio
 EXHAUSTED = 1e-13  # relative size below which a new basis vector is rounding
 CANCELLED = 0.1  # a vector of which less is left after Gram and Schmidt's pass gets a second one
 LOOK = 4  # fewest steps of the bidiagonalisation between two looks at the direction, which cost an SVD each
-BLOCK = 32  # rows of a basis that are stored together
+BLOCK = 32  # rows of a basis that memory is taken for at a time
 
 
 class Direction(NamedTuple):
@@ -57,16 +55,14 @@ class Family:
     truncation : float
         Singular values below this share of the largest are left out.
     method : "auto", "dense" or "krylov"
-        dense: J is formed, and its singular values come group by group from Gram matrices, as exact as from an SVD
-        (when truncation > 1e-7 all at once). krylov: Golub-Kahan bidiagonalisation with full reorthogonalisation from
-        products with J and J^T alone; memory rank (m + n).
+        dense: J is formed, and its singular values come group by group from Gram matrices, as exact as from an SVD.
+        krylov: Golub-Kahan bidiagonalisation with full reorthogonalisation from products with J and J^T alone; memory
+        rank (m + n).
     rank : int or None
         Most steps of the bidiagonalisation; None: until the direction has settled.
-    apart : bool
-        The outputs along axis 0 are samples that see x independently: see Linearised.rows.
     """
 
-    def __init__(self, power=0.75, damping=0.0, truncation=1e-10, method="auto", rank=None, apart=False):
+    def __init__(self, power=0.75, damping=0.0, truncation=1e-10, method="auto", rank=None):
         if not (is_number(power) and 0 <= power <= 1):
             raise ValueError(f"power must be from 0 to 1, got {power!r}; 0.75 gives half-inverse gradients")
         if not (is_number(damping) and 0 <= damping < np.inf):
@@ -78,161 +74,96 @@ class Family:
         if rank is not None and not (isinstance(rank, int) and rank >= 1):
             raise ValueError(f"rank must be a whole number >= 1, got {rank!r}; leave it out for no limit")
         self.power, self.damping, self.truncation = float(power), float(damping), float(truncation)
-        self.method, self.rank, self.apart = method, rank, bool(apart)
+        self.method, self.rank = method, rank
 
     def __call__(self, linearised, g):
         """Flat Direction for a flat cotangent g of the outputs."""
         if self.forms(*linearised.shape):
-            return self.dense(linearised.rows(self.apart), g)
-        return self.krylov(linearised.push, linearised.pull, g, min(linearised.shape))
+            return self.dense(linearised.rows(), linearised.spectrum(), g)
+        return self.krylov(linearised, g)
 
     def forms(self, rows, columns):
         """Whether J is formed."""
         return self.method == "dense" or (self.method == "auto" and rows * columns <= DENSE)
 
-    def dense(self, jacobian, g):
-        """Direction from J itself, m x n."""
-        if not jacobian.size:
-            return Direction(np.zeros(jacobian.shape[1]), np.zeros(0), 0, "dense")
-        if self.truncation > 1e-7 and len(jacobian) <= jacobian.shape[1]:
-            return self._gram(jacobian, g)
-        combine, s, parts = decomposed(jacobian, g)
-        weights, kept = self._weights(s, parts)
-        return Direction(combine(weights), s, kept, "dense")
+    def dense(self, jacobian, spectrum, g):
+        """Direction from J itself, m x n: (J^T J + damping)^(-power) J^T g, or with J J^T where that is smaller."""
+        vectors, s = spectrum
+        shares, kept = self._shares(s)
+        if len(jacobian) <= jacobian.shape[1]:
+            return Direction((vectors @ (shares * (g @ vectors))) @ jacobian, s, kept, "dense")
+        return Direction(vectors @ (shares * (g @ jacobian @ vectors)), s, kept, "dense")
 
-    def _gram(self, jacobian, g):
-        squares, u = scipy.linalg.eigh(jacobian @ jacobian.T, check_finite=False)
-        s = np.sqrt(np.maximum(squares[::-1], 0.0))
-        u = u[:, ::-1]
-        weights, kept = self._weights(s, u.T @ g)
-        inner = np.divide(weights, s, out=np.zeros_like(s), where=s > 0)
-        return Direction(jacobian.T @ (u @ inner), s, kept, "gram")
-
-    def _weights(self, s, parts):
-        """s (s^2 + damping)^(-power) parts, 0 for the singular values that are left out."""
-        kept = (s > self.truncation * s[0]) & (s > 0)
-        factor = np.zeros_like(s)
-        root = np.hypot(s[kept], np.sqrt(self.damping))
-        factor[kept] = s[kept] * root ** (-2 * self.power)
-        return factor * parts, int(np.count_nonzero(kept))
-
-    def krylov(self, push, pull, g, limit):
+    def krylov(self, linearised, g):
         """Direction from products with J and J^T.
 
-        The bidiagonalisation started with g gives J^T P = Q L^T with orthonormal P, Q and a lower bidiagonal L, and
-        the direction is Q L^T (L L^T + damping)^(-power) P^T g: exact after min(m, n) steps, and usually settled long
+        The bidiagonalisation started with J^T g gives J Q = P B with orthonormal P, Q and an upper bidiagonal B, and
+        the direction is Q (B^T B + damping)^(-power) Q^T J^T g: exact after min(m, n) steps, and usually settled long
         before. Source: G. H. Golub, W. Kahan, SIAM J. Numer. Anal. 2, 1965.
         """
-        size = float(np.linalg.norm(g))
-        rank = min(limit, self.rank or limit)
-        basis = _Bidiagonal(push, pull, g) if size > 0 else None
-        if basis is None or not basis.steps:
-            return Direction(pull(0.0 * g), np.zeros(0), 0, "krylov")
-        before = None
-        while True:
-            more = basis.grow(min(max(LOOK, basis.steps // 8), rank - basis.steps))
-            weights, s, kept = self._small(basis, size)
-            if not more or basis.steps >= rank or _settled(weights, before):
-                return Direction(basis.combine(weights), s, kept, "krylov")
-            before = weights
+        left, right = map(_Rows, linearised.shape)
+        diagonal: list = []
+        above, largest = [right.add(linearised.pull(g))], 0.0
+        limit, look, weights = min(*linearised.shape, self.rank or np.inf), LOOK, np.zeros(0)
+        while len(diagonal) < limit and above[-1] > EXHAUSTED * largest:
+            size = left.add(linearised.push(right.last))
+            if not size > EXHAUSTED * largest:
+                break
+            diagonal.append(size)
+            above.append(right.add(linearised.pull(left.last)))
+            largest = max(largest, size, above[-1])
+            if len(diagonal) == look:
+                before, weights = weights, self._small(diagonal, above)[0]
+                if np.linalg.norm(weights - np.pad(before, (0, look - len(before)))) <= SETTLED * np.linalg.norm(
+                    weights
+                ):
+                    break
+                look += max(LOOK, look // 8)
+        weights, s, kept = self._small(diagonal, above)
+        return Direction(weights @ right.rows[: len(weights)], s, kept, "krylov")
 
-    def _small(self, basis, size):
-        left, s, right = scipy.linalg.svd(basis.matrix(), check_finite=False)
-        weights, kept = self._weights(s, left[0] * size)
-        return right.T @ weights, s, kept
+    def _small(self, diagonal, above):
+        """The direction in the basis Q, the singular values of B, and how many of them were kept."""
+        small = np.diag(diagonal) + np.diag(above[1 : len(diagonal)], 1)
+        _, s, vectors = np.linalg.svd(small)
+        shares, kept = self._shares(s)
+        return above[0] * (shares * vectors[:, :1].sum(axis=1)) @ vectors, s, kept
 
-
-def _settled(weights, before):
-    if before is None:
-        return False
-    change = np.linalg.norm(weights[: len(before)] - before) + np.linalg.norm(weights[len(before) :])
-    return change <= SETTLED * np.linalg.norm(weights)
+    def _shares(self, s):
+        """(s^2 + damping)^(-power), 0 for the singular values that are left out; how many are not."""
+        kept = (s > self.truncation * np.max(s, initial=0.0)) & (s > 0)
+        shares = np.zeros_like(s)
+        shares[kept] = np.hypot(s[kept], np.sqrt(self.damping)) ** (-2 * self.power)
+        return shares, int(np.count_nonzero(kept))
 
 
 class _Rows:
-    """Orthonormal rows, in blocks: no copy is made when one more comes."""
+    """Orthonormal rows; memory for a block of them is taken at a time."""
 
     def __init__(self, size):
-        self._size, self._blocks, self.count = size, [], 0
-        self.last = np.empty(0)
-
-    def append(self, row):
-        if self.count == BLOCK * len(self._blocks):
-            self._blocks.append(np.empty((BLOCK, self._size)))
-        self.last = self._blocks[-1][self.count % BLOCK]
-        self.last[:] = row
-        self.count += 1
-
-    def _parts(self):
-        return [block[: self.count - BLOCK * i] for i, block in enumerate(self._blocks)]
-
-    def apart(self, vector):
-        """The part of a vector orthogonal to the rows; twice where little is left, so that rounding stays out."""
-        before = float(np.linalg.norm(vector))
-        vector = vector - self._sum([rows @ vector for rows in self._parts()])
-        if np.linalg.norm(vector) > CANCELLED * before:
-            return vector
-        return vector - self._sum([rows @ vector for rows in self._parts()])
-
-    def combine(self, weights):
-        """weights @ rows."""
-        return self._sum([weights[BLOCK * i : BLOCK * (i + 1)] for i in range(len(self._blocks))])
-
-    def _sum(self, shares):
-        total = np.zeros(self._size)
-        for share, rows in zip(shares, self._parts(), strict=True):
-            total += share @ rows
-        return total
-
-
-class _Bidiagonal:
-    """J^T P = Q L^T, one column more at a time."""
-
-    def __init__(self, push, pull, g):
-        self._push, self._pull = push, pull
-        u = g / np.linalg.norm(g)
-        v = pull(u)
-        self._left, self._right = _Rows(u.size), _Rows(v.size)
-        self._diagonal, self._below = [], []
-        self._largest = 0.0
-        self._add(u, v)
+        self._memory, self._count = np.empty((BLOCK, size)), 0
 
     @property
-    def steps(self):
-        return len(self._diagonal)
+    def rows(self):
+        return self._memory[: self._count]
 
-    def _add(self, u, v):
-        """Append a left vector and v, what J^T makes of it; false when the space is exhausted."""
-        v = self._right.apart(v)
-        size = float(np.linalg.norm(v))
-        if not size > EXHAUSTED * self._largest:
-            return False
-        self._largest = max(self._largest, size)
-        self._left.append(u)
-        self._right.append(v / size)
-        self._diagonal.append(size)
-        return True
+    @property
+    def last(self):
+        return self._memory[self._count - 1]
 
-    def grow(self, steps):
-        """Up to so many steps; false when there is no further one."""
-        for _ in range(steps):
-            u = self._left.apart(self._push(self._right.last))
-            size = float(np.linalg.norm(u))
-            if not size > EXHAUSTED * self._largest:
-                return False
-            u = u / size
-            if not self._add(u, self._pull(u)):
-                return False
-            self._below.append(size)
-        return steps > 0
-
-    def matrix(self):
-        """L, k x k."""
-        return np.diag(self._diagonal) + np.diag(self._below, -1)
-
-    def combine(self, weights):
-        """Q times weights."""
-        return self._right.combine(weights)
+    def add(self, vector):
+        """Append the direction of what of a vector is orthogonal to the rows; the length of that."""
+        rest = vector - (self.rows @ vector) @ self.rows
+        if np.linalg.norm(rest) <= CANCELLED * np.linalg.norm(
+            vector
+        ):  # twice where little is left, so that rounding stays out
+            rest = rest - (self.rows @ rest) @ self.rows
+        if self._count == len(self._memory):
+            self._memory = np.concatenate([self._memory, np.empty((BLOCK, vector.size))])
+        size = float(np.linalg.norm(rest))
+        self._memory[self._count] = rest / (size or 1.0)
+        self._count += 1
+        return size
 
 
 def update_direction(outputs, x, g=None, **options):
@@ -276,8 +207,9 @@ def update_direction(outputs, x, g=None, **options):
     array([4., 1.])
     """
     check_function("update_direction", outputs, "lambda x: A @ x - b")
+    apart = bool(options.pop("apart", False))
     family, packing = Family(**options), Packing(x)
-    linearised = Linearised(outputs, packing, packing.pack(x))
+    linearised = Linearised(outputs, packing, packing.pack(x), apart=apart)
     cotangent = linearised.flat if g is None else linearised.like(g)
     found = family(linearised, cotangent)
     return found._replace(step=packing.unpack(found.step))

@@ -8,7 +8,7 @@ from sparsedp.fields import check_finite
 from sparsedp.tape import is_variable
 from sparsedp.tree import flatten
 
-__all__ = ["Packing"]
+__all__ = ["Packing", "power_of_two"]
 
 FINITE = "must be finite (dp.check.gradient(loss, x) shows where it comes from)"
 
@@ -43,13 +43,10 @@ class Packing:
         if not self._places:
             raise DerivativeError("minimize needs floating values in start, and found none; write start.astype(float)")
         leaves = [np.asarray(self._found[place]) for place in self._places]
-        self.size = sum(map(self._width, leaves))
         self.complex = any(map(np.iscomplexobj, leaves))
         self.eps = max(float(np.finfo(leaf.dtype).eps) for leaf in leaves)
-
-    @staticmethod
-    def _width(leaf):
-        return np.size(leaf) * (2 if np.iscomplexobj(leaf) else 1)
+        self._ends = np.cumsum([_numbers(leaf).size for leaf in leaves])
+        self.size = int(self._ends[-1])
 
     def pack(self, tree):
         """Tree of the same structure -> flat vector of doubles."""
@@ -57,7 +54,7 @@ class Packing:
 
     def pack_leaves(self, leaves):
         """Leaves of a tree of the same structure -> flat vector of doubles."""
-        return np.concatenate([_parts(np.asarray(leaves[place])) for place in self._places])
+        return np.concatenate([_numbers(leaves[place]) for place in self._places])
 
     def pack_gradient(self, tree):
         """Gradient of the same structure -> flat gradient with respect to the packed vector.
@@ -69,27 +66,21 @@ class Packing:
             raise DerivativeError(
                 f"the gradient has {len(leaves)} leaves where start has {len(self._found)}; return a tree like start"
             )
-        parts = []
+        parts = {}
         for place in self._places:
             g, leaf = np.asarray(leaves[place]), self._found[place]
             if g.shape != np.shape(leaf):
                 wanted = f"{np.shape(leaf)} is needed; return a tree like start"
                 raise DerivativeError(f"a leaf of the gradient has shape {g.shape} where {wanted}")
-            check_finite(self._gradient_name(place), g, FINITE)
-            parts.append(_parts(np.conj(g).astype(complex) if np.iscomplexobj(leaf) else g.real))
-        return np.concatenate(parts)
-
-    def _gradient_name(self, place):
-        return "the gradient" if len(self._found) == 1 else f"leaf {place} of the gradient"
+            check_finite("the gradient" if len(leaves) == 1 else f"leaf {place} of the gradient", g, FINITE)
+            parts[place] = np.conj(g).astype(complex) if np.iscomplexobj(leaf) else g.real
+        return self.pack_leaves(parts)
 
     def unpack(self, vector):
         """Flat vector -> fresh tree; every leaf has the type, shape and dtype of its original."""
-        leaves, start = list(self._found), 0
-        for place in self._places:
-            leaf = self._found[place]
-            stop = start + self._width(leaf)
-            leaves[place] = _leaf(leaf, vector[start:stop])
-            start = stop
+        leaves = list(self._found)
+        for place, numbers in zip(self._places, np.split(vector, self._ends)):  # one empty part is left over
+            leaves[place] = _leaf(leaves[place], numbers)
         return self._rebuild(leaves)
 
     def join(self, tree):
@@ -101,30 +92,29 @@ class Packing:
         """Every floating leaf with a new leading axis of so many copies of itself; read-only, they share memory."""
         leaves = list(flatten(tree)[0])
         for place in self._places:
-            leaf = np.asarray(leaves[place])
-            leaves[place] = np.broadcast_to(leaf, (count, *leaf.shape))
+            leaves[place] = np.broadcast_to(leaves[place], (count, *np.shape(leaves[place])))
         return self._rebuild(leaves)
 
-    def pack_copies(self, tree, out):
-        """Tree as `copies` gives it -> one packed row of `out` for each copy."""
-        leaves, start = flatten(tree)[0], 0
-        for place in self._places:
-            rows = np.asarray(leaves[place]).reshape(len(out), -1)
-            out[:, start : start + rows.shape[1]] = rows
-            start += rows.shape[1]
+    def pack_copies(self, tree, count):
+        """Tree as `copies` gives it -> one packed row for each copy."""
+        leaves = flatten(tree)[0]
+        return np.concatenate([np.reshape(leaves[place], (count, -1)) for place in self._places], axis=1)
 
 
-def _parts(values):
-    if values.dtype.kind != "c":
-        return values.reshape(-1).astype(float)
-    return np.stack([values.real, values.imag], axis=-1).reshape(-1).astype(float)
+def _numbers(values):
+    """Entries as doubles, of a complex one both parts."""
+    values = np.asarray(values)
+    return values.reshape(-1).astype(complex if np.iscomplexobj(values) else float).view(float)
 
 
 def _leaf(leaf, numbers):
-    shape, dtype = np.shape(leaf), np.asarray(leaf).dtype
-    if dtype.kind == "c":
-        numbers = numbers[0::2] + 1j * numbers[1::2]
-    values = numbers.reshape(shape).astype(dtype)
-    if isinstance(leaf, np.ndarray):
-        return values
-    return values.dtype.type(values) if isinstance(leaf, np.generic) else type(leaf)(values)
+    like = np.asarray(leaf)
+    values = numbers.view(complex if np.iscomplexobj(like) else float).reshape(like.shape).astype(like.dtype)
+    if isinstance(leaf, (np.ndarray, np.generic)):
+        return values if isinstance(leaf, np.ndarray) else values[()]
+    return type(leaf)(values)
+
+
+def power_of_two(value):
+    """The power of two next above, so that dividing by it changes no digits."""
+    return 2.0 ** float(np.clip(np.frexp(value)[1], -900, 900)) if value > 0 else 1.0

@@ -3,96 +3,39 @@
 The loss is half the sum of squares of residuals r(x); J is their Jacobian.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from scipy.sparse.linalg import LinearOperator, lsmr
 
 from sparsedp.fields import is_number
 from sparsedp.optimize.directions import DENSE, Family
 from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked
-from sparsedp.optimize.singular_values import decomposed
 from sparsedp.optimize.trials import Stuck, Trial
 from sparsedp.tree import norm
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 
 EXACT = 1e-9  # damping relative to |J|^2 above which the Gram matrix, with rounding 1e-16, gives 6 digits of the step
-FORCING = 1e-10  # relative accuracy of the inner least-squares solution
 
 
 class SquaresState(NamedTuple):
-    """State of the least-squares methods: the point, the damping and its growth, the share to try first."""
+    """State of the least-squares methods: the point, the damping, the share to try first."""
 
     trial: Trial
     damping: float = 0.0
-    growth: float = 2.0
     share: float = 1.0
 
 
-class _Normal:
-    """Solves min |J d + r|^2 + damping |d|^2 at one point, for several dampings."""
-
-    def __init__(self, linearised, method):
-        self._linearised = linearised
-        self._jacobian: Any = None
-        self._gram: Any = None
-        self._factor: Any = None
-        if method.forms(*linearised.shape):
-            self._jacobian = jacobian = linearised.rows(method.apart)
-            self.largest = float(np.max(np.einsum("ij,ij->j", jacobian, jacobian), initial=0.0))
-        else:
-            slope = linearised.pull(linearised.flat)
-            size = norm(slope)
-            self.largest = norm(linearised.push(slope / size)) ** 2 if size > 0 else 0.0
-
-    def step(self, damping):
-        if self._jacobian is None:
-            return -self._iterated(damping)
-        if damping > EXACT * np.linalg.norm(self._jacobian) ** 2:
-            return -self._damped(damping)
-        if self._factor is None:
-            self._factor = decomposed(self._jacobian, self._linearised.flat)
-        return -_solve(self._factor, damping, max(self._jacobian.shape))
-
-    def fall(self, d):
-        """How far the linearised problem falls along d, which a bound may have cut short."""
-        change = self._linearised.push(d)
-        return -float(np.dot(change, self._linearised.flat) + 0.5 * np.dot(change, change))
-
-    def _damped(self, damping):
-        """By Cholesky of J J^T + damping or J^T J + damping, whichever is small."""
-        jacobian, r = self._jacobian, self._linearised.flat
-        wide = len(jacobian) < jacobian.shape[1]
-        if self._gram is None:
-            self._gram = jacobian @ jacobian.T if wide else jacobian.T @ jacobian
-        matrix = self._gram.copy()
-        np.einsum("ii->i", matrix)[:] += damping
-        factor = scipy.linalg.cho_factor(matrix.T, overwrite_a=True, check_finite=False)
-        if wide:
-            return scipy.linalg.cho_solve(factor, r, check_finite=False) @ jacobian
-        return scipy.linalg.cho_solve(factor, r @ jacobian, check_finite=False)
-
-    def _iterated(self, damping):
-        rows, columns = self._linearised.shape
-        product = LinearOperator(
-            (rows, columns), matvec=self._linearised.push, rmatvec=self._linearised.pull, dtype=float
-        )
-        return lsmr(product, self._linearised.flat, damp=np.sqrt(damping), atol=FORCING, btol=FORCING, conlim=1e14)[0]
-
-
-def _solve(factor, damping, size):
-    """Damped least squares from a decomposition that every damping shares; `size` is the longer side of J."""
-    combine, s, parts = factor
-    floor = np.finfo(float).eps * size * (s[0] if len(s) else 0.0)
-    kept = s > floor
-    shares = np.divide(s, s * s + damping, out=np.zeros_like(s), where=kept)
-    return combine(shares * parts)
-
-
-def _formed(dense, rows, columns):
-    return rows * columns <= DENSE and min(rows, columns) <= 4000 if dense is None else dense
+def _damped(jacobian, r, damping):
+    """By Cholesky of J J^T + damping or J^T J + damping: far faster than by singular values."""
+    wide = len(jacobian) < jacobian.shape[1]
+    gram = jacobian @ jacobian.T if wide else jacobian.T @ jacobian
+    gram.flat[:: len(gram) + 1] += damping
+    solution = scipy.linalg.solve(
+        gram.T, r if wide else r @ jacobian, overwrite_a=True, check_finite=False, assume_a="pos"
+    )
+    return solution @ jacobian if wide else solution
 
 
 class GaussNewton:
@@ -104,7 +47,7 @@ class GaussNewton:
         Residuals along axis 0 are samples that see x independently: J by a few products.
     dense : bool or None
         Whether J is formed, by products forward or in reverse, whichever are fewer; None: when it has at most 3e7
-        entries and 4000 rows or columns. Else LSMR on products with J and J^T.
+        entries and 4000 rows or columns. Else a bidiagonalisation by products with J and J^T.
     """
 
     residuals, searches = True, True
@@ -114,7 +57,15 @@ class GaussNewton:
 
     def forms(self, rows, columns):
         """Whether J is formed."""
-        return _formed(self.dense, rows, columns)
+        return rows * columns <= DENSE and min(rows, columns) <= 4000 if self.dense is None else self.dense
+
+    def step(self, linearised, damping=0.0):
+        """To the minimum of |J d + r|^2 + damping |d|^2."""
+        formed, rounding = self.forms(*linearised.shape), np.finfo(float).eps * max(linearised.shape)
+        if formed and damping > EXACT * np.linalg.norm(linearised.rows()) ** 2:
+            return -_damped(linearised.rows(), linearised.flat, damping)
+        family = Family(1.0, damping, rounding, "dense" if formed else "krylov")
+        return -family(linearised, linearised.flat).step
 
     def begin(self, first):
         """State at the start."""
@@ -122,12 +73,12 @@ class GaussNewton:
 
     def advance(self, state, trials):
         """One iteration. Raises Stuck when no lower point is found."""
-        step = _Normal(trials.linearised(state.trial), self).step(0.0)
+        step = self.step(trials.linearised(state.trial))
         trial, _ = backtracked(state.trial, step, trials, "the Gauss-Newton step")
         return state._replace(trial=trial)
 
 
-class LevenbergMarquardt:
+class LevenbergMarquardt(GaussNewton):
     """Levenberg-Marquardt: damping falls when the linearised problem predicts well and grows when not.
 
     Parameters
@@ -142,33 +93,25 @@ class LevenbergMarquardt:
     Source: H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05, 1999.
     """
 
-    residuals, searches = True, True
-
     def __init__(self, damping=1e-3, apart=False, dense=None):
         if not (is_number(damping) and 0 < damping < np.inf):
             raise ValueError(f"levenberg_marquardt needs a positive damping, got {damping!r}; the default is 1e-3")
-        self.damping, self.apart, self.dense = damping, bool(apart), dense
-
-    def forms(self, rows, columns):
-        """Whether J is formed."""
-        return _formed(self.dense, rows, columns)
-
-    def begin(self, first):
-        """State at the start; the damping is scaled at the first step."""
-        return SquaresState(first, 0.0)
+        super().__init__(apart, dense)
+        self.damping = damping
 
     def advance(self, state, trials):
         """One iteration: one Jacobian, as many dampings as it takes. Raises Stuck when none is large enough."""
-        here = state.trial
-        normal = _Normal(trials.linearised(here), self)
-        damping = state.damping or self.damping * normal.largest or 1.0
-        growth = 2.0
+        here, linearised = state.trial, trials.linearised(state.trial)
+        damping, growth = state.damping or self.damping * self._largest(linearised) or 1.0, 2.0
         for _ in range(HALVINGS):
-            step = normal.step(damping)
-            trial = trials(trials.box.inside(here.vector + step), here.value)
-            predicted = 0.5 * float(np.dot(step, damping * step - here.slope))
-            if not trial.refused and trial.value < here.value:
-                fall = predicted if trials.box.open else normal.fall(trial.vector - here.vector)
+            step = self.step(linearised, damping)
+            end = here.vector + step
+            trial = trials(trials.box.inside(end), here.value)
+            fall = predicted = 0.5 * float(np.dot(step, damping * step - here.slope))
+            if trial.value < here.value:
+                if not np.array_equal(trials.box.inside(end), end):  # a bound has cut the step short
+                    change = linearised.push(trial.vector - here.vector)
+                    fall = -float(np.dot(change, linearised.flat) + 0.5 * np.dot(change, change))
                 gain = (here.value - trial.value) / fall if fall > 0 else 0.0
                 return SquaresState(trial, damping * max(1 / 3, 1 - (2 * gain - 1) ** 3))
             if predicted <= here.rounding:
@@ -176,6 +119,13 @@ class LevenbergMarquardt:
             damping, growth = damping * growth, 2 * growth
         hopeless = predicted <= 100 * here.rounding
         raise Stuck("rounding" if hopeless else "no damping gives a lower point")
+
+    def _largest(self, linearised):
+        """The largest diagonal entry of J^T J; where J is not formed, that along the gradient."""
+        if self.forms(*linearised.shape):
+            return float(np.max(np.linalg.norm(linearised.rows(), axis=0), initial=0.0)) ** 2
+        slope = linearised.pull(linearised.flat)
+        return norm(linearised.push(slope / (norm(slope) or 1.0))) ** 2
 
 
 class HalfInverse:
@@ -200,8 +150,7 @@ class HalfInverse:
         if not (is_number(rate) and 0 < rate < np.inf):
             raise ValueError(f"half_inverse needs a positive rate, got {rate!r}; the default is 1")
         self.rate = rate
-        self.family = Family(power, 0.0, truncation, form, rank, apart)
-        self.apart = self.family.apart
+        self.family, self.apart = Family(power, 0.0, truncation, form, rank), bool(apart)
 
     def forms(self, rows, columns):
         """Whether J is formed."""

@@ -1,16 +1,21 @@
 """The Jacobian of a function of a tree at one point: products with it, and all of it when it fits."""
 
+from copy import copy
+
 import numpy as np
-from scipy.linalg.lapack import dtrtri
+import scipy.linalg
 
 from sparsedp.derivative import pullback
 from sparsedp.direction import push
-from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite
+from sparsedp.optimize.flat import power_of_two
 from sparsedp.tape import is_variable
 from sparsedp.tree import leaves
 
-__all__ = ["Linearised", "Restricted"]
+__all__ = ["Linearised", "singular"]
+
+GRADE = 1e-4  # singular values below this share of the largest wait for a Gram matrix of their own
 
 NOT_APART = (
     "with apart=True every leaf of x gets a leading axis of {} copies, one for each sample, and the outputs do not "
@@ -31,6 +36,9 @@ class Linearised:
         What `outputs` is given after x.
     forward : bool
         No tape is made before J^T is asked for.
+    apart : bool
+        The outputs along axis 0 depend on nothing but their own copy of x. Then x is handed over with a leading axis
+        of copies, one for each of the s samples, and m / s products with J^T give all rows.
 
     Raises
     ------
@@ -40,9 +48,10 @@ class Linearised:
         If an output is NaN or infinite.
     """
 
-    def __init__(self, outputs, packing, vector, rest=(), forward=False):
-        self._outputs, self._packing = lambda x: outputs(x, *rest), packing
-        self._tree, self._pull, self._jacobian = packing.unpack(vector), None, None
+    def __init__(self, outputs, packing, vector, rest=(), forward=False, apart=False):
+        self._outputs, self._packing, self._apart = lambda x: outputs(x, *rest), packing, apart
+        self._tree, self._free = packing.unpack(vector), True
+        self._pull = self._jacobian = self._spectrum = None
         if forward:
             self.value = self._outputs(self._tree)
         else:
@@ -55,6 +64,15 @@ class Linearised:
         self.flat = self.value.reshape(-1).astype(float)
         self.shape = (self.flat.size, packing.size)
 
+    def among(self, free):
+        """The same where the unknowns that are not free stand still: their columns of J are 0.
+
+        A step that counts on unknowns which a bound then holds back is no descent for the others.
+        """
+        other = copy(self)
+        other._free, other._spectrum = free, None
+        return self if free.all() else other
+
     def like(self, g):
         """A cotangent of the outputs, flat."""
         if np.shape(g) != self.value.shape:
@@ -66,57 +84,54 @@ class Linearised:
         """(m,) -> J^T w, (n,)."""
         if self._pull is None:
             self._pull = pullback(self._outputs, self._tree)[1]
-        return self._packing.pack_gradient(self._pull(w.reshape(self.value.shape).astype(self.value.dtype)))
+        return self._free * self._packing.pack_gradient(
+            self._pull(w.reshape(self.value.shape).astype(self.value.dtype))
+        )
 
     def push(self, v):
         """(n,) -> J v, (m,)."""
-        tangents = [leaf if is_variable(leaf) else None for leaf in leaves(self._packing.unpack(v))]
+        tangents = [leaf if is_variable(leaf) else None for leaf in leaves(self._packing.unpack(self._free * v))]
         return push(self._outputs, self._tree, tangents)[1].reshape(-1).astype(float)
 
-    def slope(self, formed):
-        """J^T times the outputs, (n,); `formed`: from J itself."""
-        return self.flat @ self.rows() if formed else self.pull(self.flat)
-
-    def rows(self, apart=False):
-        """J, m x n, by a product for each column or for each row, whichever are fewer.
-
-        `apart`: the outputs along axis 0 depend on nothing but their own copy of x. Then x is handed over with a
-        leading axis of copies, one for each of the s samples, and m / s products with J^T give all rows.
-        """
+    def rows(self):
+        """J, m x n, by a product for each column or for each row, whichever are fewer; apart: for each of a sample."""
         if self._jacobian is None:
             rows, columns = self.shape
-            if apart:
+            if self._apart:
                 self._jacobian = self._rows_apart()
             elif columns < rows:
-                self._jacobian = _by_products(self.push, columns, rows).T
+                self._jacobian = np.array([self.push(unit) for unit in np.eye(columns)]).reshape(columns, rows).T
             else:
-                self._jacobian = _by_products(self.pull, rows, columns)
-        return self._jacobian
+                self._jacobian = np.array([self.pull(unit) for unit in np.eye(rows)]).reshape(self.shape)
+        return self._jacobian if self._free is True else self._jacobian * self._free
 
-    def covariance(self, apart=False):
+    def spectrum(self):
+        """The singular values of J, falling, and the singular vectors of its shorter side, as columns before them."""
+        if self._spectrum is None:
+            jacobian = self.rows()
+            self._spectrum = singular(jacobian if len(jacobian) <= jacobian.shape[1] else jacobian.T)
+        return self._spectrum
+
+    def covariance(self):
         """s^2 (J^T J)^(-1), n x n, with s^2 = |outputs|^2 / (m - n); infinite where J has not the rank n."""
-        jacobian, (rows, columns) = self.rows(apart), self.shape
+        jacobian, (rows, columns) = self.rows(), self.shape
         sizes = np.linalg.norm(jacobian, axis=0)  # in units of its columns no unknown is small beside another
-        r = np.linalg.qr(np.divide(jacobian, sizes, out=np.zeros(self.shape), where=sizes > 0), mode="r")
-        with np.errstate(all="ignore"):
-            inverse = dtrtri(r)[0] / sizes[:, None]
-            if not np.linalg.norm(r) * np.linalg.norm(inverse * sizes[:, None]) < 1 / (rows * np.finfo(float).eps):
-                return np.full((columns, columns), np.inf)
+        vectors, s = singular((jacobian / np.where(sizes > 0, sizes, 1.0)).T)
+        if not s[-1] > rows * np.finfo(float).eps * s[0]:
+            return np.full((columns, columns), np.inf)
+        inverse = vectors / s / sizes[:, None]
         return float(np.dot(self.flat, self.flat)) / (rows - columns) * (inverse @ inverse.T)
 
     def _rows_apart(self):
         samples = len(self.value)
-        copies = self._packing.copies(self._tree, samples)
-        value, pull = pullback(self._outputs, copies)
+        value, pull = pullback(self._outputs, self._packing.copies(self._tree, samples))
         if value.shape != self.value.shape:
             raise ShapeError(NOT_APART.format(samples))
-        width = value.size // samples if samples else 0
+        width = value.size // max(samples, 1)
         jacobian = np.empty((samples, width, self.shape[1]))
-        weight = np.zeros((samples, width))
-        for column in range(width):
-            weight[:, column] = 1.0
-            self._packing.pack_copies(pull(weight.reshape(value.shape)), jacobian[:, column])
-            weight[:, column] = 0.0
+        for column, unit in enumerate(np.eye(width)):
+            one_each = np.broadcast_to(unit, (samples, width)).reshape(value.shape)
+            jacobian[:, column] = self._packing.pack_copies(pull(one_each), samples)
         jacobian = jacobian.reshape(self.shape)
         # A function that looks at one copy alone gives outputs of the right shape and wrong rows.
         probe = np.cos(np.arange(self.shape[0]))
@@ -126,39 +141,32 @@ class Linearised:
         return jacobian
 
 
-def _by_products(product, many, size):
-    """The products with each unit vector, (many, size)."""
-    found, unit = np.empty((many, size)), np.zeros(many)
-    for row in range(many):
-        unit[row] = 1.0
-        found[row] = product(unit)
-        unit[row] = 0.0
-    return found
+def singular(matrix):
+    r"""Wide matrix W (k, n), k <= n -> its left singular vectors (k, k) as columns, and its singular values, falling.
 
+    The Gram matrix W W^T squares the singular values: what is above 1e-4 of the largest keeps eight digits and more,
+    what is below 1e-8 is lost in rounding. So those above are taken, and the others get a Gram matrix of their own.
+    With the eigenvectors E1 (squares q1) and E2 of the two groups, rounding has left a part of E1 in E2,
 
-class Restricted:
-    """A linearisation in which some unknowns stand still: their columns of J are 0.
+        C = q1^-1 E1^T W (E2^T W)^T,    E2 <- E2 - E1 C,    E1 <- E1 + E2 C^T,
 
-    A step that counts on unknowns which a bound then holds back is no descent for the others.
-
-    Parameters
-    ----------
-    whole : Linearised
-    free : (n,) bool array
+    and without it E2^T W has no more of the first group than after Householder's reflections. The same again for
+    W <- E2^T W, until no group is left: one to four times, for an SVD of W that costs five times as much.
+    Raises NonFiniteError if W is not finite.
     """
-
-    def __init__(self, whole, free):
-        self._whole, self._free = whole, free
-        self.flat, self.shape = whole.flat, whole.shape
-
-    def pull(self, w):
-        """(m,) -> J^T w, (n,)."""
-        return np.where(self._free, self._whole.pull(w), 0.0)
-
-    def push(self, v):
-        """(n,) -> J v, (m,)."""
-        return self._whole.push(np.where(self._free, v, 0.0))
-
-    def rows(self, apart=False):
-        """J, m x n."""
-        return np.where(self._free, self._whole.rows(apart), 0.0)
+    scale = power_of_two(np.max(np.abs(matrix), initial=0.0))  # squares do not overflow, nor vanish
+    rows = matrix / scale
+    gram = rows @ rows.T
+    if not np.all(np.isfinite(gram)):
+        raise NonFiniteError("the Jacobian is not finite; start where every output has a finite derivative")
+    squares, vectors = scipy.linalg.eigh(gram.T, driver="evd", overwrite_a=True, check_finite=False)
+    few = int(np.count_nonzero(squares <= GRADE**2 * np.max(squares, initial=0.0)))  # for later; they come first
+    few = 0 if few == len(squares) else few
+    small, large = vectors[:, :few], vectors[:, few:]
+    s = scale * np.sqrt(np.maximum(squares[few:], 0.0))
+    if few:
+        leak = (large.T @ (rows @ (small.T @ rows).T)) / squares[few:, None]
+        small, large = small - large @ leak, large + small @ leak.T
+        rest, rest_s = singular(scale * (small.T @ rows))
+        return np.hstack([large[:, ::-1], small @ rest]), np.concatenate([s[::-1], rest_s])
+    return large[:, ::-1], s[::-1]

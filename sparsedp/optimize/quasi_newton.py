@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import is_whole
-from sparsedp.optimize.trials import Stuck, Trial, power_of_two
+from sparsedp.optimize.flat import power_of_two
+from sparsedp.optimize.trials import Stuck, Trial
 from sparsedp.optimize.wolfe import line_search
 from sparsedp.tree import norm
 

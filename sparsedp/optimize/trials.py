@@ -8,10 +8,10 @@ from sparsedp.derivative import pullback, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
-from sparsedp.optimize.linearised import Linearised, Restricted
+from sparsedp.optimize.linearised import Linearised
 from sparsedp.tape import isbox
 
-__all__ = ["Failure", "Stuck", "Trial", "Trials", "power_of_two"]
+__all__ = ["Failure", "Stuck", "Trial", "Trials"]
 
 OPEN, WHOLE = Box(), Batches()
 MOST = 4000  # unknowns of which the covariance is found, 128 MB
@@ -113,12 +113,12 @@ class Trials:
             return value, None
         few = not self._squares.apart and here.shape[1] < here.shape[0]
         self._forward = few and self._squares.forms(*here.shape)
-        slope = here.slope(self._forward)
+        slope = here.flat @ here.rows() if self._forward else here.pull(here.flat)
         self._last = here, np.array(vector), self.batches.number
         return value, slope
 
     def _linearise(self, vector, batch):
-        return Linearised(self._loss, self._packing, vector, batch, self._forward)
+        return Linearised(self._loss, self._packing, vector, batch, self._forward, self._squares.apart)
 
     def _both(self, vector):
         """Loss and flat gradient, each from a fresh tree."""
@@ -136,7 +136,7 @@ class Trials:
         """The residuals at a point and their Jacobian in what the bounds leave free, on the batch that saw it."""
         free = self.box.free_mask(trial.vector, trial.slope)
         here = self._linearised(trial)
-        return here if free is None else Restricted(here, free)
+        return here if free is None else here.among(free)
 
     def _linearised(self, trial):
         """Kept, when it was the last one."""
@@ -154,7 +154,7 @@ class Trials:
         here = self._linearised(trial)
         rows, columns = here.shape
         enough = columns < rows and columns <= MOST and self._squares.forms(rows, columns)
-        return here.covariance(self._squares.apart) if enough else None
+        return here.covariance() if enough else None
 
     def curvature(self, trial):
         """Function from a flat vector to the Hessian times it, at a point: one tape, one backward pass a product."""
@@ -175,8 +175,3 @@ class Trials:
         """The refused points since the last call."""
         failures, self.failures = tuple(self.failures), []
         return failures
-
-
-def power_of_two(value):
-    """The power of two next above, so that dividing by it changes no digits."""
-    return 2.0 ** float(np.clip(np.frexp(value)[1], -900, 900)) if value > 0 else 1.0
