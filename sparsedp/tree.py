@@ -9,7 +9,7 @@ from math import hypot, isfinite
 import numpy as np
 import scipy.sparse as sp
 
-__all__ = ["copied", "flatten", "leaves", "norm"]
+__all__ = ["copied", "flatten", "leaves", "mapped", "norm"]
 
 
 def flatten(tree):
@@ -45,10 +45,21 @@ def flatten(tree):
 
 def copied(tree):
     """Tree -> the same tree with copies of its arrays and sparse matrices: the caller may reuse them."""
-    if isinstance(tree, (tuple, list, dict)):
-        found, rebuild = flatten(tree)
-        return rebuild(map(copied, found))
-    return tree.copy() if isinstance(tree, np.ndarray) or sp.issparse(tree) else tree
+    return mapped(lambda leaf: leaf.copy() if isinstance(leaf, np.ndarray) or sp.issparse(leaf) else leaf, tree)
+
+
+def mapped(function, tree, *others):
+    """function(leaf) in the place of every leaf, or function(leaf, other, ...) over trees of as many leaves.
+
+    Examples
+    --------
+    >>> mapped(max, {"a": 1.0, "b": 5.0}, (2.0, 3.0))
+    {'a': 2.0, 'b': 5.0}
+    """
+    if not isinstance(tree, (tuple, list, dict)):
+        return function(tree, *others)
+    found, rebuild = flatten(tree)
+    return rebuild(map(function, found, *map(leaves, others)))
 
 
 def leaves(tree):

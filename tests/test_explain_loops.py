@@ -34,7 +34,7 @@ def test_implicit_steps_take_one_adjoint_solve_each():
 
 def test_without_diffusion_no_diffusion_solve():
     """nu = 0: the identity; nothing set up, nothing solved, and it is said."""
-    from sparsedp.integrators.implicit import Resolvent
+    from sparsedp.integrators.runge_kutta import Resolvent
 
     spread = Resolvent(L, "diffusion", dict(method="auto", rtol=1e-10, maxiter=None, nullspace="raise", options={}))
     plan = dp.explain(lambda u: anp.sum(spread(0.0, u) ** 2), U)

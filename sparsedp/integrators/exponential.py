@@ -16,6 +16,7 @@ Source: Cox and Matthews, J. Comput. Phys. 176 (2002), formulas 26 to 29; Hochbr
 Acta Numerica 19 (2010), section 2.2, exponential quadrature.
 """
 
+from functools import lru_cache
 from math import factorial
 from typing import NamedTuple
 
@@ -24,8 +25,9 @@ import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.integrators.problem import later
+from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.solvers.separable import SpectralFunction, spectrum
-from sparsedp.tape import Rule, cast, dtype_of, isbox
+from sparsedp.tape import Rule, isbox, of_argument
 
 __all__ = ["Exponential", "Function", "Functions", "phi"]
 
@@ -75,6 +77,12 @@ class Function(NamedTuple):
             found[k + 1] -= k * weight
         return Function(tuple(self.scale * weight for weight in found), self.scale, self.power + 1)
 
+    def at_zero(self, op, field):
+        """For z = 0, where f is a number."""
+        for _ in range(self.power):
+            field = op.apply(field)
+        return sum(a / factorial(k) for k, a in enumerate(self.weights)) * field
+
     def values(self, z, eigenvalues):
         """On the eigenvalues of L."""
         with np.errstate(over="ignore", invalid="ignore"):
@@ -101,101 +109,66 @@ class Functions:
     def __init__(self, op, name):
         self.op, self.name = op, name
         self.found, self.eigenvalues = _diagonalised(op, name)
-        self._tables: dict = {}  # (function, z) -> weights; plain values only
-        self._rules: dict = {}  # (functions, transposed) -> rule; a scheme has a handful
+        # Plain values only, of a few z; and rules made once, for every z, step and adjoint.
+        self._table, self._rule = lru_cache(KEPT)(self._values), lru_cache(None)(self._made)
 
     def __call__(self, functions, z, *fields):
         """The sum, differentiable in z and the fields."""
-        return self._known(functions, False)(z, *fields)
+        return self._rule(functions, False)(z, *fields)
 
-    def _known(self, functions, transposed):
-        """The rule for these functions: made once, for every z, step and adjoint."""
-        key = functions, transposed
-        if key not in self._rules:
-            self._rules[key] = self._rule(*key)
-        return self._rules[key]
-
-    def plain(self, functions, z, *fields, transposed=False):
-        """The same on plain values, or with the transpose of L."""
+    def plain(self, rows, z, fields, transposed=False):
+        """[the sum for each row of functions], on plain values, or with the transpose of L."""
         op, z = (self.op.T if transposed else self.op), float(z)
         for field in fields:
             if np.shape(field) != op.domain.shape:
                 raise ShapeError(
                     f"{self.name} takes a field on {op.domain.told}, got an array of shape {np.shape(field)}"
                 )
-        if z == 0:
-            return self._at_zero(functions, op, fields)
-        if any(np.iscomplexobj(field) for field in fields):
-            parts = [self.plain(functions, z, *map(part, fields), transposed=transposed) for part in (np.real, np.imag)]
-            return parts[0] + 1j * parts[1]
-        total = 0.0
-        for function, field in zip(functions, fields, strict=True):
-            wide = np.array(field, dtype=float)  # a copy: transforms overwrite
-            total = total + self.found.forward(wide, transposed) * self._table(function, z)
-        return self.found.backward(total, transposed).reshape(op.domain.shape)
+        if z == 0:  # no transform, and for phi_0 the field itself, bit for bit
+            return [sum(f.at_zero(op, field) for f, field in zip(row, fields, strict=True)) for row in rows]
+        if any(map(np.iscomplexobj, fields)):
+            parts = (self.plain(rows, z, [*map(part, fields)], transposed) for part in (np.real, np.imag))
+            return [real + 1j * imaginary for real, imaginary in zip(*parts, strict=True)]
+        moved = [self.found.forward(np.asarray(field, float), transposed) for field in fields]
+        sums = (sum(c * self._table(f, z) for f, c in zip(row, moved, strict=True)) for row in rows)
+        return [self.found.backward(total, transposed).reshape(op.domain.shape) for total in sums]
 
-    def _spread(self, functions, z, g, transposed):
-        """[f(z L) g for each function], by one transform of g and one back for each."""
-        coefficients = self.found.forward(np.array(g, dtype=float), transposed)
-        shape = self.op.domain.shape
-        return [self.found.backward(coefficients * self._table(f, z), transposed).reshape(shape) for f in functions]
-
-    @staticmethod
-    def _at_zero(functions, op, fields):
-        """f(0) is a number: no transform, and for phi_0 the field itself, bit for bit."""
-        total = 0.0
-        for function, field in zip(functions, fields, strict=True):
-            for _ in range(function.power):
-                field = op.apply(field)
-            total = total + sum(a / factorial(k) for k, a in enumerate(function.weights)) * field
-        return total
-
-    def _table(self, function, z):
-        key, known = (function, z), self._tables
-        values = known.get(key)
-        if values is None:
-            values = function.values(z, self.eigenvalues)
-            if not np.all(np.isfinite(values)):
-                raise NonFiniteError(
-                    f"{self.name}: exp({z:g} * {self.op.name}) is beyond 1.8e308; take a smaller dt or the other sign"
-                )
-            self._tables = {**dict([*known.items()][1 - KEPT :]), key: values}  # without the oldest
+    def _values(self, function, z):
+        """The values of a function on the eigenvalues of z L."""
+        values = function.values(z, self.eigenvalues)
+        if not np.all(np.isfinite(values)):
+            raise NonFiniteError(
+                f"{self.name}: exp({z:g} * {self.op.name}) is beyond 1.8e308; take a smaller dt or the other sign"
+            )
         return values
 
-    def _rule(self, functions, transposed):
+    def _made(self, functions, transposed):
         """The sum as a rule in (z, *fields)."""
 
-        derivatives = tuple(f.derivative() for f in functions)
-
         def forward(z, *fields):
-            return self.plain(functions, z, *fields, transposed=transposed)
+            return self.plain([functions], z, fields, transposed)[0]
 
         def slope(z, fields):
-            return self._known(derivatives, transposed)(z, *fields)
+            return self._rule(tuple(f.derivative() for f in functions), transposed)(z, *fields)
 
         def vjp(nums, ans, z, *fields):
-            chosen = tuple(functions[num - 1] for num in nums if num)
-
-            def backs(g):
-                if len(chosen) > 1 and not (isbox(g) or isbox(z) or z == 0 or np.iscomplexobj(g)):
-                    return self._spread(chosen, float(z), g, not transposed)
-                return [self._known((f,), not transposed)(z, g) for f in chosen]
+            chosen = [(functions[num - 1],) for num in nums if num]
 
             def pull(g):
-                found = iter(backs(g))
-                return tuple(next(found) if num else _real(anp.sum(g * slope(z, fields)), z) for num in nums)
+                if isbox(g) or isbox(z):
+                    backs = iter([self._rule(row, not transposed)(z, g) for row in chosen])
+                else:  # with one transform of g
+                    backs = iter(self.plain(chosen, z, [g], not transposed))
+                return tuple(next(backs) if num else of_argument(anp.sum(g * slope(z, fields)), z) for num in nums)
 
             return pull
 
         def jvp(nums, tangents, ans, z, *fields):
-            pairs = [(num, t) for num, t in zip(nums, tangents, strict=True) if num]
-            total = tangents[nums.index(0)] * slope(z, fields) if 0 in nums else 0.0
-            if pairs:
-                chosen = tuple(functions[num - 1] for num, _ in pairs)
-                total = total + self._known(chosen, transposed)(z, *(t for _, t in pairs))
-            return total
+            chosen, moves = [functions[num - 1] for num in nums if num], tangents[nums[0] == 0 :]
+            total = tangents[0] * slope(z, fields) if nums[0] == 0 else 0.0
+            return total + self._rule(tuple(chosen), transposed)(z, *moves) if chosen else total
 
-        return Rule(f"{self.name}.phi.T" if transposed else f"{self.name}.phi", forward, vjp, jvp)
+        return Rule(f"{self.name}.phi{'.T' * transposed}", forward, vjp, jvp)
 
 
 def _diagonalised(op, name):
@@ -207,11 +180,6 @@ def _diagonalised(op, name):
     if found is None:
         raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}; try imex or tr_bdf2")
     return found, found.eigenvalues
-
-
-def _real(cotangent, value):
-    """The cotangent of a real number from complex fields is the real part."""
-    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent
 
 
 WHOLE, HALF, MEAN = Function((1.0,)), Function((1.0,), 0.5), Function((0.0, 0.5), 0.5)
@@ -237,13 +205,13 @@ def quadrature(nodes, start, stop):
     return tuple(found)
 
 
-class Exponential:
+class Exponential(Scheme):
     """Exponential time differencing, Runge-Kutta of order 4."""
 
-    order, dyadic = 4, True
+    dyadic = True
 
     def __init__(self, problem):
-        self.problem = problem
+        super().__init__(problem, "etdrk4", 4)
         self.functions = Functions(problem.op, "stepper(etdrk4)")
         self.nodes = () if problem.source is None else NODES if problem.moving else NODES[:1]
         self.parts = [quadrature(self.nodes, *ends) for ends in ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0))]

@@ -1,22 +1,25 @@
-"""stepper(): a rate of change and a method -> a step for time loops."""
+"""stepper(): a rate of change and a method -> a step for time loops; and how large an explicit one may be."""
 
 import numpy as np
 
-from sparsedp.fields import is_number
+from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
+from sparsedp.fields import check_finite, is_number, rounded_down, surely_finite
 from sparsedp.integrators.adaptive import Adaptive
-from sparsedp.integrators.explicit import EXPLICIT, Explicit, Polynomial
 from sparsedp.integrators.exponential import Exponential
-from sparsedp.integrators.implicit import IMPLICIT, Imex, Linear, Nonlinear
-from sparsedp.integrators.problem import posed, positive
-from sparsedp.integrators.steps import Limit, Step
+from sparsedp.integrators.problem import Problem, like, positive
+from sparsedp.integrators.runge_kutta import EXPLICIT, IMPLICIT, Explicit, Linear, Nonlinear, Polynomial
+from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import check_settings
+from sparsedp.solvers.separable import spectrum
+from sparsedp.tape import is_variable, plain
 from sparsedp.tree import copied, leaves
 
-__all__ = ["METHODS", "stepper"]
+__all__ = ["METHODS", "Step", "stepper"]
 
-SPLIT = ("imex", "etdrk4")
-METHODS = (*EXPLICIT, *IMPLICIT, *SPLIT)
+METHODS = (*EXPLICIT, *IMPLICIT, "etdrk4")
 KEPT = {False: 2, True: 12}  # set-ups of linear steps, without and with error control
+ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
+DENSE_UP_TO = 64
 
 
 def stepper(
@@ -111,7 +114,7 @@ def stepper(
     order (crank_nicolson: below 10 tolerance). Derivatives that are small because terms cancel may be refused, too.
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
     takes about five times the steps of its value: twice as long as without the judgement.
-    Source: implicit.py, exponential.py and explicit.py name the papers.
+    Source: runge_kutta.py and exponential.py name the papers.
 
     Examples
     --------
@@ -137,16 +140,14 @@ def stepper(
     linear, floor, tolerance, rtol, options = copied((linear, floor, tolerance, float(rtol), options))
     given = dict(linear=linear, source=source, timed=timed, tolerance=tolerance, floor=floor, unstable=unstable)
     given |= dict(jacobian=jacobian, solver=solver, rtol=rtol, maxiter=maxiter, **options)
-    made = _remade, (method, rate, dt, given)
-    problem = posed(rate, linear, source, timed)
-    settings = dict(method=solver, rtol=rtol, nullspace="raise")
-    scheme = _scheme(method, problem, jacobian, settings, maxiter, options, KEPT[tolerance is not None])
-    limit = None
+    problem = Problem(rate, linear, source, timed)
+    settings = dict(method=solver, rtol=rtol, maxiter=maxiter, nullspace="raise", options=options)
+    scheme, largest = _scheme(method, problem, jacobian, settings, KEPT[tolerance is not None]), np.inf
     if tolerance is not None:
         scheme = Adaptive(scheme, float(tolerance), floor, f"stepper({method})")
     elif method in EXPLICIT and problem.op is not None and unstable == "raise":
-        limit = Limit(problem.op, EXPLICIT[method].reach, method)
-    return Step(method, problem, dt, scheme, limit, made)
+        largest = largest_step(problem.op, EXPLICIT[method].reach)
+    return Step(method, problem, dt, scheme, largest, (_remade, (method, rate, dt, given)))
 
 
 def _is_floor(leaf):
@@ -158,18 +159,163 @@ def _remade(method, rate, dt, given):
     return stepper(method, rate, dt, **given)
 
 
-def _scheme(method, problem, jacobian, settings, maxiter, options, kept):
+def _scheme(method, problem, jacobian, settings, kept):
     if method in EXPLICIT:
-        bare = problem.linear and problem.source is None
-        return Polynomial(problem, method) if bare else Explicit(problem, method)
-    if method in SPLIT and problem.op is None:
+        return (Polynomial if problem.linear and problem.source is None else Explicit)(problem, method)
+    if method in ("imex", "etdrk4") and problem.op is None:
         raise TypeError(f"{method} needs the stiff linear term: write linear=L or linear=(L, coefficient)")
     if method == "etdrk4":
         return Exponential(problem)
-    linear = dict(settings, maxiter=maxiter, options=options)
-    if method == "imex":
-        return Imex(problem, linear, kept)
-    if problem.linear:
-        return Linear(problem, method, linear, kept)
-    newton = dict(settings, **options) if maxiter is None else dict(settings, maxiter=maxiter, **options)
-    return Nonlinear(problem, method, jacobian, newton)
+    if method == "imex" or problem.linear:
+        return Linear(problem, method, settings, kept)
+    return Nonlinear(problem, method, jacobian, settings)
+
+
+class Step(Remade):
+    """step(state, params): the state after a time dt. Made by `stepper`.
+
+    Parameters
+    ----------
+    method : str
+    problem : Problem
+    dt : number, traced number, or function of params
+    scheme : callable
+        ``scheme(u, params, t, h)``: the state after a step h.
+    largest : float
+        Stable h c of an explicit step.
+    made : (function, arguments)
+        What makes the same step again.
+
+    Attributes
+    ----------
+    order : int
+        Of accuracy in time.
+    info : SolveLog or None
+        Records of the last solves and set-up.
+    taken : list of float
+        With error control: the accepted lengths of the last interval, as shares of it.
+    """
+
+    def __init__(self, method, problem, dt, scheme, largest, made):
+        self.method, self.problem, self.dt, self.scheme, self.largest = method, problem, dt, scheme, largest
+        self.name, self.made, self.order, self.info = f"stepper({method})", made, scheme.order, scheme.info
+
+    def recipe(self):
+        """The call that makes it again: see recipe.py."""
+        return self.made
+
+    @property
+    def taken(self):
+        return getattr(self.scheme, "taken", [1.0])
+
+    def __call__(self, state, params=None, *inputs):
+        """One step.
+
+        Parameters
+        ----------
+        state : array or tree u, or the pair (u, t) where the rate takes a time
+        params : tree
+        *inputs : tree, optional
+            Of this step; the rate then gets the pair (params, input) as its params.
+
+        Returns
+        -------
+        state, like the one given
+        """
+        params = (params, *inputs) if inputs else params
+        u, t = self._parts(state)
+        if self.problem.op is not None and isinstance(u, (dict, list, tuple)):
+            raise TypeError(
+                f"{self.name} has an Operator, which acts on one array, got a {type(u).__name__} as u; "
+                "stack its parts into one array, or apply the Operator inside the rate of an implicit method"
+            )
+        h = positive(self.dt(params), "dt") if callable(self.dt) else self.dt
+        if self.largest < np.inf:
+            self._check_stable(float(plain(h)), float(plain(self.problem.coefficient(params))))
+        try:
+            new = like(self.scheme(u, params, t, h), u)
+        except NonFiniteError:  # a solver on the way may have met it: name the argument
+            self._blame(state, params)
+            raise
+        if not all(map(_finite, leaves(new))):
+            self._blame(state, params)
+            raise NonFiniteError(
+                f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
+                "take smaller steps or an implicit method"
+            )
+        return (new, t + h) if self.problem.timed else new
+
+    def _check_stable(self, h, c):
+        """Refuse a step that would grow without bound."""
+        if h * c > self.largest * (1 + ROUNDING):
+            name = self.problem.op.name
+            raise UnstableStepError(
+                f"{self.method} is unstable for {name} with dt = {h:.12g}: the largest stable dt is "
+                f"{rounded_down(self.largest / c)}; take smaller steps or an implicit method, or write unstable='allow'"
+            )
+
+    def _parts(self, state):
+        if not self.problem.timed:
+            return state, None
+        if not (isinstance(state, (tuple, list)) and len(state) == 2):
+            given = type(state).__name__
+            raise TypeError(f"the rate of {self.name} takes a time, so its state is the pair (u, t), got {given}")
+        return state
+
+    def _blame(self, state, params):
+        """Refuse arguments that are not finite."""
+        for what, tree in (("state", state), ("params", params)):
+            found = leaves(tree)
+            for number, leaf in enumerate(found):
+                if is_variable(leaf):
+                    place = f"part {number + 1} of the {what}" if len(found) > 1 else f"the {what}"
+                    check_finite(f"{place} of {self.name}", np.asarray(plain(leaf)))
+
+    def __repr__(self):
+        length = "given by the params" if callable(self.dt) else f"{float(plain(self.dt)):g}"
+        return f"<{self.name}: order {self.order}, dt {length}>"
+
+
+def _finite(leaf):
+    """Whether all numbers are finite; their sum tells in one pass, unless it overflows."""
+    value = plain(leaf)
+    return not is_variable(value) or surely_finite(value) or bool(np.all(np.isfinite(value)))
+
+
+def largest_step(op, reach):
+    """The largest stable h c of an explicit step for u' = c L u; `reach`: of the method on the negative real axis.
+
+    From the eigenvalues of a sum of 1-D factors, else, where L has symmetric entries, from its least
+    eigenvalue. Of other operators nothing is known, and any step is taken.
+    """
+    least = least_eigenvalue(op)
+    return reach / -least if least is not None and least < 0 else np.inf
+
+
+def least_eigenvalue(op):
+    """The most negative eigenvalue of an operator with real ones, or None when that is not known."""
+    if op.dtype.kind == "c":
+        return None
+    found = spectrum(op.structure) if op.separable else None
+    if found is not None:
+        return float(np.min(found.eigenvalues))
+    if not op.structure.has_entries:
+        return None
+    matrix = op.matrix
+    different = abs(matrix - matrix.T)
+    if different.nnz and different.max() > 1e-14 * abs(matrix).max():
+        return None
+    return _least_of_symmetric(matrix)
+
+
+def _least_of_symmetric(matrix):
+    from scipy.sparse.linalg import ArpackError, eigsh
+
+    n = matrix.shape[0]
+    if n <= DENSE_UP_TO:
+        return float(np.min(np.linalg.eigvalsh(matrix.toarray()), initial=0.0))
+    start = np.random.default_rng(0).standard_normal(n)  # the same bits in every run
+    try:
+        return float(eigsh(matrix, 1, which="SA", v0=start, tol=1e-3, return_eigenvectors=False)[0])
+    except (ArpackError, ConvergenceError):
+        return None

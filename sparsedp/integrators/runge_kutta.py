@@ -1,0 +1,400 @@
+"""Runge-Kutta steps. An explicit one is a table of numbers; an implicit one a few stages, x of x = b + h f(x, t).
+
+Where the rate is c L u and nothing else, an explicit step of order p in p stages is a polynomial of z L, z = h c, and
+one node on the tape, with a derivative of the same form:
+
+    T_p(z) u = u + z L u + ... + (z L)^p u / p!,     dT_p(z) u = L T_{p-1}(z) u dz + T_p(z) du
+
+Sources: Heun, Z. Math. Phys. 45 (1900); Kutta, Z. Math. Phys. 46 (1901);
+Shu and Osher, J. Comput. Phys. 77 (1988), the strong-stability-preserving step of order 3.
+
+Implicit: backward Euler, Crank-Nicolson, TR-BDF2, imex. A linear problem, f = c L x + s(t), solves
+x = (1 - h c L)^-1 (b + h s); a nonlinear one finds the root.
+
+Crank-Nicolson is x = 2 w - u with w = (1 - z/2 L)^-1 (u + h/4 (s_0 + s_1)): one solve, no product with L.
+TR-BDF2 takes Crank-Nicolson over g h, g = 2 - sqrt(2), then x = b + d h f(x) with d = g/2 and
+b = u + (y - u) / (g (2 - g)): both stages have the same factor 1 - d z L.
+Sources: Bank et al., IEEE Trans. Electron Devices 32 (1985); Hosea and Shampine, Appl. Numer. Math. 20 (1996).
+
+imex, for u' = c L u + N(u, t) + s(t), is ARS(2,2,2), order 2, with the L-stable implicit part d = 1 - 1/sqrt(2),
+e = 1 - 1/(2 d), z = c h. A source s(t) belongs to the operator, as the walls whose values it brings: it is implicit, at
+the time of each stage,
+
+    x1 = u + h d N(u) + d (z L x1 + h s(t + d h)),
+    x2 = u + h (e N(u) + (1 - e) N(x1)) + (1 - d) (z L x1 + h s(t + d h)) + d (z L x2 + h s(t + h)),
+
+two solves with one factor; z L x1 + h s is taken from the first equation, without a product.
+Source: Ascher, Ruuth, Spiteri, Appl. Numer. Math. 25 (1997).
+
+The linear solve of all of them is x of (1 - z L) x = b, differentiable in z and b. With S = (1 - z L)^-1 and x = S b,
+
+    dx = S (db + dz L x),          so with y = S^T g:   b_bar = y,   z_bar = y . L x.
+
+The transposed solve is a rule of the same form with L^T: derivatives of every order follow. One set-up
+serves all stages, steps and adjoint solves of one z. For z = 0, x is b, and nothing is set up or solved.
+
+What L leaves as it is (the mean, where nothing flows through the walls) is split off before the solve and added
+after it: 1 - z L has the eigenvalue 1 there beside those of size z |L|, and would lose it to rounding.
+"""
+
+from functools import cached_property
+from math import sqrt
+from typing import Any, NamedTuple
+
+import autograd.numpy as anp
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.errors import ConvergenceError
+from sparsedp.integrators.problem import combine, later, untraced
+from sparsedp.ledger import active as recordings
+from sparsedp.ledger import tell
+from sparsedp.operator import Operator
+from sparsedp.operators.boundary import identity
+from sparsedp.solvers.cache import Cache
+from sparsedp.solvers.inverses import build
+from sparsedp.solvers.roots import implicit
+from sparsedp.solvers.solve import SolveLog
+from sparsedp.solvers.system import System
+from sparsedp.tape import Rule, of_argument
+
+__all__ = ["EXPLICIT", "IMPLICIT", "Explicit", "Linear", "Nonlinear", "Polynomial", "Resolvent", "Scheme"]
+
+
+class Scheme:
+    """``scheme(u, params, t, h)``: the state after a step h of a problem.
+
+    Attributes
+    ----------
+    order : int
+        Of accuracy in time.
+    dyadic : bool
+        Whether error control takes halves of halves of an interval, so that few set-ups are needed.
+    info : SolveLog or None
+        Records of the last solves and set-up.
+    """
+
+    dyadic = False
+    info: Any = None
+
+    def __init__(self, problem, name, order):
+        self.problem, self.name, self.order = problem, name, order
+
+
+# ---- explicit --------------------------------------------------------------------------------------------------------
+
+
+class Table(NamedTuple):
+    """Nodes and weights of a Runge-Kutta step of order p in p stages.
+
+    stages: for each stage after the first, its weights of the earlier rates. weights: of the result.
+    order. reach: the length of the stable interval on the negative real axis.
+    """
+
+    stages: tuple
+    weights: tuple
+    order: int
+    reach: float
+
+
+EXPLICIT = {
+    "euler": Table((), (1.0,), 1, 2.0),
+    "heun": Table(((1.0,),), (0.5, 0.5), 2, 2.0),
+    "ssprk3": Table(((1.0,), (0.25, 0.25)), (1 / 6, 1 / 6, 2 / 3), 3, 2.512745326618),
+    "rk4": Table(((0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6), 4, 2.785293563405),
+}
+
+
+class Explicit(Scheme):
+    """An explicit step of a problem whose state may be any tree."""
+
+    def __init__(self, problem, name):
+        self.table = EXPLICIT[name]
+        super().__init__(problem, name, self.table.order)
+
+    def __call__(self, u, params, t, h):
+        rates = [self.problem(u, params, t)]
+        for row in self.table.stages:
+            rates.append(self.problem(_ahead(u, h, row, rates), params, later(t, sum(row) * h)))
+        return _ahead(u, h, self.table.weights, rates)
+
+
+def _ahead(u, h, row, rates):
+    return combine(u, *((h * share, rate) for share, rate in zip(row, rates, strict=True) if share))
+
+
+class Polynomial(Scheme):
+    """The same for u' = c L u."""
+
+    def __init__(self, problem, name):
+        super().__init__(problem, name, EXPLICIT[name].order)
+        orders = range(1, self.order + 1)
+        self._rules = {(terms, flag): self._rule(terms, flag) for terms in orders for flag in (False, True)}
+
+    def __call__(self, u, params, t, h):
+        return self._rules[self.order, False](h * self.problem.coefficient(params), u)
+
+    def _rule(self, terms, transposed):
+        """T of L, or of L^T, as a rule in (z, u)."""
+        L = self.problem.op.T if transposed else self.problem.op
+
+        def forward(z, u):
+            z, total = float(z), u  # traced it is a NumPy scalar, which would round float32 otherwise
+            for k in reversed(range(1, terms + 1)):  # Horner's rule
+                total = L.apply(total)
+                total *= z / k
+                total += u
+            return total
+
+        def slope(z, u):
+            return self._rules[terms - 1, transposed](z, L(u)) if terms > 1 else L(u)
+
+        def vjp(nums, ans, z, u):
+            def pull(g):
+                slopes = {0: lambda: anp.sum(g * slope(z, u)), 1: lambda: self._rules[terms, not transposed](z, g)}
+                return tuple(of_argument(slopes[num](), (z, u)[num]) for num in nums)
+
+            return pull
+
+        def jvp(nums, tangents, ans, z, u):
+            pairs = zip(nums, tangents, strict=True)
+            return sum(self._rules[terms, transposed](z, t) if num else t * slope(z, u) for num, t in pairs)
+
+        return Rule(f"stepper({self.name}){'.T' * transposed}", forward, vjp, jvp)
+
+
+# ---- the linear solve ------------------------------------------------------------------------------------------------
+
+
+class Resolvent:
+    """solve(z, b): x of (1 - z L) x = b, with z >= 0 a number and b a field on the domain of L.
+
+    Parameters
+    ----------
+    op : Operator
+        L, from a space to itself.
+    name : str
+        For messages and counts.
+    settings : dict
+        method, rtol, maxiter, nullspace, options: as in `inverse`.
+    most : int
+        Number of set-ups that are kept.
+
+    Attributes
+    ----------
+    info : SolveLog
+    """
+
+    def __init__(self, op, name, settings, most=2):
+        self.op, self.name, self.settings = op, name, settings
+        self.info, self._kept = SolveLog(), Cache(most)
+        self._checked, self._free = self._rule(False, True), self._rule(False, False)
+        self._adjoint = self._rule(True, False)
+
+    def __call__(self, z, b):
+        return self._checked(z, b)
+
+    def _rule(self, transposed, checked):
+        """The solve (or the transposed solve) as a rule in (z, b)."""
+        L = self.op.T if transposed else self.op
+
+        def vjp(nums, ans, z, b):
+            def pull(g):
+                y = (self._free if transposed else self._adjoint)(z, g)
+                return tuple(of_argument(y if num else anp.sum(y * L(ans)), (z, b)[num]) for num in nums)
+
+            return pull
+
+        def jvp(nums, tangents, ans, z, b):
+            total = sum(t if num else t * L(ans) for num, t in zip(nums, tangents, strict=True))
+            return (self._adjoint if transposed else self._free)(z, total)
+
+        def forward(z, b):
+            return self._solved(z, b, transposed, checked)
+
+        return Rule(f"{self.name}.solve{'.T' * transposed}", forward, vjp, jvp)
+
+    def _solved(self, z, b, transposed, checked):
+        if z == 0:
+            if recordings:
+                tell(self._checked.name, "skipped", "dt or coefficient 0, no solve and no set-up")
+            return np.array(b, dtype=np.result_type(b, np.float32))  # whole numbers become floating ones
+        inv = self._inverse(float(z))
+        inv = inv.T if transposed else inv if checked else inv.tangent
+        if self._null_space is None:
+            return inv.apply(b)
+        b = np.asarray(b)
+        wide = b.astype(np.result_type(b, np.float64), copy=False)
+        moving = self._projected(wide, transposed)
+        x = self._projected(inv.apply(moving), transposed) + (wide - moving)
+        return x.astype(np.result_type(b, np.float32), copy=False)
+
+    def _projected(self, b, transposed):
+        """b without what L leaves as it is, field by field of a batch."""
+        fields = np.ascontiguousarray(b).reshape(-1, self.op.shape[0])
+        return np.array([self._null_space.project(field, transposed) for field in fields]).reshape(b.shape)
+
+    @cached_property
+    def _null_space(self):
+        """That of L where L is symmetric up to weights, None where there is none."""
+        system = System(self.op, self.settings["rtol"], None)
+        if not self.op.structure.has_entries or system.complex or system.weights is None:
+            return None
+        return system.null_space if system.null_space is not None and system.null_space.count else None
+
+    def _inverse(self, z):
+        """The inverse of 1 - z L: kept or set up."""
+        known = self._kept.find((z,))
+        if known is not None:
+            return known
+        op = identity(self.op.domain) - z * self.op
+        return self._kept.put((z,), build(op, name=self.name, log=self.info, **self.settings))
+
+
+# ---- implicit: steps made of stages ----------------------------------------------------------------------------------
+
+G = 2 - sqrt(2.0)
+D = G / 2
+C = 1 / (G * (2 - G))
+E = 1 - 1 / (2 * D)
+
+
+def backward_euler(stages, u, params, t, h):
+    """Order 1, L-stable."""
+    return stages.solve(u, u, params, later(t, h), h)
+
+
+def crank_nicolson(stages, u, params, t, h):
+    """Order 2, A-stable: what is stiff keeps its size and changes its sign (it rings)."""
+    return stages.trapezium(u, params, t, h)
+
+
+def tr_bdf2(stages, u, params, t, h):
+    """Order 2, L-stable."""
+    y = stages.trapezium(u, params, t, G * h)
+    return stages.solve(y, combine(u, (C, combine(y, (-1.0, u)))), params, later(t, h), D * h)
+
+
+def imex(stages, u, params, t, h):
+    """Order 2: the rate explicit, operator and source implicit (L-stable)."""
+
+    def ahead(*pairs):
+        """u and the multiples of rates, where there is a rate."""
+        return combine(u, *(pair for pair in pairs if pair[1] is not None))
+
+    first = stages.problem.explicit(u, params, t)
+    b = ahead((D * h, first))
+    x = stages.solve(u, b, params, later(t, D * h), D * h)
+    second = stages.problem.explicit(x, params, later(t, D * h))
+    moved = combine(x, (-1.0, b))  # d (z L x + h s)
+    b = ahead((E * h, first), ((1 - E) * h, second), ((1 - D) / D, moved))
+    return stages.solve(x, b, params, later(t, h), D * h)
+
+
+IMPLICIT = {
+    "backward_euler": (backward_euler, 1),
+    "crank_nicolson": (crank_nicolson, 2),
+    "tr_bdf2": (tr_bdf2, 2),
+    "imex": (imex, 2),
+}
+
+
+class Stages(Scheme):
+    """An implicit step by its stages, solve and trapezium."""
+
+    def __init__(self, problem, name):
+        self.advance, order = IMPLICIT[name]
+        super().__init__(problem, name, order)
+
+    def __call__(self, u, params, t, h):
+        return self.advance(self, u, params, t, h)
+
+
+class Linear(Stages):
+    """Stages of u' = c L u + source by one factor, hierarchy or transform for each h c.
+
+    Parameters
+    ----------
+    problem : Problem
+    name : str
+        One of IMPLICIT.
+    settings, most
+        As `Resolvent` takes them.
+    """
+
+    dyadic = True
+
+    def __init__(self, problem, name, settings, most):
+        super().__init__(problem, name)
+        self.resolvent = Resolvent(problem.op, f"stepper({name})", settings, most)
+        self.info = self.resolvent.info
+
+    def solve(self, guess, b, params, t, h):
+        """x of x = b + h (c L x + s(t))."""
+        source = self.problem.given(params, t)
+        b = b if source is None else combine(b, (h, source))
+        return self.resolvent(h * self.problem.coefficient(params), b)
+
+    def trapezium(self, u, params, t, h):
+        """x of x = u + h/2 (f(u, t) + f(x, t + h))."""
+        b = u
+        if self.problem.source is not None:
+            b = combine(u, *((0.25 * h, self.problem.given(params, at)) for at in (t, later(t, h))))
+        w = self.resolvent(0.5 * h * self.problem.coefficient(params), b)
+        return 2.0 * w - u
+
+
+class Nonlinear(Stages):
+    """Stages of u' = f(u, params, t) by Newton's method, with one adjoint solve for each.
+
+    Parameters
+    ----------
+    problem : Problem
+    name : str
+        One of IMPLICIT, except imex.
+    jacobian : callable or None
+        ``jacobian(u, params)`` or ``jacobian(u, params, t)``: df/du.
+    settings : dict
+        As `Resolvent` takes them.
+    """
+
+    def __init__(self, problem, name, jacobian, settings):
+        super().__init__(problem, name)
+        given = (settings | settings["options"]).items()
+        newton = {word: value for word, value in given if word != "options" and value is not None}
+
+        def residual(x, b, h, params, t):
+            return combine(x, (-1.0, b), (-h, problem(x, params, t)))
+
+        residual.__name__ = name
+        self.root = implicit(residual, jacobian and shifted(jacobian, problem.timed), **newton)
+        self.info = self.root.info
+
+    def __call__(self, u, params, t, h):
+        # The stages share a Jacobian while that is good enough; none outlives the step.
+        with self.root.series():
+            return super().__call__(u, params, t, h)
+
+    def solve(self, guess, b, params, t, h):
+        """x of x = b + h f(x, t)."""
+        try:
+            return self.root(untraced(guess), b, h, params, t)
+        except ConvergenceError as error:  # often there is no root: a quadratic rate may leave none for a large dt
+            error.args = f"{error}; take a smaller dt, or give stepper a tolerance", *error.args[1:]
+            raise
+
+    def trapezium(self, u, params, t, h):
+        """x of x = u + h/2 (f(u, t) + f(x, t + h))."""
+        b = combine(u, (0.5 * h, self.problem(u, params, t)))
+        return self.solve(u, b, params, later(t, h), 0.5 * h)
+
+
+def shifted(jacobian, timed):
+    """df/du -> the derivative 1 - h df/du of a stage's residual."""
+
+    def of_residual(x, b, h, params, t):
+        J = jacobian(x, params, t) if timed else jacobian(x, params)
+        J = J.matrix if isinstance(J, Operator) else J
+        return sp.eye_array(J.shape[0]) - h * J if sp.issparse(J) else np.eye(len(J)) - h * np.asarray(J)
+
+    return of_residual
