@@ -62,12 +62,8 @@ class Operator(Remade):
     def __init__(self, structure, domain, codomain, name, form=None):
         if structure.shape != (codomain.size, domain.size):
             raise ShapeError(f"{name} maps {domain} to {codomain}, but its matrix has shape {structure.shape}")
-        put = self.__dict__.__setitem__
-        put("structure", structure)
-        put("domain", domain)
-        put("codomain", codomain)
-        put("name", name)
-        put("form", form or _chosen_form(structure))
+        form = form or _chosen_form(structure)
+        self.__dict__.update(structure=structure, domain=domain, codomain=codomain, name=name, form=form)
 
     def __setattr__(self, name, value):
         raise AttributeError(f"Operator is frozen; make a new one instead of setting {name}")
@@ -114,12 +110,10 @@ class Operator(Remade):
         u, shape = field_array(self, u, batch=True), self.codomain.shape
         dtype = u.dtype if self._real else result_dtype(self.structure, u.dtype)
         lead = u.shape[: -len(self.domain.shape)]
-        if lead:
-            shape = lead + shape
         if out is None:
-            out = results.empty(shape, dtype)
+            out = results.empty(lead + shape, dtype)
         else:
-            check_out(self, out, u, dtype, shape)
+            check_out(self, out, u, dtype, lead + shape)
         if lead:
             many = prod(lead)
             for field, result in zip(u.reshape(many, self.shape[1]), out.reshape(many, self.shape[0])):
@@ -156,7 +150,7 @@ class Operator(Remade):
 
     def _make_transpose(self):
         name = self.name[:-2] if self.name.endswith(".T") else f"{_bracket(self.name)}.T"
-        turned = Operator(self.structure.transpose(), self.codomain, self.domain, name, self.form)
+        turned = self._acting_as(self.structure.transpose(), self.codomain, self.domain, name)
         if self.tangent is self:  # else the way back is the twin that checks nothing, as derivatives need it
             # Weak: a cycle would keep large matrices alive until the collector runs.
             turned.__dict__["_origin"] = weakref.ref(self)
@@ -166,9 +160,18 @@ class Operator(Remade):
     @property
     def tangent(self):
         """The operator that carries tangents: this one, without checks of primal data."""
+        return self._unchecked or self
+
+    @cached_property
+    def _unchecked(self):
         structure = self.structure.tangent()
-        same = structure is self.structure  # not kept: an operator that refers to itself would never be freed
-        return self if same else Operator(structure, self.domain, self.codomain, self.name, self.form)
+        if structure is self.structure:
+            return None  # an operator that refers to itself would never be freed
+        return self._acting_as(structure, self.domain, self.codomain, self.name)
+
+    def _acting_as(self, structure, domain, codomain, name):
+        """An operator of the same kind and form."""
+        return Operator(structure, domain, codomain, name, self.form)
 
     def __matmul__(self, other):
         if isinstance(other, Operator):
@@ -216,23 +219,25 @@ class Operator(Remade):
             raise DerivativeError(f"a traced number cannot scale an operator; write nu * {self.name}(u)")
         if isinstance(factor, Operator):
             raise TypeError(f"{self.name} * {factor.name} is not defined; write A @ B to compose operators")
-        if not (isinstance(factor, Number) or (isinstance(factor, np.ndarray) and factor.shape == ())):
+        if not _is_scalar(factor):
             return NotImplemented
-        number = complex(factor)  # type: ignore[arg-type]
+        number = complex(factor)
         if not np.isfinite(number):
             raise NonFiniteError(f"{self.name} can be scaled by a finite number only, got {factor}")
         label = "-" if number == -1 else f"{factor:g} * "
-        structure = self.structure.scaled(number if np.iscomplexobj(factor) else number.real)  # type: ignore[arg-type]
+        structure = self.structure.scaled(number if np.iscomplexobj(factor) else number.real)
         return Operator(structure, self.domain, self.codomain, f"{label}{_bracket(self.name)}")
 
     __rmul__ = __mul__
 
     def __truediv__(self, number):
-        if not (isbox(number) or isinstance(number, Number) or (isinstance(number, np.ndarray) and number.shape == ())):
+        if isbox(number):
+            return self * number  # refused
+        if not _is_scalar(number):
             return NotImplemented
-        if not isbox(number) and not (number != 0 and np.isfinite(number)):
+        if not (number != 0 and np.isfinite(number)):
             raise NonFiniteError(f"{self.name} can be divided by a finite number other than 0 only, got {number}")
-        if isbox(number) or np.iscomplexobj(number):
+        if np.iscomplexobj(number):
             return self * (1.0 / number)
         share, exponent = np.frexp(float(number))  # 1 / 1e308 has lost digits, 2^-1024 has not
         structure = self.structure.scaled(1.0 / float(share)).scaled(2.0 ** -int(exponent))
@@ -318,6 +323,10 @@ def _chosen_form(structure):
         return "matrix-free"
     limit = EXPLICIT_BELOW_COMPILED * structure.passes if kernels.compiled() else EXPLICIT_BELOW_PLAIN
     return "explicit" if max(structure.shape) <= limit else "matrix-free"
+
+
+def _is_scalar(value):
+    return isinstance(value, Number) or (isinstance(value, np.ndarray) and value.shape == ())
 
 
 def _bracket(name):

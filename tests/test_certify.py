@@ -9,7 +9,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.ledger import recording, thread
-from sparsedp.solvers.inverses import Inverse
+from sparsedp.solvers.inverses import Inverse, Solution
 from sparsedp.solvers.solve import Engine, SolveLog, Solver
 from sparsedp.solvers.system import System
 
@@ -175,7 +175,7 @@ def test_case_b7():
     load = np.sin(2 * np.pi * np.linspace(h, 1 - h, n))
     wanted = dp.inverse(A)(2 * load)
     system = System(A, 1e-10)
-    swept = Inverse(Solver(system, Sweeps(system), "raise", SolveLog(), "sweeps", (None, ())))
+    swept = Inverse(Solution(Solver(system, Sweeps(system), "raise", SolveLog(), "sweeps", (None, ()))))
     loose = dp.certified(0.5, 0.0)
     options = dict(method="gd", maxiter=125, rate=275.0, tolerance=loose)
     best = dp.minimize(lambda theta: anp.sum((swept(theta * load) - wanted) ** 2) / (2 * n), 5.0, **options)

@@ -204,8 +204,8 @@ BUGS = {
     ),
     "a function of an operator that is not transposed": Bug(
         "solvers",
-        "part.astype(float), self.transposed)",
-        "part.astype(float), False)",
+        "self.found.apply(self.weights, x, self.transposed)",
+        "self.found.apply(self.weights, x, False)",
         "tests/test_spectral.py",
     ),
     "the wrong sign in the derivative of a shift": Bug(

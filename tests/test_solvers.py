@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.solvers.inverses import Inverse
+from sparsedp.solvers.inverses import Inverse, Solution
 from sparsedp.solvers.solve import Engine, SolveLog, Solver
 from sparsedp.solvers.system import System
 
@@ -133,7 +133,7 @@ class Scripted(Engine):
 def scripted(error, word="", rtol=1e-10, **options):
     op = -dp.laplacian(dp.Grid(101, size=1.0), dp.dirichlet)
     engine = Scripted(op, error, word, **options)
-    return Inverse(Solver(System(op, rtol), engine, "raise", SolveLog(), "inverse", None)), engine
+    return Inverse(Solution(Solver(System(op, rtol), engine, "raise", SolveLog(), "inverse", None))), engine
 
 
 def test_an_inexact_method_is_refined():

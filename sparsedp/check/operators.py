@@ -200,8 +200,7 @@ def unit(structure, dtype):
 
     An inverse has it in `solver.system.rtol`: its residual is accepted there, whatever the method.
     """
-    members = getattr(structure, "members", None) or [getattr(structure, "inner", None)]
-    inner = max((unit(member, dtype) for member in members if member is not None), default=0.0)
+    inner = max((unit(member, dtype) for member in getattr(structure, "members", ())), default=0.0)
     system = getattr(getattr(structure, "solver", None), "system", structure)
     return max(float(np.finfo(dtype).eps), float(getattr(system, "rtol", 0.0)), inner)
 

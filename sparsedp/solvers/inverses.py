@@ -1,8 +1,6 @@
 """inverse(op): which method solves, by a fixed rule, with its reason in words."""
 
 import inspect
-import weakref
-from functools import cached_property
 from time import perf_counter
 
 import autograd.numpy as anp
@@ -138,7 +136,7 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
     made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
     solver = Solver(system, engine, nullspace, log or SolveLog(), name, made, reason)
     _note_setup(solver, clock)
-    return Inverse(solver)
+    return Inverse(Solution(solver))
 
 
 def build_dense(matrix, make, rtol, nullspace, name):
@@ -302,23 +300,25 @@ class Inverse(Operator):
 
     Parameters
     ----------
-    solver : Solver
-    transposed, checked : bool
+    structure : Solution
     """
 
     structure: Solution
     solver: Solver
 
-    def __init__(self, solver, transposed=False, checked=True):
+    def __init__(self, structure):
+        solver, transposed = structure.solver, structure.transposed
         op = solver.system.given
         domain, codomain = (op.domain, op.codomain) if transposed else (op.codomain, op.domain)
-        name = f"{solver.name}.T" if transposed else solver.name
-        super().__init__(Solution(solver, transposed, checked), domain, codomain, name, "matrix-free")
+        super().__init__(structure, domain, codomain, f"{solver.name}.T" if transposed else solver.name, "matrix-free")
         self.__dict__["solver"] = solver
+
+    def _acting_as(self, structure, domain, codomain, name):
+        return Inverse(structure)
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
-        return Inverse, (self.solver, self.structure.transposed, self.structure.checked)
+        return Inverse, (self.structure,)
 
     @property
     def info(self):
@@ -334,23 +334,6 @@ class Inverse(Operator):
     def method(self):
         """The word of the method in use."""
         return self.solver.engine.method
-
-    def _make_transpose(self):
-        structure = self.structure
-        turned = Inverse(self.solver, not structure.transposed, checked=False)
-        if not structure.checked:  # the transpose of a transpose is the twin that never refuses
-            turned.__dict__["_origin"] = weakref.ref(self)
-        self.__dict__["_transposed"] = turned
-        return turned
-
-    @property
-    def tangent(self):
-        """This inverse without the check of primal data: what derivative rules apply."""
-        return self._unchecked if self.structure.checked else self
-
-    @cached_property
-    def _unchecked(self):
-        return Inverse(self.solver, self.structure.transposed, checked=False)
 
     # ------------------------------------------------------------ application
 

@@ -19,7 +19,7 @@ from sparsedp.operator import Operator
 from sparsedp.operators.given import from_functions, from_matrix
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.direct import DENSE_UP_TO
-from sparsedp.solvers.inverses import Inverse, build, build_dense
+from sparsedp.solvers.inverses import Inverse, Solution, build, build_dense
 from sparsedp.solvers.solve import failure
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like
 from sparsedp.tape import called, isbox
@@ -51,7 +51,7 @@ class Linearisation:
         self.product, self.terms = solver.system.applied, solver.system.terms  # J x; a size of the terms of that
 
     def __str__(self):
-        return str(Inverse(self.solver))
+        return str(Inverse(Solution(self.solver)))
 
     @property
     def singular(self):

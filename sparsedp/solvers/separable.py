@@ -428,17 +428,15 @@ def separable_engine(system):
 class SpectralFunction(Structure):
     """f(A) for a Kronecker sum A, as a structure: one pair of transforms."""
 
-    has_entries = False
+    has_entries = takes_complex = False
 
     def __init__(self, found, weights, transposed=False):
         self.found, self.weights, self.transposed = found, weights, transposed
         size = int(np.prod(found.shape))
         self.shape = (size, size)
 
-    def apply(self, x, out):
-        parts = (x.real, x.imag) if x.dtype.kind == "c" else (x,)
-        y, *imaginary = (self.found.apply(self.weights, part.astype(float), self.transposed) for part in parts)
-        np.copyto(out, y + 1j * imaginary[0] if imaginary else y, casting="same_kind")
+    def act(self, x, out):
+        out[...] = self.found.apply(self.weights, x, self.transposed)
 
     def transpose(self):
         return SpectralFunction(self.found, self.weights, not self.transposed)

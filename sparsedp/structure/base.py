@@ -1,5 +1,7 @@
 """Structure: what acts linearly on flat arrays. Its plainest kinds are a matrix and a multiple of another one."""
 
+from operator import is_
+
 import numpy as np
 import scipy.sparse as sp
 
@@ -30,8 +32,12 @@ class Structure(Uncached):
     shape : (rows, columns)
     dtype : numpy dtype
         float64 or complex128: the field the entries live in.
+    members : tuple of Structures
+        What it is made of, where it is made of others.
     has_entries : bool
         Whether `explicit()` can list the entries without applying the map to every unit vector.
+    takes_complex : bool
+        Whether `act` takes complex arrays; else real and imaginary parts go through it apart.
     separable : bool
         Whether it is a Kronecker sum: one 1-D factor for each axis.
     passes : int
@@ -40,13 +46,27 @@ class Structure(Uncached):
 
     shape: tuple[int, int]
     dtype = np.dtype(float)
+    members: tuple = ()
     has_entries = True
+    takes_complex = True
     is_identity = False
     separable = False
     passes = 1  # over memory, of the matrix-free form
 
     def apply(self, x, out):
-        """Write A x into `out`. Both flat and contiguous, out of dtype result_dtype(self, x.dtype)."""
+        """Write A x into `out`. Both flat and contiguous, out of dtype result_dtype(self, x.dtype).
+
+        All is computed in double precision, and rounded once.
+        """
+        if x.dtype.char in "fF":
+            np.copyto(out, self.product(x.astype(np.result_type(x.dtype, float))), casting="same_kind")
+        elif x.dtype.kind == "c" and not self.takes_complex:
+            out.real, out.imag = (self.product(part.copy()) for part in (x.real, x.imag))
+        else:
+            self.act(x, out)
+
+    def act(self, x, out):
+        """As `apply`, for float64 and, where it takes them, complex128."""
         raise TypeError(f"{type(self).__name__} does not say how it acts")
 
     def transpose(self):
@@ -71,7 +91,12 @@ class Structure(Uncached):
 
     def tangent(self):
         """The same map inside derivative rules: without checks that only primal data must meet."""
-        return self
+        tangents = [member.tangent() for member in self.members]
+        return self if all(map(is_, tangents, self.members)) else self.rebuilt(tangents)
+
+    def rebuilt(self, members):
+        """The same of other members."""
+        return type(self)(members)  # type: ignore[call-arg]
 
     def product(self, x):
         """A x as a fresh array."""
@@ -90,18 +115,14 @@ class Matrix(Structure):
     """
 
     def __init__(self, matrix):
-        self.matrix = compact(matrix)
-        if self.matrix.dtype not in (np.float64, np.complex128):
-            wide = np.complex128 if self.matrix.dtype.kind == "c" else np.float64
-            self.matrix = self.matrix.astype(wide)
+        matrix = compact(matrix)
+        self.matrix = matrix.astype(np.result_type(matrix.dtype, float), copy=False)
         for part in (self.matrix.data, self.matrix.indices, self.matrix.indptr):
             part.flags.writeable = False  # an Operator is constant: nobody may write into it
-        self.shape = self.matrix.shape
-        self.dtype = self.matrix.dtype
+        self.shape, self.dtype = self.matrix.shape, self.matrix.dtype
 
-    def apply(self, x, out):
-        wide = x.astype(np.result_type(x.dtype, np.float64), copy=False)  # SciPy has no product in half precision
-        np.copyto(out, self.matrix @ wide, casting="same_kind")
+    def act(self, x, out):
+        out[...] = self.matrix @ x
 
     def transpose(self):
         return Matrix(self.matrix.T.tocsr())
@@ -117,14 +138,15 @@ class Scaled(Structure):
     """A number times a structure that cannot take the number in."""
 
     def __init__(self, inner, factor):
-        self.inner = inner
-        self.factor = factor
-        self.shape = inner.shape
+        self.members, self.inner, self.factor = (inner,), inner, factor
+        self.shape, self.has_entries, self.passes = inner.shape, inner.has_entries, inner.passes
         self.dtype = np.result_type(inner.dtype, complex if np.iscomplexobj(factor) else float)
-        self.has_entries, self.passes = inner.has_entries, inner.passes
 
-    def apply(self, x, out):
-        np.multiply(self.inner.product(x), self.factor, out=out, casting="same_kind")
+    def act(self, x, out):
+        np.multiply(self.inner.product(x), self.factor, out=out)
+
+    def rebuilt(self, members):
+        return Scaled(members[0], self.factor)
 
     def transpose(self):
         return Scaled(self.inner.transpose(), self.factor)
@@ -138,10 +160,6 @@ class Scaled(Structure):
     def magnitude(self):
         inner = self.inner.magnitude()
         return lambda x: abs(self.factor) * inner(x)
-
-    def tangent(self):
-        inner = self.inner.tangent()
-        return self if inner is self.inner else Scaled(inner, self.factor)
 
 
 def result_dtype(structure, dtype):
@@ -185,10 +203,6 @@ def rows_of(matrix):
 
 def columns_by_application(structure):
     """Entries of a map that only knows how to act: one application for each column."""
-    rows, columns = structure.shape
-    found, unit = [], np.zeros(columns)
-    for column in range(columns):
-        unit[column] = 1.0
-        found.append(sp.csc_array(structure.product(unit)[:, None]))
-        unit[column] = 0.0
-    return compact(sp.hstack(found)) if found else sp.csr_array((rows, columns))
+    size = structure.shape[1]
+    columns = [sp.csc_array(structure.product(np.eye(1, size, column)[0])[:, None]) for column in range(size)]
+    return compact(sp.hstack(columns) if columns else sp.csr_array(structure.shape))

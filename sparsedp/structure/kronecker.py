@@ -1,6 +1,8 @@
 """Kronecker: blocks of sums of Kronecker products of 1-D factors. One definition, every form."""
 
+from collections import defaultdict
 from functools import cached_property, reduce
+from itertools import accumulate, product
 from math import prod
 from typing import Any, NamedTuple
 
@@ -12,7 +14,7 @@ from sparsedp import kernels
 from sparsedp.structure.base import Structure, compact
 from sparsedp.structure.factor import Factor
 
-__all__ = ["Kronecker", "Term"]
+__all__ = ["Kronecker", "Term", "components"]
 
 
 class Term(NamedTuple):
@@ -49,6 +51,8 @@ class Kronecker(Structure):
         (row, column) -> tuple of Terms; a missing pair is a zero block.
     """
 
+    takes_complex = False  # the loops know float64 only
+
     def __init__(self, out_parts, in_parts, blocks):
         self.out_parts = tuple(out_parts)
         self.in_parts = tuple(in_parts)
@@ -63,12 +67,10 @@ class Kronecker(Structure):
         term = (Term(1.0, (None,) * len(parts[0])),)
         return cls(parts, parts, {(c, c): term for c in range(len(parts))})
 
-    @property
+    @cached_property
     def is_identity(self):  # type: ignore[override]
         """Whether this is the identity, exactly."""
-        count = len(self.out_parts)
-        one = {(c, c): (Term(1.0, (None,) * len(self.out_parts[0])),) for c in range(count)}
-        return self.out_parts == self.in_parts and self.blocks == one
+        return self.out_parts == self.in_parts and self.blocks == Kronecker.identity(self.out_parts).blocks
 
     # ------------------------------------------------------------ what is known of a Kronecker sum
 
@@ -130,20 +132,20 @@ class Kronecker(Structure):
 
     def composed(self, other):
         """self @ other, both Kronecker with matching components."""
-        blocks: dict = {}
-        for (r, k), mine in self.blocks.items():
-            for (j, c), theirs in other.blocks.items():
-                if k == j:
-                    products = tuple(a @ b for a in mine for b in theirs)
-                    blocks[r, c] = blocks.get((r, c), ()) + products
+        blocks: defaultdict = defaultdict(tuple)
+        for ((r, k), mine), ((j, c), theirs) in product(self.blocks.items(), other.blocks.items()):
+            if k == j:
+                blocks[r, c] += tuple(a @ b for a in mine for b in theirs)
         return Kronecker(self.out_parts, other.in_parts, blocks)
 
     def added(self, other):
         """self + other, both Kronecker with the same components."""
-        blocks = dict(self.blocks)
-        for key, terms in other.blocks.items():
-            blocks[key] = blocks.get(key, ()) + terms
-        return Kronecker(self.out_parts, self.in_parts, blocks)
+        keys = self.blocks | other.blocks
+        return Kronecker(
+            self.out_parts,
+            self.in_parts,
+            {key: self.blocks.get(key, ()) + other.blocks.get(key, ()) for key in keys},
+        )
 
     def magnitude(self):
         return self._absolute.product
@@ -157,27 +159,13 @@ class Kronecker(Structure):
     def explicit(self):
         if not self.blocks:
             return compact(sp.csr_array(self.shape))
-        grid = [[None] * len(self.in_parts) for _ in self.out_parts]
-        for r, out_part in enumerate(self.out_parts):
-            for c, in_part in enumerate(self.in_parts):
-                terms = self.blocks.get((r, c), ())
-                grid[r][c] = _block(terms, out_part, in_part)
-        return compact(sp.block_array(grid, format="csr"))
+        columns = list(enumerate(self.in_parts))
+        rows = [[_block(self.blocks.get((r, c), ()), m, n) for c, n in columns] for r, m in enumerate(self.out_parts)]
+        return compact(sp.block_array(rows))
 
-    def apply(self, x, out):
-        if x.dtype == np.float64:
-            self._run(x, out)
-            return
-        # The loops know float64 only: real and imaginary parts apart, and one rounding at the end.
-        pairs = [(x.real, out.real), (x.imag, out.imag)] if x.dtype.kind == "c" else [(x, out)]
-        for part, target in pairs:
-            wide = np.empty(out.shape)
-            self._run(np.array(part, dtype=float), wide)
-            np.copyto(target, wide, casting="same_kind")
-
-    def _run(self, x, out):
-        inputs = _components(x, self.in_parts)
-        for row, target in enumerate(_components(out, self.out_parts)):
+    def act(self, x, out):
+        inputs = components(x, self.in_parts)
+        for row, target in enumerate(components(out, self.out_parts)):
             steps = self._plan[row]
             if not steps:
                 target[...] = 0
@@ -220,12 +208,10 @@ class FusedPass:
 
 
 class TermPass:
-    """One term: its factors one axis after the other, the last one into the result."""
+    """One term, no multiple of the identity: its factors one axis after the other, the last one into the result."""
 
     def __init__(self, column, term, shape):
-        self.column = column
-        self.scale = term.scale
-        self.steps = []
+        self.column, self.scale, self.steps = column, term.scale, []
         for axis in term.axes:
             rows = term.factors[axis].rows
             before, after = prod(shape[:axis]), prod(shape[axis + 1 :])
@@ -233,14 +219,10 @@ class TermPass:
             self.steps.append((rows, (before, rows.cols, after), (before, rows.rows, after)))
 
     def __call__(self, u, out, accumulate):
-        if not self.steps:
-            np.add(out, self.scale * u, out=out) if accumulate else np.multiply(u, self.scale, out=out)
-            return
-        for rows, before, after in self.steps[:-1]:
-            step = np.empty(after, u.dtype)
-            kernels.along_axis(u.reshape(before), step, rows, 1.0, False)
-            u = step
-        rows, before, after = self.steps[-1]
+        *steps, (rows, before, after) = self.steps
+        for line, *shapes in steps:
+            u, given = np.empty(shapes[1]), u.reshape(shapes[0])
+            kernels.along_axis(given, u, line, 1.0, False)
         kernels.along_axis(u.reshape(before), out.reshape(after), rows, self.scale, accumulate)
 
 
@@ -253,18 +235,14 @@ def _absolute(term):
     return Term(abs(term.scale), tuple(factor and Factor(abs(factor.matrix)) for factor in term.factors))
 
 
-def _components(flat, parts):
-    found, start = [], 0
-    for part in parts:
-        found.append(flat[start : start + prod(part)].reshape(part))
-        start += prod(part)
-    return found
+def components(flat, parts):
+    """Flat field -> its components."""
+    ends = accumulate(map(prod, parts))
+    return [flat[end - prod(part) : end].reshape(part) for end, part in zip(ends, parts)]
 
 
 def _block(terms, out_part, in_part):
-    if not terms or not prod(out_part) or not prod(in_part):
-        return sp.csr_array((prod(out_part), prod(in_part)))
-    return reduce(lambda a, b: a + b, (_product_matrix(term, in_part) for term in terms))
+    return sum((_product_matrix(term, in_part) for term in terms), sp.csr_array((prod(out_part), prod(in_part))))
 
 
 def _product_matrix(term, in_part):

@@ -1,6 +1,9 @@
 """Lazy structures: diagonals, products, sums and functions. Nothing is multiplied out before it is needed."""
 
 from functools import cached_property, reduce
+from math import prod
+from operator import add, matmul
+from operator import mul as multiply
 
 import numpy as np
 import scipy.sparse as sp
@@ -9,8 +12,8 @@ from sparsedp import kernels
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import frozen
 from sparsedp.recipe import Remade
-from sparsedp.structure.base import Structure, compact, result_dtype, rows_of
-from sparsedp.structure.kronecker import Kronecker
+from sparsedp.structure.base import Structure, compact, rows_of
+from sparsedp.structure.kronecker import Kronecker, components
 
 __all__ = [
     "Chain",
@@ -30,14 +33,12 @@ class Diagonal(Structure):
     """Multiplication by one number for each entry."""
 
     def __init__(self, values):
-        values = np.array(values).reshape(-1)
-        self.values = values.astype(complex if values.dtype.kind == "c" else float)
+        self.values = np.array(values, np.result_type(values, float)).reshape(-1)
         self.values.flags.writeable = False
-        self.shape = (values.size, values.size)
-        self.dtype = self.values.dtype
+        self.shape, self.dtype = (self.values.size,) * 2, self.values.dtype
 
-    def apply(self, x, out):
-        np.multiply(x, self.values, out=out, casting="same_kind")
+    def act(self, x, out):
+        np.multiply(x, self.values, out=out)
 
     def transpose(self):
         return self
@@ -59,7 +60,7 @@ class Mask(Diagonal):
         self.keep = np.array(keep, dtype=bool).reshape(-1)
         super().__init__(self.keep)
 
-    def apply(self, x, out):
+    def act(self, x, out):
         out.fill(0)
         np.copyto(out, x, where=self.keep)
 
@@ -78,18 +79,13 @@ class Chain(Structure):
         self.has_entries = all(member.has_entries for member in members)
         self.passes = max(member.passes for member in members)
 
-    def apply(self, x, out):
-        if x.dtype == float == self.dtype and x.size >= FEW and kernels.compiled():
-            if self._fused is not None and self._fused.shape[-1] >= SHORT and self._fused.apply(x, out):
-                return
-        single = x.dtype.char in "fF"
-        x = x.astype(np.result_type(x.dtype, np.float64)) if single else x
+    def act(self, x, out):
+        large = x.dtype == float == self.dtype and x.size >= FEW and kernels.compiled()
+        if large and self._fused is not None and self._fused(x, out):
+            return
         for member in self.members[:0:-1]:
             x = member.product(x)
-        if single:  # intermediate results in double, one rounding at the end
-            np.copyto(out, self.members[0].product(x), casting="same_kind")
-        else:
-            self.members[0].apply(x, out)
+        self.members[0].apply(x, out)
 
     @cached_property
     def _fused(self):
@@ -102,7 +98,7 @@ class Chain(Structure):
         return Chain([member.transpose() for member in reversed(self.members)])
 
     def explicit(self):
-        return compact(reduce(lambda a, b: a @ b, (member.explicit() for member in self.members)))
+        return compact(reduce(matmul, (member.explicit() for member in self.members)))
 
     def scaled(self, factor):
         return Chain([self.members[0].scaled(factor), *self.members[1:]])
@@ -111,28 +107,18 @@ class Chain(Structure):
         members = [member.magnitude() for member in reversed(self.members)]
         return lambda x: reduce(lambda y, member: member(y), members, x)
 
-    def tangent(self):
-        tangents = [member.tangent() for member in self.members]
-        same = all(a is b for a, b in zip(tangents, self.members, strict=True))
-        return self if same else Chain(tangents)
-
 
 class Sum(Structure):
     """A sum of structures."""
 
     def __init__(self, members):
-        self.members = tuple(members)
-        self.shape = members[0].shape
-        self.dtype = np.result_type(*(member.dtype for member in members))
+        self.members = tuple(sorted(members, key=lambda member: member.dtype.kind))  # a complex one first: it has room
+        self.shape, self.dtype = members[0].shape, self.members[0].dtype
         self.has_entries = all(member.has_entries for member in members)
 
-    def apply(self, x, out):
-        if x.dtype.char in "fF":
-            x = x.astype(np.result_type(x.dtype, np.float64))
-            np.copyto(out, reduce(np.add, (member.product(x) for member in self.members)), casting="same_kind")
-            return
+    def act(self, x, out):
         first, *rest = self.members
-        np.copyto(out, first.product(x)) if result_dtype(first, x.dtype) != out.dtype else first.apply(x, out)
+        first.apply(x, out)
         for member in rest:
             out += member.product(x)
 
@@ -140,7 +126,7 @@ class Sum(Structure):
         return Sum([member.transpose() for member in self.members])
 
     def explicit(self):
-        return compact(reduce(lambda a, b: a + b, (member.explicit() for member in self.members)))
+        return compact(reduce(add, (member.explicit() for member in self.members)))
 
     def scaled(self, factor):
         return Sum([member.scaled(factor) for member in self.members])
@@ -148,11 +134,6 @@ class Sum(Structure):
     def magnitude(self):
         members = [member.magnitude() for member in self.members]
         return lambda x: sum(member(x) for member in members)
-
-    def tangent(self):
-        tangents = [member.tangent() for member in self.members]
-        same = all(a is b for a, b in zip(tangents, self.members, strict=True))
-        return self if same else Sum(tangents)
 
 
 class Functions(Remade, Structure):
@@ -196,17 +177,18 @@ def compose(a, b):
     Identities vanish, factor-defined maps stay factor-defined, diagonals meet in one diagonal;
     the rest becomes a chain, whose ends are tried first.
     """
-    left = list(a.members) if isinstance(a, Chain) else [a]
-    right = list(b.members) if isinstance(b, Chain) else [b]
-    while left and right:
-        joined = _joined(left[-1], right[0])
-        if joined is None:
-            break
-        left, right = left[:-1], [joined, *right[1:]]
-        if len(right) > 1 and (closer := _joined(right[0], right[1])) is not None:
-            right = [closer, *right[2:]]
+    left, right = _members(a, Chain), _members(b, Chain)
+    while left and right and (joined := _joined(left[-1], right[0])) is not None:
+        left, right[0] = left[:-1], joined
+        if len(right) > 1 and (closer := _joined(*right[:2])) is not None:
+            right[:2] = [closer]
     members = left + right
     return members[0] if len(members) == 1 else Chain(members)
+
+
+def _members(structure, kind):
+    """The members of a structure of this kind; else the structure itself."""
+    return list(structure.members) if isinstance(structure, kind) else [structure]
 
 
 def _joined(a, b):
@@ -226,17 +208,15 @@ def _joined(a, b):
 
 def total(a, b):
     """Structure of a + b."""
-    left = list(a.members) if isinstance(a, Sum) else [a]
-    right = list(b.members) if isinstance(b, Sum) else [b]
-    for member in right:
-        for place, other in enumerate(left):
-            joined = _added(other, member)
-            if joined is not None:
-                left[place] = joined
-                break
+    members = _members(a, Sum)
+    for member in _members(b, Sum):
+        joined = [_added(other, member) for other in members]
+        place = next((place for place, found in enumerate(joined) if found is not None), None)
+        if place is None:
+            members.append(member)
         else:
-            left.append(member)
-    return left[0] if len(left) == 1 else Sum(left)
+            members[place] = joined[place]
+    return members[0] if len(members) == 1 else Sum(members)
 
 
 def _added(a, b):
@@ -250,111 +230,59 @@ def _added(a, b):
 # ---- products with faces between cells, in one pass ----
 
 
-def entries_beside(left, right, axis, n, periodic):
-    """Entries of L (cells <- faces) and of R (faces <- cells) at each face across an axis, for the cells beside it.
-
-    Parameters
-    ----------
-    left, right : Kronecker
-    axis, n : int
-        n cells along the axis.
-    periodic : bool
-
-    Returns
-    -------
-    ((r_below, r_above), (l_below, l_above)), arrays of one number for each face, or None
-        None where another axis, a second term or a further cell takes part.
-    """
-    terms, slopes = left.blocks.get((0, axis), ()), right.blocks.get((axis, 0), ())
-    if len(terms) != 1 or len(slopes) != 1 or terms[0].axes != (axis,) or slopes[0].axes != (axis,):
-        return None
-    faces = n if periodic else n + 1
-    there = _beside(slopes[0].factors[axis], slopes[0].scale, n, faces, periodic)
-    back = _beside(terms[0].factors[axis].T, terms[0].scale, n, faces, periodic)
-    return None if there is None or back is None else (there, back)
-
-
-def _beside(factor, scale, n, faces, periodic):
-    """A factor from cells to faces -> its entries for the cell below and the cell above each face, or None."""
-    m = factor.matrix
-    row = rows_of(m)
-    below, above = np.zeros(faces), np.zeros(faces)
-    is_above = m.indices == row
-    is_below = (m.indices == row - 1) | (periodic & (row == 0) & (m.indices == n - 1))
-    if not np.all(is_above ^ is_below):  # further cells; or one periodic cell, on both sides of its face
-        return None
-    above[row[is_above]], below[row[is_below]] = scale * m.data[is_above], scale * m.data[is_below]
-    return below, above
-
-
-class ThroughFaces:
-    """L diag(k) R on fields of float64.
-
-    Parameters
-    ----------
-    shape : tuple
-        Of the cells, in 2-D or 3-D.
-    lines : four arrays for each axis
-        Entries of R for the cells below and above each face, then those of L.
-    k : array
-        A number for each face.
-    closed : bool
-        Whether faces with k = 0 carry 0, whatever the cells hold.
-    """
-
-    def __init__(self, shape, lines, k, closed):
-        self.closed, none = closed, np.zeros((0, 0, 0))
-        counts = [n + (line[0].size > n) for n, line in zip(shape, lines)]
-        sizes = [(*shape[:axis], count, *shape[axis + 1 :]) for axis, count in enumerate(counts)]
-        pieces = np.split(k, np.cumsum([np.prod(size, dtype=int) for size in sizes])[:-1])
-        parts, lines = [part.reshape(size) for part, size in zip(pieces, sizes)], [tuple(line) for line in lines]
-        if len(shape) == 2:
-            shape, lines = (shape[0], 1, shape[1]), [lines[0], (np.zeros(1),) * 4, lines[1]]
-            parts = [parts[0][:, None], none, parts[1][:, None]]
-        self.shape, self.parts = shape, tuple(parts)
-        ends = [side for line in lines for side in line]
-        cells = np.repeat(shape, 4)
-        wide = [np.append(side, side[0]) if side.size == n else side for n, side in zip(cells, ends)]
-        self.lines = tuple(np.stack(wide[4 * axis : 4 * axis + 4]) for axis in range(3))
-
-    def apply(self, x, out):
-        """Write the product into `out` -> whether it could be done."""
-        fields, rows = (
-            (x.reshape(self.shape), *self.parts, *self.lines, out.reshape(self.shape)),
-            np.prod(self.shape[:2]),
-        )
-        return kernels.run("stencil", "through_faces", rows, x.size, kernels.threads(), *fields, self.closed)
-
-
 def through_faces(left, middle, right):
-    """Structures L (faces -> cells), the diagonals between, R (cells -> faces) -> ThroughFaces, or None."""
+    """Structures L (faces -> cells), the diagonals between, R (cells -> faces) -> their product in one pass, or None.
+
+    It is a function of x and of the array for the result that says whether it could be done.
+    """
     if not (isinstance(left, Kronecker) and isinstance(right, Kronecker) and middle):
         return None
     if len(right.in_parts) != 1 or left.out_parts != right.in_parts or left.in_parts != right.out_parts:
         return None
     shape = right.in_parts[0]
-    if len(shape) not in (2, 3) or len(left.in_parts) != len(shape) or min(shape) < 2:
+    if len(shape) not in (2, 3) or len(left.in_parts) != len(shape) or min(shape) < 2 or shape[-1] < SHORT:
         return None
-    lines = [_line(left, right, shape, axis) for axis in range(len(shape))]
-    if any(line is None for line in lines):
+    lines = [_line(left, right, axis, n) for axis, n in enumerate(shape)]
+    closed = [isinstance(member, Mask) for member in middle]
+    k = reduce(multiply, (member.values for member in middle))
+    if any(line is None for line in lines) or k.dtype != float:
         return None
-    closed = [hasattr(member, "keep") for member in middle]
     if any(closed) and not all(one or np.all(member.values != 0) for one, member in zip(closed, middle)):
         return None  # 0 times NaN is NaN for some of the zeros, and 0 for others
-    k = middle[0].values
-    for member in middle[1:]:
-        k = k * member.values
-    return ThroughFaces(shape, lines, k, any(closed)) if k.dtype == float else None
+    parts = components(k, right.out_parts)
+    if len(shape) == 2:  # an axis of one cell, without faces
+        shape, parts = (shape[0], 1, shape[1]), [parts[0][:, None], np.zeros((0, 0, 0)), parts[1][:, None]]
+        lines.insert(1, np.zeros((4, 2)))
+
+    def run(x, out):
+        fields = x.reshape(shape), *parts, *lines, out.reshape(shape)
+        return kernels.run("stencil", "through_faces", prod(shape[:2]), x.size, kernels.threads(), *fields, any(closed))
+
+    return run
 
 
-def _line(left, right, shape, axis):
-    """Entries of R and of L at the faces across an axis; None where they are not of that kind."""
-    n, faces = shape[axis], right.out_parts[axis][axis]
-    if faces not in (n, n + 1) or right.out_parts[axis] != (*shape[:axis], faces, *shape[axis + 1 :]):
+def _line(left, right, axis, n):
+    """Entries of R for the cells below and above each face across an axis of n cells, and those of L; or None.
+
+    None where another axis, a second term or a further cell takes part. On a periodic axis the last face is the first.
+    """
+    terms = right.blocks.get((axis, 0), ()), left.blocks.get((0, axis), ())
+    if any(len(found) != 1 or found[0].axes != (axis,) for found in terms):
         return None
-    found = entries_beside(left, right, axis, n, faces == n)
-    if found is None:
+    (slope,), (back,) = terms
+    sides = _beside(slope.factors[axis], slope.scale, n), _beside(back.factors[axis].T, back.scale, n)
+    if any(side is None or np.any(side[:, 1:n] == 0) for side in sides):  # what is not read could be NaN
         return None
-    (there, back), inner = found, slice(1, n)
-    whole = all(np.all(side[inner] != 0) for side in (*there, *back))  # else what is not read could be NaN
-    return (*there, *back) if whole else None
+    return np.concatenate(sides)
+
+
+def _beside(factor, scale, n):
+    """A factor from n cells to faces -> its entries for the cell below and the cell above each face, or None."""
+    m, row, faces = factor.matrix, rows_of(factor.matrix), factor.shape[0]
+    is_below, is_above = m.indices == (row - 1) % faces, m.indices == row
+    if faces not in (n, n + 1) or not np.all(is_above ^ is_below):
+        return None  # further cells; or one periodic cell, on both sides of its face
+    sides = np.zeros((2, n + 1))
+    sides[np.where(is_below, 0, 1), row] = scale * m.data
+    sides[:, faces:] = sides[:, : n + 1 - faces]
+    return sides
