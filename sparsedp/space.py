@@ -1,6 +1,7 @@
 """Space: where the numbers of a field live, as a value. No numbers are stored here."""
 
 from functools import cached_property
+from itertools import accumulate
 from math import prod
 from typing import Any
 
@@ -53,10 +54,8 @@ class Space(Uncached):
         shape = (shape,) if np.ndim(shape) == 0 else tuple(shape)
         if not all(isinstance(n, (int, np.integer)) and n >= 0 for n in shape):
             raise ShapeError(f"a space needs whole lengths >= 0, got {shape}; write Space(7) or Space((2, 3))")
-        self.__dict__["shape"] = tuple(int(n) for n in shape)
-        self.__dict__["kind"] = kind
-        self.__dict__["grid"] = grid
-        self.__dict__["parts"] = (self.shape,) if parts is None else tuple(parts)
+        shape = tuple(map(int, shape))
+        self.__dict__.update(shape=shape, kind=kind, grid=grid, parts=(shape,) if parts is None else tuple(parts))
 
     def __setattr__(self, name, value):
         raise AttributeError(f"Space is frozen; make a new one instead of setting {name}")
@@ -69,7 +68,7 @@ class Space(Uncached):
     @cached_property
     def offsets(self):
         """Where each component starts in the flat array, and where the last one ends."""
-        return (0, *np.cumsum([prod(part) for part in self.parts]).tolist())
+        return (0, *accumulate(map(prod, self.parts)))
 
     @cached_property
     def volumes(self):
@@ -106,8 +105,7 @@ class Space(Uncached):
             return tuple(rule(v) for rule in self._parted)
         check_plain("split", v)
         flat = np.asarray(v).reshape(-1)
-        spans = zip(self.offsets, self.offsets[1:], self.parts, strict=False)
-        return tuple(flat[start:stop].reshape(part) for start, stop, part in spans)
+        return tuple(flat[start:stop].reshape(part) for start, stop, part in self._spans)
 
     def join(self, *parts):
         """Components -> one field of shape `shape`. Differentiable; inverse of `split`.
@@ -138,8 +136,12 @@ class Space(Uncached):
     @cached_property
     def _parted(self):
         """The rules of `split`: one for each component."""
-        spans = zip(self.offsets, self.offsets[1:], self.parts, strict=False)
-        return [_part(self.kind, self.shape, *span) for span in spans]
+        return [_part(self.kind, self.shape, *span) for span in self._spans]
+
+    @cached_property
+    def _spans(self):
+        """Start, end and shape of each component in the flat array."""
+        return list(zip(self.offsets, self.offsets[1:], self.parts))
 
     def __eq__(self, other):
         if not isinstance(other, Space):
@@ -187,8 +189,8 @@ def _part(kind, whole, start, stop, shape):
         return v.reshape(-1)[start:stop].reshape(shape)
 
     def put(g):
-        v = np.zeros(whole, dtype=g.dtype)
-        v.reshape(-1)[start:stop] = g.reshape(-1)
+        v = np.zeros(whole, np.result_type(g))
+        v.reshape(-1)[start:stop] = np.reshape(g, -1)
         return v
 
     return linear(f"part of {kind}", take, put)[0]
@@ -199,11 +201,7 @@ def _joined(space, *parts):
 
 
 def _join_vjp(nums, ans, space, *parts):
-    def pull(g):
-        found = space.split(g)
-        return tuple(found[num - 1] for num in nums)
-
-    return pull
+    return lambda g: tuple(space.split(g)[num - 1] for num in nums)
 
 
 def _join_jvp(nums, tangents, ans, space, *parts):

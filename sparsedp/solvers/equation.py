@@ -10,7 +10,8 @@ from sparsedp.derivative import pullback
 from sparsedp.direction import push
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, check_plain
-from sparsedp.tape import dtype_of, is_variable, isbox, linear, plain
+from sparsedp.space import Space
+from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["Equation", "Layout", "vary"]
@@ -40,8 +41,8 @@ class Layout:
         kinds = [np.asarray(leaf).dtype for leaf in found]
         self.dtypes = [kind if kind.kind == "f" else np.dtype(float) for kind in kinds]
         self.scalar = isinstance(guess, (int, float)) and not isinstance(guess, np.generic)
-        ends = np.cumsum([0, *(np.size(leaf) for leaf in found)]).tolist()
-        self.slices, self.size = list(map(slice, ends, ends[1:])), ends[-1]
+        self.space = Space(sum(map(np.size, found)), "unknowns", None, self.shapes)
+        self.size = self.space.size
 
     def flat(self, guess):
         """The numbers of the guess, without a trace, as one fresh float64 array."""
@@ -50,16 +51,15 @@ class Layout:
 
     def split(self, x):
         """Flat unknowns, traced or not -> the tree of unknowns."""
-        if len(self.shapes) == 1:
-            return self.rebuild([anp.reshape(x, self.shapes[0])])
-        return self.rebuild(anp.reshape(x[part], shape) for part, shape in zip(self.slices, self.shapes))
+        whole = len(self.shapes) == 1
+        return self.rebuild([anp.reshape(x, self.shapes[0])] if whole else self.space.split(x))
 
     def rounded(self, x):
         """The tree of unknowns in the dtypes of the guess; copies, for the rules go on using x."""
         if self.scalar and not isbox(x):
             return float(x[0])
-        take = _part if isbox(x) else _taken
-        return self.rebuild(take(x, *part) for part in zip(self.slices, self.shapes, self.dtypes))
+        take = cast if isbox(x) else np.array
+        return self.rebuild(map(take, self.space.split(x), self.dtypes))
 
 
 def _check_unknown(leaf, name):
@@ -69,21 +69,6 @@ def _check_unknown(leaf, name):
         raise TypeError(f"{name} solves for real unknowns; give real and imaginary part as two fields")
     if kind not in KINDS:
         raise TypeError(f"{name} takes a guess of numbers, got {type(leaf).__name__}")
-
-
-def _taken(x, part, shape, kind):
-    return x[part].astype(kind).reshape(shape)
-
-
-def _part(x, part, shape, kind):
-    """The same by a linear rule, for the tape."""
-
-    def put(g):
-        back = np.zeros(np.size(plain(x)))
-        back[part] = np.reshape(g, -1)
-        return back
-
-    return linear("unknowns", lambda x: _taken(x, part, shape, kind), put)[0](x)
 
 
 class Equation:

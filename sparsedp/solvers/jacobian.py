@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.derivative import NO_JVP, pushforward, traced
+from sparsedp.derivative import NO_JVP, pushforward
 from sparsedp.errors import ConvergenceError, DerivativeError, ShapeError
 from sparsedp.ledger import active as recordings
-from sparsedp.ledger import count
+from sparsedp.ledger import count, recording
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_functions, from_matrix
 from sparsedp.solvers.cache import Cache
@@ -22,8 +22,8 @@ from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.inverses import Inverse, Solution, build, build_dense
 from sparsedp.solvers.solve import failure
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like
-from sparsedp.tape import called, isbox
-from sparsedp.traces import ReverseNode, untraced
+from sparsedp.tape import isbox
+from sparsedp.tree import copied
 
 __all__ = ["Jacobians", "Linearisation"]
 
@@ -123,8 +123,7 @@ class Jacobians:
     def fresh(self, equation, x, leaves):
         """The Jacobian at this point, made now."""
         solver, exact = self._made(equation, x, leaves)
-        point = equation, x.copy(), [np.array(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
-        known = Linearisation(solver, point, exact)
+        known = Linearisation(solver, (equation, *copied((x, leaves))), exact)
         return self._points.put(_key(equation, x, leaves), known)
 
     def cached(self, equation, x, leaves):
@@ -192,22 +191,21 @@ class Jacobians:
 
     def _made(self, equation, x, leaves):
         """(the Solver of the Jacobian, whether it is the derivative itself for certain)."""
-        name = self.settings["name"]
+        size, name = equation.size, self.settings["name"]
         if self.given is not None:
             self.way = "given"
             given = self.given(equation.layout.split(x), *equation.params(leaves))
-            return self._solver(self._as_operator(given, equation.size, name)), False
+            return self._solver(self._as_operator(given, size, name)), False
         with self._alone:
-            coloured, space = self._coloured(equation, x, leaves)
+            coloured, space = self._patterns.get(size) or self._coloured(equation, x, leaves)
         if coloured is None:
             forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
-            return self._solver(from_functions(forward, backward, equation.size, equation.size, name)), True
+            return self._solver(from_functions(forward, backward, size, size, name)), True
         matrix = coloured.matrix(self._product(equation, x, leaves, coloured.by_rows))
         # A field of another shape may have as many unknowns.
         suits = space is not None and equation.layout.shapes[0] == space.shape and _is_symmetric(matrix, space)
-        make = partial(from_matrix, matrix, *(space if suits else equation.size,) * 2, name)
-        full = coloured.by_rows and coloured.pattern.nnz == equation.size**2
-        return self._solver_of(matrix, make), full
+        make = partial(from_matrix, matrix, *(space if suits else size,) * 2, name)
+        return self._solver_of(matrix, make), coloured.by_rows and coloured.pattern.nnz == size**2
 
     def _as_operator(self, given, size, name):
         if isbox(given):
@@ -238,8 +236,6 @@ class Jacobians:
     def _coloured(self, equation, x, leaves):
         """The coloured pattern for this many unknowns (None: only products will do), and the cells that they lie on."""
         size, method, pattern, space = equation.size, self.settings["method"], self.sparsity, None
-        if size in self._patterns:
-            return self._patterns[size]
         if self.by_rows is None:
             self.by_rows = not _can(pushforward, lambda y: equation(y, *leaves), x, np.ones_like(x))
         if pattern is not None:
@@ -273,16 +269,15 @@ class Jacobians:
     def _search(self, equation, x, leaves):
         """The pattern of J near x and at two opposite random points, by columns or by rows."""
         points = [point for point in _points(x) if _is_valid(equation, point, leaves)] or [x]
-        for transposed in (True,) if self.by_rows else (False, True):
-            found = self._probed(equation, points, leaves, transposed)
-            if found is not None:
-                return found
-        return None
+        found = None
+        for by_rows in (True,) if self.by_rows else (False, True):
+            found = self._probed(equation, points, leaves, by_rows) if found is None else found
+        return found
 
-    def _probed(self, equation, points, leaves, transposed):
-        products = [self._product(equation, point, leaves, transposed, "pattern") for point in points]
+    def _probed(self, equation, points, leaves, by_rows):
+        products = [self._product(equation, point, leaves, by_rows, "pattern") for point in points]
         found = find_pattern(products, equation.size, equation.size)
-        return found.T.tocsr() if transposed and found is not None else found
+        return found.T.tocsr() if by_rows and found is not None else found
 
     def _enlarge(self, equation, x, leaves, row):
         """Add the entries that J has at x. When there are none, its products are not linear."""
@@ -333,22 +328,6 @@ def _is_symmetric(matrix, space):
     return bool(gap <= SYMMETRIC * abs(weighed).max())
 
 
-class Watched(ReverseNode):
-    """A node that notes, in a list that its root holds, the spaces that Operators map from."""
-
-    __slots__ = ("found",)
-    found: Any
-
-    def __init__(self, value, fun, args, options, nums, parents):
-        super().__init__(value, fun, args, options, nums, parents)
-        self.found, op = parents[0].found, called(fun, args)
-        if isinstance(op, Operator):
-            self.found.append(op.domain)
-
-
-untraced[Watched] = untraced[ReverseNode]  # comparisons, shapes, rounding: plain values for this kind too
-
-
 def cells_met(equation, x, leaves):
     """The cells of the first grid that an Operator in the residual acts on, if x is one field on them; else None.
 
@@ -362,12 +341,10 @@ def cells_met(equation, x, leaves):
     -------
     Space or None
     """
-    layout = equation.layout
-    if len(layout.shapes) != 1 or len(layout.shapes[0]) < 2:
+    shapes = equation.layout.shapes
+    if len(shapes) != 1 or len(shapes[0]) < 2:
         return None  # on one axis banded LU needs no geometry
-    root = Watched.new_root()
-    root.found = []
-    with np.errstate(all="ignore"):
-        traced(lambda y: equation(y, *leaves), x, [root])
-    fitting = (s for s in root.found if s.grid is not None and s.kind == "cells" and s.shape == layout.shapes[0])
-    return next(fitting, None)
+    with recording() as calls, np.errstate(all="ignore"):
+        equation(x, *leaves)
+    spaces = (op.domain for actors in calls.actors.values() for op in actors.values() if isinstance(op, Operator))
+    return next((s for s in spaces if s.grid is not None and s.kind == "cells" and s.shape == shapes[0]), None)

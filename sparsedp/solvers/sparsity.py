@@ -62,38 +62,31 @@ def find_pattern(products, rows, columns):
     rng = np.random.default_rng(0)
     if _sampled_full(products[0], rows, columns, rng):
         return None
-    width = 1 << max(0, int(columns - 1).bit_length() - FIRST.bit_length() + 1)
-    row, block = np.indices((rows, -(-columns // width))).reshape(2, -1)
-    spent, colours = 0, np.arange(-(-columns // width))
+    width, spent = 1 << max(0, int(columns - 1).bit_length() - FIRST.bit_length() + 1), 0
+    pattern = dense_pattern(rows, -(-columns // width))  # of blocks
     while True:
+        colours = colour(pattern)
         spent += int(colours.max(initial=-1)) + 1
         if spent > max(columns // 2, 2 * FIRST):
             if columns > ONE_BY_ONE:
                 return None
-            row, column = np.nonzero(_touched(products, np.arange(columns), rows, rng).T)
-            return pattern_of(row, column, (rows, columns))
+            pattern, width, colours = dense_pattern(rows, columns), 1, np.arange(columns)
         touched = _touched(products, np.repeat(colours, width)[:columns], rows, rng)
+        row, block = rows_of(pattern), pattern.indices
         keep = touched[colours[block], row]
-        row, block = row[keep], block[keep]
+        pattern = pattern_of(row[keep], block[keep], pattern.shape)
         if width == 1:
-            return pattern_of(row, block, (rows, columns))
+            return pattern
         width //= 2
-        row, block = np.tile(row, 2), np.concatenate([2 * block, 2 * block + 1])
-        inside = block * width < columns
-        row, block = row[inside], block[inside]
-        colours = colour(pattern_of(row, block, (rows, -(-columns // width))))
+        pattern = sp.kron(pattern, np.ones((1, 2)), format="csr")[:, : -(-columns // width)]
 
 
 def _sampled_full(product, rows, columns, rng):
     """Whether all of a few columns have more than a quarter of the entries: then no level can save."""
     if columns < 8 * FIRST:
         return False
-    counts = []
-    for column in rng.choice(columns, SAMPLE, replace=False):
-        unit = np.zeros(columns)
-        unit[column] = 1.0
-        counts.append(np.count_nonzero(product(unit)))
-    return min(counts) > rows / 4
+    sample = rng.choice(columns, SAMPLE, replace=False)
+    return min(np.count_nonzero(product(np.eye(1, columns, column)[0])) for column in sample) > rows / 4
 
 
 def _touched(products, colours, rows, rng):
@@ -146,16 +139,16 @@ def stencil_pattern(products, shape):
     if not far.any() or not products or index.shape[1] < SMALLEST or np.prod(lengths[~far]) > SHORT:
         return None
     moves, wraps, rng = set(), np.zeros(far.shape, dtype=bool), np.random.default_rng(0)
-    kinds = [np.array(kind)[:, None] for kind in np.ndindex(*np.where(far, 1, lengths)[:, 0])]
+    kinds = np.unique(np.where(far, 0, index), axis=1).T[:, :, None]
+    period = np.where(far, lengths, 2 * lengths)
     for kind, product, place in combinations(kinds, products, (0 * lengths, lengths // 2, lengths - 1)):
         cell, v = np.where(far, place, kind), np.zeros(index.shape[1])
         v[np.ravel_multi_index(cell, shape)] = rng.uniform(0.5, 1.5) * rng.choice((-1.0, 1.0))
-        touched = index[:, np.flatnonzero(product(v))]
-        if touched.shape[1] > WIDEST:
+        ways = index[:, np.flatnonzero(product(v))] - cell
+        if ways.shape[1] > WIDEST:
             return None
-        around = np.where(far, lengths // 2, 0)
-        steps = np.where(far, (touched - cell + around) % lengths - around, touched - cell)  # the short way
-        wraps |= np.any(steps != touched - cell, axis=1, keepdims=True)
+        steps = (ways + period // 2) % period - period // 2  # the short way
+        wraps |= np.any(steps != ways, axis=1, keepdims=True)
         moves |= {(*kind[:, 0].tolist(), *step) for step in steps.T.tolist()}
     places = [np.empty((2, 0), dtype=int)]
     for move in sorted(moves):
@@ -266,14 +259,12 @@ def _lattice(links, shape, least):
 
 def _differences(links, shape):
     """Differences of the indices of linked columns, shape (dim, many), one of each pair; None when there are many."""
-    row = rows_of(links)
+    row, lengths = rows_of(links), np.array(shape)[:, None]
     upper = links.indices > row
-    steps = [b - a for a, b in zip(np.unravel_index(row[upper], shape), np.unravel_index(links.indices[upper], shape))]
-    code = np.zeros(np.count_nonzero(upper), np.int64)
-    for step, n in zip(steps, shape):
-        code = code * (2 * n) + (step + n)
-    _, first = np.unique(code, return_index=True)
-    return np.stack([step[first] for step in steps]) if first.size <= MOST_DIFFERENCES else None
+    index = np.indices(shape).reshape(len(shape), -1)
+    steps = index[:, links.indices[upper]] - index[:, row[upper]]
+    first = np.unique(np.ravel_multi_index(steps + lengths, tuple(2 * lengths[:, 0])), return_index=True)[1]
+    return steps[:, first] if first.size <= MOST_DIFFERENCES else None
 
 
 def _one_by_one(links):
