@@ -64,7 +64,7 @@ def test_bits_do_not_depend_on_threads(monkeypatch):
 
 @NUMBA
 def test_the_reference_takes_over_where_nothing_can_be_compiled(monkeypatch):
-    def refuse(words, narrow):
+    def refuse(words):
         raise TypeError("no such target")
 
     move, u, v, q = next(scenes())

@@ -25,7 +25,7 @@ with numbers or arrays, and one line of SCHEMES.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy import uint64
+from numpy import int64, uint64
 
 from sparsedp.kernels.team import Kernel, kernel
 
@@ -148,8 +148,8 @@ def sides_of(axes, a, number, first, size, where):
         stop = max(size - 1, start) if place + size > last else size
         begin, end = ((start, stop), (0, start), (stop, size))[number]
         place, last = (place + begin, last + begin - end + 1)
-    below = side_of(axes, a, 0, place == 0, block, begin, first)
-    return uint64(begin), uint64(end), below, side_of(axes, a, 1, place == last, block, begin, first)
+    below = side_of(axes, a, int64(0), place == 0, block, begin, first)  # of one type: compiled once
+    return uint64(begin), uint64(end), below, side_of(axes, a, int64(1), place == last, block, begin, first)
 
 
 def weigh(lines, line, x, start, table, row, axes, a, place, free, c, b, e):
@@ -165,14 +165,12 @@ def weigh(lines, line, x, start, table, row, axes, a, place, free, c, b, e):
         lines[line + j] *= free[side, c + j]
 
 
-def differences(steep, a, c, asked, line, size):
+def differences(steep, a, c, asked, size):
     """What is asked of behind and ahead -> the cotangents of a and b, in place of the derivatives of the last slope."""
     last = steep.shape[1] - 1
     for by in range(2):
         for j in range(size):
-            line[j] = steep[a, 0, by, c + j] * asked[0, j] + steep[a, last, by, c + j] * asked[1, j]
-        for j in range(size):
-            steep[a, last, by, c + j] = line[j]
+            steep[a, last, by, c + j] = steep[a, 0, by, c + j] * asked[0, j] + steep[a, last, by, c + j] * asked[1, j]
 
 
 def share(flow):
@@ -181,11 +179,11 @@ def share(flow):
 
 
 limiter = van_leer  # in the loop over slopes: stands for the function of the scheme it is compiled for
-USES: dict[str, Any] = {
-    f.__name__: f for f in (tile_of, pieces_of, place_of, side_of, sides_of, weigh, differences, share)
+# A product and a sum are one instruction: the same bits everywhere.
+OPTIONS: dict[str, Any] = {
+    "uses": (tile_of, pieces_of, place_of, side_of, sides_of, weigh, differences, share),
+    "fastmath": {"contract"},
 }
-# A product and a sum are one instruction: the same bits everywhere. What is called is put where it is called.
-OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "forceinline": True}
 
 # ---- the loops -------------------------------------------------------------------------------------------------------
 #
@@ -203,7 +201,7 @@ OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "forceinline": True}
 # start, stop which tiles
 
 
-@kernel("read1 read1 read1 mask2 read3 real read2 index2 real real read1 real write1 write1", uses=USES, **OPTIONS)
+@kernel("read1 read1 read1 mask2 read3 real read2 index2 real real read1 real write1 write1", **OPTIONS)
 def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, out, wrong, start, stop):
     """out = keep u0 + (1 - keep) u', and for each tile how many weights are less than `least`, or results infinite."""
     memory, lines, uneven, many = np.empty((2, LINE)), np.empty(2 * LINE), axes[0, UNEVEN], slopes.shape[1]
@@ -223,8 +221,8 @@ def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, ou
                     continue
                 i, k, m, h = below.beyond, above.beyond, below.speed, above.speed
                 if uneven:
-                    weigh(lines, NONE, w, m, table, OWN, axes, a, where[0], free, c, b, e)
-                    weigh(lines, ONE, w, h, table, OWN + 1, axes, a, where[0], free, c, b, e)
+                    for upper, (line, begin) in enumerate(((NONE, m), (ONE, h))):
+                        weigh(lines, line, w, begin, table, OWN + upper, axes, a, where[0], free, c, b, e)
                     m, h = NONE, ONE
                 for j in range(b, e):
                     low, high = ratio * speed[m + j], -ratio * speed[h + j]  # into the cells
@@ -248,7 +246,6 @@ def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, ou
 
 @kernel(
     "read1 read1 read1 read1 mask2 read3 real read2 index2 real write1 write1 write1 flag write4",
-    uses=USES,
     **OPTIONS,
 )
 def pull(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, fresh, steep, start, stop):
@@ -275,9 +272,8 @@ def pull(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, 
                     # where the cells and those beyond have what they want of a flow of 1
                     x, i, sign = c, z, 1.0 - 2.0 * upper
                     if uneven:
-                        for row, begin in enumerate((c, z)):
-                            line_of, row_of = uint64(row * LINE), OWN + 2 * row + upper
-                            weigh(lines, line_of, g, begin, table, row_of, axes, a, where[0], free, c, b, e)
+                        for row, (at, begin) in enumerate(((NONE, c), (ONE, z))):
+                            weigh(lines, at, g, begin, table, OWN + 2 * row + upper, axes, a, where[0], free, c, b, e)
                         x, i = NONE, ONE
                     o, into = (m if on_sides else cells + z), sign * ratio
                     for j in range(b, e if gu.size else b):
@@ -310,12 +306,12 @@ def pull(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, 
                     for j in range(b, e):
                         gw[m + j] = line[j] + gw[m + j] if added else line[j]
             if steep.size:
-                differences(steep, a, c, asked, line, size)
+                differences(steep, a, c, asked, size)
         for j in range(size if gu.size else NONE):
             gu[c + j] = field[j]
 
 
-@kernel("read4 mask2 index2 write1 write1", uses=USES, **OPTIONS)
+@kernel("read4 mask2 index2 write1 write1", **OPTIONS)
 def jumps(steep, free, axes, gu, ginflow, start, stop):
     """The cotangents of a and b, the differences to the cells below and above, are added to those of u and inflow."""
     line, last = np.empty(LINE), steep.shape[1] - 1
@@ -328,11 +324,13 @@ def jumps(steep, free, axes, gu, ginflow, start, stop):
                 b, e, below, above = sides_of(axes, a, number // 2, first, length, where)
                 upper, sign = number % 2, 1.0 - 2.0 * (number % 2)
                 i, _, wall, inner, shown = above if upper else below
-                for j in range(b, e if inner or not shown else b):
+                if shown and not inner:
+                    continue  # the difference to a ghost cell that repeats the cell is 0
+                for j in range(b, e):
                     line[j] = sign * (steep[a, last, upper, c + j] + inner * steep[a, last, 1 - upper, i + j])
                 for j in range(b, e if free.size else b):
                     line[j] *= free[2 * a + upper, c + j]
-                for j in range(b, e if inner or not shown else b):
+                for j in range(b, e):
                     gu[c + j] += line[j]
                 for j in range(b, b if shown else e):
                     ginflow[wall + j] -= line[j]
@@ -373,7 +371,7 @@ def _slopes(u, inflow, free, table, axes, slopes, steep, start, stop):
 def slopes_of(name, function, **options):
     """The loop over the slopes of a scheme."""
     words = "read1 read1 mask2 read2 index2 write3 write4"
-    return Kernel(_slopes, words, {**USES, "limiter": function}, f"slopes_{name}", **{**OPTIONS, **options})
+    return Kernel(_slopes, words, given={"limiter": function}, name=f"slopes_{name}", **{**OPTIONS, **options})
 
 
 slopes = {name: slopes_of(name, scheme.limiter) for name, scheme in SCHEMES.items() if scheme.limiter is not None}

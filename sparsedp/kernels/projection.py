@@ -5,6 +5,8 @@ x0, x1, x2 are the components of a face field, in three axes; a component is emp
 periodic axis the last cell and the first face meet round the end.
 """
 
+from numba import njit
+
 from sparsedp.kernels.team import kernel
 
 __all__ = ["net_flow", "push"]
@@ -38,6 +40,7 @@ def net_flow(x, x0, x1, x2, lines0, lines1, lines2, b, start, stop):
     return total, whole
 
 
+@njit(error_model="numpy")
 def _across(x, p, lines, out):
     """`push` for faces across the middle axis."""
     n = p.shape[1]
@@ -49,7 +52,7 @@ def _across(x, p, lines, out):
                 result[j] = a * given[j] + b * low[j] + c * high[j]
 
 
-@kernel("read3 read3 read3 read3 read2 read2 read2 write3 write3 write3", uses={"_across": _across})
+@kernel("read3 read3 read3 read3 read2 read2 read2 write3 write3 write3")
 def push(x0, x1, x2, p, lines0, lines1, lines2, out0, out1, out2, start, stop):
     """out = keep x + below p[f - 1] + above p[f]; the rows of `lines` hold keep, below and above of the faces."""
     n0, n1, n2 = p.shape

@@ -5,11 +5,11 @@ numba takes for its own parallel loops. Which slab a row is in changes nothing i
 """
 
 import contextlib
+import functools
 import os
 import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
 from types import FunctionType
 
 __all__ = ["SERIAL", "Kernel", "kernel", "loops"]
@@ -51,16 +51,28 @@ def _pool(size):
     return _pools[key]
 
 
-def _types(words, narrow):
+def _types(words):
     """Words such as "read3 write1 real int flag" -> types of numba; see `Kernel`."""
     from numba import types
 
     numbers = {"int": types.int64, "real": types.float64, "flag": types.boolean}
     entries = {"read": types.float64, "write": types.float64, "index": types.int64, "mask": types.boolean}
     for word in words.split():
-        kind, axes = word.strip("~")[:-1], word[-1]
-        entry = types.float32 if narrow and "~" in word else entries.get(kind)
+        kind, axes = word.strip("~^")[:-1], word[-1]
+        entry = types.float32 if "^" in word else entries.get(kind)
         yield numbers.get(word) or types.Array(entry, int(axes), "C", readonly=kind != "write")
+
+
+@functools.cache
+def _with_compiled(functions):
+    """Functions of a module -> its names, with these functions compiled: they stand where they are called."""
+    from numba import njit
+
+    names = dict(functions[0].__globals__)
+    for function in functions:
+        own = FunctionType(function.__code__, names, function.__name__)
+        names[function.__name__] = njit(error_model="numpy", forceinline=True, fastmath={"contract"})(own)
+    return names
 
 
 def kernel(words, **options):
@@ -77,14 +89,15 @@ class Kernel:
         Its last two arguments are the rows it works on, `start` and `stop`.
     words : str
         The types of its other arguments: read1 to read4 (may be read-only), write1 to write4 (float64), index1 to
-        index4 (int64), mask1 to mask4 (bool), real, int, flag. With ~ before it an array is of float32 in `single`.
-    uses : dict, optional
-        {name: function} that the loop, and these functions themselves, call by that name. They are compiled with it,
-        and stand in the same file: that is where numba looks whether what it has kept is still good.
+        index4 (int64), mask1 to mask4 (bool), real, int, flag. With ~ before it an array is of float32 in `single`,
+        where ^ stands for it.
+    uses : tuple of functions
+        That the loop calls, and these functions themselves. They are compiled once for all loops that use them, and
+        stand in the same file: that is where numba looks whether what it has kept is still good.
+    given : dict, optional
+        {name: function} that this loop alone calls by that name.
     name : str, optional
-        Tells loops of the same code that use other functions apart.
-    narrow : bool
-        Whether arrays with a ~ are of float32 here.
+        Tells loops of the same code that are given other functions apart.
     **options
         Of numba's ``njit``.
 
@@ -94,13 +107,13 @@ class Kernel:
         The same loop for arrays of float32, where its words have a ~.
     """
 
-    def __init__(self, loop, words, uses=None, name=None, narrow=False, **options):
-        self.loop, self.words, self.uses, self.options = loop, words, uses or {}, options
-        self.name, self.__doc__, self.narrow = name or loop.__name__, loop.__doc__, narrow
-        self.single = Kernel(loop, words, uses, name, True, **options) if "~" in words and not narrow else self
+    def __init__(self, loop, words, uses=(), given=None, name=None, **options):
+        self.loop, self.words, self.uses, self.given, self.options = loop, words, uses, given or {}, options
+        self.name, self.__doc__ = name or loop.__name__, loop.__doc__
+        self.single = Kernel(loop, words.replace("~", "^"), uses, given, name, **options) if "~" in words else self
         loops.append(self)
 
-    @cached_property
+    @functools.cached_property
     def compiled(self):
         """The compiled loop; None where it cannot be compiled, which is said once."""
         try:
@@ -108,11 +121,12 @@ class Kernel:
 
             options = {"nogil": True, "error_model": "numpy", **self.options}
             keep = options.pop("cache", True)
-            signature, names = tuple(_types(self.words + " int int", self.narrow)), dict(self.loop.__globals__)
+            signature = tuple(_types(self.words + " int int"))
+            names = dict(_with_compiled(self.uses) if self.uses else self.loop.__globals__)
+            for name, function in self.given.items():
+                names[name] = njit(forceinline=True, **options)(function)
             loop = FunctionType(self.loop.__code__, names, self.name)
             loop.__qualname__ = self.name  # the kept code goes by it
-            for name, function in self.uses.items():
-                names[name] = njit(**options)(FunctionType(function.__code__, names, name))
             with _announced():
                 try:
                     return njit([signature], cache=keep, **options)(loop)
