@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp.check.judge import judgement
 from sparsedp.check.operators import layouts
 from sparsedp.check.sweep import Line, Point, Trials, generator, joined, rms
 from sparsedp.derivative import value_and_grad
@@ -25,7 +26,7 @@ __all__ = ["CASES", "FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 WORDS = PASSED, REFUSED, DEGRADED, FAILED = "passed", "refused correctly", "degraded", "FAILED"
 NAMES = {"time step": ("dt", "time_step", "tau"), "viscosity": ("nu", "viscosity", "diffusivity", "kappa", "mu")}
 EPS = np.finfo(float).eps
-DIFFERENCES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-2, 1e-7)  # their steps, in units of x; those that mostly serve come first
+DIFFERENCES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-2, 1e-7)  # their steps, in units of x; the one that mostly serves comes first
 GOOD, BAD = 1e-5, 1e-2  # gaps between gradient and differences
 UNSEEN = 100 * EPS  # changes of the value, relative, that no difference sees
 ROUNDING = 8 * EPS  # change of x in its last digits
@@ -273,29 +274,25 @@ def growing(scene, _):
 
 
 def _against_differences(scene, other, out):
-    """The gradient against central differences along itself: the step that serves is found, not chosen."""
+    """The gradient against central differences along itself: one that meets it is enough, else all are judged."""
     point, gradient = Point(scene.at(other)), joined([np.conj(g) for g in out.gradient])
     if not np.any(gradient):
         return PASSED, 0.0, "gradient 0"
     name, direction = point.directions(gradient, 1, generator(SEED), ("random 1", "gradient"))[-1]
     line = Line(name, direction, Trials(scene.sheltered, point, base=out.value, gradient=gradient))
-    wanted = abs(line.slope)
-    if wanted <= UNSEEN * abs(out.value):
+    if abs(line.slope) <= UNSEEN * abs(out.value):
         return PASSED, 0.0, "the gradient is smaller than differences can see"
-    gaps = []
-    for step in DIFFERENCES:
-        level = line.level(step)
-        gap = abs(level.difference - level.slope) / wanted
-        gaps.append(gap if math.isfinite(gap) else math.inf)
+    for steps in DIFFERENCES[:1], DIFFERENCES:
+        line.sweep(steps)
+        gaps = [abs((level.difference - level.slope) / line.slope) for level in line.usable]
+        gap = min(gaps, default=math.inf)
         if gap <= GOOD:
             return PASSED, gap, ""
-    best, _, third, *_ = sorted(gaps)
-    noise = 10 * EPS * abs(out.value) / (max(DIFFERENCES) * wanted)  # of the coarsest difference
     if out.flagged:
-        return DEGRADED, best, "the gradient grows without bound on its way back"
-    if best > BAD >= noise and third - best <= 0.1 * best:
-        return FAILED, best, "the differences settle on another gradient"
-    return DEGRADED, best, "the differences do not settle on the gradient: a kink, noise or a steep change"
+        return DEGRADED, gap, "the gradient grows without bound on its way back"
+    if gap > BAD and judgement(line).word == "disagrees":
+        return FAILED, gap, "the differences settle on another gradient"
+    return DEGRADED, gap, "the differences do not settle on the gradient: a kink, noise or a steep change"
 
 
 # ---------------------------------------------------------------- cases: (scene, name, x) -> case, other x, judge
