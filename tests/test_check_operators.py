@@ -126,7 +126,7 @@ class Reused:
 
 
 MISTAKES = {
-    "A for the transpose": (given(shift, shift), {"transpose, float64", "VJP, float64", "second order"}),
+    "A for the transpose": (given(shift, shift), {"transpose, float64", "VJP, float64", "second order, float64"}),
     "one sign": (given(lambda u: u - shift(u), lambda g: g + back(g)), {"transpose, float64"}),
     "0.1 % in the transpose": (given(shift, lambda g: 1.001 * back(g)), {"transpose, float64", "VJP, float64"}),
     "one entry of the transpose": (

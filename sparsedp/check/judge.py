@@ -24,7 +24,17 @@ from sparsedp.check.summary import Result
 from sparsedp.check.sweep import REFUSALS, Line, noise_of
 from sparsedp.derivative import NO_JVP, pushforward
 
-__all__ = ["PROVED", "Judgement", "at_kinks", "curvature", "examined", "explained", "forward_mode", "judgement", "verdict"]
+__all__ = [
+    "PROVED",
+    "Judgement",
+    "at_kinks",
+    "curvature",
+    "examined",
+    "explained",
+    "forward_mode",
+    "judgement",
+    "verdict",
+]
 
 RESOLVED = 1e-3  # an error bar above this share of the derivative proves nothing
 AGREED = 1e-8  # a gap below this share is agreement, whatever the bar

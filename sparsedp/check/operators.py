@@ -28,7 +28,7 @@ LARGEST = 2**21  # unknowns above which no matrix is built for a check
 MOST_COLUMNS = 512  # columns that are found one application at a time
 POWERS = 8  # products of a power iteration
 LARGEST_SIZES = {"float32": 1e25, "float64": 1e290}  # of operators whose squares fit into a dtype, too
-PLAIN = 1e-100, 1e100  # sizes of operators whose square can be held
+SQUARED = ("second order",)  # identities that apply an operator and its transpose
 ORDINARY = 1e-30, 1e30  # sizes of operators that take fields near the ends of the range of floats
 
 
@@ -49,7 +49,7 @@ def row(name, measure, *args, optional=False):
         found = measure(*args)
     except Exception as error:
         note = f"{type(error).__name__}: {error}"
-        return Row(name, None, None, None, f"refused, {note}") if optional else Row(name, None, LIMIT, False, note)
+        return Row(name, None, None, None, f"refused, {note}") if optional else Row(name, inf, LIMIT, False, note)
     if isinstance(found, str):
         return Row(name, None, None, None, found)
     if isinstance(found, list):
@@ -118,9 +118,9 @@ class Probe:
 
     def gap(self, name, dtype):
         """Distance of the two sides of an identity in units of rounding, at worst over entries and seeds."""
-        largest = LARGEST_SIZES[np.finfo(dtype).dtype.name]
-        if 0 < self.size <= 1 / largest or self.size >= largest:
-            return f"entries of size {self.size:.1e} do not fit into {dtype}"
+        largest, size = LARGEST_SIZES[np.finfo(dtype).dtype.name], self.size * (self.size if name in SQUARED else 1.0)
+        if 0 < size <= 1 / largest or size >= largest:
+            return f"entries of size {size:.1e} do not fit into {dtype}"
         worst, rounding = 0.0, unit(self.op.structure, result_dtype(self.op.structure, dtype))
         for _ in range(self.seeds):
             left, right, bound = IDENTITIES[name](self, self.domain(dtype), self.domain(dtype), self.codomain(dtype))
@@ -306,7 +306,7 @@ def fault_of(op, rng):
     failed = [one for one in rows if one.ok is False]
     if not failed:
         return ""
-    worst = max(failed, key=lambda one: inf if one.figure is None else one.figure)
+    worst = max(failed, key=lambda one: one.figure)
     how = worst.note or f"is off by about {worst.figure * unit(probe.op.structure, float):.0e}"
     return f"its {worst.name.split(',')[0]} {how}"
 
@@ -419,17 +419,15 @@ def operator(op, seeds=3, rng=None):
             probe = Probe(op, seeds, rng)
         except Exception as error:  # a foreign function may raise anything
             return OperatorSummary(
-                op, None, [Row("application", None, LIMIT, False, f"{type(error).__name__}: {error}")]
+                op, None, [Row("application", inf, LIMIT, False, f"{type(error).__name__}: {error}")]
             )
         return OperatorSummary(op, probe, _rows(probe))
 
 
 def _rows(probe):
-    kinds = DTYPES[: 1 if probe.real else 2]
-    rows = [one for name in ("linearity", "JVP", "VJP") for one in probe.rows(name, kinds)]
-    if PLAIN[0] < probe.size < PLAIN[1]:
-        rows.append(row("second order", probe.gap, "second order", np.dtype(float)))
-    rows += probe.rows("transpose", DTYPES)
+    dtypes = dict.fromkeys(("linearity", "JVP", "VJP"), DTYPES[: 1 if probe.real else 2])
+    dtypes |= {"second order": DTYPES[:1], "transpose": DTYPES}
+    rows = [one for name, kinds in dtypes.items() for one in probe.rows(name, kinds)]
     rows += [one._replace(name=f"twin, {one.name}") for one in _form_rows(probe)]
     return rows + [row(name, test, probe) for name, test in ARGUMENTS.items()]
 

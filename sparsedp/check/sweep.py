@@ -64,21 +64,20 @@ class Point:
 
     def __init__(self, x):
         self._leaves, self._rebuild = flatten(x)
-        self.places = [place for place, leaf in enumerate(self._leaves) if is_variable(leaf)]
-        if not self.places:
+        found = {name: place for place, name in enumerate(_paths(x)) if is_variable(self._leaves[place])}
+        if not found:
             raise DerivativeError("a gradient is checked at floating values, and x holds none; write x.astype(float)")
-        self.values = [np.array(self._leaves[place]) for place in self.places]
-        paths = list(_paths(x))
-        self.names = [paths[place] for place in self.places]
+        self.names, self._places = list(found), list(found.values())
+        self.values = [np.array(self._leaves[place]) for place in self._places]
         for name, values in zip(self.names, self.values):
             if not np.all(np.isfinite(values)):
                 raise NonFiniteError(f"a gradient is checked at finite values, and {name} holds NaN or infinity")
         self.vector = joined(self.values)
         self.complex = any(map(np.iscomplexobj, self.values))
-        self._ends = np.cumsum([values.size * (1 + np.iscomplexobj(values)) for values in self.values])[:-1]
+        self._ends = np.cumsum([joined([values]).size for values in self.values])[:-1]
         self.units = np.concatenate([np.full(part.size, rms(part) or 1.0) for part in self._parts(self.vector)])
-        self.size = sum(values.size for values in self.values)
-        self.eps = max(float(np.finfo(values.dtype).eps) for values in self.values)
+        self.size = sum(map(np.size, self.values))
+        self.eps = max(eps_of(values.dtype) for values in self.values)
 
     def _parts(self, vector):
         """Views of what belongs to each leaf."""
@@ -89,12 +88,11 @@ class Point:
         parts = zip(self._parts(vector), self.values)
         return [part.view(np.result_type(x, float)).astype(x.dtype).reshape(x.shape) for part, x in parts]
 
-    def tree(self, other=None):
+    def tree(self, other=()):
         """The tree with other floating leaves, a vector or a list of arrays; all but those arrays are fresh."""
         leaves = copied(self._leaves)
-        arrays = other if isinstance(other, list) else () if other is None else self.arrays(other)
-        for place, value in zip(self.places, arrays):  # numbers stay numbers
-            leaves[place] = value if isinstance(leaves[place], np.ndarray) else np.asarray(value)[()]
+        for place, value in zip(self._places, other if isinstance(other, (list, tuple)) else self.arrays(other)):
+            leaves[place] = value if isinstance(leaves[place], np.ndarray) else np.asarray(value)[()]  # still a number
         return self._rebuild(leaves)
 
     def gradient(self, tree):
@@ -102,7 +100,7 @@ class Point:
         leaves = flatten(tree)[0]
         if len(leaves) != len(self._leaves):
             raise DerivativeError(f"the gradient has {len(leaves)} leaves where x has {len(self._leaves)}")
-        arrays = [np.conj(leaves[place]) for place in self.places]
+        arrays = [np.conj(leaves[place]) for place in self._places]
         for name, x, g in zip(self.names, self.values, arrays):
             if g.shape != x.shape:
                 raise DerivativeError(f"the gradient of {name} has shape {g.shape} where {x.shape} is needed")
@@ -113,25 +111,22 @@ class Point:
 
         Each leaf alone, all by the same, along the gradient, its largest entry; `wanted`: only those of these names.
         """
-        if self.size == 0:
-            return []
         found = {f"random {number + 1}": self._random(rng) for number in range(count)}
         for chosen, name in enumerate(self.names if 1 < len(self.names) <= MOST_LEAVES else ()):
             alone = self._random(rng)
             for other, part in enumerate(self._parts(alone)):
                 part *= other == chosen
-            if np.any(alone):
-                found[f"random in {name}"] = alone
+            found[f"random in {name}"] = alone
         slopes = self.units * np.where(np.isfinite(gradient), gradient, 0.0)
-        largest = np.argmax(np.abs(slopes))
+        largest = np.max(np.abs(slopes), initial=0.0)
         if self.size > 1:
             found["constant"] = self.units
-        if self.size > 1 and slopes[largest]:
+        if self.size > 1 and largest:
             # Along the gradient, as the units measure it, no entry moves more than 4 units.
-            shares = slopes / abs(slopes[largest])
+            shares = slopes / largest
             found["gradient"] = self.units * shares / max(rms(shares), 0.25)
-            found["largest entry"] = self.units * (np.arange(slopes.size) == largest)
-        return [pair for pair in found.items() if wanted is None or pair[0] in wanted]
+            found["largest entry"] = self.units * (np.arange(slopes.size) == np.argmax(np.abs(slopes)))
+        return [(name, way) for name, way in found.items() if np.any(way) and (wanted is None or name in wanted)]
 
     def _random(self, rng):
         """Random displacement, of root mean square 1 in each leaf."""
@@ -139,6 +134,11 @@ class Point:
         for part in self._parts(values):
             part /= rms(part) or 1.0
         return self.units * values
+
+
+def eps_of(dtype):
+    """Size of one rounding."""
+    return float(np.finfo(dtype).eps)
 
 
 def joined(arrays):
@@ -151,17 +151,16 @@ def rms(vector):
     return norm(vector) / np.sqrt(max(vector.size, 1))
 
 
-def _paths(tree, prefix=""):
+def _paths(tree, path="x"):
     """How each leaf is reached, in the order of flatten."""
     if isinstance(tree, dict):
-        for key, branch in tree.items():
-            yield from _paths(branch, f"{prefix}[{key!r}]")
+        branches = [(f"[{key!r}]", branch) for key, branch in tree.items()]
     elif isinstance(tree, (tuple, list)):
-        names = getattr(tree, "_fields", None)
-        for place, branch in enumerate(tree):
-            yield from _paths(branch, f"{prefix}.{names[place]}" if names else f"{prefix}[{place}]")
+        names = [f".{name}" for name in getattr(tree, "_fields", ())] or [f"[{place}]" for place in range(len(tree))]
+        branches = list(zip(names, tree))
     else:
-        yield f"x{prefix}"
+        return [path]
+    return [end for step, branch in branches for end in _paths(branch, path + step)]
 
 
 # ------------------------------------------------------------ losses
@@ -191,7 +190,7 @@ class Trials:
         self.loss, self.point, self.tick = loss, point, tick  # `tick` is called at each evaluation
         self.base, self.gradient = base, gradient
         self.count, self.solved, self.tolerance, self.noise = 0, False, 0.0, 0.0
-        self.eps = float(np.finfo(float).eps)
+        self.eps = eps_of(float)
 
     def value(self, tree):
         """The loss as a float."""
@@ -206,7 +205,7 @@ class Trials:
                 "the loss must be real, got a complex number; take its real part or its absolute value"
             )
         if value.dtype.kind == "f":
-            self.eps = max(self.eps, float(np.finfo(value.dtype).eps))
+            self.eps = max(self.eps, eps_of(value.dtype))
         return float(value)
 
     def start(self):
@@ -317,7 +316,7 @@ def noise_of(line):
 
     Source: the table is that of J. J. Moré and S. M. Wild, SIAM J. Sci. Comput. 33, 2011.
     """
-    distance = FIRST * max(1.0, line.point.eps / np.finfo(float).eps) ** 0.5
+    distance = FIRST * max(1.0, line.point.eps / eps_of(float)) ** 0.5
     for _ in range(MOST):
         # On one side: a kink at x is no noise.
         values, changes, notes = zip(*(line.end(place * distance) for place in range(1, POINTS + 1)))
