@@ -271,7 +271,7 @@ def test_a_file_that_came_during_the_demo_is_not_overwritten(tmp_path):
 
 def test_a_run_goes_on_from_the_state_before_the_disk_was_full(tmp_path, monkeypatch):
     """The state that found no room is not there, and the one before it takes the run to the same bits."""
-    monkeypatch.setattr("sparsedp.optimize.resume.SHARE", np.inf)
+    monkeypatch.setattr("sparsedp.optimize.checkpoint.SHARE", np.inf)
     loss, start = lambda x: ((x - 1) ** 4).sum(), np.linspace(-1, 1, 9)
     whole = dp.minimize(loss, start, maxiter=8, tolerance=0)
     fsync, room = os.fsync, [11]

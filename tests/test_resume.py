@@ -1,6 +1,5 @@
 """Runs that are killed and taken up again."""
 
-import json
 import signal
 import subprocess
 import sys
@@ -48,13 +47,13 @@ def same(a, b):
 
 @pytest.mark.parametrize("method, loss, options", RUNS)
 def test_a_run_in_pieces_is_the_run(tmp_path, monkeypatch, method, loss, options):
-    monkeypatch.setattr("sparsedp.optimize.resume.SHARE", np.inf)  # every state is written
+    monkeypatch.setattr("sparsedp.optimize.checkpoint.SHARE", np.inf)  # every state is written
     whole = dp.minimize(loss, START, method, maxiter=12, tolerance=0, **options)
     for stop in (3, 4, 9, 12):
         part = dp.minimize(loss, START, method, maxiter=stop, tolerance=0, checkpoint=tmp_path, **options)
     assert same(part, whole)
     assert part.resumed.startswith("resumed from iteration ")
-    assert len(list(tmp_path.iterdir())) == 4  # two states of two files
+    assert len(list(tmp_path.iterdir())) == 2  # the last two states
     again = dp.minimize(loss, START, method, maxiter=12, tolerance=0, checkpoint=tmp_path, **options)
     assert same(again, whole)
 
@@ -79,33 +78,35 @@ def test_what_stopped_a_run_does_not_stop_the_next(tmp_path):
     assert same(dp.minimize(valley, START, checkpoint=tmp_path, **finer), dp.minimize(valley, START, **finer))
 
 
-def test_truncated_and_foreign_files_are_named_and_skipped(tmp_path, monkeypatch):
-    monkeypatch.setattr("sparsedp.optimize.resume.SHARE", np.inf)
+def test_damaged_and_foreign_files_are_named_and_skipped(tmp_path, monkeypatch):
+    monkeypatch.setattr("sparsedp.optimize.checkpoint.SHARE", np.inf)
     whole = dp.minimize(valley, START, maxiter=8, tolerance=0)
     dp.minimize(valley, START, maxiter=6, tolerance=0, checkpoint=tmp_path)
     last = tmp_path / "state-000000006.npz"
     last.write_bytes(last.read_bytes()[:-7])
-    (tmp_path / "state-000000009.json").write_text("{}")
-    (tmp_path / "state-000000008.json").write_text(json.dumps({"format": "another", "seal": ""}))
+    (tmp_path / "state-000000009.npz").write_text("{}")
+    dp.network.save(tmp_path / "state-000000008.npz", {"iteration": 8})
     (tmp_path / "state-000000007.npz.part").write_bytes(b"half")
     best = dp.minimize(valley, START, maxiter=8, tolerance=0, checkpoint=tmp_path)
     assert same(best, whole)
     assert "resumed from iteration 5" in best.resumed
-    assert "state-000000006.json: state-000000006.npz is truncated or changed" in best.resumed
-    assert "state-000000009.json: not a manifest of sparsedp" in best.resumed
-    assert "state-000000008.json: not a manifest of sparsedp" in best.resumed
+    for number in (6, 8, 9):
+        assert f"state-00000000{number}.npz: damaged, or not a state of sparsedp" in best.resumed
     assert "state-000000007.npz.part: an unfinished write" in best.resumed
 
 
-def test_a_missing_file_and_a_manifest_that_was_changed(tmp_path, monkeypatch):
-    monkeypatch.setattr("sparsedp.optimize.resume.SHARE", np.inf)
-    dp.minimize(valley, START, maxiter=3, tolerance=0, checkpoint=tmp_path)
-    (tmp_path / "state-000000003.npz").unlink()
-    changed = tmp_path / "state-000000002.json"
-    changed.write_text(changed.read_text().replace('"iteration": 2', '"iteration": 1'))
-    best = dp.minimize(valley, START, maxiter=0, checkpoint=tmp_path)
-    assert "state-000000003.npz is missing" in best.resumed and "nothing to resume" in best.resumed
-    assert "state-000000002.json: not a manifest of sparsedp" in best.resumed
+def test_a_single_changed_byte_is_seen(tmp_path):
+    """Wherever it is: the state is skipped, or it is the same."""
+    whole = dp.minimize(valley, START, maxiter=3, tolerance=0, checkpoint=tmp_path)
+    [state] = tmp_path.glob("state-*3.npz")
+    [path.unlink() for path in tmp_path.glob("state-*") if path != state]
+    content = state.read_bytes()
+    for place in range(0, len(content), 23):
+        state.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+        best = dp.minimize(valley, START, maxiter=3, tolerance=0, checkpoint=tmp_path)
+        assert same(best, whole)
+        assert "resumed from iteration 3" in best.resumed or "damaged, or not a state" in best.resumed
+        [path.unlink() for path in tmp_path.glob("state-*")]
 
 
 @pytest.mark.parametrize(
@@ -232,8 +233,8 @@ import sys
 import autograd.numpy as anp, numpy as np, time
 import sparsedp as dp
 from sparsedp.tree import leaves
-import sparsedp.optimize.resume as resume
-resume.SHARE = np.inf
+import sparsedp.optimize.checkpoint as checkpoint
+checkpoint.SHARE = np.inf
 def valley(x):
     time.sleep(1e-3)
     return anp.sum(100 * (x[1:] - x[:-1] ** 2) ** 2 + (1 - x[:-1]) ** 2)
@@ -247,7 +248,7 @@ np.save(sys.argv[2] + ".values", [record.value for record in best.history])
 
 def newest(folder):
     """Number of the last iteration that is written down; -1 without any."""
-    return max((int(path.stem[6:]) for path in folder.glob("state-*.json")), default=-1)
+    return max((int(path.stem[6:]) for path in folder.glob("state-*.npz")), default=-1)
 
 
 def killed_on_its_way(run, folder, delay):
@@ -330,7 +331,7 @@ def test_a_second_interrupt_stops_at_once(tmp_path):
 @pytest.mark.parametrize("at", [1, 8, 12])
 def test_interrupted_inside_an_evaluation(tmp_path, monkeypatch, method, loss, at):
     """The evaluation that was cut short is made again: the resumed run has the bits and counts of the whole one."""
-    monkeypatch.setattr("sparsedp.optimize.resume.SHARE", 0.0)  # no state is written before the end
+    monkeypatch.setattr("sparsedp.optimize.checkpoint.SHARE", 0.0)  # no state is written before the end
     calls = []
 
     def cut(x):

@@ -1,11 +1,8 @@
 """Parameters of layers: drawn with a stated gain, kept in a file without pickle."""
 
-import json
-from zipfile import BadZipFile
-
 import numpy as np
 
-from sparsedp.files import write_file
+from sparsedp.files import load_tree, save_tree
 from sparsedp.network.filters import check_widths
 
 __all__ = ["convolution_weights", "dense_weights", "load", "residual_weights", "save"]
@@ -121,9 +118,7 @@ def save(path, parameters):
     >>> load(file)
     {'layers': [array([1., 1.])], 'steps': 3}
     """
-    arrays: list = []
-    text = json.dumps({"format": FORMAT, "tree": _words(parameters, arrays)})
-    write_file(path, lambda stream: np.savez(stream, np.frombuffer(text.encode(), np.uint8), *arrays))
+    save_tree(path, parameters, FORMAT)
 
 
 def load(path):
@@ -150,38 +145,7 @@ def load(path):
     >>> load(file)
     (1.5, None)
     """
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:  # a damaged file is closed too
-            words = json.loads(bytes(stored["arr_0"]).decode())
-            tree = _tree(words["tree"], stored) if words.get("format") == FORMAT else None
-    except (AttributeError, BadZipFile, EOFError, KeyError, TypeError, ValueError):
-        words = {}
-    if words.get("format") != FORMAT:
+    found = load_tree(path, FORMAT)
+    if found is None:
         raise ValueError(f"{path} was not written by dp.network.save, or is damaged; write it anew")
-    return tree
-
-
-def _words(tree, arrays):
-    """A tree as JSON holds it; arrays are moved to a list and stand there by number."""
-    if isinstance(tree, dict):
-        if not all(isinstance(key, str) for key in tree):
-            raise TypeError("save needs dicts with strings as keys; write str(key)")
-        return {"dict": [[key, _words(branch, arrays)] for key, branch in tree.items()]}
-    if isinstance(tree, (list, tuple)):
-        return {"list" if isinstance(tree, list) else "tuple": [_words(branch, arrays) for branch in tree]}
-    if isinstance(tree, (np.ndarray, np.generic)) and tree.dtype.kind in "biufc":
-        arrays.append(np.asarray(tree))
-        return {"array": len(arrays)}
-    if tree is None or isinstance(tree, (bool, int, float, str)):
-        return {"value": tree}
-    raise TypeError(f"save takes arrays, numbers, strings and None, got {type(tree).__name__}; write np.asarray(value)")
-
-
-def _tree(words, stored):
-    [(kind, value)] = words.items()
-    if kind == "dict":
-        return {key: _tree(branch, stored) for key, branch in value}
-    if kind in ("list", "tuple"):
-        branches = [_tree(branch, stored) for branch in value]
-        return branches if kind == "list" else tuple(branches)
-    return stored[f"arr_{value}"] if kind == "array" else value
+    return found[0]

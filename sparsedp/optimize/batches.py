@@ -1,6 +1,7 @@
 """What the loss is given after x: nothing, or the batch of the present iteration."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 from sparsedp.optimize.checkpoint import fingerprint
 
@@ -13,7 +14,14 @@ class Batches:
     Parameters
     ----------
     given : None, sequence or callable
-        A sequence is used in turn and again from its start; a callable is asked for the batch of an iteration.
+        A sequence is used in turn and again from its start; a callable is asked for the batch of an iteration, once.
+
+    Attributes
+    ----------
+    varied : bool
+        Whether two iterations may see two losses.
+    number : int
+        Of the present iteration.
 
     Raises
     ------
@@ -27,37 +35,20 @@ class Batches:
                 f"batches must be a list or a function of the iteration, got {type(given).__name__}; "
                 "write list(batches)"
             )
-        if given is not None and not callable(given) and not len(given):
+        self._cycle = None if given is None or callable(given) else len(given)
+        if self._cycle == 0:
             raise ValueError("batches is empty; leave it out, and the loss is called with x alone")
-        self._given, self.number = given, 0
-        self._last = -1, None  # a function is asked once for a batch that is used several times in a row
-        self._marks = {}
+        self.varied, self.number = given is not None, 0
+        self._batch = lru_cache(maxsize=2)(given if callable(given) else lambda place: given[place])
+        self._mark = lru_cache(maxsize=None)(lambda place: fingerprint(self._batch(place)))
 
-    @property
-    def varied(self):
-        """Whether two iterations may see two losses."""
-        return self._given is not None
+    def _place(self, number):
+        return number % self._cycle if self._cycle else number
 
     def now(self, back=0):
         """The arguments of the loss after x in this iteration, or so many iterations earlier."""
-        if self._given is None:
-            return ()
-        return (self._batch(self.number - back),)
-
-    def _batch(self, number):
-        if not callable(self._given):
-            return self._given[number % len(self._given)]
-        if self._last[0] != number:
-            self._last = number, self._given(number)
-        return self._last[1]
+        return (self._batch(self._place(self.number - back)),) if self.varied else ()
 
     def mark(self, number):
         """A hash of the batch of an iteration."""
-        if self._given is None:
-            return ""
-        if callable(self._given):
-            return fingerprint(self._batch(number))
-        place = number % len(self._given)
-        if place not in self._marks:
-            self._marks[place] = fingerprint(self._given[place])
-        return self._marks[place]
+        return self._mark(self._place(number)) if self.varied else ""

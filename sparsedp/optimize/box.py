@@ -12,16 +12,15 @@ ULPS = 4 * float(np.finfo(float).eps)
 
 
 class Box:
-    """Lower and upper bounds of a flat vector; without any it is open and changes nothing.
+    """Lower and upper bounds of a flat vector; without any it changes nothing.
 
     Parameters
     ----------
-    lower, upper : (n,) array or None
+    lower, upper : (n,) array or number
     """
 
-    def __init__(self, lower=None, upper=None):
+    def __init__(self, lower=-np.inf, upper=np.inf):
         self.lower, self.upper = lower, upper
-        self.open = lower is None and upper is None
 
     @classmethod
     def of(cls, bounds, packing, start):
@@ -48,31 +47,17 @@ class Box:
 
     def inside(self, vector):
         """The nearest point of the box."""
-        return vector if self.open else np.clip(vector, self.lower, self.upper)
+        return np.clip(vector, self.lower, self.upper)
 
-    def room(self, vector):
-        """How far each entry may go down, <= 0, and up, >= 0."""
-        if self.open:
-            return np.full(vector.shape, -np.inf), np.full(vector.shape, np.inf)
-        return np.minimum(self.lower - vector, 0.0), np.maximum(self.upper - vector, 0.0)
-
-    def free_mask(self, vector, slope):
-        """Which entries can go downhill: not those at which the gradient pushes against a bound. None: all."""
-        if self.open:
-            return None
+    def free(self, vector, slope):
+        """Which entries can go downhill: not those at which the gradient pushes against a bound."""
         near = ULPS * np.abs(vector)  # a step that ends on a bound may miss it by rounding
         return ~(((vector - near <= self.lower) & (slope > 0)) | ((vector + near >= self.upper) & (slope < 0)))
 
-    def free(self, vector, slope):
-        """A gradient with 0 where it pushes against a bound."""
-        return slope if self.open else np.where(self.free_mask(vector, slope), slope, 0.0)
-
 
 def _side(side, packing, start, without):
-    if side is None:
-        return np.full(packing.size, without)
-    if not isinstance(side, (tuple, list, dict)) and is_number(side):
-        return np.full(packing.size, float(side))
+    if side is None or (not isinstance(side, (tuple, list, dict)) and is_number(side)):
+        return np.full(packing.size, without if side is None else float(side))
     given, wanted = leaves(side), leaves(start)
     if len(given) != len(wanted):
         raise ValueError(

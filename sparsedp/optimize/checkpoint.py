@@ -1,150 +1,144 @@
-"""States of an optimization on disk: written whole or not at all, checked when read."""
+"""A run of minimize written down as it goes, whole or not at all, and taken up again."""
 
 import hashlib
-import io
-import json
+import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from sparsedp.files import UNFINISHED, write_file
-from sparsedp.tree import flatten
+from sparsedp.files import UNFINISHED, load_tree, save_tree
+from sparsedp.optimize.result import Failure, Record, Trial
+from sparsedp.tree import flatten, leaves
 
-__all__ = ["Checkpoint", "Found", "digest", "fingerprint"]
+__all__ = ["Checkpoint", "fingerprint"]
 
-FORMAT = "sparsedp optimization 1"
+FORMAT = "sparsedp optimization 2"
 KEPT = 2
-
-
-class Found(NamedTuple):
-    """What was read: the number of the iteration, the leaves, the words beside them, and files that were skipped."""
-
-    iteration: int
-    leaves: list
-    words: dict
-    skipped: tuple
+SHARE = 0.1  # a state is written when that takes at most this share of the time since the last one
 
 
 class Checkpoint:
-    """A folder with the last two states, each a .npz without pickle and a JSON manifest with its hash.
-
-    The manifest is written last, and a state counts only when its manifest and the hash in it are right.
+    """A folder with the last two states of a run, each a .npz file without pickle. Does nothing without a folder.
 
     Parameters
     ----------
-    folder : path
+    folder : path or None
     settings : dict
-        What the run depends on: name -> hash. A folder of another run is refused.
+        What the run depends on, beside the loss and the batches: name -> any value. A folder of another run is refused.
     """
 
     def __init__(self, folder, settings):
-        self._folder, self._settings = Path(folder), settings
+        self._folder: Any = None if folder is None else Path(folder)
+        self._settings = settings
+        self._latest: Any = None  # what is to be written
+        self._written, self._cost = -np.inf, 0.0
+        self._batches = ""  # a hash of all batches so far
+        self.told = ""
+
+    def resume(self, template, trials, watch):
+        """The last state of the folder, put into trials and watch too; None when there is none.
+
+        `template` is the state at the start: what a state looks like, and proof that the loss is the same there.
+
+        Raises
+        ------
+        ValueError
+            If the folder holds another run, or one with other batches or with another loss at its last point.
+        """
+        if self._folder is None:
+            return None
         self._folder.mkdir(parents=True, exist_ok=True)
+        self._settings = {name: fingerprint(value) for name, value in self._settings.items()}
+        self._settings["loss at the start"] = _bits(template.trial)
+        found, skipped = self._load()
+        for number in range(found["iteration"] + 1 if found else 1):
+            self._pass(trials.batches, number)
+        if not found:
+            self.told = f"nothing to resume in {self._folder}{skipped}"
+            return None
+        self.told = f"resumed from iteration {found['iteration']} in {self._folder}{skipped}"
+        for name, value in self._settings.items():
+            self._check(name, value == found["settings"].get(name))
+        self._check("list of batches", found["batches"] == self._batches)
+        state = flatten(template)[1](found["state"])
+        trials.batches.number = found["iteration"]
+        again = trials(state.trial.vector)
+        self._check("loss at the last point", not again.refused and _bits(again) == _bits(state.trial))
+        trials.best, trials.count = Trial(*found["best"]), found["evaluations"]
+        watch.resume([_record(row) for row in found["history"]], found["stopped"])
+        return state
 
-    def save(self, iteration, state, words):
-        """A tree of arrays and numbers, and words that JSON can hold."""
-        leaves = [np.asarray(leaf) for leaf in flatten(state)[0]]
-        buffer = io.BytesIO()
-        np.savez(buffer, *leaves)
-        content, name = buffer.getvalue(), f"state-{iteration:09d}"
-        manifest = {
-            "format": FORMAT, "iteration": iteration, "file": name + ".npz", "leaves": len(leaves),
-            "sha256": digest(content), "settings": self._settings, "words": words,
-        }  # fmt: skip
-        manifest["seal"] = digest(_text(manifest))
-        write_file(self._folder / f"{name}.npz", content)
-        write_file(self._folder / f"{name}.json", _text(manifest))
-        self._forget()
+    def _load(self):
+        """The newest state that is whole, empty without one, and words on files that were skipped."""
+        skipped = [f"; skipped {path.name}: an unfinished write" for path in self._folder.glob(f"*{UNFINISHED}")]
+        for path in self._states():
+            found = load_tree(path, FORMAT)
+            if found:
+                return found[0], "".join(skipped)
+            skipped.append(f"; skipped {path.name}: damaged, or not a state of sparsedp")
+        return {}, "".join(skipped)
 
-    def _forget(self):
-        for manifest in self._manifests()[KEPT:]:
-            for path in (manifest, manifest.with_suffix(".npz")):
-                path.unlink(missing_ok=True)
+    def _states(self):
+        return sorted(self._folder.glob("state-*.npz"), reverse=True)
 
-    def _manifests(self):
-        return sorted(self._folder.glob("state-*.json"), reverse=True)
-
-    def load(self):
-        """The newest state that is whole, or None.
-
-        Raises
-        ------
-        ValueError
-            If a whole state belongs to a run with other settings.
-        """
-        skipped = [f"{path.name}: an unfinished write" for path in sorted(self._folder.glob(f"*{UNFINISHED}"))]
-        for path in self._manifests():
-            manifest, leaves, reason = _read(path)
-            if reason:
-                skipped.append(f"{path.name}: {reason}")
-                continue
-            self._compare(manifest["settings"])
-            return Found(manifest["iteration"], leaves, manifest["words"], tuple(skipped))
-        return Found(-1, [], {}, tuple(skipped))
-
-    def _compare(self, settings):
-        for name in {**self._settings, **settings}:
-            self.check(name, settings.get(name) == self._settings.get(name))
-
-    def check(self, name, same):
-        """Refuse the folder unless what it holds is the same.
-
-        Raises
-        ------
-        ValueError
-            If it is not.
-        """
+    def _check(self, name, same):
         if not same:
             raise ValueError(
                 f"{self._folder} holds a run with another {name} than the one given; give what it was begun with, or "
                 "write another checkpoint folder"
             )
 
+    def _pass(self, batches, number):
+        self._batches = _digest((self._batches + batches.mark(number)).encode())
 
-def digest(content):
-    """Bytes -> SHA-256 in hexadecimal."""
+    def save(self, state, trials, watch):
+        """Write the state down, unless that was done a moment ago and the run goes on."""
+        if self._folder is None:
+            return
+        self._pass(trials.batches, watch.iteration)
+        self._latest = {
+            "iteration": watch.iteration, "settings": self._settings, "batches": self._batches,
+            "evaluations": trials.count, "stopped": watch.stopped, "state": leaves(state), "best": list(trials.best),
+        }  # fmt: skip
+        if SHARE * (time.perf_counter() - self._written) >= self._cost or watch.stopped:
+            self.write(watch.history)
+
+    def write(self, history):
+        """Write down the state of the last iteration that is complete, unless that was done."""
+        if self._latest is None:
+            return
+        begun, number = time.perf_counter(), self._latest["iteration"]
+        save_tree(self._folder / f"state-{number:09d}.npz", {**self._latest, "history": history[: number + 1]}, FORMAT)
+        for path in self._states()[KEPT:]:
+            path.unlink(missing_ok=True)
+        self._latest, self._written = None, time.perf_counter()
+        self._cost = self._written - begun
+
+
+def _digest(content):
     return hashlib.sha256(content).hexdigest()
 
 
 def fingerprint(tree):
-    """Any value -> a hash of its kind and content: of every leaf of a tree, of a function its name."""
-    return digest("\n".join(_words(tree)).encode())
+    """Any value -> a hash of its kind and content: of its structure, of every leaf, of a function its name."""
+    found, rebuild = flatten(tree)
+    return _digest("\n".join([repr(rebuild(range(len(found)))), *map(_word, found)]).encode())
 
 
-def _words(value):
-    kind = type(value).__qualname__
-    if isinstance(value, dict):
-        yield from (word for item in value.items() for word in _words(item))
-    elif isinstance(value, (tuple, list)):
-        yield from (word for item in value for word in _words(item))
-    elif isinstance(value, (np.ndarray, np.generic)) and value.dtype != object:
-        kind = f"{kind} {value.dtype} {value.shape} {digest(np.ascontiguousarray(value).tobytes())}"
-    elif callable(value):
-        kind = f"{getattr(value, '__module__', '')} {getattr(value, '__qualname__', kind)}"
-    elif " at 0x" not in repr(value):  # an address is another one in the next process
-        kind = f"{kind} {value!r}"
-    yield f"{kind} ends"
+def _word(leaf):
+    kind = type(leaf).__qualname__
+    if isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype != object:
+        return f"{kind} {leaf.dtype} {leaf.shape} {_digest(leaf.tobytes())}"
+    if callable(leaf):
+        return f"{getattr(leaf, '__module__', '')} {getattr(leaf, '__qualname__', kind)}"
+    return kind if " at 0x" in repr(leaf) else f"{kind} {leaf!r}"  # an address is another one in the next process
 
 
-def _text(manifest):
-    return json.dumps(manifest, indent=1, sort_keys=True).encode()
+def _bits(trial):
+    return _digest(np.float64(trial.value).tobytes() + trial.slope.tobytes())
 
 
-def _read(path):
-    """(manifest, leaves, None), or (None, None, what is wrong)."""
-    try:
-        manifest = json.loads(path.read_bytes())
-        seal = manifest.pop("seal")
-    except (OSError, ValueError, KeyError, AttributeError, TypeError):
-        return None, None, "not a manifest of sparsedp"
-    if manifest.get("format") != FORMAT or digest(_text(manifest)) != seal:
-        return None, None, "not a manifest of sparsedp"
-    try:
-        content = (path.parent / manifest["file"]).read_bytes()
-    except OSError:
-        return None, None, f"{manifest['file']} is missing"
-    if digest(content) != manifest["sha256"]:
-        return None, None, f"{manifest['file']} is truncated or changed"
-    with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-        return manifest, [stored[f"arr_{place}"] for place in range(manifest["leaves"])], None
+def _record(row):
+    record = Record(*row)
+    return record._replace(failed=tuple(Failure(*words) for words in record.failed))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import is_number
-from sparsedp.optimize.trials import Stuck, Trial
+from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.tree import norm
 
 __all__ = ["Adam", "AdamState", "Descent", "DescentState"]

@@ -11,7 +11,7 @@ import scipy.linalg
 from sparsedp.fields import is_number
 from sparsedp.optimize.directions import DENSE, Family
 from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked
-from sparsedp.optimize.trials import Stuck, Trial
+from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.tree import norm
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]

@@ -6,6 +6,7 @@ from sparsedp.errors import ShapeError
 from sparsedp.fields import check_function, is_number, is_whole
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
+from sparsedp.optimize.checkpoint import Checkpoint
 from sparsedp.optimize.first_order import Adam, Descent
 from sparsedp.optimize.flat import Packing
 from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
@@ -13,9 +14,8 @@ from sparsedp.optimize.newton import NewtonCG
 from sparsedp.optimize.physical import PhysicalGradient
 from sparsedp.optimize.progress import progress_bar
 from sparsedp.optimize.quasi_newton import Quasi
-from sparsedp.optimize.result import Minimum
-from sparsedp.optimize.resume import Journal
-from sparsedp.optimize.trials import Stuck, Trials
+from sparsedp.optimize.result import Minimum, Stuck
+from sparsedp.optimize.trials import Trials
 from sparsedp.optimize.watch import Watch
 from sparsedp.tree import leaves
 
@@ -144,42 +144,45 @@ def minimize(
     packing, batches = Packing(start), Batches(batches)
     if batches.varied and stepper.searches:
         raise ValueError(f"{method} compares losses and cannot use batches; write method='adam', or give gd a rate")
-    if isinstance(stepper, PhysicalGradient):
-        loss, stepper = _composed(loss, stepper.rule), Descent(rate=1.0)
-    if project is not None:
-        loss = _composed(loss, project)
+    for inner in (getattr(stepper, "rule", None), project):
+        loss = loss if inner is None else _composed(loss, inner)
     box = Box.of(bounds, packing, start)
     trials = Trials(loss, gradient, packing, box, batches, stepper if stepper.residuals else None)
-    sides = None if box.open else (box.lower, box.upper)
+    sides = box.lower, box.upper
     settings = {"method": method, "set of options": sorted(options.items()), "pair of bounds": sides, "start": start}
-    journal = Journal(checkpoint, settings)
-    watch = Watch(trials, packing, tolerance, callback, progress_bar(progress, int(maxiter)))
+    kept = Checkpoint(checkpoint, settings)
     stuck, covariance = None, None
-    try:
-        stuck = _run(stepper, trials, watch, journal, box.inside(packing.pack(start)), int(maxiter))
-        covariance = trials.covariance(trials.best)
-    except KeyboardInterrupt:
-        if not watch.history:
-            raise
-        watch.stopped = watch.stopped or "interrupted"
-    finally:
-        watch.bar.close()
-        journal.write(watch.history)
+    with progress_bar(progress, int(maxiter)) as show:
+        watch = Watch(trials, packing, tolerance, callback, show)
+        try:
+            stuck = _run(stepper, trials, watch, kept, box.inside(packing.pack(start)), maxiter)
+            covariance = trials.covariance(trials.best)
+        except KeyboardInterrupt:
+            if not watch.history:
+                raise
+            watch.stopped = watch.stopped or "interrupted"
+        finally:
+            kept.write(watch.history)
     message, converged = watch.reason(stuck)
-    best, x = trials.best, packing.unpack(trials.best.vector)
-    x, told = x if project is None else _like(project(x), x), journal.told
-    return Minimum(x, best.value, watch.history, method, message, converged, trials.count, told, covariance)
+    x = packing.unpack(trials.best.vector)
+    if project is not None:
+        given, x = x, project(x)
+        if len(leaves(x)) != len(leaves(given)):
+            raise ShapeError("project must return a tree like start; write project=lambda x: ...")
+    return Minimum(
+        x=x, value=trials.best.value, history=tuple(watch.history), method=method, message=message,
+        converged=converged, evaluations=trials.count, resumed=kept.told, covariance=covariance,
+    )  # fmt: skip
 
 
-def _run(stepper, trials, watch, journal, start, maxiter):
+def _run(stepper, trials, watch, kept, start, maxiter):
     """Begin or resume, and advance until the watch stops it or it is stuck; return why it is stuck."""
-    first = trials.first(start)
-    state = stepper.begin(first)
-    resumed = journal.resume(state, trials, watch)
-    if resumed is not None:
+    state = stepper.begin(trials.first(start))
+    resumed = kept.resume(state, trials, watch)
+    if resumed is None:
+        watch(state.trial)
+    else:
         state = resumed
-    elif watch(first):
-        return None
     while watch.iteration < maxiter and not watch.stopped:
         trials.batches.number = watch.iteration + 1  # a new point is seen by the next batch
         try:
@@ -187,18 +190,12 @@ def _run(stepper, trials, watch, journal, start, maxiter):
         except Stuck as reason:
             return str(reason)
         watch(state.trial)
-        journal.save(state, trials, watch)
+        kept.save(state, trials, watch)
     return None
 
 
 def _composed(loss, inner):
     return lambda x, *rest: loss(inner(x), *rest)
-
-
-def _like(projected, x):
-    if len(leaves(projected)) != len(leaves(x)):
-        raise ShapeError("project must return a tree like start; write project=lambda x: ...")
-    return projected
 
 
 def _stepper(method, options):

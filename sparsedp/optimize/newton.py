@@ -6,7 +6,7 @@ import numpy as np
 
 from sparsedp.fields import is_whole
 from sparsedp.optimize.flat import power_of_two
-from sparsedp.optimize.trials import Stuck, Trial
+from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.tree import norm
 
 __all__ = ["NewtonCG", "NewtonState"]
@@ -80,12 +80,12 @@ class _Model:
 
     def __init__(self, here, trials, limit, forcing):
         self._height = power_of_two(norm(here.slope))
-        self._free = trials.box.free_mask(here.vector, here.slope)
+        self._free = trials.box.free(here.vector, here.slope)
         self._product, self._limit, self._forcing = trials.curvature(here), limit, forcing
         self._slope = self._masked(here.slope / self._height)
 
     def _masked(self, vector):
-        return vector if self._free is None else np.where(self._free, vector, 0.0)
+        return np.where(self._free, vector, 0.0)
 
     def _curved(self, d):
         return self._masked(self._product(d) / self._height)

@@ -4,6 +4,7 @@ import autograd.numpy as anp
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import is_number
+from sparsedp.optimize.first_order import Descent
 from sparsedp.tape import differentiable, plain
 
 __all__ = ["PhysicalGradient", "physical_gradient"]
@@ -78,7 +79,7 @@ def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
     return rule
 
 
-class PhysicalGradient:
+class PhysicalGradient(Descent):
     """The method of minimize: gradient descent with rate 1 on x, through the inverse simulator.
 
     Parameters
@@ -88,12 +89,11 @@ class PhysicalGradient:
     rate : float
     """
 
-    residuals, searches = False, False
-
     def __init__(self, physics=None, inverse=None, rate=1.0):
         if physics is None or inverse is None:
             raise TypeError(
                 "physical_gradient needs physics and inverse; write minimize(loss_of_y, x, 'physical_gradient', "
                 "physics=f, inverse=f_inverse)"
             )
+        super().__init__(rate=1.0)
         self.rule = physical_gradient(physics, inverse, rate)

@@ -6,7 +6,7 @@ import numpy as np
 
 from sparsedp.fields import is_whole
 from sparsedp.optimize.flat import power_of_two
-from sparsedp.optimize.trials import Stuck, Trial
+from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.optimize.wolfe import line_search
 from sparsedp.tree import norm
 
@@ -101,8 +101,8 @@ class Quasi:
 def _step(state, box):
     """From the point of a state to the minimum of its model in the entries that the bounds leave free."""
     here = state.trial
-    free = box.free_mask(here.vector, here.slope)
-    free = slice(None) if free is None or free.all() else free
+    free = box.free(here.vector, here.slope)
+    free = slice(None) if free.all() else free
     g = here.slope / state.height
     shortest = _first_length(here) / state.length / (norm(g) or 1.0)
     step = np.zeros_like(g)

@@ -1,12 +1,40 @@
-"""What an optimization gives back: the best point, the history, and the reason it stopped."""
+"""What an optimization hands around and gives back: trials, the history, the best point and why it stopped."""
 
 from typing import Any, NamedTuple
 
-from sparsedp.optimize.trials import Failure
+import numpy as np
 
-__all__ = ["Minimum", "Record"]
+__all__ = ["Failure", "Minimum", "Record", "Stuck", "Trial"]
 
 SHOWN = 6  # lines of the history at each end
+
+
+class Stuck(Exception):
+    """No admissible point was found; the message says why."""
+
+
+class Trial(NamedTuple):
+    """A point, the loss and the flat gradient there. A refused point has the value infinity, and the gradient NaN.
+
+    A point that is not low enough for whoever asked may have no gradient.
+    """
+
+    vector: np.ndarray
+    value: float
+    slope: Any
+    rounding: float = 0.0  # a smaller change of the loss is not seen
+
+    @property
+    def refused(self):
+        """Whether the loss has no value here."""
+        return self.value == np.inf
+
+
+class Failure(NamedTuple):
+    """A trial point that the loss refused."""
+
+    error: str
+    message: str
 
 
 class Record(NamedTuple):
@@ -60,10 +88,8 @@ class Minimum:
     resumed: str
     covariance: Any
 
-    def __init__(self, x, value, history, method, message, converged, evaluations, resumed="", covariance=None):
-        self.__dict__.update(x=x, value=value, history=tuple(history), method=method)
-        self.__dict__.update(message=message, converged=converged, evaluations=evaluations)
-        self.__dict__.update(resumed=resumed, covariance=covariance)
+    def __init__(self, **parts):
+        self.__dict__.update(parts)
 
     def __setattr__(self, name, value):
         raise AttributeError(f"the result of minimize is frozen; {name} cannot be set")
@@ -72,12 +98,10 @@ class Minimum:
         last = self.history[-1]
         head = f"{self.method}: loss {self.value:.6g} after {last.iteration} iterations, {self.evaluations} evaluations"
         lines = [f"{'n':>6}  {'loss':>13}  {'gradient':>9}  {'seconds':>8}  evaluations  solves"]
-        cut = len(self.history) > 2 * SHOWN + 1
-        shown = self.history[:SHOWN] + self.history[-SHOWN:] if cut else self.history
-        lines += [_line(record) for record in shown]
-        if cut:
-            lines.insert(SHOWN + 1, f"{'...':>6}")
-        return "\n".join([head, *lines, self.message, *([self.resumed] if self.resumed else [])])
+        lines += map(_line, self.history)
+        if len(self.history) > 2 * SHOWN + 1:
+            lines[SHOWN + 1 : -SHOWN] = [f"{'...':>6}"]
+        return "\n".join(filter(None, [head, *lines, self.message, self.resumed]))
 
     __repr__ = __str__
 

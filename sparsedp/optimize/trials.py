@@ -1,7 +1,5 @@
 """Evaluations of a loss and its gradient: counted, refused ones kept apart, the best one remembered."""
 
-from typing import Any, NamedTuple
-
 import numpy as np
 
 from sparsedp.derivative import pullback, value_and_grad
@@ -9,41 +7,14 @@ from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, S
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.linearised import Linearised
+from sparsedp.optimize.result import Failure, Trial
+from sparsedp.solvers.cache import Cache
 from sparsedp.tape import isbox
 
-__all__ = ["Failure", "Stuck", "Trial", "Trials"]
+__all__ = ["Trials"]
 
-OPEN, WHOLE = Box(), Batches()
 MOST = 4000  # unknowns of which the covariance is found, 128 MB
 REFUSED = (UnstableStepError, ConvergenceError, NonFiniteError)
-
-
-class Stuck(Exception):
-    """No admissible point was found; the message says why."""
-
-
-class Failure(NamedTuple):
-    """A trial point that the loss refused."""
-
-    error: str
-    message: str
-
-
-class Trial(NamedTuple):
-    """A point, the loss and the flat gradient there. A refused point has the value infinity.
-
-    It has no gradient, nor has a point that is not low enough for whoever asked.
-    """
-
-    vector: np.ndarray
-    value: float
-    slope: np.ndarray | None
-    rounding: float = 0.0  # a smaller change of the loss is not seen
-
-    @property
-    def refused(self):
-        """Whether the loss has no value here."""
-        return self.value == np.inf
 
 
 class Trials:
@@ -66,13 +37,11 @@ class Trials:
 
     best: Trial
 
-    def __init__(self, loss, gradient, packing, box=OPEN, batches=WHOLE, squares=None):
+    def __init__(self, loss, gradient, packing, box=None, batches=None, squares=None):
         self._loss, self._gradient, self._packing = loss, gradient, packing
-        self._squares, self._forward = squares, False
-        self.box, self.batches = box, batches
-        self.count = 0
-        self.failures = []
-        self._last: Any = None  # what was linearised last: it, its point, the number of its batch
+        self._squares, self._forward, self._linearised = squares, False, Cache(1)
+        self.box, self.batches = box or Box(), batches or Batches()
+        self.count, self.failures = 0, []
 
     def first(self, vector):
         """The trial at the start; what the loss raises there is not caught."""
@@ -106,52 +75,44 @@ class Trials:
 
         A Jacobian with fewer columns than rows that is formed anyway is formed at once, by forward products.
         """
-        here = self._linearise(vector, self.batches.now())
+        here = self._linearise(vector, self.batches.number)
         with np.errstate(over="ignore"):  # infinity is refused
             value = 0.5 * float(np.dot(here.flat, here.flat))
         if not value < below:
             return value, None
         few = not self._squares.apart and here.shape[1] < here.shape[0]
         self._forward = few and self._squares.forms(*here.shape)
-        slope = here.flat @ here.rows() if self._forward else here.pull(here.flat)
-        self._last = here, np.array(vector), self.batches.number
-        return value, slope
+        return value, here.flat @ here.rows() if self._forward else here.pull(here.flat)
 
-    def _linearise(self, vector, batch):
-        return Linearised(self._loss, self._packing, vector, batch, self._forward, self._squares.apart)
+    def _linearise(self, vector, number):
+        """The residuals and their Jacobian at a point, on the batch of an iteration; kept for the last point."""
+        key = vector, number if self.batches.varied else 0
+        batch = self.batches.now(self.batches.number - number)
+        return self._linearised.find(key) or self._linearised.put(
+            key, Linearised(self._loss, self._packing, vector, batch, self._forward, self._squares.apart)
+        )
 
     def _both(self, vector):
         """Loss and flat gradient, each from a fresh tree."""
         tree, batch = self._packing.unpack(vector), self.batches.now()
         if self._gradient is None:
             value, gradient = value_and_grad(self._loss)(tree, *batch)
-            return value, self._packing.pack_gradient(gradient)
-        value = self._loss(tree, *batch)
+        else:
+            value, gradient = self._loss(tree, *batch), self._gradient(self._packing.unpack(vector), *batch)
         if np.shape(value) != ():
             raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(value)}; sum it")
-        gradient = self._gradient(self._packing.unpack(vector), *batch)
         return float(value), self._packing.pack_gradient(gradient)
 
     def linearised(self, trial):
         """The residuals at a point and their Jacobian in what the bounds leave free, on the batch that saw it."""
-        free = self.box.free_mask(trial.vector, trial.slope)
-        here = self._linearised(trial)
-        return here if free is None else here.among(free)
-
-    def _linearised(self, trial):
-        """Kept, when it was the last one."""
-        if self._last is not None:
-            here, vector, number = self._last
-            same_batch = not self.batches.varied or number == self.batches.number - 1
-            if same_batch and np.array_equal(vector, trial.vector):
-                return here
-        return self._linearise(trial.vector, self.batches.now(back=1))
+        here = self._linearise(trial.vector, self.batches.number - 1)
+        return here.among(self.box.free(trial.vector, trial.slope))
 
     def covariance(self, trial):
         """That of the unknowns of a least-squares problem at a point; None where its Jacobian is not formed."""
         if self._squares is None or self.batches.varied:
             return None
-        here = self._linearised(trial)
+        here = self._linearise(trial.vector, self.batches.number)
         rows, columns = here.shape
         enough = columns < rows and columns <= MOST and self._squares.forms(rows, columns)
         return here.covariance() if enough else None
@@ -168,8 +129,8 @@ class Trials:
         return lambda v: packing.pack_gradient(pull(np.asarray(v, dtype=slope.dtype)))
 
     def downhill(self, trial):
-        """The part of the gradient that the bounds leave free."""
-        return self.box.free(trial.vector, trial.slope)
+        """The gradient, 0 where the bounds hold an unknown."""
+        return np.where(self.box.free(trial.vector, trial.slope), trial.slope, 0.0)
 
     def pop_failures(self):
         """The refused points since the last call."""

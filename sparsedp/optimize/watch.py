@@ -10,22 +10,26 @@ __all__ = ["Watch"]
 
 
 class Watch:
-    """Keeps the history and decides when to stop. Called with every accepted trial; true means stop."""
+    """Keeps the history and decides when to stop. Called with every accepted trial.
 
-    def __init__(self, trials, packing, tolerance, callback, bar):
+    Attributes
+    ----------
+    history : list of Record
+    stopped : str
+        Empty while the run goes on.
+    """
+
+    def __init__(self, trials, packing, tolerance, callback, show):
         self._trials, self._packing = trials, packing
-        self._tolerance, self._callback, self.bar = tolerance, callback, bar
-        self._clock = time.perf_counter()
-        self._before, self._solves = 0.0, -thread.solves
-        self.history = []
-        self.stopped = ""
+        self._tolerance, self._callback, self._show = tolerance, callback, show
+        self._seconds, self._solves = -time.perf_counter(), -thread.solves  # at the start, taken off
+        self.history, self.stopped = [], ""
 
     def resume(self, history, stopped):
         """Go on from a history that was kept. A callback stops one run, and a tolerance that is met, this one."""
-        self.history = list(history)
-        self._before = self.history[-1].seconds
-        self._solves = self.history[-1].solves - thread.solves
-        if stopped == "converged" and (callable(self._tolerance) or self._met(self.history[-1])):
+        self.history, last = history, history[-1]
+        self._seconds, self._solves = self._seconds + last.seconds, last.solves - thread.solves
+        if stopped == "converged" and (callable(self._tolerance) or self._met(last)):
             self.stopped = stopped
 
     @property
@@ -34,38 +38,38 @@ class Watch:
         return len(self.history) - 1
 
     def __call__(self, trial):
-        seconds = self._before + time.perf_counter() - self._clock
-        failed = self._trials.pop_failures()
-        size, solves = norm(self._trials.downhill(trial)), self._solves + thread.solves
-        record = Record(len(self.history), trial.value, size, seconds, self._trials.count, failed, solves)
+        record = Record(
+            len(self.history),
+            trial.value,
+            norm(self._trials.downhill(trial)),
+            self._seconds + time.perf_counter(),
+            self._trials.count,
+            self._trials.pop_failures(),
+            self._solves + thread.solves,
+        )
         self.history.append(record)
-        self.bar.show(record)
+        self._show(record)
         if self._met(record):
             self.stopped = "converged"
         elif self._callback is not None and record.iteration > 0:
             if self._callback(record, self._packing.unpack(trial.vector)):
                 self.stopped = "stopped by the callback"
-        return bool(self.stopped)
 
     def _met(self, record):
-        first = self.history[0]
-        if record.gradient_norm == 0 and not self._trials.batches.varied:
+        first, once = self.history[0], not self._trials.batches.varied  # a batch may have the gradient 0 alone
+        if record.gradient_norm == 0 and once:
             return True
         if callable(self._tolerance):
             return bool(self._tolerance(record, first))
         goal = self._tolerance * first.gradient_norm
-        return record.gradient_norm < goal or (record.gradient_norm == goal and not self._trials.batches.varied)
+        return record.gradient_norm < goal or (record.gradient_norm == goal and once)
 
     def reason(self, stuck):
         """(message, converged) of a run that is over; `stuck` is why the method gave up, if it did."""
-        last, first = self.history[-1], self.history[0]
+        last, first = self.history[-1].gradient_norm, self.history[0].gradient_norm
         if self.stopped == "converged":
-            if last.gradient_norm == 0:
-                return "converged: the gradient is 0", True
-            return (
-                f"converged: the gradient is {last.gradient_norm / first.gradient_norm:.1e} of that at the start",
-                True,
-            )
+            share = f"{last / first:.1e} of that at the start" if last else "0"
+            return f"converged: the gradient is {share}", True
         if self.stopped:
             return self.stopped, False
         if stuck == "rounding":
@@ -74,4 +78,4 @@ class Watch:
             left = self._trials.pop_failures()
             refused = f", {len(left)} points refused ({left[-1].error}: {left[-1].message})" if left else ""
             return f"stopped: {stuck}{refused}; dp.check.gradient(loss, x) tells whether the gradient is right", False
-        return f"stopped after {last.iteration} iterations, as maxiter asks", False
+        return f"stopped after {self.iteration} iterations, as maxiter asks", False
