@@ -113,12 +113,11 @@ class Multigrid(Krylov):
 
     def __init__(self, system, visits, strength, sweeps, levels, grid=None):
         mirrored = sweeps[0] == tuple(SWEEPS[sweep] for sweep in reversed(sweeps[1]))
-        use_symmetric = system.symmetric and mirrored
-        super().__init__(system, of_symmetric=use_symmetric, maxiter=MAXITER)
-        self.symmetric = use_symmetric
+        super().__init__(system, maxiter=MAXITER)
+        self.symmetric = system.symmetric and mirrored
         unit = 2.0 ** -int(np.frexp(system.norm(False))[1])  # PyAMG prints where entries are far from 1
-        scale = unit * system.sign * (system.weights if use_symmetric else 1.0)
-        matrix = csr_array(system.matrix * np.broadcast_to(scale, system.size)[:, None])
+        self._scale = unit * system.sign * (system.weights if self.symmetric else 1.0)
+        matrix = csr_array(system.matrix * np.broadcast_to(self._scale, system.size)[:, None])
         if grid is None:
             built = _ruge_stueben(matrix, strength, levels)
         else:
@@ -126,15 +125,12 @@ class Multigrid(Krylov):
         self.forward = Hierarchy(built, visits, *sweeps)
         self._transposed: Any = None
         self.hierarchy = self.forward.words
-        self._flip = unit if use_symmetric else unit * system.sign
 
     def precondition(self, r, transposed):
         """One cycle, or one transposed cycle."""
         if transposed and self._transposed is None:
             self._transposed = self.forward.transpose()
-        z = (self._transposed if transposed else self.forward).cycle(r)
-        z *= self._flip
-        return z
+        return (self._transposed if transposed else self.forward).cycle(self._scale * r)
 
 
 class Level(NamedTuple):

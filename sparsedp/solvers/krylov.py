@@ -70,8 +70,7 @@ class Krylov(Engine):
     ----------
     system : System
     precondition : callable or None
-        precondition(r, transposed) -> z ~ A^-1 r (A^-T r), fresh. With `of_symmetric`, z ~ S^-1 r instead.
-    of_symmetric : bool
+        precondition(r, transposed) -> z ~ A^-1 r (A^-T r), fresh.
     maxiter : int, optional
         Used when the system does not say.
     iterations : int, optional
@@ -83,11 +82,10 @@ class Krylov(Engine):
     overwrites = False
     precondition: Any = None
 
-    def __init__(self, system, precondition=None, of_symmetric=False, maxiter=None, iterations=None):
+    def __init__(self, system, precondition=None, maxiter=None, iterations=None):
         self.system = system
         if precondition is not None:  # subclasses bring a method of this name
             self.precondition = precondition
-        self.of_symmetric = of_symmetric
         self.sign = system.sign or _probed_sign(system)
         self.symmetric = system.symmetric and self.sign != 0
         self.maxiter = iterations or system.maxiter or maxiter or int(np.clip(4 * system.size, 100, 20_000))
@@ -159,7 +157,7 @@ class Krylov(Engine):
         """z ~ S^-1 r, a fresh array or r itself."""
         if self.precondition is None:
             return r
-        return self.system.null_space.project(self.precondition(r if self.of_symmetric else r / factor, False))
+        return self.system.null_space.project(self.precondition(r / factor, False))
 
     def _gmres(self, b, goal, accepted, transposed):
         """Restarted GMRES from 0, preconditioned from the right: its residuals are those of A.

@@ -33,11 +33,11 @@ class NullSpace:
     """
 
     def __init__(self, labels, right, left, count):
-        self.labels = labels
-        self.right, self.left = right, left
-        self.count = count
+        self.labels, self.count = labels, count
+        self.right, self.left = self._sides = right, left
         self._products = self._dots(right, left)
-        self._sides = tuple(_thin(labels, side) for side in (right, left))
+        # A null vector that is one number everywhere, as that number: one pass less for each projection.
+        self._numbers = [_number(side) if labels is None else None for side in self._sides]
 
     def _dots(self, side, values):
         """Sum of side * values over each component; `side` is 0 beside them."""
@@ -52,11 +52,11 @@ class NullSpace:
 
     def sums(self, b, transposed=False):
         """l.b on each component."""
-        side = self._sides[not transposed]
-        if not np.isscalar(side):
-            return self._dots(side, b)
+        number = self._numbers[not transposed]
+        if number is None or b.dtype != float:
+            return self._dots(self._sides[not transposed], b)
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
-            return np.array([side * b.sum()])
+            return np.array([number * b.sum()])
 
     def project(self, b, transposed=False, into=None):
         """Take out, component by component, the part along the null space. The same map for b and x.
@@ -67,14 +67,12 @@ class NullSpace:
 
     def projected(self, b, transposed=False, into=None, sums=None):
         """What `project` gives, and its norm. `sums`: what `sums(b)` gave, when it is known."""
-        right = self._sides[transposed]
-        real = b.dtype == np.float64 == self.right.dtype
-        sums = self.sums(b, transposed) if sums is None else sums
-        shares = sums / self._products
-        if np.isscalar(right) and real:
+        shares = (self.sums(b, transposed) if sums is None else sums) / self._products
+        number = self._numbers[transposed]
+        if number is not None and b.dtype == float:
             into = np.empty_like(b) if into is None else into
-            return into, subtracted(b, right * shares[0], into)
-        part = right * (shares[0] if self.count == 1 else np.append(shares, 0.0)[self.labels])
+            return into, subtracted(b, number * shares[0], into)
+        part = self._sides[transposed] * (shares[0] if self.count == 1 else np.append(shares, 0.0)[self.labels])
         b = np.subtract(b, part, out=into)
         return b, norm(b)
 
@@ -110,9 +108,8 @@ class NullSpace:
         return found[labels[found] >= 0]
 
 
-def _thin(labels, side):
-    """A null vector that is one number everywhere, as that number: one pass less for each projection."""
-    return side[0].item() if labels is None and side.size and np.all(side == side[0]) else side
+def _number(side):
+    return float(side[0]) if side.dtype == float and side.size and np.all(side == side[0]) else None
 
 
 def find_null_space(system):
@@ -149,13 +146,9 @@ def find_null_space(system):
 def _candidates(system, labels, count, transposed):
     """The first of the candidates that the operator maps to 0, component by component."""
     found, known = np.zeros(system.size, system.op.dtype), np.zeros(count, dtype=bool)
-    candidates = [np.ones(system.size)]
-    if np.any(system.volumes != system.volumes[:1]):
-        candidates.insert(0 if transposed else 1, system.volumes)
-    active = 1.0 if system.active is None else system.active
+    candidates = [np.ones(system.size), system.volumes][: 1 if system.uniform else 2]
     members = np.bincount(labels, minlength=count + 1)[:count] > 0
-    for candidate in candidates:
-        candidate = candidate * active
+    for candidate in map(system.masked, reversed(candidates) if transposed else candidates):
         wrong = np.abs(system.product(candidate, transposed)) > ROUNDING * system.magnitude(candidate, transposed)
         fresh = members & ~known & (np.bincount(labels, wrong, count + 1)[:count] == 0)
         chosen = np.append(fresh, False)[labels]

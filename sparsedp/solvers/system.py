@@ -8,15 +8,14 @@ from scipy.sparse.csgraph import connected_components
 
 from sparsedp.errors import NonFiniteError
 from sparsedp.grid import Grid
-from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import ROUNDING, find_null_space
 from sparsedp.solvers.scaling import length, remainder
-from sparsedp.space import Space
-from sparsedp.structure.base import Matrix, probes, rows_of
+from sparsedp.structure.base import Matrix, rows_of
 from sparsedp.structure.kronecker import Kronecker
 
 __all__ = ["System"]
 
+SYMMETRIC = 1e-13  # share of the sizes of two products that is rounding
 FAR = 200  # binary exponents of |A| beyond this are scaled away: squares of solutions must not overflow
 
 
@@ -53,32 +52,22 @@ class System:
 
     # ------------------------------------------------------------ products
 
-    @cached_property
-    def _acting(self):
-        return self.op._flat, self.op._flat.T
-
     def product(self, x, transposed=False):
         """A x or A^T x for the unknowns (x is 0 elsewhere), flat and fresh. Not counted as an application."""
-        if "entries" in self.__dict__ and not isinstance(self.op.structure, Kronecker):
-            y = self._assembled[transposed].apply(x)  # one pass; a chain takes several
-        else:
-            y = self._acting[transposed].apply(x)
+        op = self.op.T if transposed else self.op
+        one_pass = "entries" in self.__dict__ and not isinstance(self.op.structure, Kronecker)  # a chain takes several
+        y = (op._matrix_structure if one_pass else op._acting).product(x)
         if self.active is not None:
             y[~self.active] = 0.0
         return y
 
     def applied(self, x):
         """A x as it was given: not scaled, for all that is not an unknown too."""
-        return self.given._flat.apply(x)
+        return self.given._acting.product(x)
 
     def terms(self, x):
         """A size of the terms that A x is the sum of."""
         return float(np.ldexp(self.norm() * length(x), self.exponent))
-
-    @cached_property
-    def _assembled(self):
-        form = Operator(Matrix(self.entries), Space(self.size), Space(self.size), self.op.name)
-        return form, form.T
 
     def residual(self, x, b, transposed=False):
         """(b - A x for the unknowns, fresh; its norm; that of x). b is 0 elsewhere."""
@@ -155,7 +144,7 @@ class System:
         """The first unknown whose row has no entries, or None."""
         if self.faces is not None and self.faces.connected:
             return None
-        unknown = self._masked(np.ones(self.size))
+        unknown = self.masked(np.ones(self.size))
         empty = (self.magnitude(unknown) == 0) & (unknown > 0)
         return int(np.argmax(empty)) if empty.any() else None
 
@@ -189,15 +178,20 @@ class System:
         return space.volumes.reshape(-1)
 
     @cached_property
+    def uniform(self):
+        """Whether all volumes are equal."""
+        return not np.any(self.volumes != self.volumes[:1])
+
+    @cached_property
     def weights(self):
         """Positive w such that diag(w) A is symmetric: 1.0, an array, or None when no such w is known.
 
-        Tried are ones, the cell volumes and their inverses. A Kronecker sum is examined factor by
-        factor, an assembled matrix entry by entry, the rest with random vectors.
+        Tried are ones, the cell volumes and their inverses, on two random vectors.
         """
-        uniform = not np.any(self.volumes != self.volumes[:1])
-        for power in (0,) if uniform else (0, 1, -1):
-            if self._symmetric_with(power, weights := self.volumes**power if power else 1.0):
+        x, y = map(self.masked, np.random.default_rng(0).standard_normal((2, self.size)))
+        ax, ay, size = self.product(x), self.product(y), self.magnitude(np.abs(x))
+        for weights in [1.0] if self.uniform else [1.0, self.volumes, 1.0 / self.volumes]:
+            if abs(y @ (weights * ax) - x @ (weights * ay)) <= SYMMETRIC * (np.abs(y) @ (weights * size)):
                 return weights
         return None
 
@@ -206,23 +200,8 @@ class System:
         """Whether A is symmetric after scaling its rows by `weights`."""
         return self.weights is not None
 
-    def _symmetric_with(self, power, weights):
-        structure = self.op.structure
-        if structure.separable:
-            grid = self.op.domain.grid or self.op.codomain.grid
-            scales = [1.0] * 3 if grid is None else [h[:, None] ** power for h in grid.widths]
-            return all(_symmetric(sp.csr_array(line.matrix * scales[a])) for a, line in structure.lines.items())
-        if isinstance(structure, Matrix) or "entries" in self.__dict__:
-            return _symmetric(sp.csr_array(self.matrix * (weights if power == 0 else weights[:, None])))
-        return self._symmetric_to_probes(weights)
-
-    def _symmetric_to_probes(self, weights):
-        x, y = (self._masked(probe) for probe in probes(self.size)[:2])
-        left, right = y @ (weights * self.product(x)), x @ (weights * self.product(y))
-        size = np.abs(y) @ (weights * self.magnitude(np.abs(x)))
-        return abs(left - right) <= 1e-13 * size
-
-    def _masked(self, x):
+    def masked(self, x):
+        """x, 0 on what is not an unknown."""
         return x if self.active is None else np.where(self.active, x, 0.0)
 
     # ------------------------------------------------------------ entries
@@ -237,8 +216,8 @@ class System:
         """The diagonal on all unknowns (0 on what is not one), or None when only products are known."""
         structure = self.op.structure
         if structure.separable:
-            return self._masked(structure.diagonal())
-        return self._masked(self.entries.diagonal()) if structure.has_entries else None
+            return self.masked(structure.diagonal())
+        return self.masked(self.entries.diagonal()) if structure.has_entries else None
 
     @cached_property
     def sign(self):
@@ -313,10 +292,3 @@ def _pinned(matrix, flags):
     result = sp.csr_array(kept + sp.diags_array(np.where(flags, largest, 0.0), format="csr"))
     result.eliminate_zeros()
     return result
-
-
-def _symmetric(matrix):
-    """Whether the entries equal their mirror images up to rounding."""
-    turned = matrix.T.tocsr()
-    excess = abs(matrix - turned) - ROUNDING * (abs(matrix) + abs(turned))
-    return excess.nnz == 0 or float(excess.max()) <= 0

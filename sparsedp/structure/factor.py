@@ -78,31 +78,25 @@ class Factor(Uncached):
     @cached_property
     def rows(self):
         """The record that the kernels read (see kernels/reference.py)."""
-        m = self.matrix
-        row = rows_of(m)
-        offset = m.indices - row
-        offsets = np.unique(offset)
-        if offsets.size > MOST_DIAGONALS:
-            offsets = offsets[:0]
-        values = np.zeros((offsets.size, m.shape[0]))
-        spans = np.zeros((2, offsets.size), dtype=np.int64)
-        for d, shift in enumerate(offsets):
-            here = row[offset == shift]
-            values[d, here] = m.data[offset == shift]
-            spans[:, d] = here[0], here[-1] + 1
+        m, row = self.matrix, rows_of(self.matrix)
+        offsets, first, diagonal = np.unique(m.indices - row, return_index=True, return_inverse=True)
+        start, stop = row[first], np.zeros(offsets.size, np.int64)
+        np.maximum.at(stop, diagonal, row + 1)
+        few = offsets.size if offsets.size <= MOST_DIAGONALS else 0
+        values = np.zeros((few, m.shape[0]))
+        if few:
+            values[diagonal, row] = m.data
         lists = m.indptr.astype(np.int64), m.indices.astype(np.int64), m.data
-        return Rows(m.shape[0], m.shape[1], *lists, offsets.astype(np.int64), spans[0], spans[1], values)
+        return Rows(m.shape[0], m.shape[1], *lists, offsets[:few], start[:few], stop[:few], values)
 
     @cached_property
     def tridiagonal(self):
         """The three-point record of the fused kernel, or None when a row reaches further."""
-        n, columns = self.shape
-        m = self.matrix
-        row = rows_of(m)
-        if n != columns or not np.all(np.isin((m.indices - row) % max(n, 1), [0, 1, max(n, 1) - 1])):
+        (n, columns), m, row = self.shape, self.matrix, rows_of(self.matrix)
+        offset = (m.indices - row) % max(n, 1)
+        if n != columns or np.any((offset > 1) & (offset < n - 1)):
             return None
         bands = np.zeros((3, n))
         # With one or two cells the neighbours coincide: what is not centre counts as upper, then lower.
-        side = np.select([m.indices == row, m.indices == (row + 1) % max(n, 1)], [1, 2], default=0)
-        bands[side, row] = m.data
+        bands[np.where(offset > 1, 0, offset + 1), row] = m.data
         return Tridiagonal(*bands)

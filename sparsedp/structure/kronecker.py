@@ -165,65 +165,53 @@ class Kronecker(Structure):
 
     def act(self, x, out):
         inputs = components(x, self.in_parts)
-        for row, target in enumerate(components(out, self.out_parts)):
-            steps = self._plan[row]
+        for steps, target in zip(self._plan, components(out, self.out_parts)):
             if not steps:
                 target[...] = 0
-            for number, step in enumerate(steps):
-                step(inputs[step.column], target, number > 0)
+            for number, (column, step) in enumerate(steps):
+                step(inputs[column], target, number > 0)
 
     @cached_property
     def _plan(self):
-        """For each component of the result, the passes that add up to it."""
+        """For each component of the result, the passes that add up to it, each with the component that it reads."""
         plans: list[list] = [[] for _ in self.out_parts]
         for (r, c), terms in self.blocks.items():
+            shape = self.in_parts[c]
             three = [t for t in terms if len(t.axes) <= 1 and all(t.factors[a].tridiagonal for a in t.axes)]
-            if three and self.out_parts[r] == self.in_parts[c] and (len(three) > 1 or not three[0].axes):
-                plans[r].append(FusedPass(c, self.in_parts[c], three))
-                terms = [t for t in terms if not any(t is u for u in three)]
-            plans[r] += [TermPass(c, term, self.in_parts[c]) for term in terms]
+            if len(three) > 1 and shape == self.out_parts[r] and not plans[r]:
+                plans[r].append((c, _fused_pass(three, shape)))
+                terms = [t for t in terms if t not in three]
+            plans[r] += [(c, _pass(term, shape)) for term in terms]
         return plans
 
 
-class FusedPass:
-    """All three-point terms of a block in one pass over memory."""
-
-    def __init__(self, column, shape, terms):
-        self.column = column
-        self.view = (1,) * (3 - len(shape)) + shape
-        self.shift = sum(term.scale for term in terms if not term.axes)
-        axes: list[Any] = [None] * 3
-        for term in terms:
-            for axis in term.axes:
-                axes[axis + 3 - len(shape)] = term.factors[axis].scaled(term.scale).tridiagonal
-        self.axes = tuple(axes)
-
-    def __call__(self, u, out, accumulate):
-        u, target = u.reshape(self.view), out.reshape(self.view)
-        if accumulate:
-            target = np.empty_like(target)
-        kernels.kronecker_sum(u, target, self.axes, self.shift)
-        if accumulate:
-            out += target.reshape(out.shape)
-
-
-class TermPass:
-    """One term, no multiple of the identity: its factors one axis after the other, the last one into the result."""
-
-    def __init__(self, column, term, shape):
-        self.column, self.scale, self.steps = column, term.scale, []
+def _fused_pass(terms, shape):
+    """Three-point terms of a block -> the function (u, out, False) that adds them up in one pass over memory."""
+    view, first = (1,) * (3 - len(shape)) + shape, 3 - len(shape)
+    shift, axes = sum(term.scale for term in terms if not term.axes), [None] * 3
+    for term in terms:
         for axis in term.axes:
-            rows = term.factors[axis].rows
-            before, after = prod(shape[:axis]), prod(shape[axis + 1 :])
-            shape = shape[:axis] + (rows.rows,) + shape[axis + 1 :]
-            self.steps.append((rows, (before, rows.cols, after), (before, rows.rows, after)))
+            axes[first + axis] = term.factors[axis].scaled(term.scale).tridiagonal
+    return lambda u, out, _: kernels.kronecker_sum(u.reshape(view), out.reshape(view), axes, shift)
 
-    def __call__(self, u, out, accumulate):
-        *steps, (rows, before, after) = self.steps
-        for line, *shapes in steps:
-            u, given = np.empty(shapes[1]), u.reshape(shapes[0])
-            kernels.along_axis(given, u, line, 1.0, False)
-        kernels.along_axis(u.reshape(before), out.reshape(after), rows, self.scale, accumulate)
+
+def _pass(term, shape):
+    """A term -> the function (u, out, whether it is added to): one axis after the other, the last into the result."""
+    steps = []
+    for axis in term.axes or (0,):
+        factor = term.factors[axis] or Factor(sp.eye_array(shape[axis]))
+        before, after = prod(shape[:axis]), prod(shape[axis + 1 :])
+        steps.append((factor.rows, (before, factor.shape[1], after), (before, factor.shape[0], after)))
+        shape = shape[:axis] + factor.shape[:1] + shape[axis + 1 :]
+
+    def run(u, out, accumulate):
+        for rows, given, made in steps[:-1]:
+            u, before = np.empty(made), u.reshape(given)
+            kernels.along_axis(before, u, rows, 1.0, False)
+        rows, given, made = steps[-1]
+        kernels.along_axis(u.reshape(given), out.reshape(made), rows, term.scale, accumulate)
+
+    return run
 
 
 def _along(line, axis, dim):
