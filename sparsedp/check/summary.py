@@ -67,7 +67,8 @@ def _plain(value):
 class Row(NamedTuple):
     """One property: its name, the measured figure, the largest one allowed, and whether it holds.
 
-    The figure is infinite for NaN and errors. `ok` is None when the property does not apply; `note` says why, or what went wrong.
+    The figure is infinite for NaN and errors. `ok` is None when the property does not apply; `note` says why, or what
+    went wrong.
     """
 
     name: str
