@@ -15,9 +15,8 @@ from sparsedp.fields import check_finite
 from sparsedp.ledger import active, count
 from sparsedp.recipe import Remade
 from sparsedp.solvers.cache import Cache
-from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_of, stencil_pattern
-from sparsedp.tape import Rule, plain
-from sparsedp.tree import copied
+from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
+from sparsedp.tape import Rule, isbox, linear, plain
 
 __all__ = ["Adopted", "adopt"]
 
@@ -94,7 +93,7 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
         raise TypeError(f"adopt takes a function of one array, got {type(f).__name__}; write dp.adopt(lambda x: ...)")
     if derivative not in ("auto", "complex", "difference"):
         raise ValueError(f"derivative must be auto, complex or difference, got {derivative!r}")
-    return Adopted(f, copied(sparsity), derivative, name or getattr(f, "__name__", "simulator"))
+    return Adopted(f, sparsity, derivative, name or getattr(f, "__name__", "simulator"))
 
 
 class Adopted(Remade):
@@ -112,18 +111,16 @@ class Adopted(Remade):
     _coloured: Any
 
     def __init__(self, f, sparsity, derivative, name, found=(None, "", None)):
-        self._f, self._sparsity, self._derivative, self.name = f, sparsity, derivative, name
+        self._f, self._derivative, self.name = f, derivative, name
+        self._sparsity = None if sparsity is None else pattern_like(sparsity)
         self._shapes, self.way, self._coloured = found
         self.runs = 0
         self._points, self._alone = Cache(), RLock()  # foreign code may work in arrays of its own: one thread at a time
-        direct: Rule
-        transposed = Rule(f"{name}.T", self._back, self._only_in_g(lambda h, x: direct(h, x)))
-        direct = Rule(f"{name}.J", self._along, self._only_in_g(lambda h, x: transposed(h, x)))
         self._rule = Rule(
             name,
             self._run,
-            lambda nums, y, x: lambda g: (transposed(g, self._same(x, y)),),
-            lambda nums, tangents, y, x: direct(tangents[0], self._same(x, y)),
+            lambda nums, y, x: lambda g: (self._products(x, y)[1](g),),
+            lambda nums, tangents, y, x: self._products(x, y)[0](tangents[0]),
         )
 
     def recipe(self):
@@ -147,19 +144,6 @@ class Adopted(Remade):
 
     __repr__ = __str__
 
-    def _only_in_g(self, turn):
-        """VJP of a map that is linear in its first argument; its second derivative is not known."""
-
-        def vjp(nums, ans, g, x):
-            if 1 in nums:
-                raise DerivativeError(
-                    f"{self.name} is adopted: its Jacobian is known, its second derivative is not; use a method with "
-                    "first derivatives, or write the function with autograd.numpy"
-                )
-            return lambda h: (turn(h, x),)
-
-        return vjp
-
     def _run(self, x):
         """One run on plain values; a copy, for foreign code may return the array that it will write into next."""
         if active:
@@ -171,11 +155,25 @@ class Adopted(Remade):
             raise TypeError(f"{self.name} must return real numbers, got dtype {y.dtype}; take the real part")
         return y.astype(float) if y.dtype.kind in "biu" else y
 
-    def _along(self, v, x):
-        return (self.jacobian(x) @ np.ravel(v)).reshape(self._shapes[1])
-
-    def _back(self, g, x):
-        return (self.jacobian(x).T @ np.ravel(g)).reshape(np.shape(x))
+    def _products(self, x, y):
+        """v -> J v and g -> J^T g at the argument of a run with the result y, each the other's derivative."""
+        if isbox(x):
+            raise DerivativeError(
+                f"{self.name} is adopted: its Jacobian is known, its second derivative is not; use a method with "
+                "first derivatives, or write the function with autograd.numpy"
+            )
+        matrix, again = self._known(x)
+        if x.dtype == float and not np.array_equal(again, plain(y)):
+            raise DerivativeError(
+                f"{self.name} gives another result for the same argument than before; it must depend on its argument "
+                "only, so what changes from call to call must be a part of it"
+            )
+        (inputs, outputs), turned = self._shapes, matrix.T
+        return linear(
+            f"{self.name}.J",
+            lambda v: (matrix @ np.ravel(v)).reshape(outputs),
+            lambda g: (turned @ np.ravel(g)).reshape(inputs),
+        )
 
     def jacobian(self, x):
         """dy/dx at a point, csr_array; kept for the last two points.
@@ -188,23 +186,13 @@ class Adopted(Remade):
         -------
         csr_array, (y.size, x.size)
         """
-        return self._known(x)[0]
+        return self._known(plain(x))[0]
 
     def _known(self, x):
         """The Jacobian at a point, and the result there."""
-        x = np.asarray(plain(x), dtype=float)
+        x = np.asarray(x, dtype=float)
         with self._alone:
-            known = self._points.find((x,))
-            return self._points.put((x,), self._made(x)) if known is None else known
-
-    def _same(self, x, y):
-        """The argument of a run; refused if its Jacobian is that of another result, as of code with a state."""
-        if plain(x).dtype == float and not np.array_equal(self._known(x)[1], plain(y)):
-            raise DerivativeError(
-                f"{self.name} gives another result for the same argument than before; it must depend on its argument "
-                "only, so what changes from call to call must be a part of it"
-            )
-        return x
+            return self._points.find((x,)) or self._points.put((x,), self._made(x))
 
     def _made(self, x):
         check_finite(f"the argument of {self.name}", x)
@@ -237,27 +225,28 @@ class Adopted(Remade):
         rows, columns = y.size, x.size
         grid = x.shape if x.shape == y.shape else None
         if self._sparsity is not None:
-            given = self._sparsity.tocsr() if hasattr(self._sparsity, "tocsr") else np.asarray(self._sparsity)
-            row, column = np.nonzero(given)
-            pattern = pattern_of(row, column, given.shape)
-            if pattern.shape != (rows, columns):
-                raise ShapeError(f"the sparsity of {self.name} must have shape {(rows, columns)}, got {pattern.shape}")
-            return Coloured(pattern, grid, by_rows=False)
+            if self._sparsity.shape != (rows, columns):
+                raise ShapeError(
+                    f"the sparsity of {self.name} must have shape {(rows, columns)}, got {self._sparsity.shape}"
+                )
+            return Coloured(self._sparsity, grid, by_rows=False)
         if known is None and not np.array_equal(self._run(x), y, equal_nan=True):
             raise DerivativeError(f"{self.name} gives two results for one argument; fix its random state first")
-        near = points_near(self._run, x)
-        products = [changes(self._run, point) for point in near]
+        points = points_near(self._run, x)
+        products = [changes(self._run, point) for point in points]
         if known is not None:  # of the derivative at x itself: a row that does not depend on a column gives exactly 0
             step, along = self._steps(x), self._product(x, DIFFERENCES)
             products.insert(0, lambda v: along(step * v.reshape(x.shape)))
-            near.insert(0, x)
+            points.insert(0, x)
+
+        def coloured(pattern):
+            return Coloured(pattern if known is None else pattern_like(pattern + known), grid, by_rows=False)
+
         guess = None if grid is None else stencil_pattern(products, grid)
-        if guess is not None:
-            coloured = Coloured(_united(guess, known), grid, by_rows=False)
-            if self._holds(coloured, near):
-                return coloured
+        if guess is not None and self._holds(coloured(guess), points):
+            return coloured(guess)
         found = find_pattern(products, rows, columns)
-        return Coloured(dense_pattern(rows, columns) if found is None else _united(found, known), grid, by_rows=False)
+        return coloured(dense_pattern(rows, columns) if found is None else found)
 
     def _holds(self, coloured, points):
         """Whether Jacobians on a guessed pattern are found right."""
@@ -295,23 +284,23 @@ class Adopted(Remade):
         ways = [(STEP, 1.0)] if self.way == STEP else []
         ways += [(DIFFERENCES, share) for share in SHARES] if self._derivative != "complex" else []
         made: dict = {}
-        matrix, wrong = None, np.ones(coloured.pattern.shape[0], dtype=bool)
-        left, judged = len(SHARES) * len(ways), False
+        matrix, wrong, judged = None, np.ones(coloured.pattern.shape[0], dtype=bool), False
         for share, way in product(reversed(SHARES), ways):
-            left -= 1
             try:
                 with _strict():
                     made[way] = made[way] if way in made else self._by_colours(coloured, x, *way)
                     matrix = made[way] if matrix is None else _with_rows(matrix, made[way], wrong)
                     wrong &= self._misses(matrix, x, way[0], share)
-                judged = True
             except MemoryError:
                 raise
-            except Exception:  # the code takes no complex numbers here, or nothing so far from x
-                if not left and not judged:
-                    raise
+            except Exception as error:  # the code takes no complex numbers here, or nothing so far from x
+                trouble = error
+                continue
+            judged = True
             if not wrong.any():
                 break
+        if not judged:
+            raise trouble
         return matrix, wrong
 
     def _misses(self, matrix, x, way, share=SHARES[-1]):
@@ -320,25 +309,19 @@ class Adopted(Remade):
         return np.any([_lacks(matrix, v, self._product(x, one), one) for one in {way, DIFFERENCES}], axis=0)
 
     def _choose(self, x):
-        if self._derivative == "difference":
-            return DIFFERENCES
-        if self._derivative == "complex" or self._is_analytic(x):
-            return STEP
-        return DIFFERENCES
-
-    def _is_analytic(self, x):
-        """Whether a complex step along one direction agrees with a difference; code that drops it gives 0."""
+        """The complex step where code is analytic: it agrees with a difference; code that drops it gives 0."""
+        if self._derivative != "auto":
+            return STEP if self._derivative == "complex" else DIFFERENCES
         v = self._steps(x) * np.random.default_rng(1).uniform(0.5, 1.5, x.shape)
         difference = self._product(x, DIFFERENCES)(v)
         try:
             with _strict():
-                step = self._product(x, STEP)(v)
+                gap = np.linalg.norm(self._product(x, STEP)(v) - difference)
         except MemoryError:
             raise
         except Exception:
-            return False
-        size = float(np.linalg.norm(difference))
-        return np.linalg.norm(step - difference) <= 1e-5 * size
+            return DIFFERENCES
+        return STEP if gap <= 1e-5 * np.linalg.norm(difference) else DIFFERENCES
 
 
 @contextmanager
@@ -349,14 +332,6 @@ def _strict():
         yield
 
 
-def _united(pattern, known):
-    """A pattern, and the entries of one from before."""
-    if known is None:
-        return pattern
-    both = (pattern + known).tocoo()
-    return pattern_of(both.row, both.col, both.shape)
-
-
 def _with_rows(matrix, other, rows):
     """A matrix with these rows from another one on the same pattern."""
     entries = np.repeat(rows, np.diff(matrix.indptr))
@@ -365,24 +340,39 @@ def _with_rows(matrix, other, rows):
 
 def _lacks(matrix, v, along, way):
     """Rows in which a matrix lacks something of the product along v."""
-    lacks = along(v) - matrix @ v.reshape(-1)
-    size = abs(matrix) @ np.abs(v).reshape(-1)
+    flat = v.reshape(-1)
+    lacks, size = along(v) - matrix @ flat, abs(matrix) @ np.abs(flat)
     share, floor = MOST[way]
     wrong = ~(np.abs(lacks) <= share * size + floor * np.max(size, initial=0.0))
-    doubtful = ~wrong & (np.abs(lacks) > GROWS * size) if way == DIFFERENCES else wrong
-    return wrong | (doubtful & _grows(lacks, v, along, matrix)) if doubtful.any() else wrong
-
-
-def _grows(lacks, v, along, matrix):
-    """Which rows lack something in proportion to the step: entries, however small. What rounding makes does not grow.
-
-    A row may be far smaller than the largest, as one of other units is.
-    """
-    gaps = [along(times * v) - times * (matrix @ v.reshape(-1)) - times * lacks for times in TIMES]
-    return np.all([~(np.abs(gap) > 0.1 * np.abs(lacks)) for gap in gaps], axis=0) & (lacks != 0)
+    doubtful = ~wrong & (np.abs(lacks) > GROWS * size)
+    if way == DIFFERENCES and doubtful.any():
+        # Entries, however small, lack something in proportion to the step, and what rounding makes does not. A row may
+        # be far smaller than the largest, as one of other units is.
+        gaps = [along(times * v) - times * (matrix @ flat + lacks) for times in TIMES]
+        wrong |= doubtful & (lacks != 0) & ~np.any(np.abs(gaps) > 0.1 * np.abs(lacks), axis=0)
+    return wrong
 
 
 # ---------------------------------------------------------------- points that foreign code takes
+
+
+def reached(run, x, way, shares):
+    """The first of some shares of a way from x at which foreign code has a finite result, and that result.
+
+    Where it has none: what it says, or the last result.
+    """
+    refusal = None
+    for share in shares:
+        try:
+            y = run(x + share * way)
+        except REFUSED as error:
+            refusal = error
+            continue
+        if np.all(np.isfinite(y)):
+            return share, y
+    if refusal is not None:
+        raise refusal
+    return share, y
 
 
 def points_near(run, x):
@@ -399,15 +389,8 @@ def points_near(run, x):
     list of arrays
     """
     rng, size = np.random.default_rng(0), typical(x)
-    parts = [0.1 * x * rng.uniform(-1, 1, x.shape) + 0.05 * size * rng.standard_normal(x.shape) for _ in range(POINTS)]
-    return [next(x + share * part for share in NEARER if _taken(run, x + share * part, share)) for part in parts]
-
-
-def _taken(run, x, share):
-    try:
-        return share == 0 or bool(np.all(np.isfinite(run(x))))
-    except REFUSED:
-        return False
+    ways = [0.1 * x * rng.uniform(-1, 1, x.shape) + 0.05 * size * rng.standard_normal(x.shape) for _ in range(POINTS)]
+    return [x + reached(run, x, way, NEARER)[0] * way for way in ways]
 
 
 def changes(run, x):
@@ -423,22 +406,7 @@ def changes(run, x):
     callable
     """
     size, before = 0.1 * typical(x), run(x)
-
-    def product(v):
-        refusal = None
-        for share in SMALLER:
-            try:
-                change = np.ravel(run(x + share * size * v.reshape(x.shape)) - before)
-            except REFUSED as error:
-                refusal = error
-                continue
-            if np.all(np.isfinite(change)):
-                return change
-        if refusal is not None:
-            raise refusal
-        return change
-
-    return product
+    return lambda v: np.ravel(reached(run, x, size * v.reshape(x.shape), SMALLER)[1] - before)
 
 
 def typical(x):
