@@ -88,62 +88,26 @@ def _check(weight, bias, x, padding):
         raise ShapeError(f"convolution got x {x}, weight {weight} and bias {bias}; inputs, outputs or samples differ")
 
 
-def _forward(x, weight, bias, padding):
-    dim = np.ndim(x) - 2
-    y = correlate(pad(x, weight.shape[-dim:], padding), weight)
-    y += bias.reshape(bias.shape + (1,) * dim)
-    return y
+def by_parts(name, forward, backs, forths):
+    """A rule from its derivatives in each of its first arguments.
 
+    Parameters
+    ----------
+    name : str
+    forward : callable
+        ``forward(*args) -> y``.
+    backs, forths : tuples of callables
+        ``back(g, y, *args)``, the cotangent of one argument, and ``forth(t, y, *args)``, the tangent of y along one.
+    """
 
-def _vjp(nums, y, x, weight, bias, padding):
-    def pull(g):
-        made = (
-            lambda: _back(g, weight, padding),
-            lambda: _weigh(x, g, weight.shape, padding),
-            lambda: _total(g, anp.ndim(bias)),
-        )
-        return tuple(made[num]() for num in nums)
+    def vjp(nums, y, *args):
+        return lambda g: tuple(backs[num](g, y, *args) for num in nums)
 
-    return pull
-
-
-def _total(g, rank):
-    """Cotangent of the bias: the sum over cells, and over samples unless each has its own."""
-    g = anp.sum(g, axis=tuple(range(2, anp.ndim(g))))
-    return g if rank == 2 else anp.sum(g, axis=0)
-
-
-def _jvp(nums, tangents, y, x, weight, bias, padding):
-    given = dict(zip(nums, tangents, strict=True))
-    total = 0.0
-    if 0 in given:
-        total = total + _linear(given[0], weight, padding)
-    if 1 in given:
-        total = total + _linear(x, given[1], padding)
-    if 2 in given:
-        dim = anp.ndim(x) - 2
-        spread = anp.reshape(given[2], anp.shape(given[2]) + (1,) * dim)
-        total = total + spread * anp.ones(anp.shape(y))
-    return total
-
-
-_convolution = Rule("convolution", _forward, _vjp, _jvp)
-
-
-def _two(name, forward, first, second):
-    """A bilinear rule of (a, b, *static); first(g, a, b, *static) and second are the cotangents of a and b."""
-
-    def vjp(nums, ans, a, b, *static):
-        return lambda g: tuple((first, second)[num](g, a, b, *static) for num in nums)
-
-    def jvp(nums, tangents, ans, a, b, *static):
-        given = dict(zip(nums, tangents, strict=True))
-        parts = [rule(given[0], b, *static)] if 0 in given else []
-        parts += [rule(a, given[1], *static)] if 1 in given else []
+    def jvp(nums, tangents, y, *args):
+        parts = [forths[num](t, y, *args) for num, t in zip(nums, tangents, strict=True)]
         return sum(parts[1:], parts[0])
 
-    rule = Rule(name, forward, vjp, jvp)
-    return rule
+    return Rule(name, forward, vjp, jvp)
 
 
 def _plain_linear(x, weight, padding):
@@ -158,23 +122,66 @@ def _plain_back(g, weight, padding):
 
 
 def _plain_weigh(x, g, shape, padding):
-    dim = np.ndim(g) - 2
-    return weigh(pad(x, shape[-dim:], padding), g, shape)
+    return weigh(pad(x, shape[2 - np.ndim(x) :], padding), g, shape)
 
 
-_linear: Rule = _two(
+def _spread(bias, cells):
+    """One number for each output, or for each of every sample -> the same on all cells."""
+    return anp.reshape(bias, anp.shape(bias) + (1,) * len(cells))
+
+
+def _forward(x, weight, bias, padding):
+    y = _plain_linear(x, weight, padding)
+    y += _spread(bias, x.shape[2:])
+    return y
+
+
+def _total(g, y, x, weight, bias, padding):
+    """Cotangent of the bias: the sum over cells, and over samples unless each has its own."""
+    g = anp.sum(g, axis=tuple(range(2, anp.ndim(g))))
+    return g if anp.ndim(bias) == 2 else anp.sum(g, axis=0)
+
+
+_convolution = by_parts(
+    "convolution",
+    _forward,
+    (
+        lambda g, y, x, weight, bias, padding: _back(g, weight, padding),
+        lambda g, y, x, weight, bias, padding: _weigh(x, g, anp.shape(weight), padding),
+        _total,
+    ),
+    (
+        lambda t, y, x, weight, bias, padding: _linear(t, weight, padding),
+        lambda t, y, x, weight, bias, padding: _linear(x, t, padding),
+        lambda t, y, x, weight, bias, padding: _spread(t, anp.shape(y)[2:]) + anp.zeros(anp.shape(y)),
+    ),
+)
+
+
+def _bilinear(name, forward, first, second):
+    """A bilinear rule of (a, b, *static); first(g, a, b, *static) and second are the cotangents of a and b."""
+    rule: Rule = by_parts(
+        name,
+        forward,
+        (lambda g, y, *args: first(g, *args), lambda g, y, *args: second(g, *args)),
+        (lambda t, y, a, *rest: rule(t, *rest), lambda t, y, a, b, *static: rule(a, t, *static)),
+    )
+    return rule
+
+
+_linear: Rule = _bilinear(
     "convolution, linear part",
     _plain_linear,
     lambda g, x, weight, padding: _back(g, weight, padding),
     lambda g, x, weight, padding: _weigh(x, g, anp.shape(weight), padding),
 )
-_back: Rule = _two(
+_back: Rule = _bilinear(
     "convolution, back",
     _plain_back,
     lambda h, g, weight, padding: _linear(h, weight, padding),
     lambda h, g, weight, padding: _weigh(h, g, anp.shape(weight), padding),
 )
-_weigh: Rule = _two(
+_weigh: Rule = _bilinear(
     "convolution, weights",
     _plain_weigh,
     lambda v, x, g, shape, padding: _back(g, v, padding),

@@ -4,8 +4,8 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.network.filters import convolution, weight_and_bias
-from sparsedp.tape import Rule, plain
+from sparsedp.network.filters import by_parts, convolution, weight_and_bias
+from sparsedp.tape import plain
 
 __all__ = ["dense", "relu", "residual_block", "softplus", "tanh"]
 
@@ -44,48 +44,34 @@ def dense(p, x):
     return _dense(x, weight, bias)
 
 
-def _forward(x, weight, bias):
-    return (x @ weight if weight.ndim == 2 else (x[:, None] @ weight)[:, 0]) + bias
-
-
 def _product(x, weight):
     return x @ weight if anp.ndim(weight) == 2 else (x[:, None] @ weight)[:, 0]
 
 
-def _vjp(nums, y, x, weight, bias):
-    """Cotangents g w^T, x^T g and the sum of g; with a weight for each sample, sample by sample."""
-    apart = anp.ndim(weight) == 3
-
-    def pull(g):
-        made = (
-            lambda: _product(g, anp.swapaxes(weight, -1, -2)),
-            lambda: x[:, :, None] * g[:, None, :] if apart else x.T @ g,
-            lambda: g if apart else anp.sum(g, axis=0),
-        )
-        return tuple(made[num]() for num in nums)
-
-    return pull
+def _forward(x, weight, bias):
+    return _product(x, weight) + bias
 
 
-def _jvp(nums, tangents, y, x, weight, bias):
-    parts = {0: lambda t: _product(t, weight), 1: lambda t: _product(x, t), 2: lambda t: t + anp.zeros(anp.shape(y))}
-    found = [parts[num](t) for num, t in zip(nums, tangents, strict=True)]
-    return sum(found[1:], found[0])
-
-
-_dense = Rule("dense", _forward, _vjp, _jvp)
+_dense = by_parts(
+    "dense",
+    _forward,
+    (
+        lambda g, y, x, weight, bias: _product(g, anp.swapaxes(weight, -1, -2)),
+        lambda g, y, x, weight, bias: x.T @ g if anp.ndim(weight) == 2 else x[:, :, None] * g[:, None, :],
+        lambda g, y, x, weight, bias: anp.sum(g, axis=0) if anp.ndim(bias) == 1 else g,
+    ),
+    (
+        lambda t, y, x, weight, bias: _product(t, weight),
+        lambda t, y, x, weight, bias: _product(x, t),
+        lambda t, y, x, weight, bias: t + anp.zeros(anp.shape(y)),
+    ),
+)
 
 
 def _activation(name, forward, slope):
     """A function of each number from its value and slope(x, y), y the value."""
-
-    def vjp(nums, y, x):
-        return lambda g: (g * slope(x, y),)
-
-    def jvp(nums, tangents, y, x):
-        return tangents[0] * slope(x, y)
-
-    return Rule(name, forward, vjp, jvp)
+    along = (lambda t, y, x: t * slope(x, y),)
+    return by_parts(name, forward, along, along)
 
 
 _TANH = _activation("tanh", np.tanh, lambda x, y: 1.0 - y * y)

@@ -16,6 +16,7 @@ from sparsedp.tree import leaves
 __all__ = ["Linearised", "singular"]
 
 GRADE = 1e-4  # singular values below this share of the largest wait for a Gram matrix of their own
+PLAIN = 2.0**-500, 2.0**500  # entries of a Gram matrix that need no scaling
 
 NOT_APART = (
     "with apart=True every leaf of x gets a leading axis of {} copies, one for each sample, and the outputs do not "
@@ -154,9 +155,13 @@ def singular(matrix):
     W <- E2^T W, until no group is left: one to four times, for an SVD of W that costs five times as much.
     Raises NonFiniteError if W is not finite.
     """
-    scale = power_of_two(np.max(np.abs(matrix), initial=0.0))  # squares do not overflow, nor vanish
-    rows = matrix / scale
-    gram = rows @ rows.T
+    rows, scale = matrix, 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        gram = rows @ rows.T
+    if not PLAIN[0] < np.max(np.diag(gram), initial=0.0) < PLAIN[1]:  # squares that overflow, or vanish
+        scale = power_of_two(np.max(np.abs(matrix), initial=0.0))
+        rows = matrix / scale
+        gram = rows @ rows.T
     if not np.all(np.isfinite(gram)):
         raise NonFiniteError("the Jacobian is not finite; start where every output has a finite derivative")
     squares, vectors = scipy.linalg.eigh(gram.T, driver="evd", overwrite_a=True, check_finite=False)
@@ -167,6 +172,6 @@ def singular(matrix):
     if few:
         leak = (large.T @ (rows @ (small.T @ rows).T)) / squares[few:, None]
         small, large = small - large @ leak, large + small @ leak.T
-        rest, rest_s = singular(scale * (small.T @ rows))
-        return np.hstack([large[:, ::-1], small @ rest]), np.concatenate([s[::-1], rest_s])
+        rest, rest_s = singular(small.T @ rows)
+        return np.hstack([large[:, ::-1], small @ rest]), np.concatenate([s[::-1], scale * rest_s])
     return large[:, ::-1], s[::-1]
