@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import is_number
+from sparsedp.optimize.flat import power_of_two
 from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.tree import norm
 
@@ -68,10 +69,7 @@ class Descent:
         if not self.searches:
             trial, share = admissible(state.trial.vector, step, state.share, trials)
             return DescentState(trial, share * step, state.rate, min(1.0, 2 * share))
-        return self._search(state, step, trials)
-
-    def _search(self, state, step, trials):
-        """Halve the step until the loss falls; a full step that does is tried at twice the length next time."""
+        # Halve the step until the loss falls; a full step that does is tried at twice the length next time.
         trial, share = backtracked(state.trial, step, trials, "the gradient")
         return DescentState(trial, share * step, state.rate * (share if share < 1 else 2.0), 1.0)
 
@@ -84,17 +82,17 @@ def backtracked(here, step, trials, along):
     Stuck
         When there is none; `along` names the step.
     """
-    refused = False
-    for halvings in range(HALVINGS):
-        share = 0.5**halvings
+    refused, share = False, 1.0
+    for _ in range(HALVINGS):
         point = trials.box.inside(here.vector + share * step)
         fall = float(np.dot(here.vector - point, here.slope))
         trial = trials(point, here.value)
-        refused |= trial.refused
-        if not trial.refused and _lower(trial, here, ENOUGH * fall):
+        if trial.value < here.value and trial.value <= here.value - ENOUGH * fall:
             return trial, share
+        refused |= trial.refused
         if abs(fall) <= here.rounding:  # below 0 where bounds turn a long step uphill: a shorter one may do
             break
+        share *= 0.5
     hopeless = not refused and abs(fall) <= 100 * share * here.rounding
     raise Stuck("rounding" if hopeless else f"no lower point along {along}")
 
@@ -110,10 +108,6 @@ def admissible(point, step, share, trials):
             return trial, share
         share *= 0.5
     raise Stuck("no admissible point along the step")
-
-
-def _lower(trial, other, fall):
-    return trial.value < other.value and trial.value <= other.value - fall
 
 
 def _is_positive(value):
@@ -161,10 +155,8 @@ class Adam:
 
     def begin(self, first):
         """State at the start."""
-        largest = float(np.max(np.abs(first.slope), initial=0.0))
-        scale = 2.0 ** np.frexp(largest)[1] if largest > 0 else 1.0  # a power of two changes no digits
         zero = np.zeros_like(first.vector)
-        return AdamState(first, zero, zero, 0, float(scale), 1.0)
+        return AdamState(first, zero, zero, 0, power_of_two(np.max(np.abs(first.slope), initial=0.0)), 1.0)
 
     def advance(self, state, trials):
         """One iteration. A step to a refused point is halved until the loss has a value."""

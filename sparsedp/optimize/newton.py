@@ -50,67 +50,54 @@ class NewtonCG:
 
     def advance(self, state, trials):
         """One iteration: smaller regions until the loss falls. Raises Stuck when none is small enough."""
-        here, radius = state.trial, state.radius or np.inf
-        model = _Model(here, trials, self.inner, min(0.1, np.sqrt(norm(here.slope) / (state.size or 1.0))))
+        here, radius, product = state.trial, state.radius or np.inf, trials.curvature(state.trial)
+        free, height = trials.box.free(here.vector, here.slope), power_of_two(norm(here.slope))
+        slope = np.where(free, here.slope / height, 0.0)  # of size 1, about
+        forcing = min(0.1, np.sqrt(norm(here.slope) / (state.size or 1.0)))
         for _ in range(SHRINKS):
-            step, predicted, edge = model.step(radius)
+            step, fall, edge = steihaug(
+                slope, lambda d: np.where(free, product(d) / height, 0.0), radius, forcing, self.inner
+            )
+            predicted, length = fall * height, norm(step)
             trial = trials(trials.box.inside(here.vector + step))
-            length = norm(step)
-            if not trial.refused and trial.value < here.value:
-                gain = (here.value - trial.value) / predicted if predicted > 0 else 0.0
-                if gain > ACCEPT:
-                    return state._replace(trial=trial, radius=_radius(radius, length, gain, edge))
+            gain = (here.value - trial.value) / predicted if predicted > 0 else 0.0
+            if gain > ACCEPT:
+                # The region for the next step: larger where the model was good and the region was in the way.
+                if gain > GOOD and edge:
+                    radius = 2 * length
+                elif gain < POOR:
+                    radius = length / 4
+                return state._replace(trial=trial, radius=radius if np.isfinite(radius) else 0.0)
             if predicted <= 10 * here.rounding:
                 break
             radius = length / 4
         raise Stuck("rounding" if predicted <= 100 * here.rounding else "no trust region gives a lower point")
 
 
-def _radius(radius, length, gain, edge):
-    """The region for the next step: larger where the model was good and the region was in the way."""
-    if gain > GOOD and edge:
-        return 2 * length
-    if gain < POOR:
-        return length / 4
-    return radius if np.isfinite(radius) else 0.0
+def steihaug(slope, curved, radius, forcing, limit):
+    """Conjugate gradients on slope.p + p.curved(p) / 2 where |p| <= radius.
 
-
-class _Model:
-    """The quadratic model of the loss at one point, in units in which its gradient has size 1."""
-
-    def __init__(self, here, trials, limit, forcing):
-        self._height = power_of_two(norm(here.slope))
-        self._free = trials.box.free(here.vector, here.slope)
-        self._product, self._limit, self._forcing = trials.curvature(here), limit, forcing
-        self._slope = self._masked(here.slope / self._height)
-
-    def _masked(self, vector):
-        return np.where(self._free, vector, 0.0)
-
-    def _curved(self, d):
-        return self._masked(self._product(d) / self._height)
-
-    def step(self, radius):
-        """Minimizer of the model within the radius -> step, predicted fall of the loss, whether it is on the edge."""
-        p, bent, edge = self._steihaug(radius)
-        return p, -float(np.dot(self._slope, p) + 0.5 * np.dot(p, bent)) * self._height, edge
-
-    def _steihaug(self, radius):
-        p, bent = np.zeros_like(self._slope), np.zeros_like(self._slope)
-        r, d = self._slope, -self._slope
-        goal = self._forcing * norm(r)
-        for _ in range(self._limit):
-            curved = self._curved(d)
-            bend, square = float(np.dot(d, curved)), float(np.dot(r, r))
-            t = square / bend if bend > 0 else np.inf
-            if not norm(p + t * d) < radius if np.isfinite(t) else True:
-                t = _to_edge(p, d, radius if np.isfinite(radius) else max(1.0, 2 * norm(p)))
-                return p + t * d, bent + t * curved, True
-            p, bent, r = p + t * d, bent + t * curved, r + t * curved
-            if norm(r) <= goal:
-                break
-            d = -r + float(np.dot(r, r)) / square * d
-        return p, bent, False
+    Returns
+    -------
+    p : (n,) array
+    fall : float
+        How far the model falls.
+    edge : bool
+        Whether |p| is the radius.
+    """
+    p, bent, r, d, edge = np.zeros_like(slope), np.zeros_like(slope), slope, -slope, False
+    for _ in range(limit):
+        curvature, square = curved(d), float(np.dot(r, r))
+        bend = float(np.dot(d, curvature))
+        t = square / bend if bend > 0 else np.inf
+        edge = not (np.isfinite(t) and norm(p + t * d) < radius)
+        if edge:
+            t = _to_edge(p, d, radius if np.isfinite(radius) else max(1.0, 2 * norm(p)))
+        p, bent, r = p + t * d, bent + t * curvature, r + t * curvature
+        if edge or norm(r) <= forcing * norm(slope):
+            break
+        d = -r + float(np.dot(r, r)) / square * d
+    return p, -float(np.dot(slope, p) + 0.5 * np.dot(p, bent)), edge
 
 
 def _to_edge(p, d, radius):

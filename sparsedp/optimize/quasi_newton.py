@@ -71,31 +71,24 @@ class Quasi:
         Stuck
             When there is no lower point along the gradient either.
         """
-        here = state.trial
-        promised = []
+        here, hopeless = state.trial, False
         for kept in (state, state._replace(steps=state.steps[:0], changes=state.changes[:0])):
             step = _step(kept, trials.box)
-            promised.append(-float(np.dot(here.slope, step)))
-            trial = line_search(here, step, trials, self.line_search) if promised[-1] > 0 else None
+            promised = -float(np.dot(here.slope, step))
+            trial = line_search(here, step, trials, self.line_search) if promised > 0 else None
             if trial is not None:
                 return self._remember(kept, trial)
+            # What the quasi-Newton step promises is lost in the rounding of the loss.
+            hopeless |= kept is state and abs(promised / 2) <= 100 * here.rounding
             if not len(state.steps):
                 break
-        # What the quasi-Newton step promises is lost in the rounding of the loss.
-        hopeless = abs(promised[0] / 2) <= 100 * here.rounding
         raise Stuck("rounding" if hopeless else "the line search found no lower point")
 
     def _remember(self, state, trial):
         step = (trial.vector - state.trial.vector) / state.length
         change = trial.slope / state.height - state.trial.slope / state.height
-        state = state._replace(trial=trial)
-        if not _curved(step, change):
-            return state
-        steps, changes = (
-            np.concatenate([kept, new[None]])[-self.memory :]
-            for kept, new in ((state.steps, step), (state.changes, change))
-        )
-        return state._replace(steps=steps, changes=changes)
+        steps, changes = np.vstack([state.steps, step]), np.vstack([state.changes, change])
+        return state._replace(trial=trial, steps=steps[-self.memory :], changes=changes[-self.memory :])
 
 
 def _step(state, box):
@@ -115,7 +108,7 @@ def two_loops(g, steps, changes, scale):
 
     Source: J. Nocedal, Updating quasi-Newton matrices with limited storage, Math. Comp. 35, 1980.
     """
-    pairs = [(s, y, np.dot(s, y)) for s, y in zip(steps, changes) if _curved(s, y)]
+    pairs = [(s, y, bend) for s, y in zip(steps, changes) if (bend := np.dot(s, y)) > CURVED * norm(s) * norm(y)]
     step, shares = -g, []
     for s, y, bend in reversed(pairs):
         shares.append(np.dot(s, step) / bend)
@@ -127,10 +120,6 @@ def two_loops(g, steps, changes, scale):
     for s, y, bend in pairs:
         step = step + (shares.pop() - np.dot(y, step) / bend) * s
     return step
-
-
-def _curved(step, change):
-    return np.dot(step, change) > CURVED * norm(step) * norm(change)
 
 
 def _first_length(first):
