@@ -1,10 +1,11 @@
 r"""Convolution layers in 1-D and 2-D: one fused rule, derivatives of every order by hand.
 
 With the padded field P x the layer is  y[o, i] = sum_{c, d} w[o, c, d] (P x)[c, i + d] + b[o],  a bilinear map of x
-and w. With the trilinear form T(x, w, g) = sum g . y its derivatives are two more bilinear maps,
+and w. With the trilinear form T(x, w, g) = sum g . y there are three such maps, each of two of the three:
 
-    back(g, w):  sum_o of g against the filters turned round, then P^T: the cotangent of x;
-    weigh(x, g): correlation of P x with g: the cotangent of w;
+    0, the cotangent of x: sum_o of g against the filters turned round, then P^T;
+    1, the cotangent of w: correlation of P x with g;
+    2, y itself;
 
 and the derivatives of each of the three are the other two.
 """
@@ -110,19 +111,30 @@ def by_parts(name, forward, backs, forths):
     return Rule(name, forward, vjp, jvp)
 
 
-def _plain_linear(x, weight, padding):
-    return correlate(pad(x, weight.shape[2 - np.ndim(x) :], padding), weight)
+def _third(a, b, slot, shape, padding):
+    """Of x, w and g in T(x, w, g), slots 0, 1 and 2, what multiplies the one in a slot: made of the next two in turn.
+
+    `shape` is that of the weight.
+    """
+    dim = np.ndim(a if slot else b) - 2
+    widths = shape[-dim:]
+    if slot == 0:
+        turned = np.swapaxes(np.flip(a, tuple(range(-dim, 0))), -dim - 1, -dim - 2)
+        return fold(correlate(pad(b, [2 * width - 1 for width in widths], "zero"), turned), widths, padding)
+    if slot == 1:
+        return weigh(pad(b, widths, padding), a, shape)
+    return correlate(pad(a, widths, padding), b)
 
 
-def _plain_back(g, weight, padding):
-    dim = np.ndim(g) - 2
-    turned = np.swapaxes(np.flip(weight, tuple(range(-dim, 0))), -dim - 1, -dim - 2)
-    widths = weight.shape[-dim:]
-    return fold(correlate(pad(g, [2 * width - 1 for width in widths], "zero"), turned), widths, padding)
-
-
-def _plain_weigh(x, g, shape, padding):
-    return weigh(pad(x, shape[2 - np.ndim(x) :], padding), g, shape)
+_trilinear: Rule = by_parts(
+    "convolution, products",
+    _third,
+    (
+        lambda g, y, a, b, slot, *rest: _trilinear(b, g, (slot + 1) % 3, *rest),
+        lambda g, y, a, b, slot, *rest: _trilinear(g, a, (slot + 2) % 3, *rest),
+    ),
+    (lambda t, y, a, *rest: _trilinear(t, *rest), lambda t, y, a, b, *rest: _trilinear(a, t, *rest)),
+)
 
 
 def _spread(bias, cells):
@@ -131,7 +143,7 @@ def _spread(bias, cells):
 
 
 def _forward(x, weight, bias, padding):
-    y = _plain_linear(x, weight, padding)
+    y = _third(x, weight, 2, weight.shape, padding)
     y += _spread(bias, x.shape[2:])
     return y
 
@@ -146,44 +158,13 @@ _convolution = by_parts(
     "convolution",
     _forward,
     (
-        lambda g, y, x, weight, bias, padding: _back(g, weight, padding),
-        lambda g, y, x, weight, bias, padding: _weigh(x, g, anp.shape(weight), padding),
+        lambda g, y, x, weight, bias, padding: _trilinear(weight, g, 0, anp.shape(weight), padding),
+        lambda g, y, x, weight, bias, padding: _trilinear(g, x, 1, anp.shape(weight), padding),
         _total,
     ),
     (
-        lambda t, y, x, weight, bias, padding: _linear(t, weight, padding),
-        lambda t, y, x, weight, bias, padding: _linear(x, t, padding),
-        lambda t, y, x, weight, bias, padding: _spread(t, anp.shape(y)[2:]) + anp.zeros(anp.shape(y)),
+        lambda t, y, x, weight, bias, padding: _trilinear(t, weight, 2, anp.shape(weight), padding),
+        lambda t, y, x, weight, bias, padding: _trilinear(x, t, 2, anp.shape(weight), padding),
+        lambda t, y, x, *rest: _spread(t, anp.shape(y)[2:]) + anp.zeros(anp.shape(y)),
     ),
-)
-
-
-def _bilinear(name, forward, first, second):
-    """A bilinear rule of (a, b, *static); first(g, a, b, *static) and second are the cotangents of a and b."""
-    rule: Rule = by_parts(
-        name,
-        forward,
-        (lambda g, y, *args: first(g, *args), lambda g, y, *args: second(g, *args)),
-        (lambda t, y, a, *rest: rule(t, *rest), lambda t, y, a, b, *static: rule(a, t, *static)),
-    )
-    return rule
-
-
-_linear: Rule = _bilinear(
-    "convolution, linear part",
-    _plain_linear,
-    lambda g, x, weight, padding: _back(g, weight, padding),
-    lambda g, x, weight, padding: _weigh(x, g, anp.shape(weight), padding),
-)
-_back: Rule = _bilinear(
-    "convolution, back",
-    _plain_back,
-    lambda h, g, weight, padding: _linear(h, weight, padding),
-    lambda h, g, weight, padding: _weigh(h, g, anp.shape(weight), padding),
-)
-_weigh: Rule = _bilinear(
-    "convolution, weights",
-    _plain_weigh,
-    lambda v, x, g, shape, padding: _back(g, v, padding),
-    lambda v, x, g, shape, padding: _linear(x, v, padding),
 )
