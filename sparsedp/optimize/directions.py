@@ -11,11 +11,11 @@ import numpy as np
 
 from sparsedp.fields import check_function, is_number
 from sparsedp.optimize.flat import Packing
-from sparsedp.optimize.linearised import Linearised
+from sparsedp.optimize.linearised import Linearised, singular
 
 __all__ = ["Direction", "Family", "update_direction"]
 
-DENSE = 3e7  # entries of a Jacobian (240 MB) above which it is not formed
+DENSE, DENSE_SIDE = 3e7, 4000  # entries of a Jacobian (240 MB), and its shorter side, above which it is not formed
 SETTLED = 1e-9  # relative change of the direction at which the bidiagonalisation stops
 EXHAUSTED = 1e-13  # relative size below which a new basis vector is rounding
 CANCELLED = 0.1  # a vector of which less is left after Gram and Schmidt's pass gets a second one
@@ -79,18 +79,20 @@ class Family:
     def __call__(self, linearised, g):
         """Flat Direction for a flat cotangent g of the outputs."""
         if self.forms(*linearised.shape):
-            return self.dense(linearised.rows(), linearised.spectrum(), g)
+            return self.dense(linearised.rows(), g)
         return self.krylov(linearised, g)
 
     def forms(self, rows, columns):
         """Whether J is formed."""
-        return self.method == "dense" or (self.method == "auto" and rows * columns <= DENSE)
+        fits = rows * columns <= DENSE and min(rows, columns) <= DENSE_SIDE
+        return self.method == "dense" or (self.method == "auto" and fits)
 
-    def dense(self, jacobian, spectrum, g):
+    def dense(self, jacobian, g):
         """Direction from J itself, m x n: (J^T J + damping)^(-power) J^T g, or with J J^T where that is smaller."""
-        vectors, s = spectrum
+        wide = len(jacobian) <= jacobian.shape[1]
+        vectors, s = singular(jacobian if wide else jacobian.T)
         shares, kept = self._shares(s)
-        if len(jacobian) <= jacobian.shape[1]:
+        if wide:
             return Direction((vectors @ (shares * (g @ vectors))) @ jacobian, s, kept, "dense")
         return Direction(vectors @ (shares * (g @ jacobian @ vectors)), s, kept, "dense")
 
@@ -114,9 +116,8 @@ class Family:
             largest = max(largest, size, above[-1])
             if len(diagonal) == look:
                 before, weights = weights, self._small(diagonal, above)[0]
-                if np.linalg.norm(weights - np.pad(before, (0, look - len(before)))) <= SETTLED * np.linalg.norm(
-                    weights
-                ):
+                moved = weights - np.pad(before, (0, look - len(before)))
+                if np.linalg.norm(moved) <= SETTLED * np.linalg.norm(weights):
                     break
                 look += max(LOOK, look // 8)
         weights, s, kept = self._small(diagonal, above)

@@ -9,13 +9,14 @@ import numpy as np
 import scipy.linalg
 
 from sparsedp.fields import is_number
-from sparsedp.optimize.directions import DENSE, Family
+from sparsedp.optimize.directions import Family
 from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked
 from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.tree import norm
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 
+ROUNDING = 1e-12  # singular values below this share of the largest are taken for 0
 EXACT = 1e-9  # damping relative to |J|^2 above which the Gram matrix, with rounding 1e-16, gives 6 digits of the step
 
 
@@ -53,19 +54,11 @@ class GaussNewton:
     residuals, searches = True, True
 
     def __init__(self, apart=False, dense=None):
-        self.apart, self.dense = bool(apart), dense
+        self.apart, self.method = bool(apart), {None: "auto", True: "dense", False: "krylov"}[dense]
 
-    def forms(self, rows, columns):
-        """Whether J is formed."""
-        return rows * columns <= DENSE and min(rows, columns) <= 4000 if self.dense is None else self.dense
-
-    def step(self, linearised, damping=0.0):
-        """To the minimum of |J d + r|^2 + damping |d|^2."""
-        formed, rounding = self.forms(*linearised.shape), np.finfo(float).eps * max(linearised.shape)
-        if formed and damping > EXACT * np.linalg.norm(linearised.rows()) ** 2:
-            return -_damped(linearised.rows(), linearised.flat, damping)
-        family = Family(1.0, damping, rounding, "dense" if formed else "krylov")
-        return -family(linearised, linearised.flat).step
+    def family(self, damping=0.0):
+        """The direction to the minimum of |J d + r|^2 + damping |d|^2, backwards."""
+        return Family(1.0, damping, ROUNDING, self.method)
 
     def begin(self, first):
         """State at the start."""
@@ -73,7 +66,8 @@ class GaussNewton:
 
     def advance(self, state, trials):
         """One iteration. Raises Stuck when no lower point is found."""
-        step = self.step(trials.linearised(state.trial))
+        linearised = trials.linearised(state.trial)
+        step = -self.family()(linearised, linearised.flat).step
         trial, _ = backtracked(state.trial, step, trials, "the Gauss-Newton step")
         return state._replace(trial=trial)
 
@@ -102,33 +96,35 @@ class LevenbergMarquardt(GaussNewton):
     def advance(self, state, trials):
         """One iteration: one Jacobian, as many dampings as it takes. Raises Stuck when none is large enough."""
         here, linearised = state.trial, trials.linearised(state.trial)
-        damping, growth = state.damping or self.damping * self._largest(linearised) or 1.0, 2.0
+        formed = self.family().forms(*linearised.shape)
+        damping, growth = state.damping or self.damping * _largest(linearised, formed) or 1.0, 2.0
         for _ in range(HALVINGS):
-            step = self.step(linearised, damping)
-            end = here.vector + step
-            trial = trials(trials.box.inside(end), here.value)
-            fall = predicted = 0.5 * float(np.dot(step, damping * step - here.slope))
+            if formed and damping > EXACT * np.linalg.norm(linearised.rows()) ** 2:
+                step = -_damped(linearised.rows(), linearised.flat, damping)
+            else:
+                step = -self.family(damping)(linearised, linearised.flat).step
+            point = trials.box.inside(here.vector + step)
+            trial, change = trials(point, here.value), linearised.push(point - here.vector)
+            predicted = -float(np.dot(change, linearised.flat + 0.5 * change))
             if trial.value < here.value:
-                if not np.array_equal(trials.box.inside(end), end):  # a bound has cut the step short
-                    change = linearised.push(trial.vector - here.vector)
-                    fall = -float(np.dot(change, linearised.flat) + 0.5 * np.dot(change, change))
-                gain = (here.value - trial.value) / fall if fall > 0 else 0.0
+                gain = (here.value - trial.value) / predicted if predicted > 0 else 0.0
                 return SquaresState(trial, damping * max(1 / 3, 1 - (2 * gain - 1) ** 3))
-            if predicted <= here.rounding:
+            if abs(predicted) <= here.rounding:  # below 0 where a bound bends a long step uphill: a shorter one may do
                 break
             damping, growth = damping * growth, 2 * growth
         hopeless = predicted <= 100 * here.rounding
         raise Stuck("rounding" if hopeless else "no damping gives a lower point")
 
-    def _largest(self, linearised):
-        """The largest diagonal entry of J^T J; where J is not formed, that along the gradient."""
-        if self.forms(*linearised.shape):
-            return float(np.max(np.linalg.norm(linearised.rows(), axis=0), initial=0.0)) ** 2
-        slope = linearised.pull(linearised.flat)
-        return norm(linearised.push(slope / (norm(slope) or 1.0))) ** 2
+
+def _largest(linearised, formed):
+    """The largest diagonal entry of J^T J; where J is not formed, that along the gradient."""
+    if formed:
+        return float(np.max(np.linalg.norm(linearised.rows(), axis=0), initial=0.0)) ** 2
+    slope = linearised.pull(linearised.flat)
+    return norm(linearised.push(slope / (norm(slope) or 1.0))) ** 2
 
 
-class HalfInverse:
+class HalfInverse(GaussNewton):
     """Half-inverse gradients: J^T (J J^T)^(-3/4) r, each singular value to the power -1/2.
 
     Parameters
@@ -144,25 +140,20 @@ class HalfInverse:
     Source: P. Schnell, P. Holl, N. Thuerey, Half-inverse gradients for physical deep learning, ICLR 2022.
     """
 
-    residuals, searches = True, False
+    searches = False
 
     def __init__(self, rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto"):
         if not (is_number(rate) and 0 < rate < np.inf):
             raise ValueError(f"half_inverse needs a positive rate, got {rate!r}; the default is 1")
-        self.rate = rate
-        self.family, self.apart = Family(power, 0.0, truncation, form, rank), bool(apart)
+        self.rate, self.apart, self._family = rate, bool(apart), Family(power, 0.0, truncation, form, rank)
 
-    def forms(self, rows, columns):
-        """Whether J is formed."""
-        return self.family.forms(rows, columns)
-
-    def begin(self, first):
-        """State at the start."""
-        return SquaresState(first)
+    def family(self, damping=0.0):
+        """The direction with these options; it is not damped."""
+        return self._family
 
     def advance(self, state, trials):
         """One iteration, on the batch of the present one."""
         linearised = trials.linearised(state.trial)
-        step = -self.rate * self.family(linearised, linearised.flat).step
+        step = -self.rate * self._family(linearised, linearised.flat).step
         trial, share = admissible(state.trial.vector, step, state.share, trials)
         return SquaresState(trial, share=min(1.0, 2 * share))

@@ -35,8 +35,6 @@ class Linearised:
     vector : (n,) array
     rest : tuple
         What `outputs` is given after x.
-    forward : bool
-        No tape is made before J^T is asked for.
     apart : bool
         The outputs along axis 0 depend on nothing but their own copy of x. Then x is handed over with a leading axis
         of copies, one for each of the s samples, and m / s products with J^T give all rows.
@@ -49,14 +47,11 @@ class Linearised:
         If an output is NaN or infinite.
     """
 
-    def __init__(self, outputs, packing, vector, rest=(), forward=False, apart=False):
+    def __init__(self, outputs, packing, vector, rest=(), apart=False):
         self._outputs, self._packing, self._apart = lambda x: outputs(x, *rest), packing, apart
         self._tree, self._free = packing.unpack(vector), True
-        self._pull = self._jacobian = self._spectrum = None
-        if forward:
-            self.value = self._outputs(self._tree)
-        else:
-            self.value, self._pull = pullback(self._outputs, self._tree)
+        self._pull = self._jacobian = None
+        self.value = np.asarray(self._outputs(packing.unpack(vector)))
         if np.ndim(self.value) == 0:
             raise DerivativeError("the outputs are one number; return the residuals as an array, do not sum them")
         if np.iscomplexobj(self.value) or packing.complex:
@@ -71,7 +66,7 @@ class Linearised:
         A step that counts on unknowns which a bound then holds back is no descent for the others.
         """
         other = copy(self)
-        other._free, other._spectrum = free, None
+        other._free = free
         return self if free.all() else other
 
     def like(self, g):
@@ -91,6 +86,8 @@ class Linearised:
 
     def push(self, v):
         """(n,) -> J v, (m,)."""
+        if self._jacobian is not None:
+            return self._jacobian @ (self._free * v)
         tangents = [leaf if is_variable(leaf) else None for leaf in leaves(self._packing.unpack(self._free * v))]
         return push(self._outputs, self._tree, tangents)[1].reshape(-1).astype(float)
 
@@ -105,13 +102,6 @@ class Linearised:
             else:
                 self._jacobian = np.array([self.pull(unit) for unit in np.eye(rows)]).reshape(self.shape)
         return self._jacobian if self._free is True else self._jacobian * self._free
-
-    def spectrum(self):
-        """The singular values of J, falling, and the singular vectors of its shorter side, as columns before them."""
-        if self._spectrum is None:
-            jacobian = self.rows()
-            self._spectrum = singular(jacobian if len(jacobian) <= jacobian.shape[1] else jacobian.T)
-        return self._spectrum
 
     def covariance(self):
         """s^2 (J^T J)^(-1), n x n, with s^2 = |outputs|^2 / (m - n); infinite where J has not the rank n."""

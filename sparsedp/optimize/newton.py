@@ -92,16 +92,10 @@ def steihaug(slope, curved, radius, forcing, limit):
         t = square / bend if bend > 0 else np.inf
         edge = not (np.isfinite(t) and norm(p + t * d) < radius)
         if edge:
-            t = _to_edge(p, d, radius if np.isfinite(radius) else max(1.0, 2 * norm(p)))
+            far = radius if np.isfinite(radius) else max(1.0, 2 * norm(p))
+            t = np.max(np.roots([np.dot(d, d), 2 * np.dot(p, d), np.dot(p, p) - far**2]).real)  # |p + t d| = far
         p, bent, r = p + t * d, bent + t * curvature, r + t * curvature
         if edge or norm(r) <= forcing * norm(slope):
             break
         d = -r + float(np.dot(r, r)) / square * d
     return p, -float(np.dot(slope, p) + 0.5 * np.dot(p, bent)), edge
-
-
-def _to_edge(p, d, radius):
-    """t >= 0 with |p + t d| = radius."""
-    a, b, c = float(np.dot(d, d)), float(np.dot(p, d)), float(np.dot(p, p)) - radius**2
-    root = np.sqrt(max(b * b - a * c, 0.0))
-    return (root - b) / a if b <= 0 else -c / (b + root)

@@ -31,15 +31,15 @@ class Trials:
     batches : Batches
         What the loss is given after x; `batches.number` is moved by the loop.
     squares : method of least squares, or None
-        With one, the loss returns residuals r, and what falls is |r|^2 / 2; ``squares.forms(rows, columns)`` tells
-        whether it forms their Jacobian.
+        With one, the loss returns residuals r, and what falls is |r|^2 / 2; ``squares.family()`` tells whether their
+        Jacobian is formed.
     """
 
     best: Trial
 
     def __init__(self, loss, gradient, packing, box=None, batches=None, squares=None):
         self._loss, self._gradient, self._packing = loss, gradient, packing
-        self._squares, self._forward, self._linearised = squares, False, Cache(1)
+        self._squares, self._linearised = squares, Cache(1)
         self.box, self.batches = box or Box(), batches or Batches()
         self.count, self.failures = 0, []
 
@@ -80,16 +80,16 @@ class Trials:
             value = 0.5 * float(np.dot(here.flat, here.flat))
         if not value < below:
             return value, None
-        few = not self._squares.apart and here.shape[1] < here.shape[0]
-        self._forward = few and self._squares.forms(*here.shape)
-        return value, here.flat @ here.rows() if self._forward else here.pull(here.flat)
+        tall = not self._squares.apart and here.shape[1] < here.shape[0]
+        formed = tall and self._squares.family().forms(*here.shape)
+        return value, here.flat @ here.rows() if formed else here.pull(here.flat)
 
     def _linearise(self, vector, number):
         """The residuals and their Jacobian at a point, on the batch of an iteration; kept for the last point."""
         key = vector, number if self.batches.varied else 0
         batch = self.batches.now(self.batches.number - number)
         return self._linearised.find(key) or self._linearised.put(
-            key, Linearised(self._loss, self._packing, vector, batch, self._forward, self._squares.apart)
+            key, Linearised(self._loss, self._packing, vector, batch, self._squares.apart)
         )
 
     def _both(self, vector):
@@ -114,7 +114,7 @@ class Trials:
             return None
         here = self._linearise(trial.vector, self.batches.number)
         rows, columns = here.shape
-        enough = columns < rows and columns <= MOST and self._squares.forms(rows, columns)
+        enough = columns < rows and columns <= MOST and self._squares.family().forms(rows, columns)
         return here.covariance() if enough else None
 
     def curvature(self, trial):
