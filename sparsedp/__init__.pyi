@@ -12,10 +12,10 @@ from .conditions import no_slip as no_slip
 from .conditions import outflow as outflow
 from .conditions import robin as robin
 from .derivative import grad as grad
+from .derivative import hvp as hvp
+from .derivative import jvp as jvp
 from .derivative import value_and_grad as value_and_grad
 from .derivative import vjp as vjp
-from .direction import hvp as hvp
-from .direction import jvp as jvp
 from .flow.momentum import convection as convection
 from .flow.momentum import face_laplacian as face_laplacian
 from .flow.momentum import face_lift as face_lift

@@ -11,10 +11,10 @@ from sparsedp.fields import check_function, is_whole
 from sparsedp.recipe import Made
 from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
 from sparsedp.traces import backward, forward_root, growing, reverse_root, split_box, trace
-from sparsedp.tree import flatten
+from sparsedp.tree import copied, flatten, keys, leaves
 
-__all__ = ["NO_JVP", "directions", "forward", "grad", "pullback", "pushforward", "tangent_of", "traced",
-    "value_and_grad", "vjp", "zero_like"]  # fmt: skip
+__all__ = ["NO_JVP", "grad", "hvp", "jvp", "linearised", "pullback", "push", "pushforward", "value_and_grad", "vjp",
+    "zero_like"]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
 NO_JVP = (DerivativeError, NotImplementedError)
@@ -54,31 +54,49 @@ def pullback(fun, x):
     (5.0, 2.0)
     """
     found, rebuild = flatten(x)
-    roots = [reverse_root() if is_variable(leaf) else None for leaf in found]
-    found = [_apart_from_caller(leaf) if root else leaf for leaf, root in zip(found, roots, strict=True)]
-    if not any(roots):
+    moving = list(map(is_variable, found))
+    if not any(moving):
         kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in found})
         raise DerivativeError(
             f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write x.astype(float)"
         )
-    result, number = traced(fun, rebuild(found), roots)
-    if not _is_array(result):
-        raise DerivativeError(
-            f"the function must return one array or number, got {type(result).__name__}; sum or join it"
-        )
-    value, node = split_box(result, number)
+    found = [_apart_from_caller(leaf) if moves else leaf for leaf, moves in zip(found, moving, strict=True)]
+
+    def one_array(x):
+        result = fun(x)
+        if not _is_array(result):
+            raise DerivativeError(
+                f"the function must return one array or number, got {type(result).__name__}; sum or join it"
+            )
+        return result
+
+    (value,), _, back = linearised(one_array, rebuild(found), moving)
 
     def pull(g):
         if np.shape(g) != np.shape(value):
             raise ShapeError(f"the cotangent must have the shape {np.shape(value)} of the value, got {np.shape(g)}")
-        with growing():  # rollouts make tapes on their way back
-            cotangents = {} if node is None else backward(node, g)
-        pairs = zip(found, roots, strict=True)
-        return rebuild(
-            _apart([None if root is None else _gradient(leaf, cotangents.get(root)) for leaf, root in pairs], g)
-        )
+        slopes = zip(found, moving, back([g]), strict=True)
+        return rebuild(_apart([_gradient(leaf, slope) if moves else None for leaf, moves, slope in slopes], g))
 
     return _apart_from_caller(value), pull
+
+
+def linearised(fun, tree, moving):
+    """A function at a tree, of whose leaves some move -> (leaves of its result, how to build it, pull).
+
+    ``pull(cotangents)``: of the leaves of the result -> of the leaves of the tree; None where there is none.
+    """
+    roots = [reverse_root() if moves else None for moves in moving]
+    result, number = traced(fun, tree, roots)
+    ends, rebuild = flatten(result)
+    pairs = [split_box(end, number) for end in ends]
+
+    def pull(cotangents):
+        with growing():  # rollouts make tapes on their way back
+            found = backward([node for _, node in pairs], cotangents)
+        return [found.get(root) for root in roots]
+
+    return [value for value, _ in pairs], rebuild, pull
 
 
 def traced(fun, x, roots):
@@ -148,7 +166,7 @@ def pushforward(fun, x, tangent):
     >>> float(value), float(slope)
     (10.0, 5.0)
     """
-    return forward(fun, x, directions(x, tangent))
+    return forward(fun, x, _directions(x, tangent))
 
 
 def forward(fun, x, tangents):
@@ -173,23 +191,18 @@ def zero_like(value):
     return np.zeros(np.shape(plain(value)), dtype_of(value))[()]
 
 
-def directions(x, tangent):
+def _directions(x, tangent):
     """Tangent of each leaf of `x`, None where it is not floating; entries of dicts are paired by name."""
-    if isinstance(x, dict):
-        if not isinstance(tangent, dict) or tangent.keys() != x.keys():
-            raise ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
-        pairs = [(branch, tangent[name]) for name, branch in x.items()]
-    elif isinstance(x, (tuple, list)):
-        if not isinstance(tangent, (tuple, list)) or len(tangent) != len(x):
-            raise ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
-        pairs = list(zip(x, tangent, strict=True))
-    else:
-        if not is_variable(x):
-            return [None]
-        if not _is_array(tangent) or np.shape(tangent) != np.shape(x):
-            raise ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
-        return [tangent]
-    return [leaf for branch, other in pairs for leaf in directions(branch, other)]
+    names, error = keys(x), ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
+    if names is not None:
+        if keys(tangent) != names:
+            raise error
+        return [leaf for name in names for leaf in _directions(x[name], tangent[name])]
+    if not is_variable(x):
+        return [None]
+    if not _is_array(tangent) or np.shape(tangent) != np.shape(x):
+        raise error
+    return [tangent]
 
 
 def _is_array(value):
@@ -203,6 +216,98 @@ def _words(tree):
     if isinstance(tree, (tuple, list)):
         return f"a {type(tree).__name__} of length {len(tree)}"
     return f"an array of shape {np.shape(tree)}" if _is_array(tree) else type(tree).__name__
+
+
+def jvp(fun, x, tangent):
+    """Function of a tree -> its value and its directional derivative.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(x)``; its result may be a tree.
+    x, tangent : trees of arrays of the same structure
+        The tangent of a leaf that is not floating is ignored.
+
+    Returns
+    -------
+    (value, tangent of value)
+
+    Raises
+    ------
+    TypeError
+        If `fun` is not a function.
+    ShapeError
+        If the tangent has another structure than `x`, or a leaf of it another shape.
+
+    Notes
+    -----
+    Forward mode; by two reverse passes where a part of `fun` has no forward derivative.
+
+    Examples
+    --------
+    >>> value, slope = jvp(lambda x: x[0] * x[1], (2.0, 5.0), (1.0, 0.0))
+    >>> float(value), float(slope)
+    (10.0, 5.0)
+    """
+    check_function("jvp", fun, "lambda u: ...")
+    return copied(push(fun, x, _directions(x, tangent)))  # the caller may write into x, the tangent and the results
+
+
+def hvp(loss, x, tangent):
+    """Scalar loss of a tree, a direction -> the Hessian of the loss times the direction.
+
+    Parameters
+    ----------
+    loss : callable
+        ``loss(x) -> real scalar``.
+    x, tangent : trees of arrays of the same structure
+        The tangent of a leaf that is not floating is ignored.
+
+    Returns
+    -------
+    tree like x
+        None at leaves that are not floating.
+
+    Raises
+    ------
+    TypeError, ShapeError, DerivativeError
+        As `jvp` and `value_and_grad`.
+
+    Examples
+    --------
+    >>> hvp(lambda x: x[0] ** 2 * x[1], (2.0, 5.0), (1.0, 0.0))
+    (10.0, 4.0)
+    """
+    product = jvp(grad(loss), x, tangent)[1]
+    found, rebuild = flatten(product)
+    return rebuild([float(p) if isinstance(u, float) and not isbox(p) else p for p, u in zip(found, leaves(x))])
+
+
+def push(fun, tree, tangents):
+    """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants).
+
+    Forward, or by two reverse passes where a part of `fun` has no JVP.
+    """
+    try:
+        return forward(fun, tree, tangents)
+    except NO_JVP:
+        if any(dtype_of(t).kind == "c" for t in tangents if t is not None):
+            raise
+        return _twice_reverse(fun, tree, tangents)
+
+
+def _twice_reverse(fun, tree, tangents):
+    """The pullback z -> J^T z is linear, so the gradient in z of <J^T z, tangent> is J tangent."""
+    values, rebuild, pull = linearised(fun, tree, [tangent is not None for tangent in tangents])
+    moving = list(map(is_variable, values))
+
+    def paired(z):
+        pairs = zip(pull(z), tangents, strict=True)
+        return sum((anp.sum(back * tangent) for back, tangent in pairs if back is not None), 0.0)
+
+    zeros = [zero_like(value) if moves else None for value, moves in zip(values, moving, strict=True)]
+    slopes = linearised(paired, zeros, moving)[2]([1.0])
+    return rebuild(values), rebuild(map(tangent_of, values, slopes))
 
 
 def vjp(fun, *x):

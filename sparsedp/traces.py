@@ -156,11 +156,24 @@ def split_box(value, number):
     return (value._value, value._node) if isbox(value) and value._trace == number else (value, None)
 
 
-def backward(end, g):
-    """Accumulate cotangents from the node `end` to the roots; return {root: cotangent}."""
-    cotangents = {end: (g, False)}
-    accumulate(cotangents, toposort(end))
-    return {root: g for root, (g, _) in cotangents.items()}
+class _Ends:
+    """Stands for the last node of a graph with several results: hands each its cotangent."""
+
+    def __init__(self, pairs):
+        self.parents, self._cotangents = [node for node, _ in pairs], [g for _, g in pairs]
+
+    def vjp(self, g):
+        """The cotangents, in the order of the results."""
+        return self._cotangents
+
+
+def backward(nodes, cotangents):
+    """Accumulate cotangents from nodes to the roots, where neither is None; return {root: cotangent}."""
+    pairs = zip(nodes, cotangents, strict=True)
+    end = _Ends([(node, g) for node, g in pairs if node is not None and g is not None])
+    found = {end: (None, False)}
+    accumulate(found, toposort(end))
+    return {root: g for root, (g, _) in found.items()}
 
 
 def accumulate(cotangents, nodes):

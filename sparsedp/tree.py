@@ -9,7 +9,7 @@ from math import hypot, isfinite
 import numpy as np
 import scipy.sparse as sp
 
-__all__ = ["copied", "flatten", "leaves", "mapped", "norm"]
+__all__ = ["copied", "flatten", "keys", "leaves", "mapped", "norm"]
 
 
 def flatten(tree):
@@ -108,15 +108,20 @@ def norm(tree):
     return largest * hypot(*(float(np.linalg.norm(a / largest)) for a in arrays))
 
 
+def keys(tree):
+    """The keys of the branches of a tree; None of a leaf."""
+    if isinstance(tree, dict):
+        return tree.keys()
+    return range(len(tree)) if isinstance(tree, (tuple, list)) else None
+
+
 def _collect(tree, found):
-    if isinstance(tree, (tuple, list)):
-        for branch in tree:
-            _collect(branch, found)
-    elif isinstance(tree, dict):
-        for branch in tree.values():
-            _collect(branch, found)
-    else:
+    names = keys(tree)
+    if names is None:
         found.append(tree)
+    else:
+        for name in names:
+            _collect(tree[name], found)
 
 
 def _build(tree, values):

@@ -19,8 +19,7 @@ from sparsedp.check.judge import (
 from sparsedp.check.progress import shown
 from sparsedp.check.summary import Result, table
 from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, default_steps, generator
-from sparsedp.derivative import value_and_grad
-from sparsedp.direction import hvp
+from sparsedp.derivative import hvp, value_and_grad
 from sparsedp.fields import check_function, is_whole
 
 __all__ = ["Audit", "gradient"]

@@ -13,8 +13,7 @@ import numpy as np
 from sparsedp.check.properties import facts_of
 from sparsedp.check.summary import Row, Summary
 from sparsedp.check.sweep import generator
-from sparsedp.derivative import pullback, pushforward
-from sparsedp.direction import hvp
+from sparsedp.derivative import hvp, pullback, pushforward
 from sparsedp.errors import DerivativeError
 from sparsedp.operators.given import check_operator
 from sparsedp.structure.base import Matrix, result_dtype

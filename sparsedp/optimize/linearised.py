@@ -5,8 +5,7 @@ from copy import copy
 import numpy as np
 import scipy.linalg
 
-from sparsedp.derivative import pullback
-from sparsedp.direction import push
+from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite
 from sparsedp.optimize.flat import power_of_two

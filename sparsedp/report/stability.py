@@ -12,7 +12,7 @@ import numpy as np
 
 from sparsedp.check.summary import Result, table
 from sparsedp.check.sweep import Point, joined
-from sparsedp.direction import jvp
+from sparsedp.derivative import jvp
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
 from sparsedp.tree import flatten, leaves, norm

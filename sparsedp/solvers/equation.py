@@ -6,8 +6,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import constant
-from sparsedp.derivative import pullback
-from sparsedp.direction import push
+from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.space import Space

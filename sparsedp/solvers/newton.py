@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.direction import push
+from sparsedp.derivative import push
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import check_finite
 from sparsedp.solvers.direct import DENSE_UP_TO

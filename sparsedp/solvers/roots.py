@@ -19,8 +19,7 @@ from zlib import crc32
 
 import numpy as np
 
-from sparsedp.derivative import pullback
-from sparsedp.direction import push
+from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import tell, thread

@@ -10,13 +10,13 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import constant
-from sparsedp.direction import pull_ends
+from sparsedp.derivative import linearised
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import frozen
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
-from sparsedp.traces import reverse_root, split_box, trace, traces_of
+from sparsedp.traces import traces_of
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask
-from sparsedp.tree import flatten, leaves
+from sparsedp.tree import flatten
 
 __all__ = ["All", "Each", "Last"]
 
@@ -120,7 +120,6 @@ class Each:
         self.layout, self.function = layout, function
         self._stacks: dict = {}
         self._trees: list = []
-        self._groups: dict = {}
         self._marks: list = []  # of what the function returned, where it will be called again
         self._outer, self._compared = set(), False
 
@@ -136,7 +135,7 @@ class Each:
             refuse_mask("keep returned a masked array", plain(leaf))
         places = [self._store(leaf) if is_variable(leaf) else None for leaf in found]
         if self._compared:
-            self._compare(state.i, [_marked(leaf) for leaf, place in zip(found, places, strict=True) if place])
+            self._compare(state.i, found)
         others = constant([None if place else leaf for leaf, place in zip(found, places, strict=True)])
         self._trees.append((flatten(rebuild(others))[1], others, places))
         return state
@@ -148,13 +147,14 @@ class Each:
                 "keep uses a traced value that is not part of the state, and its derivative would be lost; "
                 "return what it needs of the state, and combine the two outside of rollout"
             )
-        key = _sort(leaf)
+        key = np.shape(leaf), dtype_of(leaf).char
         stack = self._stacks.setdefault(key, [])
         stack.append(owned(leaf))
         return list(self._stacks).index(key), len(stack) - 1
 
-    def _compare(self, i, marks):
+    def _compare(self, i, found):
         """Refuse a function that returns something else for a state than it did before."""
+        marks = [_marked(leaf) for leaf in found if is_variable(leaf)]
         if i == len(self._marks):
             self._marks.append(marks)
         elif self._marks[i] != marks:
@@ -165,7 +165,6 @@ class Each:
     def finish(self):
         """The arrays to hand out: one for each shape and dtype."""
         stacks, self._stacks = self._stacks, {}
-        self._groups = {key: number for number, key in enumerate(stacks)}
         return tuple((anp if any(map(isbox, stack)) else np).stack(stack) for stack in stacks.values())
 
     def tree(self, outputs):
@@ -177,31 +176,17 @@ class Each:
 
     def source(self, n, g):
         """Cotangents of the stacks -> function (index, variables, statics) -> cotangents of a state."""
-        counters = [len(stack) for stack in g]
 
         def at(i, values, statics):
-            return self._pull(i, values, statics, g, counters)
+            moving = self.layout.spread([True] * len(values))
+            state = self.layout.build(values, statics)
+            ends, _, pull = linearised(lambda tree: self.function(i, tree), state, moving)
+            self._compare(i, ends)
+            places = self._trees[i][2]
+            found = pull([g[place[0]][place[1]] if place else None for place in places])
+            return [found[place] for place in self.layout.places]
 
         return at
-
-    def _pull(self, i, values, statics, g, counters):
-        roots = [reverse_root() for _ in values]
-        state = self.layout.build(values, statics)
-        result, number = trace(lambda tree: self.function(i, tree), state, self.layout.spread(roots))
-        nodes, slopes = [], []
-        ends = [split_box(leaf, number) for leaf in leaves(result) if is_variable(leaf)]
-        self._compare(i, [_marked(value) for value, _ in ends])
-        for value, node in reversed(ends):
-            group = self._groups[_sort(value)]
-            counters[group] -= 1
-            if node is not None:
-                nodes.append(node)
-                slopes.append(g[group][counters[group]])
-        return pull_ends(nodes, slopes, roots)
-
-
-def _sort(value):
-    return np.shape(value), dtype_of(value).char
 
 
 def _marked(value):

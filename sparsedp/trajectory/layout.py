@@ -10,7 +10,7 @@ from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.traces import traces_of
-from sparsedp.tree import flatten
+from sparsedp.tree import flatten, keys
 
 __all__ = ["Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask"]
 
@@ -119,15 +119,15 @@ class Layout:
 
     def _collect(self, wanted, tree, path, when, found):
         """The leaves of a tree, at a path of keys; refused where it branches otherwise than `wanted`."""
-        keys = _keys(wanted)
-        if _keys(tree) != keys:
-            form = _kind(wanted) if keys is not None else "one array" if self.bare else "one leaf"
+        names = keys(wanted)
+        if keys(tree) != names:
+            form = _kind(wanted) if names is not None else "one array" if self.bare else "one leaf"
             raise ShapeError(_changed(_at(self.root, path), form, _kind(tree), when))
-        if keys is None:
+        if names is None:
             found.append(tree)
             return
-        for key in keys:
-            self._collect(wanted[key], tree[key], (*path, key), when, found)
+        for name in names:
+            self._collect(wanted[name], tree[name], (*path, name), when, found)
 
     def check(self, values, when, outer=frozenset()):
         """Values of the variables after a step -> the same, contiguous; refuse another shape or dtype.
@@ -232,19 +232,12 @@ def _bits(value):
     return hash((flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes(), flat[end:].tobytes()))
 
 
-def _keys(tree):
-    """The keys of the branches; None of a leaf."""
-    if isinstance(tree, dict):
-        return tree.keys()
-    return range(len(tree)) if isinstance(tree, (tuple, list)) else None
-
-
 def _labels(tree, root, path=()):
     """Names of all leaves, from left to right."""
-    keys = _keys(tree)
-    if keys is None:
+    names = keys(tree)
+    if names is None:
         return [_at(root, path)]
-    return [label for key in keys for label in _labels(tree[key], root, (*path, key))]
+    return [label for name in names for label in _labels(tree[name], root, (*path, name))]
 
 
 def _at(root, path):
