@@ -10,11 +10,11 @@ from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.fields import check_function, is_whole
 from sparsedp.recipe import Made
 from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
-from sparsedp.traces import backward, forward_root, growing, reverse_root, split_box, trace
+from sparsedp.traces import backward, boxed, forward_root, growing, new_trace, reverse_root, split_box
 from sparsedp.tree import copied, flatten, keys, leaves
 
-__all__ = ["NO_JVP", "grad", "hvp", "jvp", "linearised", "pullback", "push", "pushforward", "value_and_grad", "vjp",
-    "zero_like"]  # fmt: skip
+__all__ = ["NO_JVP", "grad", "hvp", "jvp", "linearised", "pullback", "push", "pushforward", "traced", "value_and_grad",
+    "vjp", "zero_like"]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
 NO_JVP = (DerivativeError, NotImplementedError)
@@ -99,11 +99,16 @@ def linearised(fun, tree, moving):
     return [value for value, _ in pairs], rebuild, pull
 
 
-def traced(fun, x, roots):
-    """`tape.trace`, with a word of advice where NumPy, math or Python refuse a traced value."""
+def traced(fun, tree, roots):
+    """fun(tree) with a box for every root -> (the tree of results, the number of the trace).
+
+    With a word of advice where NumPy, math or Python refuse a traced value.
+    """
+    found, rebuild = flatten(tree)
+    number = new_trace()
     try:
         with growing():
-            return trace(fun, x, roots)
+            return fun(rebuild(boxed(found, roots, number))), number
     except (TypeError, ValueError, AttributeError) as error:
         said = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
         if isinstance(error, SparsedpError) or not any("ArrayBox" in words for words in said):

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import autograd.numpy as anp
 import numpy as np
 
-__all__ = ["added", "along", "arithmetic", "direct", "install"]
+__all__ = ["added", "along", "arithmetic", "direct", "install", "noted"]
 
 FLOAT = np.dtype(float)
 REAL = {np.ndarray, np.float64, float, int}
@@ -73,17 +73,25 @@ def direct(primitive, raw, boxes, new_box):
         nums = [num for num, arg in enumerate(args) if type(arg) in boxes]
         if not nums:
             return raw(*args)
-        trace, values, parents = args[nums[0]]._trace, list(args), []
+        trace = args[nums[0]]._trace
         for num in nums:
             box = args[num]
-            values[num] = box._value
-            if box._trace != trace or type(values[num]) in boxes:
+            if box._trace != trace or type(box._value) in boxes:
                 return primitive(*args)
-            parents.append(box._node)
-        ans = raw(*values)
-        return new_box(ans, trace, type(parents[0])(ans, primitive, tuple(values), {}, tuple(nums), tuple(parents)))
+        return noted(primitive, raw, args, nums, new_box)
 
     return call
+
+
+def noted(primitive, raw, args, nums, new_box):
+    """A call whose arguments `nums` are on one trace: `raw` of what is below it, and a node for `primitive`."""
+    values, parents = list(args), []
+    for num in nums:
+        values[num] = args[num]._value
+        parents.append(args[num]._node)
+    ans = raw(*values)
+    node = type(parents[0])(ans, primitive, tuple(values), {}, tuple(nums), tuple(parents))
+    return new_box(ans, args[nums[0]]._trace, node)
 
 
 def install(boxes, new_box):

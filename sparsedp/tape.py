@@ -19,7 +19,7 @@ from sparsedp.constants import constant_args, sparing
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, tell, timed
 from sparsedp.recipe import Remade
-from sparsedp.shortcuts import NUMBERS, direct
+from sparsedp.shortcuts import NUMBERS, direct, noted
 from sparsedp.tree import leaves
 
 __all__ = [
@@ -144,7 +144,7 @@ def _run(rule, *args):
             raise DerivativeError(
                 f"{rule.name} got a traced value inside a {type(arg).__name__}; pass it as an argument"
             )
-    return timed(rule.name, "forward", rule.forward, *args) if active else rule.forward(*args)
+    return timed(rule.name, "forward", rule.forward, *args)
 
 
 _primitive = primitive(_run)
@@ -156,15 +156,8 @@ def through(rule, *args):
 
     Only the innermost trace, if it is a reverse-mode one, gets a node; all others go through those functions.
     """
-    nums, values = innermost(args), list(args)
-    for num in nums:
-        values[num] = args[num]._value
-    ans = _run(rule, *values)
-    if not nums:
-        return ans
-    parents, places = tuple(args[num]._node for num in nums), tuple(num + 1 for num in nums)
-    node = type(parents[0])(ans, through, (rule, *values), {}, places, parents)
-    return new_box(ans, args[nums[0]]._trace, node)
+    nums = [num + 1 for num in innermost(args)]
+    return noted(through, _run, (rule, *args), nums, new_box) if nums else _run(rule, *args)
 
 
 def innermost(values):
@@ -184,8 +177,7 @@ def _call_vjp(argnums, ans, args, kwargs):
     pull = rule.vjp(nums, ans, *values)
 
     def checked_pull(g):
-        back = timed(rule.name, "vjp", pull, g) if active else pull(g)
-        return _checked(rule.name, [values[num] for num in nums], back, g)
+        return _checked(rule.name, [values[num] for num in nums], timed(rule.name, "vjp", pull, g), g)
 
     return checked_pull
 
@@ -285,7 +277,7 @@ def _set_linear(rule, transposed):
 
 
 def _apply(op, u):
-    return timed(op.name, "forward", op.apply, u) if active else op.apply(u)
+    return timed(op.name, "forward", op.apply, u)
 
 
 _operator = primitive(_apply)
@@ -297,7 +289,7 @@ def _operator_vjp(argnums, ans, args, kwargs):
 
     def pull(g, dtype=u.dtype):
         act = partial(apply_operator, op.T) if isbox(g) else op.T.apply
-        back = timed(op.name, "vjp", act, g) if active else act(g)
+        back = timed(op.name, "vjp", act, g)
         return (back if back.dtype == dtype else cast(back, dtype),)
 
     return pull

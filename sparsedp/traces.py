@@ -14,7 +14,6 @@ from autograd.tracer import box_types, isbox, new_box, notrace_primitives, topos
 from sparsedp.constants import constant, constant_args, sparing
 from sparsedp.ledger import thread
 from sparsedp.shortcuts import ARRAY, COPY, ITEM, NUMBERS, Part, added, along, arithmetic, install
-from sparsedp.tree import flatten
 
 __all__ = [
     "ReverseNode",
@@ -26,7 +25,6 @@ __all__ = [
     "new_trace",
     "reverse_root",
     "split_box",
-    "trace",
     "traces_of",
     "untraced",
 ]
@@ -137,13 +135,6 @@ def traces_of(values):
             numbers.add(value._trace)
             value = value._value
     return numbers
-
-
-def trace(fun, tree, roots):
-    """Run fun(tree) with one box for every root; return the tree of results and the trace number."""
-    found, rebuild = flatten(tree)
-    number = new_trace()
-    return fun(rebuild(boxed(found, roots, number))), number
 
 
 def boxed(values, roots, number):

@@ -185,10 +185,11 @@ def _kind(keep, layout):
 def _check_values(loop, args, traced):
     for layout, values in zip(loop.layouts, loop.split(args), strict=False):
         layout.check_finite([plain(value) for value in values], "rollout")
-        for name, value in zip(layout.names, values, strict=True):
+        for number, value in enumerate(values):
             if dtype_of(value).kind not in "fc":
                 raise DerivativeError(
-                    f"{name} of rollout is traced but holds {dtype_of(value)}; derivatives need floating numbers"
+                    f"{layout.names[number]} of rollout is traced but holds {dtype_of(value)}; "
+                    "derivatives need floating numbers"
                 )
     if traced and not loop.state.places:
         kinds = ", ".join(sorted({str(dtype_of(leaf)) for leaf in loop.state.statics if leaf is not None}))

@@ -51,17 +51,16 @@ class Layout:
     def __init__(self, tree, root):
         self.root, self.bare = root, is_variable(tree) and not isinstance(tree, np.ma.MaskedArray)
         found, rebuild = flatten(tree)
-        self.labels = _labels(tree, root)
-        for label, leaf in zip(self.labels, found, strict=True):
-            refuse_mask(f"rollout takes plain arrays, got a masked array as {label}", leaf)
         self.places = [place for place, leaf in enumerate(found) if is_variable(leaf)]
         variables = [plain(found[place]) for place in self.places]
         self.statics = self._others(found)
         # Rebuilt without the variables: what is kept must not hold a trace or a large array.
         self._template = rebuild(self.statics)
         self._rebuild = flatten(self._template)[1]
+        for number, leaf in enumerate(found):
+            if isinstance(leaf, np.ma.MaskedArray):
+                refuse_mask(f"rollout takes plain arrays, got a masked array as {self.labels[number]}", leaf)
         self.open = _is_open(tree)
-        self.names = [self.labels[place] for place in self.places]
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
         self.shapes = [np.shape(leaf) for leaf in variables]
         self.dtypes = [dtype_of(leaf) for leaf in variables]
@@ -69,6 +68,16 @@ class Layout:
     def _others(self, found):
         """All leaves, None in place of the variables, as constants."""
         return tuple(map(constant, self._filled(found, [None] * len(self.places))))
+
+    @cached_property
+    def labels(self):
+        """Names of all leaves."""
+        return _labels(self._template, self.root)
+
+    @property
+    def names(self):
+        """Names of the variables."""
+        return [self.labels[place] for place in self.places]
 
     @cached_property
     def nbytes(self):
@@ -165,9 +174,9 @@ class Layout:
 
     def check_finite(self, values, owner):
         """Refuse NaN and infinity in plain variables: leaf, first index, count."""
-        for name, value in zip(self.names, values, strict=True):
+        for number, value in enumerate(values):
             if not surely_finite(value):
-                check_finite(f"{name} of {owner}", value)
+                check_finite(f"{self.names[number]} of {owner}", value)
 
     def is_finite(self, values):
         """Whether all variables are finite."""
