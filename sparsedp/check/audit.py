@@ -11,9 +11,8 @@ from sparsedp.check.judge import (
     PROVED,
     at_kinks,
     curvature,
-    examined,
-    explained,
     forward_mode,
+    looked_at,
     verdict,
 )
 from sparsedp.check.progress import shown
@@ -30,7 +29,6 @@ SHIFT = 7, 2.0**-6  # seed and length of the step to the point where a kinked lo
 LOOSE = 1e-8  # a tolerance of solves above this may explain any gap that no call is to blame for
 QUICK = ("random 1", "gradient")  # the directions of a quick audit
 LEFT_OUT = "other directions, single leaves and entries, complex steps and the Hessian product were not looked at"
-UNDERFLOW = 1e-303  # differences of a loss that changes by less are not normal numbers
 FORGIVEN = 1e3  # tolerances of the solves inside that the modes may differ by; beyond, no solve is to blame
 APART = 1e-10  # of the derivative: what rounding leaves of a complex step
 TINY_STEP = 2.0**-100  # of a complex step, in units of x: its square is lost beside x
@@ -121,7 +119,7 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
     if steps is not None and (len(set(chosen)) < FEWEST_STEPS or not all(0 < step < math.inf for step in chosen)):
         raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {chosen}")
     point, count = Point(x), min(directions, 1) if quick else directions
-    chosen, names = chosen or default_steps(point.eps), QUICK if quick else None
+    chosen, names = chosen or default_steps(point.eps), QUICK.__contains__ if quick else None
     lines = len(point.directions(point.vector, count, generator(0), names))
     with shown(3 + POINTS * min(lines, 2) + 2 * len(chosen) * lines) as tick:
         return _audit(Trials(loss, point, tick), gradient, chosen, steps is None, count, generator(rng), names)
@@ -131,7 +129,7 @@ def _audit(trials, gradient, steps, extend, count, rng, quick):
     """The audit; `quick`: names of its directions, or None for all."""
     loss, point, taped, hessian, culprit = trials.loss, trials.point, gradient is None, None, None
     slope = (lambda tree: value_and_grad(loss)(tree)[1]) if taped else gradient
-    judged, doubts = _looked_at(trials, slope, steps, extend, count, rng, quick)
+    judged, doubts = looked_at(trials, slope, steps, extend, count, rng, quick)
     if at_kinks(judged) and callable(slope):
         _look_beside(trials, slope, judged)
     random = judged[:count]
@@ -158,43 +156,9 @@ def _audit(trials, gradient, steps, extend, count, rng, quick):
         reason = notes[-1] if outcome == "agrees" else reason
     digits = [int(one.digits) for one in judged if outcome == "agrees" and one.word in PROVED]
     return Audit(
-        verdict=outcome,
-        reason=reason,
-        digits=min(digits, default=None),
-        culprit=culprit,
-        hessian=hessian,
-        value=trials.base,
-        evaluations=trials.count,
-        size=point.size,
-        notes=tuple(notes),
-        lines=tuple(judged),
-    )
-
-
-def _looked_at(trials, slope, steps, extend, count, rng, names=None):
-    """Judgements along all directions (none where loss or gradient is not finite), and the doubts before them."""
-    point, doubts = trials.point, []
-    trials.start()
-    if not math.isfinite(trials.base):
-        doubts.append(("unsound", f"the loss is {trials.base} at x"))
-    elif trials.value(point.tree()) != trials.base:
-        doubts.append(("unsound", "two evaluations of the loss differ: it is not deterministic"))
-    with np.errstate(all="ignore"):
-        vector, again = (point.gradient(slope(point.tree()) if callable(slope) else slope) for _ in range(2))
-    trials.gradient = vector
-    if not np.array_equal(vector, again, equal_nan=True):
-        doubts.append(("unsound", "two evaluations of the gradient differ: it is not deterministic"))
-    if 0 < np.max(np.abs(vector * point.units), initial=0.0) < UNDERFLOW:
-        doubts.append(("unsound", f"the loss changes by less than {UNDERFLOW:g}: it underflows, scale it"))
-    for name, values in zip(point.names, point.arrays(vector)):
-        if not np.all(np.isfinite(values)):
-            doubts.append(("broken", f"the gradient of {name} holds NaN or infinity"))
-    if not (math.isfinite(trials.base) and np.all(np.isfinite(vector))):
-        return [], doubts
-    judged = examined(trials, point.directions(vector, count, rng, names), steps, extend)
-    for one in judged if callable(slope) else ():
-        explained(one, slope)
-    return judged, doubts
+        verdict=outcome, reason=reason, digits=min(digits, default=None), culprit=culprit, hessian=hessian,
+        value=trials.base, evaluations=trials.count, size=point.size, notes=tuple(notes), lines=tuple(judged),
+    )  # fmt: skip
 
 
 def _look_beside(trials, slope, judged):
@@ -206,7 +170,7 @@ def _look_beside(trials, slope, judged):
     away = point.directions(point.vector, 1, generator(SHIFT[0]))[0][1]
     with suppress(*REFUSALS):
         other = Trials(trials.loss, Point(point.tree(point.vector + SHIFT[1] * away)), trials.tick)
-        found = _looked_at(other, slope, default_steps(point.eps), True, RANDOM, generator(None))
+        found = looked_at(other, slope, default_steps(point.eps), True, RANDOM, generator(None))
         if verdict(*found)[0] != "disagrees":
             for one in judged:
                 if one.word in ("outside", "disagrees"):

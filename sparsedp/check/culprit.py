@@ -7,7 +7,7 @@ any loss. An Operator is linear: <A u, g> - <u, A^T g> and A (u + v) - A u - A v
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.check.judge import examined, forward_mode
+from sparsedp.check.judge import forward_mode, looked_at
 from sparsedp.check.nodes import witnessed
 from sparsedp.check.operators import fault_of, field
 from sparsedp.check.sweep import Point, Trials, default_steps, generator
@@ -103,16 +103,12 @@ def _wrong_rule(node, rng):
     def loss(values):
         return anp.sum(anp.real(g * node.again(values)))
 
-    trials = Trials(loss, point)
-    trials.start()
-    if not np.isfinite(trials.base):
-        return ""
-    trials.gradient = point.gradient(value_and_grad(loss)(point.tree())[1])
-    if not np.all(np.isfinite(trials.gradient)):
-        return "its VJP gives NaN or infinity"
     # In each argument alone, and the largest entry: a loss of many entries hides single ones.
-    directions = [pair for pair in point.directions(trials.gradient, DIRECTIONS, rng) if pair[0] not in SKIPPED]
-    judged = examined(trials, directions, default_steps(point.eps), True)
+    slope, steps = lambda tree: value_and_grad(loss)(tree)[1], default_steps(point.eps)
+    wanted = lambda name: name not in SKIPPED
+    judged, doubts = looked_at(Trials(loss, point), slope, steps, True, DIRECTIONS, rng, wanted)
+    if "broken" in dict(doubts):
+        return "its VJP gives NaN or infinity"
     for one in judged:
         if one.word == "disagrees":
             return f"its VJP is {one.note}" if one.note.startswith("off") else one.note

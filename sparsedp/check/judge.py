@@ -24,17 +24,7 @@ from sparsedp.check.summary import Result
 from sparsedp.check.sweep import REFUSALS, Line, noise_of
 from sparsedp.derivative import NO_JVP, pushforward
 
-__all__ = [
-    "PROVED",
-    "Judgement",
-    "at_kinks",
-    "curvature",
-    "examined",
-    "explained",
-    "forward_mode",
-    "judgement",
-    "verdict",
-]
+__all__ = ["PROVED", "at_kinks", "curvature", "forward_mode", "judgement", "looked_at", "verdict"]
 
 RESOLVED = 1e-3  # an error bar above this share of the derivative proves nothing
 AGREED = 1e-8  # a gap below this share is agreement, whatever the bar
@@ -42,6 +32,7 @@ NOISY = 1e-6  # the same behind a solve that the ledger shows, or in noise: what
 LEFT = 1e-9  # a gap below this share of the loss may be what a solve leaves: not wrong, but not right either
 LOOSE = 10.0  # the same in units of the tolerance of the solves, where that is looser
 PER_NOISE = 1e4  # between the two: this multiple of the measured noise of the loss
+UNDERFLOW = 1e-303  # differences of a loss that changes by less are not normal numbers
 VANISHED = 1e-6  # a derivative and bar below this share of the curvature are 0
 FAR, NEAR = 10.0, 3.0  # gap over bar: beyond FAR it is wrong, below NEAR it is right
 FINEST = 5  # levels that tell the noise of the loss
@@ -165,14 +156,14 @@ def verdict(judged, doubts):
     """Judgements of all directions and doubts, pairs of word and reason -> (verdict, reason in words)."""
     largest = max((one.scale for one in judged), default=0.0)
     known = [(word, reason, np.inf) for word, reason in doubts]
-    for one in judged:
-        if not (one.word in ("noise", "masked", "few") and _negligible(one, largest)):
-            weight = abs(one.gap) / one.scale if one.wrong else 0.0
-            known.append((one.word, f"along {one.direction}: {one.note}", weight))
+    known += [
+        (one.word, f"along {one.direction}: {one.note}", one.share if one.wrong else 0.0)
+        for one in judged if not _negligible(one, largest)
+    ]  # fmt: skip
     for words, outcome in VERDICTS:
-        members = [(weight, reason) for word, reason, weight in known if word in words]
+        members = [pair for word, *pair in known if word in words]
         if members:
-            return outcome, max(members, key=lambda pair: pair[0])[1]
+            return outcome, max(members, key=lambda pair: pair[1])[0]
     proved = {one.word for one in judged} & set(PROVED)
     if not proved:
         return "inconclusive", "the loss is constant to rounding"
@@ -181,7 +172,7 @@ def verdict(judged, doubts):
 
 def _negligible(one, largest):
     """An open direction whose derivative, by gradient and by differences, is little beside the others."""
-    if abs(one.gap) > NEAR * one.bar:
+    if one.word not in ("noise", "masked", "few") or abs(one.gap) > NEAR * one.bar:
         return False
     small = one.word == "noise" and one.resolution <= 0.1 and one.bar <= SMALL * largest
     return small or one.scale + one.bar <= NEGLIGIBLE * largest
@@ -364,14 +355,50 @@ def orders(t, remainder, usable, most=MOST):
 # ------------------------------------------------------------ all directions
 
 
-def examined(trials, directions, steps, extend):
-    """Trials and directions, pairs of name and displacement -> one Judgement for each.
+def looked_at(trials, slope, steps, extend, count, rng, wanted=None):
+    """Judgements along all directions (none where loss or gradient is not finite), and the doubts before them.
 
+    Parameters
+    ----------
+    trials : Trials
+    slope : callable or tree
+        The gradient under test.
+    steps, extend
+        As in `measured`.
+    count, rng, wanted
+        As in `Point.directions`.
+
+    Notes
+    -----
     The noise belongs to the loss, not to a direction: the larger one along the first and the last counts for all.
     """
+    point = trials.point
+    trials.start()
+    base = trials.base
+    with np.errstate(all="ignore"):
+        vector, again = (point.gradient(slope(point.tree()) if callable(slope) else slope) for _ in range(2))
+    trials.gradient = vector
+    finite, change = math.isfinite(base), np.max(np.abs(vector * point.units), initial=0.0)
+    evidence = [
+        ("unsound", not finite, f"the loss is {base} at x"),
+        ("unsound", finite and trials.value(point.tree()) != base,
+         "two evaluations of the loss differ: it is not deterministic"),
+        ("unsound", not np.array_equal(vector, again, equal_nan=True),
+         "two evaluations of the gradient differ: it is not deterministic"),
+        ("unsound", 0 < change < UNDERFLOW, f"the loss changes by less than {UNDERFLOW:g}: it underflows, scale it"),
+        *(("broken", not np.all(np.isfinite(values)), f"the gradient of {name} holds NaN or infinity")
+          for name, values in zip(point.names, point.arrays(vector))),
+    ]  # fmt: skip
+    doubts = [(word, reason) for word, holds, reason in evidence if holds]
+    if not (finite and np.all(np.isfinite(vector))):
+        return [], doubts
+    directions = point.directions(vector, count, rng, wanted)
     lines = [Line(name, direction, trials) for name, direction in directions]
     trials.noise = max(map(noise_of, lines[:1] + lines[1:][-1:]), default=0.0)
-    return [measured(line, steps, extend, line is lines[0]) for line in lines]
+    judged = [measured(line, steps, extend, line is lines[0]) for line in lines]
+    for one in judged if callable(slope) else ():
+        explained(one, slope)
+    return judged, doubts
 
 
 def at_kinks(judged):
@@ -450,21 +477,19 @@ def explained(found, gradient):
     A gradient that bends by as much as the gap, within steps over which the gap does not move the loss beyond its
     noise, belongs to a loss whose ripple no difference can see.
     """
-    line, noise = found.line, max(2.0, found.jitter) * found.line.trials.eps * abs(found.line.base)
+    line, point = found.line, found.line.point
+    reach = max(2.0, found.jitter) * line.trials.eps * abs(line.base) / found.size
 
     def bend(step):
-        ends = [line.point.tree(line.point.vector + side * line.direction) for side in (step, -step)]
-        slopes = [line.point.gradient(gradient(end)) @ line.direction for end in ends]
-        return abs(slopes[0] + slopes[1] - 2 * line.slope)
+        ends = [point.tree(point.vector + side * line.direction) for side in (step, -step)]
+        return abs(sum(point.gradient(gradient(end)) @ line.direction for end in ends) - 2 * line.slope)
 
-    for step in [times * noise / found.size for times in WITHIN] if found.word == "disagrees" else []:
+    for step in [times * reach for times in WITHIN] if found.word == "disagrees" else ():
         with suppress(*REFUSALS):
             size = bend(step) if step < NEARER * found.step else 0.0
             if size > SEES * found.size and size > 2 * bend(JUMP * step):  # at a kink it jumps, however near
-                note = (
-                    f"the gradient bends by {size / found.scale:.1e} of itself within a step of {step:.0e}: a ripple "
-                )
-                found.learn(word="ripple", note=f"{note}below the noise of the loss may explain the gap")
+                note = f"the gradient bends by {size / found.scale:.1e} of itself within a step of {step:.0e}: "
+                found.learn(word="ripple", note=f"{note}a ripple below the noise of the loss may explain the gap")
                 return
 
 

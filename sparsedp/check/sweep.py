@@ -109,7 +109,7 @@ class Point:
     def directions(self, gradient, count, rng, wanted=None):
         """Names and displacements: random ones, and structured ones that see what random ones average away.
 
-        Each leaf alone, all by the same, along the gradient, its largest entry; `wanted`: only those of these names.
+        Each leaf alone, all by the same, along the gradient, its largest entry; ``wanted(name)``: whether it is.
         """
         found = {f"random {number + 1}": self._random(rng) for number in range(count)}
         for chosen, name in enumerate(self.names if 1 < len(self.names) <= MOST_LEAVES else ()):
@@ -126,7 +126,7 @@ class Point:
             shares = slopes / largest
             found["gradient"] = self.units * shares / max(rms(shares), 0.25)
             found["largest entry"] = self.units * (np.arange(slopes.size) == np.argmax(np.abs(slopes)))
-        return [(name, way) for name, way in found.items() if np.any(way) and (wanted is None or name in wanted)]
+        return [(name, way) for name, way in found.items() if np.any(way) and (wanted is None or wanted(name))]
 
     def _random(self, rng):
         """Random displacement, of root mean square 1 in each leaf."""
