@@ -77,70 +77,45 @@ NEARER = 0.01  # steps of the plateau: within this a smooth gradient does not be
 PROVED = "agrees", "vanishes"
 
 
-# Evidence -> word and reason: the first row that holds. Where few levels are usable, only the first four can.
-WORDS = (
-    ("constant", lambda e: e.silent and e.slope == 0, "the loss does not change along this direction"),
-    (
-        "disagrees",
-        lambda e: e.silent and abs(e.slope) * e.silent > 2 * FAR * e.line.trials.eps * abs(e.line.base),
-        "the loss does not change along this direction, the gradient says it does",
-    ),
-    ("noise", lambda e: e.silent, "the rounding of the loss hides the derivative"),
-    ("few", lambda e: e.used < LEVELS, "{e.used} usable steps, at least 4 are needed ({e.refusals})"),
-    # Between two one-sided derivatives every value is a matter of convention.
-    (
-        "outside",
-        lambda e: e.beyond > FAR * (e.bar + e.uncertain) and e.beyond > RESOLVED * e.scale,
-        "outside the one-sided derivatives, off by {e.share:.1e}",
-    ),
-    ("kink", lambda e: e.split, "a kink: the one-sided derivatives differ by {e.split:.1e}, of {e.scale:.1e}"),
-    (
-        "noise",
-        lambda e: e.wrong and e.size <= e.left,
-        "off by {e.share:.1e}: solves may leave this in such a loss, tighten their rtol",
-    ),
-    # Noise that swallows the whole difference may be a chaotic loss with a right gradient.
-    (
-        "disagrees",
-        lambda e: e.wrong and (e.jitter < ROUNDING or abs(e.difference) > FAR * e.bar),
-        "off by {e.share:.1e}, with error bars of {e.resolution:.1e}",
-    ),
-    ("noise", lambda e: e.wrong, "the loss is noisy or chaotic: differences see no derivative at all"),
-    (
-        "noise",
-        lambda e: e.resolved and not e.close,
-        "off by {e.share:.1e}, with error bars of {e.resolution:.1e}: not enough to tell",
-    ),
-    (
-        "masked",
-        lambda e: e.close and e.jitter > ROUNDING and e.bar > NOISY * e.scale,
-        "noise of {e.loudness:.0e} of the loss leaves {e.digits:.0f} digits, 6 are needed",
-    ),
-    (
-        "rough",
-        lambda e: (e.close or e.zero) and e.used2 >= FEWEST and not e.rate2 >= SECOND,
-        "the second Taylor remainder is of order {e.rate2:.2f}: not twice differentiable here",
-    ),
-    (
-        "rough",
-        lambda e: (e.close or e.zero) and e.used1 >= FEWEST and not abs(e.rate1 - 1) <= FIRST,
-        "the loss changes with order {e.rate1:.2f} in the step, not 1",
-    ),
-    (
-        "few",
-        lambda e: e.close and 0 < e.used2 < FEWEST,
-        "the second Taylor remainder stands out of the noise on {e.used2} steps, 3 are needed",
-    ),
-    (
-        "few",
-        lambda e: e.close and e.used1 < FEWEST and not e.flat,
-        "the change of the loss stands out of the noise on {e.used1} steps, 3 are needed",
-    ),
-    ("agrees", lambda e: e.close and e.used1 < FEWEST, "flat: there is no climb to judge order 1 by"),
-    ("agrees", lambda e: e.close, ""),
-    ("vanishes", lambda e: e.zero, "the derivative is 0 to rounding, beside the curvature"),
-    ("noise", lambda e: True, "noise of {e.resolution:.1e} of the derivative hides it"),
-)
+def words(e):
+    """Evidence along a line -> rows of (word, whether it holds, reason): the first that holds decides.
+
+    Where few levels are usable, that is one of the first four.
+    """
+    return (
+        ("constant", e.silent and e.slope == 0, "the loss does not change along this direction"),
+        ("disagrees", e.silent and abs(e.slope) * e.silent > 2 * FAR * e.line.trials.eps * abs(e.line.base),
+         "the loss does not change along this direction, the gradient says it does"),
+        ("noise", e.silent, "the rounding of the loss hides the derivative"),
+        ("few", e.used < LEVELS, "{e.used} usable steps, at least 4 are needed ({e.refusals})"),
+        # Between two one-sided derivatives every value is a matter of convention.
+        ("outside", e.beyond > FAR * (e.bar + e.uncertain) and e.beyond > RESOLVED * e.scale,
+         "outside the one-sided derivatives, off by {e.share:.1e}"),
+        ("kink", e.split, "a kink: the one-sided derivatives differ by {e.split:.1e}, of {e.scale:.1e}"),
+        ("noise", e.wrong and e.size <= e.left,
+         "off by {e.share:.1e}: solves may leave this in such a loss, tighten their rtol"),
+        # Noise that swallows the whole difference may be a chaotic loss with a right gradient.
+        ("disagrees", e.wrong and (e.jitter < ROUNDING or abs(e.difference) > FAR * e.bar),
+         "off by {e.share:.1e}, with error bars of {e.resolution:.1e}"),
+        ("noise", e.wrong, "the loss is noisy or chaotic: differences see no derivative at all"),
+        ("noise", e.resolved and not e.close,
+         "off by {e.share:.1e}, with error bars of {e.resolution:.1e}: not enough to tell"),
+        ("masked", e.close and e.jitter > ROUNDING and e.bar > NOISY * e.scale,
+         "noise of {e.loudness:.0e} of the loss leaves {e.digits:.0f} digits, 6 are needed"),
+        ("rough", (e.close or e.zero) and e.used2 >= FEWEST and not e.rate2 >= SECOND,
+         "the second Taylor remainder is of order {e.rate2:.2f}: not twice differentiable here"),
+        ("rough", (e.close or e.zero) and e.used1 >= FEWEST and not abs(e.rate1 - 1) <= FIRST,
+         "the loss changes with order {e.rate1:.2f} in the step, not 1"),
+        ("few", e.close and 0 < e.used2 < FEWEST,
+         "the second Taylor remainder stands out of the noise on {e.used2} steps, 3 are needed"),
+        ("few", e.close and e.used1 < FEWEST and not e.flat,
+         "the change of the loss stands out of the noise on {e.used1} steps, 3 are needed"),
+        ("agrees", e.close and e.used1 < FEWEST, "flat: there is no climb to judge order 1 by"),
+        ("agrees", e.close, ""),
+        ("vanishes", e.zero, "the derivative is 0 to rounding, beside the curvature"),
+        ("noise", True, "noise of {e.resolution:.1e} of the derivative hides it"),
+    )  # fmt: skip
+
 
 # What is known at the end -> verdict: the first group with a member decides, by the member that counts most.
 VERDICTS = (
@@ -214,7 +189,8 @@ class Judgement(Result):
     _plain = (*"direction word difference slope gap bar scale step rate1 rate2 digits jitter note bend rate3".split(),)
     gap = size = share = jitter = step = rate1 = rate2 = bend = rate3 = math.nan
     bar, digits = math.inf, 0.0
-    close = wrong = zero = False
+    split = beyond = uncertain = used1 = used2 = off = jumps = math.nan
+    close = wrong = zero = resolved = flat = False
 
     __repr__ = object.__repr__
 
@@ -236,7 +212,7 @@ def judgement(line):
         known |= _taylor(**known)
     found = Judgement(**known)
     found.learn(difference=found.slope + found.gap, resolution=found.bar / found.scale)
-    word, note = first(WORDS, found)
+    word, note = first(words, found)
     found.learn(word=word, note=note)
     return found
 
@@ -335,7 +311,7 @@ def _taylor(t, changes, rests, kinks, noise, slope, size, bar, scale, step, clos
 
 def first(rows, evidence):
     """Word and reason of the first row of a table that holds."""
-    return next((word, text.format(e=evidence)) for word, holds, text in rows if holds(evidence))
+    return next((word, text.format(e=evidence)) for word, holds, text in rows(evidence) if holds)
 
 
 def both(sides):
@@ -495,13 +471,16 @@ def explained(found, gradient):
 
 # ------------------------------------------------------------ Hessian products
 
-HESSIANS = (
-    ("agrees", lambda e: not e.used3, "is noise"),
-    ("inconclusive", lambda e: e.used3 < FEWEST, "stands out of the noise on {e.used3} steps, 3 are needed"),
-    ("agrees", lambda e: e.rate3 >= THIRD, "of order {e.rate3:.2f}"),
-    ("inconclusive", lambda e: e.rate3 > WRONG or e.jumps, "of order {e.rate3:.2f}: not three times differentiable"),
-    ("disagrees", lambda e: True, "of order {e.rate3:.2f}: it is off by {e.off:.1e}"),
-)
+
+def orders_of_hessians(e):
+    """The same for a Hessian product."""
+    return (
+        ("agrees", not e.used3, "is noise"),
+        ("inconclusive", e.used3 < FEWEST, "stands out of the noise on {e.used3} steps, 3 are needed"),
+        ("agrees", e.rate3 >= THIRD, "of order {e.rate3:.2f}"),
+        ("inconclusive", e.rate3 > WRONG or e.jumps, "of order {e.rate3:.2f}: not three times differentiable"),
+        ("disagrees", True, "of order {e.rate3:.2f}: it is off by {e.off:.1e}"),
+    )
 
 
 @np.errstate(all="ignore")
@@ -521,5 +500,5 @@ def curvature(found, bend, extend):
     off = abs(ahead + behind) / min(e.t[usable], default=e.t[0]) ** 2 / abs(bend)
     found.learn(used3=used, bend=bend, rate3=min(rates, default=np.inf if not used else np.nan), off=off)
     found.learn(jumps=abs(ahead - behind) > ODD * abs(ahead + behind))
-    word, text = first(HESSIANS, found)
+    word, text = first(orders_of_hessians, found)
     return word, f"d.Hd = {bend:.9g} along {found.direction}, third Taylor remainder {text}"
