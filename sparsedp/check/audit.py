@@ -1,8 +1,8 @@
 """The audit of a gradient: differences over many step sizes, Taylor rates, determinism, forward against reverse."""
 
-import math
 import warnings
 from contextlib import suppress
+from math import inf, isinf, isnan
 
 import numpy as np
 
@@ -116,7 +116,7 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
     if not is_whole(directions, 0):
         raise ValueError(f"a sweep needs directions >= 0, a whole number, got {directions!r}; the default is 3")
     chosen = tuple(map(float, () if steps is None else steps))
-    if steps is not None and (len(set(chosen)) < FEWEST_STEPS or not all(0 < step < math.inf for step in chosen)):
+    if steps is not None and (len(set(chosen)) < FEWEST_STEPS or not all(0 < step < inf for step in chosen)):
         raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {chosen}")
     point, count = Point(x), min(directions, 1) if quick else directions
     chosen, names = chosen or default_steps(point.eps), QUICK.__contains__ if quick else None
@@ -307,4 +307,4 @@ class Audit(Result):
 
 
 def _order(rate):
-    return "-" if math.isnan(rate) else "exact" if math.isinf(rate) else f"{rate:.2f}"
+    return "-" if isnan(rate) else "exact" if isinf(rate) else f"{rate:.2f}"

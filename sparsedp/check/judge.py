@@ -15,8 +15,8 @@ the t^2 and t^3 parts of a smooth loss cannot cancel.
 Source: the extrapolation is that of C. J. F. Ridders, Advances in Engineering Software 4, 1982.
 """
 
-import math
 from contextlib import suppress
+from math import inf, isfinite, nan
 
 import numpy as np
 
@@ -130,7 +130,7 @@ VERDICTS = (
 def verdict(judged, doubts):
     """Judgements of all directions and doubts, pairs of word and reason -> (verdict, reason in words)."""
     largest = max((one.scale for one in judged), default=0.0)
-    known = [(word, reason, np.inf) for word, reason in doubts]
+    known = [(word, reason, inf) for word, reason in doubts]
     known += [
         (one.word, f"along {one.direction}: {one.note}", one.share if one.wrong else 0.0)
         for one in judged if not _negligible(one, largest)
@@ -187,9 +187,9 @@ class Judgement(Result):
     """
 
     _plain = (*"direction word difference slope gap bar scale step rate1 rate2 digits jitter note bend rate3".split(),)
-    gap = size = share = jitter = step = rate1 = rate2 = bend = rate3 = math.nan
-    bar, digits = math.inf, 0.0
-    split = beyond = uncertain = used1 = used2 = off = jumps = math.nan
+    gap = size = share = jitter = step = rate1 = rate2 = bend = rate3 = nan
+    bar, digits = inf, 0.0
+    split = beyond = uncertain = used1 = used2 = off = jumps = nan
     close = wrong = zero = resolved = flat = False
 
     __repr__ = object.__repr__
@@ -303,8 +303,8 @@ def _taylor(t, changes, rests, kinks, noise, slope, size, bar, scale, step, clos
     used1, rates1 = orders(t, change, seen & climbs)
     still = bar + size <= VANISHED * scale and not np.any(seen | (climb >= clear))
     return {
-        "used1": used1, "rate1": max(rates1, key=lambda rate: abs(rate - 1), default=np.nan),
-        "used2": used2, "rate2": min(rates2, default=np.nan) if used2 else np.inf,
+        "used1": used1, "rate1": max(rates1, key=lambda rate: abs(rate - 1), default=nan),
+        "used2": used2, "rate2": min(rates2, default=nan) if used2 else inf,
         "flat": bool(still or np.any(seen & ~climbs)),
     }  # fmt: skip
 
@@ -354,7 +354,7 @@ def looked_at(trials, slope, steps, extend, count, rng, wanted=None):
     with np.errstate(all="ignore"):
         vector, again = (point.gradient(slope(point.tree()) if callable(slope) else slope) for _ in range(2))
     trials.gradient = vector
-    finite, change = math.isfinite(base), np.max(np.abs(vector * point.units), initial=0.0)
+    finite, change = isfinite(base), np.max(np.abs(vector * point.units), initial=0.0)
     evidence = [
         ("unsound", not finite, f"the loss is {base} at x"),
         ("unsound", finite and trials.value(point.tree()) != base,
@@ -498,7 +498,7 @@ def curvature(found, bend, extend):
         return curvature(found, bend, False)
     ahead, behind = rests[:, np.max(np.flatnonzero(usable), initial=0)]
     off = abs(ahead + behind) / min(e.t[usable], default=e.t[0]) ** 2 / abs(bend)
-    found.learn(used3=used, bend=bend, rate3=min(rates, default=np.inf if not used else np.nan), off=off)
+    found.learn(used3=used, bend=bend, rate3=min(rates, default=inf if not used else nan), off=off)
     found.learn(jumps=abs(ahead - behind) > ODD * abs(ahead + behind))
     word, text = first(orders_of_hessians, found)
     return word, f"d.Hd = {bend:.9g} along {found.direction}, third Taylor remainder {text}"

@@ -21,7 +21,7 @@ from sparsedp.tree import norm
 
 __all__ = ["OperatorSummary", "fault_of", "field", "layouts", "operator", "transpose", "twin"]
 
-LIMIT = 10.0
+LIMIT = Summary.limit
 DTYPES = ("float64", "complex128", "float32", "complex64")
 LARGEST = 2**21  # unknowns above which no matrix is built for a check
 MOST_COLUMNS = 512  # columns that are found one application at a time

@@ -1,6 +1,6 @@
 """Order of accuracy: how the error falls when the grid is refined."""
 
-import math
+from math import inf, isnan, nan
 
 import numpy as np
 
@@ -49,11 +49,11 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
     if expected is not None and np.ndim(expected) == 0:
         expected = expected - 0.1, expected + 0.1
     errors = tuple(float(error_at(n)) for n in sizes)
-    rise = np.log([error if 0 < error < math.inf else math.nan for error in errors])
+    rise = np.log([error if 0 < error < inf else nan for error in errors])
     run = -np.log(sizes)
     slopes, away = np.diff(rise) / np.diff(run), run[-3:] - np.mean(run[-3:])
     found, verdict, reason = float(away @ rise[-3:] / (away @ away)), "inconclusive", "no order was expected"
-    if math.isnan(found):
+    if isnan(found):
         reason = "an error is 0 or not finite: no slope"
     elif expected is not None:
         verdict = "agrees" if expected[0] <= found <= expected[1] else "disagrees"

@@ -96,10 +96,12 @@ class Summary(Result):
     _word = "a finding"
     _plain = ("title", "verdict", "limit", "worst", "rows")
 
-    def __init__(self, title, rows, limit=10.0, **values):
+    limit = 10.0
+
+    def __init__(self, title, rows, **values):
         failed = tuple(row.name for row in rows if row.ok is False)
         verdict = "disagrees" if failed else "agrees" if any(row.ok for row in rows) else "inconclusive"
-        super().__init__(title=title, rows=tuple(rows), limit=limit, failed=failed, verdict=verdict, **values)
+        super().__init__(title=title, rows=tuple(rows), failed=failed, verdict=verdict, **values)
 
     @property
     def worst(self):

@@ -12,6 +12,8 @@ Source: N. A. Pierce and M. B. Giles, SIAM Review 42, 2000.
 """
 
 from collections import Counter
+from functools import partial
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,9 +37,10 @@ CORRECTIONS = 20  # of one evaluation, at most
 ROUNDING = 1e-14  # of the value
 
 
-def distance(one, other):
-    """Euclidean distance of two trees; None counts for nothing."""
-    return norm([np.subtract(a, b) for a, b in zip(leaves(one), leaves(other), strict=True) if a is not None])
+def distance(one, other, relative=False):
+    """Euclidean distance of two trees, or its share of the second; None counts for nothing."""
+    gap = norm([np.subtract(a, b) for a, b in zip(leaves(one), leaves(other), strict=True) if a is not None])
+    return gap / (norm(other) or 1.0) if relative else gap
 
 
 # ---------------------------------------------------------------- recorded solves
@@ -87,37 +90,38 @@ class RecordedSolves(dict):
     def linear(self, solver, b, transposed, checked, start):
         """The solution of one linear solve, flat. The solver calls this in place of its own `solved`."""
         product = (solver.system.given.T if transposed else solver.system.given)._flat.apply
-        key, x = self._earlier(solver.name, "adjoint" if transposed else "forward", b.size)
-        if x is None and self.fresh:
-            x = solver.approximate(b, self.fresh, transposed)
-        elif x is None:
-            x = solver.solved(b, transposed, checked, start)
-        elif self.share is not None:
-            x = x + solver.approximate(b - product(x) - self._left(key), self.share, transposed)
-        rtol, iterative = solver.system.rtol, solver.engine.iterative
-        self[key] = RecordedSolve(x, b - product(x), float(np.linalg.norm(b)), rtol, iterative)
-        return x
+        first = partial(solver.solved, b, transposed, checked, start)
+        if self.fresh:
+            first = partial(solver.approximate, b, self.fresh, transposed)
+
+        def corrected(x, left):
+            return x + solver.approximate(b - product(x) - left, self.share, transposed)
+
+        facts = float(np.linalg.norm(b)), solver.system.rtol, solver.engine.iterative
+        kind = "adjoint" if transposed else "forward"
+        return self._solved((solver.name, kind), b.size, first, corrected, lambda x: b - product(x), facts)
 
     def root(self, root, equation, guess, leaves):
         """The solution of one nonlinear solve, flat."""
-        key, x = self._earlier(root.name, "forward", guess.size)
-        if x is None:
-            x = root.solved(equation, guess, leaves)
-        elif self.share is not None:
-            x = root.corrected(equation, x, leaves, self.share, -self._left(key))
-        self[key] = RecordedSolve(x, -equation.value(x, leaves), 0.0, root.rtol, True)
-        return x
+        first = partial(root.solved, equation, guess, leaves)
 
-    def _earlier(self, name, kind, size):
-        """(key of this solve, solution of the same one in the earlier run or None)."""
-        key = name, kind, self._turns[name, kind]
-        self._turns[name, kind] += 1
+        def corrected(x, left):
+            return root.corrected(equation, x, leaves, self.share, -left)
+
+        facts, residual = (0.0, root.rtol, True), lambda x: -equation.value(x, leaves)
+        return self._solved((root.name, "forward"), guess.size, first, corrected, residual, facts)
+
+    def _solved(self, name, size, first, corrected, residual, facts):
+        """A solution: of the first solve, or that of the earlier run, ``corrected(x, residual that stays)``."""
+        key = *name, self._turns[name]
+        self._turns[name] += 1
         solve = self.before.get(key)
-        return key, solve.x if solve is not None and solve.x.size == size else None
-
-    def _left(self, key):
-        """The residual that is to stay."""
-        return 0.0 if self.correct(key) else self.before[key].r
+        if solve is None or solve.x.size != size:
+            x = first()
+        else:
+            x = solve.x if self.share is None else corrected(solve.x, 0.0 if self.correct(key) else solve.r)
+        self[key] = RecordedSolve(x, residual(x), *facts)
+        return x
 
     def products(self):
         """y . r for each forward solve, or None when there is one without its adjoint solve.
@@ -192,11 +196,11 @@ def certify(loss, x, target=TARGET):
     left = RecordedSolves(solves)
     slope, half = left.run(gradient_of, x)[1], corrected(lambda key: key[1] == "adjoint")
     causes = {"forward solves": distance(slope, half) / size, "adjoint solves": distance(half, gradient) / size}
-    error, rows = distance(slope, gradient) / size, []
-    names = dict.fromkeys(map(_solver, solves))
+    error, names = distance(slope, gradient) / size, dict.fromkeys(map(_solver, solves))
+    rows = []
     for name in names:
         own = slope if len(names) == 1 else corrected(lambda key, name=name: _solver(key) == name)
-        mine = {key: solve for key, solve in solves.items() if _solver(key) == name}
+        mine = [(key[1], solve) for key, solve in solves.items() if _solver(key) == name]
         rows.append(_row(name, distance(own, gradient) / size, mine))
     best = RecordedSolves(left).run(loss, x)  # once more: a value tells its own error, and that of the correction
     return Certificate(
@@ -211,13 +215,12 @@ def _solver(key):
 
 
 def _row(name, error, solves):
-    """What is known about one solver."""
-    row = {"solver": name, "rtol": max(s.rtol for s in solves.values()), "error": error}
-    row["iterative"] = any(solve.iterative for solve in solves.values())
+    """What is known about one solver, from pairs of kind and solve."""
+    row = {"solver": name, "rtol": max(solve.rtol for _, solve in solves), "error": error}
+    row["iterative"] = any(solve.iterative for _, solve in solves)
     for kind in ("forward", "adjoint"):
-        own = [solve for key, solve in solves.items() if key[1] == kind]
-        row[kind] = len(own)
-        row[f"{kind} residual"] = float(max((np.linalg.norm(s.r) / s.size for s in own if s.size), default=0.0))
+        own = [np.linalg.norm(solve.r) / (solve.size or inf) for way, solve in solves if way == kind]
+        row |= {kind: len(own), f"{kind} residual": float(max(own, default=0.0))}
     return row
 
 

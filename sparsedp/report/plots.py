@@ -11,8 +11,8 @@ from sparsedp.grid import check_grid
 from sparsedp.tape import plain
 
 __all__ = [
-    "animate", "convergence", "curves", "figure", "plot", "read_picture", "sample_file", "save", "stability_chart",
-    "unbeaten", "v_curve", "write_picture",
+    "animate", "convergence", "current", "curves", "figure", "plot", "read_picture", "sample_file", "save",
+    "stability_chart", "unbeaten", "v_curve", "write_picture",
 ]  # fmt: skip
 
 ARROWS = 24  # arrows along an axis of a face field, at most
@@ -62,7 +62,7 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, cmap="viridis", 
     if np.iscomplexobj(u):
         raise TypeError(f"plot draws real fields, got dtype {u.dtype}; plot its real part or its absolute value")
     u, kind, arrows = _scalar(grid, u, at)
-    ax = _current(ax)
+    ax = current(ax)
     if title is not None:
         ax.set_title(title)
     if grid.dim == 1:
@@ -273,7 +273,7 @@ def convergence(best, ax=None, against="iteration"):
     """
     if against not in ("iteration", "seconds", "evaluations", "solves"):
         raise ValueError(f"convergence is drawn against iteration, seconds, evaluations or solves, got {against!r}")
-    ax = _current(ax)
+    ax = current(ax)
     records = [(getattr(record, against), record.value, record.gradient_norm) for record in best.history]
     across, values, norms = np.array(records, float).T
     least = min(values.min(), 0.0)
@@ -318,7 +318,7 @@ def v_curve(audit, ax=None):
             for axis, value in zip(lines[row["direction"]], (row["step"], abs(row["gap"]))):
                 axis.append(value)
     title = f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}"
-    return _dressed(lines, _current(ax), "step", "|difference - gradient| / |derivative|", title)
+    return _dressed(lines, current(ax), "step", "|difference - gradient| / |derivative|", title)
 
 
 def stability_chart(growth, ax):
@@ -350,7 +350,7 @@ def figure():
     return _matplotlib("figure").Figure(figsize=(5.5, 4.4), layout="constrained")
 
 
-def _current(ax):
+def current(ax):
     """The axes given, or the current ones of pyplot."""
     return _matplotlib("pyplot").gca() if ax is None else ax
 

@@ -100,24 +100,21 @@ class StabilityMap(Result):
     _plain = ("time_steps", "viscosities", "factors")
 
     def __str__(self):
-        cells = [["refused" if np.isnan(factor) else f"{factor:.3g}" for factor in row] for row in self.factors]
-        rows = [(f"{dt:.1e}", *row) for dt, row in zip(self.time_steps, cells)]
-        return table(rows, (" \\ ".join(self.names), *(f"{nu:.1e}" for nu in self.viscosities)))
+        cells = np.where(np.isnan(self.factors), "refused", self.factors.astype(object))
+        rows = [(dt, *row) for dt, row in zip(self.time_steps, cells)]
+        return table(rows, (" \\ ".join(self.names), *self.viscosities))
 
 
 def stability_map(scene):
     """Scene -> StabilityMap, or None where it has no loop, or no named time step and viscosity of one number each."""
-    names = tuple(scene.named.values())
-    here = [scene.leaves.get(name, np.zeros(1)) for name in names]
-    alone = all(value.size == 1 and value > 0 for value in here)
-    if not alone or scene.growth is None or scene.growth.refusal:
+    names, known = tuple(scene.named.values()), scene.leaves
+    here = [known[name].item() for name in names if name and known[name].size == 1 and known[name] > 0]
+    if len(here) < 2 or scene.growth is None or scene.growth.refusal:
         return None
-    here = [value.item() for value in here]
     dts, nus = (_values(value, scene.ranges.get(name)) for name, value in zip(names, here))
 
     def factor(*pair):
-        other = {name: np.full_like(scene.leaves[name], value) for name, value in zip(names, pair)}
-        growth = scene.growth_at(other)
+        growth = scene.growth_at({name: np.full_like(known[name], value) for name, value in zip(names, pair)})
         return growth.factor if growth else np.nan
 
     factors = np.array([[factor(dt, nu) for nu in nus] for dt in dts])

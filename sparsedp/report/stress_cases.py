@@ -3,10 +3,10 @@
 CASES is the table: for each group a function that lists its cases, the values to try and the judge of what comes out.
 """
 
-import math
 import re
 import warnings
 from functools import cached_property, partial
+from math import inf, isfinite, ldexp, log, log2, nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
 from sparsedp.report.certificate import distance
 from sparsedp.report.stability import SEED, STEADY, growth_of
-from sparsedp.tree import copied, flatten, norm
+from sparsedp.tree import copied, flatten
 
 __all__ = ["CASES", "FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 
@@ -98,7 +98,7 @@ class Scene:
     def sheltered(self, x):
         """The loss there, NaN whatever it raises: a scene may raise anything."""
         value = _attempt(self.loss, x)
-        return math.nan if isinstance(value, Exception) else value
+        return nan if isinstance(value, Exception) else value
 
     def growth_at(self, other):
         """How a step grows there."""
@@ -106,7 +106,7 @@ class Scene:
 
     def legal(self, name, value):
         """Whether a value lies in the range of a parameter; without a range everything does."""
-        low, high = self.ranges.get(name, (-math.inf, math.inf))
+        low, high = self.ranges.get(name, (-inf, inf))
         return bool(np.all(value >= low) and np.all(value <= high))
 
     def fault(self, other):
@@ -144,7 +144,7 @@ class Outcome(NamedTuple):
 
     @property
     def finite(self):
-        return math.isfinite(self.value) and all(np.all(np.isfinite(g)) for g in self.gradient)
+        return isfinite(self.value) and all(np.all(np.isfinite(g)) for g in self.gradient)
 
     @property
     def refusal(self):
@@ -152,7 +152,7 @@ class Outcome(NamedTuple):
         chance = isinstance(self.error, (np.linalg.LinAlgError, UnicodeError))
         typed = isinstance(self.error, (SparsedpError, ValueError, TypeError)) and not chance
         words = " ".join(f"{type(self.error).__name__}: {self.error}".split())
-        return (REFUSED if typed else DEGRADED), math.nan, words
+        return (REFUSED if typed else DEGRADED), nan, words
 
 
 def run(loss, x):
@@ -160,7 +160,7 @@ def run(loss, x):
     grown = thread.grown
     result = _attempt(value_and_grad(loss), x)
     if isinstance(result, Exception):
-        return Outcome(math.nan, [], result)
+        return Outcome(nan, [], result)
     gradient = [np.asarray(g) for g in flatten(result[1])[0] if g is not None]
     return Outcome(float(result[0]), gradient, None, thread.grown > grown)
 
@@ -185,8 +185,8 @@ def finite(scene, other):
         word, *rest = out.refusal
         return FAILED if word == REFUSED and not other else word, *rest
     if not out.finite:
-        what = f"value {out.value:g}" if not math.isfinite(out.value) else "the gradient is not finite"
-        return scene.fault(other), math.nan, f"{what}, and no error"
+        what = f"value {out.value:g}" if not isfinite(out.value) else "the gradient is not finite"
+        return scene.fault(other), nan, f"{what}, and no error"
     return _against_differences(scene, other, out)
 
 
@@ -208,9 +208,9 @@ def near(scene, other, good=0.0, bad=1e-10, note="differs from the plain case", 
         word, *rest = (base if out.error is None else out).refusal
         return word if good else FAILED, *rest
     if _bits(x) != before:
-        return FAILED, math.nan, "the input was modified"
-    pairs = (out.value, base.value), (out.gradient, base.gradient)
-    return _graded(max(distance(*pair) / (norm(pair[1]) or 1.0) for pair in pairs), good, bad, note, unit)
+        return FAILED, nan, "the input was modified"
+    gaps = distance(out.value, base.value, True), distance(out.gradient, base.gradient, True)
+    return _graded(max(gaps), good, bad, note, unit)
 
 
 def _bits(x):
@@ -230,9 +230,9 @@ def scaled(scene, other, exponent):
     out, power = scene.run(other), scene.degrees[name] * exponent
     if out.error is not None:
         return out.refusal
-    if abs(math.log2(abs(scene.base.value)) + power) > LARGEST:
-        return DEGRADED, math.nan, f"the value is {out.value:g}: not representable"
-    gap = abs(out.value / math.ldexp(scene.base.value, power) - 1.0)
+    if abs(log2(abs(scene.base.value)) + power) > LARGEST:
+        return DEGRADED, nan, f"the value is {out.value:g}: not representable"
+    gap = abs(out.value / ldexp(scene.base.value, power) - 1.0)
     return _graded(gap, 1e-12, 1e-3, f"is not 2^{power} times the plain value")
 
 
@@ -251,16 +251,16 @@ def refused(scene, other, located=False):
         return word, figure, words
     if located and out.finite:
         return FAILED, out.value, "swallowed: the value and the gradient are finite"
-    return DEGRADED, math.nan, f"taken without an error; value {out.value:g}"
+    return DEGRADED, nan, f"taken without an error; value {out.value:g}"
 
 
 def growing(scene, _):
     """The growth factor of a step: above 1 is right only if the physics grows."""
     growth, dt = scene.growth, scene.named["time step"]
     if growth is None:
-        return None, math.nan, "no rollout in the loss; give step=lambda x: (advance, state)"
+        return None, nan, "no rollout in the loss; give step=lambda x: (advance, state)"
     if growth.refusal:
-        return REFUSED, math.nan, growth.refusal
+        return REFUSED, nan, growth.refusal
     if growth.factor <= STEADY:
         return PASSED, growth.factor, ""
     if growth.flips:
@@ -268,7 +268,7 @@ def growing(scene, _):
     if dt is None:
         return DEGRADED, growth.factor, "grows; name the time step, so that physics and step can be told apart"
     finer = scene.growth_at({dt: scene.leaves[dt] / FINER}).factor
-    if finer > 1 and math.log(growth.factor) <= 4 * FINER * math.log(finer):
+    if finer > 1 and log(growth.factor) <= 4 * FINER * log(finer):
         return PASSED, growth.factor, "grows as the physics does"
     return FAILED, growth.factor, "grows, and does not with a smaller step"
 
@@ -285,7 +285,7 @@ def _against_differences(scene, other, out):
     for steps in DIFFERENCES[:1], DIFFERENCES:
         line.sweep(steps)
         gaps = [abs((level.difference - level.slope) / line.slope) for level in line.usable]
-        gap = min(gaps, default=math.inf)
+        gap = min(gaps, default=inf)
         if gap <= GOOD:
             return PASSED, gap, ""
     if out.flagged:
@@ -352,7 +352,7 @@ def constants_added(scene, name, x):
 
 
 def not_finite(scene, name, x):
-    for bad in (math.nan, math.inf) if name in scene.steepest else ():
+    for bad in (nan, inf) if name in scene.steepest else ():
         spoilt = np.array(x)
         spoilt[scene.steepest[name]] = bad
         yield f"one {bad}", spoilt, partial(refused, located=True)

@@ -75,12 +75,11 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
             raise ValueError(f"stress has no cases {group!r}; write some of {', '.join(GROUPS)}")
     chosen = GROUPS if only is None else only
     scene = Scene(loss, x, ranges, step, time_step, viscosity)
-    judged = [(*names, *judge()) for *names, judge in cases(scene, chosen)]
-    rows = [dict(zip(COLUMNS, row)) for row in judged if row[3]]
-    skipped = [f"{row[2]}: {row[5]}" for row in judged if not row[3]]
+    rows = [dict(zip(COLUMNS, (*names, *judge()))) for *names, judge in cases(scene, chosen)]
+    skipped = [f"{row['case']}: {row['note']}" for row in rows if not row["outcome"]]
+    rows = [row for row in rows if row["outcome"]]
     ran = {row["group"] for row in rows}
-    reasons = {group: GROUPS[group] if group in chosen else "not asked for" for group in GROUPS if group not in ran}
-    skipped += [f"{group}: {reason}" for group, reason in reasons.items()]
+    skipped += [f"{name}: {GROUPS[name] if name in chosen else 'not asked for'}" for name in GROUPS if name not in ran]
     growth = stability_map(scene) if "time step and viscosity" in chosen else None
     return Stress(rows=rows, left_out=[*skipped, *ELSEWHERE], map=growth)
 
@@ -125,6 +124,7 @@ class Stress(Table):
         Parameters
         ----------
         ax : matplotlib Axes, optional
+            Default: the current axes of pyplot.
 
         Returns
         -------
@@ -137,7 +137,7 @@ class Stress(Table):
         """
         if self.map is None:
             raise ValueError("this scene has no stability map; it needs a rollout, a time step and a viscosity by name")
-        return plots.stability_chart(self.map, plots.figure().add_subplot() if ax is None else ax)
+        return plots.stability_chart(self.map, plots.current(ax))
 
     @property
     def summary(self):

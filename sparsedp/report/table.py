@@ -3,6 +3,8 @@
 A table is a list of rows (dicts) and the names of the columns that are shown.
 """
 
+from typing import Any
+
 from sparsedp.check.summary import Result, csv_text, table, text_of
 from sparsedp.files import write_file
 from sparsedp.report import plots
@@ -22,9 +24,9 @@ class Table(Result):
 
     left_out: tuple | list = ()
 
-    def _parts(self):
-        """(lines above the table, its rows, the names of its columns, lines below it); the first line is its title."""
-        return [type(self).__name__], self.rows, self._columns, []
+    _parts: (
+        Any  # () -> (lines above the table, its rows, the names of its columns, lines below it); the first is a title
+    )
 
     def __str__(self):
         above, rows, names, below = self._parts()

@@ -3,11 +3,11 @@
 import csv
 import itertools
 import json
-import math
 import platform
 import tracemalloc
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from math import inf, isfinite, isnan, nan
 from pathlib import Path
 from time import perf_counter
 
@@ -23,7 +23,7 @@ from sparsedp.report import plots
 from sparsedp.report.certificate import distance
 from sparsedp.report.plan import total
 from sparsedp.report.table import Table, csv_text, write_table
-from sparsedp.tree import leaves, norm
+from sparsedp.tree import leaves
 
 __all__ = ["COLUMNS", "Rows", "measured_row", "relative_distance", "timed", "versions", "words_of", "workprec"]
 
@@ -125,7 +125,7 @@ def workprec(
             figures, *result = measured_row(problem, settings, repeats)
             figures |= errors({name: settings[name] for name in over}, *result)
             figures |= {**dict(zip(KEY, key)), "versions": versions()}
-            finished[key] = {name: figures.get(name, np.nan) for name in COLUMNS}
+            finished[key] = {name: figures.get(name, nan) for name in COLUMNS}
             if file:
                 _append(Path(file), finished[key])
         rows.append(finished[key])
@@ -205,7 +205,7 @@ def _warm(run):
 
     Gives the calls of the last run, whether it is warm, and the seconds of the calls of the first.
     """
-    before, first = math.inf, Calls()
+    before, first = inf, Calls()
     for _ in range(MOST_WARM_UPS):
         with recording() as calls:
             now, _ = timed(run)
@@ -224,7 +224,7 @@ def _times(runs, row, repeats):
     least = 0.0
     for name, run in zip(("seconds_forward", "seconds_backward"), runs):
         pairs = [timed(run) for _ in range(repeats)]
-        seconds = [max(spent - least, 0.0) if row["status"] == "ok" else math.nan for spent, _ in pairs]
+        seconds = [max(spent - least, 0.0) if row["status"] == "ok" else nan for spent, _ in pairs]
         least, result = min(seconds), pairs[-1][1]
         row |= {name: least, f"{name}_median": float(np.median(seconds)), f"{name}_max": max(seconds)}
     return result if len(runs) > 1 else (result, None)
@@ -277,7 +277,7 @@ def _reference(problem, given, compare, shared):
         value, gradient = (loss(), None) if x is None else value_and_grad(loss)(x)
         results.append((_answer(value, x, facts), gradient))
     gaps = [compare(a, b) for a, b in zip(*results[-2:]) if a is not None] if len(results) > 1 else []
-    return *results[-1], max(gaps, default=math.nan)
+    return *results[-1], max(gaps, default=nan)
 
 
 def relative_distance(one, other):
@@ -285,7 +285,7 @@ def relative_distance(one, other):
     for a, b in zip(map(np.shape, leaves(one)), map(np.shape, leaves(other)), strict=True):
         if a != b:
             raise ValueError(f"workprec cannot compare shape {a} with {b}; give compare=function(found, wanted)")
-    return distance(one, other) / (norm(other) or 1.0)
+    return distance(one, other, relative=True)
 
 
 # ---------------------------------------------------------------- the table
@@ -322,7 +322,7 @@ class Rows(Table):
     def _points(self, error):
         """(seconds, error, row) of the runs that have both."""
         points = [(self.seconds(row, error), row[error], row) for row in self.rows if row["status"] == "ok"]
-        return [point for point in points if math.isfinite(point[0] + point[1])]
+        return [point for point in points if isfinite(point[0] + point[1])]
 
     def pareto(self, error="gradient_error"):
         """Rows that no other row beats in both time and error, the fastest first."""
@@ -344,7 +344,7 @@ class Rows(Table):
         best = [*self.pareto(), *self.pareto("forward_error")]
         marked = [row | {"best": "*" * (own in best)} for row, own in zip(rows, self.rows)]
         star = "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."
-        errors = [row["reference_error"] for row in self.rows if not math.isnan(row["reference_error"])]
+        errors = [row["reference_error"] for row in self.rows if not isnan(row["reference_error"])]
         stated = [f"Error of the reference: {max(errors):.1e}."] if errors else []
         names = [*used[:1], *apart, *used[1:], "best"]
         return [f"{self.scene}: error against run time"], marked, names, [star, *stated]
@@ -355,13 +355,14 @@ class Rows(Table):
         Parameters
         ----------
         ax : matplotlib Axes, optional
+            Default: the current axes of pyplot.
         error : "gradient_error" or "forward_error"
 
         Returns
         -------
         matplotlib Axes
         """
-        ax = plots.figure().add_subplot() if ax is None else ax
+        ax = plots.current(ax)
         curves: dict = {}
         for seconds, gap, row in self._points(error):
             if gap > 0:
