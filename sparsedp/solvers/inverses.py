@@ -21,7 +21,7 @@ from sparsedp.solvers.solve import EmptySystem, SolveLog, Solver, failure
 from sparsedp.solvers.system import System
 from sparsedp.space import fits
 from sparsedp.structure.base import Structure, result_dtype
-from sparsedp.tape import Rule, isbox
+from sparsedp.tape import plain
 from sparsedp.tree import copied
 
 __all__ = ["Inverse", "METHODS", "build", "build_dense", "check_settings", "inverse"]
@@ -259,24 +259,23 @@ class Solution(Structure):
     """The solve as a structure on flat arrays. Transposes and tangents share set-up and log.
 
     `checked`: primal data, which must be compatible with a singular operator. Transposes and tangents
-    are not, so that a derivative of any order is projected and never refused.
+    are not, so that a derivative of any order is projected and never refused. `start`: first guess, flat; they
+    have none.
     """
 
     has_entries = False
 
-    def __init__(self, solver, transposed=False, checked=True):
-        self.solver = solver
-        self.transposed, self.checked = transposed, checked
-        self.shape = (solver.system.size,) * 2
-        self.dtype = solver.system.op.dtype
+    def __init__(self, solver, transposed=False, checked=True, start=None):
+        self.solver, self.transposed, self.checked, self.start = solver, transposed, checked, start
+        self.shape, self.dtype = (solver.system.size,) * 2, solver.system.op.dtype
 
     def apply(self, x, out):
         np.copyto(out, self.solved(x))
 
-    def solved(self, b, start=None):
+    def solved(self, b):
         """A^-1 b as a fresh flat array: solved in double precision, rounded once."""
-        wide, dtype = np.complex128 if b.dtype.kind == "c" else np.float64, result_dtype(self, b.dtype)
-        start = None if start is None else start.astype(wide)
+        wide, dtype = np.result_type(b, float), result_dtype(self, b.dtype)
+        start = None if self.start is None else self.start.astype(wide)
         x = self.solver.solve(b.astype(wide, copy=False), self.transposed, self.checked, start)
         if x.dtype == dtype:
             return x
@@ -290,7 +289,8 @@ class Solution(Structure):
         return Solution(self.solver, not self.transposed, checked=False)
 
     def tangent(self):
-        return Solution(self.solver, self.transposed, checked=False) if self.checked else self
+        warm = self.start is not None
+        return Solution(self.solver, self.transposed, checked=False) if self.checked or warm else self
 
 
 class Inverse(Operator):
@@ -351,26 +351,14 @@ class Inverse(Operator):
             return super().__call__(b)
         if np.shape(start) != self.codomain.shape:
             raise ShapeError(f"{self.name} takes a start on {self.codomain}, got an array of shape {np.shape(start)}")
-        return self._warm()(b, start) if isbox(b) or isbox(start) else self._solve_from(b, start)
+        structure, start = self.structure, np.asarray(plain(start)).reshape(-1)
+        return Inverse(Solution(self.solver, structure.transposed, structure.checked, start))(b)
 
     def apply(self, u, out=None):
         """Solve for a plain array, without the tape; see `Operator.apply`."""
-        return self._solve_from(u) if out is None and np.ndim(u) == len(self.domain.shape) else super().apply(u, out)
-
-    def _solve_from(self, b, start=None):
-        start = None if start is None else np.asarray(start).reshape(-1)
-        return self.structure.solved(field_array(self, b).reshape(-1), start).reshape(self.codomain.shape)
-
-    def _warm(self):
-        """The rule of a solve from a start: x does not depend on the start. Not kept: it holds this inverse."""
-
-        def vjp(nums, ans, b, start):
-            return lambda g: tuple(self.T(g) if num == 0 else 0.0 * start for num in nums)
-
-        def jvp(nums, tangents, ans, b, start):
-            return sum(self.tangent(t) if num == 0 else 0.0 * t for num, t in zip(nums, tangents, strict=True))
-
-        return Rule(self.name, self._solve_from, vjp, jvp)
+        if out is not None or (np.ndim(u) > len(self.domain.shape) and self.structure.start is None):
+            return super().apply(u, out)
+        return self.structure.solved(field_array(self, u).reshape(-1)).reshape(self.codomain.shape)
 
     # ------------------------------------------------------------ words
 

@@ -14,6 +14,7 @@ axis and elimination along the other; Grassmann, Taksar, Heyman, Operations Rese
 subtractions; Bracewell, J. Opt. Soc. Am. 73 (1983), the real form of the Fourier transform.
 """
 
+from functools import reduce
 from math import prod
 
 import numpy as np
@@ -207,12 +208,12 @@ class Spectrum:
         axes = tuple(axis.dense() if few else axis for axis, few in zip(axes, short, strict=True))
         self.shape, self.axes, self.shift = shape, axes, shift
         self.fourier = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier" and axis.matrices is None)
-        total = np.full((1,) * len(shape), float(shift))
-        for a, axis in enumerate(axes):
-            if a == 0 and len(axes) > 1 and not np.any(axis.eigenvalues):
-                continue  # one line of sums serves all
-            values = axis.eigenvalues[: shape[a] // 2 + 1] if self.fourier[-1:] == (a,) else axis.eigenvalues
-            total = total + values.reshape([-1 if b == a else 1 for b in range(len(shape))])
+        lines = [axis.eigenvalues for axis in axes]
+        for last in self.fourier[-1:]:
+            lines[last] = lines[last][: shape[last] // 2 + 1]
+        if len(axes) > 1 and not np.any(lines[0]):
+            lines[0] = lines[0][:1]  # one line of sums serves all
+        total = reduce(np.add.outer, lines, np.full((), float(shift)))
         largest = sum(np.max(np.abs(axis.eigenvalues)) for axis in axes) + abs(shift)
         # Eigenvalues that were computed, not written down, are only known to some rounding.
         uncertain = 1.0 if any(axis.kind == "eigenvectors" for axis in axes) else 0.25
@@ -295,12 +296,12 @@ class Sweep:
         n = bands.centre.size
         self.lower, self.upper = bands.lower, bands.upper
         lower, upper = np.abs(bands.lower), np.abs(bands.upper)
-        self.inverses = np.empty((n, modes.size))  # of the pivots; 0 where the system is singular
+        self.inverses = np.zeros((n, modes.size))  # of the pivots; 0 where the system is singular
         self.column = self.row = np.empty((0, modes.size))
         if lower[0] == 0 and upper[-1] == 0:
             rest = 0.0
             for i in range(n):
-                rest = excess[i] + modes + (lower[i] * rest * self.inverses[i - 1] if i else 0.0)
+                rest = excess[i] + modes + lower[i] * rest * self.inverses[i - 1]
                 inverted(upper[i] + rest, self.inverses[i])
         else:
             self.column, self.row = np.empty((2, n, modes.size))

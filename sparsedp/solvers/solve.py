@@ -174,13 +174,15 @@ class Solver(Remade):
 
     def _in_parts(self, b, transposed, checked, start):
         """A real operator acts on the real and on the imaginary part."""
-        parts, infos = [], []
-        for take in (np.real, np.imag):
-            begin = None if start is None else np.ascontiguousarray(take(start))
-            parts.append(self.solve(np.ascontiguousarray(take(b)), transposed, checked, begin))
-            infos.append(self.log.adjoint if transposed else self.log.forward)
-        self.log.note(merged(*infos), transposed)
-        return parts[0] + 1j * parts[1]
+
+        def part(take):
+            begin = None if start is None else take(start).copy()
+            x = self.solve(take(b).copy(), transposed, checked, begin)
+            return x, self.log.adjoint if transposed else self.log.forward
+
+        (real, one), (imaginary, other) = map(part, (np.real, np.imag))
+        self.log.note(merged(one, other), transposed)
+        return real + 1j * imaginary
 
     def _scaled(self, b, run, start):
         """The solve with data and solution in the middle of the range of floats."""
@@ -433,11 +435,10 @@ def failure(status):
 
 def merged(one, other):
     """The record of two solves that belong together."""
+    names = "residual", "backward_error", "defect"
     return SolveInfo(
         max(one.status, other.status, key=STATUS_WORDS.index),
         one.iterations + other.iterations,
-        max(one.residual, other.residual),
-        max(one.backward_error, other.backward_error),
-        max(one.defect, other.defect),
-        one.seconds + other.seconds,
+        **{name: max(getattr(one, name), getattr(other, name)) for name in names},
+        seconds=one.seconds + other.seconds,
     )
