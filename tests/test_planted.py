@@ -200,7 +200,7 @@ BUGS = {
         "solvers",
         "for side in (self.after, self.before))",
         "for side in (self.before, self.after))",
-        "tests/test_solvers_methods.py tests/test_solvers_geometric.py",
+        "tests/test_solvers_methods.py",
     ),
     "a function of an operator that is not transposed": Bug(
         "solvers",

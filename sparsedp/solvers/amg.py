@@ -4,24 +4,19 @@ One cycle is a linear map M ~ A^-1. With pre-smoothing sweeps s_1 ... s_m, prolo
 and post-smoothing sweeps t_1 ... t_n, its transpose is the cycle on A^T with prolongation R^T,
 restriction P^T, pre-smoothing t_n^T ... t_1^T and post-smoothing s_m^T ... s_1^T; the transpose of a
 forward Gauss-Seidel sweep on A is a backward sweep on A^T.
-
-A geometric hierarchy interpolates linearly between the centres of pairs of cells, axis by axis: two neighbours along
-each axis become one cell of the next grid, P is the Kronecker product of interpolations along the axes, R = P^T, and
-the next matrix is R A P. P keeps constants, so a null space of constants goes down all levels.
 """
 
-from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
-from scipy.sparse import coo_array, csr_array, csr_matrix, kron
+from scipy.sparse import csr_array, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sparsedp.fields import is_number, is_whole
 from sparsedp.solvers.krylov import Krylov
 
-__all__ = ["Multigrid", "coarse_solver", "geometric_levels", "multigrid_engine"]
+__all__ = ["Multigrid", "coarse_solver", "multigrid_engine"]
 
 CYCLES = {"V": 1, "W": 2}
 SWEEPS = {"forward": "backward", "backward": "forward"}  # each with its mirror image
@@ -30,9 +25,7 @@ MAXITER = 200
 RESIDUE = 1e-13  # share of the entries that were added up, below which a row of a coarse level is rounding
 
 
-def multigrid_engine(
-    system, *, cycle="V", strength=0.25, sweeps=(("forward",), ("backward",)), levels=25, hierarchy="algebraic"
-):
+def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), ("backward",)), levels=25):
     """System -> Multigrid: conjugate gradients (GMRES when not symmetric) around one multigrid cycle.
 
     Parameters
@@ -48,9 +41,6 @@ def multigrid_engine(
         Gauss-Seidel sweeps before and after the coarse correction.
     levels : int
         Most levels.
-    hierarchy : "algebraic" or "geometric"
-        Levels from the entries (Ruge-Stueben), or from pairs of cells of the grid (geometric.py): a
-        fraction of the set-up, for coefficients that are smooth and the same along all axes.
 
     Returns
     -------
@@ -59,8 +49,7 @@ def multigrid_engine(
     Raises
     ------
     ValueError
-        If the diagonal has both signs or a zero, there are no entries or, for a geometric hierarchy, no
-        cells of a grid, or an option is out of range.
+        If the diagonal has both signs or a zero, there are no entries, or an option is out of range.
 
     Notes
     -----
@@ -86,15 +75,7 @@ def multigrid_engine(
             f"multigrid needs a diagonal of one sign; {system.given} has {ends.min():.1e} and {ends.max():.1e}; "
             "write method='direct'"
         )
-    if hierarchy not in ("algebraic", "geometric"):
-        raise ValueError(f"hierarchy must be 'algebraic' or 'geometric', got {hierarchy!r}")
-    grid = system.op.domain.grid if hierarchy == "geometric" else None
-    if hierarchy == "geometric" and (grid is None or system.op.domain.kind != "cells"):
-        raise ValueError(
-            f"a geometric hierarchy needs an operator on the cells of a grid, {system.given} is not; "
-            "write hierarchy='algebraic'"
-        )
-    return Multigrid(system, CYCLES[cycle], float(strength), tuple(map(tuple, sweeps)), int(levels), grid)
+    return Multigrid(system, CYCLES[cycle], float(strength), tuple(map(tuple, sweeps)), int(levels))
 
 
 def _are_sweeps(given):
@@ -111,18 +92,14 @@ class Multigrid(Krylov):
     hierarchical = True
     unit = "cycles"
 
-    def __init__(self, system, visits, strength, sweeps, levels, grid=None):
+    def __init__(self, system, visits, strength, sweeps, levels):
         mirrored = sweeps[0] == tuple(SWEEPS[sweep] for sweep in reversed(sweeps[1]))
         super().__init__(system, maxiter=MAXITER)
         self.symmetric = system.symmetric and mirrored
         unit = 2.0 ** -int(np.frexp(system.norm(False))[1])  # PyAMG prints where entries are far from 1
         self._scale = unit * system.sign * (system.weights if self.symmetric else 1.0)
         matrix = csr_array(system.matrix * np.broadcast_to(self._scale, system.size)[:, None])
-        if grid is None:
-            built = _ruge_stueben(matrix, strength, levels)
-        else:
-            built = geometric_levels(matrix, grid, levels, COARSEST)
-        self.forward = Hierarchy(built, visits, *sweeps)
+        self.forward = Hierarchy(_ruge_stueben(matrix, strength, levels), visits, *sweeps)
         self._transposed: Any = None
         self.hierarchy = self.forward.words
 
@@ -223,54 +200,6 @@ def _without_residues(built):
             A.eliminate_zeros()
         levels.append(Level(A, *(() if level is built[-1] else (csr_array(level.P), csr_array(level.R)))))
     return levels
-
-
-def geometric_levels(matrix, grid, levels, coarsest):
-    """Matrix on the cells of a grid -> Levels; P and R are None on the last one.
-
-    Parameters
-    ----------
-    matrix : csr_array
-    grid : Grid
-    levels : int
-        Most levels.
-    coarsest : int
-        Unknowns from which on no next level is made.
-    """
-    widths: list = list(grid.widths)
-    built: list = []
-    matrix = _short(matrix)
-    while len(built) < levels - 1 and matrix.shape[0] > coarsest:
-        lines = [_interpolation(h, periodic) for h, periodic in zip(widths, grid.periodic, strict=True)]
-        P = _short(reduce(lambda a, b: kron(a, b, format="csr"), lines))
-        built.append(Level(matrix, P, _short(P.T)))
-        matrix = _short(built[-1].R @ matrix @ P)
-        widths = [np.add.reduceat(h, np.arange(0, h.size, 2)) for h in widths]
-    return [*built, Level(matrix)]
-
-
-def _interpolation(widths, periodic):
-    """The 1-D matrix: a cell takes from the two pairs whose centres are next to its own, by the distance."""
-    n, wraps = widths.size, periodic and widths.size > 4  # with two pairs, both sides of a cell are the same one
-    ends = np.concatenate([[0.0], np.cumsum(widths)])
-    fine = 0.5 * (ends[1:] + ends[:-1])
-    coarse = 0.5 * (ends[np.minimum(np.arange(2, n + 2, 2), n)] + ends[:-1:2])
-    around = np.concatenate([[coarse[-1] - ends[-1]], coarse, [coarse[0] + ends[-1]]])
-    fine = fine if wraps else np.clip(fine, coarse[0], coarse[-1])
-    below = np.searchsorted(around, fine, side="right") - 1
-    share = (fine - around[below]) / (around[below + 1] - around[below])
-    places = np.tile(np.arange(n), 2), np.concatenate([below - 1, below]) % coarse.size
-    line = csr_array(coo_array((np.concatenate([1.0 - share, share]), places), shape=(n, coarse.size)))
-    line.eliminate_zeros()
-    return line
-
-
-def _short(matrix):
-    """With sorted 32-bit indices, which PyAMG's sweeps ask for."""
-    matrix = csr_array(matrix)
-    matrix.sort_indices()
-    matrix.indices, matrix.indptr = matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32)
-    return matrix
 
 
 def coarse_solver(matrix):

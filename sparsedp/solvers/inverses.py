@@ -51,11 +51,6 @@ DIRECT_UP_TO = {
 # of its solve, at 24^3 26 times and 1.3 times.
 DIRECT_BELOW_STRUCTURED = {"many": {1: 10_000_000, 2: 16_384, 3: 4_096}, "few": {1: 10_000_000, 2: 4_096, 3: 1_000}}
 
-# In 3-D multigrid takes its levels from pairs of cells where coefficients differ by less than this along an axis,
-# and between the axes. Measured: set-up and two solves take half the time of those with Ruge-Stueben, 12 iterations
-# against 9; in 2-D, with larger jumps, in flat cells or around obstacles as much time or more.
-EVEN_ALONG, EVEN_BETWEEN = 20.0, 2.0
-
 
 def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **options):
     """Operator -> its inverse, an Operator: x = inv(b) solves op(x) = b, inv.T(g) the transposed system.
@@ -74,7 +69,7 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     nullspace : "raise" or "project"
         What to do with data outside the range of a singular operator: refuse it, or take that part out.
     **options
-        multigrid: cycle="V" or "W", strength=0.25, sweeps, levels=25, hierarchy="algebraic" or "geometric".
+        multigrid: cycle="V" or "W", strength=0.25, sweeps, levels=25.
         krylov: preconditioner=None, "jacobi", an Operator or a function; diff="implicit" or "unrolled";
         iterations=None. structured: precision="single" or "double". The others have none.
 
@@ -224,9 +219,6 @@ def _chosen(system, solves):
     if size <= limit:
         return "direct", f"{where}; up to {limit}, for {solves} solves, kept LU factors are fastest", None
     where = f"{where}; {unsuited}; above {limit}, for {solves} solves, LU costs more"
-    if system.sign and dimension == 3 and _even(system):
-        reason = f"{where}; coefficients and cells are even enough for levels from pairs of cells"
-        return "multigrid", reason, _engine(system, "multigrid", {"hierarchy": "geometric"})
     if system.sign:
         return "multigrid", f"{where}; the diagonal has one sign", None
     return "direct", f"{where}; the diagonal has no single sign, which rules multigrid out", None
@@ -240,16 +232,6 @@ def _transforms(system, dimension):
     found = spectrum(structure)
     dense = [] if found is None else [axis.eigenvalues.size for axis in found.axes if axis.kind == "eigenvectors"]
     return None if found is None or max(dense, default=0) > LONGEST_EIGENVECTORS else transforming(structure, found)
-
-
-def _even(system):
-    """Whether all cells are linked, about equally strongly along each axis and along different ones."""
-    if system.faces is None or not system.faces.connected:
-        return False
-    links = [c[c > 0] for c in system.faces.links if c.any()]
-    tops = [float(c.max()) for c in links]
-    along = all(top <= EVEN_ALONG * c.min() for c, top in zip(links, tops))
-    return along and max(tops) <= EVEN_BETWEEN * min(tops)
 
 
 # ---- the inverse as an operator ----
