@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sparsedp.grid import AXES, real_numbers
+from sparsedp.recipe import Frozen
 
 __all__ = [
     "Condition", "FlowCondition", "check_condition", "dirichlet", "free_slip", "inflow", "neumann", "no_slip",
@@ -21,29 +22,21 @@ __all__ = [
 ]  # fmt: skip
 
 
-class Condition:
+class Condition(Frozen):
     """a u + b du/dn = value on a wall. Frozen, equal by value. Use dirichlet, neumann or robin."""
 
-    __slots__ = ("a", "b")
     choices = "dirichlet, neumann, robin(a, b)"
     a: float
     b: float
 
     def __init__(self, a, b):
-        object.__setattr__(self, "a", a)
-        object.__setattr__(self, "b", b)
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"Condition is frozen; make a new one instead of setting {name}")
+        vars(self).update(a=a, b=b)
 
     def __eq__(self, other):
-        return (self.a, self.b) == (other.a, other.b) if isinstance(other, Condition) else NotImplemented
+        return vars(self) == vars(other) if isinstance(other, Condition) else NotImplemented
 
     def __hash__(self):
         return hash((self.a, self.b))
-
-    def __reduce__(self):
-        return Condition, (self.a, self.b)
 
     def __repr__(self):
         return {(1.0, 0.0): "dirichlet", (0.0, 1.0): "neumann"}.get((self.a, self.b), f"robin({self.a:g}, {self.b:g})")

@@ -11,12 +11,13 @@
 """
 
 from functools import cached_property, reduce
+from itertools import compress
 from math import prod
 
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.recipe import Uncached
+from sparsedp.recipe import Frozen, Uncached
 from sparsedp.space import Space
 
 __all__ = [
@@ -28,7 +29,7 @@ __all__ = [
 ]
 
 
-class Grid(Uncached):
+class Grid(Frozen, Uncached):
     """A box of cells in 1-D, 2-D or 3-D, with uniform or stretched spacing. Frozen, equal by value.
 
     Parameters
@@ -73,16 +74,14 @@ class Grid(Uncached):
         shape = lengths(shape)
         if size is not None and spacing is not None:
             raise ValueError("a grid takes size or spacing, not both; leave one out")
-        put = self.__dict__.__setitem__
-        put("shape", shape)
-        put("dim", len(shape))
-        put("axes", AXES[: len(shape)])
-        put("periodic", tuple(flag(entry, shape) for entry in per_axis(periodic, shape, "periodic")))
-        put("origin", tuple(finite_number(entry, "origin") for entry in per_axis(origin, shape, "origin")))
-        put("widths", cell_widths(shape, size, spacing))
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"Grid is frozen; make a new one instead of setting {name}")
+        vars(self).update(
+            shape=shape,
+            dim=len(shape),
+            axes=AXES[: len(shape)],
+            periodic=tuple(flag(entry, shape) for entry in per_axis(periodic, shape, "periodic")),
+            origin=tuple(finite_number(entry, "origin") for entry in per_axis(origin, shape, "origin")),
+            widths=cell_widths(shape, size, spacing),
+        )
 
     @cached_property
     def cells(self):
@@ -92,20 +91,26 @@ class Grid(Uncached):
     @cached_property
     def nodes(self):
         """Space of node fields."""
-        return Space(tuple(map(self.node_count, range(self.dim))), "nodes", self)
+        return Space(self._part("nodes", 0), "nodes", self)
 
     @cached_property
     def faces(self):
         """Space of face fields, flat: x-faces, then y-faces, then z-faces."""
-        return self._stacked("faces", [self.face_shape(axis) for axis in range(self.dim)])
+        return self._stacked("faces")
 
     @cached_property
     def edges(self):
         """Space of edge fields, flat: x-edges, then y-edges, then z-edges."""
-        return self._stacked("edges", [self._edge_shape(axis) for axis in range(self.dim)])
+        return self._stacked("edges")
 
-    def _stacked(self, kind, parts):
+    def _stacked(self, kind):
+        parts = [self._part(kind, axis) for axis in range(self.dim)]
         return Space(sum(map(prod, parts)), kind, self, parts)
+
+    def _part(self, kind, component):
+        """Shape of a component of a space."""
+        on_nodes = node_axes(kind, component, self.dim)
+        return tuple(self.node_count(a) if a in on_nodes else n for a, n in enumerate(self.shape))
 
     def node_count(self, axis):
         """Number of nodes (and of faces) along one axis."""
@@ -113,10 +118,7 @@ class Grid(Uncached):
 
     def face_shape(self, axis):
         """Shape of the component of a face field that crosses `axis`."""
-        return tuple(self.node_count(a) if a == axis else n for a, n in enumerate(self.shape))
-
-    def _edge_shape(self, axis):
-        return tuple(n if a == axis else self.node_count(a) for a, n in enumerate(self.shape))
+        return self._part("faces", axis)
 
     @cached_property
     def volumes(self):
@@ -286,12 +288,9 @@ class Grid(Uncached):
         words = [" x ".join(map(str, self.shape)) + " cells", "size " + " x ".join(f"{size:.6g}" for size in self.size)]
         if any(self.origin):
             words.append("origin " + ", ".join(f"{start:.6g}" for start in self.origin))
-        if any(self.periodic):
-            words.append("periodic in " + ", ".join(a for a, flag in zip(AXES, self.periodic, strict=False) if flag))
-        if not all(self.uniform):
-            words.append(
-                "stretched in " + ", ".join(a for a, flag in zip(AXES, self.uniform, strict=False) if not flag)
-            )
+        for word, flags in (("periodic", self.periodic), ("stretched", [not uniform for uniform in self.uniform])):
+            if any(flags):
+                words.append(f"{word} in {', '.join(compress(AXES, flags))}")
         return f"Grid({', '.join(words)})"
 
 

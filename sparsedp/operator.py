@@ -11,7 +11,7 @@ from sparsedp import kernels, results
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_out, field_array
 from sparsedp.ledger import active
-from sparsedp.recipe import Remade
+from sparsedp.recipe import Frozen, Remade
 from sparsedp.space import Space, fits
 from sparsedp.structure.base import Matrix, Structure, assembled, result_dtype
 from sparsedp.structure.lazy import Diagonal, compose, total
@@ -24,7 +24,7 @@ EXPLICIT_BELOW_COMPILED = 4608
 EXPLICIT_BELOW_PLAIN = 262144
 
 
-class Operator(Remade):
+class Operator(Frozen, Remade):
     """A constant linear map from fields on `domain` to fields on `codomain`. Frozen.
 
     Make one with a builder (`gradient`, `from_matrix`, ...), combine with ``@ + - *``, apply with
@@ -63,10 +63,7 @@ class Operator(Remade):
         if structure.shape != (codomain.size, domain.size):
             raise ShapeError(f"{name} maps {domain} to {codomain}, but its matrix has shape {structure.shape}")
         form = form or _chosen_form(structure)
-        self.__dict__.update(structure=structure, domain=domain, codomain=codomain, name=name, form=form)
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"Operator is frozen; make a new one instead of setting {name}")
+        vars(self).update(structure=structure, domain=domain, codomain=codomain, name=name, form=form)
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""

@@ -7,7 +7,7 @@ from threading import local
 from types import MethodType
 from typing import Any
 
-__all__ = ["Made", "Remade", "Uncached"]
+__all__ = ["Frozen", "Made", "Remade", "Uncached"]
 
 
 class Remade:
@@ -92,3 +92,10 @@ class Uncached:
     def __getstate__(self):
         kept = vars(self).items()
         return {name: value for name, value in kept if not isinstance(getattr(type(self), name, None), cached_property)}
+
+
+class Frozen:
+    """An object whose attributes are set once, by ``vars(self).update(...)``."""
+
+    def __setattr__(self, name, value):
+        raise AttributeError(f"{type(self).__name__} is frozen; make a new one instead of setting {name}")

@@ -10,13 +10,13 @@ import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import check_plain
-from sparsedp.recipe import Uncached
+from sparsedp.recipe import Frozen, Uncached
 from sparsedp.tape import Rule, dtype_of, isbox, linear, plain
 
 __all__ = ["Space", "fits"]
 
 
-class Space(Uncached):
+class Space(Frozen, Uncached):
     """The place of a field: the cells, faces, nodes or edges of a grid, or a plain shape.
 
     Parameters
@@ -55,10 +55,7 @@ class Space(Uncached):
         if not all(isinstance(n, (int, np.integer)) and n >= 0 for n in shape):
             raise ShapeError(f"a space needs whole lengths >= 0, got {shape}; write Space(7) or Space((2, 3))")
         shape = tuple(map(int, shape))
-        self.__dict__.update(shape=shape, kind=kind, grid=grid, parts=(shape,) if parts is None else tuple(parts))
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"Space is frozen; make a new one instead of setting {name}")
+        vars(self).update(shape=shape, kind=kind, grid=grid, parts=(shape,) if parts is None else tuple(parts))
 
     @cached_property
     def size(self):
