@@ -14,7 +14,7 @@ from sparsedp.ledger import active
 from sparsedp.recipe import Frozen, Remade
 from sparsedp.space import Space, fits
 from sparsedp.structure.base import Matrix, Structure, assembled, result_dtype
-from sparsedp.structure.lazy import Diagonal, compose, total
+from sparsedp.structure.lazy import Diagonal, compose, times, total
 from sparsedp.tape import apply_operator, isbox
 
 __all__ = ["Operator"]
@@ -222,7 +222,7 @@ class Operator(Frozen, Remade):
         if not np.isfinite(number):
             raise NonFiniteError(f"{self.name} can be scaled by a finite number only, got {factor}")
         label = "-" if number == -1 else f"{factor:g} * "
-        structure = self.structure.scaled(number if np.iscomplexobj(factor) else number.real)
+        structure = times(self.structure, number if np.iscomplexobj(factor) else number.real)
         return Operator(structure, self.domain, self.codomain, f"{label}{_bracket(self.name)}")
 
     __rmul__ = __mul__
@@ -237,7 +237,7 @@ class Operator(Frozen, Remade):
         if np.iscomplexobj(number):
             return self * (1.0 / number)
         share, exponent = np.frexp(float(number))  # 1 / 1e308 has lost digits, 2^-1024 has not
-        structure = self.structure.scaled(1.0 / float(share)).scaled(2.0 ** -int(exponent))
+        structure = times(times(self.structure, 1.0 / float(share)), 2.0 ** -int(exponent))
         return Operator(structure, self.domain, self.codomain, f"{_bracket(self.name)} / {number:g}")
 
     def __array_ufunc__(self, ufunc, method, *inputs, **options):

@@ -1,4 +1,4 @@
-"""Structure: what acts linearly on flat arrays. Its plainest kinds are a matrix and a multiple of another one."""
+"""Structure: what acts linearly on flat arrays. Its plainest kind is a matrix."""
 
 from operator import is_
 
@@ -11,7 +11,6 @@ from sparsedp.recipe import Uncached
 __all__ = [
     "INT32_LIMIT",
     "Matrix",
-    "Scaled",
     "Structure",
     "assembled",
     "compact",
@@ -78,8 +77,8 @@ class Structure(Uncached):
         return columns_by_application(self)
 
     def scaled(self, factor):
-        """factor * A."""
-        return Scaled(self, factor)
+        """factor * A; None where it cannot take the number in."""
+        return None
 
     def magnitude(self):
         """The function x -> an upper bound of |A| x, entry by entry, for x >= 0."""
@@ -132,34 +131,6 @@ class Matrix(Structure):
 
     def scaled(self, factor):
         return Matrix(self.matrix * factor)
-
-
-class Scaled(Structure):
-    """A number times a structure that cannot take the number in."""
-
-    def __init__(self, inner, factor):
-        self.members, self.inner, self.factor = (inner,), inner, factor
-        self.shape, self.has_entries, self.passes = inner.shape, inner.has_entries, inner.passes
-        self.dtype = np.result_type(inner.dtype, complex if np.iscomplexobj(factor) else float)
-
-    def act(self, x, out):
-        np.multiply(self.inner.product(x), self.factor, out=out)
-
-    def rebuilt(self, members):
-        return Scaled(members[0], self.factor)
-
-    def transpose(self):
-        return Scaled(self.inner.transpose(), self.factor)
-
-    def explicit(self):
-        return compact(self.inner.explicit() * self.factor)
-
-    def scaled(self, factor):
-        return Scaled(self.inner, self.factor * factor)
-
-    def magnitude(self):
-        inner = self.inner.magnitude()
-        return lambda x: abs(self.factor) * inner(x)
 
 
 def result_dtype(structure, dtype):

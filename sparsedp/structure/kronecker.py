@@ -121,9 +121,8 @@ class Kronecker(Structure):
         return Kronecker(self.in_parts, self.out_parts, turned)
 
     def scaled(self, factor):
-        if np.iscomplexobj(factor):
-            return super().scaled(factor)
-        return self._each(lambda term: Term(factor * term.scale, term.factors))
+        real = not np.iscomplexobj(factor)
+        return self._each(lambda term: Term(factor * term.scale, term.factors)) if real else None
 
     def _each(self, change):
         """The same blocks with every term changed."""

@@ -22,6 +22,7 @@ __all__ = [
     "Mask",
     "Sum",
     "compose",
+    "times",
     "total",
 ]
 
@@ -54,19 +55,22 @@ class Diagonal(Structure):
 
 
 class Mask(Diagonal):
-    """Zero outside `keep`, exactly: what is masked out may be NaN."""
+    """Zero outside `keep`, exactly: what is masked out may be NaN. Inside, one number for each entry."""
 
-    def __init__(self, keep):
+    def __init__(self, keep, values=1.0):
         self.keep = np.array(keep, dtype=bool).reshape(-1)
-        super().__init__(self.keep)
+        super().__init__(np.where(self.keep, values, 0.0))
 
     def act(self, x, out):
         out.fill(0)
-        np.copyto(out, x, where=self.keep)
+        np.multiply(x, self.values, out=out, where=self.keep)
 
     def explicit(self):
         kept = np.flatnonzero(self.keep)
-        return compact(sp.coo_array((np.ones(kept.size), (kept, kept)), shape=self.shape))
+        return compact(sp.coo_array((self.values[kept], (kept, kept)), shape=self.shape))
+
+    def scaled(self, factor):
+        return Mask(self.keep, self.values * factor)
 
 
 class Chain(Structure):
@@ -101,7 +105,7 @@ class Chain(Structure):
         return compact(reduce(matmul, (member.explicit() for member in self.members)))
 
     def scaled(self, factor):
-        return Chain([self.members[0].scaled(factor), *self.members[1:]])
+        return compose(times(self.members[0], factor), Chain(self.members[1:]))
 
     def magnitude(self):
         members = [member.magnitude() for member in reversed(self.members)]
@@ -129,7 +133,7 @@ class Sum(Structure):
         return compact(reduce(add, (member.explicit() for member in self.members)))
 
     def scaled(self, factor):
-        return Sum([member.scaled(factor) for member in self.members])
+        return Sum([times(member, factor) for member in self.members])
 
     def magnitude(self):
         members = [member.magnitude() for member in self.members]
@@ -199,11 +203,18 @@ def _joined(a, b):
         return b
     if isinstance(a, Kronecker) and isinstance(b, Kronecker) and a.in_parts == b.out_parts:
         return a.composed(b)
-    if isinstance(a, Mask) and isinstance(b, Mask):
-        return Mask(a.keep & b.keep)
     if isinstance(a, Diagonal) and isinstance(b, Diagonal):
-        return Diagonal(a.values * b.values)
+        kept = [member.keep for member in (a, b) if isinstance(member, Mask)]
+        return Mask(np.all(kept, axis=0), a.values * b.values) if kept else Diagonal(a.values * b.values)
     return None
+
+
+def times(structure, factor):
+    """Structure of factor * structure."""
+    scaled = structure.scaled(factor)
+    if scaled is not None:
+        return scaled
+    return compose(Diagonal(np.full(structure.shape[0], factor)), structure)
 
 
 def total(a, b):
@@ -247,7 +258,7 @@ def through_faces(left, middle, right):
     k = reduce(multiply, (member.values for member in middle))
     if any(line is None for line in lines) or k.dtype != float:
         return None
-    if any(closed) and not all(one or np.all(member.values != 0) for one, member in zip(closed, middle)):
+    if any(closed) and not all(np.all(member.values[getattr(member, "keep", ...)] != 0) for member in middle):
         return None  # 0 times NaN is NaN for some of the zeros, and 0 for others
     parts = components(k, right.out_parts)
     if len(shape) == 2:  # an axis of one cell, without faces
