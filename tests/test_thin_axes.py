@@ -9,7 +9,6 @@ from dense import Dense
 
 import sparsedp as dp
 from sparsedp.conditions import resolve
-from sparsedp.flow import passes
 
 SHAPES = [(1,), (2,), (3,), (1, 4), (4, 1), (1, 1), (2, 1), (3, 2), (1, 1, 4), (3, 1, 3), (1, 2, 1), (2, 2, 3)]
 WORDS = (dp.no_slip, dp.free_slip, dp.inflow, dp.outflow)
@@ -204,25 +203,3 @@ def test_transport(scheme, condition, rng):
         found = dp.transport(wide, scheme, sides)(u[None], wide.join(0.0, v[None]), 0.05)[0]
         wanted = dp.transport(line, scheme, condition or dp.neumann)(u, v, 0.05)
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("place", range(2))
-def test_a_planted_mistake_in_the_passes(place, monkeypatch, rng):
-    """Coefficients that are not those of D and G are seen before they are used; the contract solves instead."""
-    grid, right = dp.Grid((1, 4), spacing=0.3), passes._coefficients
-    boundary = {"x": (dp.inflow, dp.inflow), "y": (dp.inflow, dp.outflow)}
-
-    def wrong(*arguments):
-        found = right(*arguments)
-        found[place][1][-1:] *= 0.5
-        return found
-
-    setup = dp.projection(grid, boundary=boundary).structure.setup
-    if setup.passes is setup.products:
-        pytest.skip("numba is not installed")
-    monkeypatch.setattr(passes, "_coefficients", wrong)
-    P, (matrix, _) = dp.projection(grid, boundary=boundary), Dense(grid, words(grid, boundary)).projection()
-    v = rng.standard_normal(grid.faces.size)
-    assert P.structure.setup.passes is P.structure.setup.products
-    near(P(v), matrix @ v)
-    near(P.T(v), matrix.T @ v)

@@ -10,14 +10,16 @@ import scipy.sparse as sp
 
 from sparsedp.conditions import dirichlet, free_slip, no_slip, outflow, resolve
 from sparsedp.flow.setup import faces_that
+from sparsedp.grid import Grid
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
-from sparsedp.operators.stencils import along, differences, means, one_sided, slopes, wall_slopes
+from sparsedp.operators.difference import divergence, gradient
+from sparsedp.operators.stencils import along, differences, means, pick, slopes, wall_slopes
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker
-from sparsedp.structure.lazy import Mask, compose
+from sparsedp.structure.lazy import Mask, compose, total
 from sparsedp.tape import Rule
 from sparsedp.tree import copied
 
@@ -217,43 +219,20 @@ def _free(grid, sides, solid):
 def _second(grid, c, a, sides):
     """Second differences of component c along axis a."""
     if a == c:
-        back = _from_centres(grid, c)
-        return (back if grid.periodic[c] else Factor(back.matrix[:, 1:-1])) @ differences(grid, a)
+        return slopes(grid, c, sides[c] and (dirichlet, dirichlet)) @ differences(grid, c)
     return differences(grid, a) @ slopes(grid, a, _conditions(sides[a]))
 
 
 def _around(grid, c, sides, closed, condition):
-    """The Laplacian of component c with the faces `closed` by obstacles, as a matrix."""
-    shape, total = grid.face_shape(c), 0
-    for a in range(grid.dim):
-        if a == c:  # a closed face holds the value of the obstacle itself
-            total = total + _matrix(_second(grid, c, a, sides), a, shape)
-            continue
-        lower, upper = _beside(closed, a, grid.periodic[a])
-        slope = _diagonal(~(lower | upper)) @ _matrix(slopes(grid, a, _conditions(sides[a])), a, shape)
-        slope = slope + _diagonal(lower & ~upper) @ _matrix(one_sided(grid, a, True, condition), a, shape)
-        slope = slope + _diagonal(upper & ~lower) @ _matrix(one_sided(grid, a, False, condition), a, shape)
-        corners = tuple(grid.node_count(b) if b == a else n for b, n in enumerate(shape))
-        total = total + _matrix(differences(grid, a), a, corners) @ slope
-    return total
-
-
-def _beside(flags, axis, periodic):
-    """Flags of cells along an axis -> flags of the neighbours below and above each node."""
-    if periodic:
-        return np.roll(flags, 1, axis).ravel(), flags.ravel()
-    pad = [(0, 0)] * flags.ndim
-    pad[axis] = (1, 0)
-    return np.pad(flags, pad).ravel(), np.pad(flags, [side[::-1] for side in pad]).ravel()
-
-
-def _matrix(factor, axis, shape):
-    out = tuple(factor.shape[0] if a == axis else n for a, n in enumerate(shape))
-    return Kronecker((out,), (shape,), {(0, 0): along(axis, len(shape), factor)}).explicit()
-
-
-def _diagonal(flags):
-    return sp.diags_array(flags.astype(float), format="csr")
+    """The Laplacian of component c with the faces `closed` by obstacles, as a matrix: on cells of a grid of its own."""
+    spacing = [np.ones(n) if a == c else grid.widths[a] for a, n in enumerate(grid.face_shape(c))]
+    own = Grid(grid.face_shape(c), spacing=spacing, periodic=grid.periodic)
+    named = {name: _conditions(sides[a]) for a, name in enumerate(grid.axes) if sides[a] and a != c}
+    beside = Mask(own.join(*(a != c for a in range(grid.dim))))
+    across = compose(divergence(own).structure, compose(beside, gradient(own, named, closed, condition).structure))
+    # Along its own axis a closed face holds the value of the obstacle itself.
+    blocks = {(0, 0): along(c, grid.dim, _second(grid, c, c, sides))}
+    return total(across, Kronecker(own.cells.parts, own.cells.parts, blocks)).explicit()
 
 
 def _flux_parts(grid):
@@ -273,18 +252,16 @@ def _flux_parts(grid):
 
 def _to_centres(grid, c):
     """Nodes -> cells: means; on a bounded axis the wall values stand before and after them."""
-    n, m = grid.shape[c], grid.node_count(c)
-    cell, half = np.arange(n), np.full(n, 0.5)
+    inner = (pick(grid, c, False) + pick(grid, c, True)).scaled(0.5)
     if grid.periodic[c]:
-        return Factor.from_diagonals((n, m), (cell, cell, half), (cell, (cell + 1) % max(n, 1), half))
-    ends = np.array([0, n + 1]), np.array([0, n]), np.ones(2)
-    return Factor.from_diagonals((n + 2, m), (cell + 1, cell, half), (cell + 1, cell + 1, half), ends)
+        return inner
+    nodes = sp.eye_array(grid.node_count(c), format="csr")
+    return Factor(sp.vstack([nodes[:1], inner.matrix, nodes[-1:]], format="csr"))
 
 
 def _from_centres(grid, c):
     """Fluxes at cells (and walls) -> nodes: (F[i] - F[i - 1]) / d[i]."""
-    n, m = grid.shape[c], grid.node_count(c)
-    node, d = np.arange(m), 1 / grid.spacings(c)
     if grid.periodic[c]:
-        return Factor.from_diagonals((m, n), (node, node, d), (node, (node - 1) % max(n, 1), -d))
-    return Factor.from_diagonals((m, n + 2), (node, node + 1, d), (node, node, -d))
+        return slopes(grid, c, None)
+    lower, upper = (wall_slopes(grid, c, side, dirichlet).matrix for side in (0, 1))
+    return Factor(sp.hstack([lower, slopes(grid, c, (dirichlet, dirichlet)).matrix, upper], format="csr"))

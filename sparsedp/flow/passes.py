@@ -7,14 +7,12 @@ same form, with G^T in the place of D and D^T in that of G.
 from math import sqrt
 
 import numpy as np
-import scipy.sparse as sp
 
 from sparsedp.kernels import projection
-from sparsedp.solvers.scaling import largest, norm
+from sparsedp.solvers.scaling import norm
+from sparsedp.structure.lazy import face_entries
 
 __all__ = ["Passes", "Products"]
-
-EPS = np.finfo(float).eps
 
 
 class Products:
@@ -50,24 +48,21 @@ class Passes:
     Parameters
     ----------
     grid : Grid
-    products : Products
-        Of operators that are blocks of 1-D factors; on each axis all faces of a line are closed, or none.
+    lines : list of (kept, entries) for each axis
+        The faces along the axis that are not closed; for each face what it takes from the cells below and above it, and
+        what it gives to them, 0 where it is closed.
     """
 
-    def __init__(self, grid, products):
+    def __init__(self, grid, lines):
         missing = 3 - grid.dim  # axes beside those of the grid, without faces
         self.cells = (1,) * missing + grid.shape
         self.parts = [(slice(0), (0, 0, 0))] * missing
         self.inward, self.outward = ([np.zeros((rows, 0))] * missing for rows in (2, 3))
-        for place, faces in enumerate(grid.faces.split(products.kept), missing):
-            axis = place - missing
-            line = np.moveaxis(faces, axis, -1).reshape(-1, faces.shape[axis])[0]
-            shape = tuple(line.size if a == place else n for a, n in enumerate(self.cells))
-            n, m = grid.shape[axis], line.size
-            lines = _line(products.first, (0, axis), (n, m)), _line(products.second, (axis, 0), (m, n))
-            self.parts.append((slice(*grid.faces.offsets[axis : axis + 2]), shape))
-            for kept, found in zip((self.inward, self.outward), _coefficients(*lines, line), strict=True):
-                kept.append(found)
+        for axis, (kept, entries) in enumerate(lines):
+            self.parts.append((slice(*grid.faces.offsets[axis : axis + 2]), (1,) * missing + grid.face_shape(axis)))
+            below, above, down, up = entries
+            self.inward.append(np.stack([up[:-1], down[1:]]))  # of each cell, from its lower and its upper face
+            self.outward.append(np.stack([kept, below[: kept.size], above[: kept.size]]))
 
     def _components(self, x):
         return [x[part].reshape(shape) for part, shape in self.parts]
@@ -83,33 +78,15 @@ class Passes:
         given, found = self._components(x), self._components(out)
         projection.push.compiled(*given, p.reshape(self.cells), *self.outward, *found, 0, 1)
 
-    def agrees(self, products):
-        """Whether they are those passes, to rounding.
 
-        Linear maps that agree on random fields agree everywhere: the residual of a solve, which the passes take, is
-        then that of the operators themselves.
-        """
-        generator = np.random.default_rng(0)
-        x, p = generator.random(products.kept.size), generator.random(np.prod(self.cells))
-        flows, faces = np.empty((2, p.size)), np.empty((2, x.size))
-        for passes, flow, out in zip((self, products), flows, faces, strict=True):
-            passes.net_flow(x, flow)
-            passes.push(x, p, out)
-        return all(largest(one - two) <= 256 * EPS * (1.0 + largest(two)) for one, two in (flows, faces))
-
-
-def _line(op, block, shape):
-    """The 1-D matrix of a block; one that is missing is 0: the slope along one closed cell."""
-    terms = op.blocks.get(block)
-    return terms[0].factors[max(block)].scaled(terms[0].scale).matrix if terms else sp.csr_array(shape)
-
-
-def _coefficients(inward, outward, kept):
-    """What a cell takes from its lower and upper face, and (kept, below, above): what a face takes from x and p."""
-    n, m = inward.shape
-    cell, face = np.arange(n), np.arange(m)
-    lower, upper = inward[cell, cell] * kept[cell], inward[cell, (cell + 1) % m] * kept[(cell + 1) % m]
-    below, above = outward[face, (face - 1) % n] * kept, outward[face, face % n] * kept
-    if m > n:  # the wall faces have a cell on one side only
-        below[0] = above[-1] = 0.0
-    return np.stack([lower, upper]), np.stack([kept, below, above])
+def compiled(grid, products):
+    """The Passes that do what the products do; None where an axis has one cell, or entries of another kind."""
+    lines = []
+    for axis, faces in enumerate(grid.faces.split(products.kept)):
+        n = grid.shape[axis]
+        kept = np.moveaxis(faces, axis, -1).reshape(-1, faces.shape[axis])[0]  # without obstacles all lines are equal
+        entries = face_entries(products.first, products.second, axis, n)
+        if entries is None:
+            return None
+        lines.append((kept, entries * np.resize(kept, n + 1)))  # the last face of a periodic axis is the first
+    return Passes(grid, lines)

@@ -17,7 +17,7 @@ from sparsedp import kernels
 from sparsedp.conditions import inflow, no_slip, resolve
 from sparsedp.errors import NonFiniteError
 from sparsedp.fields import check_finite, place
-from sparsedp.flow.passes import Passes, Products
+from sparsedp.flow.passes import Products, compiled
 from sparsedp.grid import Grid
 from sparsedp.kernels import projection
 from sparsedp.operators.boundary import check_solid, solid_faces
@@ -56,10 +56,11 @@ class Setup(Remade):
         maps = (forward,) if self.symmetric else (forward, (forward[1].transpose(), forward[0].transpose()))
         ones = np.ones(grid.faces.size)
         self._reach = [largest(first.magnitude()(ones)) for first, _ in maps]
-        self.products = [Products(*pair, self.open.astype(float)) for pair in maps]
-        self.passes = (
-            self._compiled() or self.products
-        )  # of the forward solve, and of the adjoint one where it is another
+        # Of the forward solve, and of the adjoint one where it is another.
+        self.products = self.passes = [Products(*pair, self.open.astype(float)) for pair in maps]
+        if self._exact and kernels.compiled() and projection.net_flow.compiled:
+            found = [compiled(grid, products) for products in self.products]
+            self.passes = found if all(found) else self.products
 
     @property
     def info(self):
@@ -73,13 +74,6 @@ class Setup(Remade):
     @property
     def _exact(self):
         return self.inverse.method == "separable" and self.grid.cells.size > 0
-
-    def _compiled(self):
-        """The passes as loops; None where they are not what the operators do."""
-        if not (self._exact and kernels.compiled() and projection.net_flow.compiled):
-            return None
-        found = [Passes(self.grid, products) for products in self.products]
-        return found if all(map(Passes.agrees, found, self.products)) else None
 
     def split(self, x, out, transposed=False, source=None):
         """Flat face field, and source on cells -> p (q); w (z) is written into `out`."""
@@ -155,19 +149,16 @@ class Setup(Remade):
 
     def _refuse_lost_inflow(self):
         """What enters must be able to leave, in every region apart."""
-        system, shape = self.inverse.solver.system, self.grid.shape
-        labels = system.null_space.labels if system.size else None
-        closed = np.zeros(shape, dtype=bool)
-        if system.size and system.null_space.count:
-            closed = np.ones(shape, dtype=bool) if labels is None else (labels >= 0).reshape(shape)
+        system = self.inverse.solver.system
+        if not system.size:
+            return
+        closed = system.null_space.right != 0
         if system.active is not None:  # a cell with no free face at all
-            closed |= ~system.active.reshape(shape)
-        if self.solid is not None:
-            closed &= ~self.solid
+            closed = closed | ~system.active
+        closed = closed.reshape(self.grid.shape) & (True if self.solid is None else ~self.solid)
         for axis, pair in enumerate(self.sides):
             for side, condition in zip((0, -1), pair or (), strict=False):
-                cells = np.moveaxis(closed, axis, 0)
-                if condition == inflow and cells.size and cells[side].any():
+                if condition == inflow and np.take(closed, side, axis).any():
                     where = f"{('lower', 'upper')[side]} {self.grid.axes[axis]} side"
                     raise ValueError(f"the inflow on the {where} enters a region without an outflow; open a side of it")
 

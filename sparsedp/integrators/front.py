@@ -144,7 +144,7 @@ def stepper(
     settings = dict(method=solver, rtol=rtol, maxiter=maxiter, nullspace="raise", options=options)
     scheme, largest = _scheme(method, problem, jacobian, settings, KEPT[tolerance is not None]), np.inf
     if tolerance is not None:
-        scheme = Adaptive(scheme, float(tolerance), floor, f"stepper({method})")
+        scheme = Adaptive(scheme, float(tolerance), floor)
     elif method in EXPLICIT and problem.op is not None and unstable == "raise":
         largest = largest_step(problem.op, EXPLICIT[method].reach)
     return Step(method, problem, dt, scheme, largest, (_remade, (method, rate, dt, given)))

@@ -22,6 +22,7 @@ __all__ = [
     "Mask",
     "Sum",
     "compose",
+    "face_entries",
     "times",
     "total",
 ]
@@ -253,7 +254,7 @@ def through_faces(left, middle, right):
     shape = right.in_parts[0]
     if len(shape) not in (2, 3) or len(left.in_parts) != len(shape) or min(shape) < 2 or shape[-1] < SHORT:
         return None
-    lines = [_line(left, right, axis, n) for axis, n in enumerate(shape)]
+    lines = [face_entries(left, right, axis, n) for axis, n in enumerate(shape)]
     closed = [isinstance(member, Mask) for member in middle]
     k = reduce(multiply, (member.values for member in middle))
     if any(line is None for line in lines) or k.dtype != float:
@@ -272,7 +273,7 @@ def through_faces(left, middle, right):
     return run
 
 
-def _line(left, right, axis, n):
+def face_entries(left, right, axis, n):
     """Entries of R for the cells below and above each face across an axis of n cells, and those of L; or None.
 
     None where another axis, a second term or a further cell takes part. On a periodic axis the last face is the first.
