@@ -82,7 +82,7 @@ def projection(grid, solid=None, boundary=no_slip, method="auto", rtol=1e-10, ma
 class Projected(Structure):
     """P or P^T on flat face fields. It solves in double precision, and rounds once."""
 
-    has_entries = False
+    has_entries = takes_complex = False
 
     def __init__(self, setup, transposed=False):
         self.setup, self.transposed = setup, transposed
@@ -96,18 +96,7 @@ class Projected(Structure):
     def transpose(self):
         return type(self)(self.setup, not self.transposed)
 
-    def apply(self, x, out):
-        if x.dtype.kind == "c":
-            self.apply(np.ascontiguousarray(x.real), out.real)
-            self.apply(np.ascontiguousarray(x.imag), out.imag)
-        elif x.dtype == out.dtype == np.float64 and out.flags.c_contiguous:
-            self.solve(x, out)
-        else:
-            self.solve(x.astype(np.float64), wide := np.empty(out.size))
-            np.copyto(out, wide, casting="same_kind")
-
-    def solve(self, x, out):
-        """The map of flat float64 arrays."""
+    def act(self, x, out):
         self.setup.split(x, out, self.transposed)
 
 
@@ -118,7 +107,7 @@ class Potential(Projected):
     def sizes(self):
         return self.setup.grid.cells.size, self.setup.grid.faces.size
 
-    def solve(self, x, out):
+    def act(self, x, out):
         scale = 2.0**self.setup.exponent
         if self.transposed:
             self.setup.split(np.zeros(out.size), out, True, scale * x)

@@ -52,11 +52,9 @@ class Setup(Remade):
         D, G = divergence(near), gradient(near, self.pressure_conditions, self.solid)
         self.inverse = _inverse(-D @ G, *settings)
         self._refuse_lost_inflow()
-        forward = D.structure, G.structure
-        maps = (forward,) if self.symmetric else (forward, (forward[1].transpose(), forward[0].transpose()))
-        ones = np.ones(grid.faces.size)
-        self._reach = [largest(first.magnitude()(ones)) for first, _ in maps]
-        # Of the forward solve, and of the adjoint one where it is another.
+        maps = (D.structure, G.structure), (G.T.structure, D.T.structure)
+        self._reach = [largest(first.magnitude()(np.ones(grid.faces.size))) for first, _ in maps]
+        # Of the forward solve, and of the adjoint one.
         self.products = self.passes = [Products(*pair, self.open.astype(float)) for pair in maps]
         if self._exact and kernels.compiled() and projection.net_flow.compiled:
             found = [compiled(grid, products) for products in self.products]
@@ -79,7 +77,6 @@ class Setup(Remade):
         """Flat face field, and source on cells -> p (q); w (z) is written into `out`."""
         if source is not None:
             source = self.inverse.solver.system.null_space.project(source, transposed)
-            source = -source if transposed and self.symmetric else source  # the lines are one then, with q = -p
         p = self._split(x, out, transposed, source)
         if self.still and source is None:  # P; the transposed pressure alone makes something of a source
             out[:] = 0.0
@@ -87,7 +84,7 @@ class Setup(Remade):
 
     def _split(self, x, out, transposed, source):
         turned, solver = transposed and not self.symmetric, self.inverse.solver
-        passes, reach, b = self.passes[turned], self._reach[turned], np.empty(self.grid.cells.size)
+        passes, reach, b = self.passes[transposed], self._reach[transposed], np.empty(self.grid.cells.size)
 
         def net_flow(v):
             """Right-hand side, of which the norm is returned, and that of all terms in it."""

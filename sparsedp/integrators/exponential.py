@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.integrators.problem import later
@@ -45,22 +46,13 @@ def phi(k, x):
     """
     near = np.abs(x) <= NEAR
     small, large = np.where(near, x, 0.0), np.where(near, NEAR, x)
-    series = [sum_of_series(k, small)]
-    for j in reversed(range(k)):
-        series.insert(0, small * series[0] + 1 / factorial(j))
+    series = [polyval(small, [1 / factorial(n + k) for n in range(TERMS)])]
     with np.errstate(over="ignore"):
         upward = [np.exp(large)]
     for j in range(k):
+        series.insert(0, small * series[0] + 1 / factorial(k - 1 - j))
         upward.append((upward[j] - 1 / factorial(j)) / large)
     return [np.where(near, low, high) for low, high in zip(series, upward, strict=True)]
-
-
-def sum_of_series(k, x):
-    """phi_k(x) = sum over n of x^n / (n + k)!, for small x."""
-    total = np.zeros_like(x)
-    for n in reversed(range(TERMS)):
-        total = total * x + 1 / factorial(n + k)
-    return total
 
 
 class Function(NamedTuple):

@@ -124,6 +124,7 @@ def stepper(
     >>> value_and_grad(lambda nu: step(np.array([3.0, 3.0]), nu)[0])(2.0)
     (1.5, -0.375)
     """
+    given = copied(locals())  # the caller may reuse the arrays
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     if unstable not in ("raise", "allow"):
@@ -136,18 +137,14 @@ def stepper(
     if not all(map(_is_floor, leaves(floor))):
         raise ValueError(f"floor must hold numbers >= 0, in the units of u, got {floor!r}; write for example 1e-3")
     dt = dt if callable(dt) else positive(dt, "dt")
-    # The caller may reuse the arrays.
-    linear, floor, tolerance, rtol, options = copied((linear, floor, tolerance, float(rtol), options))
-    given = dict(linear=linear, source=source, timed=timed, tolerance=tolerance, floor=floor, unstable=unstable)
-    given |= dict(jacobian=jacobian, solver=solver, rtol=rtol, maxiter=maxiter, **options)
-    problem = Problem(rate, linear, source, timed)
-    settings = dict(method=solver, rtol=rtol, maxiter=maxiter, nullspace="raise", options=options)
+    problem = Problem(rate, given["linear"], source, timed)
+    settings = dict(method=solver, rtol=float(rtol), maxiter=maxiter, nullspace="raise", options=given["options"])
     scheme, largest = _scheme(method, problem, jacobian, settings, KEPT[tolerance is not None]), np.inf
     if tolerance is not None:
-        scheme = Adaptive(scheme, float(tolerance), floor)
+        scheme = Adaptive(scheme, float(tolerance), given["floor"])
     elif method in EXPLICIT and problem.op is not None and unstable == "raise":
         largest = largest_step(problem.op, EXPLICIT[method].reach)
-    return Step(method, problem, dt, scheme, largest, (_remade, (method, rate, dt, given)))
+    return Step(method, problem, dt, scheme, largest, given)
 
 
 def _is_floor(leaf):
@@ -155,8 +152,8 @@ def _is_floor(leaf):
     return leaf is None or (np.asarray(leaf).dtype.kind in "fiu" and bool(np.all(np.asarray(leaf) >= 0)))
 
 
-def _remade(method, rate, dt, given):
-    return stepper(method, rate, dt, **given)
+def _remade(given):
+    return stepper(**{word: value for word, value in given.items() if word != "options"}, **given["options"])
 
 
 def _scheme(method, problem, jacobian, settings, kept):
@@ -183,8 +180,8 @@ class Step(Remade):
         ``scheme(u, params, t, h)``: the state after a step h.
     largest : float
         Stable h c of an explicit step.
-    made : (function, arguments)
-        What makes the same step again.
+    given : dict
+        The arguments of `stepper`.
 
     Attributes
     ----------
@@ -196,13 +193,13 @@ class Step(Remade):
         With error control: the accepted lengths of the last interval, as shares of it.
     """
 
-    def __init__(self, method, problem, dt, scheme, largest, made):
+    def __init__(self, method, problem, dt, scheme, largest, given):
         self.method, self.problem, self.dt, self.scheme, self.largest = method, problem, dt, scheme, largest
-        self.name, self.made, self.order, self.info = f"stepper({method})", made, scheme.order, scheme.info
+        self.name, self.given, self.order, self.info = f"stepper({method})", given, scheme.order, scheme.info
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
-        return self.made
+        return _remade, (self.given,)
 
     @property
     def taken(self):

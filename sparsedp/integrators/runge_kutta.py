@@ -50,12 +50,12 @@ from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import tell
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import identity
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.inverses import build
 from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
+from sparsedp.structure.kronecker import Kronecker
 from sparsedp.tape import Rule, of_argument
 
 __all__ = ["EXPLICIT", "IMPLICIT", "Explicit", "Linear", "Nonlinear", "Polynomial", "Resolvent", "Scheme"]
@@ -247,7 +247,8 @@ class Resolvent:
         known = self._kept.find((z,))
         if known is not None:
             return known
-        op = identity(self.op.domain) - z * self.op
+        one = Kronecker.identity(self.op.domain.parts)
+        op = Operator(one, self.op.domain, self.op.domain, "identity") - z * self.op
         return self._kept.put((z,), build(op, name=self.name, log=self.info, **self.settings))
 
 
