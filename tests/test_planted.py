@@ -84,8 +84,8 @@ BUGS = {
     ),
     "off by one in the last step": Bug(
         "trajectory",
-        "range(run.n - 1, -1, -1)",
-        "range(run.n - 2, -1, -1)",
+        'range(n - 1, -1, -1), "backward"',
+        'range(n - 2, -1, -1), "backward"',
         "tests/test_rollout.py",
     ),
     "a cotangent of the wrong dtype": Bug(
@@ -120,8 +120,8 @@ BUGS = {
     ),
     "a checkpoint that misses a vector of the optimizer": Bug(
         "optimize",
-        "        (state, best), history = _restored(template, found.leaves)",
-        "        (state, best), history = _restored(template, found.leaves)\n"
+        '        state = flatten(template)[1](found["state"])',
+        '        state = flatten(template)[1](found["state"])\n'
         "        state = state._replace(**{state._fields[1]: template[1]})",
         "tests/test_resume.py",
     ),

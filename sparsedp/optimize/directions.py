@@ -99,36 +99,42 @@ class Family:
     def krylov(self, linearised, g):
         """Direction from products with J and J^T.
 
-        The bidiagonalisation started with J^T g gives J Q = P B with orthonormal P, Q and an upper bidiagonal B, and
-        the direction is Q (B^T B + damping)^(-power) Q^T J^T g: exact after min(m, n) steps, and usually settled long
-        before. Source: G. H. Golub, W. Kahan, SIAM J. Numer. Anal. 2, 1965.
+        The bidiagonalisation started with g gives J Q = P B with orthonormal P, Q and a lower bidiagonal B of one row
+        more than columns, and the direction is Q (B^T B + damping)^(-power) B^T P^T g: exact after min(m, n) steps,
+        and usually settled long before. What of g is not in the range of J stays in P, and does no harm.
+        Source: G. H. Golub, W. Kahan, SIAM J. Numer. Anal. 2, 1965; C. C. Paige, M. A. Saunders, ACM TOMS 8, 1982.
         """
         left, right = map(_Rows, linearised.shape)
-        diagonal: list = []
-        above, largest = [right.add(linearised.pull(g))], 0.0
         limit, look, weights = min(*linearised.shape, self.rank or np.inf), LOOK, np.zeros(0)
-        while len(diagonal) < limit and above[-1] > EXHAUSTED * largest:
-            size = left.add(linearised.push(right.last))
+        length, largest = left.add(g), 0.0
+        diagonal: list = []
+        below: list = []
+        while len(diagonal) < limit:
+            size = right.add(linearised.pull(left.last))
             if not size > EXHAUSTED * largest:
                 break
             diagonal.append(size)
-            above.append(right.add(linearised.pull(left.last)))
-            largest = max(largest, size, above[-1])
+            below.append(left.add(linearised.push(right.last)))
+            largest = max(largest, size, below[-1])
+            if not below[-1] > EXHAUSTED * largest:
+                break
             if len(diagonal) == look:
-                before, weights = weights, self._small(diagonal, above)[0]
+                before, weights = weights, self._small(length, diagonal, below)[0]
                 moved = weights - np.pad(before, (0, look - len(before)))
                 if np.linalg.norm(moved) <= SETTLED * np.linalg.norm(weights):
                     break
                 look += max(LOOK, look // 8)
-        weights, s, kept = self._small(diagonal, above)
+        weights, s, kept = self._small(length, diagonal, below)
         return Direction(weights @ right.rows[: len(weights)], s, kept, "krylov")
 
-    def _small(self, diagonal, above):
+    def _small(self, length, diagonal, below):
         """The direction in the basis Q, the singular values of B, and how many of them were kept."""
-        small = np.diag(diagonal) + np.diag(above[1 : len(diagonal)], 1)
-        _, s, vectors = np.linalg.svd(small)
+        small = np.zeros((len(diagonal) + 1, len(diagonal)))
+        np.fill_diagonal(small, diagonal)
+        np.fill_diagonal(small[1:], below)
+        left, s, right = np.linalg.svd(small, full_matrices=False)
         shares, kept = self._shares(s)
-        return above[0] * (shares * vectors[:, :1].sum(axis=1)) @ vectors, s, kept
+        return length * (shares * s * left[0]) @ right, s, kept
 
     def _shares(self, s):
         """(s^2 + damping)^(-power), 0 for the singular values that are left out; how many are not."""

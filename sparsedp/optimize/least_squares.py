@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+from scipy.sparse.linalg import LinearOperator, lsmr
 
 from sparsedp.fields import is_number
 from sparsedp.optimize.directions import Family
@@ -17,6 +18,7 @@ from sparsedp.tree import norm
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 
 ROUNDING = 1e-12  # singular values below this share of the largest are taken for 0
+FORCING, CONDITION = 1e-10, 1e14  # of LSMR: relative accuracy, and where it gives up
 EXACT = 1e-9  # damping relative to |J|^2 above which the Gram matrix, with rounding 1e-16, gives 6 digits of the step
 
 
@@ -48,7 +50,7 @@ class GaussNewton:
         Residuals along axis 0 are samples that see x independently: J by a few products.
     dense : bool or None
         Whether J is formed, by products forward or in reverse, whichever are fewer; None: when it has at most 3e7
-        entries and 4000 rows or columns. Else a bidiagonalisation by products with J and J^T.
+        entries and 4000 rows or columns. Else LSMR on products with J and J^T.
     """
 
     residuals, searches = True, True
@@ -60,14 +62,21 @@ class GaussNewton:
         """The direction to the minimum of |J d + r|^2 + damping |d|^2, backwards."""
         return Family(1.0, damping, ROUNDING, self.method)
 
+    def step(self, linearised, damping=0.0):
+        """The step to that minimum."""
+        family, r = self.family(damping), linearised.flat
+        if family.forms(*linearised.shape):
+            return -family(linearised, r).step
+        product = LinearOperator(linearised.shape, linearised.push, linearised.pull, dtype=float)
+        return -lsmr(product, r, damp=np.sqrt(damping), atol=FORCING, btol=FORCING, conlim=CONDITION)[0]
+
     def begin(self, first):
         """State at the start."""
         return SquaresState(first)
 
     def advance(self, state, trials):
         """One iteration. Raises Stuck when no lower point is found."""
-        linearised = trials.linearised(state.trial)
-        step = -self.family()(linearised, linearised.flat).step
+        step = self.step(trials.linearised(state.trial))
         trial, _ = backtracked(state.trial, step, trials, "the Gauss-Newton step")
         return state._replace(trial=trial)
 
@@ -102,7 +111,7 @@ class LevenbergMarquardt(GaussNewton):
             if formed and damping > EXACT * np.linalg.norm(linearised.rows()) ** 2:
                 step = -_damped(linearised.rows(), linearised.flat, damping)
             else:
-                step = -self.family(damping)(linearised, linearised.flat).step
+                step = self.step(linearised, damping)
             point = trials.box.inside(here.vector + step)
             trial, change = trials(point, here.value), linearised.push(point - here.vector)
             predicted = -float(np.dot(change, linearised.flat + 0.5 * change))

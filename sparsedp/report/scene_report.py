@@ -86,8 +86,11 @@ def load(target):
 
 
 @contextlib.contextmanager
-def refusing(sentence):
-    """In it code of the user's runs: it prints to stderr, and what it raises, an exit too, is refused."""
+def audited(name, file=None):
+    """In it code of the user's runs: it prints to stderr, and what it raises, an exit too, is refused.
+
+    name: of its loss. file: it is the file itself that runs.
+    """
     try:
         with contextlib.redirect_stdout(sys.stderr):
             yield
@@ -95,12 +98,10 @@ def refusing(sentence):
         raise
     except BaseException as error:
         cure = "" if isinstance(error, Exception) else "; it ended the program, let it return its value"
-        raise ValueError(f"{sentence(error)}{type(error).__name__}: {error}{cure}") from error
-
-
-def audited(name):
-    """A `with` block in which a loss of the user's runs."""
-    return refusing(lambda error: f"{name} cannot be audited: ")
+        reason = f"{type(error).__name__}: {error}{cure}"
+        if file is None:
+            raise ValueError(f"{name} cannot be audited: {reason}") from error
+        raise ValueError(f"{file} does not run: {_where(error, str(file))}{reason}") from error
 
 
 def _of_one(loss, x):
@@ -118,7 +119,7 @@ def _run(file):
     before = sys.argv, sys.path
     sys.argv, sys.path = [str(file)], [str(file.resolve().parent), *sys.path]
     try:
-        with refusing(lambda error: f"{file} does not run: {_where(error, str(file))}"):
+        with audited(file.stem, file):
             return runpy.run_path(str(file), run_name=file.stem)
     finally:
         sys.argv, sys.path = before
