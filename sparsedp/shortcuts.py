@@ -5,7 +5,7 @@ here.
 """
 
 import operator
-from functools import wraps
+from functools import partial, wraps
 from inspect import unwrap
 from typing import Any, NamedTuple
 
@@ -177,21 +177,38 @@ def _real(g):
 
 
 def _of_two(part):
-    """part(num, x, y, g), the derivative in an operand times g -> (vjp, jvp)."""
+    """part(num, x, y), the derivative in an operand as a function of g that holds no array in vain -> (vjp, jvp)."""
 
     def back(nums, x, y):
-        return lambda g: [part(num, x, y, g) for num in nums]
+        act = part(nums[0], x, y)
+        if len(nums) == 1:
+            return lambda g: (act(g),)
+        other = part(1, x, y)
+        return lambda g: (act(g), other(g))
 
     def forth(value, nums, tangents, x, y):
-        g = part(nums[0], x, y, tangents[0])
-        return g + part(1, x, y, tangents[1]) if len(nums) == 2 else g
+        g = part(nums[0], x, y)(tangents[0])
+        return g + part(1, x, y)(tangents[1]) if len(nums) == 2 else g
 
     return back, forth
 
 
 def _total(many):
-    """many(x), over which a sum is divided -> vjp of the sum of all entries."""
-    return lambda nums, x, *axis: None if axis or not x.size else lambda g: (g / many(x) * np.ones(x.shape),)
+    """many(x), by which a sum of all entries is divided -> its vjp."""
+
+    def back(nums, x, *axis):
+        shape, divisor = x.shape, many(x)
+        return None if axis or not divisor else lambda g: (_everywhere(g / divisor, shape),)
+
+    return back
+
+
+def _everywhere(g, shape):
+    return np.full(shape, g) if type(g) in (float, np.float64) else g * np.ones(shape)
+
+
+def _same(g):
+    return g
 
 
 def _none(*args):
@@ -222,9 +239,9 @@ def _copy(nums, positional, options, x):
 
 # Of a function of autograd: vjp(nums, *args) -> back, and jvp(value, nums, tangents, *args).
 RULES: dict[Any, Any] = {
-    anp.add: _of_two(lambda num, x, y, g: g),
-    anp.subtract: _of_two(lambda num, x, y, g: -g if num else g),
-    anp.multiply: _of_two(lambda num, x, y, g: (x if num else y) * g),
+    anp.add: _of_two(lambda num, x, y: _same),
+    anp.subtract: _of_two(lambda num, x, y: operator.neg if num else _same),
+    anp.multiply: _of_two(lambda num, x, y: partial(operator.mul, x if num else y)),
     anp.negative: (lambda nums, x: lambda g: (-g,), lambda value, nums, tangents, x: -tangents[0]),
     anp.sum: (_total(lambda x: 1), _none),
     MEAN: (_total(np.size), _none),

@@ -177,7 +177,12 @@ def _call_vjp(argnums, ans, args, kwargs):
     pull = rule.vjp(nums, ans, *values)
 
     def checked_pull(g):
-        return _checked(rule.name, [values[num] for num in nums], timed(rule.name, "vjp", pull, g), g)
+        backs = timed(rule.name, "vjp", pull, g)
+        if not isinstance(backs, (tuple, list)) or len(backs) != len(nums):  # autograd would accept it silently
+            raise DerivativeError(
+                f"{rule.name} must return one derivative for each of the {len(nums)} values asked for"
+            )
+        return [fit(rule.name, values[num], back, g) for num, back in zip(nums, backs, strict=True)]
 
     return checked_pull
 
@@ -206,13 +211,6 @@ def _call_jvp(argnums, tangents, ans, args, kwargs):
 defvjp_argnums(_primitive, _call_vjp)
 defvjp_argnums(through, _call_vjp)
 defjvp_argnums(_primitive, _call_jvp)
-
-
-def _checked(name, values, cotangents, g):
-    """A wrong count, shape or kind of derivative is accepted silently by autograd; not here."""
-    if not isinstance(cotangents, (tuple, list)) or len(cotangents) != len(values):
-        raise DerivativeError(f"{name} must return one derivative for each of the {len(values)} values asked for")
-    return tuple(fit(name, value, back, g) for value, back in zip(values, cotangents, strict=True))
 
 
 def fit(name, value, cotangent, g):
@@ -267,13 +265,10 @@ def linear(name, forward, transpose):
     """
     there = Rule(name, forward)
     back = Rule(f"{name}.T", transpose)
-    _set_linear(there, back)
-    _set_linear(back, there)
+    for rule, transposed in ((there, back), (back, there)):
+        rule.vjp = lambda nums, ans, x, act=transposed: lambda g: (act(g),)
+        rule.jvp = lambda nums, tangents, ans, x, act=rule: act(tangents[0])
     return there, back
-
-
-def _set_linear(rule, transposed):
-    rule.vjp, rule.jvp = lambda nums, ans, x: lambda g: (transposed(g),), lambda nums, ts, ans, x: rule(ts[0])
 
 
 def _apply(op, u):

@@ -91,7 +91,7 @@ BUDGETS = {
     "solvers": 40_800,
     "solvers/multigrid": 10_000,
     "structure": 6_700,
-    "trajectory": 10_800,
+    "trajectory": 10_700,
 }
 EXTRAS = ("numba", "matplotlib", "tqdm")  # foreign libraries that need not be there
 LAZY = ("pyamg", "numba", "matplotlib", "tqdm", "scipy", "autograd", "numpy")  # not touched by `import sparsedp`

@@ -9,7 +9,7 @@ from sparsedp.tape import fit, isbox
 from sparsedp.traces import accumulate
 from sparsedp.trajectory.layout import fingerprint, refuse_lost
 from sparsedp.trajectory.progress import shown_steps
-from sparsedp.trajectory.record import LIMIT, Growth
+from sparsedp.trajectory.record import Growth
 from sparsedp.trajectory.schedule import stride
 
 __all__ = ["BackwardPass"]
@@ -67,10 +67,9 @@ class BackwardPass:
         if active:
             count("rollout.step", "vjp", n)
             count("rollout.step", "recomputed", self.recomputed)
+        record = growth.record(many, self.recomputed)
         if run.record is not None:
-            run.record(growth.record(many, self.recomputed))
-        elif growth.grown() > LIMIT:
-            growth.record(many, self.recomputed)
+            run.record(record)
         params = [self.cotangents.get(root, NONE)[0] for root in steps.roots]
         inputs = [anp.stack(block) if isinstance(block, list) else block for block in self.inputs]
         return [*(total or [None] * len(run.loop.state.places)), *map(_fitted, params, steps.p), *inputs]

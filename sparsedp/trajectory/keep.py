@@ -16,7 +16,7 @@ from sparsedp.fields import frozen
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.traces import traces_of
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask
-from sparsedp.tree import flatten
+from sparsedp.tree import flatten, leaves
 
 __all__ = ["All", "Each", "Last"]
 
@@ -178,9 +178,8 @@ class Each:
         """Cotangents of the stacks -> function (index, variables, statics) -> cotangents of a state."""
 
         def at(i, values, statics):
-            moving = self.layout.spread([True] * len(values))
             state = self.layout.build(values, statics)
-            ends, _, pull = linearised(lambda tree: self.function(i, tree), state, moving)
+            ends, _, pull = linearised(lambda tree: self.function(i, tree), state, map(is_variable, leaves(state)))
             self._compare(i, ends)
             places = self._trees[i][2]
             found = pull([g[place[0]][place[1]] if place else None for place in places])

@@ -90,10 +90,6 @@ class Layout:
             return variables[0]
         return self._rebuild(self._filled(self.statics if statics is None else statics, variables))
 
-    def spread(self, values):
-        """One value for each variable -> one for each leaf, None for the others."""
-        return self._filled([None] * len(self.statics), values)
-
     def _filled(self, leaves, values):
         """All leaves, those of the variables replaced."""
         found = list(leaves)

@@ -6,6 +6,8 @@ gradient says little about the physics, and a GrowthWarning says so.
 """
 
 import warnings
+from itertools import pairwise
+from math import inf, log
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +16,7 @@ from sparsedp.errors import GrowthWarning
 from sparsedp.ledger import thread
 from sparsedp.tape import plain
 
-__all__ = ["LIMIT", "Growth", "Record", "looked_at"]
+__all__ = ["Growth", "Record"]
 
 LIMIT = 1e8  # half of the digits are gone
 SAMPLES = 32  # measurements of the cotangent in a long run
@@ -60,16 +62,11 @@ class Record(NamedTuple):
         return self.amplification > LIMIT
 
 
-def looked_at(n):
-    """The cotangent of n steps is measured at states whose number is a multiple of this."""
-    return max(n // SAMPLES, APART)
-
-
 class Growth:
     """Measures the cotangent of the state now and then on the way back."""
 
     def __init__(self, n, truncate):
-        self._n, self.every, self._truncate = n, looked_at(n), truncate
+        self._n, self.every, self._truncate = n, max(n // SAMPLES, APART), truncate
         self.norms: list = []
 
     def see(self, i, g):
@@ -79,29 +76,23 @@ class Growth:
         norm = max((_largest(plain(leaf)) for leaf in g if leaf is not None), default=0.0)
         self.norms.append((i, norm))
 
-    def _pieces(self):
-        """Pairs of neighbouring measurements with no cut between them: (steps, growth of the logarithm)."""
-        known = [(i, np.log(norm)) for i, norm in self.norms if 0 < norm < np.inf]
-        for (i, first), (j, second) in zip(known, known[1:], strict=False):
-            if self._truncate is None or (self._n - i) // self._truncate == (self._n - j - 1) // self._truncate:
-                yield i - j, second - first
-
-    def grown(self):
-        """The largest norm over the first one."""
-        first = next((norm for _, norm in self.norms if norm > 0), 0.0)
-        return max(norm / first for _, norm in self.norms) if first > 0 else float("nan")
-
     def record(self, kept, recomputed):
         """The record of the way back; warns when the cotangent grew too much."""
-        pieces, grown = list(self._pieces()), self.grown()
+        n, cut = self._n, self._truncate
+        first = next((norm for _, norm in self.norms if norm > 0), float("nan"))
+        grown = max((norm / first for _, norm in self.norms), default=first)
+        known = [(i, log(norm)) for i, norm in self.norms if 0 < norm < inf]
+        # Pairs of neighbouring measurements with no cut between them: (steps, growth of the logarithm).
+        pairs = ((i, j, b - a) for (i, a), (j, b) in pairwise(known))
+        pieces = [(i - j, rise) for i, j, rise in pairs if cut is None or (n - i) // cut == (n - j - 1) // cut]
         steps = sum(length for length, _ in pieces)
-        rate = float(sum(rise for _, rise in pieces) / steps) if steps else float("nan")
-        found = Record("backward", self._n, kept, recomputed, tuple(self.norms), rate, float(grown))
+        rate = sum(rise for _, rise in pieces) / steps if steps else float("nan")
+        found = Record("backward", n, kept, recomputed, tuple(self.norms), rate, grown)
         if found.flagged:
             thread.grown += 1
             warnings.warn(
                 GrowthWarning(
-                    f"the cotangent grew by {grown:.0e} over {self._n} steps of rollout, {rate:.2g} a step in the "
+                    f"the cotangent grew by {grown:.0e} over {n} steps of rollout, {rate:.2g} a step in the "
                     "logarithm; the gradient is exact and of little use, take fewer steps or truncate"
                 ),
                 stacklevel=2,

@@ -15,12 +15,11 @@ beta(s-1, r-1) <= n - m <= beta(s-1, r).
 
 import re
 from bisect import bisect_left
-from typing import NamedTuple
 
 from sparsedp.fields import is_number
+from sparsedp.trajectory.record import Record
 
 __all__ = [
-    "Plan",
     "advances",
     "budget_within_reach",
     "checkpoints",
@@ -138,35 +137,14 @@ def _bytes(memory):
     return int(memory)
 
 
-class Plan(NamedTuple):
-    """What a budget means for a run, before it is made.
-
-    Attributes
-    ----------
-    steps : int
-    kept : int
-        States kept for the way back.
-    recomputed : int
-        Steps run again; the least number that is possible with so many states.
-    """
-
-    steps: int
-    kept: int
-    recomputed: int
-
-    @property
-    def factor(self):
-        """Plain steps over steps, the first run included."""
-        return 1 + self.recomputed / max(self.steps, 1)
-
-
 def plan(n, memory, state_bytes, beside=0):
-    """Steps, memory and bytes of a state, and of what is there once -> Plan.
+    """Steps, memory and bytes of a state, and of what is there once -> the Record that a run will make.
 
     Examples
     --------
-    >>> plan(10_000, "100 MB", 256 * 256 * 8)
-    Plan(steps=10000, kept=181, recomputed=9818)
+    >>> told = plan(10_000, "100 MB", 256 * 256 * 8)
+    >>> told.kept, told.recomputed
+    (181, 9818)
     """
     slots = max(n, 1) if memory is None else slots_within(memory, state_bytes, n, beside)
-    return Plan(n, slots, recomputed(n, slots))
+    return Record("backward", n, slots, recomputed(n, slots))
