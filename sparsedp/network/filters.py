@@ -116,10 +116,11 @@ def _third(a, b, slot, shape, padding):
 
     `shape` is that of the weight.
     """
-    dim = np.ndim(a if slot else b) - 2
-    widths = shape[-dim:]
+    if np.ndim(a if slot else b) == 3:  # a field in 1-D is one in 2-D with one line
+        return _third(a[..., None, :], b[..., None, :], slot, (*shape[:-1], 1, shape[-1]), padding)[..., 0, :]
+    widths = shape[-2:]
     if slot == 0:
-        turned = np.swapaxes(np.flip(a, tuple(range(-dim, 0))), -dim - 1, -dim - 2)
+        turned = np.swapaxes(a[..., ::-1, ::-1], -3, -4)
         return fold(correlate(pad(b, [2 * width - 1 for width in widths], "zero"), turned), widths, padding)
     if slot == 1:
         return weigh(pad(b, widths, padding), a, shape)
