@@ -81,7 +81,7 @@ BUDGETS = {
     "": 183_000,
     "advection": 14_000,
     "check": 17_700,
-    "flow": 5_960,
+    "flow": 5_860,
     "integrators": 10_700,
     "kernels": 14_000,
     "network": 3_000,

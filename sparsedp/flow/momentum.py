@@ -5,6 +5,8 @@ hold the wall values; along the other axes it is a field between walls half a ce
 condition that what the fluid does there implies (`along` of conditions.py).
 """
 
+from itertools import product
+
 import numpy as np
 import scipy.sparse as sp
 
@@ -170,16 +172,17 @@ def convection(grid, boundary=no_slip, solid=None):
     array([ 2.,  0., -2.,  0.])
     """
     sides = resolve(grid, boundary, no_slip)
-    flux = _flux_parts(grid)
-    carried, carrier, gain = {}, {}, {}
-    for number, (c, a) in enumerate((c, a) for c in range(grid.dim) for a in range(grid.dim)):
+    carried, carrier, gain, flux = {}, {}, {}, []
+    for number, (c, a) in enumerate(product(range(grid.dim), repeat=2)):  # component c through the sides across axis a
         if a == c:
-            carried[number, c] = carrier[number, c] = along(c, grid.dim, _to_centres(grid, c))
-            gain[c, number] = along(c, grid.dim, _from_centres(grid, c))
+            mean = other = _to_centres(grid, c)
+            back = _from_centres(grid, c)
         else:
-            carried[number, c] = along(a, grid.dim, means(grid, a, _conditions(sides[a])))
-            carrier[number, a] = along(c, grid.dim, means(grid, c, _conditions(sides[c])))
-            gain[c, number] = along(a, grid.dim, differences(grid, a))
+            mean, other = (means(grid, b, _conditions(sides[b])) for b in (a, c))
+            back = differences(grid, a)
+        carried[number, c], carrier[number, a] = along(a, grid.dim, mean), along(c, grid.dim, other)
+        gain[c, number] = along(a, grid.dim, back)
+        flux.append(tuple(mean.shape[0] if b == a else n for b, n in enumerate(grid.face_shape(c))))
     faces, sites = grid.faces, Space(sum(int(np.prod(part)) for part in flux), "fluxes", grid, flux)
     free = Mask(_free(grid, sides, solid))
     A = Operator(Kronecker(flux, faces.parts, carried), faces, sites, "carried")
@@ -235,23 +238,10 @@ def _around(grid, c, sides, closed, condition):
     return total(across, Kronecker(own.cells.parts, own.cells.parts, blocks)).explicit()
 
 
-def _flux_parts(grid):
-    """Shapes of the fluxes of component c through the sides across axis a.
-
-    Along its own axis: the centres of the cells, and on a bounded axis the two walls, for the
-    half control volume of an open side.
-    """
-    parts = []
-    for c in range(grid.dim):
-        for a in range(grid.dim):
-            shape = list(grid.face_shape(c))
-            shape[a] = grid.shape[a] + 2 * (not grid.periodic[a]) if a == c else grid.node_count(a)
-            parts.append(tuple(shape))
-    return tuple(parts)
-
-
 def _to_centres(grid, c):
-    """Nodes -> cells: means; on a bounded axis the wall values stand before and after them."""
+    """Nodes -> cells: means; on a bounded axis the wall values stand before and after them, for the half control volume
+    of an open side.
+    """
     inner = (pick(grid, c, False) + pick(grid, c, True)).scaled(0.5)
     if grid.periodic[c]:
         return inner

@@ -29,6 +29,7 @@ derivative.
 """
 
 from collections import deque
+from math import prod
 from typing import Any, NamedTuple
 
 import autograd.numpy as anp
@@ -38,6 +39,7 @@ from sparsedp.constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.integrators.runge_kutta import Scheme
+from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain
 from sparsedp.tree import flatten, leaves, mapped
 
@@ -101,8 +103,8 @@ class Adaptive(Scheme):
 
     def _check_tolerance(self, u):
         """Steps of a state that cannot hold the digits asked for would shrink to nothing."""
-        for leaf in leaves(u):
-            rounding = np.finfo(dtype_of(leaf)).eps if is_variable(leaf) else 0.0
+        for leaf in filter(is_variable, leaves(u)):
+            rounding = np.finfo(dtype_of(leaf)).eps
             if self.tolerance < 4 * rounding:
                 raise ValueError(
                     f"{self.name} cannot meet the tolerance {self.tolerance:g} with a state of {dtype_of(leaf)}, whose "
@@ -279,28 +281,26 @@ class Moving:
 
     def __init__(self, tree, moves, sizes):
         self.found, self.rebuild = flatten(tree)
-        places = [(place, plain(leaf)) for place, leaf in enumerate(self.found) if moves(leaf)]
-        self.moving = [
-            (place, leaf, np.where(sizes(place, leaf) > 0, sizes(place, leaf), 1.0)) for place, leaf in places
-        ]
+        known = [(place, plain(leaf)) for place, leaf in enumerate(self.found) if moves(leaf)]
+        sizes = [sizes(*pair) for pair in known]
+        self.moving = [(*pair, np.where(size > 0, size, 1.0)) for pair, size in zip(known, sizes, strict=True)]
+        shapes = [np.shape(leaf) for _, leaf in known for _ in range(1 + np.iscomplexobj(leaf))]
+        self.space = Space(sum(map(prod, shapes)), parts=shapes)
 
     def off(self, tree):
         """Tree -> flat."""
-        found, flat = leaves(tree), []
+        found, parts = leaves(tree), []
         for place, leaf, size in self.moving:
             part = _off(found[place], leaf) / size
-            flat += [anp.real(part), anp.imag(part)] if dtype_of(part).kind == "c" else [part]
-        return _flat(flat)
+            parts += [anp.real(part), anp.imag(part)] if np.iscomplexobj(leaf) else [part]
+        return self.space.join(*parts)
 
     def at(self, flat):
         """Flat -> tree."""
-        found, start = list(self.found), 0
+        found, parts = list(self.found), iter(self.space.split(flat))
         for place, leaf, size in self.moving:
-            kind, count = dtype_of(leaf), np.size(leaf)
-            part, start = flat[start : start + count], start + count
-            if kind.kind == "c":
-                part, start = part + 1j * flat[start : start + count], start + count
-            found[place] = leaf + cast(size * anp.reshape(part, np.shape(leaf)), kind)
+            part = next(parts) + 1j * next(parts) if np.iscomplexobj(leaf) else next(parts)
+            found[place] = leaf + cast(size * part, dtype_of(leaf))
         return self.rebuild(found)
 
 

@@ -1,7 +1,7 @@
 """Runge-Kutta steps. An explicit one is a table of numbers; an implicit one a few stages, x of x = b + h f(x, t).
 
 Where the rate is c L u and nothing else, an explicit step of order p in p stages is a polynomial of z L, z = h c, and
-one node on the tape, with a derivative of the same form:
+one node on the tape:
 
     T_p(z) u = u + z L u + ... + (z L)^p u / p!,     dT_p(z) u = L T_{p-1}(z) u dz + T_p(z) du
 
@@ -37,7 +37,7 @@ What L leaves as it is (the mean, where nothing flows through the walls) is spli
 after it: 1 - z L has the eigenvalue 1 there beside those of size z |L|, and would lose it to rounding.
 """
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -50,7 +50,6 @@ from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import tell
 from sparsedp.operator import Operator
-from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.inverses import build
 from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog
@@ -128,37 +127,40 @@ class Polynomial(Scheme):
 
     def __init__(self, problem, name):
         super().__init__(problem, name, EXPLICIT[name].order)
-        orders = range(1, self.order + 1)
-        self._rules = {(terms, flag): self._rule(terms, flag) for terms in orders for flag in (False, True)}
+        self._rule, self._transposed = self._made(False), self._made(True)
 
     def __call__(self, u, params, t, h):
-        return self._rules[self.order, False](h * self.problem.coefficient(params), u)
+        return self._rule(h * self.problem.coefficient(params), u)
 
-    def _rule(self, terms, transposed):
-        """T of L, or of L^T, as a rule in (z, u)."""
-        L = self.problem.op.T if transposed else self.problem.op
+    def _made(self, transposed):
+        """T_p of L, or of L^T, as a rule in (z, u)."""
+        L, orders = self.problem.op.T if transposed else self.problem.op, range(self.order, 0, -1)
 
         def forward(z, u):
             z, total = float(z), u  # traced it is a NumPy scalar, which would round float32 otherwise
-            for k in reversed(range(1, terms + 1)):  # Horner's rule
+            for k in orders:  # Horner's rule
                 total = L.apply(total)
                 total *= z / k
                 total += u
             return total
 
         def slope(z, u):
-            return self._rules[terms - 1, transposed](z, L(u)) if terms > 1 else L(u)
+            total = u
+            for k in orders[1:]:
+                total = u + (z / k) * L(total)
+            return L(total)
 
         def vjp(nums, ans, z, u):
             def pull(g):
-                slopes = {0: lambda: anp.sum(g * slope(z, u)), 1: lambda: self._rules[terms, not transposed](z, g)}
+                back = self._rule if transposed else self._transposed
+                slopes = {0: lambda: anp.sum(g * slope(z, u)), 1: lambda: back(z, g)}
                 return tuple(of_argument(slopes[num](), (z, u)[num]) for num in nums)
 
             return pull
 
         def jvp(nums, tangents, ans, z, u):
-            pairs = zip(nums, tangents, strict=True)
-            return sum(self._rules[terms, transposed](z, t) if num else t * slope(z, u) for num, t in pairs)
+            same, pairs = self._transposed if transposed else self._rule, zip(nums, tangents, strict=True)
+            return sum(same(z, t) if num else t * slope(z, u) for num, t in pairs)
 
         return Rule(f"stepper({self.name}){'.T' * transposed}", forward, vjp, jvp)
 
@@ -187,7 +189,7 @@ class Resolvent:
 
     def __init__(self, op, name, settings, most=2):
         self.op, self.name, self.settings = op, name, settings
-        self.info, self._kept = SolveLog(), Cache(most)
+        self.info, self._inverse = SolveLog(), lru_cache(most)(self._set_up)
         self._checked, self._free = self._rule(False, True), self._rule(False, False)
         self._adjoint = self._rule(True, False)
 
@@ -238,18 +240,13 @@ class Resolvent:
     def _null_space(self):
         """That of L where L is symmetric up to weights, None where there is none."""
         system = System(self.op, self.settings["rtol"], None)
-        if not self.op.structure.has_entries or system.complex or system.weights is None:
-            return None
-        return system.null_space if system.null_space is not None and system.null_space.count else None
+        known = self.op.structure.has_entries and not system.complex and system.weights is not None
+        return system.null_space if known and system.null_space.count else None
 
-    def _inverse(self, z):
-        """The inverse of 1 - z L: kept or set up."""
-        known = self._kept.find((z,))
-        if known is not None:
-            return known
-        one = Kronecker.identity(self.op.domain.parts)
-        op = Operator(one, self.op.domain, self.op.domain, "identity") - z * self.op
-        return self._kept.put((z,), build(op, name=self.name, log=self.info, **self.settings))
+    def _set_up(self, z):
+        """The inverse of 1 - z L."""
+        one = Operator(Kronecker.identity(self.op.domain.parts), self.op.domain, self.op.domain, "identity")
+        return build(one - z * self.op, name=self.name, log=self.info, **self.settings)
 
 
 # ---- implicit: steps made of stages ----------------------------------------------------------------------------------
