@@ -277,16 +277,14 @@ class Operator(Frozen, Remade):
 
     def explicit(self):
         """The same operator, applied through its matrix."""
-        return self if self.form == "explicit" else self._in_form("explicit")
+        return self._in_form("explicit")
 
     def matrix_free(self):
         """The same operator, applied without a matrix. One that was given as a matrix stays as it is."""
-        if self.form == "matrix-free" or isinstance(self.structure, Matrix):
-            return self
-        return self._in_form("matrix-free")
+        return self if isinstance(self.structure, Matrix) else self._in_form("matrix-free")
 
     def _in_form(self, form):
-        return Operator(self.structure, self.domain, self.codomain, self.name, form)
+        return self if form == self.form else Operator(self.structure, self.domain, self.codomain, self.name, form)
 
     def matvec(self, x):
         """Flat product A x, as SciPy calls it."""

@@ -126,7 +126,6 @@ class Scripted(Engine):
     def solve(self, b, goal, transposed):
         self.calls += 1
         exact = (self.inverse.T if transposed else self.inverse) @ b
-        b[:] = np.nan  # it may use the array it was given
         return exact * (1 + self.error), 3, self.word
 
 

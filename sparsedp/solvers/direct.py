@@ -44,7 +44,6 @@ class Direct(Engine):
     """
 
     method = "direct"
-    overwrites = False
 
     def __init__(self, solve, words, anchors=()):
         self._solve, self.hierarchy, self._anchors = solve, words, anchors

@@ -114,14 +114,13 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     check_operator("inverse", op)
     if not fits(op.domain, op.codomain):
         raise ShapeError(f"inverse takes a square operator, got one from {op.domain} to {op.codomain}; write op.T @ op")
-    check_settings(method, rtol, maxiter, nullspace, options)
-    return build(op, method, float(rtol), maxiter, nullspace, copied(options))
+    return build(op, **check_settings(method, rtol, maxiter, nullspace, options))
 
 
 def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, solves="many"):
     """The set-up behind `inverse`, for callers that name it, keep its log, or expect "few" solves of it."""
     clock = perf_counter()
-    system = System(op, rtol, None if maxiter is None else int(maxiter))
+    system = System(op, rtol, maxiter)
     word, reason, engine = (method, "as asked", None) if method != "auto" else _chosen(system, solves)
     _check_options(word, options)
     if system.complex and word != "direct":
@@ -130,8 +129,7 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
     name = name or f"inverse({op.name})"
     made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
     solver = Solver(system, engine, nullspace, log or SolveLog(), name, made, reason)
-    _note_setup(solver, clock)
-    return Inverse(Solution(solver))
+    return Inverse(Solution(_set_up(solver, clock)))
 
 
 def build_dense(matrix, make, rtol, nullspace, name):
@@ -140,22 +138,22 @@ def build_dense(matrix, make, rtol, nullspace, name):
     engine = dense_engine(system := DenseSystem(matrix, make, rtol))
     if engine is None:
         return None
-    solver = Solver(system, engine, nullspace, SolveLog(), name, None, "a small full matrix")
-    _note_setup(solver, clock)
-    return solver
+    return _set_up(Solver(system, engine, nullspace, SolveLog(), name, None, "a small full matrix"), clock)
 
 
-def _note_setup(solver, clock):
+def _set_up(solver, clock):
+    """The Solver, its set-up noted, which began at this time."""
     log, name = solver.log, solver.name
     log.setup_seconds, log.hierarchy = perf_counter() - clock, solver.engine.hierarchy
     if recordings:
         count(name, "setup")
         count(name, "hierarchy", int(solver.engine.hierarchical))
         spent(name, "setup", log.setup_seconds)
+    return solver
 
 
-def check_settings(method, rtol, maxiter, nullspace, options=()):
-    """Refuse settings that the method, or with "auto" every method, cannot take."""
+def check_settings(method, rtol, maxiter, nullspace, options):
+    """Refuse settings that the method, or with "auto" every method, cannot take -> them, as keywords of `build`."""
     if method not in ("auto", *METHODS):
         raise ValueError(f"method must be auto, {', '.join(METHODS)}, got {method!r}")
     if not (is_number(rtol) and 0 < rtol < 1):
@@ -165,6 +163,8 @@ def check_settings(method, rtol, maxiter, nullspace, options=()):
     if nullspace not in ("raise", "project"):
         raise ValueError(f"nullspace must be 'raise' or 'project', got {nullspace!r}")
     _check_options(method, options)
+    maxiter = None if maxiter is None else int(maxiter)
+    return dict(method=method, rtol=float(rtol), maxiter=maxiter, nullspace=nullspace, options=copied(options))
 
 
 def _check_options(word, options):

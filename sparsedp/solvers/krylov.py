@@ -79,7 +79,6 @@ class Krylov(Engine):
 
     method = "krylov"
     iterative = True
-    overwrites = False
     precondition: Any = None
 
     def __init__(self, system, precondition=None, maxiter=None, iterations=None):

@@ -37,7 +37,6 @@ from sparsedp.space import Space, fits
 from sparsedp.structure.base import compact, rows_of
 from sparsedp.structure.lazy import Chain, Diagonal, Sum
 from sparsedp.tape import Rule, isbox, of_argument, plain
-from sparsedp.tree import copied
 
 __all__ = ["Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]
 
@@ -107,11 +106,6 @@ class ParametricSolver(Remade):
         return f"{self!r}, {len(self._cache)} of {self._cache.most} set-ups kept, the last one:\n{self._cache.last}"
 
 
-def _settings(method, rtol, maxiter, nullspace, options):
-    check_settings(method, rtol, maxiter, nullspace, options)
-    return dict(method=method, rtol=float(rtol), maxiter=maxiter, nullspace=nullspace, options=copied(options))
-
-
 # ---------------------------------------------------------------- a coefficient on the faces
 
 
@@ -172,7 +166,7 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
             f"elliptic_solver needs D @ G to be square: {D.name} maps {D.domain} to {D.codomain}, "
             f"{G.name} {G.domain} to {G.codomain}"
         )
-    return EllipticSolver(D, G, _settings(method, rtol, maxiter, nullspace, options))
+    return EllipticSolver(D, G, check_settings(method, rtol, maxiter, nullspace, options))
 
 
 class EllipticSolver(ParametricSolver):
@@ -329,7 +323,7 @@ def matrix_solver(pattern, method="auto", rtol=1e-10, maxiter=None, nullspace="r
     >>> value_and_grad(lambda data: solve(data, b)[1])(data)
     (1.0, array([ 0.125, -0.25 , -0.25 ]))
     """
-    settings = _settings(method, rtol, maxiter, nullspace, options)
+    settings = check_settings(method, rtol, maxiter, nullspace, options)
     entries = pattern if sp.issparse(pattern) else np.asarray(pattern)
     if entries.ndim != 2:
         raise ShapeError(f"matrix_solver takes a 2-D pattern, got an array of shape {entries.shape}")

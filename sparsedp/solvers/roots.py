@@ -30,7 +30,6 @@ from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Newton
 from sparsedp.solvers.solve import Run, SolveLog
 from sparsedp.tape import Rule, plain
-from sparsedp.tree import copied
 
 __all__ = ["Root", "implicit"]
 
@@ -114,11 +113,10 @@ def implicit(
     if not (callable(residual) and (jacobian is None or callable(jacobian))):
         given = [("residual", residual), ("jacobian", jacobian)][callable(residual)]
         raise TypeError(f"implicit takes a function as {given[0]}, got {type(given[1]).__name__}; write lambda x: ...")
-    check_settings(method, rtol, maxiter, nullspace, options)
+    settings = check_settings(method, rtol, maxiter, nullspace, options)
     if maxiter is None:
         raise ValueError("maxiter must be a whole number >= 1, got None")
-    settings = dict(method=method, nullspace=nullspace, options=copied(options))
-    return Root(residual, jacobian, sparsity, float(rtol), int(maxiter), settings)
+    return Root(residual, jacobian, sparsity, settings.pop("maxiter"), settings)
 
 
 class Root(Remade):
@@ -130,12 +128,12 @@ class Root(Remade):
         `.forward`: the last Newton solve (iterations: Newton steps); `.adjoint`: the last adjoint solve.
     """
 
-    def __init__(self, residual, jacobian, sparsity, rtol, maxiter, settings):
-        self.residual, self.rtol, self.maxiter = residual, rtol, maxiter
+    def __init__(self, residual, jacobian, sparsity, maxiter, settings):
+        self.residual, self.rtol, self.maxiter = residual, settings["rtol"], maxiter
         self.name = f"implicit({getattr(residual, '__name__', type(residual).__name__)})"
         self.info, self._settings = SolveLog(), settings
         self._series: dict = {}  # by thread, inside `series`: size -> Jacobian of the last solve
-        self._jacobians = Jacobians(self.name, jacobian, sparsity, dict(rtol=rtol, maxiter=None, **settings))
+        self._jacobians = Jacobians(self.name, jacobian, sparsity, dict(settings, maxiter=None))
         self._solution = Rule(self.name, self._newton, self._vjp, self._jvp)
         self._linear = [
             Rule(f"{self.name}{suffix}", *self._linear_rule(transposed))
@@ -145,7 +143,7 @@ class Root(Remade):
     def recipe(self):
         """The call that makes it again: see recipe.py."""
         given, sparsity = self._jacobians.given, self._jacobians.sparsity
-        return Root, (self.residual, given, sparsity, self.rtol, self.maxiter, self._settings)
+        return Root, (self.residual, given, sparsity, self.maxiter, self._settings)
 
     @contextmanager
     def series(self):

@@ -375,7 +375,6 @@ class Separable(Engine):
 
     method = "separable"
     unit = "refinements"
-    overwrites = False
 
     def __init__(self, found, elimination=None):
         self.spectrum, self.elimination = found, elimination

@@ -15,7 +15,7 @@ An engine is what solves inside the contract. It is any object with
 
     solve(b, goal, transposed) -> (x, iterations, word)
 
-on flat float64 arrays (complex128 for the direct method, when the operator is complex). `b` is
+on flat float64 arrays (complex128 for the direct method, when the operator is complex). `b` is left as it is, and
 compatible, 0 on what is not an unknown, of a norm between 2^-200 and 2^200. Stop when |b - A x| <= goal
 (2-norm), or when |b - A x| is below rounding; `word` is "" when that was met, else a status word. An
 engine is homogeneous: no absolute thresholds. `x` is a fresh array; its part along the null space, and
@@ -27,7 +27,6 @@ need not be exact: the contract refines with further calls on the residual. Attr
     hierarchy        one line: levels, unknowns, entries
     iterative        True: what it leaves depends on the tolerance
     hierarchical     True: its set-up is a multigrid hierarchy
-    overwrites       False: `b` is left as it is, so that the contract need not copy it
     refines          False: one call, no refinement and no error (fixed numbers of iterations)
     unrolled         True: inv(b) is engine.unroll(b, start, transposed)[0], differentiated as it runs
 
@@ -62,7 +61,6 @@ class Engine:
     hierarchy = ""
     iterative = False
     hierarchical = False
-    overwrites = True
     refines = True
     unrolled = False
 
@@ -275,7 +273,7 @@ class Solver(Remade):
         for _ in range(ROUNDS if not word else 0):
             # A correction need not go below what rounding leaves of the whole; an engine sees the correction alone.
             floor = 0.0 if x is None else system.rounding(x, data, transposed)
-            step, used, trouble = self._correction(r, r is b, residual, max(goal, floor), transposed)
+            step, used, trouble = self._correction(r, residual, max(goal, floor), transposed)
             run.iterations += used
             trial = step if x is None else np.add(x, step, out=step)
             trial = system.null_space.project(trial, transposed, into=trial)
@@ -314,13 +312,11 @@ class Solver(Remade):
             return ""
         return self.system.accepts(residual, goal, self.system.norm(run.transposed) * length + data)
 
-    def _correction(self, r, is_data, residual, goal, transposed):
+    def _correction(self, r, residual, goal, transposed):
         """One call of the engine, on a residual in the middle of the range of floats."""
         exponent = far_exponent(r, residual)
         if exponent:
             r, goal = shifted(r, -exponent), float(np.ldexp(goal, -exponent))
-        elif is_data and self.engine.overwrites:
-            r = r.copy()
         step, used, trouble = self.engine.solve(r, goal, transposed)
         if self.system.active is not None:
             step[~self.system.active] = 0.0

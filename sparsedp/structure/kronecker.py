@@ -1,9 +1,10 @@
 """Kronecker: blocks of sums of Kronecker products of 1-D factors. One definition, every form."""
 
 from collections import defaultdict
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from itertools import accumulate, product
 from math import prod
+from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -97,21 +98,20 @@ class Kronecker(Structure):
 
     def diagonal(self):
         """The diagonal of a Kronecker sum."""
-        total = np.full(self.out_parts[0], float(self.shift))
-        for axis, line in self.lines.items():
-            total += _along(line.matrix.diagonal(), axis, total.ndim)
-        return total.reshape(-1)
+        lines = [
+            self.lines[axis].matrix.diagonal() if axis in self.lines else np.zeros(n)
+            for axis, n in enumerate(self.out_parts[0])
+        ]
+        return reduce(np.add.outer, lines, np.full((), float(self.shift))).reshape(-1)
 
     def components(self):
         """(labels, count): components of a Kronecker sum are the products of those along the axes."""
-        shape, count = self.out_parts[0], 1
-        labels = np.zeros(shape, dtype=np.int64)
-        for axis, n in enumerate(shape):
+        labels, count = np.zeros((), np.int64), 1
+        for axis, n in enumerate(self.out_parts[0]):
             many, line = n, np.arange(n)
             if axis in self.lines:
                 many, line = connected_components(self.lines[axis].matrix, directed=False)
-            labels = labels * many + _along(line, axis, len(shape))
-            count *= many
+            labels, count = np.add.outer(labels * many, line), count * many
         return labels.reshape(-1), count
 
     # ------------------------------------------------------------ algebra
@@ -213,11 +213,6 @@ def _pass(term, shape):
     return run
 
 
-def _along(line, axis, dim):
-    """One number for each point of an axis, ready to be spread over the others."""
-    return line.reshape([-1 if a == axis else 1 for a in range(dim)])
-
-
 def _absolute(term):
     return Term(abs(term.scale), tuple(factor and Factor(abs(factor.matrix)) for factor in term.factors))
 
@@ -229,7 +224,8 @@ def components(flat, parts):
 
 
 def _block(terms, out_part, in_part):
-    return sum((_product_matrix(term, in_part) for term in terms), sp.csr_array((prod(out_part), prod(in_part))))
+    matrices = [_product_matrix(term, in_part) for term in terms]
+    return reduce(add, matrices) if matrices else sp.csr_array((prod(out_part), prod(in_part)))
 
 
 def _product_matrix(term, in_part):
@@ -237,7 +233,7 @@ def _product_matrix(term, in_part):
         sp.eye_array(n, format="csr") if factor is None else factor.matrix
         for factor, n in zip(term.factors, in_part, strict=True)
     ]
-    return term.scale * reduce(lambda a, b: sp.kron(a, b, format="csr"), sides)
+    return term.scale * reduce(partial(sp.kron, format="csr"), sides)
 
 
 def _merge(terms):

@@ -121,7 +121,6 @@ class Structured(Engine):
 
     method = "structured"
     iterative = hierarchical = True
-    overwrites = False
 
     def __init__(self, stencil, free, maxiter=None, dtype=np.float32):
         from sparsedp.solvers.multigrid import loops
