@@ -122,9 +122,9 @@ def test_operator_is_the_step_and_refused_where_there_is_none():
 def test_only_what_is_asked_is_computed(monkeypatch):
     move, args, loss = scene("upwind", GRIDS["2-D"], "faces", "flux")
     asked = []
-    pull = Eulerian.pull
+    pull = Eulerian.vjp
     spy = lambda self, nums, *rest, **more: asked.append(nums) or pull(self, nums, *rest, **more)
-    monkeypatch.setattr(Eulerian, "pull", spy)
+    monkeypatch.setattr(Eulerian, "vjp", spy)
     for name, number in (("u", (0,)), ("v", (1,)), ("dt", (1,)), ("inflow", (3,))):  # of dt by way of v
         asked.clear()
         value_and_grad(lambda x: squares(move, {**args, name: x}))(args[name])

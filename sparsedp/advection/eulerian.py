@@ -74,16 +74,16 @@ class Eulerian(Law):
         unseen = inflow.sum() if inflow.size else 0.0
         return unseen if self.setting.solid is None else unseen + v.sum()
 
-    def pull(self, nums, g, u, v, dt, inflow):
+    def vjp(self, nums, g, u, v, dt, inflow):
         if not able() or any(map(isbox, (g, u, v, dt, inflow))):
-            return self.reference.pull(nums, g, u, v, dt, inflow)
+            return self.reference.vjp(nums, g, u, v, dt, inflow)
         w, field = self.velocity(v), FIELD in nums or INFLOW in nums
         gw = results.empty(w.shape, float) if VELOCITY in nums else NOTHING
-        of_field, of_inflow = self._pull(np.ascontiguousarray(g), u, w, dt, inflow, gw, field)
+        of_field, of_inflow = self._stages_vjp(np.ascontiguousarray(g), u, w, dt, inflow, gw, field)
         found = {FIELD: of_field, INFLOW: of_inflow, VELOCITY: self.velocity_vjp(gw) if gw.size else None}
         return tuple(found[num] for num in nums)
 
-    def _pull(self, g, u, w, dt, inflow, gw, field):
+    def _stages_vjp(self, g, u, w, dt, inflow, gw, field):
         """Cotangents of u (field: where it is wanted) and inflow; that of w goes into gw."""
         known: list = []
         for keep in self.scheme.stages:
@@ -98,14 +98,14 @@ class Eulerian(Law):
             if keep:  # a share of the cotangent goes to the first field
                 rest, g = (keep * g if rest is None else rest + keep * g), (1.0 - keep) * g
             gu = results.empty(u.shape, float) if known or field else NOTHING
-            self.loops.pull(g, x, slopes, w, dt, inflow, gu, ginflow, gw, fresh)
+            self.loops.vjp(g, x, slopes, w, dt, inflow, gu, ginflow, gw, fresh)
             g, fresh = gu, False
         if rest is not None and field:
             g += rest
         return g, ginflow
 
-    def push(self, tangents, u, v, dt, inflow):
-        return self.reference.push(tangents, u, v, dt, inflow)
+    def jvp(self, tangents, u, v, dt, inflow):
+        return self.reference.jvp(tangents, u, v, dt, inflow)
 
     def matrix(self, v, dt):
         nothing = np.zeros(self.setting.space.size), v, np.zeros(self.walls.size)

@@ -5,9 +5,9 @@ import numpy as np
 from sparsedp.advection.eulerian import Eulerian
 from sparsedp.advection.law import Law, Setting
 from sparsedp.advection.maccormack import MacCormack
+from sparsedp.advection.no_cells import NoCells
 from sparsedp.advection.rule import rule_of
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
-from sparsedp.advection.still import Still
 from sparsedp.advection.values import check_step, flat_numbers
 from sparsedp.conditions import dirichlet, neumann, resolve
 from sparsedp.errors import DerivativeError
@@ -159,7 +159,7 @@ class Transport(Remade):
     _rule: Rule
 
     def __init__(self, setting):
-        law = (LAWS[setting.scheme] if setting.grid.cells.size else Still)(setting)
+        law = (LAWS[setting.scheme] if setting.grid.cells.size else NoCells)(setting)
         self.__dict__.update(setting=setting, law=law, _rule=rule_of(law))
 
     def __setattr__(self, name, value):

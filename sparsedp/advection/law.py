@@ -71,10 +71,10 @@ class Law:
 
     ``forward(u, v, dt, inflow)``
         The moved field.
-    ``pull(nums, g, u, v, dt, inflow)``
+    ``vjp(nums, g, u, v, dt, inflow)``
         Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed. dt is not asked for:
         a step depends on v dt alone, and `rule` derives it from v.
-    ``push(tangents, u, v, dt, inflow)``
+    ``jvp(tangents, u, v, dt, inflow)``
         {number of an argument: tangent} -> tangent of the result; dt as above.
     ``matrix(v, dt)``
         csr_array of the step in `u`, inflow 0; only where `linear`.
@@ -89,15 +89,15 @@ class Law:
     linear : bool
         Whether the step is linear in (u, inflow).
     twice : bool
-        Whether `pull` and `push` take traced values too, so that derivatives of every order follow.
+        Whether `vjp` and `jvp` take traced values too, so that derivatives of every order follow.
     """
 
     options: tuple[str, ...] = ("form", "unstable")
     linear = False
     twice = False
     forward: Any
-    pull: Any
-    push: Any
+    vjp: Any
+    jvp: Any
     matrix: Any
 
     def __init__(self, setting):

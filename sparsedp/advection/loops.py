@@ -24,12 +24,12 @@ class Loops:
         self.many = 1 if self.scheme.symmetric else 2  # arrays of slopes for each axis
         self.least = 1.0 - self.scheme.most - ROUNDING
 
-    def slopes(self, u, inflow, steep):
-        """For each component the slopes and (steep) their derivatives in a and b; empty for a scheme of first order."""
+    def slopes(self, u, inflow, partials):
+        """For each component the slopes and (partials) their derivatives in a and b; empty for a first-order scheme."""
         found = []
         for part in self.components:
             axes, cells = len(part.axes), part.field.stop - part.field.start if self.limiter else 0
-            shapes = (axes, self.many, cells), (axes, self.many, 2, cells * steep)
+            shapes = (axes, self.many, cells), (axes, self.many, 2, cells * partials)
             arrays = [results.empty(shape, float) for shape in shapes]
             if self.limiter:
                 part.run(self.limiter, u[part.field], inflow[part.inflow], part.free, part.table, part.axes, *arrays)
@@ -60,15 +60,15 @@ class Loops:
             total += wrong.sum()
         return total
 
-    def pull(self, g, u, slopes, w, dt, inflow, gu, ginflow, gw, fresh):
+    def vjp(self, g, u, slopes, w, dt, inflow, gu, ginflow, gw, fresh):
         """The cotangent of u + dt du/dt -> that of u into gu, those of the rest added to theirs.
 
         gu, gw: empty where they are not wanted; fresh: there is nothing in gw. The derivatives in `slopes` are
         overwritten.
         """
-        for part, (values, steep) in zip(self.components, slopes, strict=True):
+        for part, (values, partials) in zip(self.components, slopes, strict=True):
             given = self._given(part, u, inflow, w, values, dt)
             targets = gu[part.field], ginflow[part.inflow], gw[part.speed]
-            part.run(fluxes.pull, g[part.field], *given, *targets, fresh, steep)
-            if steep.size and gu.size:
-                part.run(fluxes.jumps, steep, part.free, part.axes, *targets[:2])
+            part.run(fluxes.vjp, g[part.field], *given, *targets, fresh, partials)
+            if partials.size and gu.size:
+                part.run(fluxes.jumps, partials, part.free, part.axes, *targets[:2])

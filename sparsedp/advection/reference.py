@@ -18,7 +18,7 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.advection.lattice import components
+from sparsedp.advection.control_volumes import components
 from sparsedp.derivative import pullback, pushforward
 from sparsedp.kernels.fluxes import OWN
 from sparsedp.tape import isbox, linear, plain
@@ -122,11 +122,11 @@ class Reference:
             found = keep * u + (1.0 - keep) * new if keep else new
         return found
 
-    def pull(self, nums, g, *args):
+    def vjp(self, nums, g, *args):
         """Cotangent of the moved field -> those of the arguments `nums`."""
         return pullback(lambda some: self.step(*_with(args, nums, some)), tuple(args[num] for num in nums))[1](g)
 
-    def push(self, tangents, *args):
+    def jvp(self, tangents, *args):
         """{number of an argument: tangent} -> tangent of the moved field."""
         given = tuple(args[num] for num in tangents)
         return pushforward(lambda some: self.step(*_with(args, tangents, some)), given, tuple(tangents.values()))[1]

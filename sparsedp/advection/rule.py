@@ -26,7 +26,7 @@ def rule_of(law):
             if traced and not law.twice:
                 found = tuple(back(g) for back, _ in _turned(law, nums, flat))
             else:
-                found = _pulled(law, nums, g, flat)
+                found = _vjp(law, nums, g, flat)
             for num, back in zip(nums, found, strict=True):
                 _check_slope(law, "the gradient in " + LETTERS[num], back, (g,))
             return tuple([unflatten(args[num], back) for num, back in zip(nums, found, strict=True)])
@@ -42,17 +42,17 @@ def rule_of(law):
         else:
             if STEP in along:
                 along[VELOCITY] = along.get(VELOCITY, 0.0) + along.pop(STEP) / flat[STEP] * flat[VELOCITY]
-            found = law.push(along, *flat)
+            found = law.jvp(along, *flat)
         _check_slope(law, "the tangent", found, tangents)
         return unflatten(ans, found)
 
     return Rule(law.name, forward, vjp, jvp)
 
 
-def _pulled(law, nums, g, flat):
+def _vjp(law, nums, g, flat):
     """Cotangents of the arguments `nums`. A step depends on the velocity times dt: that of dt follows from v's."""
     asked = tuple({VELOCITY if num == STEP else num for num in nums})
-    found = dict(zip(asked, law.pull(asked, g, *flat), strict=True))
+    found = dict(zip(asked, law.vjp(asked, g, *flat), strict=True))
     if STEP in nums:
         found[STEP] = anp.dot(flat[VELOCITY], found[VELOCITY]) / flat[STEP]
     return [found[num] for num in nums]
@@ -76,7 +76,7 @@ def _turned(law, nums, flat):
         raise DerivativeError(f"{law.name} has first derivatives only; for second ones write scheme='upwind'")
 
     def rules(num):
-        pull = lambda g: law.pull((num,), np.asarray(g), *plain_flat)[0]
-        return linear(f"{law.name}.T", pull, lambda tangent: law.push({num: tangent}, *plain_flat))
+        pull = lambda g: law.vjp((num,), np.asarray(g), *plain_flat)[0]
+        return linear(f"{law.name}.T", pull, lambda tangent: law.jvp({num: tangent}, *plain_flat))
 
     return map(rules, nums)

@@ -72,7 +72,7 @@ class SemiLagrangian(Law):
             passage.value(out[span])
         return self._keep_solid(out, u)
 
-    def pull(self, nums, g, u, v, dt, inflow):
+    def vjp(self, nums, g, u, v, dt, inflow):
         """Cotangent of the advected field -> those of the arguments `nums`."""
         field, speed, g = FIELD in nums or INFLOW in nums, VELOCITY in nums, np.ascontiguousarray(g)
         moved = g if self.solid is None else np.where(self.solid, 0.0, g)
@@ -87,7 +87,7 @@ class SemiLagrangian(Law):
             found[VELOCITY] = self.velocity_vjp(of_w)
         return tuple(found[num] for num in nums)
 
-    def push(self, tangents, u, v, dt, inflow):
+    def jvp(self, tangents, u, v, dt, inflow):
         """{argument: tangent} -> tangent of the advected field."""
         given = {FIELD: u, VELOCITY: v, INFLOW: inflow}
         du, dv, dinflow = (np.ascontiguousarray(tangents.get(num, np.zeros(x.size))) for num, x in given.items())

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.advection.lattice import place_words
+from sparsedp.advection.control_volumes import place_words
 from sparsedp.errors import UnstableStepError
 from sparsedp.fields import check_finite, rounded_down
 

@@ -34,7 +34,7 @@ __all__ = [
     "TILE",
     "Scheme",
     "jumps",
-    "pull",
+    "vjp",
     "slopes",
     "slopes_of",
     "stage",
@@ -165,12 +165,14 @@ def weigh(lines, line, x, start, table, row, axes, a, place, free, c, b, e):
         lines[line + j] *= free[side, c + j]
 
 
-def differences(steep, a, c, asked, size):
+def differences(partials, a, c, asked, size):
     """What is asked of behind and ahead -> the cotangents of a and b, in place of the derivatives of the last slope."""
-    last = steep.shape[1] - 1
+    last = partials.shape[1] - 1
     for by in range(2):
         for j in range(size):
-            steep[a, last, by, c + j] = steep[a, 0, by, c + j] * asked[0, j] + steep[a, last, by, c + j] * asked[1, j]
+            partials[a, last, by, c + j] = (
+                partials[a, 0, by, c + j] * asked[0, j] + partials[a, last, by, c + j] * asked[1, j]
+            )
 
 
 def share(flow):
@@ -194,7 +196,7 @@ OPTIONS: dict[str, Any] = {
 # w           flat array, axis by axis: the velocity on the sides or in the cells
 # free        for each side (lower, upper, axis by axis) whether those of the cells are open; no cells where all are
 # slopes      for each axis behind and ahead, or (many = 1) what both are; no cells for the first order
-# steep       for each of the slopes its derivatives in a and b
+# partials       for each of the slopes its derivatives in a and b
 # dt          the time step
 # table, axes see N
 # flux        1 in flux form, 0 in advective form
@@ -248,10 +250,10 @@ def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, ou
     "read1 read1 read1 read1 mask2 read3 real read2 index2 real write1 write1 write1 flag write4",
     **OPTIONS,
 )
-def pull(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, fresh, steep, start, stop):
+def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, fresh, partials, start, stop):
     """The cotangent of u' -> those of u with constant slopes, of the inflow (added) and of w (added or, fresh, set).
 
-    gu, gw: empty where they are not wanted. The cotangents of a and b are left in the last slopes of `steep`.
+    gu, gw: empty where they are not wanted. The cotangents of a and b are left in the last slopes of `partials`.
     """
     memory, lines, uneven, rest = np.empty((4, LINE)), np.empty(2 * LINE), axes[0, UNEVEN], 1.0 - flux
     field, line, asked, given, many = memory[0], memory[1], memory[2:], lines if uneven else g, slopes.shape[1]
@@ -285,7 +287,7 @@ def pull(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, 
                             field[j] += more
                         else:
                             ginflow[wall + j] += more
-                    for j in range(b, e if steep.size else b):
+                    for j in range(b, e if partials.size else b):
                         more = inner * max(-into * w[o + j], 0.0) * given[i + j]
                         asked[upper, j] = sign * (max(-into * w[m + j], 0.0) * given[x + j] - more)
                     if not gw.size or upper and on_sides and inner:
@@ -305,16 +307,16 @@ def pull(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, 
                         line[j] += ratio * (given[x + j] - back * given[i + j]) * slope
                     for j in range(b, e):
                         gw[m + j] = line[j] + gw[m + j] if added else line[j]
-            if steep.size:
-                differences(steep, a, c, asked, size)
+            if partials.size:
+                differences(partials, a, c, asked, size)
         for j in range(size if gu.size else NONE):
             gu[c + j] = field[j]
 
 
 @kernel("read4 mask2 index2 write1 write1", **OPTIONS)
-def jumps(steep, free, axes, gu, ginflow, start, stop):
+def jumps(partials, free, axes, gu, ginflow, start, stop):
     """The cotangents of a and b, the differences to the cells below and above, are added to those of u and inflow."""
-    line, last = np.empty(LINE), steep.shape[1] - 1
+    line, last = np.empty(LINE), partials.shape[1] - 1
     for part in range(start, stop):
         first, length = tile_of(axes, part)
         c = uint64(first)
@@ -327,7 +329,7 @@ def jumps(steep, free, axes, gu, ginflow, start, stop):
                 if shown and not inner:
                     continue  # the difference to a ghost cell that repeats the cell is 0
                 for j in range(b, e):
-                    line[j] = sign * (steep[a, last, upper, c + j] + inner * steep[a, last, 1 - upper, i + j])
+                    line[j] = sign * (partials[a, last, upper, c + j] + inner * partials[a, last, 1 - upper, i + j])
                 for j in range(b, e if free.size else b):
                     line[j] *= free[2 * a + upper, c + j]
                 for j in range(b, e):
@@ -336,8 +338,8 @@ def jumps(steep, free, axes, gu, ginflow, start, stop):
                     ginflow[wall + j] -= line[j]
 
 
-def _slopes(u, inflow, free, table, axes, slopes, steep, start, stop):
-    """The slopes by `limiter` and, where steep is not empty, their derivatives."""
+def _slopes(u, inflow, free, table, axes, slopes, partials, start, stop):
+    """The slopes by `limiter` and, where partials is not empty, their derivatives."""
     memory, found, lines = np.empty((2, LINE)), np.empty((6, LINE)), np.ones(3 * LINE)
     many, every = slopes.shape[1], free[:, :0]
     for part in range(start, stop):
@@ -355,17 +357,17 @@ def _slopes(u, inflow, free, table, axes, slopes, steep, start, stop):
                     memory[upper, j] *= free[2 * a + upper, c + j]
                 line = uint64(upper * LINE)
                 weigh(lines, line, lines, TWO, table, DISTANCE + upper, axes, a, where[0], every, c, b, e)
-            for j in range(size if steep.size else NONE):
+            for j in range(size if partials.size else NONE):
                 results = limiter(memory[0, j], memory[1, j], lines[j], lines[ONE + j])
                 found[1, j], found[0, j], found[4, j], found[5, j], found[2, j], found[3, j] = results
-            for j in range(NONE if steep.size else size):
+            for j in range(NONE if partials.size else size):
                 found[1, j], found[0, j] = limiter(memory[0, j], memory[1, j], lines[j], lines[ONE + j])[:2]
             for k in range(2 - many, 2):  # behind, ahead
                 for j in range(size):
                     slopes[a, k % many, c + j] = found[k, j]
-                for j in range(size if steep.size else NONE):
-                    steep[a, k % many, 0, c + j] = found[2 + 2 * k, j]
-                    steep[a, k % many, 1, c + j] = found[3 + 2 * k, j]
+                for j in range(size if partials.size else NONE):
+                    partials[a, k % many, 0, c + j] = found[2 + 2 * k, j]
+                    partials[a, k % many, 1, c + j] = found[3 + 2 * k, j]
 
 
 def slopes_of(name, function, **options):

@@ -6,10 +6,10 @@ import scipy.sparse as sp
 from sparsedp.advection.law import FIELD, INFLOW, VELOCITY, Law
 from sparsedp.advection.stability import check_numbers
 
-__all__ = ["Still"]
+__all__ = ["NoCells"]
 
 
-class Still(Law):
+class NoCells(Law):
     """The identity, whatever the scheme."""
 
     linear = True
@@ -19,11 +19,11 @@ class Still(Law):
         check_numbers(self.setting, u, v, inflow)
         return u + 0.0
 
-    def pull(self, nums, g, u, v, dt, inflow):
+    def vjp(self, nums, g, u, v, dt, inflow):
         found = {FIELD: g + 0.0, VELOCITY: np.zeros(np.shape(v)), INFLOW: np.zeros(np.shape(inflow))}
         return tuple(found[num] for num in nums)
 
-    def push(self, tangents, u, v, dt, inflow):
+    def jvp(self, tangents, u, v, dt, inflow):
         return tangents.get(FIELD, np.zeros(np.shape(u))) + 0.0
 
     def matrix(self, v, dt):
