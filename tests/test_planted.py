@@ -285,8 +285,8 @@ BUGS = {
     ),
     "cotangents of a trajectory at the step before": Bug(
         "trajectory",
-        "[block[i] for block in g]",
-        "[block[i - 1] for block in g]",
+        "[block[state.i] for block in g]",
+        "[block[state.i - 1] for block in g]",
         "tests/test_rollout.py tests/test_rollout_kinds.py",
     ),
     # ---- optimize, blackbox, network

@@ -1,13 +1,12 @@
 """The backward pass over all steps of a run."""
 
-import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.derivative import zero_like
 from sparsedp.ledger import active, count
-from sparsedp.tape import fit, isbox
+from sparsedp.tape import fit
 from sparsedp.traces import accumulate
-from sparsedp.trajectory.layout import fingerprint, refuse_lost
+from sparsedp.trajectory.layout import refuse_lost, stacked
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import Growth
 from sparsedp.trajectory.schedule import stride
@@ -34,36 +33,34 @@ class BackwardPass:
         self.run, self.steps, self.kept, self.tapes = run, steps, kept, tapes
         self.recomputed = 0
         self.cotangents: dict = {}  # of params: root -> (sum so far, whether it may be written to)
-        self.inputs: list = []
+        pairs = zip(steps.x, steps.input_roots, strict=True)  # of inputs: for each row
+        self.inputs = [list(zero_like(block)) if root else [] for block, root in pairs]
 
     def back(self, g):
         """Cotangents of the outputs -> those of all arguments, None where there is none."""
         run, steps, tapes, n = self.run, self.steps, self.tapes, self.run.loop.n
-        zeros = [zero_like(block) if root else None for block, root in zip(steps.x, steps.input_roots, strict=True)]
-        traced = n and (steps.outer or any(map(isbox, g)))  # an array takes no traced values
-        self.inputs = [list(zero) if traced and zero is not None else zero for zero in zeros]
         growth, many = Growth(n, run.loop.truncate), len(self.kept) - 1
         source = run.keep.source(n, g)
         state = self.kept.pop()
-        total = source(*state)
+        total = source(state)
         growth.see(n, total)
         for i in shown_steps(run.progress, range(n - 1, -1, -1), "backward"):
             if total is None and not run.keep.along:
                 break  # cut by truncation
             tape = tapes.pop() if i + 1 == len(tapes) else None
-            end = None if tape else fingerprint(*state[1:])  # what is on a tape is not run again
+            end = None if tape else state.marks()  # what is on a tape is not run again
             state = self._state_at(i)
             if total is not None:
                 if tape is None:
                     tape, after = steps.taped(state)
-                    run.compare(fingerprint(*after[1:]), end)
+                    run.compare(after.marks(), end)
                     del after
                 total = self._pull(tape, state, total)
             del tape
             if i % growth.every == 0:
                 growth.see(i, total)
             if run.keep.along and (i > 0 or run.loop.wants(0)):
-                total = _sum(total, source(*state))
+                total = _sum(total, source(state))
         if active:
             count("rollout.step", "vjp", n)
             count("rollout.step", "recomputed", self.recomputed)
@@ -71,7 +68,7 @@ class BackwardPass:
         if run.record is not None:
             run.record(record)
         params = [self.cotangents.get(root, NONE)[0] for root in steps.roots]
-        inputs = [anp.stack(block) if isinstance(block, list) else block for block in self.inputs]
+        inputs = [stacked(rows) if rows else None for rows in self.inputs]
         return [*(total or [None] * len(run.loop.state.places)), *map(_fitted, params, steps.p), *inputs]
 
     def _pull(self, tape, state, g):
@@ -82,16 +79,16 @@ class BackwardPass:
                 known = cotangents.get(node)
                 cotangents[node] = (back if known is None else known[0] + back), False
         accumulate(cotangents, reversed(tape.nodes))
-        for block, root in zip(self.inputs, tape.inputs, strict=True):
-            if root in cotangents:
-                block[state.i] = cotangents.pop(root)[0]
-        backs = [cotangents.pop(root, NONE)[0] for root in tape.state]
+        backs, many = [cotangents.pop(root, NONE)[0] for root in tape.starts], len(g)
+        for rows, back in zip(self.inputs, backs[many:], strict=True):
+            if back is not None:
+                rows[state.i] = back
         for root, (back, own) in cotangents.items():
             if root not in self.steps.roots:
                 refuse_lost("the step")  # in a call of another step
             if not own and type(back) is np.ndarray:
                 cotangents[root] = back.copy(), True
-        return list(map(_fitted, backs, state.values)) if any(tape.state) else None
+        return list(map(_fitted, backs, state.values)) if any(tape.starts[:many]) else None
 
     def _state_at(self, i):
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""

@@ -6,7 +6,6 @@ the last run (`tree`), and going backward says which cotangent enters at which s
 
 from typing import Any
 
-import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import constant
@@ -15,7 +14,7 @@ from sparsedp.errors import DerivativeError
 from sparsedp.fields import frozen
 from sparsedp.tape import dtype_of, is_variable, isbox, plain
 from sparsedp.traces import traces_of
-from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask
+from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, stacked
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["All", "Each", "Last"]
@@ -55,8 +54,8 @@ class Last:
         return self.layout.build([float(v) if bare and not isbox(v) else v for v, bare in pairs], self._last)
 
     def source(self, n, g):
-        """Cotangents of the outputs -> function (index, variables, statics) -> cotangents of a state, or None."""
-        return lambda i, values, statics: g if i == n else None
+        """Cotangents of the outputs -> function from a state to cotangents of a state, or None."""
+        return lambda state: g if state.i == n else None
 
 
 class All:
@@ -93,7 +92,7 @@ class All:
 
     def _whole(self, block):
         if isinstance(block, list):
-            return anp.stack(block)
+            return stacked(block)
         block.flags.writeable = not self._stored  # the way back uses these very arrays
         return block
 
@@ -102,8 +101,8 @@ class All:
         return self.layout.build(outputs, [_stacked(line) for line in zip(*self._statics, strict=True)])
 
     def source(self, n, g):
-        """Cotangents of the outputs -> function (index, variables, statics) -> cotangents of a state."""
-        return lambda i, values, statics: [block[i] for block in g]
+        """Cotangents of the outputs -> function from a state to cotangents of a state."""
+        return lambda state: [block[state.i] for block in g]
 
 
 def _stacked(line):
@@ -165,7 +164,7 @@ class Each:
     def finish(self):
         """The arrays to hand out: one for each shape and dtype."""
         stacks, self._stacks = self._stacks, {}
-        return tuple((anp if any(map(isbox, stack)) else np).stack(stack) for stack in stacks.values())
+        return tuple(map(stacked, stacks.values()))
 
     def tree(self, outputs):
         """Outputs of the rule -> the tuple of what the function returned."""
@@ -175,13 +174,15 @@ class Each:
         )
 
     def source(self, n, g):
-        """Cotangents of the stacks -> function (index, variables, statics) -> cotangents of a state."""
+        """Cotangents of the stacks -> function from a state to cotangents of a state."""
 
-        def at(i, values, statics):
-            state = self.layout.build(values, statics)
-            ends, _, pull = linearised(lambda tree: self.function(i, tree), state, map(is_variable, leaves(state)))
-            self._compare(i, ends)
-            places = self._trees[i][2]
+        def at(state):
+            given = self.layout.build(state.values, state.statics)
+            ends, _, pull = linearised(
+                lambda tree: self.function(state.i, tree), given, map(is_variable, leaves(given))
+            )
+            self._compare(state.i, ends)
+            places = self._trees[state.i][2]
             found = pull([g[place[0]][place[1]] if place else None for place in places])
             return [found[place] for place in self.layout.places]
 

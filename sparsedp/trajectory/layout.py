@@ -3,6 +3,7 @@
 from functools import cached_property
 from math import prod
 
+import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import constant
@@ -12,7 +13,7 @@ from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.traces import traces_of
 from sparsedp.tree import flatten, keys
 
-__all__ = ["Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask"]
+__all__ = ["Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask", "stacked"]
 
 
 FOLD = 509  # words to a line of a fingerprint: a prime, so that a field that was shifted has another one
@@ -200,6 +201,11 @@ def owned(value):
     if isbox(value):
         return value
     return np.array(value, order="C", subok=False) if np.ndim(value) else np.asarray(value)[()]
+
+
+def stacked(parts):
+    """Arrays of one shape, traced or not -> one array, along a new first axis."""
+    return (anp if any(map(isbox, parts)) else np).stack(parts)
 
 
 def refuse_mask(what, leaf):

@@ -16,11 +16,11 @@ from sparsedp.ledger import active, count, thread
 from sparsedp.tape import Rule, isbox, plain
 from sparsedp.trajectory.backward_pass import BackwardPass
 from sparsedp.trajectory.carried import carries, in_plain_forms
-from sparsedp.trajectory.layout import dense, fingerprint
+from sparsedp.trajectory.layout import dense
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import Record
 from sparsedp.trajectory.schedule import checkpoints
-from sparsedp.trajectory.steps import State, Steps
+from sparsedp.trajectory.steps import Steps
 
 __all__ = ["Run", "rollout_rule"]
 
@@ -54,11 +54,11 @@ class Run:
         steps = Steps(loop, args, in_plain_forms(loop) if self.carried else loop.step)
         self.keep.start(loop.n, steps.outer, bool(loop.wanted))
         with steps.guarded():
-            state, kept, tapes = self._advance(steps, State(0, loop.split(args)[0], loop.state.statics))
+            state, kept, tapes = self._advance(steps)
         if not loop.state.is_finite(state.values):
-            self._refuse(steps, State(0, loop.split(args)[0], loop.state.statics))
+            self._refuse(steps)
         if loop.wanted:
-            self._end = fingerprint(*state[1:])
+            self._end = state.marks()
             self.stored = steps, [*kept, state if self.keep.whole else state.owned()], tapes
         if active:
             count("rollout.step", "forward", loop.n)
@@ -67,10 +67,10 @@ class Run:
             self.record(Record("forward", loop.n, len(kept), 0))
         return self.keep.finish()
 
-    def _advance(self, steps, state):
+    def _advance(self, steps):
         """(last state, the states kept, the tapes kept) after all steps from the first state."""
         n, recorder, kept, tapes = self.loop.n, steps.recorder, [], []  # type: Any, Any, list, list
-        state, stops = self.keep.see(state), set(checkpoints(n, self.slots) if self.loop.wanted else ())
+        state, stops = self.keep.see(steps.first), set(checkpoints(n, self.slots) if self.loop.wanted else ())
         # How many tapes there is room for: the first two tell. What goes in besides may be constants, which all
         # steps share: the second one tells. The first shows traced values that the step keeps, too.
         fit, solves = 2 if self.loop.wanted else 0, thread.solves
@@ -91,9 +91,9 @@ class Run:
             state = self.keep.see(state)
         return state, kept, tapes
 
-    def _refuse(self, steps, state):
+    def _refuse(self, steps):
         """Refuse a run that is not finite at its end: NaN stays, so one look tells, and a second run finds the step."""
-        layout = self.loop.state
+        state, layout = steps.first, self.loop.state
         for i in range(self.loop.n):
             state = steps.forward(state)
             for name, value in zip(layout.names, state.values, strict=True):

@@ -9,7 +9,7 @@ from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
 from sparsedp.tape import plain
 from sparsedp.traces import boxed, new_trace, reverse_root, split_box, traces_of
-from sparsedp.trajectory.layout import owned
+from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.tree import copied, flatten, leaves
 
 __all__ = ["Loop", "State", "Steps", "Tape"]
@@ -33,24 +33,26 @@ class State(NamedTuple):
         """The same in memory of its own: a step may use the arrays again that it has returned."""
         return self._replace(values=list(map(owned, self.values)))
 
+    def marks(self):
+        """Fingerprints of all of it."""
+        return fingerprint(self.values, self.statics)
+
 
 class Tape(NamedTuple):
     """One step: its calls in order, so that the backward pass need not sort a graph.
 
     Attributes
     ----------
-    state : list
-        Nodes that its state begins with: roots, or those that the tape before ends with; None where a constant is.
-    inputs : list
-        The roots of its inputs.
+    starts : list
+        Nodes of its state, roots or those that the tape before ends with, and roots of its inputs; None where a
+        constant is.
     nodes : list
         All calls.
     ends : list
         The nodes of the state after it, None where that does not depend on anything traced.
     """
 
-    state: list
-    inputs: list
+    starts: list
     nodes: list
     ends: list
 
@@ -134,6 +136,7 @@ class Steps:
 
     Attributes
     ----------
+    first : State
     roots, input_roots : lists
         Of params, the same for all steps, and one for each variable of inputs; None where no cotangent is wanted.
     outer : set of int
@@ -146,7 +149,8 @@ class Steps:
         self.loop, self.step, self.number, self.recorder = loop, step, new_trace(), Recorder()
         self.outer, self.last = traces_of(args), None
         self._open = any(layout.open for layout in loop.layouts)
-        _, self.p, self.x = loop.split(args)
+        values, self.p, self.x = loop.split(args)
+        self.first = State(0, values, loop.state.statics)
         roots = [reverse_root(self.recorder) if number in loop.wanted else None for number in range(len(args))]
         _, self.roots, self.input_roots = loop.split(roots)
         given = list(map(frozen, self.p))
@@ -155,7 +159,7 @@ class Steps:
 
     def forward(self, state):
         """The state after this one."""
-        values, statics = self._called(state, self._given(state), self.params, self._rows(state.i))
+        values, statics = self._called(state, self._given(state), self.params)
         return State(state.i + 1, self.loop.state.check(values, "the step", self.outer), statics)
 
     def taped(self, state, before=None):
@@ -163,11 +167,10 @@ class Steps:
         starts = before.ends if before and before.links else [reverse_root(self.recorder) for _ in state.values]
         if not self.loop.wants(state.i):
             starts = [None] * len(starts)
-        inputs = [root and reverse_root(self.recorder) for root in self.input_roots]
+        starts = [*starts, *(root and reverse_root(self.recorder) for root in self.input_roots)]
         given = boxed(self._given(state), starts, self.number)
-        rows = boxed(self._rows(state.i), inputs, self.number)
         try:
-            found, statics = self._called(state, given, self._traced_params, rows)
+            found, statics = self._called(state, given, self._traced_params)
         finally:
             nodes = self.recorder.taken()
         pairs = [split_box(value, self.number) for value in found]
@@ -175,28 +178,26 @@ class Steps:
         values = self.loop.state.check([value for value, _ in pairs], "the step", self.outer)
         # What is on no tape may be an array that the step uses again.
         values = [value if node else owned(value) for value, node in zip(values, ends, strict=True)]
-        return Tape(starts, inputs, nodes, ends), State(state.i + 1, values, statics)
+        return Tape(starts, nodes, ends), State(state.i + 1, values, statics)
 
     def _given(self, state):
-        """The variables that a step gets: constants where the derivative is cut."""
-        return [frozen(plain(value) if self.loop.is_cut(state.i) else value) for value in state.values]
+        """The variables of state and inputs that a step gets: constants where the derivative is cut."""
+        values = map(plain, state.values) if self.loop.is_cut(state.i) else state.values
+        return [frozen(value) for value in (*values, *(block[state.i] for block in self.x))]
 
-    def _rows(self, i):
-        """The variables of inputs -> those of step i."""
-        return [frozen(block[i]) for block in self.x]
-
-    def _parts(self, state, values, params, rows):
-        """The arguments of a step, of their variables."""
-        parts, inputs = [self.loop.state.build(values, state.statics), params], self.loop.inputs
+    def _parts(self, state, values, params):
+        """The arguments of a step, of the variables of state and inputs."""
+        many, inputs = len(state.values), self.loop.inputs
+        parts = [self.loop.state.build(values[:many], state.statics), params]
         if inputs is not None:
             rest = [leaf[state.i] if isinstance(leaf, np.ndarray) else leaf for leaf in inputs.statics]
-            parts.append(inputs.build(rows, rest))
+            parts.append(inputs.build(values[many:], rest))
         return parts
 
-    def _called(self, state, values, params, rows):
+    def _called(self, state, values, params):
         """The step on variables that may be traced -> those of the next state, and its statics."""
         self.last = state
-        parts = self._parts(state, values, params, rows)
+        parts = self._parts(state, values, params)
         given = [leaves(part) for part in parts] if self._open else None
         result = self.step(*parts)
         if given is not None:
@@ -229,7 +230,7 @@ class Steps:
         state: Any = self.last
         if state is None:
             return None
-        found, rebuild = flatten(self._parts(state, state.values, self.params, self._rows(state.i)))
+        found, rebuild = flatten(self._parts(state, self._given(state), self.params))
         for number, name in enumerate(label for layout in self.loop.layouts for label in layout.labels):
             if isinstance(found[number], np.ndarray):
                 copies = copied(list(map(plain, found)))
