@@ -1,12 +1,14 @@
 """A tree of arrays as one flat vector of doubles, and back."""
 
+from itertools import compress
+
 import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import check_finite
 from sparsedp.tape import is_variable
-from sparsedp.tree import flatten
+from sparsedp.tree import flatten, leaves, mapped
 
 __all__ = ["Packing", "power_of_two"]
 
@@ -39,66 +41,60 @@ class Packing:
 
     def __init__(self, tree):
         self._found, self._rebuild = flatten(tree)
-        self._places = [place for place, leaf in enumerate(self._found) if is_variable(leaf)]
-        if not self._places:
+        self._floating = list(map(is_variable, self._found))
+        originals = [np.asarray(leaf) for leaf in compress(self._found, self._floating)]
+        if not originals:
             raise DerivativeError("minimize needs floating values in start, and found none; write start.astype(float)")
-        leaves = [np.asarray(self._found[place]) for place in self._places]
-        self.complex = any(map(np.iscomplexobj, leaves))
-        self.eps = max(float(np.finfo(leaf.dtype).eps) for leaf in leaves)
-        self._ends = np.cumsum([_numbers(leaf).size for leaf in leaves])
+        self.complex = any(map(np.iscomplexobj, originals))
+        self.eps = max(float(np.finfo(leaf.dtype).eps) for leaf in originals)
+        self._ends = np.cumsum([_numbers(leaf).size for leaf in originals])
         self.size = int(self._ends[-1])
 
     def pack(self, tree):
         """Tree of the same structure -> flat vector of doubles."""
-        return self.pack_leaves(flatten(tree)[0])
+        return self.pack_leaves(leaves(tree))
 
-    def pack_leaves(self, leaves):
+    def pack_leaves(self, found):
         """Leaves of a tree of the same structure -> flat vector of doubles."""
-        return np.concatenate([_numbers(leaves[place]) for place in self._places])
+        return np.concatenate([_numbers(leaf) for leaf in compress(found, self._floating)])
 
     def pack_gradient(self, tree):
         """Gradient of the same structure -> flat gradient with respect to the packed vector.
 
         For a complex leaf the tape gives dL/dRe - i dL/dIm, so its imaginary part changes sign.
         """
-        leaves = flatten(tree)[0]
-        if len(leaves) != len(self._found):
+        found = leaves(tree)
+        if len(found) != len(self._found):
             raise DerivativeError(
-                f"the gradient has {len(leaves)} leaves where start has {len(self._found)}; return a tree like start"
+                f"the gradient has {len(found)} leaves where start has {len(self._found)}; return a tree like start"
             )
-        parts = {}
-        for place in self._places:
-            g, leaf = np.asarray(leaves[place]), self._found[place]
+        for place in compress(range(len(found)), self._floating):
+            g, leaf = np.asarray(found[place]), self._found[place]
             if g.shape != np.shape(leaf):
                 wanted = f"{np.shape(leaf)} is needed; return a tree like start"
                 raise DerivativeError(f"a leaf of the gradient has shape {g.shape} where {wanted}")
-            check_finite("the gradient" if len(leaves) == 1 else f"leaf {place} of the gradient", g, FINITE)
-            parts[place] = np.conj(g).astype(complex) if np.iscomplexobj(leaf) else g.real
-        return self.pack_leaves(parts)
+            check_finite("the gradient" if len(found) == 1 else f"leaf {place} of the gradient", g, FINITE)
+            found[place] = np.conj(g).astype(complex) if np.iscomplexobj(leaf) else g.real
+        return self.pack_leaves(found)
 
     def unpack(self, vector):
         """Flat vector -> fresh tree; every leaf has the type, shape and dtype of its original."""
-        leaves = list(self._found)
-        for place, numbers in zip(self._places, np.split(vector, self._ends)):  # one empty part is left over
-            leaves[place] = _leaf(leaves[place], numbers)
-        return self._rebuild(leaves)
+        parts = iter(np.split(vector, self._ends))
+        pairs = zip(self._found, self._floating)
+        return self._rebuild(_leaf(leaf, next(parts)) if floating else leaf for leaf, floating in pairs)
 
     def join(self, tree):
         """The floating leaves of a tree that may be traced, as one traced vector."""
-        leaves = flatten(tree)[0]
-        return anp.concatenate([anp.reshape(leaves[place], (-1,)) for place in self._places])
+        return anp.concatenate([anp.reshape(leaf, (-1,)) for leaf in compress(leaves(tree), self._floating)])
 
     def copies(self, tree, count):
         """Every floating leaf with a new leading axis of so many copies of itself; read-only, they share memory."""
-        leaves = list(flatten(tree)[0])
-        for place in self._places:
-            leaves[place] = np.broadcast_to(leaves[place], (count, *np.shape(leaves[place])))
-        return self._rebuild(leaves)
+        return mapped(lambda x: np.broadcast_to(x, (count, *np.shape(x))) if is_variable(x) else x, tree)
 
-    def pack_copies(self, tree, count):
-        """Tree as `copies` gives it -> one packed row for each copy."""
-        leaves = flatten(tree)[0]
-        return np.concatenate([np.reshape(leaves[place], (count, -1)) for place in self._places], axis=1)
+    def pack_copies(self, tree, out):
+        """Tree as `copies` gives it -> one packed row of `out` for each copy."""
+        floating = compress(leaves(tree), self._floating)
+        np.concatenate([np.reshape(leaf, (len(out), -1)) for leaf in floating], axis=1, out=out)
 
 
 def _numbers(values):

@@ -50,7 +50,10 @@ class Linearised:
         self._outputs, self._packing, self._apart = lambda x: outputs(x, *rest), packing, apart
         self._tree, self._free = packing.unpack(vector), True
         self._pull = self._jacobian = None
-        self.value = np.asarray(self._outputs(packing.unpack(vector)))
+        if apart:  # a product with J^T is sure to come
+            self.value, self._pull = pullback(self._outputs, self._tree)
+        else:
+            self.value = np.asarray(self._outputs(packing.unpack(vector)))
         if np.ndim(self.value) == 0:
             raise DerivativeError("the outputs are one number; return the residuals as an array, do not sum them")
         if np.iscomplexobj(self.value) or packing.complex:
@@ -121,7 +124,7 @@ class Linearised:
         jacobian = np.empty((samples, width, self.shape[1]))
         for column, unit in enumerate(np.eye(width)):
             one_each = np.broadcast_to(unit, (samples, width)).reshape(value.shape)
-            jacobian[:, column] = self._packing.pack_copies(pull(one_each), samples)
+            self._packing.pack_copies(pull(one_each), jacobian[:, column])
         jacobian = jacobian.reshape(self.shape)
         # A function that looks at one copy alone gives outputs of the right shape and wrong rows.
         probe = np.cos(np.arange(self.shape[0]))
