@@ -58,6 +58,8 @@ class Operator(Frozen, Remade):
     codomain: Space
     name: str
     form: str
+    _transposed = None
+    _origin = staticmethod(lambda: None)  # what it was turned from, while that is there
 
     def __init__(self, structure, domain, codomain, name, form=None):
         if structure.shape != (codomain.size, domain.size):
@@ -105,7 +107,7 @@ class Operator(Frozen, Remade):
             If `out` overlaps `u` or is not contiguous.
         """
         u, shape = field_array(self, u, batch=True), self.codomain.shape
-        dtype = u.dtype if self._real else result_dtype(self.structure, u.dtype)
+        dtype = result_dtype(self.structure, u.dtype)
         lead = u.shape[: -len(self.domain.shape)]
         if out is None:
             out = results.empty(lead + shape, dtype)
@@ -120,10 +122,6 @@ class Operator(Frozen, Remade):
         return out
 
     @cached_property
-    def _real(self):
-        return self.dtype.kind != "c"
-
-    @cached_property
     def _acting(self):
         """The structure that does the work in this form."""
         return self._matrix_structure if self.form == "explicit" else self.structure
@@ -132,7 +130,7 @@ class Operator(Frozen, Remade):
     def _matrix_structure(self):
         if isinstance(self.structure, Matrix):
             return self.structure
-        origin = self.__dict__.get("_origin", lambda: None)()
+        origin = self._origin()
         # Turned entry by entry, so that the two matrices hold the same bits.
         return origin._matrix_structure.transpose() if origin is not None else assembled(self.structure, self.name)
 
@@ -141,17 +139,15 @@ class Operator(Frozen, Remade):
     @property
     def T(self):
         """The plain transpose (for complex entries too), from codomain to domain."""
-        origin = self.__dict__.get("_origin")
-        known = origin() if origin is not None else self.__dict__.get("_transposed")
-        return known if known is not None else self._make_transpose()
+        return self._origin() or self._transposed or self._make_transpose()
 
     def _make_transpose(self):
         name = self.name[:-2] if self.name.endswith(".T") else f"{_bracket(self.name)}.T"
         turned = self._acting_as(self.structure.transpose(), self.codomain, self.domain, name)
         if self.tangent is self:  # else the way back is the twin that checks nothing, as derivatives need it
             # Weak: a cycle would keep large matrices alive until the collector runs.
-            turned.__dict__["_origin"] = weakref.ref(self)
-        self.__dict__["_transposed"] = turned
+            vars(turned)["_origin"] = weakref.ref(self)
+        vars(self)["_transposed"] = turned
         return turned
 
     @property

@@ -98,8 +98,7 @@ class Axis:
             matrix, n = self.matrices[1 - back].T if transposed else self.matrices[back], x.shape[axis]
             if axis == x.ndim - 1:
                 return (x.reshape(-1, n) @ matrix.T).reshape(x.shape)
-            flat = x.reshape(n, -1) if axis == 0 else x.reshape(-1, n, prod(x.shape[axis + 1 :]))
-            return np.matmul(matrix, flat).reshape(x.shape)
+            return np.matmul(matrix, x.reshape(-1, n, prod(x.shape[axis + 1 :]))).reshape(x.shape)
         if self.kind in ("identity", "fourier"):
             return x
         transform, number = TRANSFORMS[self.kind[:3]][back], int(self.kind[-1])

@@ -10,7 +10,7 @@ from sparsedp.errors import NonFiniteError
 from sparsedp.grid import Grid
 from sparsedp.solvers.nullspace import ROUNDING, find_null_space
 from sparsedp.solvers.scaling import length, remainder
-from sparsedp.structure.base import Matrix, rows_of
+from sparsedp.structure.base import Matrix
 from sparsedp.structure.kronecker import Kronecker
 
 __all__ = ["System"]
@@ -144,9 +144,8 @@ class System:
         """The first unknown whose row has no entries, or None."""
         if self.faces is not None and self.faces.connected:
             return None
-        unknown = self.masked(np.ones(self.size))
-        empty = (self.magnitude(unknown) == 0) & (unknown > 0)
-        return int(np.argmax(empty)) if empty.any() else None
+        empty = np.flatnonzero(self.masked(self.sums[False] == 0))
+        return int(empty[0]) if empty.size else None
 
     @cached_property
     def components(self):
@@ -284,11 +283,8 @@ def _rescaled(grid):
 
 def _pinned(matrix, flags):
     """Matrix -> copy whose flagged rows and columns are those of the identity, scaled to its entries."""
-    row = rows_of(matrix)
-    keep = ~(flags[row] | flags[matrix.indices])
-    size = matrix.diagonal()[~flags]
+    keep, size = sp.diags_array(np.where(flags, 0.0, 1.0)), matrix.diagonal()[~flags]
     largest = size[np.argmax(np.abs(size))] if size.size and np.any(size) else 1.0
-    kept = sp.csr_array((matrix.data * keep, matrix.indices, matrix.indptr), shape=matrix.shape)
-    result = sp.csr_array(kept + sp.diags_array(np.where(flags, largest, 0.0), format="csr"))
+    result = sp.csr_array(keep @ matrix @ keep + sp.diags_array(np.where(flags, largest, 0.0)))
     result.eliminate_zeros()
     return result
