@@ -40,7 +40,7 @@ def heterogeneous(k, boundary=dp.dirichlet):
 def test_the_transposed_cycle_is_the_transpose(cycle, sweeps, rng):
     inv = dp.inverse(wind(50), "multigrid", cycle=cycle, sweeps=SWEEPS[sweeps])
     forward = inv.solver.engine.forward
-    backward = forward.transpose()
+    backward = forward.T
     assert len(forward.levels) >= 4
     b, g = rng.standard_normal((2, 2500))
     x, y = forward.cycle(b), backward.cycle(g)

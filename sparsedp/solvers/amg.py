@@ -6,6 +6,7 @@ restriction P^T, pre-smoothing t_n^T ... t_1^T and post-smoothing s_m^T ... s_1^
 forward Gauss-Seidel sweep on A is a backward sweep on A^T.
 """
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -100,14 +101,11 @@ class Multigrid(Krylov):
         self._scale = unit * system.sign * (system.weights if self.symmetric else 1.0)
         matrix = csr_array(system.matrix * np.broadcast_to(self._scale, system.size)[:, None])
         self.forward = Hierarchy(_ruge_stueben(matrix, strength, levels), visits, *sweeps)
-        self._transposed: Any = None
         self.hierarchy = self.forward.words
 
     def precondition(self, r, transposed):
         """One cycle, or one transposed cycle."""
-        if transposed and self._transposed is None:
-            self._transposed = self.forward.transpose()
-        return (self._transposed if transposed else self.forward).cycle(self._scale * r)
+        return (self.forward.T if transposed else self.forward).cycle(self._scale * r)
 
 
 class Level(NamedTuple):
@@ -126,7 +124,8 @@ class Hierarchy:
         self.before, self.after = before, after
         self._coarse = coarse or coarse_solver(levels[-1].A)
 
-    def transpose(self):
+    @cached_property
+    def T(self):
         """The hierarchy of the transposed cycle."""
         levels = [Level(_turned(level.A), _turned(level.R), _turned(level.P)) for level in self.levels]
         before, after = (tuple(SWEEPS[sweep] for sweep in reversed(side)) for side in (self.after, self.before))

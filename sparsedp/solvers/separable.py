@@ -263,10 +263,9 @@ def spectrum(structure):
     Spectrum or None
     """
     shape = structure.out_parts[0]
-    axes: list = [Axis("identity", np.zeros(n)) for n in shape]
-    for a, line in structure.lines.items():
-        axes[a] = diagonalise(line)
-    return None if None in axes else Spectrum(shape, tuple(axes), structure.shift)
+    lines = structure.lines
+    axes = [diagonalise(lines[a]) if a in lines else Axis("identity", np.zeros(n)) for a, n in enumerate(shape)]
+    return None if None in axes else Spectrum(shape, axes, structure.shift)
 
 
 # ---------------------------------------------------------------- elimination along the first axis

@@ -236,9 +236,7 @@ def colour(pattern, shape=None):
         return np.arange(size)
     links = sp.csr_array(pattern.astype(np.int32))
     links = sp.csr_array(links.T @ links + sp.eye_array(size, dtype=np.int32))  # every column is linked to itself
-    found = _lattice(links, (size,), least)
-    if shape is not None and len(shape) > 1 and np.prod(shape) == size and found.max() >= least:
-        found = min(found, _lattice(links, shape, least), key=np.max)
+    found = _lattice(links, shape or (size,), least)
     if found.max() >= (least if size <= SMALL else 2 * least):
         found = min(found, _one_by_one(links), key=np.max)
     return found
