@@ -117,7 +117,7 @@ def test_table_and_data():
 
 def test_own_steps_and_bad_arguments():
     steps = np.logspace(-9, -1, 9)
-    assert AUDIT(smooth, X, steps=steps).evaluations == 3 + 6 * 18
+    assert AUDIT(smooth, X, steps=steps).evaluations == 3 + 2 * 8 + 6 * 18  # two tables of differences for the noise
     with pytest.raises(ValueError, match=r"a sweep needs at least 8 different positive steps, got \(0.1,\)"):
         AUDIT(smooth, X, steps=[0.1])
     with pytest.raises(

@@ -46,6 +46,20 @@ def test_stairs_that_the_steps_of_the_sweep_cannot_see():
     assert AUDIT(slope, 1 / 3, gradient=1.001).verdict != "agrees"
 
 
+@pytest.mark.parametrize("size", [1e-6, 1e-8, 1e-10])
+def test_a_right_gradient_is_not_accused_for_noise_of_any_size(size):
+    """Noise that is new at every point: a table of differences measures it, wherever the steps of the sweep are."""
+    rng = np.random.default_rng(1)
+    for scale in (0.1, 1.0, 10.0, 1.0, 0.1, 10.0):
+        x, weights = scale * rng.normal(size=3), np.arange(1.0, 4.0)
+
+        def loss(z, size=size, weights=weights):
+            return np.sum(np.sin(z) * np.exp(z / 3)) + size * (weights @ z * 1e9 % 1.0 - 0.5)
+
+        found = dp.check.gradient(loss, x, gradient=lambda z: (np.cos(z) + np.sin(z) / 3) * np.exp(z / 3))
+        assert found.verdict != "disagrees", found
+
+
 def test_several_kinks_at_once_follow_a_convention():
     weights = np.random.default_rng(3).standard_normal(20)
     clipped = lambda u: anp.sum(weights * anp.clip(u - X, -9.0, 0.0)) + 3 * anp.sum(u)

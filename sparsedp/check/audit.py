@@ -17,7 +17,7 @@ from sparsedp.check.judge import (
 )
 from sparsedp.check.progress import shown
 from sparsedp.check.summary import Result, table
-from sparsedp.check.sweep import REFUSALS, Point, Trials, default_steps, generator
+from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, default_steps, generator
 from sparsedp.derivative import hvp, value_and_grad
 from sparsedp.fields import check_function, is_whole
 
@@ -87,7 +87,7 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
     or in the kernel of a Laplacian: no order 1).
     Forward against reverse mode: 1e-10, and 1e-6 behind a solve or in noise.
 
-    Noise is what the finest steps vary by. Where it is more than rounding, agreement
+    Noise is measured by a table of differences of neighbouring values. Where it is more than rounding, agreement
     needs six digits; with fewer the verdict is inconclusive and says how many there are. A ripple (a part of the loss
     that is small, with a derivative that is not) is inconclusive too: where fine steps see another derivative than
     coarse ones, or the gradient itself varies within steps that the noise hides. A ripple below the rounding of the
@@ -121,7 +121,7 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
     point, count = Point(x), min(directions, 1) if quick else directions
     chosen, names = chosen or default_steps(point.eps), QUICK.__contains__ if quick else None
     lines = len(point.directions(point.vector, count, generator(0), names))
-    with shown(3 + 2 * len(chosen) * lines) as tick:
+    with shown(3 + POINTS * min(lines, 2) + 2 * len(chosen) * lines) as tick:
         return _audit(Trials(loss, point, tick), gradient, chosen, steps is None, count, generator(rng), names)
 
 

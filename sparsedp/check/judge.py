@@ -21,7 +21,7 @@ from math import inf, isfinite, nan
 import numpy as np
 
 from sparsedp.check.summary import Result
-from sparsedp.check.sweep import REFUSALS, Line
+from sparsedp.check.sweep import REFUSALS, Line, noise_of
 from sparsedp.derivative import NO_JVP, pushforward
 
 __all__ = ["PROVED", "at_kinks", "curvature", "forward_mode", "judgement", "looked_at", "verdict"]
@@ -228,7 +228,7 @@ def _read(line):
     rounding = line.trials.eps * np.max(np.abs(levels[1:3]), axis=0, initial=max(abs(line.base), TINY))
     # What the finest levels vary by, in roundings of the loss. Rounding does that, or a solver inside.
     varied = np.abs(np.diff(m)) * t[1:] / rounding[1:]
-    jitter = float(np.max(varied[1 - FINEST :]))
+    jitter = max(float(np.max(varied[1 - FINEST :])), 2 * line.trials.noise)
     return {
         "t": t, "changes": changes, "rests": rests, "m": m, "kinks": kinks, "rounding": rounding, "jitter": jitter,
         "noise": max(2.0, jitter) * rounding, "curvature": float(np.median(np.abs(kinks / t)[:3])),
@@ -343,6 +343,10 @@ def looked_at(trials, slope, steps, extend, count, rng, wanted=None):
         As in `measured`.
     count, rng, wanted
         As in `Point.directions`.
+
+    Notes
+    -----
+    The noise belongs to the loss, not to a direction: the larger one along the first and the last counts for all.
     """
     point = trials.point
     trials.start()
@@ -366,6 +370,7 @@ def looked_at(trials, slope, steps, extend, count, rng, wanted=None):
         return [], doubts
     directions = point.directions(vector, count, rng, wanted)
     lines = [Line(name, direction, trials) for name, direction in directions]
+    trials.noise = max(map(noise_of, lines[:1] + lines[1:][-1:]), default=0.0)
     judged = [measured(line, steps, extend, line is lines[0]) for line in lines]
     for one in judged if callable(slope) else ():
         explained(one, slope)

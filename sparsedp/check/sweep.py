@@ -1,9 +1,11 @@
 """The numbers of an audit: a point, directions to leave it, and losses over a sweep of step sizes on both sides.
 
 A point is one vector of real numbers, complex leaves as pairs, and so are gradients and directions: the derivative
-along a direction is a plain dot product. The loss itself only ever sees fresh copies of its own tree.
+along a direction is a plain dot product. The noise of the loss comes from a table of differences of neighbouring
+values. The loss itself only ever sees fresh copies of its own tree.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +16,7 @@ from sparsedp.tape import is_variable
 from sparsedp.tree import copied, flatten, norm
 
 __all__ = [
+    "POINTS",
     "REFUSALS",
     "Line",
     "Point",
@@ -21,14 +24,12 @@ __all__ = [
     "default_steps",
     "generator",
     "joined",
+    "noise_of",
     "rms",
     "solvers_of",
 ]
 
 REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # what a loss may raise away from x
-# Of the root mean square of a leaf. No power of two: else the stairs of a loss that was rounded (to single precision,
-# by a table) fall on the points of a sweep and hide.
-UNIT = 0.9
 MOST_LEAVES = 8  # with more leaves than this, none gets a direction of its own
 SAME = "the loss does not change"
 
@@ -53,7 +54,7 @@ def default_steps(eps):
 class Point:
     """Where a loss is examined, as a vector.
 
-    Each leaf has a unit: about the root mean square of its values (1 if they are all 0). A step of size t
+    Each leaf has a unit: the root mean square of its values (1 if they are all 0). A step of size t
     moves every leaf by t times its unit, so that leaves of different physical size are all examined.
 
     Parameters
@@ -74,7 +75,7 @@ class Point:
         self.vector = joined(self.values)
         self.complex = any(map(np.iscomplexobj, self.values))
         self._ends = np.cumsum([joined([values]).size for values in self.values])[:-1]
-        self.units = UNIT * np.concatenate([np.full(part.size, rms(part) or 1.0) for part in self._parts(self.vector)])
+        self.units = np.concatenate([np.full(part.size, rms(part) or 1.0) for part in self._parts(self.vector)])
         self.size = sum(map(np.size, self.values))
         self.eps = max(eps_of(values.dtype) for values in self.values)
 
@@ -173,6 +174,8 @@ class Trials:
     base : float
         The loss at the point; whoever makes the trials sets it and the gradient.
     gradient : vector
+    noise : float
+        Noise of the loss in units of its rounding, where a table of differences has shown it; else 0.
     count : int
         Evaluations.
     solved : bool
@@ -186,7 +189,7 @@ class Trials:
     def __init__(self, loss, point, tick=lambda: None, base=np.nan, gradient=None):
         self.loss, self.point, self.tick = loss, point, tick  # `tick` is called at each evaluation
         self.base, self.gradient = base, gradient
-        self.count, self.solved, self.tolerance = 0, False, 0.0
+        self.count, self.solved, self.tolerance, self.noise = 0, False, 0.0, 0.0
         self.eps = eps_of(float)
 
     def value(self, tree):
@@ -292,3 +295,36 @@ class Line:
     def silent(self):
         """Steps that left the loss the same, if all did: it is constant along this direction, to rounding."""
         return [] if self.usable else [level.step for level in self.levels if level.note == SAME]
+
+
+# ------------------------------------------------------------ noise
+
+POINTS = 8  # of a table of differences
+ORDER, VARIANCE = 4, 70.0  # of the differences that are read: parabolas leave them alone; (2k)! / (k!)^2
+FIRST = 0.7320508 * 2.0**-28  # least distance, in units of x, of double precision; no power of two times a step
+GROWTH = 2.0**6  # of the distance, while the loss stands still
+MOST = 4  # distances tried
+
+
+def noise_of(line):
+    """Line -> how much the loss varies where it should not, in units of its rounding; 0 where nothing varies.
+
+    Values at equal distances, so close that a smooth loss is a straight line there. The k-th differences of a line
+    are 0; those of independent errors of standard deviation s have the variance s^2 (2k)! / (k!)^2. The distance is
+    no power of two times a step of the sweep, and it grows until the loss changes from point to point: else the
+    steps of a loss that was rounded (to single precision, by a table) fall on the points of the sweep and hide.
+
+    Source: the table is that of J. J. Moré and S. M. Wild, SIAM J. Sci. Comput. 33, 2011.
+    """
+    distance = FIRST * max(1.0, line.point.eps / eps_of(float)) ** 0.5
+    for _ in range(MOST):
+        # On one side: a kink at x is no noise.
+        values, changes, notes = zip(*(line.end(place * distance) for place in range(1, POINTS + 1)))
+        if any(notes):
+            return 0.0
+        if np.count_nonzero(np.diff(values)) > POINTS // 2:
+            size = max(*map(abs, values), abs(line.base), np.finfo(float).tiny)
+            rests = np.array(values) - line.base - changes
+            return norm(np.diff(rests, ORDER)) / math.sqrt((POINTS - ORDER) * VARIANCE) / (line.trials.eps * size)
+        distance *= GROWTH
+    return 0.0
