@@ -119,7 +119,7 @@ class Each:
         self.layout, self.function = layout, function
         self._stacks: dict = {}
         self._trees: list = []
-        self._marks: list = []  # of what the function returned, where it will be called again
+        self.marks: list = []  # of what the function returned, where it will be called again
         self._outer, self._compared = set(), False
 
     def start(self, n, outer, stored):
@@ -154,9 +154,9 @@ class Each:
     def _compare(self, i, found):
         """Refuse a function that returns something else for a state than it did before."""
         marks = [_marked(leaf) for leaf in found if is_variable(leaf)]
-        if i == len(self._marks):
-            self._marks.append(marks)
-        elif self._marks[i] != marks:
+        if i == len(self.marks):
+            self.marks.append(marks)
+        elif self.marks[i] != marks:
             raise DerivativeError(
                 "keep returns something else when it is called again; it must depend on its arguments only"
             )

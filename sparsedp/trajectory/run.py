@@ -16,6 +16,7 @@ from sparsedp.ledger import active, count, thread
 from sparsedp.tape import Rule, isbox, plain
 from sparsedp.trajectory.backward_pass import BackwardPass
 from sparsedp.trajectory.carried import carries, in_plain_forms
+from sparsedp.trajectory.keep import Each
 from sparsedp.trajectory.layout import dense
 from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import Record
@@ -120,6 +121,8 @@ class Run:
         """Cotangents of the outputs -> those of the arguments that want one, in that order."""
         if self.carried and any(map(isbox, g)):  # a backward form is for plain values
             self.carried = False
+            if isinstance(self.keep, Each):
+                self.keep.marks.clear()  # the other form of the step may round otherwise
             self.forward(args)
         elif self.stored is None:
             end = self._end
