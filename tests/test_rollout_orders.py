@@ -21,7 +21,7 @@ class Own:
         return u + 0.1 * anp.sin(p * u)
 
     def forward(self, u, p):
-        return np.add(u, np.sin(p * u) / 10.0)  # rounded otherwise than the call
+        return np.add(u, 0.1 * np.sin(p * u)) * (1 + 4e-16)  # rounded otherwise than the call
 
     def backward(self, u, p, g):
         return np.multiply(g, 1 + 0.1 * p * np.cos(p * u)), float(np.sum(g * 0.1 * u * np.cos(p * u)))
