@@ -13,7 +13,7 @@ import numpy as np
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
 from sparsedp.ledger import recording, thread
 from sparsedp.tape import is_variable
-from sparsedp.tree import copied, flatten, norm
+from sparsedp.tree import copied, flatten, keys, norm
 
 __all__ = [
     "POINTS",
@@ -153,14 +153,11 @@ def rms(vector):
 
 def _paths(tree, path="x"):
     """How each leaf is reached, in the order of flatten."""
-    if isinstance(tree, dict):
-        branches = [(f"[{key!r}]", branch) for key, branch in tree.items()]
-    elif isinstance(tree, (tuple, list)):
-        names = [f".{name}" for name in getattr(tree, "_fields", ())] or [f"[{place}]" for place in range(len(tree))]
-        branches = list(zip(names, tree))
-    else:
+    names, fields = keys(tree), getattr(tree, "_fields", None)
+    if names is None:
         return [path]
-    return [end for step, branch in branches for end in _paths(branch, path + step)]
+    steps = {name: f".{fields[name]}" if fields else f"[{name!r}]" for name in names}
+    return [end for name, step in steps.items() for end in _paths(tree[name], path + step)]
 
 
 # ------------------------------------------------------------ losses
