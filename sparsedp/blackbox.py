@@ -284,12 +284,12 @@ class Adopted(Remade):
         ways = [(STEP, 1.0)] if self.way == STEP else []
         ways += [(DIFFERENCES, share) for share in SHARES] if self._derivative != "complex" else []
         made: dict = {}
-        matrix, wrong, judged = None, np.ones(coloured.pattern.shape[0], dtype=bool), False
+        matrix, wrong, judged = coloured.pattern, np.ones(coloured.pattern.shape[0], dtype=bool), False
         for share, way in product(reversed(SHARES), ways):
             try:
                 with _strict():
                     made[way] = made[way] if way in made else self._by_colours(coloured, x, *way)
-                    matrix = made[way] if matrix is None else _with_rows(matrix, made[way], wrong)
+                    matrix = _with_rows(matrix, made[way], wrong)
                     wrong &= self._misses(matrix, x, way[0], share)
             except MemoryError:
                 raise

@@ -18,14 +18,13 @@ CURVED = 1e-12  # a pair of step and change is used where s.y is more than this 
 class QuasiState(NamedTuple):
     """State of L-BFGS: the point, and the last steps and changes of the gradient, oldest first.
 
-    The changes are kept as the gradient in units of `height`, the steps in units of `length` (powers of two, set
-    at the start), so that no product of two of them leaves the range of floating point numbers.
+    The changes are kept as the gradient in units of `height`, a power of two set at the start, so that no product of
+    two of them leaves the range of floating point numbers.
     """
 
     trial: Trial
     steps: np.ndarray
     changes: np.ndarray
-    length: float
     height: float
 
 
@@ -61,7 +60,7 @@ class Quasi:
     def begin(self, first):
         """State at the start."""
         nothing = np.zeros((0, first.vector.size))
-        return QuasiState(first, nothing, nothing, power_of_two(_first_length(first)), power_of_two(norm(first.slope)))
+        return QuasiState(first, nothing, nothing, power_of_two(norm(first.slope)))
 
     def advance(self, state, trials):
         """One iteration; a line search that fails is tried once more without the memory.
@@ -85,7 +84,7 @@ class Quasi:
         raise Stuck("rounding" if hopeless else "the line search found no lower point")
 
     def _remember(self, state, trial):
-        step = (trial.vector - state.trial.vector) / state.length
+        step = trial.vector - state.trial.vector
         change = trial.slope / state.height - state.trial.slope / state.height
         steps, changes = np.vstack([state.steps, step]), np.vstack([state.changes, change])
         return state._replace(trial=trial, steps=steps[-self.memory :], changes=changes[-self.memory :])
@@ -96,11 +95,10 @@ def _step(state, box):
     here = state.trial
     free = box.free(here.vector, here.slope)
     free = slice(None) if free.all() else free
-    g = here.slope / state.height
-    shortest = _first_length(here) / state.length / (norm(g) or 1.0)
-    step = np.zeros_like(g)
+    g, step = here.slope / state.height, np.zeros_like(here.vector)
+    shortest = _first_length(here) / (norm(g) or 1.0)
     step[free] = two_loops(g[free], state.steps[:, free], state.changes[:, free], shortest)
-    return state.length * step
+    return step
 
 
 def two_loops(g, steps, changes, scale):
