@@ -86,7 +86,7 @@ BUDGETS = {
     "kernels": 14_000,
     "network": 3_000,
     "operators": 5_800,
-    "optimize": 13_300,
+    "optimize": 13_200,
     "report": 19_400,
     "solvers": 40_500,
     "solvers/multigrid": 10_000,

@@ -35,20 +35,15 @@ class Batches:
                 f"batches must be a list or a function of the iteration, got {type(given).__name__}; "
                 "write list(batches)"
             )
-        self._cycle = None if given is None or callable(given) else len(given)
-        if self._cycle == 0:
+        if isinstance(given, Sequence) and not given:
             raise ValueError("batches is empty; leave it out, and the loss is called with x alone")
         self.varied, self.number = given is not None, 0
-        self._batch = lru_cache(maxsize=2)(given if callable(given) else lambda place: given[place])
-        self._mark = lru_cache(maxsize=None)(lambda place: fingerprint(self._batch(place)))
-
-    def _place(self, number):
-        return number % self._cycle if self._cycle else number
+        self._batch = lru_cache(maxsize=2)(given if callable(given) else lambda number: given[number % len(given)])
 
     def now(self, back=0):
         """The arguments of the loss after x in this iteration, or so many iterations earlier."""
-        return (self._batch(self._place(self.number - back)),) if self.varied else ()
+        return (self._batch(self.number - back),) if self.varied else ()
 
     def mark(self, number):
         """A hash of the batch of an iteration."""
-        return self._mark(self._place(number)) if self.varied else ""
+        return fingerprint(self.now(self.number - number))

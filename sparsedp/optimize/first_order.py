@@ -43,7 +43,7 @@ class Descent:
     residuals = False
 
     def __init__(self, rate=None, momentum=0.0, line_search=None):
-        if rate is not None and not _is_positive(rate):
+        if rate is not None and not is_positive(rate):
             raise ValueError(f"gd needs a positive rate, got {rate}; leave it out and it is searched for")
         if not (is_number(momentum) and 0 <= momentum < 1):
             raise ValueError(f"gd needs a momentum from 0 to below 1, got {momentum}; leave it out for none")
@@ -110,7 +110,8 @@ def admissible(point, step, share, trials):
     raise Stuck("no admissible point along the step")
 
 
-def _is_positive(value):
+def is_positive(value):
+    """Whether a value is a number above 0, and finite."""
     return is_number(value) and 0 < value < np.inf
 
 
@@ -145,11 +146,11 @@ class Adam:
     residuals, searches = False, False
 
     def __init__(self, rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8):
-        if not _is_positive(rate):
+        if not is_positive(rate):
             raise ValueError(f"adam needs a positive rate, got {rate}; the default is 1e-3")
         if np.shape(betas) != (2,) or not all(is_number(beta) and 0 <= beta < 1 for beta in betas):
             raise ValueError(f"adam needs two betas from 0 to below 1, got {betas}; the default is (0.9, 0.999)")
-        if not _is_positive(epsilon):
+        if not is_positive(epsilon):
             raise ValueError(f"adam needs a positive epsilon, got {epsilon}; the default is 1e-8")
         self.rate, self.betas, self.epsilon = rate, tuple(betas), epsilon
 

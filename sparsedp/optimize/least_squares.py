@@ -9,9 +9,8 @@ import numpy as np
 import scipy.linalg
 from scipy.sparse.linalg import LinearOperator, lsmr
 
-from sparsedp.fields import is_number
 from sparsedp.optimize.directions import Family
-from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked
+from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked, is_positive
 from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.tree import norm
 
@@ -97,7 +96,7 @@ class LevenbergMarquardt(GaussNewton):
     """
 
     def __init__(self, damping=1e-3, apart=False, dense=None):
-        if not (is_number(damping) and 0 < damping < np.inf):
+        if not is_positive(damping):
             raise ValueError(f"levenberg_marquardt needs a positive damping, got {damping!r}; the default is 1e-3")
         super().__init__(apart, dense)
         self.damping = damping
@@ -152,7 +151,7 @@ class HalfInverse(GaussNewton):
     searches = False
 
     def __init__(self, rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto"):
-        if not (is_number(rate) and 0 < rate < np.inf):
+        if not is_positive(rate):
             raise ValueError(f"half_inverse needs a positive rate, got {rate!r}; the default is 1")
         self.rate, self.apart, self._family = rate, bool(apart), Family(power, 0.0, truncation, form, rank)
 

@@ -3,8 +3,7 @@
 import autograd.numpy as anp
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import is_number
-from sparsedp.optimize.first_order import Descent
+from sparsedp.optimize.first_order import Descent, is_positive
 from sparsedp.tape import differentiable, plain
 
 __all__ = ["PhysicalGradient", "physical_gradient"]
@@ -59,7 +58,7 @@ def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
     >>> round(1.0 - update, 12)  # x - update is the solution
     2.0
     """
-    if not (is_number(rate) and rate > 0):
+    if not is_positive(rate):
         raise ValueError(f"physical_gradient needs a positive rate, got {rate!r}; the default is 1")
     rate = float(rate)
 
