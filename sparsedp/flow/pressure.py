@@ -20,7 +20,6 @@ from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.solvers.inverses import check_settings
 from sparsedp.structure.base import Structure
-from sparsedp.tree import copied
 
 __all__ = ["Projection", "projection"]
 
@@ -74,8 +73,7 @@ def projection(grid, solid=None, boundary=no_slip, method="auto", rtol=1e-10, ma
     array([2., 3., 2., 3., 0., 0., 0., 0.])
     """
     check_grid("projection", grid)
-    check_settings(method, rtol, maxiter, "project", options)
-    settings = (method, float(rtol), maxiter, copied(options))
+    settings = check_settings(method, rtol, maxiter, "project", options)
     return Projection(Setup(grid, solid, boundary, settings))
 
 

@@ -50,7 +50,7 @@ class Setup(Remade):
         self.exponent = int(np.frexp(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))[1])
         near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
         D, G = divergence(near), gradient(near, self.pressure_conditions, self.solid)
-        self.inverse = _inverse(-D @ G, *settings)
+        self.inverse = _inverse(-D @ G, settings)
         self._refuse_lost_inflow()
         maps = (D.structure, G.structure), (G.T.structure, D.T.structure)
         self._reach = [largest(first.magnitude()(np.ones(grid.faces.size))) for first, _ in maps]
@@ -160,15 +160,14 @@ class Setup(Remade):
                     raise ValueError(f"the inflow on the {where} enters a region without an outflow; open a side of it")
 
 
-def _inverse(op, method, rtol, maxiter, options):
+def _inverse(op, settings):
     """The inverse for the pressure. Transforms are preferred on small grids too: the passes go with them."""
-    settings = rtol, maxiter, "project", options, "pressure solve"
-    if method == "auto" and op.domain.size < FEW and op.separable:
+    if settings["method"] == "auto" and op.domain.size < FEW and op.separable:
         try:
-            return build(op, "separable", *settings)
+            return _inverse(op, settings | {"method": "separable"})
         except ValueError:  # an axis that cannot be diagonalised with all its digits
             pass
-    return build(op, method, *settings)
+    return build(op, name="pressure solve", **settings)
 
 
 def _exponent(x, source):

@@ -129,7 +129,8 @@ def stepper(
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     if unstable not in ("raise", "allow"):
         raise ValueError(f"unstable must be 'raise' or 'allow', got {unstable!r}")
-    check_settings(solver, rtol, maxiter, "raise", set(options) - {"sparsity"})  # which `implicit` takes
+    known = {word: value for word, value in options.items() if word != "sparsity"}  # which `implicit` takes
+    settings = check_settings(solver, rtol, maxiter, "raise", known) | dict(options=given["options"])
     if (method in EXPLICIT or method == "etdrk4") and (options or jacobian is not None):
         raise TypeError(f"{method} solves nothing; leave out {', '.join([*options] or ['jacobian'])}")
     if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
@@ -138,7 +139,6 @@ def stepper(
         raise ValueError(f"floor must hold numbers >= 0, in the units of u, got {floor!r}; write for example 1e-3")
     dt = dt if callable(dt) else positive(dt, "dt")
     problem = Problem(rate, given["linear"], source, timed)
-    settings = dict(method=solver, rtol=float(rtol), maxiter=maxiter, nullspace="raise", options=given["options"])
     scheme, largest = _scheme(method, problem, jacobian, settings, KEPT[tolerance is not None]), np.inf
     if tolerance is not None:
         scheme = Adaptive(scheme, float(tolerance), given["floor"])
