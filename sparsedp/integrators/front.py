@@ -1,8 +1,9 @@
 """stepper(): a rate of change and a method -> a step for time loops; and how large an explicit one may be."""
 
 import numpy as np
+from scipy.sparse.linalg import ArpackError, eigsh
 
-from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
+from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.fields import check_finite, is_number, rounded_down, surely_finite
 from sparsedp.integrators.adaptive import Adaptive
 from sparsedp.integrators.exponential import Exponential
@@ -298,21 +299,13 @@ def least_eigenvalue(op):
         return float(np.min(found.eigenvalues))
     if not op.structure.has_entries:
         return None
-    matrix = op.matrix
-    different = abs(matrix - matrix.T)
-    if different.nnz and different.max() > 1e-14 * abs(matrix).max():
+    matrix, n = op.matrix, op.shape[0]
+    if n and abs(matrix - matrix.T).max() > 1e-14 * abs(matrix).max():
         return None
-    return _least_of_symmetric(matrix)
-
-
-def _least_of_symmetric(matrix):
-    from scipy.sparse.linalg import ArpackError, eigsh
-
-    n = matrix.shape[0]
     if n <= DENSE_UP_TO:
         return float(np.min(np.linalg.eigvalsh(matrix.toarray()), initial=0.0))
     start = np.random.default_rng(0).standard_normal(n)  # the same bits in every run
     try:
         return float(eigsh(matrix, 1, which="SA", v0=start, tol=1e-3, return_eigenvectors=False)[0])
-    except (ArpackError, ConvergenceError):
+    except ArpackError:
         return None

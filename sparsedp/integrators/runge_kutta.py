@@ -127,12 +127,12 @@ class Polynomial(Scheme):
 
     def __init__(self, problem, name):
         super().__init__(problem, name, EXPLICIT[name].order)
-        self._rule, self._transposed = self._made(False), self._made(True)
+        self._rules = [self._rule(transposed) for transposed in (False, True)]
 
     def __call__(self, u, params, t, h):
-        return self._rule(h * self.problem.coefficient(params), u)
+        return self._rules[False](h * self.problem.coefficient(params), u)
 
-    def _made(self, transposed):
+    def _rule(self, transposed):
         """T_p of L, or of L^T, as a rule in (z, u)."""
         L, orders = self.problem.op.T if transposed else self.problem.op, range(self.order, 0, -1)
 
@@ -152,15 +152,14 @@ class Polynomial(Scheme):
 
         def vjp(nums, ans, z, u):
             def pull(g):
-                back = self._rule if transposed else self._transposed
-                slopes = {0: lambda: anp.sum(g * slope(z, u)), 1: lambda: back(z, g)}
+                slopes = {0: lambda: anp.sum(g * slope(z, u)), 1: lambda: self._rules[not transposed](z, g)}
                 return tuple(of_argument(slopes[num](), (z, u)[num]) for num in nums)
 
             return pull
 
         def jvp(nums, tangents, ans, z, u):
-            same, pairs = self._transposed if transposed else self._rule, zip(nums, tangents, strict=True)
-            return sum(same(z, t) if num else t * slope(z, u) for num, t in pairs)
+            pairs = zip(nums, tangents, strict=True)
+            return sum(self._rules[transposed](z, t) if num else t * slope(z, u) for num, t in pairs)
 
         return Rule(f"stepper({self.name}){'.T' * transposed}", forward, vjp, jvp)
 
@@ -190,26 +189,25 @@ class Resolvent:
     def __init__(self, op, name, settings, most=2):
         self.op, self.name, self.settings = op, name, settings
         self.info, self._inverse = SolveLog(), lru_cache(most)(self._set_up)
-        self._checked, self._free = self._rule(False, True), self._rule(False, False)
-        self._adjoint = self._rule(True, False)
+        self._checked, self._rules = self._rule(False, True), [self._rule(False), self._rule(True)]
 
     def __call__(self, z, b):
         return self._checked(z, b)
 
-    def _rule(self, transposed, checked):
+    def _rule(self, transposed, checked=False):
         """The solve (or the transposed solve) as a rule in (z, b)."""
         L = self.op.T if transposed else self.op
 
         def vjp(nums, ans, z, b):
             def pull(g):
-                y = (self._free if transposed else self._adjoint)(z, g)
+                y = self._rules[not transposed](z, g)
                 return tuple(of_argument(y if num else anp.sum(y * L(ans)), (z, b)[num]) for num in nums)
 
             return pull
 
         def jvp(nums, tangents, ans, z, b):
             total = sum(t if num else t * L(ans) for num, t in zip(nums, tangents, strict=True))
-            return (self._adjoint if transposed else self._free)(z, total)
+            return self._rules[transposed](z, total)
 
         def forward(z, b):
             return self._solved(z, b, transposed, checked)
