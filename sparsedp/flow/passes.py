@@ -8,7 +8,7 @@ from math import sqrt
 
 import numpy as np
 
-from sparsedp.kernels import projection
+from sparsedp import kernels
 from sparsedp.solvers.scaling import norm
 from sparsedp.structure.lazy import face_entries
 
@@ -51,9 +51,12 @@ class Passes:
     lines : list of (kept, entries) for each axis
         The faces along the axis that are not closed; for each face what it takes from the cells below and above it, and
         what it gives to them, 0 where it is closed.
+    loops : module
+        kernels/projection.py, which needs numba.
     """
 
-    def __init__(self, grid, lines):
+    def __init__(self, grid, lines, loops):
+        self.loops = loops
         missing = 3 - grid.dim  # axes beside those of the grid, without faces
         self.cells = (1,) * missing + grid.shape
         self.parts = [(slice(0), (0, 0, 0))] * missing
@@ -70,17 +73,21 @@ class Passes:
     def net_flow(self, x, b):
         """b = D K x; the norms of b and of x."""
         components, cells = self._components(x), b.reshape(self.cells)
-        flow, size = projection.net_flow.compiled(x, *components, *self.inward, cells, 0, self.cells[0])
+        flow, size = self.loops.net_flow.compiled(x, *components, *self.inward, cells, 0, self.cells[0])
         return sqrt(flow), sqrt(size)
 
     def push(self, x, p, out):
         """out = K (x + G p)."""
         given, found = self._components(x), self._components(out)
-        projection.push.compiled(*given, p.reshape(self.cells), *self.outward, *found, 0, 1)
+        self.loops.push.compiled(*given, p.reshape(self.cells), *self.outward, *found, 0, 1)
 
 
 def compiled(grid, products):
-    """The Passes that do what the products do; None where an axis has one cell, or entries of another kind."""
+    """The Passes that do what the products do; None without numba, or where an axis has entries of another kind."""
+    if not kernels.compiled():
+        return None
+    from sparsedp.kernels import projection
+
     lines = []
     for axis, faces in enumerate(grid.faces.split(products.kept)):
         n = grid.shape[axis]
@@ -89,4 +96,4 @@ def compiled(grid, products):
         if entries is None:
             return None
         lines.append((kept, entries * np.resize(kept, n + 1)))  # the last face of a periodic axis is the first
-    return Passes(grid, lines)
+    return Passes(grid, lines, projection) if projection.net_flow.compiled else None

@@ -13,13 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
-from sparsedp import kernels
 from sparsedp.conditions import inflow, no_slip, resolve
 from sparsedp.errors import NonFiniteError
 from sparsedp.fields import check_finite, place
 from sparsedp.flow.passes import Products, compiled
 from sparsedp.grid import Grid
-from sparsedp.kernels import projection
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.recipe import Remade
@@ -56,7 +54,7 @@ class Setup(Remade):
         self._reach = [largest(first.magnitude()(np.ones(grid.faces.size))) for first, _ in maps]
         # Of the forward solve, and of the adjoint one.
         self.products = self.passes = [Products(*pair, self.open.astype(float)) for pair in maps]
-        if self._exact and kernels.compiled() and projection.net_flow.compiled:
+        if self._exact:
             found = [compiled(grid, products) for products in self.products]
             self.passes = found if all(found) else self.products
 
