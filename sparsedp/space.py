@@ -11,7 +11,7 @@ import numpy as np
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import check_plain
 from sparsedp.recipe import Frozen, Uncached
-from sparsedp.tape import Rule, dtype_of, isbox, linear, plain
+from sparsedp.tape import dtype_of, isbox, linear
 
 __all__ = ["Space", "fits"]
 
@@ -128,7 +128,8 @@ class Space(Frozen, Uncached):
             part if np.shape(part) == shape else _broadcast(self, part, shape)
             for part, shape in zip(parts, self.parts, strict=True)
         ]
-        return _join(self, *found) if any(map(isbox, found)) else _joined(self, *found)
+        numpy = anp if any(map(isbox, found)) else np  # the same, without the tape
+        return numpy.reshape(numpy.concatenate([numpy.reshape(part, (-1,)) for part in found]), self.shape)
 
     @cached_property
     def _parted(self):
@@ -191,19 +192,3 @@ def _part(kind, whole, start, stop, shape):
         return v
 
     return linear(f"part of {kind}", take, put)[0]
-
-
-def _joined(space, *parts):
-    return np.concatenate([np.reshape(part, -1) for part in parts]).reshape(space.shape)
-
-
-def _join_vjp(nums, ans, space, *parts):
-    return lambda g: tuple(space.split(g)[num - 1] for num in nums)
-
-
-def _join_jvp(nums, tangents, ans, space, *parts):
-    moved = dict(zip(nums, tangents, strict=True))
-    return space.join(*(moved.get(num, np.zeros_like(plain(part))) for num, part in enumerate(parts, 1)))
-
-
-_join = Rule("join", _joined, _join_vjp, _join_jvp)
