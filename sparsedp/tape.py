@@ -7,7 +7,7 @@ Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A
 """
 
 import inspect
-from functools import partial, wraps
+from functools import cached_property, partial, wraps
 
 import autograd.numpy as anp
 import numpy as np
@@ -98,8 +98,6 @@ def _copied(value):
 class Rule(Remade):
     """A function with hand-written derivatives whose results are fresh arrays. Users make one with `differentiable`."""
 
-    __slots__ = ("_signature", "forward", "jvp", "keywords", "made", "name", "vjp")
-
     def __init__(self, name, forward, vjp=None, jvp=None, keywords=(), made=None):
         self.name = name
         self.forward = forward
@@ -107,7 +105,6 @@ class Rule(Remade):
         self.jvp = jvp
         self.keywords = keywords
         self.made = made or (Rule, (name, forward, vjp, jvp, keywords))  # see recipe.py
-        self._signature = _signature(forward)
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
@@ -126,16 +123,16 @@ class Rule(Remade):
         bound.apply_defaults()
         return bound.args
 
+    @cached_property
+    def _signature(self):
+        """How it is called. A function that does not tell, as NumPy's own did not in 1.26, takes all by position."""
+        try:
+            return inspect.signature(self.forward)
+        except (TypeError, ValueError):
+            return inspect.signature(lambda *args: None)
+
     def __repr__(self):
         return f"<rule {self.name}>"
-
-
-def _signature(forward):
-    """How a function is called. One that does not tell, as NumPy's own did not in 1.26, takes all by position."""
-    try:
-        return inspect.signature(forward)
-    except (TypeError, ValueError):
-        return inspect.signature(lambda *args: None)
 
 
 def _run(rule, *args):
