@@ -65,7 +65,8 @@ class GaussNewton:
         """The step to that minimum."""
         family, r = self.family(damping), linearised.flat
         if family.forms(*linearised.shape):
-            return -family(linearised, r).step
+            cheap = damping > EXACT * np.linalg.norm(linearised.rows()) ** 2
+            return -_damped(linearised.rows(), r, damping) if cheap else -family(linearised, r).step
         product = LinearOperator(linearised.shape, linearised.push, linearised.pull, dtype=float)
         return -lsmr(product, r, damp=np.sqrt(damping), atol=FORCING, btol=FORCING, conlim=CONDITION)[0]
 
@@ -104,13 +105,9 @@ class LevenbergMarquardt(GaussNewton):
     def advance(self, state, trials):
         """One iteration: one Jacobian, as many dampings as it takes. Raises Stuck when none is large enough."""
         here, linearised = state.trial, trials.linearised(state.trial)
-        formed = self.family().forms(*linearised.shape)
-        damping, growth = state.damping or self.damping * _largest(linearised, formed) or 1.0, 2.0
+        damping, growth = state.damping or self.damping * self.largest(linearised) or 1.0, 2.0
         for _ in range(HALVINGS):
-            if formed and damping > EXACT * np.linalg.norm(linearised.rows()) ** 2:
-                step = -_damped(linearised.rows(), linearised.flat, damping)
-            else:
-                step = self.step(linearised, damping)
+            step = self.step(linearised, damping)
             point = trials.box.inside(here.vector + step)
             trial, change = trials(point, here.value), linearised.push(point - here.vector)
             predicted = -float(np.dot(change, linearised.flat + 0.5 * change))
@@ -120,16 +117,15 @@ class LevenbergMarquardt(GaussNewton):
             if abs(predicted) <= here.rounding:  # below 0 where a bound bends a long step uphill: a shorter one may do
                 break
             damping, growth = damping * growth, 2 * growth
-        hopeless = predicted <= 100 * here.rounding
+        hopeless = abs(predicted) <= 100 * here.rounding
         raise Stuck("rounding" if hopeless else "no damping gives a lower point")
 
-
-def _largest(linearised, formed):
-    """The largest diagonal entry of J^T J; where J is not formed, that along the gradient."""
-    if formed:
-        return float(np.max(np.linalg.norm(linearised.rows(), axis=0), initial=0.0)) ** 2
-    slope = linearised.pull(linearised.flat)
-    return norm(linearised.push(slope / (norm(slope) or 1.0))) ** 2
+    def largest(self, linearised):
+        """The largest diagonal entry of J^T J; where J is not formed, that along the gradient."""
+        if self.family().forms(*linearised.shape):
+            return float(np.max(np.linalg.norm(linearised.rows(), axis=0), initial=0.0)) ** 2
+        slope = linearised.pull(linearised.flat)
+        return norm(linearised.push(slope / (norm(slope) or 1.0))) ** 2
 
 
 class HalfInverse(GaussNewton):
