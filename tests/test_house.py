@@ -82,7 +82,7 @@ BUDGETS = {
     "advection": 14_000,
     "check": 17_700,
     "flow": 5_800,
-    "integrators": 10_600,
+    "integrators": 10_670,
     "kernels": 14_000,
     "network": 3_000,
     "operators": 5_800,
