@@ -8,6 +8,7 @@ Run ``python -m benchmarks.triad [--quick]`` in the root of the repository.
 """
 
 import argparse
+import os
 import time
 from functools import reduce
 from math import prod
@@ -30,6 +31,8 @@ def _numpy_triad(a, b, c, s):
 
 
 def _numba_triad():
+    # The threads of numba's own parallel loops would go on spinning after a triad, on the processor of the next task.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     from numba import njit, prange
 
     @njit(parallel=True, nogil=True)

@@ -13,9 +13,12 @@ __all__ = ["across_rows", "along_rows", "kronecker_sum", "through_faces"]
 TILE = 1024  # numbers of a row that are worked on at a time: all of its diagonals find them in the L1 cache
 
 
-@kernel("read3 write3 read2 read2 read2 real", fastmath={"contract"})  # a product and a sum are one instruction
-def kronecker_sum(u, out, far, middle, along, shift, start, stop):
-    """out = shift u + sum of T_a u, T_a tridiagonal and cyclic along axis a: rows lower, centre, upper."""
+@kernel("read3 write3 read2 read2 read2 flag real", fastmath={"contract"})  # a product and a sum are one instruction
+def kronecker_sum(u, out, far, middle, along, uniform, shift, start, stop):
+    """out = shift u + sum of T_a u, T_a tridiagonal and cyclic along axis a: rows lower, centre, upper.
+
+    `uniform`: the rows are the same for all cells but the first and the last of the last axis.
+    """
     n0, n1, n = u.shape
     rows, last = n0 * n1, n - 1
     cells, totals = u.reshape(rows, n), out.reshape(rows, n)
@@ -29,8 +32,9 @@ def kronecker_sum(u, out, far, middle, along, shift, start, stop):
         after1 = cells[row + (k + 1) % n1 - k if b != 0.0 else row]
         before0 = cells[(row - n1) % rows if c != 0.0 else row]
         after0 = cells[(row + n1) % rows if d != 0.0 else row]
-        for j in range(1, last):  # the compiler makes two loops of it: in 2-D there is nothing to read along axis 0
-            total = (weight + centre[j]) * here[j] + (lower[j] * here[j - 1] + upper[j] * here[j + 1])
+        for j in range(1, last):  # the compiler makes four loops of it: in 2-D there is nothing to read along axis 0
+            p = 1 if uniform else j  # three numbers in place of three rows that would fill the cache
+            total = (weight + centre[p]) * here[j] + (lower[p] * here[j - 1] + upper[p] * here[j + 1])
             if n0 > 1:
                 total += c * before0[j] + d * after0[j]
             result[j] = total + (a * before1[j] + b * after1[j])

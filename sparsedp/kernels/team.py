@@ -14,10 +14,7 @@ from types import FunctionType
 
 __all__ = ["SERIAL", "Kernel", "kernel", "loops"]
 
-SERIAL = 1 << 19  # numbers: below, a few tenths of a millisecond, a second thread costs more than it brings
-
-_pools: dict[tuple[int, int], ThreadPoolExecutor] = {}  # by process (a forked child has none of the threads) and size
-
+SERIAL = 524_288  # numbers: below, a few tenths of a millisecond, a second thread costs more than it brings
 
 loops: list["Kernel"] = []  # all that the imported modules define
 
@@ -43,12 +40,10 @@ def _announced():
         yield
 
 
-def _pool(size):
-    """The threads beside the one that asks; they wait between loops."""
-    key = os.getpid(), size
-    if key not in _pools:
-        _pools[key] = ThreadPoolExecutor(size, "sparsedp")
-    return _pools[key]
+@functools.cache
+def _pool(size, process):
+    """The threads beside the one that asks; they wait between loops. A forked process has none of its parent's."""
+    return ThreadPoolExecutor(size, "sparsedp")
 
 
 def _types(words):
@@ -147,7 +142,7 @@ class Kernel:
             self.compiled(*args, 0, rows)
             return
         cuts = [rows * part // parts for part in range(parts + 1)]
-        others = [_pool(parts - 1).submit(self.compiled, *args, *ends) for ends in zip(cuts[1:], cuts[2:])]
+        others = [_pool(parts - 1, os.getpid()).submit(self.compiled, *args, *ends) for ends in zip(cuts[1:], cuts[2:])]
         try:
             self.compiled(*args, *cuts[:2])
         finally:
