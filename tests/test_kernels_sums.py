@@ -34,25 +34,21 @@ def test_what_is_not_finite_stays_so():
     assert norm(np.full(9, 1e200)) == np.inf
 
 
-def bands(rng, n, periodic, uniform):
+def bands(rng, n, uniform):
     """Off-diagonal entries of one sign, rows that sum to 0: (Tridiagonal, dense matrix)."""
     lower, upper = (np.ones((2, n)) if uniform else rng.uniform(0.5, 2.0, (2, n))) * -1.0
-    if not periodic:
-        lower[0] = upper[-1] = 0.0
-    dense, i = np.diag(-lower - upper), np.arange(n)
-    np.add.at(dense, (i, i - 1), lower)
-    np.add.at(dense, (i, (i + 1) % n), upper)
+    lower[0] = upper[-1] = 0.0
+    dense = np.diag(-lower - upper) + np.diag(lower[1:], -1) + np.diag(upper[:-1], 1)
     return Tridiagonal(lower, -lower - upper, upper), dense
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=NUMBA)])
 @pytest.mark.parametrize("transposed", [False, True])
-@pytest.mark.parametrize("periodic", [False, True])
 @pytest.mark.parametrize("n", [3, 4, 50])
-def test_elimination_solves_every_mode(n, periodic, transposed, compiled, rng, monkeypatch):
+def test_elimination_solves_every_mode(n, transposed, compiled, rng, monkeypatch):
     monkeypatch.setattr(kernels, "compiled", lambda: compiled)
     for uniform in (True, False):
-        line, dense = bands(rng, n, periodic, uniform)
+        line, dense = bands(rng, n, uniform)
         modes = np.array([1e-9, 0.3, 7.0, 1e4] * 10)
         b = rng.standard_normal((n, modes.size))
         Sweep(line, np.zeros(n), modes, 1.0).solve(x := b.copy(), transposed)
@@ -63,9 +59,8 @@ def test_elimination_solves_every_mode(n, periodic, transposed, compiled, rng, m
 
 
 def test_a_singular_mode_is_solved_up_to_its_null_vector(rng):
-    for periodic in (False, True):
-        line, dense = bands(rng, 40, periodic, True)
-        b = rng.standard_normal((40, 16))
-        b = b - b.mean(axis=0)
-        Sweep(line, np.zeros(40), np.zeros(16), 1.0).solve(x := b.copy(), False)
-        assert np.max(np.abs(dense @ x - b)) <= 1e-12 * np.max(np.abs(x))
+    line, dense = bands(rng, 40, True)
+    b = rng.standard_normal((40, 16))
+    b = b - b.mean(axis=0)
+    Sweep(line, np.zeros(40), np.zeros(16), 1.0).solve(x := b.copy(), False)
+    assert np.max(np.abs(dense @ x - b)) <= 1e-12 * np.max(np.abs(x))

@@ -168,12 +168,10 @@ def along_axis(u, out, rows, scale, accumulate):
         reference.product_along(u, out, rows, scale, accumulate)
 
 
-def sweep(x, lower, upper, inverses, column, row, ends):
+def sweep(x, lower, upper, inverses):
     """Right-hand sides -> solutions, in place: tridiagonal systems along the first axis, eliminated before.
 
-    Down the rows x_i = (x_i - lower_i x_(i-1)) inverses_i, up x_i -= (upper_i x_(i+1) + column_i x_last)
-    inverses_i; the last row first loses the sum of row_i x_i. `column` and `row` are what elimination
-    makes of the links between the ends of a periodic axis; without rows, the axis is bounded.
+    Down the rows x_i = (x_i - lower_i x_(i-1)) inverses_i, up x_i -= upper_i x_(i+1) inverses_i.
 
     Parameters
     ----------
@@ -182,20 +180,16 @@ def sweep(x, lower, upper, inverses, column, row, ends):
     lower, upper : float64 arrays, shape (n,)
     inverses : float64 array, shape (n, m)
         1 / pivots.
-    column, row : float64 arrays, shape (n, m) or (0, m)
-        Row n - 2 holds the link to the last unknown too; row n - 1 is not read.
-    ends : int64 array, shape (m,)
-        Rows from here to n - 3 of `column` and `row` hold 0 only.
 
     Examples
     --------
     >>> import numpy as np
-    >>> x, none, ends = np.array([[1.0], [3.0]]), np.zeros((0, 1)), np.zeros(1, int)
-    >>> sweep(x, np.array([0.0, 1.0]), np.array([1.0, 0.0]), np.array([[0.5], [2 / 3]]), none, none, ends)
+    >>> x = np.array([[1.0], [3.0]])
+    >>> sweep(x, np.array([0.0, 1.0]), np.array([1.0, 0.0]), np.array([[0.5], [2 / 3]]))
     >>> x  # 2 a + b = 1, a + 2 b = 3
     array([[-0.33333333],
            [ 1.66666667]])
     """
-    given = x, lower, upper, inverses, column, row, ends
+    given = x, lower, upper, inverses
     if not x.size or not run("elimination", "eliminate", x.shape[1], x.size, threads(), *given):
         reference.eliminate(*given)

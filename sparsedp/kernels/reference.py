@@ -70,15 +70,9 @@ def product_along(u, out, rows, scale, add):
     np.copyto(out, out + product if add else product)
 
 
-def eliminate(x, lower, upper, inverses, column, row, ends):
+def eliminate(x, lower, upper, inverses):
     """See `sparsedp.kernels.sweep`."""
-    n, cyclic = len(x), int(row.size > 0)
-    for i in range(n - cyclic):
-        x[i] = (x[i] - lower[i] * x[i - 1] if i else x[i]) * inverses[i]
-        if cyclic:
-            x[-1] -= row[i] * x[i]
-    if cyclic:
-        x[-1] *= inverses[-1]
-    for i in range(n - 2, -1, -1):
-        others = upper[i] * x[i + 1] if i < n - 1 - cyclic else 0.0
-        x[i] -= (others + column[i] * x[-1] if cyclic else others) * inverses[i]
+    for i, pivots in enumerate(inverses):
+        x[i] = (x[i] - lower[i] * x[i - 1] if i else x[i]) * pivots
+    for i in range(len(x) - 2, -1, -1):
+        x[i] -= upper[i] * x[i + 1] * inverses[i]
