@@ -10,6 +10,7 @@ import numpy as np
 from sparsedp.errors import NonFiniteError, ShapeError
 
 __all__ = [
+    "BLOCK",
     "check_finite",
     "check_function",
     "check_out",
@@ -25,7 +26,7 @@ __all__ = [
 ]
 
 FLOAT = np.dtype(float)
-SHORT = 8192  # numbers of which one product of BLAS is taken: it uses one thread up to 10000
+BLOCK = 8192  # numbers of which one product of BLAS is taken: it uses one thread up to 10000, and wakes no others
 
 
 def field_array(op, u, batch=False):
@@ -94,7 +95,7 @@ def surely_finite(value):
     """One pass without a temporary array; False also when a finite sum is too large."""
     if type(value) is np.float64:
         return isfinite(value)
-    if type(value) is np.ndarray and value.size <= SHORT and value.dtype == FLOAT and value.flags.c_contiguous:
+    if type(value) is np.ndarray and value.size <= BLOCK and value.dtype == FLOAT and value.flags.c_contiguous:
         flat = value.reshape(-1)
         if isfinite(np.vdot(flat, flat)):  # one cheap call; a square may overflow where the value does not
             return True

@@ -51,7 +51,7 @@ class Component(NamedTuple):
 
 def components(setting, limited):
     """All components of the moved field. limited: the scheme has slopes."""
-    found, starts, at_points = [], [0, 0, 0], setting.at_points
+    found, starts, at_points, in_solid = [], [0, 0, 0], setting.at_points, setting.solid_points
     for own, shape in enumerate(setting.space.parts):
         rows, cells, speed, wall = [], prod(shape), 0, 0
         tables: list = []
@@ -66,8 +66,8 @@ def components(setting, limited):
             tables.append(lines)
             speed += cells + extra * (many // stride)
         axes, free = np.array(rows, np.int64), np.zeros((2 * len(shape), 0), bool)
-        if setting.solid is not None:
-            solid, cell = setting.solid_points[starts[0] :][:cells], np.arange(cells)
+        if in_solid is not None:
+            solid, cell = in_solid[starts[0] :][:cells], np.arange(cells)
             free = np.concatenate([~(solid | solid[_sides(row, cell).beyond]) for row in axes])
         axes[:, UNEVEN] = free.size or any(np.any(x[:, :4] != x[0, 0]) for x in tables)
         stops = [starts[0] + cells, starts[1] + wall, starts[2] + speed]
@@ -97,8 +97,8 @@ def _sides(row, cell):
 def _lines(grid, axis, staggered, at_points, limited):
     """The columns of an axis in the table: one for each place along it, or one for all.
 
-    Lengths are those between points, at a wall the width of the control volume, or (at_points and not limited) the
-    widths of control volumes, infinite where there is none.
+    Lengths are the widths of control volumes, infinite where there is none; or (at_points and not limited) those
+    between points, at a wall the width of the control volume.
     """
     cells, between, periodic = grid.widths[axis], grid.spacings(axis), grid.periodic[axis]
     widths, inner = (between, cells) if staggered else (cells, between[1:-1])

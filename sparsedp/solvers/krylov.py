@@ -16,7 +16,7 @@ import numpy as np
 from sparsedp.fields import is_whole
 from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.scaling import BLOCK, inverted, norm
+from sparsedp.solvers.scaling import dot, inverted, norm
 from sparsedp.solvers.solve import Engine
 from sparsedp.structure.base import probes
 from sparsedp.tape import plain
@@ -244,11 +244,6 @@ def _preconditioner(system, given):
 
 
 # ---------------------------------------------------------------- the iterations
-
-
-def dot(x, y):
-    """Inner product; without BLAS where that would start threads, which stall compiled kernels."""
-    return float(x.dot(y) if x.size <= BLOCK else np.einsum("i,i->", x, y))
 
 
 def _without_descent(pq, rz, p, q, r, z):

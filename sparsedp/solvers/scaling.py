@@ -6,8 +6,10 @@ does not wake its threads for so few numbers: they would stall those of compiled
 
 import numpy as np
 
+from sparsedp.fields import BLOCK
+
 __all__ = [
-    "BLOCK",
+    "dot",
     "far_exponent",
     "in_range",
     "inverted",
@@ -19,7 +21,6 @@ __all__ = [
     "subtracted",
 ]
 
-BLOCK = 8192  # numbers that BLAS sums up on one thread
 SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve computes leaves the range of floats
 
 
@@ -27,6 +28,11 @@ def _blocks(*arrays):
     """The parts of flat arrays of the same size that belong together."""
     for start in range(0, arrays[0].size, BLOCK):
         yield [x[start : start + BLOCK] for x in arrays]
+
+
+def dot(x, y):
+    """Inner product of flat real arrays."""
+    return float(sum(one @ other for one, other in _blocks(x, y)))
 
 
 def _square(x):
