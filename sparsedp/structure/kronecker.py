@@ -78,7 +78,7 @@ class Kronecker(Structure):
     @cached_property
     def separable(self):  # type: ignore[override]
         """Whether it is a Kronecker sum on one component: one factor along one axis in each term."""
-        one = len(self.out_parts) == len(self.in_parts) == 1 and self.out_parts == self.in_parts
+        one = len(self.out_parts) == 1 and self.out_parts == self.in_parts
         return one and all(len(term.axes) <= 1 for term in self.terms)
 
     @property
@@ -258,4 +258,4 @@ def _sum_on_axis(one, other):
 
 
 def _is_zero(term):
-    return term.scale == 0 or any(f is not None and f.matrix.nnz == 0 for f in term.factors)
+    return term.scale == 0 or any(factor and factor.matrix.nnz == 0 for factor in term.factors)

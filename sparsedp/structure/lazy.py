@@ -66,10 +66,6 @@ class Mask(Diagonal):
         out.fill(0)
         np.multiply(x, self.values, out=out, where=self.keep)
 
-    def explicit(self):
-        kept = np.flatnonzero(self.keep)
-        return compact(sp.coo_array((self.values[kept], (kept, kept)), shape=self.shape))
-
     def scaled(self, factor):
         return Mask(self.keep, self.values * factor)
 
@@ -180,14 +176,13 @@ def compose(a, b):
     """Structure of a @ b.
 
     Identities vanish, factor-defined maps stay factor-defined, diagonals meet in one diagonal;
-    the rest becomes a chain, whose ends are tried first.
+    the rest becomes a chain.
     """
-    left, right = _members(a, Chain), _members(b, Chain)
-    while left and right and (joined := _joined(left[-1], right[0])) is not None:
-        left, right[0] = left[:-1], joined
-        if len(right) > 1 and (closer := _joined(*right[:2])) is not None:
-            right[:2] = [closer]
-    members = left + right
+    members = _members(a, Chain)
+    for member in _members(b, Chain):
+        while members and (joined := _joined(members[-1], member)) is not None:
+            members, member = members[:-1], joined
+        members.append(member)
     return members[0] if len(members) == 1 else Chain(members)
 
 
@@ -222,12 +217,12 @@ def total(a, b):
     """Structure of a + b."""
     members = _members(a, Sum)
     for member in _members(b, Sum):
-        joined = [_added(other, member) for other in members]
-        place = next((place for place, found in enumerate(joined) if found is not None), None)
-        if place is None:
-            members.append(member)
+        for place, other in enumerate(members):
+            if (joined := _added(other, member)) is not None:
+                members[place] = joined
+                break
         else:
-            members[place] = joined[place]
+            members.append(member)
     return members[0] if len(members) == 1 else Sum(members)
 
 
