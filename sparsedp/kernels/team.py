@@ -114,7 +114,7 @@ class Kernel:
         try:
             from numba import njit
 
-            options = {"nogil": True, "error_model": "numpy", **self.options}
+            options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **self.options}
             keep = options.pop("cache", True)
             signature = tuple(_types(self.words + " int int"))
             names = dict(_with_compiled(self.uses) if self.uses else self.loop.__globals__)

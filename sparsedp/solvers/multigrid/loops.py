@@ -189,10 +189,15 @@ def add_up(sums, a, b, start, stop, sizes):
             sums[g] += product(a[at : at + n], b[at : at + n])
 
 
+# ---- the loops -----------------------------------------------------------------------------------------------------
+#
+# Their arrays are the package's own. Those that are only read are declared as written too: the functions above are
+# compiled once for each kind of arguments, and an array that may not be written is another kind.
+
 # ---- conjugate gradients -------------------------------------------------------------------------------------------
 
 
-@kernel("read2 ~read1 write1 index1 index1 write1")
+@kernel("write2 ~write1 write1 index1 index1 write1")
 def image(c, x, out, steps, sizes, sums, start, stop):
     """out = A x; x . out to sums."""
     end = (GHOST + stop) * sizes[0]
@@ -205,7 +210,7 @@ def image(c, x, out, steps, sizes, sums, start, stop):
     add_up(sums, x, out, start, stop, sizes)
 
 
-@kernel("~write1 ~read1 index1 real")
+@kernel("~write1 ~write1 index1 real")
 def direct(p, z, sizes, beta, start, stop):
     """p = z + beta p."""
     at, end = (GHOST + start) * sizes[0], (GHOST + stop) * sizes[0]
@@ -215,7 +220,7 @@ def direct(p, z, sizes, beta, start, stop):
     fill(p, start, stop, sizes)
 
 
-@kernel("write1 ~read1 write1 read1 ~write1 ~read1 index1 write1 real", fastmath=FAST)
+@kernel("write1 ~write1 write1 write1 ~write1 ~write1 index1 write1 real", fastmath=FAST)
 def update(x, p, r, q, light, gauge, sizes, sums, alpha, start, stop):
     """x += alpha p; r -= alpha q, and the same in the precision of the cycle; the sum of (gauge r)^2 to sums."""
     plane = sizes[0]
@@ -248,7 +253,7 @@ def combined(out, there, n, c, at, x, place, b, steps, own, rest, share):
             row[i] = own * given[i] + rest * right[i] + share * row[i]
 
 
-@kernel("~read2 ~read1 ~read1 ~write1 ~write1 ~read1 index1 index1 write1")
+@kernel("~write2 ~write1 ~write1 ~write1 ~write1 ~write1 index1 index1 write1")
 def smooth(c, x, b, between, out, factors, steps, sizes, sums, start, stop):
     """y = f x + g b + h c x, out = f y + g b + h c y with f, g, h twice in factors; b . out to sums if there are any.
 
@@ -283,7 +288,7 @@ def collect(out, a, b, c, x):
         out[k] += a[k] * x[2 * k] + b[k] * x[2 * k + 1] + c[k] * x[2 * k + 2]
 
 
-@kernel("~read2 ~read1 ~write1 index1 index1 index1")
+@kernel("~write2 ~write1 ~write1 index1 index1 index1")
 def restrict(weights, r, out, steps, fine, coarse, start, stop):
     """out = the weighted sum of the fine cells around each coarse one, which are that many steps away."""
     n = coarse[5]
@@ -306,7 +311,7 @@ def spread(out, a, b, c, here, there):
         out[2 * k + 1] += c[k] * here[k] + a[k] * there[k]
 
 
-@kernel("~read2 ~read1 ~write1 index1 index1")
+@kernel("~write2 ~write1 ~write1 index1 index1")
 def prolong(weights, e, x, fine, coarse, start, stop):
     """x += the transpose of `restrict`. Between two coarse lines, or planes, a line takes from both."""
     half, rows = coarse[5], weights.shape[0] // 3
