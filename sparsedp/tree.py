@@ -9,7 +9,7 @@ from math import hypot, isfinite
 import numpy as np
 import scipy.sparse as sp
 
-__all__ = ["copied", "flatten", "keys", "leaves", "mapped", "norm"]
+__all__ = ["copied", "flatten", "keys", "labels", "leaves", "mapped", "norm"]
 
 
 def flatten(tree):
@@ -81,6 +81,21 @@ def leaves(tree):
     found: list = []
     _collect(tree, found)
     return found
+
+
+def labels(tree, root):
+    """Tree and its name -> the names of its leaves, from left to right, as one would write them.
+
+    Examples
+    --------
+    >>> labels({"u": (1.0, 2.0), "n": 3}, "x")
+    ["x['u'][0]", "x['u'][1]", "x['n']"]
+    """
+    names, fields = keys(tree), getattr(tree, "_fields", None)
+    if names is None:
+        return [root]
+    steps = [f".{fields[name]}" if fields else f"[{name!r}]" for name in names]
+    return [label for name, step in zip(names, steps) for label in labels(tree[name], root + step)]
 
 
 def norm(tree):

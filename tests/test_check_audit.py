@@ -122,14 +122,14 @@ def test_own_steps_and_bad_arguments():
         AUDIT(smooth, X, steps=[0.1])
     with pytest.raises(
         dp.errors.DerivativeError,
-        match=r"a gradient is checked at floating values, and x holds none; write x.astype\(float\)",
+        match=r"floating values are needed, and x holds none; write x.astype\(float\)",
     ):
         AUDIT(smooth, np.arange(3))
     with pytest.raises(
         dp.errors.NonFiniteError, match="a gradient is checked at finite values, and x holds NaN or infinity"
     ):
         AUDIT(smooth, X * np.nan)
-    with pytest.raises(dp.errors.DerivativeError, match="the gradient has 2 leaves where x has 1"):
+    with pytest.raises(dp.errors.DerivativeError, match="the gradient has 2 leaves where x has 1; return"):
         AUDIT(smooth, X, gradient=lambda u: (u, u))
     with pytest.raises(dp.errors.DerivativeError, match=r"the gradient of x has shape \(1,\) where \(20,\) is needed"):
         AUDIT(smooth, X, gradient=lambda u: u[:1])

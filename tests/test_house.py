@@ -39,6 +39,7 @@ FLOORS = [
     ("kernels", 1),
     ("fields", 1),
     ("derivative", 2),
+    ("packing", 2),
     ("space", 2),
     ("conditions", 4),
     ("grid", 3),

@@ -31,10 +31,12 @@ def test_errors_at_the_start_are_not_hidden():
         foreign(lambda x: np.nan, lambda x: x)
     hint = r"\(dp.check.gradient\(loss, x\) shows where it comes from\)"
     with pytest.raises(
-        NonFiniteError, match=rf"^the gradient must be finite {hint}, got 2 that are NaN or infinite, the first at 0$"
+        NonFiniteError,
+        match=rf"^the gradient of start must be finite {hint}, got 2 that are NaN or infinite, the first at 0$",
     ):
         foreign(lambda x: 1.0, lambda x: x * np.nan)
-    with pytest.raises(NonFiniteError, match=r"^leaf 1 of the gradient must be finite .*, the first at \(0, 1\)$"):
+    where = r"^the gradient of start\['b'\] must be finite .*, the first at \(0, 1\)$"
+    with pytest.raises(NonFiniteError, match=where):
         start = {"a": 1.0, "b": np.ones((2, 2))}
         dp.minimize(lambda x: 1.0, start, gradient=lambda x: {"a": 1.0, "b": np.array([[1, np.nan], [1, 1]])})
 
@@ -85,7 +87,7 @@ def test_ranges_of_options():
 
 def test_losses_and_gradients():
     with pytest.raises(
-        DerivativeError, match=r"minimize needs floating values in start, and found none; write start.astype\(float\)"
+        DerivativeError, match=r"floating values are needed, and start holds none; write start.astype\(float\)"
     ):
         dp.minimize(bowl, np.arange(3))
     with pytest.raises(ShapeError, match=r"the loss must be a scalar, got an array of shape \(2,\); sum it"):
@@ -94,7 +96,7 @@ def test_losses_and_gradients():
         foreign(lambda x: 1.0, lambda x: (x, x))
     with pytest.raises(
         DerivativeError,
-        match=r"a leaf of the gradient has shape \(1,\) where \(2,\) is needed; return a tree like start",
+        match=r"the gradient of start has shape \(1,\) where \(2,\) is needed; return a tree like start",
     ):
         foreign(lambda x: 1.0, lambda x: x[:1])
 

@@ -140,7 +140,7 @@ def _audit(trials, gradient, steps, extend, count, rng, quick):
     if taped and random and not quick and judged[0].word in PROVED:
         hessian, note = _hessian(loss, point, judged[0], extend)
         doubts.append(("note", note))
-    if judged and trials.value(point.tree()) != trials.base:
+    if judged and trials.value(point.fresh()) != trials.base:
         doubts.append(("unsound", "the loss gives another value after the audit: it keeps a state"))
     outcome, reason = verdict(judged, doubts)
     notes = [note for word, note in doubts if word == "note"]
@@ -157,7 +157,7 @@ def _audit(trials, gradient, steps, extend, count, rng, quick):
     digits = [int(one.digits) for one in judged if outcome == "agrees" and one.word in PROVED]
     return Audit(
         verdict=outcome, reason=reason, digits=min(digits, default=None), culprit=culprit, hessian=hessian,
-        value=trials.base, evaluations=trials.count, size=point.size, notes=tuple(notes), lines=tuple(judged),
+        value=trials.base, evaluations=trials.count, size=point.entries, notes=tuple(notes), lines=tuple(judged),
     )  # fmt: skip
 
 
@@ -169,7 +169,7 @@ def _look_beside(trials, slope, judged):
     point = trials.point
     away = point.directions(point.vector, 1, generator(SHIFT[0]))[0][1]
     with suppress(*REFUSALS):
-        other = Trials(trials.loss, Point(point.tree(point.vector + SHIFT[1] * away)), trials.tick)
+        other = Trials(trials.loss, Point(point.unpack(point.vector + SHIFT[1] * away)), trials.tick)
         found = looked_at(other, slope, default_steps(point.eps), True, RANDOM, generator(None))
         if verdict(*found)[0] != "disagrees":
             for one in judged:
@@ -222,7 +222,7 @@ def _hessian(loss, point, one, extend):
     along = one.line.direction
     try:
         with np.errstate(all="ignore"):
-            product = point.gradient(hvp(loss, point.tree(), point.tree(along))) @ along
+            product = point.gradient(hvp(loss, point.fresh(), point.unpack(along))) @ along
     except Exception as error:  # a rule, ours or not, may lack a second derivative and say so in any way
         return None, f"Hessian product: not available ({type(error).__name__})"
     word, reason = curvature(one, float(product), extend)

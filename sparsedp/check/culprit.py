@@ -42,7 +42,7 @@ def culprit_of(loss, point):
     cleared: set[int] = set()  # Operators that were found right
     with np.errstate(all="ignore"):
         with witnessed() as nodes:
-            value_and_grad(loss)(point.tree())
+            value_and_grad(loss)(point.fresh())
         for node in _examined(nodes):
             fault = _fault(node, cleared, rng)
             if fault:

@@ -352,12 +352,12 @@ def looked_at(trials, slope, steps, extend, count, rng, wanted=None):
     trials.start()
     base = trials.base
     with np.errstate(all="ignore"):
-        vector, again = (point.gradient(slope(point.tree()) if callable(slope) else slope) for _ in range(2))
+        vector, again = (point.gradient(slope(point.fresh()) if callable(slope) else slope) for _ in range(2))
     trials.gradient = vector
     finite, change = isfinite(base), np.max(np.abs(vector * point.units), initial=0.0)
     evidence = [
         ("unsound", not finite, f"the loss is {base} at x"),
-        ("unsound", finite and trials.value(point.tree()) != base,
+        ("unsound", finite and trials.value(point.fresh()) != base,
          "two evaluations of the loss differ: it is not deterministic"),
         ("unsound", not np.array_equal(vector, again, equal_nan=True),
          "two evaluations of the gradient differ: it is not deterministic"),
@@ -393,7 +393,7 @@ def forward_mode(loss, judged):
         line, point = one.line, one.line.point
         try:
             with np.errstate(all="ignore"):
-                slope = float(pushforward(loss, point.tree(), point.tree(line.direction))[1])
+                slope = float(pushforward(loss, point.fresh(), point.unpack(line.direction))[1])
         except NO_JVP:
             return None
         gaps.append(abs(slope - one.slope) / one.scale if slope != one.slope else 0.0)
@@ -457,7 +457,7 @@ def explained(found, gradient):
     reach = max(2.0, found.jitter) * line.trials.eps * abs(line.base) / found.size
 
     def bend(step):
-        ends = [point.tree(point.vector + side * line.direction) for side in (step, -step)]
+        ends = [point.unpack(point.vector + side * line.direction) for side in (step, -step)]
         return abs(sum(point.gradient(gradient(end)) @ line.direction for end in ends) - 2 * line.slope)
 
     for step in [times * reach for times in WITHIN] if found.word == "disagrees" else ():

@@ -12,8 +12,8 @@ import numpy as np
 
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
 from sparsedp.ledger import recording, thread
-from sparsedp.tape import is_variable
-from sparsedp.tree import copied, flatten, keys, norm
+from sparsedp.packing import Packing, joined
+from sparsedp.tree import copied, mapped, norm
 
 __all__ = [
     "POINTS",
@@ -23,7 +23,6 @@ __all__ = [
     "Trials",
     "default_steps",
     "generator",
-    "joined",
     "noise_of",
     "rms",
     "solvers_of",
@@ -51,7 +50,7 @@ def default_steps(eps):
 # ------------------------------------------------------------ points and directions
 
 
-class Point:
+class Point(Packing):
     """Where a loss is examined, as a vector.
 
     Each leaf has a unit: the root mean square of its values (1 if they are all 0). A step of size t
@@ -63,48 +62,27 @@ class Point:
     """
 
     def __init__(self, x):
-        self._leaves, self._rebuild = flatten(x)
-        found = {name: place for place, name in enumerate(_paths(x)) if is_variable(self._leaves[place])}
-        if not found:
-            raise DerivativeError("a gradient is checked at floating values, and x holds none; write x.astype(float)")
-        self.names, self._places = list(found), list(found.values())
-        self.values = [np.array(self._leaves[place]) for place in self._places]
+        # Numbers of NumPy in place of Python's: those divide by 0, and take complex steps.
+        super().__init__(mapped(lambda leaf: np.asarray(leaf)[()] if isinstance(leaf, (float, complex)) else leaf, x))
         for name, values in zip(self.names, self.values):
             if not np.all(np.isfinite(values)):
                 raise NonFiniteError(f"a gradient is checked at finite values, and {name} holds NaN or infinity")
         self.vector = joined(self.values)
-        self.complex = any(map(np.iscomplexobj, self.values))
-        self._ends = np.cumsum([joined([values]).size for values in self.values])[:-1]
-        self.units = np.concatenate([np.full(part.size, rms(part) or 1.0) for part in self._parts(self.vector)])
-        self.size = sum(map(np.size, self.values))
-        self.eps = max(eps_of(values.dtype) for values in self.values)
+        self.values = self.arrays(self.vector)  # the caller may write into those of x
+        self.units = np.concatenate([np.full(part.size, rms(part) or 1.0) for part in self.split(self.vector)])
+        self.entries = sum(map(np.size, self.values))
 
-    def _parts(self, vector):
-        """Views of what belongs to each leaf."""
-        return np.split(vector, self._ends)
+    def tree(self, arrays):
+        """As of any packing, with copies of the other leaves."""
+        return copied(super().tree(arrays))
 
-    def arrays(self, vector):
-        """Arrays of the shapes and dtypes of the floating leaves; this rounds."""
-        parts = zip(self._parts(vector), self.values)
-        return [part.view(np.result_type(x, float)).astype(x.dtype).reshape(x.shape) for part, x in parts]
-
-    def tree(self, other=()):
-        """The tree with other floating leaves, a vector or a list of arrays; all but those arrays are fresh."""
-        leaves = copied(self._leaves)
-        for place, value in zip(self._places, other if isinstance(other, (list, tuple)) else self.arrays(other)):
-            leaves[place] = value if isinstance(leaves[place], np.ndarray) else np.asarray(value)[()]  # still a number
-        return self._rebuild(leaves)
+    def fresh(self):
+        """The tree."""
+        return self.unpack(self.vector)
 
     def gradient(self, tree):
-        """Vector of a gradient, a tree like x: dL/dRe - i dL/dIm of complex leaves becomes (dL/dRe, dL/dIm)."""
-        leaves = flatten(tree)[0]
-        if len(leaves) != len(self._leaves):
-            raise DerivativeError(f"the gradient has {len(leaves)} leaves where x has {len(self._leaves)}")
-        arrays = [np.conj(leaves[place]) for place in self._places]
-        for name, x, g in zip(self.names, self.values, arrays):
-            if g.shape != x.shape:
-                raise DerivativeError(f"the gradient of {name} has shape {g.shape} where {x.shape} is needed")
-        return joined([g.astype(np.result_type(x, float)) for g, x in zip(arrays, self.values)])
+        """Vector of a gradient, a tree like x."""
+        return joined(self.slopes(tree))
 
     def directions(self, gradient, count, rng, wanted=None):
         """Names and displacements: random ones, and structured ones that see what random ones average away.
@@ -114,14 +92,14 @@ class Point:
         found = {f"random {number + 1}": self._random(rng) for number in range(count)}
         for chosen, name in enumerate(self.names if 1 < len(self.names) <= MOST_LEAVES else ()):
             alone = self._random(rng)
-            for other, part in enumerate(self._parts(alone)):
+            for other, part in enumerate(self.split(alone)):
                 part *= other == chosen
             found[f"random in {name}"] = alone
         slopes = self.units * np.where(np.isfinite(gradient), gradient, 0.0)
         largest = np.max(np.abs(slopes), initial=0.0)
-        if self.size > 1:
+        if self.entries > 1:
             found["constant"] = self.units
-        if self.size > 1 and largest:
+        if self.entries > 1 and largest:
             # Along the gradient, as the units measure it, no entry moves more than 4 units.
             shares = slopes / largest
             found["gradient"] = self.units * shares / max(rms(shares), 0.25)
@@ -131,7 +109,7 @@ class Point:
     def _random(self, rng):
         """Random displacement, of root mean square 1 in each leaf."""
         values = rng.standard_normal(self.vector.size)
-        for part in self._parts(values):
+        for part in self.split(values):
             part /= rms(part) or 1.0
         return self.units * values
 
@@ -141,23 +119,9 @@ def eps_of(dtype):
     return float(np.finfo(dtype).eps)
 
 
-def joined(arrays):
-    """Arrays -> one vector of doubles, complex numbers as pairs."""
-    return np.concatenate([np.ravel(x).astype(np.result_type(x, float)).view(float) for x in arrays])
-
-
 def rms(vector):
     """Root mean square."""
     return norm(vector) / np.sqrt(max(vector.size, 1))
-
-
-def _paths(tree, path="x"):
-    """How each leaf is reached, in the order of flatten."""
-    names, fields = keys(tree), getattr(tree, "_fields", None)
-    if names is None:
-        return [path]
-    steps = {name: f".{fields[name]}" if fields else f"[{name!r}]" for name in names}
-    return [end for name, step in steps.items() for end in _paths(tree[name], path + step)]
 
 
 # ------------------------------------------------------------ losses
@@ -208,11 +172,11 @@ class Trials:
     def start(self):
         """Find the loss at the point. Solves are seen in one more run: recording is no part of what is judged."""
         before = thread.solves
-        self.base = self.value(self.point.tree())
+        self.base = self.value(self.point.fresh())
         self.solved = thread.solves > before
         if self.solved:
             with recording() as calls, np.errstate(all="ignore"):
-                self.loss(self.point.tree())
+                self.loss(self.point.fresh())
             loose = [solver.system.rtol for _, solver in solvers_of(calls) if solver.engine.iterative]
             self.tolerance = max(loose, default=0.0)
 

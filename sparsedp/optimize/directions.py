@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import check_function, is_number
-from sparsedp.optimize.flat import Packing
+from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.linearised import Linearised, singular
 
 __all__ = ["Direction", "Family", "update_direction"]
@@ -215,7 +215,7 @@ def update_direction(outputs, x, g=None, **options):
     """
     check_function("update_direction", outputs, "lambda x: A @ x - b")
     apart = bool(options.pop("apart", False))
-    family, packing = Family(**options), Packing(x)
+    family, packing = Family(**options), Unknowns(x)
     linearised = Linearised(outputs, packing, packing.pack(x), apart=apart)
     cotangent = linearised.flat if g is None else linearised.like(g)
     found = family(linearised, cotangent)

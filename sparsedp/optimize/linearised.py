@@ -30,7 +30,7 @@ class Linearised:
     ----------
     outputs : callable
         ``outputs(x, *rest) -> array``, of any shape.
-    packing : Packing
+    packing : Unknowns
     vector : (n,) array
     rest : tuple
         What `outputs` is given after x.

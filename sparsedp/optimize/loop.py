@@ -8,7 +8,7 @@ from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.checkpoint import Checkpoint
 from sparsedp.optimize.first_order import Adam, Descent
-from sparsedp.optimize.flat import Packing
+from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
 from sparsedp.optimize.newton import NewtonCG
 from sparsedp.optimize.physical import PhysicalGradient
@@ -141,7 +141,7 @@ def minimize(
                 "number"
             )
         loss, gradient = tolerance.inside(loss, gradient)
-    packing, batches = Packing(start), Batches(batches)
+    packing, batches = Unknowns(start, "start"), Batches(batches)
     if batches.varied and stepper.searches:
         raise ValueError(f"{method} compares losses and cannot use batches; write method='adam', or give gd a rate")
     for inner in (getattr(stepper, "rule", None), project):

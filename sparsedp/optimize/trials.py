@@ -25,7 +25,7 @@ class Trials:
     loss : callable
     gradient : callable or None
         None: reverse mode.
-    packing : Packing
+    packing : Unknowns
     box : Box
         The points that are allowed.
     batches : Batches

@@ -11,10 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.check.summary import Result, table
-from sparsedp.check.sweep import Point, joined
+from sparsedp.check.sweep import Point
 from sparsedp.derivative import jvp
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
+from sparsedp.packing import joined
 from sparsedp.tree import flatten, leaves, norm
 
 __all__ = ["SEED", "STEADY", "Growth", "StabilityMap", "growth_of", "stability_map"]
@@ -74,7 +75,7 @@ def _measured(advance, state):
     for _ in range(STEPS):
         before = change / (norm(change) or 1.0)
         point = Point(state)
-        state, moved = jvp(advance, state, point.tree(before))
+        state, moved = jvp(advance, state, point.unpack(before))
         change = joined([np.asarray(leaf) for leaf in leaves(moved) if leaf is not None])
         size = norm(change)
         if size == 0 or not np.isfinite(size):

@@ -13,10 +13,11 @@ import numpy as np
 
 from sparsedp.check.judge import judgement
 from sparsedp.check.operators import layouts
-from sparsedp.check.sweep import Line, Point, Trials, generator, joined, rms
+from sparsedp.check.sweep import Line, Point, Trials, generator, rms
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
+from sparsedp.packing import joined
 from sparsedp.report.certificate import distance
 from sparsedp.report.stability import SEED, STEADY, growth_of
 from sparsedp.tree import copied, flatten

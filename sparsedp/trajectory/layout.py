@@ -11,7 +11,7 @@ from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.traces import traces_of
-from sparsedp.tree import flatten, keys
+from sparsedp.tree import flatten, keys, labels
 
 __all__ = ["Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask", "stacked"]
 
@@ -73,7 +73,7 @@ class Layout:
     @cached_property
     def labels(self):
         """Names of all leaves."""
-        return _labels(self._template, self.root)
+        return labels(self._template, self.root)
 
     @property
     def names(self):
@@ -241,14 +241,6 @@ def _bits(value):
     flat = value.reshape(-1).view(np.uint8)
     end = flat.size - flat.size % (8 * fold)
     return hash((flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes(), flat[end:].tobytes()))
-
-
-def _labels(tree, root, path=()):
-    """Names of all leaves, from left to right."""
-    names = keys(tree)
-    if names is None:
-        return [_at(root, path)]
-    return [label for name in names for label in _labels(tree[name], root, (*path, name))]
 
 
 def _at(root, path):

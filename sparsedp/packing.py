@@ -1,0 +1,122 @@
+"""The floating leaves of a tree as one vector of doubles, and back: what a search moves and a check examines."""
+
+from functools import cached_property
+from itertools import compress
+
+import numpy as np
+
+from sparsedp.errors import DerivativeError
+from sparsedp.tape import is_variable
+from sparsedp.tree import flatten, labels, leaves
+
+__all__ = ["Packing", "joined"]
+
+
+class Packing:
+    """How the floating leaves of a tree lie in one vector.
+
+    Leaves that are not floating (int, bool, None, str) are kept as they are. A complex leaf takes two
+    numbers for each entry, the real and the imaginary part.
+
+    Parameters
+    ----------
+    tree : tree of arrays
+    root : str
+        What messages call it.
+
+    Attributes
+    ----------
+    values : list of arrays
+        The floating leaves.
+    complex : bool
+        Whether one of them is.
+    eps : float
+        Rounding of the coarsest dtype.
+    size : int
+        Length of the vector.
+
+    Raises
+    ------
+    DerivativeError
+        If the tree holds no floating leaf.
+
+    Examples
+    --------
+    >>> packing = Packing({"a": 2.0, "n": 3, "z": 1.0 + 4.0j})
+    >>> packing.pack({"a": 2.0, "n": 3, "z": 1.0 + 4.0j})
+    array([2., 1., 4.])
+    >>> packing.unpack(np.array([5.0, 6.0, 7.0]))
+    {'a': 5.0, 'n': 3, 'z': (6+7j)}
+    """
+
+    def __init__(self, tree, root="x"):
+        self.root = root
+        self._leaves, self._rebuild = flatten(tree)
+        self._floating = list(map(is_variable, self._leaves))
+        self.values = [np.asarray(leaf) for leaf in compress(self._leaves, self._floating)]
+        if not self.values:
+            raise DerivativeError(f"floating values are needed, and {root} holds none; write {root}.astype(float)")
+        self.complex = any(map(np.iscomplexobj, self.values))
+        self.eps = max(float(np.finfo(x.dtype).eps) for x in self.values)
+        *self._ends, self.size = map(int, np.cumsum([joined([x]).size for x in self.values]))
+
+    @cached_property
+    def names(self):
+        """Of the floating leaves, as one would write them: ``x['u'][0]``."""
+        return list(compress(labels(self._rebuild(self._leaves), self.root), self._floating))
+
+    def pack(self, tree):
+        """Tree of the same structure -> flat vector of doubles."""
+        return self.pack_leaves(leaves(tree))
+
+    def pack_leaves(self, found):
+        """Leaves of a tree of the same structure -> flat vector of doubles."""
+        return joined(compress(found, self._floating))
+
+    def slopes(self, gradient):
+        """Gradient of the same structure -> its floating leaves, dL/dRe + i dL/dIm of complex ones.
+
+        The tape gives dL/dRe - i dL/dIm there. Joined, they are the gradient with respect to the packed vector.
+        """
+        found = leaves(gradient)
+        if len(found) != len(self._leaves):
+            numbers = f"{len(found)} leaves where {self.root} has {len(self._leaves)}"
+            raise DerivativeError(f"the gradient has {numbers}; return a tree like {self.root}")
+        given = [np.asarray(leaf) for leaf in compress(found, self._floating)]
+        for place, (g, x) in enumerate(zip(given, self.values)):
+            if g.shape != x.shape:
+                shapes = f"shape {g.shape} where {x.shape} is needed"
+                raise DerivativeError(
+                    f"the gradient of {self.names[place]} has {shapes}; return a tree like {self.root}"
+                )
+        return [np.conj(g).astype(complex) if np.iscomplexobj(x) else g.real for g, x in zip(given, self.values)]
+
+    def split(self, vector):
+        """Flat vector -> views of what belongs to each floating leaf."""
+        return np.split(vector, self._ends)
+
+    def arrays(self, vector):
+        """Flat vector -> fresh arrays of the shapes and dtypes of the floating leaves; this rounds."""
+        pairs = zip(self.split(vector), self.values)
+        return [part.view(np.result_type(x.dtype, float)).astype(x.dtype).reshape(x.shape) for part, x in pairs]
+
+    def tree(self, arrays):
+        """Arrays -> the tree with these floating leaves, numbers where the original has numbers."""
+        values = iter(arrays)
+        pairs = zip(self._leaves, self._floating)
+        return self._rebuild(_like(leaf, next(values)) if floating else leaf for leaf, floating in pairs)
+
+    def unpack(self, vector):
+        """Flat vector -> fresh tree; every leaf has the type, shape and dtype of its original."""
+        return self.tree(self.arrays(vector))
+
+
+def joined(arrays):
+    """Arrays -> one vector of doubles, complex numbers as pairs."""
+    return np.concatenate([np.ravel(x).astype(np.result_type(x, float)).view(float) for x in arrays])
+
+
+def _like(leaf, value):
+    if isinstance(leaf, np.ndarray):
+        return value
+    return np.asarray(value)[()] if isinstance(leaf, np.generic) else type(leaf)(value)
