@@ -98,6 +98,7 @@ def run_compile(_):
     """The command `compile` -> exit code: 1 where a loop does not compile."""
     from sparsedp import kernels
     from sparsedp.kernels import team
+    from sparsedp.progress import bar
 
     if not kernels.compiled():
         return refuse("there is nothing to compile: numba is not installed or switched off; install sparsedp[fast]")
@@ -105,19 +106,10 @@ def run_compile(_):
         importlib.import_module(name)
     print(f"compiling {len(team.loops)} loops, those that are not on disk yet", flush=True)
     start, works = time.perf_counter(), True
-    for loop in _with_bar(team.loops):
+    for loop in bar(team.loops, needed=False, unit="loop", leave=False, disable=None):  # None: where someone watches
         works = works and loop.compiled is not None
     print(f"done in {time.perf_counter() - start:.1f} s" if works else "these loops do not work here; NumPy is used")
     return 0 if works else 1
-
-
-def _with_bar(loops):
-    """Loops -> the same, with a bar where tqdm is installed and someone is watching."""
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        return loops
-    return tqdm(loops, unit="loop", leave=False, disable=None)
 
 
 def run_demo(options):

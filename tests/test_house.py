@@ -34,6 +34,7 @@ FLOORS = [
     ("files", 0),
     ("recipe", 0),
     ("results", 0),
+    ("progress", 0),
     ("traces", 1),
     ("tape", 1),
     ("kernels", 1),
@@ -70,7 +71,7 @@ DOORS = [
     ("llvmlite", r"nowhere", ()),
     ("numba", r"kernels/.*|solvers/multigrid/loops\.py", ()),
     ("matplotlib", r"report/plots\.py", ()),
-    ("tqdm", r"report/.*|__main__\.py|(.*/)?progress\.py", ()),
+    ("tqdm", r"progress\.py", ()),
 ]
 TALKS = r"report/.*|__main__\.py"  # may print
 NOWHERE = {"utils.py", "util.py", "helpers.py", "helper.py", "misc.py", "common.py"}

@@ -1,5 +1,6 @@
 """The audit of a gradient: differences over many step sizes, Taylor rates, determinism, forward against reverse."""
 
+import sys
 import warnings
 from contextlib import suppress
 from math import inf, isinf, isnan
@@ -15,11 +16,11 @@ from sparsedp.check.judge import (
     looked_at,
     verdict,
 )
-from sparsedp.check.progress import shown
 from sparsedp.check.summary import Result, table
 from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, default_steps, generator
 from sparsedp.derivative import hvp, value_and_grad
 from sparsedp.fields import check_function, is_whole
+from sparsedp.progress import bar
 
 __all__ = ["Audit", "gradient"]
 
@@ -121,8 +122,17 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
     point, count = Point(x), min(directions, 1) if quick else directions
     chosen, names = chosen or default_steps(point.eps), QUICK.__contains__ if quick else None
     lines = len(point.directions(point.vector, count, generator(0), names))
-    with shown(3 + POINTS * min(lines, 2) + 2 * len(chosen) * lines) as tick:
-        return _audit(Trials(loss, point, tick), gradient, chosen, steps is None, count, generator(rng), names)
+    ticks = _announced(3 + POINTS * min(lines, 2) + 2 * len(chosen) * lines)
+    trials = Trials(loss, point, lambda: next(ticks, None))
+    return _audit(trials, gradient, chosen, steps is None, count, generator(rng), names)
+
+
+def _announced(total):
+    """How many evaluations are to come, about -> as many ticks; told to those who watch a terminal, with a bar."""
+    if not sys.stderr.isatty():
+        return iter(())
+    sys.stderr.write(f"check.gradient: about {total} evaluations of the loss to come\n")
+    return iter(bar(range(total), needed=False, desc="check.gradient", unit="evaluation", leave=False))
 
 
 def _audit(trials, gradient, steps, extend, count, rng, quick):

@@ -1,6 +1,8 @@
-"""The progress bar. The only file below the side rooms that asks for tqdm, and only when a bar is wanted."""
+"""The progress bar of a search."""
 
 from contextlib import contextmanager
+
+from sparsedp.progress import bar
 
 __all__ = ["progress_bar"]
 
@@ -17,15 +19,11 @@ def progress_bar(wanted, total):
     if not wanted:
         yield lambda record: None
         return
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise ImportError("a progress bar needs tqdm; install sparsedp[plot], or leave progress out") from error
-    with tqdm(total=total, desc=wanted if isinstance(wanted, str) else "minimize") as bar:
+    with bar(total=total, desc=wanted if isinstance(wanted, str) else "minimize") as shown:
 
         def show(record):
             refused = f", {len(record.failed)} refused" if record.failed else ""
-            bar.set_postfix_str(f"loss {record.value:.6g}, gradient {record.gradient_norm:.1e}{refused}")
-            bar.update(1 if record.iteration else 0)
+            shown.set_postfix_str(f"loss {record.value:.6g}, gradient {record.gradient_norm:.1e}{refused}")
+            shown.update(1 if record.iteration else 0)
 
         yield show

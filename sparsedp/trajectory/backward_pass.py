@@ -4,10 +4,10 @@ import numpy as np
 
 from sparsedp.derivative import zero_like
 from sparsedp.ledger import active, count
+from sparsedp.progress import shown_steps
 from sparsedp.tape import fit
 from sparsedp.traces import accumulate
 from sparsedp.trajectory.layout import refuse_lost, stacked
-from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import Growth
 from sparsedp.trajectory.schedule import stride
 

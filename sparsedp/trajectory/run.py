@@ -13,12 +13,12 @@ from sparsedp.derivative import zero_like
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.fields import place, surely_finite
 from sparsedp.ledger import active, count, thread
+from sparsedp.progress import shown_steps
 from sparsedp.tape import Rule, isbox, plain
 from sparsedp.trajectory.backward_pass import BackwardPass
 from sparsedp.trajectory.carried import carries, in_plain_forms
 from sparsedp.trajectory.keep import Each
 from sparsedp.trajectory.layout import dense
-from sparsedp.trajectory.progress import shown_steps
 from sparsedp.trajectory.record import Record
 from sparsedp.trajectory.schedule import checkpoints
 from sparsedp.trajectory.steps import Steps
