@@ -10,7 +10,7 @@ from sparsedp.ledger import thread
 from sparsedp.tape import called, isbox
 from sparsedp.traces import ReverseNode, untraced
 
-__all__ = ["Node", "bytes_held", "bytes_of", "witnessed"]
+__all__ = ["Node", "bytes_held", "witnessed"]
 
 EMPTY = CellType()
 DEEPEST = 12  # levels of containers inside each other; deeper ones are not the tape's
@@ -101,15 +101,13 @@ def witnessed(nodes=None):
 
 
 def bytes_held(nodes):
-    """Bytes of all arrays that nodes of a tape keep alive, each buffer once."""
-    return bytes_of([node.vjp for node in nodes])
+    """Bytes of all arrays that nodes of a tape keep alive, each buffer once.
 
-
-def bytes_of(thing, opened=()):
-    """Bytes of all arrays below functions (what they close over, their defaults), containers and `opened` types."""
+    They are below functions (what they close over, their defaults) and containers.
+    """
     buffers: dict[int, int] = {}
     seen: set[int] = set()
-    waiting = [(thing, 0)]
+    waiting: list = [(node.vjp, 0) for node in nodes]
     while waiting:
         thing, depth = waiting.pop()
         if isinstance(thing, np.ndarray):
@@ -118,19 +116,17 @@ def bytes_of(thing, opened=()):
             buffers[id(thing)] = thing.nbytes
         elif depth <= DEEPEST and id(thing) not in seen:
             seen.add(id(thing))
-            waiting += [(part, depth + 1) for part in _parts(thing, opened)]
+            waiting += [(part, depth + 1) for part in _parts(thing)]
     return sum(buffers.values())
 
 
-def _parts(thing, opened):
+def _parts(thing):
     if isinstance(thing, (tuple, list, set)):
         return thing
     if isinstance(thing, dict):
         return thing.values()
     if isbox(thing):
         return (thing._value,)
-    if isinstance(thing, opened):
-        return vars(thing).values()
     if hasattr(thing, "func") and hasattr(thing, "keywords"):  # functools.partial
         return (thing.func, thing.args, thing.keywords)
     held = [cell.cell_contents for cell in getattr(thing, "__closure__", None) or () if cell != EMPTY]

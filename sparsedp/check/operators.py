@@ -4,7 +4,7 @@ Figures are in units of rounding times the size of the operator; each check is a
 """
 
 from functools import cached_property
-from math import inf, isnan, prod, sqrt
+from math import inf, isnan, log10, prod, sqrt
 from typing import Any
 
 import autograd.numpy as anp
@@ -16,7 +16,7 @@ from sparsedp.check.sweep import generator
 from sparsedp.derivative import hvp, pullback, pushforward
 from sparsedp.errors import DerivativeError
 from sparsedp.operators.given import check_operator
-from sparsedp.structure.base import Matrix, result_dtype
+from sparsedp.structure.base import Matrix
 from sparsedp.tree import norm
 
 __all__ = ["OperatorSummary", "fault_of", "field", "layouts", "operator", "transpose", "twin"]
@@ -26,9 +26,10 @@ DTYPES = ("float64", "complex128", "float32", "complex64")
 LARGEST = 2**21  # unknowns above which no matrix is built for a check
 MOST_COLUMNS = 512  # columns that are found one application at a time
 POWERS = 8  # products of a power iteration
-LARGEST_SIZES = {"float32": 1e25, "float64": 1e290}  # of operators whose squares fit into a dtype, too
-SQUARED = ("second order",)  # identities that apply an operator and its transpose
-ORDINARY = 1e-30, 1e30  # sizes of operators that take fields near the ends of the range of floats
+DECADES = {"float32": 25, "float64": 290}  # sizes 10^+-d of operators fit into a dtype, with room for the fields
+# Which power of the size has to fit into that range.
+EXPONENTS = {"second order": 2, "scaling by 2^+-900": 10, "transposed scaling by 2^+-900": 10}
+EXACT = tuple(EXPONENTS)[1:]  # identities that no solve may blur
 
 
 def field(rng, shape, dtype):
@@ -117,10 +118,10 @@ class Probe:
 
     def gap(self, name, dtype):
         """Distance of the two sides of an identity in units of rounding, at worst over entries and seeds."""
-        largest, size = LARGEST_SIZES[np.finfo(dtype).dtype.name], self.size * (self.size if name in SQUARED else 1.0)
-        if 0 < size <= 1 / largest or size >= largest:
-            return f"entries of size {size:.1e} do not fit into {dtype}"
-        worst, rounding = 0.0, unit(self.op.structure, result_dtype(self.op.structure, dtype))
+        if self.size and abs(log10(self.size)) >= DECADES[np.finfo(dtype).dtype.name] / EXPONENTS.get(name, 1):
+            return f"entries of size {self.size:.1e} leave the range of {dtype}"
+        worst, tolerance = 0.0, 0.0 if name in EXACT else tolerance_of(self.op.structure)
+        rounding = max(tolerance, float(np.finfo(dtype).eps))
         for _ in range(self.seeds):
             left, right, bound = IDENTITIES[name](self, self.domain(dtype), self.domain(dtype), self.codomain(dtype))
             gaps = np.abs(left - right).reshape(-1, max(np.size(bound), 1))
@@ -161,6 +162,11 @@ class Probe:
         return size
 
 
+def _scaled(op, u):
+    """Results for a field times 2^900 and 2^-900, scaled back: the same digits."""
+    return np.stack([op.apply(u * 2.0**k) * 2.0**-k for k in (900, -900)])
+
+
 def _dot(a, b):
     """Summed in double precision: the sums are not what is tested."""
     return np.sum(a * b.astype(np.result_type(b, float)))
@@ -181,6 +187,8 @@ IDENTITIES = {
         p.transposed(p.op.apply(v), True),
         p.size * p.size * norm(v),
     ),
+    "scaling by 2^+-900": lambda p, u, v, g: (_scaled(p.op, u), p.op.apply(u), p.bound(u)),
+    "transposed scaling by 2^+-900": lambda p, u, v, g: (_scaled(p.op.T, g), p.op.T.apply(g), p.bound(g, True)),
     "forward": lambda p, u, v, g: (
         p.matrix @ u.reshape(-1),
         np.stack([form.apply(u).reshape(-1) for form in p.forms]),
@@ -194,14 +202,13 @@ IDENTITIES = {
 }
 
 
-def unit(structure, dtype):
-    """Size of one rounding: eps of the dtype, or the tolerance of a structure that solves, if it is larger.
+def tolerance_of(structure):
+    """Of a structure that solves, or has members that do, the largest; else 0.
 
     An inverse has it in `solver.system.rtol`: its residual is accepted there, whatever the method.
     """
-    inner = max((unit(member, dtype) for member in getattr(structure, "members", ())), default=0.0)
     system = getattr(getattr(structure, "solver", None), "system", structure)
-    return max(float(np.finfo(dtype).eps), float(getattr(system, "rtol", 0.0)), inner)
+    return max(float(getattr(system, "rtol", 0.0)), *map(tolerance_of, getattr(structure, "members", ())), 0.0)
 
 
 # ------------------------------------------------------------ transpose
@@ -306,29 +313,10 @@ def fault_of(op, rng):
     if not failed:
         return ""
     worst = max(failed, key=lambda one: one.figure)
-    how = worst.note or f"is off by about {worst.figure * unit(probe.op.structure, float):.0e}"
+    how = (
+        worst.note or f"is off by about {worst.figure * max(tolerance_of(probe.op.structure), np.finfo(float).eps):.0e}"
+    )
     return f"its {worst.name.split(',')[0]} {how}"
-
-
-# ------------------------------------------------------------ arguments: each test gives a list of mistakes
-#
-# What every Operator does with an argument before it is applied (shapes, memory layouts, integers, batches) is the
-# same code for all of them, and tested once; here stands what one operator can get wrong.
-
-
-def _dtypes(probe):
-    """The result has the dtype of the field."""
-    mistakes = []
-    for dtype in map(np.dtype, DTYPES):
-        try:
-            found = probe.op(probe.domain(dtype)).dtype
-        except (TypeError, DerivativeError):
-            if dtype.kind == "c" and probe.real:
-                continue  # a clean refusal of complex fields
-            raise
-        if found != result_dtype(probe.op.structure, dtype):
-            mistakes.append(f"{dtype} gives {found}")
-    return mistakes
 
 
 def layouts(u):
@@ -339,36 +327,6 @@ def layouts(u):
         "read-only": np.broadcast_to(u.copy(), u.shape),
         "reversed": np.flip(np.flip(u).copy()),
     }
-
-
-def _freshness(probe):
-    u = probe.domain()
-    before, first = u.copy(), probe.op(u)
-    kept, second = first.copy(), probe.op(-2.0 * u)
-    shared = np.may_share_memory(first, u) or np.may_share_memory(first, second)
-    mistakes = {
-        "the input is modified": not _equal(u, before),
-        "the result is not a fresh array": shared or not _equal(first, kept),
-    }
-    return [name for name, found in mistakes.items() if found]
-
-
-def _repeats(probe):
-    pairs = {"applications": (probe.op, probe.domain()), "transposed applications": (probe.op.T, probe.codomain())}
-    return [f"two {name} differ" for name, (op, u) in pairs.items() if not _equal(op(u), op(u))]
-
-
-def _equal(a, b):
-    return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=True)
-
-
-def _scaling(probe, op, u):
-    """A field times 2^900 or 2^-900 gives the same digits: largest difference, relative, in roundings."""
-    if not ORDINARY[0] < probe.size < ORDINARY[1]:
-        return f"entries of size {probe.size:.1e} leave the range of floats then"
-    wanted = op.apply(u)
-    gaps = [np.max(np.abs(op.apply(u * 2.0**p) * 2.0**-p - wanted), initial=0.0) for p in (900, -900)]
-    return max(gaps) and max(gaps) / (np.finfo(float).eps * np.max(np.abs(wanted)))
 
 
 # ------------------------------------------------------------ the summary
@@ -395,11 +353,11 @@ def operator(op, seeds=3, rng=None):
     Notes
     -----
     Rows: linearity, transpose (scaled dot test in four dtypes), twin (explicit against matrix-free,
-    forward and transposed), JVP, VJP, second order, dtypes, fresh results, same bits twice, the
-    same digits for a field times 2^+-900. Beside them stand facts without a verdict (`facts`): cost and bytes, row
-    sums, spectrum, the largest stable step, what the operator is adjoint to, the derivative that it stands for and
-    its order. Figures are in units of rounding; an inverse is judged by the tolerance of its solve, without its check
-    of primal data. Shapes, integers, batches and memory layouts are the same code for every Operator and have no row.
+    forward and transposed), JVP, VJP, second order, same bits twice, the same digits for a field times 2^+-900.
+    Beside them stand facts without a verdict (`facts`): row sums, spectrum, the largest stable step, the derivative
+    that the operator stands for and its order. Figures are in units of rounding; an inverse is judged by the
+    tolerance of its solve, without its check of primal data. Shapes, dtypes, integers, batches and memory layouts
+    are the same code for every Operator: no rows.
 
     Examples
     --------
@@ -425,19 +383,27 @@ def operator(op, seeds=3, rng=None):
 
 def _rows(probe):
     dtypes = dict.fromkeys(("linearity", "JVP", "VJP"), DTYPES[: 1 if probe.real else 2])
-    dtypes |= {"second order": DTYPES[:1], "transpose": DTYPES}
+    dtypes |= {"second order": DTYPES[:1], "transpose": DTYPES} | dict.fromkeys(EXACT, DTYPES[:1])
     rows = [one for name, kinds in dtypes.items() for one in probe.rows(name, kinds)]
     rows += [one._replace(name=f"twin, {one.name}") for one in _form_rows(probe)]
-    return rows + [row(name, test, probe) for name, test in ARGUMENTS.items()]
+    return [*rows, row("same bits twice", _repeats, probe)]
 
 
-ARGUMENTS = {
-    "dtypes": _dtypes,
-    "input unmodified, result fresh": _freshness,
-    "same bits twice": _repeats,
-    "scaling by 2^+-900": lambda probe: _scaling(probe, probe.op, probe.domain()),
-    "scaling by 2^+-900, transposed": lambda probe: _scaling(probe, probe.op.T, probe.codomain()),
-}
+def _repeats(probe):
+    """Two applications give the same bits, and leave the field alone.
+
+    What every Operator does with an argument before it is applied (shapes, dtypes, memory layouts, batches) is the
+    same code for all of them, and tested once.
+    """
+    mistakes = []
+    for name, op, u in (
+        ("applications", probe.op, probe.domain()),
+        ("transposed applications", probe.op.T, probe.codomain()),
+    ):
+        before, first, second = u.copy(), op(u), op(u)
+        mistakes += [f"two {name} differ"] * (not np.array_equal(first, second, equal_nan=True))
+        mistakes += [f"{name} modify their input"] * (not np.array_equal(u, before))
+    return mistakes
 
 
 class OperatorSummary(Summary):
@@ -451,12 +417,10 @@ class OperatorSummary(Summary):
     nnz : int or None
         Number of stored entries, where listing them costs no application.
     facts : dict
-        What the operator is: domain, codomain, form, dtype, nnz, bytes, size; seconds of one application
-        in each form; row sums, symmetry, M-matrix; integration by parts in the volumes of its grid, the derivative
-        that a row inside stands for and its order, or why they are not known; of a square one
-        spectral radius, definiteness, null space
-        and the largest stable step of u' = A u by explicit Euler. Found when they are asked for; what cannot
-        be found at a fair price is left out.
+        What the operator is: domain, codomain, form, dtype, nnz, size; row sums, symmetry; the derivative that a
+        row inside stands for and its order, or why they are not known; of a square one spectral radius,
+        definiteness, null space and the largest stable step of u' = A u by explicit Euler. Found when they are
+        asked for; what cannot be found at a fair price is left out.
     """
 
     def __init__(self, op, probe, rows):
@@ -477,11 +441,6 @@ class OperatorSummary(Summary):
         return super().to_dict() | self.facts
 
     def _head(self):
-        facts = (f"  {name}: {_words(value)}" for name, value in self.facts.items() if value is not None)
+        known = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in self.facts.items())
+        facts = (f"  {name}: {value}" for name, value in known if value is not None)
         return [*super()._head(), *facts]
-
-
-def _words(value):
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {_words(one)}" for name, one in value.items())
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

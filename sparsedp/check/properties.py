@@ -1,37 +1,26 @@
-"""What an operator is: its cost in each form, its signs and spectrum, what it is adjoint to, which derivative it is.
+"""What an operator is: its signs and spectrum, and which derivative it stands for.
 
 Facts for the summary of an operator, not verdicts.
 """
 
-from functools import partial
 from itertools import product
-from timeit import repeat
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 from scipy.sparse.linalg import ArpackError, eigs, eigsh
 from scipy.special import factorial
 
-from sparsedp.check.nodes import bytes_of
 from sparsedp.errors import DerivativeError
 from sparsedp.grid import node_axes
-from sparsedp.operators.boundary import interior
-from sparsedp.operators.difference import divergence, gradient
 from sparsedp.space import fits
-from sparsedp.structure.base import Structure
-from sparsedp.tree import norm
 
 __all__ = ["facts_of"]
 
 DENSE_UP_TO = 256  # rows up to which all eigenvalues are found
 LARGEST_SPECTRUM = 100_000  # rows above which no eigenvalue is sought
-ZERO = 1e-10  # of the largest: a smaller eigenvalue, row sum or entry is 0
+ZERO = 1e-10  # of the largest: a smaller eigenvalue or row sum is 0
 OUTER = 1e-4  # the same where only the ends of the spectrum are found
 SYMMETRIC = 1e-13
-REPEATS = 5  # of a measurement of time
-OPENED = Structure, sp.sparray  # types whose attributes an operator stores
-HOLDS = 1e-12  # gap of a rule of integration by parts, of the sizes of both sides
 MOST = 400  # entries of a row that is still a stencil
 INSIDE = 0.5, 0.3, 0.7  # shares of the way along an axis where a row is looked at, the first that is not 0
 FEWEST = 5  # cells along an axis: fewer, and no row is inside
@@ -51,11 +40,8 @@ def facts_of(op, listed, right):
     right : bool
         Whether nothing is wrong with it: else its spectrum is left out.
     """
-    facts: dict[str, Any] = {"seconds": _seconds(op.tangent, listed), "integration by parts": _by_parts(op.tangent)}
-    if not hasattr(op, "solver"):  # factors and hierarchies of a solver are not the operator's
-        facts["bytes"] = bytes_of(op._acting, OPENED)
     square = fits(op.domain, op.codomain)
-    facts |= _signs(op.matrix, square) if listed else {}
+    facts = _signs(op.matrix, square) if listed else {}
     try:
         facts |= _stencil(op.tangent)
     except _UnknownError as reason:
@@ -66,39 +52,17 @@ def facts_of(op, listed, right):
     return facts
 
 
-def _seconds(op, listed):
-    """Seconds of one application in each form that exists: dict, the least of several."""
-    u, seconds = np.ones(op.domain.shape), {}
-    for one in (op.explicit(), op.matrix_free()) if listed else (op,):
-        again = partial(one.apply, u, one.apply(u))  # the first application may compile
-        seconds[one.form] = min(repeat(again, number=1, repeat=REPEATS))
-    return seconds
-
-
 # ------------------------------------------------------------ entries and eigenvalues
 
 
 def _signs(A, square):
-    """Row sums, symmetry and M-matrix, from the entries."""
-    sums, largest = A.sum(axis=1), ZERO * np.max(abs(A).sum(axis=1), initial=0.0)
-    still = np.all(np.abs(sums) <= largest)
+    """Row sums and symmetry, from the entries."""
+    sums, largest = A.sum(axis=1), np.max(abs(A).sum(axis=1), initial=0.0)
+    still = np.all(np.abs(sums) <= ZERO * largest)
     facts: dict[str, Any] = {"row sums": "0" if still else f"{sums.real.min():.3g} to {sums.real.max():.3g}"}
     if square:
         facts["symmetric"] = not A.nnz or bool(abs(A - A.T).max() <= SYMMETRIC * abs(A).max())
-        facts["M-matrix"] = _m_matrix(A, sums, largest) if A.dtype.kind != "c" else "no: complex"
     return facts
-
-
-def _m_matrix(A, sums, rounding):
-    """Off-diagonal entries of one sign, diagonal of the other and weakly dominant: then A, or -A, has A^-1 >= 0."""
-    diagonal = A.diagonal()
-    sign = 1.0 if np.sum(diagonal) >= 0 else -1.0
-    wrong = np.count_nonzero((sign * (A - sp.diags_array(diagonal))).data > rounding)
-    if wrong:
-        return f"no: {wrong} entries beside the diagonal have its sign"
-    if np.any(sign * sums < -rounding) or np.any(sign * diagonal < 0):
-        return "no: the diagonal is not dominant"
-    return "yes" if sign > 0 else "yes, of -A"
 
 
 def _spectrum(op, symmetric):
@@ -133,39 +97,6 @@ def _spectrum(op, symmetric):
     return facts
 
 
-# ------------------------------------------------------------ integration by parts
-
-
-def _by_parts(op):
-    """Operator -> what it is adjoint to in the volumes of its grid, in words.
-
-    With V and W the volumes of cells and faces and I the inner faces: a gradient has <W I G u, v> = -<V u, D I v>
-    with the divergence of its grid, a divergence the same with the gradient; an operator of one space may be
-    self-adjoint, <V A u, v> = <V u, A v>. Tried on random fields.
-    """
-    one, other, rng = op.domain, op.codomain, np.random.default_rng(1)
-    if one.grid is None or one.grid != other.grid or op.dtype.kind == "c":
-        return "not known: it is between no two real fields of one grid"
-    partners = {("cells", "faces"): divergence, ("faces", "cells"): gradient}
-    partner, rule = partners.get((one.kind, other.kind)), "self-adjoint in the volumes of its grid"
-    if partner:
-        rule = f"with the {partner.__name__} of its grid"
-    elif one != other or node_axes(one.kind, 0, one.grid.dim) is None:
-        return f"not known: no rule for {one.kind} -> {other.kind}"
-    u, v = (rng.standard_normal(space.shape) * _open(space) for space in (one, other))
-    value = op.apply(u)
-    v = v * (value != 0)
-    left, back = other.volumes * value * v, partner(one.grid).apply(v) if partner else -op.apply(v)
-    gap, scale = abs(left.sum() + np.sum(one.volumes * u * back)), norm(left) * np.sqrt(left.size)
-    gap = gap / (scale or 1.0)
-    return f"{rule}, to {gap:.0e}" if gap <= HOLDS else f"not {rule} (off by {gap:.0e})"
-
-
-def _open(space):
-    """1 where a value takes part: not on walls."""
-    return interior(space.grid).apply(np.ones(space.shape)) if space.kind == "faces" else 1.0
-
-
 # ------------------------------------------------------------ the derivative that a row stands for
 
 
@@ -189,16 +120,16 @@ def _stencil(op):
             raise _UnknownError(f"it needs {FEWEST} cells along each axis")
     if op.dtype.kind == "c":
         raise _UnknownError("it is complex")
-    orders, words = zip(*(_row(op, component) for component in range(len(op.codomain.parts))))
+    orders, words = zip(*(_derivative(op, component) for component in range(len(op.codomain.parts))))
     order = min(orders)
     return {"order": int(order) if order < np.inf else "exact on polynomials", "acts as": "; ".join(words)}
 
 
-def _row(op, component):
+def _derivative(op, component):
     """(order, words) of the row in the middle of one component."""
-    moments = _moments(op, *_weights(op, component))
+    moments = _moments(op.domain, *_row(op, component))
     low, *more = sorted(moments) or [0]
-    words = _terms(moments.get(low, {}), op)
+    words = _terms(moments.get(low, {}), op.domain)
     if not words:
         raise _UnknownError("its row in the middle is 0 on polynomials")
     if not more:
@@ -206,61 +137,59 @@ def _row(op, component):
     h = max(np.max(widths) for widths in op.domain.grid.widths)
     size, error = (max(map(abs, moments[degree].values())) for degree in (low, more[0]))
     if error > size * h ** (more[0] - low):
-        raise _UnknownError(f"it mixes {words} with {_terms(moments[more[0]], op)}")
+        raise _UnknownError(f"it mixes {words} with {_terms(moments[more[0]], op.domain)}")
     return more[0] - low, words
 
 
-def _weights(op, component):
-    """(place, weights) of the row in the middle of one component."""
-    part = op.codomain.parts[component]
+def _row(op, component):
+    """Coordinates and weights of the row in the middle of one component."""
+    space, lines = op.codomain, _coordinates(op.codomain, component)
     for share in INSIDE:  # a row may be closed by a solid
-        place = op.codomain.offsets[component] + np.ravel_multi_index([int(share * n) for n in part], part)
-        unit = (np.arange(op.codomain.size) == place).astype(float)
+        index = [int(share * line.size) for line in lines]
+        unit = np.zeros(space.size)
+        unit[space.offsets[component] + np.ravel_multi_index(index, space.parts[component])] = 1.0
         try:
-            weights = op.T.apply(unit.reshape(op.codomain.shape)).reshape(-1)
+            weights = op.T.apply(unit.reshape(space.shape)).reshape(-1)
         except DerivativeError as error:
             raise _UnknownError("it has no transpose") from error
         used = np.count_nonzero(weights)
         if used > min(MOST, weights.size / 2):
             raise _UnknownError("a row is no stencil of neighbours")
         if used:
-            return place, weights
+            return [line[i] for line, i in zip(lines, index)], weights
     raise _UnknownError("its rows in the middle are 0")
 
 
-def _positions(space):
-    """Positions of all values and the component of each, shape (size, dim + 1)."""
-    grid, lines = space.grid, []
-    for component in range(len(space.parts)):
-        on_nodes = node_axes(space.kind, component, grid.dim)
-        at = [grid.coordinates(a, "nodes" if a in on_nodes else "cells") for a in range(grid.dim)]
-        lines.append(np.stack(np.meshgrid(*at, component, indexing="ij"), axis=-1).reshape(-1, grid.dim + 1))
-    return np.concatenate(lines)
+def _coordinates(space, component):
+    """Coordinates of the values of a component, along each axis."""
+    on_nodes = node_axes(space.kind, component, space.grid.dim)
+    return [space.grid.coordinates(a, "nodes" if a in on_nodes else "cells") for a in range(space.grid.dim)]
 
 
-def _moments(op, place, weights):
+def _moments(space, place, weights):
     """Degree -> {(component, powers): moment}, where it is more than rounding; powers of x first."""
-    grid, used = op.domain.grid, weights != 0
-    found: dict[int, dict] = {}
-    at, weights = _positions(op.domain)[used], weights[used]
-    away = at[:, :-1] - _positions(op.codomain)[place, :-1]
-    away -= np.where(grid.periodic, grid.size * np.round(away / grid.size), 0.0)  # the short way round
+    grid, found = space.grid, {}  # type: Any, dict[int, dict]
     powers = [power for power in product(range(DEGREES), repeat=grid.dim) if sum(power) < DEGREES]
-    for component, power in product(np.unique(at[:, -1]), powers[::-1]):
-        degree, terms = sum(power), weights * np.prod(away**power / factorial(power), axis=1)
-        moment = float(terms @ (at[:, -1] == component))
-        reach = np.abs(weights) @ np.max(np.abs(away), axis=1) ** degree / factorial(degree)
-        if abs(moment) > MOMENT * reach:
-            found.setdefault(degree, {})[component, power] = moment
+    for component, part in enumerate(space.parts):
+        start = space.offsets[component]
+        block = weights[start : start + np.prod(part)].reshape(part)
+        used = np.nonzero(block)
+        away = np.stack([x[i] for x, i in zip(_coordinates(space, component), used)], axis=1) - place
+        away -= np.where(grid.periodic, grid.size * np.round(away / grid.size), 0.0)  # the short way round
+        for power in powers[::-1]:
+            terms = block[used] * np.prod(away**power / factorial(power), axis=1)
+            reach = np.max(np.abs(away), axis=1) ** sum(power) / factorial(sum(power))
+            if abs(terms.sum()) > MOMENT * (np.abs(block[used]) @ reach):
+                found.setdefault(sum(power), {})[component, power] = float(terms.sum())
     return found
 
 
-def _terms(moments, op):
+def _terms(moments, space):
     """The moments of one degree as a sum of derivatives, such as 2 u_xx + u_yy."""
     text = ""
     for (component, power), moment in moments.items():
-        name = f"u{component + 1:.0f}" if len(op.domain.parts) > 1 else "u"
-        slopes = "".join(axis * p for axis, p in zip(op.domain.grid.axes, power))
+        name = f"u{component + 1}" if len(space.parts) > 1 else "u"
+        slopes = "".join(axis * p for axis, p in zip(space.grid.axes, power))
         size = "" if abs(abs(moment) - 1) < MOMENT else f"{abs(moment):.4g} "
         text += f" {'-' if moment < 0 else '+'} {size}{name}{'_' * bool(slopes)}{slopes}"
     return text.removeprefix(" + ").replace(" - ", "-", text.startswith(" - "))
