@@ -264,11 +264,11 @@ def test_an_inverse_is_an_operator_too(method):
 # ---- order ---------------------------------------------------------------------------------------------------------
 
 
-def laplacian_error(n):
+def laplacian_error(n, factor=1.0):
     grid = dp.Grid(n, size=1.0)
     (x,) = grid.centres()
     u = np.cos(np.pi * x)
-    return np.max(np.abs(dp.laplacian(grid)(u) + np.pi**2 * u)[2:-2])
+    return np.max(np.abs(factor * dp.laplacian(grid)(u) + np.pi**2 * u)[2:-2])
 
 
 def test_order_of_the_laplacian():
@@ -278,6 +278,19 @@ def test_order_of_the_laplacian():
     assert len(result.orders) == 3
     assert "n" in str(result) and "expected 1.9 to 2.2" in str(result)
     assert json.loads(json.dumps(result.to_dict()))["sizes"] == [16, 32, 64, 128]
+
+
+def test_a_wrong_factor_and_a_one_sided_difference():
+    """What is linear and has its transpose may still be another derivative, or of a lower order."""
+    assert dp.check.operator(1.001 * dp.laplacian(dp.Grid(16, size=1.0)))
+    assert dp.check.order(lambda n: laplacian_error(n, 1.001), expected=2).verdict == "disagrees"
+
+    def upwind_error(n):
+        grid = dp.Grid(n, size=1.0)
+        (x,) = grid.centres()
+        return np.max(np.abs(dp.upwind(grid, "x")(np.sin(3 * x)) - 3 * np.cos(3 * x))[3:-3])
+
+    assert dp.check.order(upwind_error, expected=1)
 
 
 def test_order_that_is_wrong_unknown_or_undefined():

@@ -1,4 +1,4 @@
-"""What the card of an operator tells: signs, spectrum, stable step, the derivative that it is, and scaling."""
+"""What the card of an operator tells: signs, spectrum, stable step, and scaling."""
 
 import json
 
@@ -51,7 +51,7 @@ def test_what_is_not_known_is_left_out():
     facts = CARD(blur, seeds=1).facts
     assert "spectral radius" not in facts and "symmetric" not in facts
     broken = CARD(dp.from_functions(lambda u: u[:2], lambda g: g, 3, 3, name="broken"))
-    assert "order" not in broken.facts and "broken" in str(broken)
+    assert "row sums" not in broken.facts and "broken" in str(broken)
 
 
 def test_scaling():
@@ -65,84 +65,6 @@ def test_scaling():
 
 def test_text_and_data():
     card = CARD(dp.laplacian(GRID))
-    for words in ("row sums: 0", "symmetric: True", "spectral radius", "stable step", "acts as: u_xx + u_yy"):
+    for words in ("row sums: 0", "symmetric: True", "spectral radius", "stable step"):
         assert words in str(card)
     assert json.loads(json.dumps(card.to_dict()))["null space"] == 1
-
-
-# ---- order -----------------------------------------------------------------------------------
-
-STRETCHED = dp.Grid((9, 8), spacing=[np.linspace(1.0, 2.0, 9), 0.3])
-SOLID = np.zeros((9, 8), bool)
-SOLID[3:5, 3:5] = True
-DERIVATIVES = {
-    "gradient": (dp.gradient(GRID), 2, "u_x; u_y"),
-    "at a wall of value": (dp.gradient(STRETCHED, dp.dirichlet), 1, "u_x; u_y"),
-    "around a solid": (dp.gradient(GRID, solid=SOLID), 2, "u_x; u_y"),
-    "divergence": (dp.divergence(GRID), 2, "u1_x + u2_y"),
-    "laplacian": (dp.laplacian(STRETCHED), 1, "u_xx + u_yy"),
-    "upwind": (3 * dp.upwind(GRID, "x"), 1, "3 u_x"),
-    "average": (dp.average(GRID), 2, "u; u"),
-    "curl": (dp.curl(GRID), 2, "u_y; -u_x"),
-    "identity": (dp.identity(GRID.cells), "exact on polynomials", "u"),
-    "mixed": (
-        dp.identity(GRID.cells) - 2 * dp.laplacian(GRID),
-        "not known: it mixes u with -2 u_xx",
-        "",
-    ),
-    "inverse": (dp.inverse(-dp.laplacian(GRID, dp.dirichlet)), "not known: a row is no stencil", ""),
-    "matrix": (dp.from_matrix(np.eye(5)), "not known: it is no operator", ""),
-    "few cells": (dp.laplacian(dp.Grid(4)), "not known: it needs 5 cells", ""),
-    "complex": (1j * dp.laplacian(GRID), "not known: it is complex", ""),
-    "zero": (0 * dp.laplacian(GRID), "not known: its rows in the middle are 0", ""),
-    "one way": (
-        dp.from_functions(lambda u: 2 * u, None, GRID.cells, GRID.cells),
-        "not known: it has no transpose",
-        "",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", DERIVATIVES)
-def test_derivative_and_order(name):
-    """Which derivative, and how exactly; or why that is not known."""
-    op, order, terms = DERIVATIVES[name]
-    card = CARD(op, seeds=1)
-    if isinstance(order, int):
-        assert card.facts["order"] == order and card.facts["acts as"] == terms
-        assert f"order: {order}" in str(card)
-    else:
-        assert card.facts["order"].startswith(order) and card.facts.get("acts as", "") == terms
-
-
-def test_a_sign_and_a_factor_show():
-    grid = dp.Grid((9, 8), spacing=0.5)
-    G = dp.gradient(grid)
-    bent = dp.from_functions(lambda u: 1.001 * G.apply(u), lambda v: 1.001 * G.T.apply(v), G.domain, G.codomain, "bent")
-    assert CARD(bent, seeds=1).facts["acts as"] == "1.001 u_x; 1.001 u_y"
-    assert CARD(-dp.divergence(grid), seeds=1).facts["acts as"] == "-u1_x - u2_y"
-
-
-def test_the_order_that_refinement_shows():
-    """The order from one row is the slope of the error over grids."""
-
-    def error(build):
-        def at(n):
-            op = build(dp.Grid(n, size=1.0))
-            (x,), inside = op.domain.grid.centres(), slice(3, -3)
-            return np.max(np.abs(op(np.sin(3 * x)) - 3 * np.cos(3 * x))[inside])
-
-        return at
-
-    wind = lambda grid: dp.upwind(grid, "x")
-    assert dp.check.order(error(wind), expected=CARD(wind(dp.Grid(16)), seeds=1).facts["order"])
-
-
-def test_one_component_of_faces_has_its_places_and_volumes():
-    """x-faces sit on nodes along x: a difference between the centres beside them is of second order."""
-    for axis, slope in enumerate(("u_x", "u_y")):
-        one = dp.component(GRID, axis)
-        assert np.array_equal(one.codomain.volumes, GRID.split(GRID.faces.volumes)[axis])
-        facts = CARD(one @ dp.gradient(GRID)).facts
-        assert (facts["acts as"], facts["order"]) == (slope, 2)
-    assert CARD(dp.lift(GRID, dp.dirichlet)).facts["order"] == "not known: values on walls have no places"

@@ -106,3 +106,9 @@ def test_volumes_that_overflow_are_refused():
         match="volumes overflow: the spacing is too large; rescale the lengths of the grid",
     ):
         dp.Grid((2, 2, 2), spacing=2.0**450).volumes
+
+
+def test_one_component_of_faces_has_its_volumes():
+    grid = dp.Grid((9, 8), spacing=0.5)
+    for axis, volumes in enumerate(grid.split(grid.faces.volumes)):
+        assert np.array_equal(dp.component(grid, axis).codomain.volumes, volumes)

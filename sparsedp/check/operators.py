@@ -363,10 +363,10 @@ def operator(op, seeds=3, rng=None):
     -----
     Rows: linearity, transpose (scaled dot test in four dtypes), twin (explicit against matrix-free,
     forward and transposed), JVP, VJP, second order, same bits twice, the same digits for a field times 2^+-900.
-    Beside them stand facts without a verdict (`facts`): row sums, spectrum, the largest stable step, the derivative
-    that the operator stands for and its order. Figures are in units of rounding; an inverse is judged by the
-    tolerance of its solve, without its check of primal data. Shapes, dtypes, integers, batches and memory layouts
-    are the same code for every Operator: no rows.
+    Beside them stand facts without a verdict (`facts`): row sums, spectrum, the largest stable step. Whether an
+    operator is the derivative that it should be, and of which order, `check.order` tells. Figures are in units of
+    rounding; an inverse is judged by the tolerance of its solve, without its check of primal data. Shapes, dtypes,
+    integers, batches and memory layouts are the same code for every Operator: no rows.
 
     Examples
     --------
@@ -406,10 +406,9 @@ class OperatorSummary(Summary):
     nnz : int or None
         Number of stored entries, where listing them costs no application.
     facts : dict
-        What the operator is: domain, codomain, form, dtype, nnz, size; row sums, symmetry; the derivative that a
-        row inside stands for and its order, or why they are not known; of a square one spectral radius,
-        definiteness, null space and the largest stable step of u' = A u by explicit Euler. Found when they are
-        asked for; what cannot be found at a fair price is left out.
+        What the operator is: domain, codomain, form, dtype, nnz, size; row sums, symmetry; of a square one spectral
+        radius, definiteness, null space and the largest stable step of u' = A u by explicit Euler. Found when they
+        are asked for; what cannot be found at a fair price is left out.
     """
 
     def __init__(self, op, probe, rows):
