@@ -69,7 +69,7 @@ class Point(Packing):
                 raise NonFiniteError(f"a gradient is checked at finite values, and {name} holds NaN or infinity")
         self.vector = joined(self.values)
         self.values = self.arrays(self.vector)  # the caller may write into those of x
-        self.units = np.concatenate([np.full(part.size, rms(part) or 1.0) for part in self.split(self.vector)])
+        self.units = self.sizes(self.vector)
         self.entries = sum(map(np.size, self.values))
 
     def tree(self, arrays):
@@ -84,17 +84,19 @@ class Point(Packing):
         """Vector of a gradient, a tree like x."""
         return joined(self.slopes(tree))
 
+    def sizes(self, vector):
+        """Root mean square of each leaf, 1 of zeros, for each of its entries."""
+        return np.concatenate([np.full(part.size, rms(part) or 1.0) for part in self.split(vector)])
+
     def directions(self, gradient, count, rng, wanted=None):
         """Names and displacements: random ones, and structured ones that see what random ones average away.
 
         Each leaf alone, all by the same, along the gradient, its largest entry; ``wanted(name)``: whether it is.
         """
         found = {f"random {number + 1}": self._random(rng) for number in range(count)}
-        for chosen, name in enumerate(self.names if 1 < len(self.names) <= MOST_LEAVES else ()):
-            alone = self._random(rng)
-            for other, part in enumerate(self.split(alone)):
-                part *= other == chosen
-            found[f"random in {name}"] = alone
+        leaf = np.concatenate([np.full(part.size, place) for place, part in enumerate(self.split(self.vector))])
+        for place, name in enumerate(self.names if 1 < len(self.names) <= MOST_LEAVES else ()):
+            found[f"random in {name}"] = self._random(rng) * (leaf == place)
         slopes = self.units * np.where(np.isfinite(gradient), gradient, 0.0)
         largest = np.max(np.abs(slopes), initial=0.0)
         if self.entries > 1:
@@ -109,9 +111,7 @@ class Point(Packing):
     def _random(self, rng):
         """Random displacement, of root mean square 1 in each leaf."""
         values = rng.standard_normal(self.vector.size)
-        for part in self.split(values):
-            part /= rms(part) or 1.0
-        return self.units * values
+        return self.units * (values / self.sizes(values))
 
 
 def eps_of(dtype):
