@@ -8,7 +8,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.check.judge import forward_mode, looked_at
-from sparsedp.check.nodes import witnessed
+from sparsedp.check.nodes import calls_seen, in_order
 from sparsedp.check.operators import fault_of, field
 from sparsedp.check.sweep import Point, Trials, default_steps, generator
 from sparsedp.derivative import pullback, value_and_grad
@@ -41,7 +41,7 @@ def culprit_of(loss, point):
     rng = generator(None)
     cleared: set[int] = set()  # Operators that were found right
     with np.errstate(all="ignore"):
-        with witnessed() as nodes:
+        with calls_seen() as nodes:
             value_and_grad(loss)(point.fresh())
         for node in _examined(nodes):
             fault = _fault(node, cleared, rng)
@@ -52,20 +52,12 @@ def culprit_of(loss, point):
 
 def _examined(nodes):
     """Calls that can be judged alone, those inside of a call before it; of many calls of one rule some."""
-    inner: dict[int, list] = {}
     groups: dict[int, list] = {}
+    nodes = list(in_order(nodes))
     for node in nodes:
-        inner.setdefault(id(node.inside), []).append(node)
         groups.setdefault(id(node.subject), []).append(node)
     chosen = {id(node) for calls in groups.values() for node in calls[:: -(-len(calls) // MOST)]}
-
-    def ordered(outer):
-        for node in inner.get(id(outer), ()):
-            yield from ordered(node)
-            if node.plain and not isinstance(node.value, tuple) and id(node) in chosen:
-                yield node
-
-    return ordered(None)
+    return [node for node in nodes if id(node) in chosen and node.plain and not isinstance(node.value, tuple)]
 
 
 def _fault(node, cleared, rng):

@@ -238,22 +238,23 @@ def _read(line):
 def _estimate(line, t, m, kinks, noise, jitter, scale, slope, curvature, **_):
     """The estimate with the smallest bar that no finer level contradicts, away from kinks if there is one."""
     spread, least = line.point.eps, NOISY if line.trials.solved else AGREED
+    floor = 8 * spread * curvature + 4 * spread * line.typical
     agreed = max(float(np.clip(PER_NOISE * line.trials.eps * jitter, least, NOISY)), 300 * spread)
     bends, found = _estimates(t, kinks, 1, 2 * noise), []
     for gap, bar, index in _estimates(t, m, 2, noise):
-        # A derivative is a limit, not a passing plateau: all finer levels agree with it.
-        passing = np.any((np.abs(m - gap) > bar + 6 * noise / t)[index + 1 :])
         # The jump of the one-sided derivatives around the level, and its bar; 0 if it goes to 0.
         jump, error = next((pair[:2] for pair in bends if abs(pair[2] - index) <= 1), (0.0, 0.0))
         size = max(scale, abs(slope + gap))
         split = abs(jump) * (abs(jump) > max(FAR * error, agreed * size))
-        found.append((passing, bool(split) or bar > RESOLVED * size, gap, bar, t[index], size, split, error))
+        found.append({
+            "gap": gap, "bar": bar + floor, "step": float(t[index]), "scale": size, "split": split, "uncertain": error,
+            "floor": floor, "agreed": agreed, "doubtful": bool(split) or bar > RESOLVED * size,
+            # A derivative is a limit, not a passing plateau: all finer levels agree with it.
+            "passing": np.any((np.abs(m - gap) > bar + 6 * noise / t)[index + 1 :]),
+        })  # fmt: skip
     # Away from kinks the first, with the smallest bar; of passing ones the last.
-    lasting = [one for one in found if not one[0]] or found[-1:]
-    best = min(lasting, key=lambda one: one[1])[2:]
-    floor = 8 * spread * curvature + 4 * spread * line.typical
-    chosen = dict(zip(("gap", "bar", "step", "scale", "split", "uncertain"), best))
-    return chosen | {"bar": best[1] + floor, "step": float(best[2]), "floor": floor, "agreed": agreed}
+    lasting = [one for one in found if not one["passing"]] or found[-1:]
+    return min(lasting, key=lambda one: one["doubtful"])
 
 
 def _estimates(t, values, power, noise):
@@ -496,9 +497,11 @@ def curvature(found, bend, extend):
     if extend and 0 < used < FEWEST:
         found.line.sweep(HALVES)
         return curvature(found, bend, False)
-    ahead, behind = rests[:, np.max(np.flatnonzero(usable), initial=0)]
-    off = abs(ahead + behind) / min(e.t[usable], default=e.t[0]) ** 2 / abs(bend)
-    found.learn(used3=used, bend=bend, rate3=min(rates, default=inf if not used else nan), off=off)
-    found.learn(jumps=abs(ahead - behind) > ODD * abs(ahead + behind))
+    finest = np.max(np.flatnonzero(usable), initial=0)
+    ahead, behind = rests[:, finest]
+    found.learn(
+        used3=used, bend=bend, rate3=min(rates, default=inf if not used else nan),
+        off=abs(ahead + behind) / e.t[finest] ** 2 / abs(bend), jumps=abs(ahead - behind) > ODD * abs(ahead + behind),
+    )  # fmt: skip
     word, text = first(orders_of_hessians, found)
     return word, f"d.Hd = {bend:.9g} along {found.direction}, third Taylor remainder {text}"

@@ -10,7 +10,7 @@ from sparsedp.ledger import thread
 from sparsedp.tape import called, isbox
 from sparsedp.traces import ReverseNode, untraced
 
-__all__ = ["Node", "bytes_held", "witnessed"]
+__all__ = ["Node", "bytes_held", "calls_seen", "in_order", "witnessed"]
 
 EMPTY = CellType()
 DEEPEST = 12  # levels of containers inside each other; deeper ones are not the tape's
@@ -28,15 +28,15 @@ class Node:
         The arguments that are differentiated.
     plain : bool
         Whether no argument belongs to an outer trace.
-    inside : Node or None
-        The call whose derivative made this one, as a time loop does that runs its steps again; None for the steps
-        of a loop that keeps its tape: they stand before the loop.
+    inner : list of Node
+        The calls that its derivative made, as that of a time loop does that runs its steps again; the steps of a
+        loop that keeps its tape stand before the loop.
     again : callable
         ``again(values)`` is the same call with other values of these arguments.
     """
 
-    def __init__(self, fun, value, args, options, nums, inside):
-        self.subject, self.value, self.inside = called(fun, args), value, inside
+    def __init__(self, fun, value, args, options, nums):
+        self.subject, self.value, self.inner = called(fun, args), value, []  # type: Any, Any, list[Node]
         self.values, self.plain = [args[num] for num in nums], not any(map(isbox, args))
 
         def again(values):
@@ -52,21 +52,11 @@ class Node:
 
 
 @contextmanager
-def witnessed(nodes=None):
-    """A `with` block in which every node of every reverse-mode trace is seen.
+def witnessed(see):
+    """A `with` block in which ``see(node, function, value, arguments, options, numbers)`` gets each node of a tape.
 
-    Parameters
-    ----------
-    nodes : list, optional
-        Gets the nodes of the tape themselves; then no values are kept, and nothing is yielded.
-
-    Yields
-    ------
-    list of Node
-        In the order of the calls.
+    Nodes of every reverse-mode trace, when they are made; `numbers`: those of the arguments that are differentiated.
     """
-    found: list[Node] = []
-    running: list[Node] = []  # calls whose derivative is under way, the innermost last
 
     class Witness(ReverseNode):
         """A node that reports itself."""
@@ -75,29 +65,45 @@ def witnessed(nodes=None):
 
         def __init__(self, value, fun, args, options, nums, parents):
             super().__init__(value, fun, args, options, nums, parents)
-            if nodes is not None:
-                nodes.append(self)
-                return
-            node = Node(fun, value, args, options, nums, running[-1] if running else None)
-            found.append(node)
-            pull = self.vjp
-
-            def watched(g):
-                running.append(node)
-                try:
-                    return pull(g)
-                finally:
-                    running.pop()
-
-            self.vjp = watched
+            see(self, fun, value, args, options, nums)
 
     untraced[Witness] = untraced[ReverseNode]  # comparisons, shapes, rounding: plain values for this kind too
     thread.witnesses.append(Witness)
     try:
-        yield found
+        yield
     finally:
         thread.witnesses.remove(Witness)
         del untraced[Witness]
+
+
+@contextmanager
+def calls_seen():
+    """A `with` block that yields the list of the calls made in it, each with those inside of it."""
+    found: list[Node] = []
+    running: list[Node] = []  # calls whose derivative is under way, the innermost last
+
+    def see(tape_node, *call):
+        node, pull = Node(*call), tape_node.vjp
+        (running[-1].inner if running else found).append(node)
+
+        def watched(g):
+            running.append(node)
+            try:
+                return pull(g)
+            finally:
+                running.pop()
+
+        tape_node.vjp = watched
+
+    with witnessed(see):
+        yield found
+
+
+def in_order(nodes):
+    """All calls, those inside of a call before it."""
+    for node in nodes:
+        yield from in_order(node.inner)
+        yield node
 
 
 def bytes_held(nodes):

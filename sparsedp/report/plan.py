@@ -87,7 +87,7 @@ def explain(loss, x, gradient=True):
         turn.append(perf_counter())
         return value
 
-    with recording() as calls, witnessed(nodes):
+    with recording() as calls, witnessed(lambda node, *_: nodes.append(node)):
         value = value_and_grad(watched)(x)[0] if gradient else float(watched(x))
         end = perf_counter()
     seconds, many, size, forward, resumed = turn
