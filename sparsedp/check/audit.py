@@ -17,7 +17,7 @@ from sparsedp.check.judge import (
     verdict,
 )
 from sparsedp.check.summary import Result, table
-from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, default_steps, generator
+from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, generator
 from sparsedp.derivative import hvp, value_and_grad
 from sparsedp.fields import check_function, is_whole
 from sparsedp.progress import bar
@@ -120,11 +120,12 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
     if steps is not None and (len(set(chosen)) < FEWEST_STEPS or not all(0 < step < inf for step in chosen)):
         raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {chosen}")
     point, count = Point(x), min(directions, 1) if quick else directions
-    chosen, names = chosen or default_steps(point.eps), QUICK.__contains__ if quick else None
+    trials = Trials(loss, point, (lambda tree: value_and_grad(loss)(tree)[1]) if gradient is None else gradient, chosen)
+    names = QUICK.__contains__ if quick else None
     lines = len(point.directions(point.vector, count, generator(0), names))
-    ticks = _announced(3 + POINTS * min(lines, 2) + 2 * len(chosen) * lines)
-    trials = Trials(loss, point, lambda: next(ticks, None))
-    return _audit(trials, gradient, chosen, steps is None, count, generator(rng), names)
+    ticks = _announced(3 + POINTS * min(lines, 2) + 2 * len(trials.steps) * lines)
+    trials.tick = lambda: next(ticks, None)
+    return _audit(trials, gradient is None, count, generator(rng), names)
 
 
 def _announced(total):
@@ -135,20 +136,19 @@ def _announced(total):
     return iter(bar(range(total), needed=False, desc="check.gradient", unit="evaluation", leave=False))
 
 
-def _audit(trials, gradient, steps, extend, count, rng, quick):
+def _audit(trials, taped, count, rng, quick):
     """The audit; `quick`: names of its directions, or None for all."""
-    loss, point, taped, hessian, culprit = trials.loss, trials.point, gradient is None, None, None
-    slope = (lambda tree: value_and_grad(loss)(tree)[1]) if taped else gradient
-    judged, doubts = looked_at(trials, slope, steps, extend, count, rng, quick)
-    if at_kinks(judged) and callable(slope):
-        _look_beside(trials, slope, judged)
+    loss, point, hessian, culprit = trials.loss, trials.point, None, None
+    judged, doubts = looked_at(trials, count, rng, quick)
+    if at_kinks(judged) and callable(trials.slope):
+        _look_beside(trials, judged)
     random = judged[:count]
     if taped and random:
         doubts.append(_modes(forward_mode(loss, random), trials.tolerance))
     if random and not quick and not point.complex:
         doubts += _complex_step(loss, point, judged[0], trials.base)
     if taped and random and not quick and judged[0].word in PROVED:
-        hessian, note = _hessian(loss, point, judged[0], extend)
+        hessian, note = _hessian(loss, point, judged[0])
         doubts.append(("note", note))
     if judged and trials.value(point.fresh()) != trials.base:
         doubts.append(("unsound", "the loss gives another value after the audit: it keeps a state"))
@@ -171,7 +171,7 @@ def _audit(trials, gradient, steps, extend, count, rng, quick):
     )  # fmt: skip
 
 
-def _look_beside(trials, slope, judged):
+def _look_beside(trials, judged):
     """At several kinks at once a derivative may lie outside the one-sided ones and follow a convention all the same.
 
     What is wrong beside the kinks as well is wrong.
@@ -179,9 +179,9 @@ def _look_beside(trials, slope, judged):
     point = trials.point
     away = point.directions(point.vector, 1, generator(SHIFT[0]))[0][1]
     with suppress(*REFUSALS):
-        other = Trials(trials.loss, Point(point.unpack(point.vector + SHIFT[1] * away)), trials.tick)
-        found = looked_at(other, slope, default_steps(point.eps), True, RANDOM, generator(None))
-        if verdict(*found)[0] != "disagrees":
+        beside = Point(point.unpack(point.vector + SHIFT[1] * away))
+        other = Trials(trials.loss, beside, trials.slope, tick=trials.tick)
+        if verdict(*looked_at(other, RANDOM, generator(None)))[0] != "disagrees":
             for one in judged:
                 if one.word in ("outside", "disagrees"):
                     one.learn(word="kink", note="several kinks; beside them nothing speaks against the gradient")
@@ -221,7 +221,7 @@ def _complex_step(loss, point, one, base):
     return [("note", f"complex step: agrees to {gap:.0e}")] if analytic else []
 
 
-def _hessian(loss, point, one, extend):
+def _hessian(loss, point, one):
     """d . H d -> (word or None, note).
 
     The gradient has its verdict without it: a pullback that uses a value it captured has a right gradient and a
@@ -235,7 +235,7 @@ def _hessian(loss, point, one, extend):
             product = point.gradient(hvp(loss, point.fresh(), point.unpack(along))) @ along
     except Exception as error:  # a rule, ours or not, may lack a second derivative and say so in any way
         return None, f"Hessian product: not available ({type(error).__name__})"
-    word, reason = curvature(one, float(product), extend)
+    word, reason = curvature(one, float(product))
     return word, f"Hessian product: {word}, {reason}"
 
 

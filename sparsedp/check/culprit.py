@@ -10,7 +10,7 @@ import numpy as np
 from sparsedp.check.judge import forward_mode, looked_at
 from sparsedp.check.nodes import calls_seen, in_order
 from sparsedp.check.operators import fault_of, field
-from sparsedp.check.sweep import Point, Trials, default_steps, generator
+from sparsedp.check.sweep import Point, Trials, generator
 from sparsedp.derivative import pullback, value_and_grad
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
@@ -96,9 +96,8 @@ def _wrong_rule(node, rng):
         return anp.sum(anp.real(g * node.again(values)))
 
     # In each argument alone, and the largest entry: a loss of many entries hides single ones.
-    slope, steps = lambda tree: value_and_grad(loss)(tree)[1], default_steps(point.eps)
-    wanted = lambda name: name not in SKIPPED
-    judged, doubts = looked_at(Trials(loss, point), slope, steps, True, DIRECTIONS, rng, wanted)
+    trials = Trials(loss, point, lambda tree: value_and_grad(loss)(tree)[1])
+    judged, doubts = looked_at(trials, DIRECTIONS, rng, lambda name: name not in SKIPPED)
     if "broken" in dict(doubts):
         return "its VJP gives NaN or infinity"
     for one in judged:

@@ -332,16 +332,12 @@ def orders(t, remainder, usable, most=MOST):
 # ------------------------------------------------------------ all directions
 
 
-def looked_at(trials, slope, steps, extend, count, rng, wanted=None):
+def looked_at(trials, count, rng, wanted=None):
     """Judgements along all directions (none where loss or gradient is not finite), and the doubts before them.
 
     Parameters
     ----------
     trials : Trials
-    slope : callable or tree
-        The gradient under test.
-    steps, extend
-        As in `measured`.
     count, rng, wanted
         As in `Point.directions`.
 
@@ -353,7 +349,7 @@ def looked_at(trials, slope, steps, extend, count, rng, wanted=None):
     trials.start()
     base = trials.base
     with np.errstate(all="ignore"):
-        vector, again = (point.gradient(slope(point.fresh()) if callable(slope) else slope) for _ in range(2))
+        vector, again = (trials.gradient_at(point.fresh()) for _ in range(2))
     trials.gradient = vector
     finite, change = isfinite(base), np.max(np.abs(vector * point.units), initial=0.0)
     evidence = [
@@ -372,9 +368,9 @@ def looked_at(trials, slope, steps, extend, count, rng, wanted=None):
     directions = point.directions(vector, count, rng, wanted)
     lines = [Line(name, direction, trials) for name, direction in directions]
     trials.noise = max(map(noise_of, lines[:1] + lines[1:][-1:]), default=0.0)
-    judged = [measured(line, steps, extend, line is lines[0]) for line in lines]
-    for one in judged if callable(slope) else ():
-        explained(one, slope)
+    judged = [measured(line, line is lines[0]) for line in lines]
+    for one in judged if callable(trials.slope) else ():
+        explained(one)
     return judged, doubts
 
 
@@ -405,7 +401,7 @@ def forward_mode(loss, judged):
 # ------------------------------------------------------------ more steps where the first leave it open
 
 
-def measured(line, steps, extend, close=False):
+def measured(line, close):
     """Sweep, judge, and where the derivative stays open go on: finer if there may be finer features.
 
     Noise at the level of rounding asks for coarser steps: x may be small beside the scale of the loss.
@@ -413,13 +409,11 @@ def measured(line, steps, extend, close=False):
     Parameters
     ----------
     line : Line
-    steps : sequence of float
-    extend : bool
-        Whether other steps may be taken too.
     close : bool
         Whether steps far below the plateau are looked at, where there is noise, though all agrees.
     """
-    line.sweep(steps)
+    extend = line.trials.extend
+    line.sweep(line.trials.steps)
     found = judgement(line)
     if extend and found.word in ("few", "rough") and found.step > 0:  # more levels between those there are
         line.sweep(found.step * BETWEEN)
@@ -448,7 +442,7 @@ def _see_ripple(found, finer):
 
 
 @np.errstate(all="ignore")
-def explained(found, gradient):
+def explained(found):
     """Whether a ripple below the noise of the loss, that the gradient shows, may explain a gap; then -> ripple.
 
     A gradient that bends by as much as the gap, within steps over which the gap does not move the loss beyond its
@@ -459,7 +453,7 @@ def explained(found, gradient):
 
     def bend(step):
         ends = [point.unpack(point.vector + side * line.direction) for side in (step, -step)]
-        return abs(sum(point.gradient(gradient(end)) @ line.direction for end in ends) - 2 * line.slope)
+        return abs(sum(line.trials.gradient_at(end) @ line.direction for end in ends) - 2 * line.slope)
 
     for step in [times * reach for times in WITHIN] if found.word == "disagrees" else ():
         with suppress(*REFUSALS):
@@ -485,7 +479,7 @@ def orders_of_hessians(e):
 
 
 @np.errstate(all="ignore")
-def curvature(found, bend, extend):
+def curvature(found, bend, extend=True):
     """Judgement of a gradient and a Hessian product d . H d -> word and reason, by the third Taylor remainder.
 
     The order is read on the finest usable levels, those that stand out of noise, gap and the rounding of x.
@@ -494,7 +488,7 @@ def curvature(found, bend, extend):
     rests = e.rests - e.t**2 / 2 * bend
     usable = both(rests) >= CLEAR * (e.noise + e.t * (found.size + e.floor))
     used, rates = orders(e.t, both(rests), usable, FEWEST)  # coarse ones are no limit t -> 0
-    if extend and 0 < used < FEWEST:
+    if extend and found.line.trials.extend and 0 < used < FEWEST:
         found.line.sweep(HALVES)
         return curvature(found, bend, False)
     finest = np.max(np.flatnonzero(usable), initial=0)

@@ -130,11 +130,23 @@ def rms(vector):
 class Trials:
     """A loss at a point with the gradient under test. Away from the point it may refuse: a note, and no value.
 
+    Parameters
+    ----------
+    loss : callable
+    point : Point
+    slope : callable or tree
+        The gradient under test.
+    steps : sequence of float
+        Step sizes; without any the usual ones, and more where they leave the derivative open.
+    tick : callable
+        Is called at each evaluation.
+
     Attributes
     ----------
     base : float
-        The loss at the point; whoever makes the trials sets it and the gradient.
+        The loss at the point, once it is started.
     gradient : vector
+        At the point.
     noise : float
         Noise of the loss in units of its rounding, where a table of differences has shown it; else 0.
     count : int
@@ -147,9 +159,10 @@ class Trials:
         Rounding of the coarsest dtype that the loss has returned.
     """
 
-    def __init__(self, loss, point, tick=lambda: None, base=np.nan, gradient=None):
-        self.loss, self.point, self.tick = loss, point, tick  # `tick` is called at each evaluation
-        self.base, self.gradient = base, gradient
+    def __init__(self, loss, point, slope, steps=(), tick=lambda: None):
+        self.loss, self.point, self.slope, self.tick = loss, point, slope, tick
+        self.steps, self.extend = steps or default_steps(point.eps), not steps
+        self.base, self.gradient = np.nan, np.full(point.vector.size, np.nan)
         self.count, self.solved, self.tolerance, self.noise = 0, False, 0.0, 0.0
         self.eps = eps_of(float)
 
@@ -168,6 +181,10 @@ class Trials:
         if value.dtype.kind == "f":
             self.eps = max(self.eps, eps_of(value.dtype))
         return float(value)
+
+    def gradient_at(self, tree):
+        """The gradient under test, as a vector."""
+        return self.point.gradient(self.slope(tree) if callable(self.slope) else self.slope)
 
     def start(self):
         """Find the loss at the point. Solves are seen in one more run: recording is no part of what is judged."""

@@ -280,7 +280,9 @@ def _against_differences(scene, other, out):
     if not np.any(gradient):
         return PASSED, 0.0, "gradient 0"
     name, direction = point.directions(gradient, 1, generator(SEED), ("random 1", "gradient").__contains__)[-1]
-    line = Line(name, direction, Trials(scene.sheltered, point, base=out.value, gradient=gradient))
+    trials = Trials(scene.sheltered, point, out.gradient)
+    trials.base, trials.gradient = out.value, gradient
+    line = Line(name, direction, trials)
     if abs(line.slope) <= UNSEEN * abs(out.value):
         return PASSED, 0.0, "the gradient is smaller than differences can see"
     for steps in DIFFERENCES[:1], DIFFERENCES:
