@@ -108,7 +108,7 @@ class StabilityMap(Result):
 
 def stability_map(scene):
     """Scene -> StabilityMap, or None where it has no loop, or no named time step and viscosity of one number each."""
-    names, known = tuple(scene.named.values()), scene.leaves
+    names, known = (scene.time_step, scene.viscosity), scene.leaves
     here = [known[name].item() for name in names if name and known[name].size == 1 and known[name] > 0]
     if len(here) < 2 or scene.growth is None or scene.growth.refusal:
         return None

@@ -5,7 +5,7 @@ CASES is the table: for each group a function that lists its cases, the values t
 
 import re
 import warnings
-from functools import cached_property, partial
+from functools import partial
 from math import inf, isfinite, ldexp, log, log2, nan
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from sparsedp.tree import copied, flatten
 __all__ = ["CASES", "FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 
 WORDS = PASSED, REFUSED, DEGRADED, FAILED = "passed", "refused correctly", "degraded", "FAILED"
-NAMES = {"time step": ("dt", "time_step", "tau"), "viscosity": ("nu", "viscosity", "diffusivity", "kappa", "mu")}
+TIME_STEPS, VISCOSITIES = ("dt", "time_step", "tau"), ("nu", "viscosity", "diffusivity", "kappa", "mu")
 EPS = np.finfo(float).eps
 DIFFERENCES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-2, 1e-7)  # their steps, in units of x; the one that mostly serves comes first
 GOOD, BAD = 1e-5, 1e-2  # gaps between gradient and differences
@@ -61,8 +61,8 @@ class Scene:
         Name -> array: the floating leaves of x.
     ranges : dict
         Name -> (low, high).
-    named : dict
-        "time step", "viscosity" -> name of the parameter, or None.
+    time_step, viscosity : str or None
+        Names of these parameters.
     base : Outcome
         Value and gradient as given.
     growth : Growth or None
@@ -73,18 +73,15 @@ class Scene:
         paths = [name.removeprefix("x") or "x" for name in self.point.names]
         names = [re.sub(r"^\['?([^\[\]']*)'?\]$", r"\1", path) for path in paths]
         self.leaves = dict(zip(names, self.point.values))
-        ranges = {names[0]: ranges} if isinstance(ranges, (tuple, list)) and len(names) == 1 else ranges or {}
-        for name in (*ranges, time_step, viscosity):
+        self.ranges = ranges if isinstance(ranges, dict) else {"x": ranges} if ranges else {}
+        for name in (*self.ranges, time_step, viscosity):
             if name is not None and name not in names:
                 raise ValueError(f"stress knows the parameters {', '.join(names)}, got {name!r}; write one of them")
-        for name, limits in ranges.items():
+        for name, limits in self.ranges.items():
             if np.size(limits) != 2 or not np.all(np.isfinite(limits)) or limits[0] >= limits[1]:
                 raise ValueError(f"stress needs ranges of two finite numbers, low < high, got {limits!r} for {name}")
-        self.ranges = {name: tuple(map(float, limits)) for name, limits in ranges.items()}
-        self.named = {
-            kind: given or next((word for word in words if word in names), None)
-            for (kind, words), given in zip(NAMES.items(), (time_step, viscosity))
-        }
+        self.time_step = time_step or next((name for name in TIME_STEPS if name in names), None)
+        self.viscosity = viscosity or next((name for name in VISCOSITIES if name in names), None)
         self.base = self.run({})
         self.growth = self.growth_at({})
 
@@ -113,26 +110,8 @@ class Scene:
     def fault(self, other):
         """The word for a wrong number: FAILED as given, in stated ranges, and without viscosity."""
         stated = all(name in self.ranges and self.legal(name, value) for name, value in other.items())
-        inviscid = not np.any(other.get(self.named["viscosity"], 1.0))
+        inviscid = not np.any(other.get(self.viscosity, 1.0))
         return FAILED if stated or inviscid else DEGRADED
-
-    @cached_property
-    def steepest(self):
-        """Name -> index of the entry with the largest derivative, of what the loss depends on."""
-        pairs = zip(self.leaves, map(np.abs, self.base.gradient))  # no gradient where it is refused
-        return {name: np.unravel_index(np.argmax(g), g.shape) for name, g in pairs if np.max(g, initial=0.0) > 0}
-
-    @cached_property
-    def degrees(self):
-        """Name -> d, where the loss is a monomial s^d in the scale s of a parameter."""
-        degrees = {}
-        for name, leaf in self.leaves.items():
-            values = np.array([self.run({name: s * leaf}).value for s in (0.5, 1.0, 2.0)])  # NaN where it is refused
-            with np.errstate(all="ignore"):
-                powers = np.diff(np.log2(np.abs(values)))
-            if np.sum(np.abs(powers - np.rint(powers[0]))) < 1e-12:
-                degrees[name] = round(powers[0])
-        return degrees
 
 
 class Outcome(NamedTuple):
@@ -223,12 +202,9 @@ def _graded(gap, good, bad, note, unit=1.0):
     return word, gap, "" if word == PASSED else note.format(gap / unit)
 
 
-def scaled(scene, other, exponent):
-    """A monomial scales exactly; another loss is judged at the new point as it is."""
-    (name,) = other
-    if not scene.degrees.get(name):
-        return steady(scene, other)
-    out, power = scene.run(other), scene.degrees[name] * exponent
+def scaled(scene, other, power):
+    """The value is 2^power times the plain one, exactly."""
+    out = scene.run(other)
     if out.error is not None:
         return out.refusal
     if abs(log2(abs(scene.base.value)) + power) > LARGEST:
@@ -257,7 +233,7 @@ def refused(scene, other, located=False):
 
 def growing(scene, _):
     """The growth factor of a step: above 1 is right only if the physics grows."""
-    growth, dt = scene.growth, scene.named["time step"]
+    growth, dt = scene.growth, scene.time_step
     if growth is None:
         return None, nan, "no rollout in the loss; give step=lambda x: (advance, state)"
     if growth.refusal:
@@ -313,8 +289,19 @@ def as_given(scene):
 
 
 def scalings(scene, name, x):
+    """A monomial in a parameter scales exactly; another loss is judged at the new point as it is."""
+    degree = _degree(scene, name, x)
     for exponent in (1, -1, 10, -10, 100, -100, 900, -900) if np.any(x) else ():
-        yield f"times 2^{exponent}", x * 2.0**exponent, partial(scaled, exponent=exponent)
+        judge = partial(scaled, power=degree * exponent) if degree else steady
+        yield f"times 2^{exponent}", x * 2.0**exponent, judge
+
+
+def _degree(scene, name, x):
+    """d, where the loss is a monomial s^d in the scale s of a parameter, else 0."""
+    values = [scene.run({name: s * x}).value for s in (0.5, 1.0, 2.0)]  # NaN where it is refused
+    with np.errstate(all="ignore"):
+        low, high = np.diff(np.log2(np.abs(values)))
+    return round(low) if abs(low - high) + abs(low - np.rint(low)) < 1e-12 else 0
 
 
 def legal_range(scene, name, x):
@@ -333,7 +320,7 @@ def legal_range(scene, name, x):
 
 
 def zeros_and_signs(scene, name, x):
-    if name not in scene.named.values():
+    if name not in (scene.time_step, scene.viscosity):
         yield "all 0", 0.0 * x, finite
         yield "sign changed", -1.0 * x, finite
 
@@ -355,9 +342,11 @@ def constants_added(scene, name, x):
 
 
 def not_finite(scene, name, x):
-    for bad in (nan, inf) if name in scene.steepest else ():
+    """One entry, that with the largest derivative, where the loss depends on it."""
+    slope = np.abs(dict(zip(scene.leaves, scene.base.gradient)).get(name, 0.0))  # no gradient where it is refused
+    for bad in (nan, inf) if np.max(slope, initial=0.0) > 0 else ():
         spoilt = np.array(x)
-        spoilt[scene.steepest[name]] = bad
+        spoilt.flat[np.argmax(slope)] = bad
         yield f"one {bad}", spoilt, partial(refused, located=True)
 
 
@@ -375,17 +364,18 @@ def all_integers(scene):
 
 
 def factors(scene, name, x):
-    if name in scene.named.values():
+    if name in (scene.time_step, scene.viscosity):
         for factor in (1e-8, 1e-4, 1e-2, 1e-1, 1e1, 1e2, 1e4, 1e8):
             yield f"times {factor:g}", x * factor, steady
-        if name == scene.named["viscosity"]:
-            yield "0", 0.0 * x, finite
+    if name == scene.viscosity:
+        yield "0", 0.0 * x, finite
 
 
 def wrong_signs(scene, name, x):
-    if name in scene.named.values():
-        for value in (0.0 * x, -x) if name == scene.named["time step"] else (-x,):
-            yield f"{np.min(value):g}", value, refused
+    if name == scene.time_step:
+        yield "0", 0.0 * x, refused
+    if name in (scene.time_step, scene.viscosity):
+        yield f"{np.min(-x):g}", -x, refused
 
 
 def _random(x, low, high):

@@ -7,7 +7,7 @@ import platform
 import tracemalloc
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from math import inf, isfinite, isnan, nan
+from math import inf, isfinite, nan
 from pathlib import Path
 from time import perf_counter
 
@@ -18,14 +18,14 @@ from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.fields import check_function, is_whole
 from sparsedp.files import write_file
-from sparsedp.ledger import Calls, recording
+from sparsedp.ledger import recording
 from sparsedp.report import plots
 from sparsedp.report.certificate import distance
 from sparsedp.report.plan import total
 from sparsedp.report.table import Table, csv_text, write_table
 from sparsedp.tree import leaves
 
-__all__ = ["COLUMNS", "Rows", "measured_row", "relative_distance", "timed", "versions", "words_of", "workprec"]
+__all__ = ["COLUMNS", "Rows", "relative_distance", "timed", "words_of", "workprec"]
 
 COLUMNS = (
     "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
@@ -34,7 +34,7 @@ COLUMNS = (
     "seconds_backward_median", "seconds_backward_max",
 )  # fmt: skip
 TEXTS = ("scene", "method", "status", "seed", "versions", "settings")
-KEY = ("scene", "method", "settings", "seed")  # what a row of an earlier run is found by
+KEY = ("scene", "method", "settings", "seed", "versions")  # what a row of an earlier run is found by
 SHOWN = COLUMNS[1:15]
 COUNTS = {"solves_forward": "solve", "solves_adjoint": "adjoint", "iterations": "iterations"}  # in the ledger
 SETTLED = 2.0  # a run that is not faster than the last one by more is warm
@@ -110,26 +110,27 @@ def workprec(
         raise ValueError(f"workprec needs repeats >= 1, a whole number, got {repeats!r}; the default is 3")
     if not methods or not isinstance(methods, dict):
         raise ValueError("workprec needs at least one method; write {'name': {settings}}")
-    scene, over, rows = scene or getattr(problem, "__name__", "scene"), over or {}, []
-    finished, skipped = _finished(Path(file)) if file else ({}, [])
-    errors = partial(_errors, problem, reference, compare or relative_distance, {})
+    scene, over, now, rows = scene or getattr(problem, "__name__", "scene"), over or {}, _versions(), []
+    compare = compare or relative_distance
+    exact = _exact(problem, reference, compare)
+    finished = {tuple(map(row.get, KEY)): row for row in _stored(file)}
+    other = sum(row["versions"] != now for row in finished.values())
+    skipped = [f"{other} rows of {Path(file).name} from other versions: run again"] if other else []
     for (method, own), *values in itertools.product(methods.items(), *over.values()):
-        shared = dict(zip(over, values))
-        settings = shared | own
+        settings = dict(zip(over, values)) | own
         reason = skip and skip(str(method), settings)
         if reason:
             skipped.append(f"{method} with {_words(settings)}: {reason}")
             continue
-        key = scene, str(method), _text_of(settings), str(seed)
+        key = scene, str(method), _text_of(settings), str(seed), now
         if key not in finished:
-            figures, *result = measured_row(problem, settings, repeats)
-            figures |= errors({name: settings[name] for name in over}, *result)
-            figures |= {**dict(zip(KEY, key)), "versions": versions()}
-            finished[key] = {name: figures.get(name, nan) for name in COLUMNS}
+            figures, *result = _measured(problem, settings, repeats)
+            figures |= _errors(exact, compare, {name: settings[name] for name in over}, *result)
+            finished[key] = {name: figures.get(name, nan) for name in COLUMNS} | dict(zip(KEY, key))
             if file:
-                _append(Path(file), finished[key])
+                write_file(file, csv_text([*_stored(file), finished[key]], COLUMNS))
         rows.append(finished[key])
-    return Rows(scene=scene, rows=rows, left_out=skipped)
+    return Rows(scene=scene, over=tuple(over), rows=rows, left_out=skipped)
 
 
 def words_of(row):
@@ -145,7 +146,7 @@ def _text_of(settings):
     return json.dumps(settings, sort_keys=True, default=str)
 
 
-def versions():
+def _versions():
     """Python and the libraries that figures depend on, in words."""
     found = [f"python {platform.python_version()}"]
     for name in ("sparsedp", "numpy", "scipy", "autograd", "pyamg", "numba"):
@@ -159,75 +160,79 @@ def versions():
 # ---------------------------------------------------------------- one run: timed, weighed, counted
 
 
-def measured_row(problem, settings, repeats):
-    """Settings of one run -> (row of figures, answer, gradient). What fails keeps a row with its status."""
-    try:
-        setup, given = timed(partial(problem, **settings))
-        loss, x, facts = _task(given)
-        runs = [loss] if x is None else [partial(loss, x), partial(value_and_grad(loss), x)]
-        calls, status, first = _warm(runs[-1])
-        row = {"status": status, "seconds_setup": setup + total(first, "setup")}
-        row |= {name: total(calls, kind) for name, kind in COUNTS.items()}
-        value, gradient = _times(runs, row, repeats)
-        row["peak_bytes"] = _peak(runs[-1])
-        answer = _answer(value, x, facts)
-    except FAILURES as error:
-        return {"status": _failure(error)}, None, None
-    if not np.all(np.isfinite(answer)):
-        row["status"] = "nonfinite"
-    size = sum(map(np.size, leaves(answer if x is None else x)))
-    return {"unknowns": size, **facts, **row}, answer, gradient
-
-
-def _task(given):
-    """(loss, x) or (loss, x, facts) -> all three."""
+def _prepared(problem, settings):
+    """Settings -> (runs of the value, and of value and gradient; facts; what the result of the last run answers)."""
+    given = problem(**settings)
     if not isinstance(given, tuple) or len(given) not in (2, 3):
         raise TypeError(
             f"a problem gives (loss, x) or (loss, x, facts), got {type(given).__name__}; write return loss, x"
         )
-    return (*given, {})[:3]
-
-
-def _answer(value, x, facts):
-    """What the forward error is about: the output if the facts name one, else the value."""
+    loss, x, facts = (*given, {})[:3]
+    alone = x is None  # the loss is the run itself, its result the answer
+    runs = [loss] if alone else [partial(loss, x), partial(value_and_grad(loss), x)]
     output = facts.get("output")
-    return np.asarray(value if output is None else output(x), float)
+
+    def answers(result):
+        """(What the forward error is about, gradient)."""
+        value, gradient = (result, None) if alone else result
+        return np.asarray(value if output is None else output(x), float), gradient
+
+    return runs, facts if alone else {"unknowns": sum(map(np.size, leaves(x))), **facts}, answers
+
+
+def _measured(problem, settings, repeats):
+    """Settings of one run -> (figures, answer, gradient). What fails keeps a row with its status."""
+    try:
+        seconds, (runs, facts, answers) = timed(partial(_prepared, problem, settings))
+        status, first, *_, last = _warm(runs[-1])
+        times, result = _times(runs, repeats)
+        peak = _peak(runs[-1])
+        answer, gradient = answers(result)
+    except FAILURES as error:
+        return {"status": _failure(error)}, None, None
+    row = {
+        "unknowns": answer.size,
+        **facts,
+        "peak_bytes": peak,
+        "seconds_setup": seconds + total(first.seconds, "setup"),
+    }
+    row |= {name: total(last, kind) for name, kind in COUNTS.items()}
+    row |= times if status == "ok" else {}
+    return row | {"status": status if np.all(np.isfinite(answer)) else "nonfinite"}, answer, gradient
 
 
 def timed(run):
+    """A function without arguments -> (seconds, what it gives)."""
     clock = perf_counter()
     result = run()
     return perf_counter() - clock, result
 
 
 def _warm(run):
-    """Run until the time has settled: compiled code, caches of set-ups, imports.
-
-    Gives the calls of the last run, whether it is warm, and the seconds of the calls of the first.
-    """
-    before, first = inf, Calls()
+    """Run until the time has settled (compiled code, caches of set-ups, imports) -> [status, calls of each run]."""
+    before, records = inf, []
     for _ in range(MOST_WARM_UPS):
         with recording() as calls:
             now, _ = timed(run)
-        first = first or calls
+        records.append(calls)
         if before <= SETTLED * now + SHORT:  # it does not fall any more
-            return calls, "ok", first.seconds
+            return ["ok", *records]
         before = now
-    return calls, "not_warm", first.seconds
+    return ["not_warm", *records]
 
 
-def _times(runs, row, repeats):
-    """Run times into the row: the least, the median and the largest of the repeats -> (value, gradient).
+def _times(runs, repeats):
+    """Runs of the value, and of value and gradient -> (columns of their times, what the last one gave).
 
-    NaN when the caches never got warm. The time of the gradient is that of both less the least of the value.
+    The time of the gradient is that of both less the least of the value.
     """
-    least = 0.0
+    row, least, result = {}, 0.0, None
     for name, run in zip(("seconds_forward", "seconds_backward"), runs):
-        pairs = [timed(run) for _ in range(repeats)]
-        seconds = [max(spent - least, 0.0) if row["status"] == "ok" else nan for spent, _ in pairs]
-        least, result = min(seconds), pairs[-1][1]
-        row |= {name: least, f"{name}_median": float(np.median(seconds)), f"{name}_max": max(seconds)}
-    return result if len(runs) > 1 else (result, None)
+        seconds, results = zip(*(timed(run) for _ in range(repeats)))
+        own, result = np.maximum(np.subtract(seconds, least), 0.0), results[-1]
+        least = float(np.min(own))
+        row |= {name: least, f"{name}_median": float(np.median(own)), f"{name}_max": float(np.max(own))}
+    return row, result
 
 
 def _peak(run):
@@ -252,32 +257,40 @@ def _failure(error):
 # ---------------------------------------------------------------- exact answers
 
 
-def _errors(problem, given, compare, cache, shared, answer, gradient):
-    """The columns of errors of one run; a reference is found once for the settings that the methods share."""
-    if given is None or answer is None:
+def _errors(exact, compare, shared, answer, gradient):
+    """The columns of errors of one run, beside the exact answer for the settings that the methods share."""
+    if answer is None:
         return {}
     try:
-        key = _text_of(shared)
-        if key not in cache:
-            cache[key] = _reference(problem, given, compare, shared)
-        value, slope, error = cache[key]
-        gaps = {"forward_error": compare(answer, value), "reference_error": error}
-        return gaps if gradient is None or slope is None else {**gaps, "gradient_error": compare(gradient, slope)}
+        value, slope, error = exact(shared)
+        pairs = {"forward_error": (answer, value), "gradient_error": (gradient, slope)}
+        gaps = {name: compare(a, b) for name, (a, b) in pairs.items() if a is not None and b is not None}
+        return gaps | {"reference_error": error}
     except FAILURES as trouble:
         return {"status": f"reference: {_failure(trouble)}"}
 
 
-def _reference(problem, given, compare, shared):
-    """(answer, gradient, error of the reference)."""
-    if callable(given) or isinstance(given, tuple):
-        return *(given(**shared) if callable(given) else given), 0.0
-    results = []
-    for settings in [given] if isinstance(given, dict) else given:
-        loss, x, facts = _task(problem(**{**shared, **settings}))
-        value, gradient = (loss(), None) if x is None else value_and_grad(loss)(x)
-        results.append((_answer(value, x, facts), gradient))
-    gaps = [compare(a, b) for a, b in zip(*results[-2:]) if a is not None] if len(results) > 1 else []
-    return *results[-1], max(gaps, default=nan)
+def _exact(problem, given, compare):
+    """The reference in any of its forms -> function of the shared settings: (answer, gradient, error of both)."""
+    known: dict = {}  # by the settings, in words: found once for all methods
+
+    def found(shared):
+        if given is None:
+            return None, None, nan
+        if callable(given) or isinstance(given, tuple):
+            return *(given(**shared) if callable(given) else given), 0.0
+        tasks = [_prepared(problem, shared | own) for own in ([given] if isinstance(given, dict) else given)]
+        *coarser, finest = [answers(runs[-1]()) for runs, _, answers in tasks]
+        gaps = [compare(a, b) for rough in coarser for a, b in zip(rough, finest) if a is not None]
+        return *finest, max(gaps, default=nan)
+
+    def exact(shared):
+        words = _text_of(shared)
+        if words not in known:
+            known[words] = found(shared)
+        return known[words]
+
+    return exact
 
 
 def relative_distance(one, other):
@@ -297,6 +310,8 @@ class Rows(Table):
     Attributes
     ----------
     scene : str
+    over : tuple of str
+        Names of the settings that vary.
     rows : list of dict
         Keys are COLUMNS; NaN where a figure does not exist.
     left_out : list of str
@@ -334,20 +349,14 @@ class Rows(Table):
 
     def _parts(self):
         """The table for readers: what is known of the runs, and the settings that tell those of a method apart."""
-        rows = [json.loads(row["settings"]) | row for row in self.rows]
-        first: dict = {}
-        apart = dict.fromkeys(
-            name for row in rows for name in row
-            if name not in COLUMNS and row[name] != first.setdefault(row["method"], row)[name]
-        )  # fmt: skip
-        used = [name for name in SHOWN if any(text_of(row[name]) for row in rows)]
         best = [*self.pareto(), *self.pareto("forward_error")]
-        marked = [row | {"best": "*" * (own in best)} for row, own in zip(rows, self.rows)]
+        rows = [json.loads(row["settings"]) | row | {"best": "*" * (row in best)} for row in self.rows]
+        first, *used = [name for name in SHOWN if any(text_of(row[name]) for row in rows)]
+        apart = [name for name in self.over if name not in COLUMNS]
         star = "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."
-        errors = [row["reference_error"] for row in self.rows if not isnan(row["reference_error"])]
+        errors = [row["reference_error"] for row in rows if text_of(row["reference_error"])]
         stated = [f"Error of the reference: {max(errors):.1e}."] if errors else []
-        names = [*used[:1], *apart, *used[1:], "best"]
-        return [f"{self.scene}: error against run time"], marked, names, [star, *stated]
+        return [f"{self.scene}: error against run time"], rows, [first, *apart, *used, "best"], [star, *stated]
 
     def plot(self, ax=None, error="gradient_error"):
         """Log-log picture: run time across, error up, one curve for each method, the Pareto set marked.
@@ -387,27 +396,17 @@ class Rows(Table):
 # ---------------------------------------------------------------- a file that can be continued
 
 
-def _append(path, row):
-    """Add a finished row to a CSV file, on a line of its own: somebody may have cut the last one off."""
-    before = path.read_text(encoding="utf-8") if path.exists() else ""
-    lines = csv_text([row], COLUMNS)
-    write_file(path, f"{before.rstrip()}\n{lines.partition(chr(10))[2]}" if before else lines)
-
-
-def _finished(path):
-    """CSV file -> (finished rows of these versions by key, what is left out)."""
-    if not path.exists() or not path.stat().st_size:
-        return {}, []
+def _stored(file):
+    """CSV file -> its rows, without one that was cut off; none without a file."""
+    path = file and Path(file)
+    if not path or not path.exists() or not path.stat().st_size:
+        return []
     with path.open(encoding="utf-8", newline="") as stream:
         reader = csv.DictReader(stream)
         if tuple(reader.fieldnames or ()) != COLUMNS:
             raise ValueError(f"{path.name} is no table of workprec; give another file name")
-        rows = [row for row in reader if row["versions"] and row["seconds_backward_max"] is not None]
-    same = [row for row in rows if row["versions"] == versions()]
-    other = len(rows) - len(same)
-    left = [f"{other} rows of {path.name} from other versions: run again"] if other else []
-    typed = [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in same]
-    return {tuple(map(row.get, KEY)): row for row in typed}, left
+        whole = [row for row in reader if row[COLUMNS[-1]] is not None]
+    return [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in whole]
 
 
 def _number(text):
