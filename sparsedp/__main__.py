@@ -36,14 +36,12 @@ def main(arguments=None):
         return code
     except KeyboardInterrupt:
         return refuse("interrupted; there is no result", INTERRUPTED)
-    except FileExistsError as error:
-        return refuse(error)
     except (OSError, UnicodeEncodeError) as error:
         place, why = getattr(error, "filename", None), getattr(error, "strerror", None)
         if place is None:
             sys.stdout = open(os.devnull, "w")  # or Python tries once more at its end, and changes the exit code
         return refuse(f"{place or 'the output'} cannot be written: {why or error}; make room, or write elsewhere")
-    except ValueError as error:  # the scene, its loss or the folder: what is wrong with it
+    except (ValueError, ImportError) as error:  # the scene, its loss, the field or the folder: what is wrong with it
         return refuse(error)
 
 
@@ -118,14 +116,10 @@ def run_demo(options):
     from sparsedp.report.demo import story, terrain
     from sparsedp.report.scene_report import claim
 
-    try:
-        ground = terrain.load(options.input)
-        grids = story.grids_for(ground, options.size)
-        claim(options.out, [*story.PICTURES, *story.ARRAYS], options.force)
-        hidden = story.prepare(ground, grids)
-    except (ValueError, OSError, ImportError) as error:
-        return refuse(error)
-    return 0 if story.tell(hidden, options.out, options.force) else 1
+    ground = terrain.load(options.input)
+    grids = story.grids_for(ground, options.size)
+    claim(options.out, story.FILES, options.force)
+    return 0 if story.tell(story.prepare(ground, grids), options.out, options.force) else 1
 
 
 ARGUMENTS: dict[str, Any] = {

@@ -257,16 +257,20 @@ def test_a_name_that_cannot_be_printed(tmp_path, monkeypatch, capsys):
     assert "the output cannot be written: 'ascii' codec can't encode" in capsys.readouterr().err
 
 
-def test_a_file_that_came_during_the_demo_is_not_overwritten(tmp_path):
-    (tmp_path / "table.csv").write_text("mine")
-    with pytest.raises(
-        FileExistsError,
-        match=r".*table\.csv came there during the run; name another folder with --out, or write --force",
-    ):
-        story.write_arrays(tmp_path, False, [{"a": 1}], np.zeros(3))
+def test_a_file_that_came_during_the_demo_is_not_overwritten(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(story, "ITERATIONS", 1)
+    check = dp.check.gradient
+
+    def slow(*args, **options):
+        (tmp_path / "table.csv").write_text("mine")
+        return check(*args, **options)
+
+    monkeypatch.setattr(dp.check, "gradient", slow)
+    assert main(["demo", "--size", "12", "--out", str(tmp_path)]) == 2
+    assert "table.csv is there already; name another folder with --out, or write --force" in capsys.readouterr().err
     assert contents(tmp_path) == {"table.csv": b"mine"}
-    story.write_arrays(tmp_path, True, [{"a": 1}], np.zeros(3))
-    assert contents(tmp_path)["table.csv"] == b"a\n1\n"
+    assert main(["demo", "--size", "12", "--out", str(tmp_path), "--force"]) == 0
+    assert contents(tmp_path)["table.csv"].startswith(b"grid,unknowns")
 
 
 def test_a_run_goes_on_from_the_state_before_the_disk_was_full(tmp_path, monkeypatch):

@@ -3,6 +3,8 @@
 import io
 import re
 import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,9 +27,10 @@ def mesh(ax):
 
 
 def drawn(ax):
-    stream = io.BytesIO()
-    plots.save(ax.figure, stream)
-    return stream.getvalue()
+    """The picture as it is written."""
+    with tempfile.TemporaryDirectory() as folder:
+        plots.write_picture(Path(folder, "a.png"), lambda _: ax)
+        return Path(folder, "a.png").read_bytes()
 
 
 def test_axis_0_is_x(ax):

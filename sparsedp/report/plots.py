@@ -11,7 +11,7 @@ from sparsedp.grid import check_grid
 from sparsedp.tape import plain
 
 __all__ = [
-    "animate", "convergence", "current", "curves", "figure", "plot", "read_picture", "sample_file", "save",
+    "animate", "convergence", "current", "curves", "figure", "plot", "read_picture", "sample_file",
     "stability_chart", "unbeaten", "v_curve", "write_picture",
 ]  # fmt: skip
 
@@ -355,19 +355,11 @@ def current(ax):
     return _matplotlib("pyplot").gca() if ax is None else ax
 
 
-def save(picture, stream):
-    """Write a figure as PNG to an open binary stream."""
-    picture.savefig(stream, format="png", dpi=150, bbox_inches="tight", pad_inches=0.15)
-
-
 def write_picture(path, draw):
-    """``draw(axes) -> axes``, and where it goes -> [path] of the PNG that was written; [] without matplotlib."""
-    try:
-        ax = figure().add_subplot()
-    except ImportError:
-        return []
-    write_file(path, partial(save, draw(ax).figure))
-    return [path]
+    """``draw(axes) -> axes`` -> PNG at a path."""
+    picture = draw(figure().add_subplot()).figure
+    options = {"format": "png", "dpi": 150, "bbox_inches": "tight", "pad_inches": 0.15}
+    write_file(path, lambda stream: picture.savefig(stream, **options))
 
 
 def sample_file(name):

@@ -3,6 +3,7 @@
 A table is a list of rows (dicts) and the names of the columns that are shown.
 """
 
+import contextlib
 from typing import Any
 
 from sparsedp.check.summary import Result, csv_text, table, text_of
@@ -59,7 +60,11 @@ def _cells(rows, names):
 
 def write_table(folder, stem, markdown, csv, draw=None):
     """Texts of a table, and ``draw(axes) -> axes`` -> paths of stem.md, stem.csv and, with matplotlib, stem.png."""
-    paths = [folder / f"{stem}.{kind}" for kind in ("md", "csv", "png")]
-    write_file(paths[0], markdown)
-    write_file(paths[1], csv)
-    return [*paths[:2], *(plots.write_picture(paths[2], draw) if draw else ())]
+    page, numbers, picture = [folder / f"{stem}.{kind}" for kind in ("md", "csv", "png")]
+    write_file(page, markdown)
+    write_file(numbers, csv)
+    if draw is not None:
+        with contextlib.suppress(ImportError):
+            plots.write_picture(picture, draw)
+            return [page, numbers, picture]
+    return [page, numbers]

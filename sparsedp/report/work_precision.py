@@ -226,7 +226,8 @@ def _times(runs, repeats):
 
     The time of the gradient is that of both less the least of the value.
     """
-    row, least, result = {}, 0.0, None
+    row: dict = {}
+    least, result = 0.0, None
     for name, run in zip(("seconds_forward", "seconds_backward"), runs):
         seconds, results = zip(*(timed(run) for _ in range(repeats)))
         own, result = np.maximum(np.subtract(seconds, least), 0.0), results[-1]

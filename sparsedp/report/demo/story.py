@@ -3,7 +3,6 @@
 What the reader sees is printed; pictures, the table and the recovered field are left behind.
 """
 
-import os
 from functools import partial
 from typing import NamedTuple
 
@@ -16,15 +15,17 @@ from sparsedp.report import plots
 from sparsedp.report.demo.scene import NOISE, Ground, Survey, objective, regulariser, survey
 from sparsedp.report.demo.terrain import Terrain, hidden_ground, remap
 from sparsedp.report.plan import total
+from sparsedp.report.scene_report import claim
 from sparsedp.report.table import csv_text, text_table
 
-__all__ = ["ARRAYS", "PICTURES", "Study", "grids_for", "prepare", "tell", "write_arrays"]
+__all__ = ["FILES", "Study", "grids_for", "prepare", "tell"]
 
 SMALLEST, LARGEST = 12, 512  # cells along the longest side
 THINNEST = 0.25  # shortest side of the box
 ITERATIONS = 80
-PICTURES = ("truth.png", "recovery.png", "convergence.png")
 ARRAYS = ("table.csv", "recovered.npy")
+PICTURES = ("truth.png", "recovery.png", "convergence.png")
+FILES = (*ARRAYS, *PICTURES)
 COUNTED = {"solves_forward": "solve", "solves_adjoint": "adjoint", "setups": "setup"}
 SHOWN = ("grid", "unknowns", "iterations", *COUNTED, "seconds", "misfit", "error")
 
@@ -33,7 +34,7 @@ class Study(NamedTuple):
     """What all grids share: the survey, and the hidden ground they try to find, on the finest of them."""
 
     terrain: Terrain
-    grids: tuple
+    grids: list
     data: Survey
     truth: np.ndarray
 
@@ -52,7 +53,7 @@ def grids_for(terrain, size):
         raise ValueError(f"--size needs a whole number from {SMALLEST} to {LARGEST}, got {size}")
     sides = np.maximum(np.divide(terrain.field.shape, max(terrain.field.shape)), THINNEST)
     cells = np.rint(np.outer((size // 2, 3 * size // 4, size), sides)).astype(int)
-    return tuple(dp.Grid(tuple(shape), size=tuple(sides)) for shape in cells.tolist())
+    return [dp.Grid(tuple(shape), size=tuple(sides)) for shape in cells.tolist()]
 
 
 def prepare(terrain, grids):
@@ -69,40 +70,40 @@ def prepare(terrain, grids):
 
 
 class Recovery(NamedTuple):
-    """What one grid found: the log-conductivity, and (seconds, misfit, error) after each iteration.
+    """What one grid found: the log-conductivity, its row of the table, and the errors after each iteration."""
+
+    found: np.ndarray
+    row: dict
+    curve: np.ndarray  # seconds, errors
+
+
+def recover(study, grid, loss, check):
+    """Study and loss on a grid, and the audit of its gradient -> Recovery, by L-BFGS; prints a line an iteration.
 
     Misfit: root mean square of (computed - read) / noise, 1 is a fit within the noise. Error: distance from the truth,
     relative, 1 for the flat start.
     """
-
-    found: np.ndarray
-    trace: list
-    row: dict  # of the table
-
-
-def recover(study, grid, loss, check):
-    """Study and loss on a grid, and the audit of its gradient -> Recovery, by L-BFGS; prints a line an iteration."""
-    roughness, to_finest, trace = regulariser(grid), remap(grid, study.grids[-1]), []
+    roughness, to_finest = regulariser(grid), remap(grid, study.grids[-1])
+    rows: list[dict] = []
 
     def note(record, logk):
-        misfit = np.sqrt(max(0.0, 2 * (record.value - roughness(logk))))
-        error = np.linalg.norm(to_finest(logk) - study.truth) / np.linalg.norm(study.truth)
-        trace.append((record.seconds, float(misfit), float(error)))
-        print(f"  {len(trace):9d}   {misfit:12.3f}   {error:5.3f}   {record.seconds:7.2f}", flush=True)
+        misfit = float(np.sqrt(max(0.0, 2 * (record.value - roughness(logk)))))
+        error = float(np.linalg.norm(to_finest(logk) - study.truth) / np.linalg.norm(study.truth))
+        rows.append({"iterations": len(rows) + 1, "seconds": record.seconds, "misfit": misfit, "error": error})
+        print("  {iterations:9d}   {misfit:12.3f}   {error:5.3f}   {seconds:7.2f}".format(**rows[-1]), flush=True)
 
     print(f"Recovery on {grid}\n  iteration   misfit/noise   error   seconds")
     with recording() as calls:
         best = dp.minimize(loss, np.zeros(grid.shape), maxiter=ITERATIONS, callback=note, memory=20)
     if best.message.startswith("interrupted"):  # minimize keeps its best point; the demo ends
         raise KeyboardInterrupt
-    if best.history[-1].iteration > len(trace):  # the iteration that meets the tolerance is not reported
+    if best.history[-1].iteration > len(rows):  # the iteration that meets the tolerance is not reported
         note(best.history[-1], best.x)
     counts = {name: total(calls, kind) for name, kind in COUNTED.items()}
     print(f"  {', '.join(f'{many} {name}' for name, many in counts.items())}\n")
-    gap = max((abs(line.gap) / line.scale for line in check.lines if line.scale > 0), default=np.nan)
-    row = {"grid": " x ".join(map(str, grid.shape)), "unknowns": best.x.size, "iterations": len(trace), **counts}
-    row |= dict(zip(("seconds", "misfit", "error"), trace[-1]), gradient_error=gap)
-    return Recovery(best.x, trace, row)
+    row = {"grid": " x ".join(map(str, grid.shape)), "unknowns": best.x.size, **rows[-1], **counts}
+    row["gradient_error"] = max((line.share for line in check.lines), default=np.nan)
+    return Recovery(best.x, row, np.array([(one["seconds"], one["error"]) for one in rows]).T)
 
 
 # ---------------------------------------------------------------- what the reader sees
@@ -115,9 +116,8 @@ def tell(study, folder, force):
     ----------
     study : Study
     folder : pathlib.Path
-        Claimed before.
     force : bool
-        Whether files may be overwritten that appear during the run.
+        Whether files may be overwritten.
 
     Returns
     -------
@@ -127,7 +127,9 @@ def tell(study, folder, force):
     Raises
     ------
     OSError
-        If a file cannot be written, or is there and `force` is not set.
+        If a file cannot be written.
+    ValueError
+        If one has come there during the run, and `force` is not set.
     """
     print(INTRODUCTION.format(s=study, d=study.data, noise=100 * NOISE), flush=True)
     losses = [objective(Ground(grid, study.data.wells, study.data.sensors), study.data) for grid in study.grids]
@@ -140,11 +142,13 @@ def tell(study, folder, force):
     found = [recover(study, *parts) for parts in zip(study.grids, losses, checks)]
     print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
     print(text_table([one.row for one in found], SHOWN), end="\n\n")
-    write_arrays(folder, force, [one.row for one in found], found[-1].found)
+    claim(folder, FILES, force)  # once more: it is a while since the run began
+    write_file(folder / "table.csv", csv_text([one.row for one in found]))
+    write_file(folder / "recovered.npy", lambda stream: np.save(stream, found[-1].found, allow_pickle=False))
     try:
-        draw = partial(_map, study, "Hidden ground", study.truth), partial(_map, study, "Recovered", found[-1].found)
-        for name, picture in zip(PICTURES, (*draw, partial(_convergence, found))):
-            _write(folder / name, force, partial(plots.save, picture(plots.figure().add_subplot()).figure))
+        plots.write_picture(folder / "truth.png", partial(_map, study, "Hidden ground", study.truth))
+        plots.write_picture(folder / "recovery.png", partial(_map, study, "Recovered", found[-1].found))
+        plots.write_picture(folder / "convergence.png", partial(_convergence, found))
     except ImportError as error:
         print(f"No pictures: {error}")
     print(f"Written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
@@ -159,22 +163,6 @@ The task     find log k in every cell from the readings: L-BFGS through the adjo
 """
 
 
-# ---------------------------------------------------------------- what is left behind
-
-
-def _write(path, force, content):
-    """A file. Without `force` one that appeared during the run is safe too."""
-    if not force and os.path.lexists(path):
-        raise FileExistsError(f"{path} came there during the run; name another folder with --out, or write --force")
-    write_file(path, content)
-
-
-def write_arrays(folder, force, rows, recovered):
-    """Table rows (dicts with the same keys) and the recovered field -> table.csv, recovered.npy."""
-    _write(folder / "table.csv", force, csv_text(rows))
-    _write(folder / "recovered.npy", force, lambda stream: np.save(stream, recovered, allow_pickle=False))
-
-
 def _map(study, title, field, ax):
     """A field with the wells and the sensors; truth and recovery with the same colours."""
     limits = float(study.truth.min()), float(study.truth.max())
@@ -186,5 +174,5 @@ def _map(study, title, field, ax):
 
 def _convergence(found, ax):
     """Error against run time, one curve for each grid."""
-    curves = {f"{one.row['grid']} cells": np.transpose(one.trace)[[0, 2]] for one in found}
-    return plots.curves(curves, ax, "run time [s]", "relative error of log conductivity (flat start: 1)")
+    lines = {f"{one.row['grid']} cells": one.curve for one in found}
+    return plots.curves(lines, ax, "run time [s]", "relative error of log conductivity (flat start: 1)")
