@@ -1,6 +1,8 @@
 """Pictures of fields, charts of measurements. The only file of the package that imports matplotlib (extra `plot`)."""
 
+import io
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -66,19 +68,20 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, cmap="viridis", 
     if title is not None:
         ax.set_title(title)
     if grid.dim == 1:
-        _line(grid, u, kind, ax, label)
+        ax.plot(grid.coordinates(0, kind), u, marker="." if u.size <= 64 else None)
+        ax.set(xlim=(grid.origin[0], grid.origin[0] + grid.size[0]), xlabel="x", ylabel=label or "")
         return ax
     low, high = limits or _range(u)
-    mesh = partial(_mesh, grid, kind, vmin=low, vmax=high, cmap=cmap, shading="auto", rasterized=True)
-    if grid.dim == 2:
-        image = mesh(u, (0, 1), ax)
-        bar = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the map, whatever its shape
-    else:
-        image = _slices(grid, u, kind, ax, mesh)
-        bar = ax.inset_axes((0.93, 0.15, 0.02, 0.7))
+    for view, values, axes in [(ax, u, (0, 1))] if grid.dim == 2 else _slices(grid, u, kind, ax):
+        # pcolormesh wants rows along y, so the array is turned here and nowhere else.
+        lines, options = [_lines(grid, a, kind) for a in axes], {"vmin": low, "vmax": high, "cmap": cmap}
+        image = view.pcolormesh(*lines, values.T, shading="auto", rasterized=True, **options)
+        view.set(aspect="equal", xlabel=grid.axes[axes[0]], ylabel=grid.axes[axes[1]])
+    bar = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the map, whatever its shape
     ax.figure.colorbar(image, cax=bar, label=label or "")
     if arrows and grid.dim == 2:
-        _arrows(grid, arrows, ax)
+        steps = tuple(slice(n // ARROWS // 2, None, -(-n // ARROWS)) for n in grid.shape)
+        ax.quiver(*(part[steps] for part in (*grid.centres(), *arrows)), color="white", pivot="mid")
     return ax
 
 
@@ -120,34 +123,32 @@ def animate(grid, frames, path, title=None, limits=None, cmap="viridis", rate=12
     if not frames:
         raise ValueError("animate needs at least one frame, got none; run with keep='all'")
     limits = limits or _range(np.concatenate([_scalar(grid, frame)[0].ravel() for frame in frames]))
-    picture, images = figure(), []
-    from PIL import Image  # comes with matplotlib
-
-    _matplotlib("backends.backend_agg").FigureCanvasAgg(picture)
+    image, images = _images(), []
     for frame in frames:
-        picture.clear()
+        picture, pixels = figure(), io.BytesIO()
         plot(grid, frame, ax=picture.add_subplot(), title=title, limits=limits, cmap=cmap)
-        picture.canvas.draw()
-        pixels = np.asarray(picture.canvas.buffer_rgba())
-        images.append(Image.fromarray(pixels[..., :3].copy()).quantize(256))
-    first, *rest = images
-    film = partial(first.save, format="GIF", save_all=True, append_images=rest, duration=round(1000 / rate), loop=0)
+        picture.savefig(pixels, format="rgba", dpi="figure")
+        raw = image.frombytes("RGBA", picture.canvas.get_width_height(), pixels.getvalue())
+        images.append(raw.convert("RGB").quantize(256))
+    options = {"save_all": True, "append_images": images[1:], "duration": round(1000 / rate), "loop": 0}
+    film = partial(images[0].save, format="GIF", **options)
     film(path) if hasattr(path, "write") else write_file(path, film)
 
 
 def _scalar(grid, u, at=None):
-    """(the numbers that a map shows, where they live, components): of a face field its magnitude, at the centres."""
+    """(the numbers that a map shows, "cells" or "nodes", components): of a face field its magnitude, at the centres."""
     kinds = (at,) if at else ("cells", "faces", "nodes")
     kind = next((kind for kind in kinds if u.shape == getattr(grid, kind).shape), None)
     if kind is None:
         where = at or "cells, faces or nodes"
         raise ShapeError(f"plot takes a field on the {where} of {grid}, got an array of shape {u.shape}")
-    if kind != "faces" or grid.dim == 1:
+    if kind != "faces":
         return u, kind, []
-    parts = []
-    for a, part in enumerate(grid.split(u)):
-        means = 0.5 * (part + np.roll(part, -1, a))
-        parts.append(means.take(range(grid.shape[a]), a))  # the last face of a bounded axis has no other beyond it
+    if grid.dim == 1:
+        return u, "nodes", []
+    pairs = [(part, np.roll(part, -1, a)) for a, part in enumerate(grid.split(u))]
+    inside = tuple(map(slice, grid.shape))  # the last face of a bounded axis has no other beyond it
+    parts = [0.5 * (lower + upper)[inside] for lower, upper in pairs]
     return np.sqrt(sum(part**2 for part in parts)), "cells", parts
 
 
@@ -156,40 +157,20 @@ def _range(u):
     return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
 
 
-def _places(grid, axis, kind):
-    return grid.coordinates(axis, "cells" if kind == "cells" else "nodes")
+def _lines(grid, axis, kind):
+    """The coordinates that pcolormesh takes along one axis: of nodes, or of the corners of cells."""
+    if kind == "nodes":
+        return grid.coordinates(axis, kind)
+    return grid.origin[axis] + np.append(0.0, np.cumsum(grid.widths[axis]))
 
 
-def _line(grid, u, kind, ax, label):
-    ax.plot(_places(grid, 0, kind), u, marker="." if u.size <= 64 else None)
-    ax.set(xlim=(grid.origin[0], grid.origin[0] + grid.size[0]), xlabel="x", ylabel=label or "")
-
-
-def _mesh(grid, kind, u, axes, ax, **options):
-    """One map of a 2-D array over two axes of the grid -> image."""
-    lines = [grid.coordinates(a, "nodes") for a in axes]
-    if kind == "cells":  # the mesh of pcolormesh is the corners of the cells
-        lines = [np.append(0.0, np.cumsum(grid.widths[a])) + grid.origin[a] for a in axes]
-    ax.set(aspect="equal", xlabel=grid.axes[axes[0]], ylabel=grid.axes[axes[1]])
-    # pcolormesh wants rows along y, so the array is turned here and nowhere else.
-    return ax.pcolormesh(*lines, u.T, **options)
-
-
-def _slices(grid, u, kind, ax, mesh):
-    """The three middle slices of a 3-D field, side by side inside one pair of axes -> image."""
+def _slices(grid, u, kind, ax):
+    """The three middle slices of a 3-D field, side by side inside one pair of axes: (axes, array, its two axes)."""
     ax.set_axis_off()
     for place, across in enumerate((2, 1, 0)):
-        inset = ax.inset_axes((place * 0.33, 0.0, 0.2, 1.0))
-        middle = u.shape[across] // 2
-        image = mesh(np.take(u, middle, axis=across), [axis for axis in range(3) if axis != across], inset)
-        inset.set_title(f"{grid.axes[across]} = {_places(grid, across, kind)[middle]:.3g}", fontsize="medium")
-    return image
-
-
-def _arrows(grid, arrows, ax):
-    steps = tuple(slice(n // ARROWS // 2, None, max(1, -(-n // ARROWS))) for n in grid.shape)
-    x, y = (centre[steps] for centre in grid.centres())
-    ax.quiver(x, y, arrows[0][steps], arrows[1][steps], color="white", pivot="mid")
+        inset, middle = ax.inset_axes((0.35 * place, 0.0, 0.25, 1.0)), u.shape[across] // 2
+        inset.set_title(f"{grid.axes[across]} = {grid.coordinates(across, kind)[middle]:.3g}", fontsize="medium")
+        yield inset, u.take(middle, across), [axis for axis in range(3) if axis != across]
 
 
 # ---------------------------------------------------------------- charts
@@ -224,14 +205,15 @@ def curves(lines, ax, xlabel, ylabel, title=None):
     -------
     matplotlib Axes
     """
-    best = unbeaten([point for x, y in lines.values() for point in zip(x, y)])
+    best = unbeaten([point for x, y in lines.values() for point in zip(x, y) if point[1] > 0])
     ax.plot(*np.reshape(best, (-1, 2)).T, color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
     return _dressed(lines, ax, xlabel, ylabel, title)
 
 
 def _dressed(lines, ax, xlabel, ylabel, title, xscale="log"):
     for name, (x, y) in lines.items():
-        ax.plot(x, y, marker=".", markersize=4, linewidth=1, label=name)
+        heights = np.where(np.greater(y, 0), y, np.nan)  # 0 has no logarithm, and leaves a gap
+        ax.plot(x, heights, marker=".", markersize=4, linewidth=1, label=name)
     ax.set(xlabel=xlabel, ylabel=ylabel, title=title, xscale=xscale, yscale="log")
     if lines:  # a map has none
         ax.grid(visible=True, color="0.93")
@@ -277,9 +259,8 @@ def convergence(best, ax=None, against="iteration"):
     records = [(getattr(record, against), record.value, record.gradient_norm) for record in best.history]
     across, values, norms = np.array(records, float).T
     least = min(values.min(), 0.0)
-    lines = {"loss - least loss" if values.min() <= 0 else "loss": values - least, "gradient norm": norms}
-    # A height of 0 has no logarithm and leaves a gap.
-    lines = {name: (across, np.where(heights > 0, heights, np.nan)) for name, heights in lines.items()}
+    name = "loss - least loss" if values.min() <= 0 else "loss"
+    lines = {name: (across, values - least), "gradient norm": (across, norms)}
     return _dressed(lines, ax, against, "", f"{best.method}: {best.message.split(':')[0]}", xscale="linear")
 
 
@@ -312,11 +293,10 @@ def v_curve(audit, ax=None):
     >>> v_curve(result, figure().add_subplot()).get_xlabel()
     'step'
     """
-    lines: dict = {one.direction: ([], []) for one in audit.lines}
-    for row in audit.rows:
-        if not row["note"] and row["gap"]:  # 0 has no logarithm
-            for axis, value in zip(lines[row["direction"]], (row["step"], abs(row["gap"]))):
-                axis.append(value)
+    lines = {}
+    for one in audit.lines:
+        gaps = [(level.step, abs(level.difference - level.slope) / one.scale) for level in one.line.usable]
+        lines[one.direction] = np.reshape(gaps, (-1, 2)).T
     title = f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}"
     return _dressed(lines, current(ax), "step", "|difference - gradient| / |derivative|", title)
 
@@ -347,12 +327,12 @@ def stability_chart(growth, ax):
 
 def figure():
     """An empty figure that belongs to no window."""
-    return _matplotlib("figure").Figure(figsize=(5.5, 4.4), layout="constrained")
+    return _matplotlib(".figure").Figure(figsize=(5.5, 4.4), layout="constrained")
 
 
 def current(ax):
     """The axes given, or the current ones of pyplot."""
-    return _matplotlib("pyplot").gca() if ax is None else ax
+    return _matplotlib(".pyplot").gca() if ax is None else ax
 
 
 def write_picture(path, draw):
@@ -368,19 +348,21 @@ def sample_file(name):
 
 
 def read_picture(path):
-    """Picture file -> grey values, shape (rows, columns), rows from the top."""
-    _matplotlib()
-    from PIL import Image  # comes with matplotlib, and refuses pictures that would fill the memory
-
-    with Image.open(path) as picture:
+    """Picture file -> grey values, shape (rows, columns), rows from the top; one too large for memory is refused."""
+    with _images().open(path) as picture:
         return np.asarray(picture.convert("F"))
 
 
-def _matplotlib(part=None):
-    """matplotlib or one of its modules, imported when a picture is asked for."""
-    try:
-        import matplotlib
+def _images():
+    """Pillow, which comes with matplotlib."""
+    _matplotlib()
+    return import_module("PIL.Image")
 
-        return __import__(f"matplotlib.{part}", fromlist=[part]) if part else matplotlib
+
+def _matplotlib(part=""):
+    """matplotlib or one of its modules (with the dot), imported when a picture is asked for."""
+    try:
+        import_module("matplotlib")
+        return import_module(f"matplotlib{part}")
     except ImportError as error:
         raise ImportError('pictures need matplotlib; install the extra: pip install "sparsedp[plot]"') from error

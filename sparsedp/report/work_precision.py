@@ -373,13 +373,12 @@ class Rows(Table):
         matplotlib Axes
         """
         ax = plots.current(ax)
-        curves: dict = {}
-        for seconds, gap, row in self._points(error):
-            if gap > 0:
-                curves.setdefault(row["method"], []).append((seconds, gap))
-        lines = {name: np.transpose(sorted(points)) for name, points in curves.items()}
+        lines: dict = {}
+        for seconds, gap, row in sorted(self._points(error), key=lambda point: point[0]):
+            lines.setdefault(row["method"], []).append((seconds, gap))
         if lines:  # nothing has no logarithm
-            plots.curves(lines, ax, "run time [s]", error.replace("_", " "))
+            curves = {name: np.transpose(points) for name, points in lines.items()}
+            plots.curves(curves, ax, "run time [s]", error.replace("_", " "))
         ax.set_title(self.scene)
         return ax
 
