@@ -20,7 +20,7 @@ from sparsedp.ledger import thread
 from sparsedp.packing import joined
 from sparsedp.report.certificate import distance
 from sparsedp.report.stability import SEED, STEADY, growth_of
-from sparsedp.tree import copied, flatten
+from sparsedp.tree import copied, leaves, norm
 
 __all__ = ["CASES", "FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 
@@ -94,9 +94,11 @@ class Scene:
         return run(self.loss, self.at(other))
 
     def sheltered(self, x):
-        """The loss there, NaN whatever it raises: a scene may raise anything."""
-        value = _attempt(self.loss, x)
-        return nan if isinstance(value, Exception) else value
+        """The loss there, NaN whatever it raises."""
+        try:
+            return quietly(self.loss, x)
+        except Exception:  # a scene may raise anything
+            return nan
 
     def growth_at(self, other):
         """How a step grows there."""
@@ -105,7 +107,7 @@ class Scene:
     def legal(self, name, value):
         """Whether a value lies in the range of a parameter; without a range everything does."""
         low, high = self.ranges.get(name, (-inf, inf))
-        return bool(np.all(value >= low) and np.all(value <= high))
+        return np.all((low <= value) & (value <= high))
 
     def fault(self, other):
         """The word for a wrong number: FAILED as given, in stated ranges, and without viscosity."""
@@ -115,44 +117,32 @@ class Scene:
 
 
 class Outcome(NamedTuple):
-    """What one run gave: value and gradient leaves, or the error."""
+    """What one run gave: value and gradient leaves; and what a judge says of the error, if there was one."""
 
     value: float
-    gradient: Any
-    error: Any = None
+    gradient: list
+    refusal: tuple = ()  # the word is right for an error that the library raises on purpose
     flagged: bool = False  # the gradient grew without bound on its way back
-
-    @property
-    def finite(self):
-        return isfinite(self.value) and all(np.all(np.isfinite(g)) for g in self.gradient)
-
-    @property
-    def refusal(self):
-        """What a judge says of the error: one that the library raises on purpose is right."""
-        chance = isinstance(self.error, (np.linalg.LinAlgError, UnicodeError))
-        typed = isinstance(self.error, (SparsedpError, ValueError, TypeError)) and not chance
-        words = " ".join(f"{type(self.error).__name__}: {self.error}".split())
-        return (REFUSED if typed else DEGRADED), nan, words
 
 
 def run(loss, x):
     """Value and gradient of a loss at x -> Outcome; whatever it raises is part of it."""
     grown = thread.grown
-    result = _attempt(value_and_grad(loss), x)
-    if isinstance(result, Exception):
-        return Outcome(nan, [], result)
-    gradient = [np.asarray(g) for g in flatten(result[1])[0] if g is not None]
-    return Outcome(float(result[0]), gradient, None, thread.grown > grown)
+    try:
+        value, gradient = quietly(value_and_grad(loss), x)
+    except Exception as error:  # a scene may raise anything: its row shows it
+        chance = isinstance(error, (np.linalg.LinAlgError, UnicodeError))
+        typed = isinstance(error, (SparsedpError, ValueError, TypeError)) and not chance
+        words = " ".join(f"{type(error).__name__}: {error}".split())
+        return Outcome(nan, [], (REFUSED if typed else DEGRADED, nan, words))
+    return Outcome(float(value), [np.asarray(g) for g in leaves(gradient) if g is not None], (), thread.grown > grown)
 
 
-def _attempt(function, x):
-    """function(x) or what it raises, without warnings."""
+def quietly(function, x):
+    """function(x) without warnings."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        try:
-            return function(x)
-        except Exception as error:  # a scene may raise anything: its row shows it
-            return error
+        return function(x)
 
 
 # ---------------------------------------------------------------- judges: (scene, other values) -> (word, figure, note)
@@ -161,12 +151,13 @@ def _attempt(function, x):
 def finite(scene, other):
     """The run ends with finite numbers, and the gradient agrees with differences. As given, it may not be refused."""
     out = scene.run(other)
-    if out.error is not None:
+    if out.refusal:
         word, *rest = out.refusal
         return FAILED if word == REFUSED and not other else word, *rest
-    if not out.finite:
-        what = f"value {out.value:g}" if not isfinite(out.value) else "the gradient is not finite"
-        return scene.fault(other), nan, f"{what}, and no error"
+    if not isfinite(out.value):
+        return scene.fault(other), nan, f"value {out.value:g}, and no error"
+    if not isfinite(norm(out.gradient)):
+        return scene.fault(other), nan, "the gradient is not finite, and no error"
     return _against_differences(scene, other, out)
 
 
@@ -184,9 +175,9 @@ def near(scene, other, good=0.0, bad=1e-10, note="differs from the plain case", 
     x, base = scene.at(other), scene.base
     before = _bits(x)
     out = run(scene.loss, x)
-    if out.error is not None or base.error is not None:
-        word, *rest = (base if out.error is None else out).refusal
-        return word if good else FAILED, *rest
+    refusal = out.refusal or base.refusal
+    if refusal:
+        return refusal[0] if good else FAILED, *refusal[1:]
     if _bits(x) != before:
         return FAILED, nan, "the input was modified"
     gaps = distance(out.value, base.value, True), distance(out.gradient, base.gradient, True)
@@ -194,7 +185,7 @@ def near(scene, other, good=0.0, bad=1e-10, note="differs from the plain case", 
 
 
 def _bits(x):
-    return [leaf.tobytes() if isinstance(leaf, np.ndarray) else leaf for leaf in flatten(x)[0]]
+    return [leaf.tobytes() for leaf in leaves(x) if isinstance(leaf, np.ndarray)]
 
 
 def _graded(gap, good, bad, note, unit=1.0):
@@ -205,7 +196,7 @@ def _graded(gap, good, bad, note, unit=1.0):
 def scaled(scene, other, power):
     """The value is 2^power times the plain one, exactly."""
     out = scene.run(other)
-    if out.error is not None:
+    if out.refusal:
         return out.refusal
     if abs(log2(abs(scene.base.value)) + power) > LARGEST:
         return DEGRADED, nan, f"the value is {out.value:g}: not representable"
@@ -220,13 +211,13 @@ def refused(scene, other, located=False):
     way), or to name the parameter.
     """
     out = scene.run(other)
-    if out.error is not None:
+    if out.refusal:
         word, figure, words = out.refusal
         place = rf"the first at|got -?(nan|inf)\b|\b{re.escape(next(iter(other)))}\b"
         if word == REFUSED and located and not re.search(place, words):
             return DEGRADED, figure, f"refused without a name or a place: {words}"
         return word, figure, words
-    if located and out.finite:
+    if located and isfinite(norm([out.value, out.gradient])):
         return FAILED, out.value, "swallowed: the value and the gradient are finite"
     return DEGRADED, nan, f"taken without an error; value {out.value:g}"
 
