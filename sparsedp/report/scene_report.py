@@ -5,7 +5,6 @@ The folder gets Markdown, CSV and pictures of each instrument, and a page that s
 
 import contextlib
 import inspect
-import math
 import os
 import re
 import runpy
@@ -21,8 +20,8 @@ from sparsedp.report import plots
 from sparsedp.report.certificate import certify
 from sparsedp.report.plan import explain
 from sparsedp.report.stress_table import stress
-from sparsedp.report.table import Result, markdown_table, write_table
-from sparsedp.report.work_precision import Rows, words_of, workprec
+from sparsedp.report.table import Result, write_table
+from sparsedp.report.work_precision import words_of, workprec
 
 __all__ = ["Source", "audited", "claim", "load", "write_report"]
 
@@ -30,8 +29,7 @@ STARTS = ("start", "x")  # names of the point, the first that is there
 OPTIONS = ("workprec_options", "stress_options")  # dicts of arguments in the file
 PAGE = "report.md"
 NO_PROBLEM = "the file gives no workprec_options (problem, methods, over, reference)"
-GOAL = 0.01  # the error that the page recommends a method for, in a sentence
-GOALS = 0.1, GOAL, 1e-3, 1e-4, 1e-6  # and in a table
+GOALS = 0.1, 0.01, 1e-3, 1e-4, 1e-6  # the errors that the page recommends a method for, as far as one reaches them
 MEANING = {  # the worst first: one that is wrong beats one that is open
     "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
     "inconclusive": "Nothing is proved: the reason stands below. This is no pass.",
@@ -86,10 +84,10 @@ def load(target):
 
 
 @contextlib.contextmanager
-def audited(name, file=None):
+def audited(what, file=""):
     """In it code of the user's runs: it prints to stderr, and what it raises, an exit too, is refused.
 
-    name: of its loss. file: it is the file itself that runs.
+    what: the beginning of the sentence that refuses it. file: where the line at fault is looked for.
     """
     try:
         with contextlib.redirect_stdout(sys.stderr):
@@ -98,10 +96,7 @@ def audited(name, file=None):
         raise
     except BaseException as error:
         cure = "" if isinstance(error, Exception) else "; it ended the program, let it return its value"
-        reason = f"{type(error).__name__}: {error}{cure}"
-        if file is None:
-            raise ValueError(f"{name} cannot be audited: {reason}") from error
-        raise ValueError(f"{file} does not run: {_where(error, str(file))}{reason}") from error
+        raise ValueError(f"{what}: {_where(error, file)}{type(error).__name__}: {error}{cure}") from error
 
 
 def _of_one(loss, x):
@@ -119,7 +114,7 @@ def _run(file):
     before = sys.argv, sys.path
     sys.argv, sys.path = [str(file)], [str(file.resolve().parent), *sys.path]
     try:
-        with audited(file.stem, file):
+        with audited(f"{file} does not run", str(file)):
             return runpy.run_path(str(file), run_name=file.stem)
     finally:
         sys.argv, sys.path = before
@@ -166,7 +161,7 @@ def write_report(source, folder, force=False):
         If a file cannot be written.
     """
     claim(folder, [PAGE], force)
-    with audited(source.name):
+    with audited(f"{source.name} cannot be audited"):
         results = [_attempt(chapter.run, source) for chapter in CHAPTERS]
     words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
     verdict = next(word for word in MEANING if word in words)
@@ -176,13 +171,16 @@ def write_report(source, folder, force=False):
         if isinstance(result, Result):
             told, subject = list(chapter.tell(result)), chapter.failed.partition(":")[0]
             skipped = [f"{subject} left out: {sentence}" for sentence in getattr(result, "left_out", ())]
-            files += _save(folder, chapter, result)
+            text, stem = f"# {chapter.title}\n\n{result.markdown()}", getattr(result, "stem", chapter.stem)
+            files += write_table(folder, stem, text, result.csv(), chapter.draw(result))
         lines += told + skipped
         left += [f"- {sentence}" for sentence in skipped]
         page += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in told)]
-        page += ["", *_goals(result)] if isinstance(result, Rows) else []
-    page += ["", "## What was left out, and why", "", *left, "", *_details(files)]
-    write_file(folder / PAGE, "\n".join(page))
+    page += ["", "## What was left out, and why", "", *left, "", "## Details", ""]
+    names = sorted(path.name for path in files)
+    page += [f"Tables and numbers: {', '.join(f'[{name}]({name})' for name in names)}", ""]
+    page += [f"![{name}]({name})" for name in names if name.endswith(".png")]
+    write_file(folder / PAGE, "\n".join([*page, ""]))
     return verdict, lines
 
 
@@ -194,12 +192,6 @@ def _attempt(run, source):
         return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _save(folder, chapter, result):
-    """Result -> names of its files."""
-    text, stem = f"# {chapter.title}\n\n{result.markdown()}", getattr(result, "stem", chapter.stem)
-    return [path.name for path in write_table(folder, stem, text, result.csv(), chapter.draw(result))]
-
-
 def _audit(audit):
     digits = f", {audit.digits} digits" if audit.digits is not None else ""
     yield f"gradient: {audit.verdict}{digits}{': ' if audit.reason else ''}{audit.reason}"
@@ -208,21 +200,12 @@ def _audit(audit):
 
 
 def _workprec(table):
-    words, row = f"a {table.judged.replace('_', ' ')} of", table.best(GOAL, table.judged)
-    if row is None:
-        yield f"error against run time: no method reaches {words} {GOAL:g}, see {table.stem}.md"
-    else:
-        spent = f"{row['method']} ({words_of(row)}), {table.seconds(row, table.judged):.1e} s"
-        yield f"fastest at {words} {100 * GOAL:g} %: {spent}"
-
-
-def _goals(table):
-    """The fastest method for each error, as lines of a Markdown table."""
-    rows = []
     for goal in GOALS:
-        row = table.best(goal, table.judged) or {"method": "none here", "settings": "{}", table.judged: math.nan}
-        rows.append({**row, "at most": f"{100 * goal:g} %", "settings": words_of(row)})
-    return markdown_table(rows, ("at most", "method", "settings", table.judged, "seconds_forward"))
+        words, row = f"a {table.judged.replace('_', ' ')} of {100 * goal:g} %", table.best(goal, table.judged)
+        if row is None:
+            yield f"error against run time: no method reaches {words}, see {table.stem}.md"
+            return
+        yield f"fastest at {words}: {row['method']} ({words_of(row)}), {table.seconds(row, table.judged):.1e} s"
 
 
 def _certificate(certificate):
@@ -263,9 +246,3 @@ CHAPTERS = (
     Chapter("stress", "Stiff and extreme cases", "stress: not run",
             lambda s: stress(s.loss, s.x, **s.stress), _stress, lambda trial: trial.plot if trial.map else None),
 )  # fmt: skip
-
-
-def _details(names):
-    links = ", ".join(f"[{name}]({name})" for name in sorted(names))
-    pictures = [f"![{name}]({name})" for name in names if name.endswith(".png")]
-    return ["## Details", "", f"Tables and numbers: {links}", "", *pictures, ""]
