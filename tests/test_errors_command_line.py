@@ -111,7 +111,9 @@ def test_the_report(scene, tmp_path, capsys):
     assert "fastest at a gradient error of 1 %: direct" in page
     assert "left out: multigrid hierarchy" in page and "stress left out: 10^4 steps" in page
     assert "may stop at" in page
-    assert "of 1 %: direct (cells=16, method=direct), " in page and "no method reaches a gradient error of 0.1 %" in page
+    assert (
+        "of 1 %: direct (cells=16, method=direct), " in page and "no method reaches a gradient error of 0.1 %" in page
+    )
     answers = page.index("## Which method for which error?"), page.index("## What was left out, and why")
     assert answers[0] < page.index("fastest at") < answers[1] < page.index("left out: multigrid hierarchy")
     table = (out / "point_load.md").read_text(encoding="utf-8")

@@ -37,10 +37,14 @@ CORRECTIONS = 20  # of one evaluation, at most
 ROUNDING = 1e-14  # of the value
 
 
-def distance(one, other, relative=False):
-    """Euclidean distance of two trees, or its share of the second; None counts for nothing."""
-    gap = norm([np.subtract(a, b) for a, b in zip(leaves(one), leaves(other), strict=True) if a is not None])
-    return gap / (norm(other) or 1.0) if relative else gap
+def distance(one, other, unit=None):
+    """Euclidean distance of two trees, relative to a third: by default the second; None counts for nothing."""
+    pairs = [pair for pair in zip(leaves(one), leaves(other), strict=True) if pair[0] is not None]
+    for a, b in pairs:
+        if np.shape(a) != np.shape(b):
+            shapes = f"shape {np.shape(a)} with {np.shape(b)}"
+            raise ValueError(f"workprec cannot compare {shapes}; give compare=function(found, wanted)")
+    return norm([np.subtract(a, b) for a, b in pairs]) / (norm(other if unit is None else unit) or 1.0)
 
 
 # ---------------------------------------------------------------- recorded solves
@@ -188,20 +192,19 @@ def certify(loss, x, target=TARGET):
         raise ValueError(f"certify needs a target between 0 and 1, got {target!r}; write for example target=0.01")
     gradient_of, solves = value_and_grad(loss), RecordedSolves()
     value, gradient = solves.run(gradient_of, x)
-    size = norm(gradient) or 1.0
 
     def corrected(correct):
         return RecordedSolves(solves, correct).run(gradient_of, x)[1]
 
     left = RecordedSolves(solves)
     slope, half = left.run(gradient_of, x)[1], corrected(lambda key: key[1] == "adjoint")
-    causes = {"forward solves": distance(slope, half) / size, "adjoint solves": distance(half, gradient) / size}
-    error, names = distance(slope, gradient) / size, dict.fromkeys(map(_solver, solves))
+    causes = {"forward solves": distance(slope, half, gradient), "adjoint solves": distance(half, gradient)}
+    error, names = distance(slope, gradient), dict.fromkeys(map(_solver, solves))
     rows = []
     for name in names:
         own = slope if len(names) == 1 else corrected(lambda key, name=name: _solver(key) == name)
         mine = [(key[1], solve) for key, solve in solves.items() if _solver(key) == name]
-        rows.append(_row(name, distance(own, gradient) / size, mine))
+        rows.append(_row(name, distance(own, gradient), mine))
     best = RecordedSolves(left).run(loss, x)  # once more: a value tells its own error, and that of the correction
     return Certificate(
         value=value, gradient=gradient, corrected_value=best, corrected_gradient=slope, gradient_error=error,
@@ -389,7 +392,7 @@ class Certified:
         left = self.share / (1.0 - self.share)
         change = abs(new_value if self._value is None else self._value - new_value)
         allowed = max(self.fraction * change, ROUNDING * abs(new_value))
-        exact = left * distance(gradient, new_gradient) <= self.fraction * norm(new_gradient)
+        exact = left * distance(gradient, new_gradient) <= self.fraction
         return exact and left * abs(value - new_value) <= allowed
 
     @property

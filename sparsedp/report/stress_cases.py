@@ -180,7 +180,7 @@ def near(scene, other, good=0.0, bad=1e-10, note="differs from the plain case", 
         return refusal[0] if good else FAILED, *refusal[1:]
     if _bits(x) != before:
         return FAILED, nan, "the input was modified"
-    gaps = distance(out.value, base.value, True), distance(out.gradient, base.gradient, True)
+    gaps = distance(out.value, base.value), distance(out.gradient, base.gradient)
     return _graded(max(gaps), good, bad, note, unit)
 
 

@@ -25,7 +25,7 @@ from sparsedp.report.plan import total
 from sparsedp.report.table import Table, csv_text, write_table
 from sparsedp.tree import leaves
 
-__all__ = ["COLUMNS", "Rows", "relative_distance", "timed", "words_of", "workprec"]
+__all__ = ["COLUMNS", "Rows", "timed", "words_of", "workprec"]
 
 COLUMNS = (
     "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
@@ -111,7 +111,7 @@ def workprec(
     if not methods or not isinstance(methods, dict):
         raise ValueError("workprec needs at least one method; write {'name': {settings}}")
     scene, over, now, rows = scene or getattr(problem, "__name__", "scene"), over or {}, _versions(), []
-    compare = compare or relative_distance
+    compare = compare or distance
     exact = _exact(problem, reference, compare)
     finished = {tuple(map(row.get, KEY)): row for row in _stored(file)}
     other = sum(row["versions"] != now for row in finished.values())
@@ -292,14 +292,6 @@ def _exact(problem, given, compare):
         return known[words]
 
     return exact
-
-
-def relative_distance(one, other):
-    """Euclidean distance relative to the second."""
-    for a, b in zip(map(np.shape, leaves(one)), map(np.shape, leaves(other)), strict=True):
-        if a != b:
-            raise ValueError(f"workprec cannot compare shape {a} with {b}; give compare=function(found, wanted)")
-    return distance(one, other, relative=True)
 
 
 # ---------------------------------------------------------------- the table

@@ -147,7 +147,7 @@ def read_field(path):
     array([0.03125, 0.03125, 0.03125, 0.125  ])
     """
     # A .npy file is mapped into memory, for its header may promise more than it holds.
-    readers: dict[str, Any] = {".npy": partial(np.load, mmap_mode="r"), ".npz": _archive, ".png": plots.read_picture}
+    readers: dict[str, Any] = {".npy": partial(np.load, mmap_mode="r"), ".npz": _only_map, ".png": _turned}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise ValueError(f"{path} is not a .npy, .npz or .png file; save the field with numpy.save")
@@ -160,22 +160,12 @@ def read_field(path):
     except Exception as error:  # foreign bytes fail in many ways, all with the same meaning
         reason = getattr(error, "strerror", None) or error
         raise ValueError(f"{path} cannot be read ({reason}); save the field with numpy.save") from error
-    if isinstance(field, dict):
-        maps = [name for name, array in field.items() if np.ndim(array) == 2]
-        if len(maps) != 1:
-            names = ", ".join(name[:24] for name in (maps or [*field])[:4]) or "nothing"
-            raise ValueError(f"{path} needs exactly one 2-D array, got {len(maps)} among {len(field)} arrays ({names})")
-        field = field[maps[0]]
-    if path.suffix.lower() == ".png":
-        field = field[::-1].T
-    if field.ndim != 2:
-        raise ValueError(f"{path} needs a 2-D array, got shape {field.shape}")
+    if field.ndim != 2 or min(field.shape) < LEAST:
+        raise ValueError(f"{path} needs a 2-D array, {LEAST} values or more along each axis, got shape {field.shape}")
     if field.size > MOST:
         raise ValueError(f"{path} holds {field.size} values, at most {MOST} are taken; thin it out first")
     if field.dtype.kind not in "biuf":
         raise ValueError(f"{path} needs real numbers, got dtype {str(field.dtype)[:40]}; save it as floats")
-    if min(field.shape) < LEAST:
-        raise ValueError(f"{path} needs at least {LEAST} values along each axis, got shape {field.shape}")
     with np.errstate(over="ignore"):
         field = field.astype(float)
     check_finite(path, field, "needs finite values")
@@ -184,7 +174,16 @@ def read_field(path):
     )  # by a power of two: nothing is rounded, nothing overflows
 
 
-def _archive(path):
-    """Path of a .npz file -> {name: array}."""
+def _only_map(path):
+    """Path of a .npz file -> the 2-D array in it."""
     with np.load(path) as archive:
-        return {name: archive[name] for name in archive.files}
+        maps = {name: archive[name] for name in archive.files if np.ndim(archive[name]) == 2}
+        if len(maps) != 1:
+            names = ", ".join(name[:24] for name in list(maps or archive.files)[:4]) or "nothing"
+            raise ValueError(f"it needs exactly one 2-D array, got {len(maps)} among {len(archive.files)}: {names}")
+    return maps.popitem()[1]
+
+
+def _turned(path):
+    """Path of a picture -> field: its rows run from the top."""
+    return plots.read_picture(path)[::-1].T
