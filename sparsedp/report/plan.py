@@ -77,26 +77,25 @@ def explain(loss, x, gradient=True):
     """
     check_function("explain", loss, "lambda x: np.sum(x**2)")
     nodes: list = []
-    turn: list = []  # what is known when the forward pass ends
-    clock = perf_counter()
+    forward: list = []  # what is known when the forward pass ends: time, nodes, bytes, calls, time after counting
 
     def watched(tree):
         value = loss(tree)
-        turn[:] = perf_counter() - clock, len(nodes), bytes_held(nodes), calls.copy()
+        forward[:] = perf_counter(), len(nodes), bytes_held(nodes), calls.copy()
         nodes.clear()
-        turn.append(perf_counter())
+        forward.append(perf_counter())
         return value
 
+    start = perf_counter()
     with recording() as calls, witnessed(lambda node, *_: nodes.append(node)):
-        value = value_and_grad(watched)(x)[0] if gradient else float(watched(x))
-        end = perf_counter()
-    seconds, many, size, forward, resumed = turn
+        value = value_and_grad(watched)(x)[0] if gradient else watched(x)
+    seconds = forward[0] - start, perf_counter() - forward[4]
     totals = {word: total(calls, *kinds) for word, kinds in TOTALS.items()}
     steps = sum(calls[name, "forward"] for name, kind in list(calls) if kind == "recomputed")
     return Plan(
-        value=float(value), counts=calls, totals=totals, rows=_rows(calls), tape_nodes=many,
-        left_out=[*_gradient(x, gradient), *_skipped(calls, forward, gradient), *_extras()],
-        tape_bytes=size + total(calls, "bytes"), seconds=(seconds, end - resumed),
+        value=float(value), counts=calls, totals=totals, rows=_rows(calls), tape_nodes=forward[1],
+        left_out=[*_gradient(x, gradient), *_skipped(calls, forward[3], gradient), *_extras()],
+        tape_bytes=forward[2] + total(calls, "bytes"), seconds=seconds,
         recomputation=1.0 + totals["steps recomputed"] / steps if steps else 1.0,
     )  # fmt: skip
 
@@ -168,9 +167,8 @@ def _how(calls, name):
     """Form or method, and why."""
     words = list(calls.told.get((name, "method"), ()))
     for actor in calls.actors.get(name, {}).values():
-        engine = getattr(actor, "engine", None)
-        if engine is not None:
-            words.append(f"{engine.method}: {actor.reason}")
+        if hasattr(actor, "engine"):
+            words.append(f"{actor.engine.method}: {actor.reason}")
         elif _applied(actor):
             words.append(actor.form)
     return "; ".join(dict.fromkeys(words)) or "rule"
