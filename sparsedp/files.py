@@ -11,6 +11,7 @@ import numpy as np
 
 __all__ = ["UNFINISHED", "load_tree", "save_tree", "write_file"]
 
+SEQUENCES = {"list": list, "tuple": tuple}
 UNFINISHED = ".part"  # how the name of a file ends that is being written, or was when its run was killed
 
 
@@ -118,12 +119,13 @@ def _words(tree, arrays):
         if not all(isinstance(key, str) for key in tree):
             raise TypeError("save needs dicts with strings as keys; write str(key)")
         return {"dict": [[key, _words(branch, arrays)] for key, branch in tree.items()]}
-    if isinstance(tree, (list, tuple)):
-        return {"list" if isinstance(tree, list) else "tuple": [_words(branch, arrays) for branch in tree]}
+    for kind, sequence in SEQUENCES.items():
+        if isinstance(tree, sequence):
+            return {kind: [_words(branch, arrays) for branch in tree]}
     if isinstance(tree, (np.ndarray, np.generic)) and tree.dtype.kind in "biufc":
         arrays.append(np.asarray(tree))
         return {"array": len(arrays)}
-    if tree is None or isinstance(tree, (bool, int, float, str)):
+    if tree is None or isinstance(tree, (int, float, str)):
         return {"value": tree}
     raise TypeError(f"save takes arrays, numbers, strings and None, got {type(tree).__name__}; write np.asarray(value)")
 
@@ -132,7 +134,6 @@ def _tree(words, stored):
     [(kind, value)] = words.items()
     if kind == "dict":
         return {key: _tree(branch, stored) for key, branch in value}
-    if kind in ("list", "tuple"):
-        branches = [_tree(branch, stored) for branch in value]
-        return branches if kind == "list" else tuple(branches)
+    if kind in SEQUENCES:
+        return SEQUENCES[kind](_tree(branch, stored) for branch in value)
     return stored[f"arr_{value}"] if kind == "array" else value

@@ -114,15 +114,11 @@ def timed(name, kind, function, *args):
         return function(*args)
     finally:
         whole = perf_counter() - clock
-        _add(name, kind, whole - thread.inner.pop(), whole)
+        spent(name, kind, whole - thread.inner.pop(), whole)
 
 
-def spent(name, kind, seconds):
-    """Add the seconds of something that was not called through `timed`."""
-    _add(name, kind, seconds, seconds)
-
-
-def _add(name, kind, own, whole):
+def spent(name, kind, own, whole):
+    """Add the seconds of a call: its own, and those of the calls inside it too."""
     if thread.inner:
         thread.inner[-1] += whole
     for calls in thread.calls:

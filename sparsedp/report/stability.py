@@ -16,14 +16,14 @@ from sparsedp.derivative import jvp
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
 from sparsedp.packing import joined
-from sparsedp.tree import flatten, leaves, norm
+from sparsedp.tree import leaves, mapped, norm
 
 __all__ = ["SEED", "STEADY", "Growth", "StabilityMap", "growth_of", "stability_map"]
 
 SEED = 20240229  # of random changes, here and in the stress cases
 STEPS, SETTLED = 40, 20  # steps in all, and those that are measured
 STEADY = 1.0 + 1e-3  # growth factors up to here do not count as growth
-POINTS, DECADES = 9, 2.0  # of the map along each axis; on either side of the values of the scene
+POINTS, AROUND = 9, 100.0  # of the map along each axis; ratio of its ends to the values of the scene
 
 
 class Growth(NamedTuple):
@@ -54,8 +54,7 @@ def growth_of(loss, x, step=None):
 def _first_rollout(loss, x):
     def leave(step, state, params, inputs, n):
         if n:
-            found, rebuild = flatten(inputs)
-            first = rebuild([leaf[0] if isinstance(leaf, np.ndarray) else leaf for leaf in found])
+            first = mapped(lambda leaf: leaf[0] if isinstance(leaf, np.ndarray) else leaf, inputs)
             rest = () if inputs is None else (first,)
             raise Loop(lambda state: step(state, params, *rest), state)
 
@@ -70,19 +69,17 @@ def _first_rollout(loss, x):
 
 
 def _measured(advance, state):
-    change = np.random.default_rng(SEED).standard_normal(Point(state).vector.size)
-    logarithms, flips = [], []
+    change, steps = np.random.default_rng(SEED).standard_normal(Point(state).vector.size), []
     for _ in range(STEPS):
-        before = change / (norm(change) or 1.0)
-        point = Point(state)
-        state, moved = jvp(advance, state, point.unpack(before))
+        before = change / norm(change)
+        state, moved = jvp(advance, state, Point(state).unpack(before))
         change = joined([np.asarray(leaf) for leaf in leaves(moved) if leaf is not None])
         size = norm(change)
         if size == 0 or not np.isfinite(size):
             return Growth(float(size), flips=size > 0)
-        logarithms.append(np.log(size))
-        flips.append(before @ change < 0)
-    return Growth(float(np.exp(np.mean(logarithms[-SETTLED:]))), bool(np.mean(flips[-SETTLED:]) > 0.5))
+        steps.append((np.log(size), before @ change < 0))
+    rate, flips = np.mean(steps[-SETTLED:], axis=0)
+    return Growth(float(np.exp(rate)), bool(flips > 0.5))
 
 
 class StabilityMap(Result):
@@ -109,20 +106,21 @@ class StabilityMap(Result):
 def stability_map(scene):
     """Scene -> StabilityMap, or None where it has no loop, or no named time step and viscosity of one number each."""
     names, known = (scene.time_step, scene.viscosity), scene.leaves
-    here = [known[name].item() for name in names if name and known[name].size == 1 and known[name] > 0]
-    if len(here) < 2 or scene.growth is None or scene.growth.refusal:
+    if scene.growth is None or scene.growth.refusal or not all(name and known[name].size == 1 for name in names):
         return None
-    dts, nus = (_values(value, scene.ranges.get(name)) for name, value in zip(names, here))
+    here = tuple(known[name].item() for name in names)
+    if min(here) <= 0:
+        return None
+    dts, nus = (_values(value, *scene.ranges.get(name, (0, 0))) for name, value in zip(names, here))
 
     def factor(*pair):
         growth = scene.growth_at({name: np.full_like(known[name], value) for name, value in zip(names, pair)})
         return growth.factor if growth else np.nan
 
     factors = np.array([[factor(dt, nu) for nu in nus] for dt in dts])
-    return StabilityMap(names=names, time_steps=dts, viscosities=nus, factors=factors, here=tuple(here))
+    return StabilityMap(names=names, time_steps=dts, viscosities=nus, factors=factors, here=here)
 
 
-def _values(value, limits):
-    if limits is not None and limits[0] > 0:
-        return np.geomspace(limits[0], limits[1], POINTS)
-    return value * 10.0 ** np.linspace(-DECADES, DECADES, POINTS)
+def _values(value, low, high):
+    """Over the range of a parameter, if it has one of positive numbers, or around its value."""
+    return np.geomspace(*((low, high) if low > 0 else (value / AROUND, value * AROUND)), POINTS)

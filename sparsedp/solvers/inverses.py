@@ -148,7 +148,7 @@ def _set_up(solver, clock):
     if recordings:
         count(name, "setup")
         count(name, "hierarchy", int(solver.engine.hierarchical))
-        spent(name, "setup", log.setup_seconds)
+        spent(name, "setup", log.setup_seconds, log.setup_seconds)
     return solver
 
 
