@@ -103,9 +103,9 @@ def run_compile(_):
     for name in LOOPS:
         importlib.import_module(name)
     print(f"compiling {len(team.loops)} loops, those that are not on disk yet", flush=True)
-    start, works = time.perf_counter(), True
-    for loop in bar(team.loops, needed=False, unit="loop", leave=False, disable=None):  # None: where someone watches
-        works = works and loop.compiled is not None
+    start = time.perf_counter()
+    watched = bar(team.loops, needed=False, unit="loop", leave=False, disable=None)  # None: where someone watches
+    works = all(loop.compiled is not None for loop in watched)
     print(f"done in {time.perf_counter() - start:.1f} s" if works else "these loops do not work here; NumPy is used")
     return 0 if works else 1
 

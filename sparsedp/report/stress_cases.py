@@ -148,8 +148,11 @@ def quietly(function, x):
 # ---------------------------------------------------------------- judges: (scene, other values) -> (word, figure, note)
 
 
-def finite(scene, other):
-    """The run ends with finite numbers, and the gradient agrees with differences. As given, it may not be refused."""
+def sound(scene, other):
+    """The run ends with finite numbers, the gradient agrees with differences, and no step grows by fault of the scheme.
+
+    As given it may not be refused; its growth is a case of its own.
+    """
     out = scene.run(other)
     if out.refusal:
         word, *rest = out.refusal
@@ -158,13 +161,8 @@ def finite(scene, other):
         return scene.fault(other), nan, f"value {out.value:g}, and no error"
     if not isfinite(norm(out.gradient)):
         return scene.fault(other), nan, "the gradient is not finite, and no error"
-    return _against_differences(scene, other, out)
-
-
-def steady(scene, other):
-    """As `finite`, and the step at that point does not grow by the fault of the scheme."""
-    verdict = finite(scene, other)
-    growth = verdict[0] == PASSED and scene.growth and scene.growth_at(other)
+    verdict = _against_differences(scene, other, out)
+    growth = scene.growth_at(other) if other and scene.growth and verdict[0] == PASSED else None
     if growth and growth.factor > STEADY and growth.flips:
         return scene.fault(other), growth.factor, "growth factor of a step: unstable, and no error"
     return verdict
@@ -272,7 +270,7 @@ def as_given(scene):
     """The scene as a whole: what stands for a value are the other values of all parameters."""
     rng = np.random.default_rng(SEED)
     moved = [(name, x, rng.choice([-1.0, 1.0], x.shape)) for name, x in scene.leaves.items()]
-    yield "value and gradient", {}, finite
+    yield "value and gradient", {}, sound
     yield "two runs", {}, near
     amplified = partial(near, note="rounding is amplified by {:.0e}", unit=ROUNDING, **DIGITS)
     yield "last digits of x changed", {name: x * (1 + sign * ROUNDING) for name, x, sign in moved}, amplified
@@ -283,7 +281,7 @@ def scalings(scene, name, x):
     """A monomial in a parameter scales exactly; another loss is judged at the new point as it is."""
     degree = _degree(scene, name, x)
     for exponent in (1, -1, 10, -10, 100, -100, 900, -900) if np.any(x) else ():
-        judge = partial(scaled, power=degree * exponent) if degree else steady
+        judge = partial(scaled, power=degree * exponent) if degree else sound
         yield f"times 2^{exponent}", x * 2.0**exponent, judge
 
 
@@ -307,20 +305,20 @@ def legal_range(scene, name, x):
             values["random in its range"] = _random(x, low, high)
         for case, value in values.items():
             if np.all(np.isfinite(value)):
-                yield case, np.zeros_like(x) + value, steady
+                yield case, np.zeros_like(x) + value, sound
 
 
 def zeros_and_signs(scene, name, x):
     if name not in (scene.time_step, scene.viscosity):
-        yield "all 0", 0.0 * x, finite
-        yield "sign changed", -1.0 * x, finite
+        yield "all 0", 0.0 * x, sound
+        yield "sign changed", -1.0 * x, sound
 
 
 def jumps(scene, name, x):
     if x.size > 1 and np.all(x > 0) and name not in scene.ranges:
         half = np.arange(x.size).reshape(x.shape) < x.size // 2
-        yield "jump of 1e8", x * np.where(half, 1e-4, 1e4), finite
-        yield "random over 8 decades", x * 10.0 ** _random(x, -4, 4), finite
+        yield "jump of 1e8", x * np.where(half, 1e-4, 1e4), sound
+        yield "random over 8 decades", x * 10.0 ** _random(x, -4, 4), sound
 
 
 def constants_added(scene, name, x):
@@ -329,7 +327,7 @@ def constants_added(scene, name, x):
         amplified = partial(near, note="amplified by {:.0e}: is a null space left in?")
         yield "plus 1e-14 of itself", x + 1e-14 * rms(x), partial(amplified, unit=1e-14, **DIGITS)
         yield "plus 1e-07 of itself", x + 1e-7 * rms(x), partial(amplified, good=1e-3, bad=0.1, unit=1e-7)
-        yield "plus 1 of itself", x + rms(x), finite
+        yield "plus 1 of itself", x + rms(x), sound
 
 
 def not_finite(scene, name, x):
@@ -357,9 +355,9 @@ def all_integers(scene):
 def factors(scene, name, x):
     if name in (scene.time_step, scene.viscosity):
         for factor in (1e-8, 1e-4, 1e-2, 1e-1, 1e1, 1e2, 1e4, 1e8):
-            yield f"times {factor:g}", x * factor, steady
+            yield f"times {factor:g}", x * factor, sound
     if name == scene.viscosity:
-        yield "0", 0.0 * x, finite
+        yield "0", 0.0 * x, sound
 
 
 def wrong_signs(scene, name, x):
