@@ -165,21 +165,17 @@ def write_report(source, folder, force=False):
         results = [_attempt(chapter.run, source) for chapter in CHAPTERS]
     words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
     verdict = next(word for word in MEANING if word in words)
-    page, left, lines, files = [f"# {source.name}: {verdict}", "", MEANING[verdict]], [], [], []
+    page, lines = [f"# {source.name}: {verdict}", "", MEANING[verdict]], []
     for chapter, result in zip(CHAPTERS, results):
-        told, skipped = [f"{chapter.failed}, {result}"], []
+        told, files = [f"{chapter.subject}: {chapter.failed}, {result}"], []
         if isinstance(result, Result):
-            told, subject = list(chapter.tell(result)), chapter.failed.partition(":")[0]
-            skipped = [f"{subject} left out: {sentence}" for sentence in getattr(result, "left_out", ())]
+            left_out = (f"{chapter.subject} left out: {sentence}" for sentence in getattr(result, "left_out", ()))
+            told = [*chapter.tell(result), *left_out]
             text, stem = f"# {chapter.title}\n\n{result.markdown()}", getattr(result, "stem", chapter.stem)
-            files += write_table(folder, stem, text, result.csv(), chapter.draw(result))
-        lines += told + skipped
-        left += [f"- {sentence}" for sentence in skipped]
-        page += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in told)]
-    page += ["", "## What was left out, and why", "", *left, "", "## Details", ""]
-    names = sorted(path.name for path in files)
-    page += [f"Tables and numbers: {', '.join(f'[{name}]({name})' for name in names)}", ""]
-    page += [f"![{name}]({name})" for name in names if name.endswith(".png")]
+            files = write_table(folder, stem, text, result.csv(), chapter.draw(result))
+        links = (f"{'!' if path.suffix == '.png' else ''}[{path.name}]({path.name})" for path in files)
+        page += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in told), "", *links]
+        lines += told
     write_file(folder / PAGE, "\n".join([*page, ""]))
     return verdict, lines
 
@@ -227,7 +223,8 @@ class Chapter(NamedTuple):
 
     stem: str
     title: str
-    failed: str  # what is said when it fails; with what stands before the colon begins what it left out
+    subject: str  # what its sentences begin with
+    failed: str  # what is said when it fails
     run: Any
     tell: Any
     draw: Any = lambda result: None  # result -> what draws it on axes, or None
@@ -235,14 +232,14 @@ class Chapter(NamedTuple):
 
 # The audit comes first and the stress cases last: both have a say in the verdict.
 CHAPTERS = (
-    Chapter("audit", "Is the gradient right?", "gradient: not audited",
+    Chapter("audit", "Is the gradient right?", "gradient", "not audited",
             lambda s: check.gradient(s.loss, s.x), _audit, lambda audit: partial(plots.v_curve, audit)),
-    Chapter("workprec", "Which method for which error?", "error against run time: not measured",
+    Chapter("workprec", "Which method for which error?", "error against run time", "not measured",
             lambda s: workprec(**s.workprec) if s.workprec else NO_PROBLEM, _workprec,
-            lambda rows: partial(rows.plot, error=rows.judged)),
-    Chapter("certificate", "How exact is the gradient, and how exact need the solves be?", "certificate: not made",
+            lambda rows: rows.plot),
+    Chapter("certificate", "How exact is the gradient, and how exact need the solves be?", "certificate", "not made",
             lambda s: certify(s.loss, s.x), _certificate),
-    Chapter("plan", "What one gradient computes", "plan: not made", lambda s: explain(s.loss, s.x), _plan),
-    Chapter("stress", "Stiff and extreme cases", "stress: not run",
+    Chapter("plan", "What one gradient computes", "plan", "not made", lambda s: explain(s.loss, s.x), _plan),
+    Chapter("stress", "Stiff and extreme cases", "stress", "not run",
             lambda s: stress(s.loss, s.x, **s.stress), _stress, lambda trial: trial.plot if trial.map else None),
 )  # fmt: skip

@@ -351,7 +351,7 @@ class Rows(Table):
         stated = [f"Error of the reference: {max(errors):.1e}."] if errors else []
         return [f"{self.scene}: error against run time"], rows, [first, *apart, *used, "best"], [star, *stated]
 
-    def plot(self, ax=None, error="gradient_error"):
+    def plot(self, ax=None, error=None):
         """Log-log picture: run time across, error up, one curve for each method, the Pareto set marked.
 
         Parameters
@@ -359,12 +359,13 @@ class Rows(Table):
         ax : matplotlib Axes, optional
             Default: the current axes of pyplot.
         error : "gradient_error" or "forward_error"
+            Default: that of the gradient, where there is one.
 
         Returns
         -------
         matplotlib Axes
         """
-        ax = plots.current(ax)
+        ax, error = plots.current(ax), error or self.judged
         lines: dict = {}
         for seconds, gap, row in sorted(self._points(error), key=lambda point: point[0]):
             lines.setdefault(row["method"], []).append((seconds, gap))
@@ -382,7 +383,7 @@ class Rows(Table):
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        return write_table(folder, self.stem, self.markdown(), self.csv(), partial(self.plot, error=self.judged))
+        return write_table(folder, self.stem, self.markdown(), self.csv(), self.plot)
 
 
 # ---------------------------------------------------------------- a file that can be continued
