@@ -23,7 +23,7 @@ __all__ = ["SEED", "STEADY", "Growth", "StabilityMap", "growth_of", "stability_m
 SEED = 20240229  # of random changes, here and in the stress cases
 STEPS, SETTLED = 40, 20  # steps in all, and those that are measured
 STEADY = 1.0 + 1e-3  # growth factors up to here do not count as growth
-POINTS, AROUND = 9, 100.0  # of the map along each axis; ratio of its ends to the values of the scene
+SHARES = np.geomspace(1e-2, 1e2, 9)  # of the time step and viscosity of the scene, along the axes of the map
 
 
 class Growth(NamedTuple):
@@ -105,22 +105,16 @@ class StabilityMap(Result):
 
 def stability_map(scene):
     """Scene -> StabilityMap, or None where it has no loop, or no named time step and viscosity of one number each."""
-    names, known = (scene.time_step, scene.viscosity), scene.leaves
-    if scene.growth is None or scene.growth.refusal or not all(name and known[name].size == 1 for name in names):
+    names = scene.time_step, scene.viscosity
+    here = [scene.leaves[name] for name in names if name]
+    if not scene.growth or scene.growth.refusal or [x.size for x in here] != [1, 1] or min(here) <= 0:
         return None
-    here = tuple(known[name].item() for name in names)
-    if min(here) <= 0:
-        return None
-    dts, nus = (_values(value, *scene.ranges.get(name, (0, 0))) for name, value in zip(names, here))
+    dt, nu = here
 
-    def factor(*pair):
-        growth = scene.growth_at({name: np.full_like(known[name], value) for name, value in zip(names, pair)})
+    def factor(longer, stiffer):
+        growth = scene.growth_at(dict(zip(names, (dt * longer, nu * stiffer))))
         return growth.factor if growth else np.nan
 
-    factors = np.array([[factor(dt, nu) for nu in nus] for dt in dts])
-    return StabilityMap(names=names, time_steps=dts, viscosities=nus, factors=factors, here=here)
-
-
-def _values(value, low, high):
-    """Over the range of a parameter, if it has one of positive numbers, or around its value."""
-    return np.geomspace(*((low, high) if low > 0 else (value / AROUND, value * AROUND)), POINTS)
+    factors = np.array([[factor(longer, stiffer) for stiffer in SHARES] for longer in SHARES])
+    steps, viscosities, place = dt.item() * SHARES, nu.item() * SHARES, (dt.item(), nu.item())
+    return StabilityMap(names=names, time_steps=steps, viscosities=viscosities, factors=factors, here=place)

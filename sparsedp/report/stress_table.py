@@ -76,10 +76,10 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     chosen = GROUPS if only is None else only
     scene = Scene(loss, x, ranges, step, time_step, viscosity)
     rows = [dict(zip(COLUMNS, (*names, *judge()))) for *names, judge in cases(scene, chosen)]
-    skipped = [f"{row['case']}: {row['note']}" for row in rows if not row["outcome"]]
-    rows = [row for row in rows if row["outcome"]]
     ran = {row["group"] for row in rows}
-    skipped += [f"{name}: {GROUPS[name] if name in chosen else 'not asked for'}" for name in GROUPS if name not in ran]
+    skipped = [f"{name}: {GROUPS[name] if name in chosen else 'not asked for'}" for name in GROUPS if name not in ran]
+    if scene.growth is None:
+        skipped.append("growth in one step: no rollout in the loss; give step=lambda x: (advance, state)")
     growth = stability_map(scene) if "time step and viscosity" in chosen else None
     return Stress(rows=rows, left_out=[*skipped, *ELSEWHERE], map=growth)
 

@@ -25,9 +25,7 @@ class Table(Result):
 
     left_out: tuple | list = ()
 
-    _parts: (
-        Any  # () -> (lines above the table, its rows, the names of its columns, lines below it); the first is a title
-    )
+    _parts: Any  # () -> (lines above the table, the first a title; its rows, the names of its columns; lines below it)
 
     def __str__(self):
         above, rows, names, below = self._parts()
@@ -44,17 +42,17 @@ class Table(Result):
 
 def text_table(rows, names):
     """Table -> text in columns."""
-    return table(_cells(rows, names), names)
+    return table([map(row.get, names) for row in rows], names)
 
 
 def markdown_table(rows, names):
     """Table -> lines of Markdown."""
-    cells = [[" ".join(text.split()).replace("|", "\\|") for text in line] for line in (names, *_cells(rows, names))]
+    cells = [[" ".join(text.split()).replace("|", "\\|") for text in line] for line in (names, *_texts(rows, names))]
     head, *body = [f"| {' | '.join(line)} |" for line in cells]
     return [head, f"|{'---|' * len(names)}", *body]
 
 
-def _cells(rows, names):
+def _texts(rows, names):
     return [[text_of(row.get(name)) for name in names] for row in rows]
 
 
