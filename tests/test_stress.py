@@ -118,6 +118,11 @@ def test_a_wrong_gradient_and_a_swallowed_nan_fail():
     assert (
         dp.stress(lambda u: anp.sum(off(u)), START).failures[0]["note"] == "the differences settle on another gradient"
     )
+    lost = dp.differentiable("lost", lambda u: u**3, lambda nums, ans, u: lambda g: (0.0 * g,))
+    assert dp.stress(lambda u: anp.sum(lost(u)), START).failures[0]["note"] == (
+        "the gradient is 0, the differences are not"
+    )
+    assert dp.stress(lambda u: 1.0 + anp.sum(u**2), 0 * START, only=["as given"])  # as it should be
     swallow = lambda u: anp.sum(anp.where(anp.isfinite(u), u, 0.0) ** 2)
     failed = dp.stress(swallow, START, only=["not finite"]).failures
     assert {row["case"] for row in failed} >= {"one nan"} and "swallowed" in failed[0]["note"]

@@ -125,7 +125,8 @@ def test_failures_keep_their_row():
     )
     assert wide.rows[0]["status"].startswith("reference: ValueError")
     with pytest.raises(
-        ValueError, match=r"workprec cannot compare shape \(3,\) with \(4,\); give compare=function\(found, wanted\)"
+        ValueError,
+        match=r"workprec cannot compare shapes \[\(3,\)\] with \[\(4,\)\]; give compare=function\(found, wanted\)",
     ):
         work_precision.distance(np.ones(3), np.ones(4))
     short = lambda found, wanted: abs(np.sum(found) - np.sum(wanted))

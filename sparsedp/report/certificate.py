@@ -39,12 +39,11 @@ ROUNDING = 1e-14  # of the value
 
 def distance(one, other, unit=None):
     """Euclidean distance of two trees, relative to a third: by default the second; None counts for nothing."""
-    pairs = [pair for pair in zip(leaves(one), leaves(other), strict=True) if pair[0] is not None]
-    for a, b in pairs:
-        if np.shape(a) != np.shape(b):
-            shapes = f"shape {np.shape(a)} with {np.shape(b)}"
-            raise ValueError(f"workprec cannot compare {shapes}; give compare=function(found, wanted)")
-    return norm([np.subtract(a, b) for a, b in pairs]) / (norm(other if unit is None else unit) or 1.0)
+    found, wanted = ([np.shape(leaf) for leaf in leaves(tree)] for tree in (one, other))
+    if found != wanted:
+        raise ValueError(f"workprec cannot compare shapes {found} with {wanted}; give compare=function(found, wanted)")
+    gaps = [np.subtract(a, b) for a, b in zip(leaves(one), leaves(other)) if a is not None]
+    return norm(gaps) / (norm(other if unit is None else unit) or 1.0)
 
 
 # ---------------------------------------------------------------- recorded solves

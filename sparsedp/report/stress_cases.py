@@ -238,15 +238,19 @@ def growing(scene, _):
 
 
 def _against_differences(scene, other, out):
-    """The gradient against central differences along itself: one that meets it is enough, else all are judged."""
+    """The gradient against central differences along itself (a random direction, where it is 0).
+
+    One difference that meets it is enough, else all are judged.
+    """
     point, gradient = Point(scene.at(other)), joined([np.conj(g) for g in out.gradient])
-    if not np.any(gradient):
-        return PASSED, 0.0, "gradient 0"
     name, direction = point.directions(gradient, 1, generator(SEED), ("random 1", "gradient").__contains__)[-1]
     trials = Trials(scene.sheltered, point, out.gradient)
     trials.base, trials.gradient = out.value, gradient
     line = Line(name, direction, trials)
     if abs(line.slope) <= UNSEEN * abs(out.value):
+        line.sweep(DIFFERENCES)
+        if judgement(line).word == "disagrees":
+            return FAILED, inf, "the gradient is 0, the differences are not"
         return PASSED, 0.0, "the gradient is smaller than differences can see"
     for steps in DIFFERENCES[:1], DIFFERENCES:
         line.sweep(steps)
