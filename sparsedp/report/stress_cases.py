@@ -1,6 +1,6 @@
 """The stress cases of a scene: extreme values of its parameters, and what has to come out of each.
 
-CASES is the table: for each group a function that lists its cases, the values to try and the judge of what comes out.
+GROUPS is the table: for each group a function that lists its cases, the values to try and the judge of what comes out.
 """
 
 import re
@@ -22,7 +22,7 @@ from sparsedp.report.certificate import distance
 from sparsedp.report.stability import SEED, STEADY, growth_of
 from sparsedp.tree import copied, leaves, norm
 
-__all__ = ["CASES", "FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
+__all__ = ["FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 
 WORDS = PASSED, REFUSED, DEGRADED, FAILED = "passed", "refused correctly", "degraded", "FAILED"
 TIME_STEPS, VISCOSITIES = ("dt", "time_step", "tau"), ("nu", "viscosity", "diffusivity", "kappa", "mu")
@@ -34,19 +34,6 @@ ROUNDING = 8 * EPS  # change of x in its last digits
 DIGITS = {"good": 1e-8, "bad": 1e-5}  # changes of the result by a change in the last digits: allowed, and too large
 FINER = 8.0  # of the time step, to tell physics that grows from a step that does
 LARGEST = 960  # power of 2 up to which a value is sure to be representable
-
-# Group -> why it may have no case in a scene.
-GROUPS = {
-    "as given": "",
-    "scaling": "every parameter is 0, or its range leaves no room",
-    "legal range": "no ranges were given; write ranges={'name': (low, high)}",
-    "zeros and signs": "outside the legal ranges",
-    "jumps": "no array of positive numbers or with a range",
-    "constant added": "no array that is not 0",
-    "not finite": "the loss depends on no parameter",
-    "kinds of arrays": "no arrays",
-    "time step and viscosity": "no parameter has such a name; write time_step='name', viscosity='name'",
-}
 
 
 # ---------------------------------------------------------------- a scene, and a run of it
@@ -268,13 +255,13 @@ def _against_differences(scene, other, out):
 # ---------------------------------------------------------------- cases: (scene, name, x) -> case, other x, judge
 
 
-def as_given(scene):
-    """The scene as a whole: what stands for a value are the other values of all parameters."""
+def as_given(scene, *_):
     rng = np.random.default_rng(SEED)
     moved = [(name, x, rng.choice([-1.0, 1.0], x.shape)) for name, x in scene.leaves.items()]
     yield "value and gradient", {}, sound
     yield "two runs", {}, near
     amplified = partial(near, note="rounding is amplified by {:.0e}", unit=ROUNDING, **DIGITS)
+    yield "all integers", {name: x.astype(int) for name, x in scene.leaves.items()}, refused
     yield "last digits of x changed", {name: x * (1 + sign * ROUNDING) for name, x, sign in moved}, amplified
     if scene.growth:
         yield "growth in one step", {}, growing
@@ -357,10 +344,6 @@ def kinds_of_arrays(scene, name, x):
             yield f"shape {other.shape}, {other.dtype}", other, refused
 
 
-def all_integers(scene):
-    yield "all integers", {name: x.astype(int) for name, x in scene.leaves.items()}, refused
-
-
 def factors(scene, name, x):
     for factor in (1e-8, 1e-4, 1e-2, 1e-1, 1e1, 1e2, 1e4, 1e8) if name in (scene.time_step, scene.viscosity) else ():
         yield f"times {factor:g}", x * factor, sound
@@ -369,30 +352,32 @@ def factors(scene, name, x):
 class Group(NamedTuple):
     """Cases of one kind."""
 
-    name: str
-    cases: Any  # of one parameter; of the scene as a whole where `whole` is set
-    whole: bool = False
+    cases: Any  # (scene, name, x) of one parameter -> case, other x, judge
+    reason: str  # why it may have no case in a scene
     legal: bool = False  # values outside the range of a parameter are left out, but those that have to be refused
 
 
-CASES = (
-    Group("as given", as_given, whole=True),
-    Group("scaling", scalings, legal=True),
-    Group("legal range", legal_range),
-    Group("zeros and signs", zeros_and_signs, legal=True),
-    Group("jumps", jumps),
-    Group("constant added", constants_added, legal=True),
-    Group("not finite", not_finite),
-    Group("kinds of arrays", kinds_of_arrays),
-    Group("kinds of arrays", all_integers, whole=True),
-    Group("time step and viscosity", factors, legal=True),
-)
+WHOLE = "as given"  # of the scene as a whole: what stands for another x are the other values of all parameters
+GROUPS = {
+    WHOLE: Group(as_given, ""),
+    "scaling": Group(scalings, "every parameter is 0, or its range leaves no room", legal=True),
+    "legal range": Group(legal_range, "no ranges were given; write ranges={'name': (low, high)}"),
+    "zeros and signs": Group(zeros_and_signs, "outside the legal ranges", legal=True),
+    "jumps": Group(jumps, "no array of positive numbers or with a range"),
+    "constant added": Group(constants_added, "no array that is not 0", legal=True),
+    "not finite": Group(not_finite, "the loss depends on no parameter"),
+    "kinds of arrays": Group(kinds_of_arrays, "no arrays"),
+    "time step and viscosity": Group(
+        factors, "no parameter has such a name; write time_step='name', viscosity='name'", legal=True
+    ),
+}
 
 
 def cases(scene, groups):
     """Scene and names of groups -> (group, parameter, case, function that gives (word, figure, note))."""
-    for group in (group for group in CASES if group.name in groups):
-        for name, x in [("", None)] if group.whole else scene.leaves.items():
-            for case, value, judge in group.cases(scene) if group.whole else group.cases(scene, name, x):
-                if not group.legal or judge is refused or scene.legal(name, value):
-                    yield group.name, name, case, partial(judge, scene, value if group.whole else {name: value})
+    for group in groups:
+        whole, legal = group == WHOLE, GROUPS[group].legal
+        for name, x in [("", None)] if whole else scene.leaves.items():
+            for case, value, judge in GROUPS[group].cases(scene, name, x):
+                if not legal or judge is refused or scene.legal(name, value):
+                    yield group, name, case, partial(judge, scene, value if whole else {name: value})

@@ -73,11 +73,13 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     for group in only or ():
         if group not in GROUPS:
             raise ValueError(f"stress has no cases {group!r}; write some of {', '.join(GROUPS)}")
-    chosen = GROUPS if only is None else only
+    chosen = [name for name in GROUPS if only is None or name in only]
     scene = Scene(loss, x, ranges, step, time_step, viscosity)
     rows = [dict(zip(COLUMNS, (*names, *judge()))) for *names, judge in cases(scene, chosen)]
     ran = {row["group"] for row in rows}
-    skipped = [f"{name}: {GROUPS[name] if name in chosen else 'not asked for'}" for name in GROUPS if name not in ran]
+    skipped = [
+        f"{name}: {GROUPS[name].reason if name in chosen else 'not asked for'}" for name in GROUPS if name not in ran
+    ]
     if scene.growth is None:
         skipped.append("growth in one step: no rollout in the loss; give step=lambda x: (advance, state)")
     growth = stability_map(scene) if "time step and viscosity" in chosen else None
