@@ -41,6 +41,16 @@ def test_errors_at_the_start_are_not_hidden():
         dp.minimize(lambda x: 1.0, start, gradient=lambda x: {"a": 1.0, "b": np.array([[1, np.nan], [1, 1]])})
 
 
+@pytest.mark.parametrize("method", ["gauss_newton", "levenberg_marquardt", "newton_cg"])
+def test_a_wrong_derivative_is_no_convergence(method):
+    """A rule with the wrong sign: no point is lower along it, and that is no rounding."""
+    wrong = dp.differentiable("wrong", lambda x: x**2, lambda nums, y, x: lambda g: (-2 * x * g,))
+    loss = (lambda x: anp.sum(wrong(x))) if method == "newton_cg" else (lambda x: wrong(x) + 1.0)
+    best = dp.minimize(loss, np.ones(2), method)
+    assert not best.converged and np.array_equal(best.x, np.ones(2))
+    assert best.message.endswith("dp.check.gradient(loss, x) tells whether the gradient is right")
+
+
 def test_methods_and_options():
     with pytest.raises(
         ValueError, match="method must be one of lbfgs, gd, adam, newton_cg, .*, physical_gradient, got 'newton'"

@@ -9,13 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.fields import check_function, is_number
+from sparsedp.errors import ShapeError
+from sparsedp.fields import check_finite, check_function, is_number
 from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.linearised import Linearised, singular
 
-__all__ = ["Direction", "Family", "update_direction"]
+__all__ = ["Direction", "Family", "form_of", "update_direction"]
 
-DENSE, DENSE_SIDE = 3e7, 4000  # entries of a Jacobian (240 MB), and its shorter side, above which it is not formed
+FORMS = {"auto": None, "dense": True, "krylov": False}  # whether the Jacobian is formed; None: when it is small
 SETTLED = 1e-9  # relative change of the direction at which the bidiagonalisation stops
 EXHAUSTED = 1e-13  # relative size below which a new basis vector is rounding
 CANCELLED = 0.1  # a vector of which less is left after Gram and Schmidt's pass gets a second one
@@ -44,7 +45,11 @@ class Direction(NamedTuple):
 
 
 class Family:
-    """Which update direction, and how it is found.
+    """Which update direction.
+
+    Where J is formed its singular values come group by group from Gram matrices, as exact as from an SVD. Else Golub
+    and Kahan's bidiagonalisation with full reorthogonalisation takes products with J and J^T alone, and memory
+    rank (m + n).
 
     Parameters
     ----------
@@ -54,47 +59,33 @@ class Family:
         >= 0, added to the squares of the singular values.
     truncation : float
         Singular values below this share of the largest are left out.
-    method : "auto", "dense" or "krylov"
-        dense: J is formed, and its singular values come group by group from Gram matrices, as exact as from an SVD.
-        krylov: Golub-Kahan bidiagonalisation with full reorthogonalisation from products with J and J^T alone; memory
-        rank (m + n).
     rank : int or None
         Most steps of the bidiagonalisation; None: until the direction has settled.
     """
 
-    def __init__(self, power=0.75, damping=0.0, truncation=1e-10, method="auto", rank=None):
+    def __init__(self, power=0.75, damping=0.0, truncation=1e-10, rank=None):
         if not (is_number(power) and 0 <= power <= 1):
             raise ValueError(f"power must be from 0 to 1, got {power!r}; 0.75 gives half-inverse gradients")
         if not (is_number(damping) and 0 <= damping < np.inf):
             raise ValueError(f"damping must be finite and >= 0, got {damping!r}; the default is 0")
         if not (is_number(truncation) and 0 <= truncation < 1):
             raise ValueError(f"truncation must be from 0 to below 1, got {truncation!r}; the default is 1e-10")
-        if method not in ("auto", "dense", "krylov"):
-            raise ValueError(f"method must be auto, dense or krylov, got {method!r}")
         if rank is not None and not (isinstance(rank, int) and rank >= 1):
             raise ValueError(f"rank must be a whole number >= 1, got {rank!r}; leave it out for no limit")
         self.power, self.damping, self.truncation = float(power), float(damping), float(truncation)
-        self.method, self.rank = method, rank
+        self.rank = rank
 
     def __call__(self, linearised, g):
         """Flat Direction for a flat cotangent g of the outputs."""
-        if self.forms(*linearised.shape):
-            return self.dense(linearised.rows(), g)
-        return self.krylov(linearised, g)
-
-    def forms(self, rows, columns):
-        """Whether J is formed."""
-        fits = rows * columns <= DENSE and min(rows, columns) <= DENSE_SIDE
-        return self.method == "dense" or (self.method == "auto" and fits)
+        return self.dense(linearised.rows(), g) if linearised.dense else self.krylov(linearised, g)
 
     def dense(self, jacobian, g):
         """Direction from J itself, m x n: (J^T J + damping)^(-power) J^T g, or with J J^T where that is smaller."""
         wide = len(jacobian) <= jacobian.shape[1]
         vectors, s = singular(jacobian if wide else jacobian.T)
         shares, kept = self._shares(s)
-        if wide:
-            return Direction((vectors @ (shares * (g @ vectors))) @ jacobian, s, kept, "dense")
-        return Direction(vectors @ (shares * (g @ jacobian @ vectors)), s, kept, "dense")
+        weights = vectors @ (shares * ((g if wide else g @ jacobian) @ vectors))
+        return Direction(weights @ jacobian if wide else weights, s, kept, "dense")
 
     def krylov(self, linearised, g):
         """Direction from products with J and J^T.
@@ -173,7 +164,14 @@ class _Rows:
         return size
 
 
-def update_direction(outputs, x, g=None, **options):
+def form_of(word):
+    """Whether the Jacobian is formed: True, False, or None for when it is small."""
+    if word not in tuple(FORMS):
+        raise ValueError(f"method must be auto, dense or krylov, got {word!r}")
+    return FORMS[word]
+
+
+def update_direction(outputs, x, g=None, method="auto", apart=False, **options):
     """Function and point -> the direction J^T (J J^T + damping)^(-power) g, with the spectrum of J.
 
     Parameters
@@ -183,10 +181,13 @@ def update_direction(outputs, x, g=None, **options):
     x : array, or any nesting of them; n floating numbers
     g : array like outputs(x), optional
         The cotangent, dL/dy. Default: the outputs themselves, the gradient of half their sum of squares.
+    method : "auto", "dense" or "krylov"
+        Whether J is formed; auto: when it is small.
+    apart : bool
+        As in `minimize`.
     **options
-        power=0.75 (0: gradient, 3/4: half-inverse, 1: Gauss-Newton), damping=0.0, truncation=1e-10,
-        method="auto" | "dense" | "krylov", rank=None, apart=False. truncation: singular values below this share
-        of the largest are left out; rank: at most so many are kept; apart: as in `minimize`.
+        power=0.75 (0: gradient, 3/4: half-inverse, 1: Gauss-Newton), damping=0.0, truncation=1e-10, rank=None.
+        truncation: singular values below this share of the largest are left out; rank: at most so many are kept.
 
     Returns
     -------
@@ -214,9 +215,12 @@ def update_direction(outputs, x, g=None, **options):
     array([4., 1.])
     """
     check_function("update_direction", outputs, "lambda x: A @ x - b")
-    apart = bool(options.pop("apart", False))
     family, packing = Family(**options), Unknowns(x)
-    linearised = Linearised(outputs, packing, packing.pack(x), apart=apart)
-    cotangent = linearised.flat if g is None else linearised.like(g)
-    found = family(linearised, cotangent)
+    linearised = Linearised(outputs, packing, packing.pack(x), apart=apart, dense=form_of(method))
+    g = linearised.value if g is None else g
+    if np.shape(g) != linearised.value.shape:
+        shape = linearised.value.shape
+        raise ShapeError(f"the cotangent must have the shape {shape} of the outputs, got {np.shape(g)}")
+    check_finite("the cotangent", g)
+    found = family(linearised, np.asarray(g, dtype=float).reshape(-1))
     return found._replace(step=packing.unpack(found.step))

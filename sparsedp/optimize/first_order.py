@@ -15,7 +15,6 @@ from sparsedp.tree import norm
 __all__ = ["Adam", "AdamState", "Descent", "DescentState"]
 
 HALVINGS = 60
-ENOUGH = 1e-4  # share of the predicted decrease that a line search asks for (Armijo)
 
 
 class DescentState(NamedTuple):
@@ -82,19 +81,15 @@ def backtracked(here, step, trials, along):
     Stuck
         When there is none; `along` names the step.
     """
-    refused, share = False, 1.0
-    for _ in range(HALVINGS):
-        point = trials.box.inside(here.vector + share * step)
-        fall = float(np.dot(here.vector - point, here.slope))
-        trial = trials(point, here.value)
-        if trial.value < here.value and trial.value <= here.value - ENOUGH * fall:
-            return trial, share
-        refused |= trial.refused
-        if abs(fall) <= here.rounding:  # below 0 where bounds turn a long step uphill: a shorter one may do
-            break
-        share *= 0.5
-    hopeless = not refused and abs(fall) <= 100 * share * here.rounding
-    raise Stuck("rounding" if hopeless else f"no lower point along {along}")
+
+    def halved():
+        for count in range(HALVINGS):
+            share = 0.5**count
+            point = trials.box.inside(here.vector + share * step)
+            yield point, float(np.dot(here.vector - point, here.slope)), share
+
+    trial, _, share = trials.lower(here, halved(), f"no lower point along {along}")
+    return trial, share
 
 
 def admissible(point, step, share, trials):

@@ -8,7 +8,7 @@ import numpy as np
 from sparsedp.fields import check_finite
 from sparsedp.packing import Packing, joined
 from sparsedp.tape import is_variable
-from sparsedp.tree import leaves, mapped
+from sparsedp.tree import leaves
 
 __all__ = ["Unknowns", "power_of_two"]
 
@@ -28,15 +28,6 @@ class Unknowns(Packing):
     def join(self, tree):
         """The floating leaves of a tree that may be traced, as one traced vector."""
         return anp.concatenate([anp.reshape(leaf, (-1,)) for leaf in compress(leaves(tree), self._floating)])
-
-    def copies(self, tree, count):
-        """Every floating leaf with a new leading axis of so many copies of itself; read-only, they share memory."""
-        return mapped(lambda x: np.broadcast_to(x, (count, *np.shape(x))) if is_variable(x) else x, tree)
-
-    def pack_copies(self, tree, out):
-        """Tree as `copies` gives it -> one packed row of `out` for each copy."""
-        floating = compress(leaves(tree), self._floating)
-        np.concatenate([np.reshape(leaf, (len(out), -1)) for leaf in floating], axis=1, out=out)
 
 
 def power_of_two(value):

@@ -9,9 +9,9 @@ import numpy as np
 import scipy.linalg
 from scipy.sparse.linalg import LinearOperator, lsmr
 
-from sparsedp.optimize.directions import Family
+from sparsedp.optimize.directions import Family, form_of
 from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked, is_positive
-from sparsedp.optimize.result import Stuck, Trial
+from sparsedp.optimize.result import Trial
 from sparsedp.tree import norm
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
@@ -29,8 +29,13 @@ class SquaresState(NamedTuple):
     share: float = 1.0
 
 
-def _damped(jacobian, r, damping):
-    """By Cholesky of J J^T + damping or J^T J + damping: far faster than by singular values."""
+def _backwards(jacobian, r, damping):
+    """From the minimum of |J d + r|^2 + damping |d|^2 to the point.
+
+    Where that is exact, by Cholesky of J J^T + damping or J^T J + damping: far faster than by singular values.
+    """
+    if damping <= EXACT * np.linalg.norm(jacobian) ** 2:
+        return Family(1.0, damping, ROUNDING).dense(jacobian, r).step
     wide = len(jacobian) < jacobian.shape[1]
     gram = jacobian @ jacobian.T if wide else jacobian.T @ jacobian
     gram.flat[:: len(gram) + 1] += damping
@@ -55,18 +60,13 @@ class GaussNewton:
     residuals, searches = True, True
 
     def __init__(self, apart=False, dense=None):
-        self.apart, self.method = bool(apart), {None: "auto", True: "dense", False: "krylov"}[dense]
-
-    def family(self, damping=0.0):
-        """The direction to the minimum of |J d + r|^2 + damping |d|^2, backwards."""
-        return Family(1.0, damping, ROUNDING, self.method)
+        self.apart, self.dense = bool(apart), dense
 
     def step(self, linearised, damping=0.0):
-        """The step to that minimum."""
-        family, r = self.family(damping), linearised.flat
-        if family.forms(*linearised.shape):
-            cheap = damping > EXACT * np.linalg.norm(linearised.rows()) ** 2
-            return -_damped(linearised.rows(), r, damping) if cheap else -family(linearised, r).step
+        """The step to the minimum of |J d + r|^2 + damping |d|^2."""
+        r = linearised.flat
+        if linearised.dense:
+            return -_backwards(linearised.rows(), r, damping)
         product = LinearOperator(linearised.shape, linearised.push, linearised.pull, dtype=float)
         return -lsmr(product, r, damp=np.sqrt(damping), atol=FORCING, btol=FORCING, conlim=CONDITION)[0]
 
@@ -77,8 +77,7 @@ class GaussNewton:
     def advance(self, state, trials):
         """One iteration. Raises Stuck when no lower point is found."""
         step = self.step(trials.linearised(state.trial))
-        trial, _ = backtracked(state.trial, step, trials, "the Gauss-Newton step")
-        return state._replace(trial=trial)
+        return state._replace(trial=backtracked(state.trial, step, trials, "the Gauss-Newton step")[0])
 
 
 class LevenbergMarquardt(GaussNewton):
@@ -105,24 +104,21 @@ class LevenbergMarquardt(GaussNewton):
     def advance(self, state, trials):
         """One iteration: one Jacobian, as many dampings as it takes. Raises Stuck when none is large enough."""
         here, linearised = state.trial, trials.linearised(state.trial)
-        damping, growth = state.damping or self.damping * self.largest(linearised) or 1.0, 2.0
-        for _ in range(HALVINGS):
-            step = self.step(linearised, damping)
-            point = trials.box.inside(here.vector + step)
-            trial, change = trials(point, here.value), linearised.push(point - here.vector)
-            predicted = -float(np.dot(change, linearised.flat + 0.5 * change))
-            if trial.value < here.value:
-                gain = (here.value - trial.value) / predicted if predicted > 0 else 0.0
-                return SquaresState(trial, damping * max(1 / 3, 1 - (2 * gain - 1) ** 3))
-            if abs(predicted) <= here.rounding:  # below 0 where a bound bends a long step uphill: a shorter one may do
-                break
-            damping, growth = damping * growth, 2 * growth
-        hopeless = abs(predicted) <= 100 * here.rounding
-        raise Stuck("rounding" if hopeless else "no damping gives a lower point")
+
+        def damped():
+            damping, growth = state.damping or self.damping * self.largest(linearised) or 1.0, 2.0
+            for _ in range(HALVINGS):
+                point = trials.box.inside(here.vector + self.step(linearised, damping))
+                change = linearised.push(point - here.vector)
+                yield point, -float(np.dot(change, linearised.flat + 0.5 * change)), damping
+                damping, growth = damping * growth, 2 * growth
+
+        trial, gain, damping = trials.lower(here, damped(), "no damping gives a lower point")
+        return SquaresState(trial, damping * max(1 / 3, 1 - (2 * gain - 1) ** 3))
 
     def largest(self, linearised):
         """The largest diagonal entry of J^T J; where J is not formed, that along the gradient."""
-        if self.family().forms(*linearised.shape):
+        if linearised.dense:
             return float(np.max(np.linalg.norm(linearised.rows(), axis=0), initial=0.0)) ** 2
         slope = linearised.pull(linearised.flat)
         return norm(linearised.push(slope / (norm(slope) or 1.0))) ** 2
@@ -149,11 +145,8 @@ class HalfInverse(GaussNewton):
     def __init__(self, rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto"):
         if not is_positive(rate):
             raise ValueError(f"half_inverse needs a positive rate, got {rate!r}; the default is 1")
-        self.rate, self.apart, self._family = rate, bool(apart), Family(power, 0.0, truncation, form, rank)
-
-    def family(self, damping=0.0):
-        """The direction with these options; it is not damped."""
-        return self._family
+        super().__init__(apart, form_of(form))
+        self.rate, self._family = rate, Family(power, 0.0, truncation, rank)
 
     def advance(self, state, trials):
         """One iteration, on the batch of the present one."""

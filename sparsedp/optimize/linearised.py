@@ -10,10 +10,12 @@ from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite
 from sparsedp.optimize.flat import power_of_two
 from sparsedp.tape import is_variable
-from sparsedp.tree import leaves
+from sparsedp.tree import leaves, mapped
 
 __all__ = ["Linearised", "singular"]
 
+DENSE, DENSE_SIDE = 3e7, 4000  # entries of a Jacobian (240 MB), and its shorter side, above which it is not formed
+MOST = 4000  # unknowns of which the covariance is found, 128 MB
 GRADE = 1e-4  # singular values below this share of the largest wait for a Gram matrix of their own
 PLAIN = 2.0**-500, 2.0**500  # entries of a Gram matrix that need no scaling
 
@@ -37,6 +39,16 @@ class Linearised:
     apart : bool
         The outputs along axis 0 depend on nothing but their own copy of x. Then x is handed over with a leading axis
         of copies, one for each of the s samples, and m / s products with J^T give all rows.
+    dense : bool or None
+        Whether J is formed; None: when it is small.
+
+    Attributes
+    ----------
+    value, flat : array
+        The outputs, and the same as m doubles.
+    shape : (m, n)
+    dense : bool
+        Whether J is formed.
 
     Raises
     ------
@@ -46,7 +58,7 @@ class Linearised:
         If an output is NaN or infinite.
     """
 
-    def __init__(self, outputs, packing, vector, rest=(), apart=False):
+    def __init__(self, outputs, packing, vector, rest=(), apart=False, dense=None):
         self._outputs, self._packing, self._apart = lambda x: outputs(x, *rest), packing, apart
         self._tree, self._free = packing.unpack(vector), True
         self._pull = self._jacobian = None
@@ -60,7 +72,10 @@ class Linearised:
             raise DerivativeError("this method takes real numbers, got complex ones; split them into two real arrays")
         check_finite("an output", self.value)
         self.flat = self.value.reshape(-1).astype(float)
-        self.shape = (self.flat.size, packing.size)
+        self.shape = rows, columns = self.flat.size, packing.size
+        small = rows * columns <= DENSE and min(rows, columns) <= DENSE_SIDE
+        self.dense = small if dense is None else dense
+        self._forward = columns < rows and not apart  # fewer products give the columns than the rows
 
     def among(self, free):
         """The same where the unknowns that are not free stand still: their columns of J are 0.
@@ -71,20 +86,14 @@ class Linearised:
         other._free = free
         return self if free.all() else other
 
-    def like(self, g):
-        """A cotangent of the outputs, flat."""
-        if np.shape(g) != self.value.shape:
-            raise ShapeError(f"the cotangent must have the shape {self.value.shape} of the outputs, got {np.shape(g)}")
-        check_finite("the cotangent", g)
-        return np.asarray(g, dtype=float).reshape(-1)
-
     def pull(self, w):
-        """(m,) -> J^T w, (n,)."""
+        """(m,) -> J^T w, (n,). Columns that are formed anyway spare the tape."""
+        if self.dense and self._forward:
+            return w @ self.rows()
         if self._pull is None:
             self._pull = pullback(self._outputs, self._tree)[1]
-        return self._free * self._packing.pack_gradient(
-            self._pull(w.reshape(self.value.shape).astype(self.value.dtype))
-        )
+        g = w.reshape(self.value.shape).astype(self.value.dtype)
+        return self._free * self._packing.pack_gradient(self._pull(g))
 
     def push(self, v):
         """(n,) -> J v, (m,)."""
@@ -99,15 +108,21 @@ class Linearised:
             rows, columns = self.shape
             if self._apart:
                 self._jacobian = self._rows_apart()
-            elif columns < rows:
+            elif self._forward:
                 self._jacobian = np.array([self.push(unit) for unit in np.eye(columns)]).reshape(columns, rows).T
             else:
                 self._jacobian = np.array([self.pull(unit) for unit in np.eye(rows)]).reshape(self.shape)
         return self._jacobian if self._free is True else self._jacobian * self._free
 
     def covariance(self):
-        """s^2 (J^T J)^(-1), n x n, with s^2 = |outputs|^2 / (m - n); infinite where J has not the rank n."""
-        jacobian, (rows, columns) = self.rows(), self.shape
+        """s^2 (J^T J)^(-1), n x n, with s^2 = |outputs|^2 / (m - n); infinite where J has not the rank n.
+
+        None where J is not formed, m <= n or n is large.
+        """
+        rows, columns = self.shape
+        if not self.dense or rows <= columns or columns > MOST:
+            return None
+        jacobian = self.rows()
         sizes = np.linalg.norm(jacobian, axis=0)  # in units of its columns no unknown is small beside another
         vectors, s = singular((jacobian / np.where(sizes > 0, sizes, 1.0)).T)
         if not s[-1] > rows * np.finfo(float).eps * s[0]:
@@ -117,14 +132,18 @@ class Linearised:
 
     def _rows_apart(self):
         samples = len(self.value)
-        value, pull = pullback(self._outputs, self._packing.copies(self._tree, samples))
+        copies = mapped(
+            lambda leaf: np.broadcast_to(leaf, (samples, *np.shape(leaf))) if is_variable(leaf) else leaf, self._tree
+        )
+        value, pull = pullback(self._outputs, copies)
         if value.shape != self.value.shape:
             raise ShapeError(NOT_APART.format(samples))
         width = value.size // max(samples, 1)
         jacobian = np.empty((samples, width, self.shape[1]))
         for column, unit in enumerate(np.eye(width)):
             one_each = np.broadcast_to(unit, (samples, width)).reshape(value.shape)
-            self._packing.pack_copies(pull(one_each), jacobian[:, column])
+            slopes = [np.reshape(slope, (samples, -1)) for slope in leaves(pull(one_each)) if slope is not None]
+            np.concatenate(slopes, axis=1, out=jacobian[:, column])
         jacobian = jacobian.reshape(self.shape)
         # A function that looks at one copy alone gives outputs of the right shape and wrong rows.
         probe = np.cos(np.arange(self.shape[0]))

@@ -6,12 +6,12 @@ import numpy as np
 
 from sparsedp.fields import is_whole
 from sparsedp.optimize.flat import power_of_two
-from sparsedp.optimize.result import Stuck, Trial
+from sparsedp.optimize.result import Trial
 from sparsedp.tree import norm
 
 __all__ = ["NewtonCG", "NewtonState"]
 
-ACCEPT, POOR, GOOD = 1e-4, 0.25, 0.75
+POOR, GOOD = 0.25, 0.75  # shares of the predicted fall below and above which the region changes
 SHRINKS = 60
 
 
@@ -50,28 +50,28 @@ class NewtonCG:
 
     def advance(self, state, trials):
         """One iteration: smaller regions until the loss falls. Raises Stuck when none is small enough."""
-        here, radius, product = state.trial, state.radius or np.inf, trials.curvature(state.trial)
+        here, product = state.trial, trials.curvature(state.trial)
         free, height = trials.box.free(here.vector, here.slope), power_of_two(norm(here.slope))
         slope = np.where(free, here.slope / height, 0.0)  # of size 1, about
         forcing = min(0.1, np.sqrt(norm(here.slope) / (state.size or 1.0)))
-        for _ in range(SHRINKS):
-            step, fall, edge = steihaug(
-                slope, lambda d: np.where(free, product(d) / height, 0.0), radius, forcing, self.inner
-            )
-            predicted, length = fall * height, norm(step)
-            trial = trials(trials.box.inside(here.vector + step))
-            gain = (here.value - trial.value) / predicted if predicted > 0 else 0.0
-            if gain > ACCEPT:
-                # The region for the next step: larger where the model was good and the region was in the way.
-                if gain > GOOD and edge:
-                    radius = 2 * length
-                elif gain < POOR:
-                    radius = length / 4
-                return state._replace(trial=trial, radius=radius if np.isfinite(radius) else 0.0)
-            if predicted <= 10 * here.rounding:
-                break
+
+        def curved(d):
+            return np.where(free, product(d) / height, 0.0)
+
+        def regions():
+            radius = state.radius or np.inf
+            for _ in range(SHRINKS):
+                step, fall, edge = steihaug(slope, curved, radius, forcing, self.inner)
+                yield trials.box.inside(here.vector + step), fall * height, (radius, norm(step), edge)
+                radius = norm(step) / 4
+
+        trial, gain, (radius, length, edge) = trials.lower(here, regions(), "no trust region gives a lower point")
+        # The region for the next step: larger where the model was good and the region was in the way.
+        if gain > GOOD and edge:
+            radius = 2 * length
+        elif gain < POOR:
             radius = length / 4
-        raise Stuck("rounding" if predicted <= 100 * here.rounding else "no trust region gives a lower point")
+        return state._replace(trial=trial, radius=radius if np.isfinite(radius) else 0.0)
 
 
 def steihaug(slope, curved, radius, forcing, limit):
@@ -85,7 +85,7 @@ def steihaug(slope, curved, radius, forcing, limit):
     edge : bool
         Whether |p| is the radius.
     """
-    p, bent, r, d, edge = np.zeros_like(slope), np.zeros_like(slope), slope, -slope, False
+    p, r, d, fall, edge = np.zeros_like(slope), slope, -slope, 0.0, False
     for _ in range(limit):
         curvature, square = curved(d), float(np.dot(r, r))
         bend = float(np.dot(d, curvature))
@@ -94,8 +94,8 @@ def steihaug(slope, curved, radius, forcing, limit):
         if edge:
             far = radius if np.isfinite(radius) else max(1.0, 2 * norm(p))
             t = np.max(np.roots([np.dot(d, d), 2 * np.dot(p, d), np.dot(p, p) - far**2]).real)  # |p + t d| = far
-        p, bent, r = p + t * d, bent + t * curvature, r + t * curvature
+        p, r, fall = p + t * d, r + t * curvature, fall + t * (square - 0.5 * t * bend)
         if edge or norm(r) <= forcing * norm(slope):
             break
         d = -r + float(np.dot(r, r)) / square * d
-    return p, -float(np.dot(slope, p) + 0.5 * np.dot(p, bent)), edge
+    return p, fall, edge

@@ -7,13 +7,12 @@ from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, S
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.linearised import Linearised
-from sparsedp.optimize.result import Failure, Trial
+from sparsedp.optimize.result import Failure, Stuck, Trial
 from sparsedp.solvers.cache import Cache
-from sparsedp.tape import isbox
 
 __all__ = ["Trials"]
 
-MOST = 4000  # unknowns of which the covariance is found, 128 MB
+ENOUGH = 1e-4  # share of the predicted fall that is asked for (Armijo)
 REFUSED = (UnstableStepError, ConvergenceError, NonFiniteError)
 
 
@@ -31,8 +30,8 @@ class Trials:
     batches : Batches
         What the loss is given after x; `batches.number` is moved by the loop.
     squares : method of least squares, or None
-        With one, the loss returns residuals r, and what falls is |r|^2 / 2; ``squares.family()`` tells whether their
-        Jacobian is formed.
+        With one, the loss returns residuals r, and what falls is |r|^2 / 2; its `apart` and `dense` say how their
+        Jacobian is found.
     """
 
     best: Trial
@@ -62,6 +61,38 @@ class Trials:
             self.best = trial  # losses of two batches cannot be compared: the last point stands
         return trial
 
+    def lower(self, here, tries, unless):
+        """The first of some points where the loss is lower than here by enough.
+
+        Parameters
+        ----------
+        here : Trial
+        tries : iterable of (vector, fall, anything)
+            A point, how far the loss should fall, and what tells one try from the next; they come ever closer.
+        unless : str
+            Why a method gives up that finds none.
+
+        Returns
+        -------
+        (Trial, gain, anything)
+            gain: the share of the fall that was predicted.
+
+        Raises
+        ------
+        Stuck
+            When there is none; "rounding" when the first was not expected to fall by more than that.
+        """
+        falls: list = []
+        for vector, fall, told in tries:
+            trial = self(vector, here.value)
+            if trial.value < here.value and here.value - trial.value >= ENOUGH * fall:
+                return trial, (here.value - trial.value) / fall if fall > 0 else 0.0, told
+            falls.append(abs(fall))
+            if falls[-1] <= here.rounding:  # below 0 where bounds turn a long step uphill: a shorter one may do
+                break
+        hopeless = falls[0] <= 100 * here.rounding and not self.failures
+        raise Stuck("rounding" if hopeless else unless)
+
     def _evaluate(self, vector, below=np.inf):
         self.count += 1
         value, slope = self._both(vector) if self._squares is None else self._summed(vector, below)
@@ -71,25 +102,18 @@ class Trials:
         return Trial(rounded, value, slope, self._packing.eps * abs(value))
 
     def _summed(self, vector, below):
-        """Half the sum of squares of the residuals, and its gradient J^T r.
-
-        A Jacobian with fewer columns than rows that is formed anyway is formed at once, by forward products.
-        """
+        """Half the sum of squares of the residuals, and its gradient J^T r."""
         here = self._linearise(vector, self.batches.number)
         with np.errstate(over="ignore"):  # infinity is refused
             value = 0.5 * float(np.dot(here.flat, here.flat))
-        if not value < below:
-            return value, None
-        tall = not self._squares.apart and here.shape[1] < here.shape[0]
-        formed = tall and self._squares.family().forms(*here.shape)
-        return value, here.flat @ here.rows() if formed else here.pull(here.flat)
+        return value, here.pull(here.flat) if value < below else None
 
     def _linearise(self, vector, number):
         """The residuals and their Jacobian at a point, on the batch of an iteration; kept for the last point."""
         key = vector, number if self.batches.varied else 0
-        batch = self.batches.now(self.batches.number - number)
+        batch, squares = self.batches.now(self.batches.number - number), self._squares
         return self._linearised.find(key) or self._linearised.put(
-            key, Linearised(self._loss, self._packing, vector, batch, self._squares.apart)
+            key, Linearised(self._loss, self._packing, vector, batch, squares.apart, squares.dense)
         )
 
     def _both(self, vector):
@@ -112,20 +136,18 @@ class Trials:
         """That of the unknowns of a least-squares problem at a point; None where its Jacobian is not formed."""
         if self._squares is None or self.batches.varied:
             return None
-        here = self._linearise(trial.vector, self.batches.number)
-        rows, columns = here.shape
-        enough = columns < rows and columns <= MOST and self._squares.family().forms(rows, columns)
-        return here.covariance() if enough else None
+        return self._linearise(trial.vector, self.batches.number).covariance()
 
     def curvature(self, trial):
         """Function from a flat vector to the Hessian times it, at a point: one tape, one backward pass a product."""
         if self._gradient is not None:
             raise TypeError("newton_cg differentiates the loss twice and takes no gradient of yours; leave it out")
         batch, packing = self.batches.now(back=1), self._packing
-        tree = packing.unpack(trial.vector)
-        slope, pull = pullback(lambda x: packing.join(value_and_grad(self._loss)(x, *batch)[1]), tree)
-        if isbox(slope) or slope.shape != trial.vector.shape:
+        if packing.complex:
             raise DerivativeError("newton_cg takes real numbers, got complex ones; split them into two real arrays")
+        slope, pull = pullback(
+            lambda x: packing.join(value_and_grad(self._loss)(x, *batch)[1]), packing.unpack(trial.vector)
+        )
         return lambda v: packing.pack_gradient(pull(np.asarray(v, dtype=slope.dtype)))
 
     def downhill(self, trial):
