@@ -27,7 +27,7 @@ SHARES = 1.0, 1e-2  # of the step of central differences: Jacobians and probes
 MOST = {STEP: (1e-9, 1e-12), DIFFERENCES: (1e-4, 1e-4)}  # what a row may lack of a probe: of itself, of the largest row
 GROWS = 1e-5  # what it may lack of a difference if that grows with the step: rounding does not
 REFUSED = ValueError, ArithmeticError, RuntimeError  # what foreign code raises where it has no result
-POINTS = 3  # points at which a pattern is probed
+POINTS = 2  # points near x at which a pattern is probed too
 NEARER = 1.0, 0.1, 1e-3, 0.0  # shares of the way, until the code takes the point; it takes x itself
 SMALLER = 1.0, -1.0, 1e-2, -1e-2, 1e-4, -1e-4
 TIMES = 2, 5, 11  # steps at which what a row lacks is looked at again
@@ -41,10 +41,10 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     f : callable
         ``f(x) -> y``, real arrays of any shapes; it must give the same y for the same x.
     sparsity : sparse matrix or array, optional
-        (y.size, x.size), not 0 where y_i may depend on x_j. Default: what three cells touch, moved over the grid, if at
-        3 points each row of the Jacobian agrees with a derivative along a random direction; else found by changing
-        random parts of x at 3 points. Where a later point takes another branch it is found again, and grows. An entry
-        below 1e-9 (differences: 1e-5) of its row may be missed.
+        (y.size, x.size), not 0 where y_i may depend on x_j. Default: what three cells touch, moved over the grid, if
+        each row of the Jacobian agrees with a derivative along a random direction; else found by changing random parts
+        of x at 3 points. Where a later point takes another branch it is found again, and grows. An entry below 1e-9
+        (differences: 1e-5) of its row may be missed.
     derivative : "auto", "complex" or "difference"
         complex: f(x + i h v), to rounding, for code that is analytic and takes complex numbers. difference: central
         differences, about ten digits. auto: complex where it is found to agree with differences.
@@ -104,7 +104,7 @@ class Adopted(Remade):
     runs : int
         Runs of the function so far.
     way : str
-        STEP or DIFFERENCES; empty before the first derivative.
+        STEP or DIFFERENCES; empty where the first derivative is to tell.
     """
 
     _shapes: Any
@@ -114,6 +114,7 @@ class Adopted(Remade):
         self._f, self._derivative, self.name = f, derivative, name
         self._sparsity = None if sparsity is None else pattern_like(sparsity)
         self._shapes, self.way, self._coloured = found
+        self.way = self.way or {"auto": "", "complex": STEP, "difference": DIFFERENCES}[derivative]
         self.runs = 0
         self._points, self._alone = Cache(), RLock()  # foreign code may work in arrays of its own: one thread at a time
         self._rule = Rule(
@@ -198,62 +199,56 @@ class Adopted(Remade):
         check_finite(f"the argument of {self.name}", x)
         y = self._run(x)
         check_finite(f"{self.name} near x", y, "must be finite to be differentiated")
-        if self._shapes is not None and self._shapes != (x.shape, y.shape):
+        if self._shapes not in (None, (x.shape, y.shape)):
             raise ShapeError(
                 f"{self.name} was adopted from {self._shapes[0]} to {self._shapes[1]}, got {x.shape} to {y.shape}; "
                 "adopt it again"
             )
-        if self._coloured is None:
-            self._shapes, self.way = (x.shape, y.shape), self._choose(x)
-            self._coloured = self._pattern(x, y)
-        matrix, wrong = self._probed(self._coloured, x)
-        if wrong.any() and self._sparsity is None:  # a branch was taken that no point before has met
-            self._coloured = self._pattern(x, y, self._coloured.pattern)
-            matrix, wrong = self._probed(self._coloured, x)
-        if wrong.any():
-            raise DerivativeError(
-                f"the Jacobian of {self.name} by {self.way} misses in row {np.argmax(wrong)} what a difference along a "
-                "random direction sees; its sparsity lacks entries, or it has a kink at x: leave sparsity and "
-                "derivative out, or move x a little"
-            )
-        return matrix, y
+        self._shapes = x.shape, y.shape
+        for coloured in self._patterns(x.reshape(-1), y.reshape(-1)):
+            self._coloured = coloured
+            matrix, wrong = self._probed(coloured, x.reshape(-1))
+            if not wrong.any():
+                return matrix, y
+        raise DerivativeError(
+            f"the Jacobian of {self.name} by {self.way or STEP} misses in row {np.argmax(wrong)} what a difference "
+            "along a random direction sees; its sparsity lacks entries, or it has a kink at x: leave sparsity and "
+            "derivative out, or move x a little"
+        )
+
+    def _flat(self, x):
+        """A run from flat numbers to flat numbers."""
+        return self._run(x.reshape(self._shapes[0])).reshape(-1)
 
     # ------------------------------------------------------------ the pattern
 
-    def _pattern(self, x, y, known=None):
-        """The coloured pattern; with the entries `known` from earlier points, those that it has near x and at x."""
-        rows, columns = y.size, x.size
-        grid = x.shape if x.shape == y.shape else None
-        if self._sparsity is not None:
-            if self._sparsity.shape != (rows, columns):
-                raise ShapeError(
-                    f"the sparsity of {self.name} must have shape {(rows, columns)}, got {self._sparsity.shape}"
-                )
-            return Coloured(self._sparsity, grid, by_rows=False)
-        if known is None and not np.array_equal(self._run(x), y, equal_nan=True):
+    def _patterns(self, x, y):
+        """Patterns to be tried at x, coloured, the cheapest first; each has the entries known from earlier points."""
+        rows, columns, known = y.size, x.size, self._sparsity
+        grid = self._shapes[0] if self._shapes[0] == self._shapes[1] else None
+        if self._coloured is not None:
+            yield self._coloured
+            known = self._coloured.pattern
+        elif known is not None:
+            if known.shape != (rows, columns):
+                raise ShapeError(f"the sparsity of {self.name} must have shape {(rows, columns)}, got {known.shape}")
+            yield Coloured(known, grid, by_rows=False)
+        elif not np.array_equal(self._flat(x), y):
             raise DerivativeError(f"{self.name} gives two results for one argument; fix its random state first")
-        points = points_near(self._run, x)
-        products = [changes(self._run, point) for point in points]
-        if known is not None:  # of the derivative at x itself: a row that does not depend on a column gives exactly 0
-            step, along = self._steps(x), self._product(x, DIFFERENCES)
-            products.insert(0, lambda v: along(step * v.reshape(x.shape)))
-            points.insert(0, x)
+        if self._sparsity is not None:
+            return
+        step = self._steps(x)
+        products = [lambda v: self._flat(x + step * v) - y]  # exactly 0 in a row that does not depend on the columns
+        products += [changes(self._flat, point) for point in points_near(self._flat, x)]
 
         def coloured(pattern):
             return Coloured(pattern if known is None else pattern_like(pattern + known), grid, by_rows=False)
 
         guess = None if grid is None else stencil_pattern(products, grid)
-        if guess is not None and self._holds(coloured(guess), points):
-            return coloured(guess)
+        if guess is not None:
+            yield coloured(guess)
         found = find_pattern(products, rows, columns)
-        return coloured(dense_pattern(rows, columns) if found is None else found)
-
-    def _holds(self, coloured, points):
-        """Whether Jacobians on a guessed pattern are found right."""
-        try:
-            return not any(self._misses(self._by_colours(coloured, x, self.way), x, self.way).any() for x in points)
-        except REFUSED:  # not finite so close to an allowed point
-            return False
+        yield coloured(dense_pattern(rows, columns) if found is None else found)
 
     # ------------------------------------------------------------ one Jacobian
 
@@ -262,14 +257,14 @@ class Adopted(Remade):
 
     def _product(self, x, way):
         if way == STEP:
-            return lambda v: np.ravel(self._run(x + 1j * COMPLEX * v).imag) / COMPLEX
-        return lambda v: np.ravel(self._run(x + v) - self._run(x - v)) / 2
+            return lambda v: self._flat(x + 1j * COMPLEX * v).imag / COMPLEX
+        return lambda v: (self._flat(x + v) - self._flat(x - v)) / 2
 
-    def _by_colours(self, coloured, x, way, share=1.0):
+    def _by_colours(self, coloured, x, way, share):
         steps = np.ones_like(x) if way == STEP else share * self._steps(x)
         along = self._product(x, way)
-        matrix = coloured.matrix(lambda v: along(steps * v.reshape(x.shape)))
-        matrix.data /= steps.reshape(-1)[matrix.indices]
+        matrix = coloured.matrix(lambda v: along(steps * v))
+        matrix.data /= steps[matrix.indices]
         if not np.all(np.isfinite(matrix.data)):
             raise NonFiniteError(f"{self.name} is not finite close to x; its Jacobian cannot be taken there")
         return matrix
@@ -277,11 +272,11 @@ class Adopted(Remade):
     def _probed(self, coloured, x):
         """The Jacobian on a pattern, and the rows in which it misses what probes see.
 
-        Rows that the way in use does not get right are taken by central differences, then by shorter ones: next to a
+        Rows that the complex step does not get right are taken by central differences, then by shorter ones: next to a
         kink these see one side of it, and at a kink the mean of both. What no short probe agrees with, as in code with
-        noise, may agree with a longer one.
+        noise, may agree with a longer one. What all rows agree with at the first point is the way at later ones.
         """
-        ways = [(STEP, 1.0)] if self.way == STEP else []
+        ways = [(STEP, 1.0)] if self.way != DIFFERENCES else []
         ways += [(DIFFERENCES, share) for share in SHARES] if self._derivative != "complex" else []
         made: dict = {}
         matrix, wrong, judged = coloured.pattern, np.ones(coloured.pattern.shape[0], dtype=bool), False
@@ -298,30 +293,16 @@ class Adopted(Remade):
                 continue
             judged = True
             if not wrong.any():
+                self.way = self.way or way[0]
                 break
         if not judged:
             raise trouble
         return matrix, wrong
 
-    def _misses(self, matrix, x, way, share=SHARES[-1]):
+    def _misses(self, matrix, x, way, share):
         """Rows in which a Jacobian misses what its own way and a difference see along a direction of this point."""
         v = share * self._steps(x) * np.random.default_rng(crc32(x.tobytes())).standard_normal(x.shape)
         return np.any([_lacks(matrix, v, self._product(x, one), one) for one in {way, DIFFERENCES}], axis=0)
-
-    def _choose(self, x):
-        """The complex step where code is analytic: it agrees with a difference; code that drops it gives 0."""
-        if self._derivative != "auto":
-            return STEP if self._derivative == "complex" else DIFFERENCES
-        v = self._steps(x) * np.random.default_rng(1).uniform(0.5, 1.5, x.shape)
-        difference = self._product(x, DIFFERENCES)(v)
-        try:
-            with _strict():
-                gap = np.linalg.norm(self._product(x, STEP)(v) - difference)
-        except MemoryError:
-            raise
-        except Exception:
-            return DIFFERENCES
-        return STEP if gap <= 1e-5 * np.linalg.norm(difference) else DIFFERENCES
 
 
 @contextmanager
@@ -340,15 +321,14 @@ def _with_rows(matrix, other, rows):
 
 def _lacks(matrix, v, along, way):
     """Rows in which a matrix lacks something of the product along v."""
-    flat = v.reshape(-1)
-    lacks, size = along(v) - matrix @ flat, abs(matrix) @ np.abs(flat)
+    lacks, size = along(v) - matrix @ v, abs(matrix) @ np.abs(v)
     share, floor = MOST[way]
     wrong = ~(np.abs(lacks) <= share * size + floor * np.max(size, initial=0.0))
     doubtful = ~wrong & (np.abs(lacks) > GROWS * size)
     if way == DIFFERENCES and doubtful.any():
         # Entries, however small, lack something in proportion to the step, and what rounding makes does not. A row may
         # be far smaller than the largest, as one of other units is.
-        gaps = [along(times * v) - times * (matrix @ flat + lacks) for times in TIMES]
+        gaps = [along(times * v) - times * (matrix @ v + lacks) for times in TIMES]
         wrong |= doubtful & (lacks != 0) & ~np.any(np.abs(gaps) > 0.1 * np.abs(lacks), axis=0)
     return wrong
 
@@ -376,7 +356,7 @@ def reached(run, x, way, shares):
 
 
 def points_near(run, x):
-    """Three points near x that `run` takes.
+    """Two points near x that `run` takes.
 
     Parameters
     ----------
@@ -394,7 +374,7 @@ def points_near(run, x):
 
 
 def changes(run, x):
-    """v -> how run(x) changes when x moves along v, flat: a tenth of the size of x, less where that is refused.
+    """v -> how run(x) changes when x moves along v: a tenth of the size of x, less where that is refused.
 
     Parameters
     ----------
@@ -406,7 +386,7 @@ def changes(run, x):
     callable
     """
     size, before = 0.1 * typical(x), run(x)
-    return lambda v: np.ravel(reached(run, x, size * v.reshape(x.shape), SMALLER)[1] - before)
+    return lambda v: reached(run, x, size * v, SMALLER)[1] - before
 
 
 def typical(x):

@@ -304,8 +304,8 @@ BUGS = {
     ),
     "central differences over one step for two": Bug(
         "blackbox.py",
-        "np.ravel(self._run(x + v) - self._run(x - v)) / 2",
-        "np.ravel(self._run(x + v) - self._run(x - v))",
+        "(self._flat(x + v) - self._flat(x - v)) / 2",
+        "self._flat(x + v) - self._flat(x - v)",
         "tests/test_blackbox.py",
     ),
     "the mean over samples for their sum": Bug(
