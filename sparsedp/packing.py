@@ -1,7 +1,7 @@
 """The floating leaves of a tree as one vector of doubles, and back: what a search moves and a check examines."""
 
 from functools import cached_property
-from itertools import compress
+from itertools import accumulate, compress
 
 import numpy as np
 
@@ -58,7 +58,8 @@ class Packing:
             raise DerivativeError(f"floating values are needed, and {root} holds none; write {root}.astype(float)")
         self.complex = any(map(np.iscomplexobj, self.values))
         self.eps = max(float(np.finfo(x.dtype).eps) for x in self.values)
-        *self._ends, self.size = map(int, np.cumsum([joined([x]).size for x in self.values]))
+        ends = [0, *accumulate(joined([x]).size for x in self.values)]
+        self._parts, self.size = list(map(slice, ends, ends[1:])), ends[-1]
 
     @cached_property
     def names(self):
@@ -93,7 +94,7 @@ class Packing:
 
     def split(self, vector):
         """Flat vector -> views of what belongs to each floating leaf."""
-        return np.split(vector, self._ends)
+        return [vector[part] for part in self._parts]
 
     def arrays(self, vector):
         """Flat vector -> fresh arrays of the shapes and dtypes of the floating leaves; this rounds."""

@@ -7,7 +7,6 @@ import numpy as np
 
 from sparsedp.fields import check_finite
 from sparsedp.packing import Packing, joined
-from sparsedp.tape import is_variable
 from sparsedp.tree import leaves
 
 __all__ = ["Unknowns", "power_of_two"]
