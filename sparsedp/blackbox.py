@@ -1,7 +1,7 @@
 """A simulator without derivatives becomes differentiable: sparse Jacobians by coloured differences."""
 
 import warnings
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import product
 from threading import RLock
 from typing import Any
@@ -27,9 +27,7 @@ SHARES = 1.0, 1e-2  # of the step of central differences: Jacobians and probes
 MOST = {STEP: (1e-9, 1e-12), DIFFERENCES: (1e-4, 1e-4)}  # what a row may lack of a probe: of itself, of the largest row
 GROWS = 1e-5  # what it may lack of a difference if that grows with the step: rounding does not
 REFUSED = ValueError, ArithmeticError, RuntimeError  # what foreign code raises where it has no result
-POINTS = 2  # points near x at which a pattern is probed too
-NEARER = 1.0, 0.1, 1e-3, 0.0  # shares of the way, until the code takes the point; it takes x itself
-SMALLER = 1.0, -1.0, 1e-2, -1e-2, 1e-4, -1e-4
+SMALLER = 1.0, -1.0, 1e-2, -1e-2, 1e-4, -1e-4  # shares of a move, until the code takes the point
 TIMES = 2, 5, 11  # steps at which what a row lacks is looked at again
 
 
@@ -43,8 +41,8 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     sparsity : sparse matrix or array, optional
         (y.size, x.size), not 0 where y_i may depend on x_j. Default: what three cells touch, moved over the grid, if
         each row of the Jacobian agrees with a derivative along a random direction; else found by changing random parts
-        of x at 3 points. Where a later point takes another branch it is found again, and grows. An entry below 1e-9
-        (differences: 1e-5) of its row may be missed.
+        of x, a little and by a tenth. Where a later point takes another branch it is found again, and grows. An entry
+        below 1e-9 (differences: 1e-5) of its row may be missed.
     derivative : "auto", "complex" or "difference"
         complex: f(x + i h v), to rounding, for code that is analytic and takes complex numbers. difference: central
         differences, about ten digits. auto: complex where it is found to agree with differences.
@@ -238,8 +236,10 @@ class Adopted(Remade):
         if self._sparsity is not None:
             return
         step = self._steps(x)
-        products = [lambda v: self._flat(x + step * v) - y]  # exactly 0 in a row that does not depend on the columns
-        products += [changes(self._flat, point) for point in points_near(self._flat, x)]
+        products = [  # exactly 0 in a row that does not depend on the columns; far moves see the other side of branches
+            lambda v: self._flat(x + step * v) - y,
+            lambda v: change(self._flat, x, y, v),
+        ]
 
         def coloured(pattern):
             return Coloured(pattern if known is None else pattern_like(pattern + known), grid, by_rows=False)
@@ -333,60 +333,14 @@ def _lacks(matrix, v, along, way):
     return wrong
 
 
-# ---------------------------------------------------------------- points that foreign code takes
-
-
-def reached(run, x, way, shares):
-    """The first of some shares of a way from x at which foreign code has a finite result, and that result.
-
-    Where it has none: what it says, or the last result.
-    """
-    refusal = None
-    for share in shares:
-        try:
-            y = run(x + share * way)
-        except REFUSED as error:
-            refusal = error
-            continue
-        if np.all(np.isfinite(y)):
-            return share, y
-    if refusal is not None:
-        raise refusal
-    return share, y
-
-
-def points_near(run, x):
-    """Two points near x that `run` takes.
-
-    Parameters
-    ----------
-    run : callable
-        ``run(x) -> y``, arrays; may raise or return NaN.
-    x : array
-
-    Returns
-    -------
-    list of arrays
-    """
-    rng, size = np.random.default_rng(0), typical(x)
-    ways = [0.1 * x * rng.uniform(-1, 1, x.shape) + 0.05 * size * rng.standard_normal(x.shape) for _ in range(POINTS)]
-    return [x + reached(run, x, way, NEARER)[0] * way for way in ways]
-
-
-def changes(run, x):
-    """v -> how run(x) changes when x moves along v: a tenth of the size of x, less where that is refused.
-
-    Parameters
-    ----------
-    run : callable
-    x : array
-
-    Returns
-    -------
-    callable
-    """
-    size, before = 0.1 * typical(x), run(x)
-    return lambda v: reached(run, x, size * v, SMALLER)[1] - before
+def change(run, x, y, v):
+    """How much run(x), which is y, changes when x moves along v by a tenth of its size; less where that is refused."""
+    for share in SMALLER:
+        with suppress(*REFUSED):
+            moved = run(x + 0.1 * share * typical(x) * v)
+            if np.all(np.isfinite(moved)):
+                return moved - y
+    return np.zeros_like(y)
 
 
 def typical(x):
