@@ -46,13 +46,9 @@ def correlate(x, weight):
     cells = [n - width + 1 for n, width in zip(x.shape[2:], weight.shape[-2:])]
     matrices = np.moveaxis(weight, -2, 0)  # one for each shift along the first axis
     matrices = matrices.reshape(*matrices.shape[:-2], -1)
-    y = np.empty((len(x), weight.shape[-4], prod(cells)), np.result_type(x, weight))
+    y = np.zeros((len(x), weight.shape[-4], prod(cells)), np.result_type(x, weight))
     for some, shift, part in _shifted(x, weight.shape[-2:]):
-        matrix = matrices[shift, some] if weight.ndim == 5 else matrices[shift]
-        if shift:
-            y[some] += matrix @ part
-        else:
-            np.matmul(matrix, part, out=y[some])
+        y[some] += (matrices[shift, some] if weight.ndim == 5 else matrices[shift]) @ part
     return y.reshape(*y.shape[:2], *cells)
 
 

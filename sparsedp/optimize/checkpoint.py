@@ -66,7 +66,7 @@ class Checkpoint:
         again = trials(state.trial.vector)
         self._check("loss at the last point", not again.refused and _bits(again) == _bits(state.trial))
         trials.best, trials.count = Trial(*found["best"]), found["evaluations"]
-        watch.resume([_record(row) for row in found["history"]], found["stopped"])
+        watch.resume([_record(row) for row in found["history"]])
         return state
 
     def _load(self):
@@ -99,7 +99,7 @@ class Checkpoint:
         self._pass(trials.batches, watch.iteration)
         self._latest = {
             "iteration": watch.iteration, "settings": self._settings, "batches": self._batches,
-            "evaluations": trials.count, "stopped": watch.stopped, "state": leaves(state), "best": list(trials.best),
+            "evaluations": trials.count, "state": leaves(state), "best": list(trials.best),
         }  # fmt: skip
         if SHARE * (time.perf_counter() - self._written) >= self._cost or watch.stopped:
             self.write(watch.history)

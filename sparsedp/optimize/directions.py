@@ -97,32 +97,28 @@ class Family:
         """
         left, right = map(_Rows, linearised.shape)
         limit, look, weights = min(*linearised.shape, self.rank or np.inf), LOOK, np.zeros(0)
-        length, largest = left.add(g), 0.0
-        diagonal: list = []
-        below: list = []
-        while len(diagonal) < limit:
-            size = right.add(linearised.pull(left.last))
-            if not size > EXHAUSTED * largest:
+        length = left.add(g)
+        sizes: list = []  # of B: diagonal, below it, diagonal, ...
+        while len(sizes) < 2 * limit:
+            onto_rows = len(sizes) % 2 == 0
+            size = right.add(linearised.pull(left.last)) if onto_rows else left.add(linearised.push(right.last))
+            if not size > EXHAUSTED * max(sizes, default=0.0):
                 break
-            diagonal.append(size)
-            below.append(left.add(linearised.push(right.last)))
-            largest = max(largest, size, below[-1])
-            if not below[-1] > EXHAUSTED * largest:
-                break
-            if len(diagonal) == look:
-                before, weights = weights, self._small(length, diagonal, below)[0]
+            sizes.append(size)
+            if len(sizes) == 2 * look:
+                before, weights = weights, self._small(length, sizes)[0]
                 moved = weights - np.pad(before, (0, look - len(before)))
                 if np.linalg.norm(moved) <= SETTLED * np.linalg.norm(weights):
                     break
                 look += max(LOOK, look // 8)
-        weights, s, kept = self._small(length, diagonal, below)
+        weights, s, kept = self._small(length, sizes)
         return Direction(weights @ right.rows[: len(weights)], s, kept, "krylov")
 
-    def _small(self, length, diagonal, below):
+    def _small(self, length, sizes):
         """The direction in the basis Q, the singular values of B, and how many of them were kept."""
-        small = np.zeros((len(diagonal) + 1, len(diagonal)))
-        np.fill_diagonal(small, diagonal)
-        np.fill_diagonal(small[1:], below)
+        place, steps = np.arange(len(sizes)), (len(sizes) + 1) // 2
+        small = np.zeros((steps + 1, steps))
+        small[(place + 1) // 2, place // 2] = sizes
         left, s, right = np.linalg.svd(small, full_matrices=False)
         shares, kept = self._shares(s)
         return length * (shares * s * left[0]) @ right, s, kept
@@ -152,9 +148,7 @@ class _Rows:
     def add(self, vector):
         """Append the direction of what of a vector is orthogonal to the rows; the length of that."""
         rest = vector - (self.rows @ vector) @ self.rows
-        if np.linalg.norm(rest) <= CANCELLED * np.linalg.norm(
-            vector
-        ):  # twice where little is left, so that rounding stays out
+        if np.linalg.norm(rest) <= CANCELLED * np.linalg.norm(vector):  # twice, so that rounding stays out
             rest = rest - (self.rows @ rest) @ self.rows
         if self._count == len(self._memory):
             self._memory = np.concatenate([self._memory, np.empty((BLOCK, vector.size))])

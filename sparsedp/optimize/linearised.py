@@ -17,7 +17,6 @@ __all__ = ["Linearised", "singular"]
 DENSE, DENSE_SIDE = 3e7, 4000  # entries of a Jacobian (240 MB), and its shorter side, above which it is not formed
 MOST = 4000  # unknowns of which the covariance is found, 128 MB
 GRADE = 1e-4  # singular values below this share of the largest wait for a Gram matrix of their own
-PLAIN = 2.0**-500, 2.0**500  # entries of a Gram matrix that need no scaling
 
 NOT_APART = (
     "with apart=True every leaf of x gets a leading axis of {} copies, one for each sample, and the outputs do not "
@@ -166,12 +165,9 @@ def singular(matrix):
     W <- E2^T W, until no group is left: one to four times, for an SVD of W that costs five times as much.
     Raises NonFiniteError if W is not finite.
     """
-    rows, scale = matrix, 1.0
-    with np.errstate(over="ignore", invalid="ignore"):
-        gram = rows @ rows.T
-    if not PLAIN[0] < np.max(np.diag(gram), initial=0.0) < PLAIN[1]:  # squares that overflow, or vanish
-        scale = power_of_two(np.max(np.abs(matrix), initial=0.0))
-        rows = matrix / scale
+    scale = power_of_two(max(np.max(matrix, initial=0.0), -np.min(matrix, initial=0.0)))  # no square overflows
+    rows = matrix / scale
+    with np.errstate(invalid="ignore"):
         gram = rows @ rows.T
     if not np.all(np.isfinite(gram)):
         raise NonFiniteError("the Jacobian is not finite; start where every output has a finite derivative")

@@ -25,12 +25,12 @@ class Watch:
         self._seconds, self._solves = -time.perf_counter(), -thread.solves  # at the start, taken off
         self.history, self.stopped = [], ""
 
-    def resume(self, history, stopped):
+    def resume(self, history):
         """Go on from a history that was kept. A callback stops one run, and a tolerance that is met, this one."""
         self.history, last = history, history[-1]
         self._seconds, self._solves = self._seconds + last.seconds, last.solves - thread.solves
-        if stopped == "converged" and (callable(self._tolerance) or self._met(last)):
-            self.stopped = stopped
+        if self._met(last):
+            self.stopped = "converged"
 
     @property
     def iteration(self):
@@ -57,12 +57,10 @@ class Watch:
 
     def _met(self, record):
         first, once = self.history[0], not self._trials.batches.varied  # a batch may have the gradient 0 alone
-        if record.gradient_norm == 0 and once:
-            return True
         if callable(self._tolerance):
-            return bool(self._tolerance(record, first))
+            return bool(record.gradient_norm == 0 and once or self._tolerance(record, first))
         goal = self._tolerance * first.gradient_norm
-        return record.gradient_norm < goal or (record.gradient_norm == goal and once)
+        return record.gradient_norm <= goal if once else record.gradient_norm < goal
 
     def reason(self, stuck):
         """(message, converged) of a run that is over; `stuck` is why the method gave up, if it did."""
