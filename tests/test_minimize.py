@@ -9,6 +9,8 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
+from sparsedp.optimize.batches import Batches
+from sparsedp.optimize.box import Box
 from sparsedp.optimize.first_order import Adam, Descent
 from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.trials import Trials
@@ -230,7 +232,7 @@ def test_states_are_values_that_can_be_resumed():
     """Every step depends on its state alone: continuing from a stored state gives the same bits."""
     for stepper in (Adam(rate=0.05), Descent(rate=1e-3, momentum=0.9), Descent()):
         packing = Unknowns(np.array([-1.2, 1.0]))
-        trials = Trials(valley, None, packing)
+        trials = Trials(valley, None, packing, Box(), Batches())
         state = stepper.begin(trials.first(np.array([-1.2, 1.0])))
         states = [state]
         for _ in range(6):

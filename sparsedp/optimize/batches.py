@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from functools import lru_cache
 
-from sparsedp.optimize.checkpoint import fingerprint
-
 __all__ = ["Batches"]
 
 
@@ -20,8 +18,6 @@ class Batches:
     ----------
     varied : bool
         Whether two iterations may see two losses.
-    number : int
-        Of the present iteration.
 
     Raises
     ------
@@ -37,13 +33,9 @@ class Batches:
             )
         if isinstance(given, Sequence) and not given:
             raise ValueError("batches is empty; leave it out, and the loss is called with x alone")
-        self.varied, self.number = given is not None, 0
+        self.varied = given is not None
         self._batch = lru_cache(maxsize=2)(given if callable(given) else lambda number: given[number % len(given)])
 
-    def now(self, back=0):
-        """The arguments of the loss after x in this iteration, or so many iterations earlier."""
-        return (self._batch(self.number - back),) if self.varied else ()
-
-    def mark(self, number):
-        """A hash of the batch of an iteration."""
-        return fingerprint(self.now(self.number - number))
+    def at(self, iteration):
+        """The arguments of the loss after x in an iteration."""
+        return (self._batch(iteration),) if self.varied else ()

@@ -11,9 +11,9 @@ from sparsedp.files import UNFINISHED, load_tree, save_tree
 from sparsedp.optimize.result import Failure, Record, Trial
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["Checkpoint", "fingerprint"]
+__all__ = ["Checkpoint"]
 
-FORMAT = "sparsedp optimization 2"
+FORMAT = "sparsedp optimization 3"
 KEPT = 2
 SHARE = 0.1  # a state is written when that takes at most this share of the time since the last one
 
@@ -62,7 +62,7 @@ class Checkpoint:
             self._check(name, value == found["settings"].get(name))
         self._check("list of batches", found["batches"] == self._batches)
         state = flatten(template)[1](found["state"])
-        trials.batches.number = found["iteration"]
+        trials.iteration = found["iteration"]
         again = trials(state.trial.vector)
         self._check("loss at the last point", not again.refused and _bits(again) == _bits(state.trial))
         trials.best, trials.count = Trial(*found["best"]), found["evaluations"]
@@ -90,7 +90,7 @@ class Checkpoint:
             )
 
     def _pass(self, batches, number):
-        self._batches = _digest((self._batches + batches.mark(number)).encode())
+        self._batches = _digest((self._batches + fingerprint(batches.at(number))).encode())
 
     def save(self, state, trials, watch):
         """Write the state down, unless that was done a moment ago and the run goes on."""

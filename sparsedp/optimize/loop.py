@@ -184,7 +184,7 @@ def _run(stepper, trials, watch, kept, start, maxiter):
     else:
         state = resumed
     while watch.iteration < maxiter and not watch.stopped:
-        trials.batches.number = watch.iteration + 1  # a new point is seen by the next batch
+        trials.iteration = watch.iteration + 1  # a new point is seen by the next batch
         try:
             state = stepper.advance(state, trials)
         except Stuck as reason:

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import LbfgsInvHessProduct
 
 from sparsedp.fields import is_whole
 from sparsedp.optimize.flat import power_of_two
@@ -96,7 +97,7 @@ def _step(state, box):
     free = box.free(here.vector, here.slope)
     free = slice(None) if free.all() else free
     g, step = here.slope / state.height, np.zeros_like(here.vector)
-    shortest = _first_length(here) / (norm(g) or 1.0)
+    shortest = first_length(here) / (norm(g) or 1.0)
     step[free] = two_loops(g[free], state.steps[:, free], state.changes[:, free], shortest)
     return step
 
@@ -106,22 +107,17 @@ def two_loops(g, steps, changes, scale):
 
     Source: J. Nocedal, Updating quasi-Newton matrices with limited storage, Math. Comp. 35, 1980.
     """
-    pairs = [(s, y, bend) for s, y in zip(steps, changes) if (bend := np.dot(s, y)) > CURVED * norm(s) * norm(y)]
-    step, shares = -g, []
-    for s, y, bend in reversed(pairs):
-        shares.append(np.dot(s, step) / bend)
-        step = step - shares[-1] * y
-    if pairs:
-        _, y, bend = pairs[-1]
-        scale = bend / np.dot(y, y)
-    step = scale * step
-    for s, y, bend in pairs:
-        step = step + (shares.pop() - np.dot(y, step) / bend) * s
-    return step
+    bends = np.einsum("ij,ij->i", steps, changes)
+    curved = [bend > CURVED * norm(s) * norm(y) for s, y, bend in zip(steps, changes, bends)]
+    if not all(curved):
+        steps, changes, bends = steps[curved], changes[curved], bends[curved]
+    if len(steps):
+        scale = bends[-1] / np.dot(changes[-1], changes[-1])
+    return -scale * LbfgsInvHessProduct(steps / scale, changes).matvec(g)
 
 
-def _first_length(first):
-    """Length of the first step: |f| / |g|, at most |x|, whichever is known."""
+def first_length(first):
+    """Length of the first step: |f| / |g|, which brings a linear loss to 0, at most |x|, whichever is known."""
     slope, size = norm(first.slope), norm(first.vector)
     known = [length for length in (abs(first.value) / slope if slope else 0.0, size) if 0 < length < np.inf]
     return min(known, default=1.0)

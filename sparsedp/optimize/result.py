@@ -23,6 +23,7 @@ class Trial(NamedTuple):
     value: float
     slope: Any
     rounding: float = 0.0  # a smaller change of the loss is not seen
+    iteration: int = 0  # whose batch the loss was given
 
     @property
     def refused(self):

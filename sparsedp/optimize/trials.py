@@ -4,8 +4,6 @@ import numpy as np
 
 from sparsedp.derivative import pullback, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.optimize.batches import Batches
-from sparsedp.optimize.box import Box
 from sparsedp.optimize.linearised import Linearised
 from sparsedp.optimize.result import Failure, Stuck, Trial
 from sparsedp.solvers.cache import Cache
@@ -28,18 +26,26 @@ class Trials:
     box : Box
         The points that are allowed.
     batches : Batches
-        What the loss is given after x; `batches.number` is moved by the loop.
+        What the loss is given after x.
     squares : method of least squares, or None
         With one, the loss returns residuals r, and what falls is |r|^2 / 2; its `apart` and `dense` say how their
         Jacobian is found.
+
+    Attributes
+    ----------
+    iteration : int
+        The present one, whose batch new points see; moved by the loop.
+    best : Trial
+    count : int
+        Evaluations so far.
     """
 
     best: Trial
 
-    def __init__(self, loss, gradient, packing, box=None, batches=None, squares=None):
+    def __init__(self, loss, gradient, packing, box, batches, squares=None):
         self._loss, self._gradient, self._packing = loss, gradient, packing
         self._squares, self._linearised = squares, Cache(1)
-        self.box, self.batches = box or Box(), batches or Batches()
+        self.box, self.batches, self.iteration = box, batches, 0
         self.count, self.failures = 0, []
 
     def first(self, vector):
@@ -99,26 +105,26 @@ class Trials:
         if not np.isfinite(value):
             raise NonFiniteError(f"the loss is {value}; it must be finite at the start, and elsewhere it is avoided")
         rounded = self._packing.pack(self._packing.unpack(vector))  # single-precision leaves round
-        return Trial(rounded, value, slope, self._packing.eps * abs(value))
+        return Trial(rounded, value, slope, self._packing.eps * abs(value), self.iteration)
 
     def _summed(self, vector, below):
         """Half the sum of squares of the residuals, and its gradient J^T r."""
-        here = self._linearise(vector, self.batches.number)
+        here = self._linearise(vector, self.iteration)
         with np.errstate(over="ignore"):  # infinity is refused
             value = 0.5 * float(np.dot(here.flat, here.flat))
         return value, here.pull(here.flat) if value < below else None
 
-    def _linearise(self, vector, number):
+    def _linearise(self, vector, iteration):
         """The residuals and their Jacobian at a point, on the batch of an iteration; kept for the last point."""
-        key = vector, number if self.batches.varied else 0
-        batch, squares = self.batches.now(self.batches.number - number), self._squares
+        batch, squares = self.batches.at(iteration), self._squares
+        key = vector, iteration if batch else 0
         return self._linearised.find(key) or self._linearised.put(
             key, Linearised(self._loss, self._packing, vector, batch, squares.apart, squares.dense)
         )
 
     def _both(self, vector):
         """Loss and flat gradient, each from a fresh tree."""
-        tree, batch = self._packing.unpack(vector), self.batches.now()
+        tree, batch = self._packing.unpack(vector), self.batches.at(self.iteration)
         if self._gradient is None:
             value, gradient = value_and_grad(self._loss)(tree, *batch)
         else:
@@ -129,20 +135,20 @@ class Trials:
 
     def linearised(self, trial):
         """The residuals at a point and their Jacobian in what the bounds leave free, on the batch that saw it."""
-        here = self._linearise(trial.vector, self.batches.number - 1)
+        here = self._linearise(trial.vector, trial.iteration)
         return here.among(self.box.free(trial.vector, trial.slope))
 
     def covariance(self, trial):
         """That of the unknowns of a least-squares problem at a point; None where its Jacobian is not formed."""
         if self._squares is None or self.batches.varied:
             return None
-        return self._linearise(trial.vector, self.batches.number).covariance()
+        return self._linearise(trial.vector, trial.iteration).covariance()
 
     def curvature(self, trial):
         """Function from a flat vector to the Hessian times it, at a point: one tape, one backward pass a product."""
         if self._gradient is not None:
             raise TypeError("newton_cg differentiates the loss twice and takes no gradient of yours; leave it out")
-        batch, packing = self.batches.now(back=1), self._packing
+        batch, packing = self.batches.at(trial.iteration), self._packing
         if packing.complex:
             raise DerivativeError("newton_cg takes real numbers, got complex ones; split them into two real arrays")
         slope, pull = pullback(
