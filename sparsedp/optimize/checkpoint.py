@@ -101,7 +101,7 @@ class Checkpoint:
             "iteration": watch.iteration, "settings": self._settings, "batches": self._batches,
             "evaluations": trials.count, "state": leaves(state), "best": list(trials.best),
         }  # fmt: skip
-        if SHARE * (time.perf_counter() - self._written) >= self._cost or watch.stopped:
+        if SHARE * (time.perf_counter() - self._written) >= self._cost or watch.message:
             self.write(watch.history)
 
     def write(self, history):

@@ -52,11 +52,8 @@ class Descent:
         self.searches = line_search is not None or rate is None
 
     def begin(self, first):
-        """State at the start. Without a rate the first step would bring a linear loss to 0."""
-        rate = self.rate
-        if rate is None:
-            size = norm(first.slope)
-            rate = (abs(first.value) / size / size or 1.0 / size) if size > 0 else 1.0
+        """State at the start."""
+        rate = first_length(first) / (norm(first.slope) or 1.0) if self.rate is None else self.rate
         return DescentState(first, np.zeros_like(first.vector), rate, 1.0)
 
     def advance(self, state, trials):
@@ -71,6 +68,13 @@ class Descent:
         # Halve the step until the loss falls; a full step that does is tried at twice the length next time.
         trial, share = backtracked(state.trial, step, trials, "the gradient")
         return DescentState(trial, share * step, state.rate * (share if share < 1 else 2.0), 1.0)
+
+
+def first_length(first):
+    """Length of the first step: |f| / |g|, which brings a linear loss to 0, at most |x|, whichever is known."""
+    slope, size = norm(first.slope), norm(first.vector)
+    known = [length for length in (abs(first.value) / slope if slope else 0.0, size) if 0 < length < np.inf]
+    return min(known, default=1.0)
 
 
 def backtracked(here, step, trials, along):

@@ -151,47 +151,47 @@ def minimize(
     sides = box.lower, box.upper
     settings = {"method": method, "set of options": sorted(options.items()), "pair of bounds": sides, "start": start}
     kept = Checkpoint(checkpoint, settings)
-    stuck, covariance = None, None
+    covariance = None
     with progress_bar(progress, int(maxiter)) as show:
         watch = Watch(trials, packing, tolerance, callback, show)
         try:
-            stuck = _run(stepper, trials, watch, kept, box.inside(packing.pack(start)), maxiter)
+            _run(stepper, trials, watch, kept, box.inside(packing.pack(start)), maxiter)
             covariance = trials.covariance(trials.best)
         except KeyboardInterrupt:
             if not watch.history:
                 raise
-            watch.stopped = watch.stopped or "interrupted"
+            watch.message = watch.message or "interrupted"
         finally:
             kept.write(watch.history)
-    message, converged = watch.reason(stuck)
     x = packing.unpack(trials.best.vector)
     if project is not None:
         given, x = x, project(x)
         if len(leaves(x)) != len(leaves(given)):
             raise ShapeError("project must return a tree like start; write project=lambda x: ...")
     return Minimum(
-        x=x, value=trials.best.value, history=tuple(watch.history), method=method, message=message,
-        converged=converged, evaluations=trials.count, resumed=kept.told, covariance=covariance,
+        x=x, value=trials.best.value, history=tuple(watch.history), method=method,
+        message=watch.message or f"stopped after {watch.iteration} iterations, as maxiter asks",
+        converged=watch.converged, evaluations=trials.count, resumed=kept.told, covariance=covariance,
     )  # fmt: skip
 
 
 def _run(stepper, trials, watch, kept, start, maxiter):
-    """Begin or resume, and advance until the watch stops it or it is stuck; return why it is stuck."""
+    """Begin or resume, and advance until the watch stops it or it is stuck."""
     state = stepper.begin(trials.first(start))
     resumed = kept.resume(state, trials, watch)
     if resumed is None:
         watch(state.trial)
     else:
         state = resumed
-    while watch.iteration < maxiter and not watch.stopped:
+    while watch.iteration < maxiter and not watch.message:
         trials.iteration = watch.iteration + 1  # a new point is seen by the next batch
         try:
             state = stepper.advance(state, trials)
         except Stuck as reason:
-            return str(reason)
+            watch.give_up(str(reason))
+            return
         watch(state.trial)
         kept.save(state, trials, watch)
-    return None
 
 
 def _composed(loss, inner):

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import LbfgsInvHessProduct
 
 from sparsedp.fields import is_whole
+from sparsedp.optimize.first_order import first_length
 from sparsedp.optimize.flat import power_of_two
 from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.optimize.wolfe import line_search
@@ -114,10 +115,3 @@ def two_loops(g, steps, changes, scale):
     if len(steps):
         scale = bends[-1] / np.dot(changes[-1], changes[-1])
     return -scale * LbfgsInvHessProduct(steps / scale, changes).matvec(g)
-
-
-def first_length(first):
-    """Length of the first step: |f| / |g|, which brings a linear loss to 0, at most |x|, whichever is known."""
-    slope, size = norm(first.slope), norm(first.vector)
-    known = [length for length in (abs(first.value) / slope if slope else 0.0, size) if 0 < length < np.inf]
-    return min(known, default=1.0)

@@ -15,22 +15,22 @@ class Watch:
     Attributes
     ----------
     history : list of Record
-    stopped : str
-        Empty while the run goes on.
+    message : str
+        Why the run is over; empty while it goes on.
+    converged : bool
     """
 
     def __init__(self, trials, packing, tolerance, callback, show):
         self._trials, self._packing = trials, packing
         self._tolerance, self._callback, self._show = tolerance, callback, show
         self._seconds, self._solves = -time.perf_counter(), -thread.solves  # at the start, taken off
-        self.history, self.stopped = [], ""
+        self.history, self.message, self.converged = [], "", False
 
     def resume(self, history):
         """Go on from a history that was kept. A callback stops one run, and a tolerance that is met, this one."""
         self.history, last = history, history[-1]
         self._seconds, self._solves = self._seconds + last.seconds, last.solves - thread.solves
-        if self._met(last):
-            self.stopped = "converged"
+        self._judge(last)
 
     @property
     def iteration(self):
@@ -49,11 +49,16 @@ class Watch:
         )
         self.history.append(record)
         self._show(record)
-        if self._met(record):
-            self.stopped = "converged"
-        elif self._callback is not None and record.iteration > 0:
+        self._judge(record)
+        if not self.converged and self._callback is not None and record.iteration > 0:
             if self._callback(record, self._packing.unpack(trial.vector)):
-                self.stopped = "stopped by the callback"
+                self.message = "stopped by the callback"
+
+    def _judge(self, record):
+        if self._met(record):
+            share = record.gradient_norm / (self.history[0].gradient_norm or 1.0)
+            self.converged = True
+            self.message = f"converged: the gradient is {f'{share:.1e} of that at the start' if share else 0}"
 
     def _met(self, record):
         first, once = self.history[0], not self._trials.batches.varied  # a batch may have the gradient 0 alone
@@ -62,18 +67,13 @@ class Watch:
         goal = self._tolerance * first.gradient_norm
         return record.gradient_norm <= goal if once else record.gradient_norm < goal
 
-    def reason(self, stuck):
-        """(message, converged) of a run that is over; `stuck` is why the method gave up, if it did."""
-        last, first = self.history[-1].gradient_norm, self.history[0].gradient_norm
-        if self.stopped == "converged":
-            share = f"{last / first:.1e} of that at the start" if last else "0"
-            return f"converged: the gradient is {share}", True
-        if self.stopped:
-            return self.stopped, False
-        if stuck == "rounding":
-            return "converged to rounding: the loss cannot fall further in floating point numbers", True
-        if stuck:
-            left = self._trials.pop_failures()
-            refused = f", {len(left)} points refused ({left[-1].error}: {left[-1].message})" if left else ""
-            return f"stopped: {stuck}{refused}; dp.check.gradient(loss, x) tells whether the gradient is right", False
-        return f"stopped after {self.iteration} iterations, as maxiter asks", False
+    def give_up(self, reason):
+        """The method found no admissible point."""
+        self.converged = reason == "rounding"
+        if self.converged:
+            self.message = "converged to rounding: the loss cannot fall further in floating point numbers"
+            return
+        left = self._trials.pop_failures()
+        refused = f", {len(left)} points refused ({left[-1].error}: {left[-1].message})" if left else ""
+        hint = "dp.check.gradient(loss, x) tells whether the gradient is right"
+        self.message = f"stopped: {reason}{refused}; {hint}"
