@@ -21,7 +21,7 @@ def bar(steps=None, needed=True, **options):
 
 
 def shown_steps(wanted, steps, label):
-    """Step numbers of a rollout -> the same, with a bar when one is wanted (True, or its label)."""
+    """Step numbers -> the same, with a bar when one is wanted (True, or its label)."""
     if not wanted:
         return steps
     return bar(steps, desc=f"{wanted} {label}" if isinstance(wanted, str) else label, leave=False)

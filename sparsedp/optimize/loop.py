@@ -12,11 +12,11 @@ from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
 from sparsedp.optimize.newton import NewtonCG
 from sparsedp.optimize.physical import PhysicalGradient
-from sparsedp.optimize.progress import progress_bar
 from sparsedp.optimize.quasi_newton import Quasi
 from sparsedp.optimize.result import Minimum, Stuck
 from sparsedp.optimize.trials import Trials
 from sparsedp.optimize.watch import Watch
+from sparsedp.progress import shown_steps
 from sparsedp.tree import leaves
 
 __all__ = ["minimize"]
@@ -152,17 +152,17 @@ def minimize(
     settings = {"method": method, "set of options": sorted(options.items()), "pair of bounds": sides, "start": start}
     kept = Checkpoint(checkpoint, settings)
     covariance = None
-    with progress_bar(progress, int(maxiter)) as show:
-        watch = Watch(trials, packing, tolerance, callback, show)
-        try:
-            _run(stepper, trials, watch, kept, box.inside(packing.pack(start)), maxiter)
-            covariance = trials.covariance(trials.best)
-        except KeyboardInterrupt:
-            if not watch.history:
-                raise
-            watch.message = watch.message or "interrupted"
-        finally:
-            kept.write(watch.history)
+    watch = Watch(trials, packing, tolerance, callback)
+    steps = shown_steps(progress, range(int(maxiter)), "minimize")
+    try:
+        _run(stepper, trials, watch, kept, box.inside(packing.pack(start)), steps)
+        covariance = trials.covariance(trials.best)
+    except KeyboardInterrupt:
+        if not watch.history:
+            raise
+        watch.message = watch.message or "interrupted"
+    finally:
+        kept.write(watch.history)
     x = packing.unpack(trials.best.vector)
     if project is not None:
         given, x = x, project(x)
@@ -175,15 +175,17 @@ def minimize(
     )  # fmt: skip
 
 
-def _run(stepper, trials, watch, kept, start, maxiter):
-    """Begin or resume, and advance until the watch stops it or it is stuck."""
+def _run(stepper, trials, watch, kept, start, steps):
+    """Begin or resume, and advance until the steps are over, the watch stops it or it is stuck."""
     state = stepper.begin(trials.first(start))
     resumed = kept.resume(state, trials, watch)
     if resumed is None:
         watch(state.trial)
     else:
         state = resumed
-    while watch.iteration < maxiter and not watch.message:
+    for _ in steps:
+        if watch.message or watch.iteration >= len(steps):
+            return
         trials.iteration = watch.iteration + 1  # a new point is seen by the next batch
         try:
             state = stepper.advance(state, trials)
@@ -192,6 +194,8 @@ def _run(stepper, trials, watch, kept, start, maxiter):
             return
         watch(state.trial)
         kept.save(state, trials, watch)
+        if not isinstance(steps, range):
+            steps.set_postfix_str(watch.history[-1].told())
 
 
 def _composed(loss, inner):

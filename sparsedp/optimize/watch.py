@@ -20,9 +20,8 @@ class Watch:
     converged : bool
     """
 
-    def __init__(self, trials, packing, tolerance, callback, show):
-        self._trials, self._packing = trials, packing
-        self._tolerance, self._callback, self._show = tolerance, callback, show
+    def __init__(self, trials, packing, tolerance, callback):
+        self._trials, self._packing, self._tolerance, self._callback = trials, packing, tolerance, callback
         self._seconds, self._solves = -time.perf_counter(), -thread.solves  # at the start, taken off
         self.history, self.message, self.converged = [], "", False
 
@@ -48,7 +47,6 @@ class Watch:
             self._solves + thread.solves,
         )
         self.history.append(record)
-        self._show(record)
         self._judge(record)
         if not self.converged and self._callback is not None and record.iteration > 0:
             if self._callback(record, self._packing.unpack(trial.vector)):
