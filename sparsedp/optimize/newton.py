@@ -51,17 +51,14 @@ class NewtonCG:
     def advance(self, state, trials):
         """One iteration: smaller regions until the loss falls. Raises Stuck when none is small enough."""
         here, product = state.trial, trials.curvature(state.trial)
-        free, height = trials.box.free(here.vector, here.slope), power_of_two(norm(here.slope))
-        slope = np.where(free, here.slope / height, 0.0)  # of size 1, about
+        height = power_of_two(norm(here.slope))
+        slope = trials.downhill(here) / height  # of size 1, about
         forcing = min(0.1, np.sqrt(norm(here.slope) / (state.size or 1.0)))
-
-        def curved(d):
-            return np.where(free, product(d) / height, 0.0)
 
         def regions():
             radius = state.radius or np.inf
             for _ in range(SHRINKS):
-                step, fall, edge = steihaug(slope, curved, radius, forcing, self.inner)
+                step, fall, edge = steihaug(slope, lambda d: product(d) / height, radius, forcing, self.inner)
                 yield trials.box.inside(here.vector + step), fall * height, (radius, norm(step), edge)
                 radius = norm(step) / 4
 

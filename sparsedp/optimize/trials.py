@@ -145,16 +145,19 @@ class Trials:
         return self._linearise(trial.vector, trial.iteration).covariance()
 
     def curvature(self, trial):
-        """Function from a flat vector to the Hessian times it, at a point: one tape, one backward pass a product."""
+        """Function from a flat vector to the Hessian times it, in what the bounds leave free at a point.
+
+        One tape, and one backward pass for each product.
+        """
         if self._gradient is not None:
             raise TypeError("newton_cg differentiates the loss twice and takes no gradient of yours; leave it out")
-        batch, packing = self.batches.at(trial.iteration), self._packing
+        batch, packing, free = self.batches.at(trial.iteration), self._packing, self.box.free(trial.vector, trial.slope)
         if packing.complex:
             raise DerivativeError("newton_cg takes real numbers, got complex ones; split them into two real arrays")
         slope, pull = pullback(
             lambda x: packing.join(value_and_grad(self._loss)(x, *batch)[1]), packing.unpack(trial.vector)
         )
-        return lambda v: packing.pack_gradient(pull(np.asarray(v, dtype=slope.dtype)))
+        return lambda v: np.where(free, packing.pack_gradient(pull(np.asarray(v, dtype=slope.dtype))), 0.0)
 
     def downhill(self, trial):
         """The gradient, 0 where the bounds hold an unknown."""
