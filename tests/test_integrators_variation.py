@@ -170,6 +170,14 @@ def test_what_cannot_be_trusted_is_refused():
         value_and_grad(loss)(20.0)
 
 
+@pytest.mark.parametrize("cut", [16.969, 16.9692, 16.9694])
+def test_what_hides_an_error_is_no_evidence(cut):
+    """What extrapolation takes away and what errors of the tolerance do have opposite signs: 69 % wrong, and taken."""
+    first, then = (dp.stepper("tr_bdf2", oscillator, length, tolerance=1e-2) for length in (cut, 20.0 - cut))
+    with pytest.raises(DerivativeError, match="give a smaller floor or tolerance"):
+        value_and_grad(lambda mu: then(first(np.array([2.0, 0.0]), mu), mu)[0])(20.0)
+
+
 def test_complex_and_single_precision():
     """Turning and growing: u = exp((1j - p) t); the derivative of |u|^2 is -2 t exp(-2 p t)."""
     step = dp.stepper("rk4", lambda u, p: (1j - p) * u, 2.0, tolerance=1e-6)

@@ -114,7 +114,7 @@ def stepper(
     away from it, relative to the params and to its largest entry, must stay below 6 tolerance^(p / (p + 1)), p the
     order (crank_nicolson: below 10 tolerance). Derivatives that are small because terms cancel may be refused, too.
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
-    takes about five times the steps of its value: twice as long as without the judgement.
+    takes about six times the steps of its value: three times as long as without the judgement.
     Source: runge_kutta.py and exponential.py name the papers.
 
     Examples
