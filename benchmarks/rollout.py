@@ -146,19 +146,6 @@ def memory(shape, n, budgets):
 # ---------------------------------------------------------------- overhead
 
 
-class Bare:
-    """A step that costs nothing, with a backward form of its own."""
-
-    def __call__(self, u, p):
-        return u
-
-    def forward(self, u, p):
-        return u
-
-    def backward(self, u, p, g):
-        return g, None
-
-
 def overhead(n=5000):
     """Print microseconds a step of 4 numbers, the user's own functions taken off."""
     u = np.ones(4)
@@ -171,14 +158,15 @@ def overhead(n=5000):
 
     grad = lambda loss: dp.value_and_grad(loss)(1.0)
     times = lambda u, p: u * p
+    bare = dp.differentiable("bare", lambda u, p: u, lambda nums, ans, u, p: lambda g: (g,))
     tasks = {
         "plain loop": lambda: loop(times, 1.0),
         "rollout, no gradient": lambda: dp.rollout(times, u, 1.0, n),
         "loop on the tape": lambda: grad(lambda p: loop(times, p)),
         "rollout, gradient": lambda: grad(lambda p: anp.sum(dp.rollout(times, u, p, n))),
         "rollout, gradient, 60 states": lambda: grad(lambda p: anp.sum(dp.rollout(times, u, p, n, memory=64 * 32))),
-        "backward form, no gradient": lambda: dp.rollout(Bare(), u, 1.0, n),
-        "backward form, gradient": lambda: dp.value_and_grad(lambda u: anp.sum(dp.rollout(Bare(), u, None, n)))(u),
+        "rule, no gradient": lambda: dp.rollout(bare, u, 1.0, n),
+        "rule, gradient": lambda: dp.value_and_grad(lambda u: anp.sum(dp.rollout(bare, u, 1.0, n)))(u),
     }
     best = {name: 1e6 / n * seconds for name, seconds in best_times(tasks, 5).items()}
     print("\nmicroseconds a step, 4 numbers")
@@ -186,7 +174,7 @@ def overhead(n=5000):
         print(f"{name:32} {value:8.2f}")
     print(f"overhead forward {best['rollout, no gradient'] - best['plain loop']:.2f} us")
     print(f"overhead with gradient {best['rollout, gradient'] - best['loop on the tape']:.2f} us, limit 50")
-    print(f"a step with a backward form of its own {best['backward form, gradient']:.2f} us")
+    print(f"a step that is a rule of its own {best['rule, gradient']:.2f} us")
 
 
 def main():

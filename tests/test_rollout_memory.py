@@ -1,4 +1,4 @@
-"""rollout under a budget: bits, counts and bytes; steps with plain forms of their own."""
+"""rollout under a budget: bits, counts and bytes; steps with a derivative of their own."""
 
 import tracemalloc
 
@@ -9,19 +9,14 @@ import pytest
 import sparsedp as dp
 from sparsedp.errors import BudgetWarning
 from sparsedp.ledger import recording
+from sparsedp.tape import Rule
 from sparsedp.trajectory.schedule import advances, budget_within_reach, plan, recomputed, stride
 
 
-class Shift:
-    """A donor-cell step with plain forms: u_i + c_i (u_(i-1) - u_i), periodic."""
+def shift(wrong=None):
+    """A donor-cell step with a derivative of its own: u_i + c_i (u_(i-1) - u_i), periodic."""
 
-    def __init__(self, wrong=None):
-        self.wrong = wrong
-
-    def __call__(self, u, c):
-        return u + c * (anp.roll(u, 1, 0) - u)
-
-    def forward(self, u, c):
+    def forward(u, c):
         out = np.empty_like(u)
         np.subtract(u[:-1], u[1:], out=out[1:])
         np.subtract(u[-1:], u[:1], out=out[:1])
@@ -29,37 +24,31 @@ class Shift:
         out += u
         return out
 
-    def backward(self, u, c, g):
-        into = np.empty_like(c)
-        moved = g * c
-        back = g - moved
-        back[:-1] += moved[1:]
-        back[-1] += moved[0]
-        into[1:] = g[1:] * (u[:-1] - u[1:])
-        into[0] = g[0] * (u[-1] - u[0])
-        return (g if self.wrong == "identity" else back), into
+    def vjp(nums, ans, u, c):
+        def pull(g):
+            moved = g * c
+            back = g - moved
+            back[:-1] += moved[1:]
+            back[-1] += moved[0]
+            into = np.empty_like(c) if 1 in nums else None
+            if into is not None:
+                into[1:] = g[1:] * (u[:-1] - u[1:])
+                into[0] = g[0] * (u[-1] - u[0])
+            cotangents = (g if wrong == "identity" else back), into
+            return tuple(cotangents[num] for num in nums)
+
+        return pull
+
+    return dp.differentiable("shift", forward, vjp)
 
 
-class Plain:
-    """The same without plain forms."""
-
-    def __call__(self, u, c):
-        return Shift()(u, c)
+def plain(u, c):
+    """The same as a user of autograd writes it."""
+    return u + c * (anp.roll(u, 1, 0) - u)
 
 
-class Tree:
-    """The same on trees, with a leaf that is no variable, and a float among the parameters."""
-
-    def __call__(self, s, p):
-        return {"u": Shift()(s["u"], p["c"]) * p["scale"], "v": s["v"], "n": s["n"]}
-
-    def forward(self, s, p):
-        return {"n": s["n"], "v": s["v"], "u": Shift().forward(s["u"], p["c"]) * p["scale"]}
-
-    def backward(self, s, p, g):
-        moved = Shift().forward(s["u"], p["c"])
-        back, of_c = Shift().backward(s["u"], p["c"], g["u"] * p["scale"])
-        return {"u": back, "v": g["v"], "n": None}, {"scale": np.sum(moved * g["u"]), "c": of_c, "word": None}
+RULE = shift()
+KINDS = pytest.mark.parametrize("step", [RULE, plain], ids=["rule", "formula"])
 
 
 N, CELLS = 40, 12
@@ -77,59 +66,27 @@ def loss(step, x, keep="last", n=N, **options):
 
 @pytest.mark.parametrize("keep", ["last", "all", lambda i, u: anp.sum(WEIGHTS[i] * u**3)], ids=["last", "all", "each"])
 @pytest.mark.parametrize("memory", [None, *BUDGETS])
-def test_plain_forms_give_the_gradient_of_the_tape(keep, memory):
+def test_a_rule_gives_the_gradient_of_the_formula(keep, memory):
     x = (U0, C0)
-    value, slope = dp.value_and_grad(lambda x: loss(Shift(), x, keep, memory=memory))(x)
-    same, exact = dp.value_and_grad(lambda x: loss(Plain(), x, keep))(x)
+    value, slope = dp.value_and_grad(lambda x: loss(RULE, x, keep, memory=memory))(x)
+    same, exact = dp.value_and_grad(lambda x: loss(plain, x, keep))(x)
     assert abs(value - same) < 1e-13
     assert max(np.max(np.abs(a - b)) for a, b in zip(slope, exact)) < 1e-13
-    _, again = dp.value_and_grad(lambda x: loss(Shift(), x, keep))(x)
+    _, again = dp.value_and_grad(lambda x: loss(RULE, x, keep))(x)
     assert all(a.tobytes() == b.tobytes() for a, b in zip(slope, again))
 
 
-def test_plain_forms_on_trees():
-    state, params = {"u": U0, "v": C0, "n": 3}, {"scale": 0.99, "c": C0, "word": "x"}
-
-    def total(step, memory=None):
-        def of(x):
-            end = dp.rollout(step, *x, N, memory=memory)
-            return anp.sum(WEIGHTS[0] * end["u"] ** 2) + anp.sum(end["v"] * C0)
-
-        return dp.value_and_grad(of)((state, params))
-
-    value, (s, p) = total(Tree())
-    same, (t, q) = total(Tree().__call__)
-    assert abs(value - same) < 1e-13 and abs(p["scale"] - q["scale"]) < 1e-12 and p["word"] is None
-    assert np.max(np.abs(s["u"] - t["u"])) < 1e-13 and np.max(np.abs(p["c"] - q["c"])) < 1e-13
-    assert np.array_equal(s["v"], C0)
-    for memory in (2 * b for b in BUDGETS):
-        _, (a, b) = total(Tree(), memory)
-        assert a["u"].tobytes() == s["u"].tobytes() and b["c"].tobytes() == p["c"].tobytes()
-
-
-def test_second_order_of_plain_forms():
-    x, d = (U0, C0), (np.cos(U0), U0)
-
-    def product(step, **options):
-        slope = lambda x: dp.value_and_grad(lambda x: loss(step, x, n=6, **options))(x)[1]
-        return dp.value_and_grad(lambda x: sum(anp.sum(a * b) for a, b in zip(slope(x), d)))(x)[1]
-
-    wanted = product(Plain())
-    for found in (product(Shift()), product(Shift(), memory=BUDGETS[1])):
-        assert max(np.max(np.abs(a - b)) for a, b in zip(found, wanted)) < 1e-13
-
-
-def test_a_wrong_plain_form_is_caught_by_the_check():
-    assert dp.check.gradient(lambda x: loss(Shift(), x), (U0, C0)).verdict == "agrees"
-    assert dp.check.gradient(lambda x: loss(Shift("identity"), x), (U0, C0)).verdict == "disagrees"
+def test_a_wrong_rule_is_caught_by_the_check():
+    assert dp.check.gradient(lambda x: loss(RULE, x), (U0, C0)).verdict == "agrees"
+    assert dp.check.gradient(lambda x: loss(shift("identity"), x), (U0, C0)).verdict == "disagrees"
 
 
 def test_an_input_is_never_overwritten():
     u, c = U0.copy(), C0.copy()
-    end = dp.rollout(Shift(), u, c, 5)
+    end = dp.rollout(RULE, u, c, 5)
     assert np.array_equal(u, U0) and np.array_equal(c, C0)
     kept = end.copy()
-    dp.rollout(Shift(), u, c, 9)
+    dp.rollout(RULE, u, c, 9)
     assert np.array_equal(end, kept)
 
 
@@ -155,7 +112,7 @@ def test_binomial_schedule_is_optimal():
     assert all(best(n, s) == advances(n, s) == ours(n, s) for n in range(60) for s in range(1, 8))
 
 
-@pytest.mark.parametrize("step", [Shift(), Plain()], ids=["plain forms", "tape"])
+@KINDS
 @pytest.mark.parametrize("slots", [1, 2, 3, 5, 11, 60])
 @pytest.mark.parametrize("n", [1, 2, 7, N])
 def test_steps_are_run_again_as_rarely_as_possible(step, slots, n):
@@ -176,7 +133,7 @@ def test_many_steps_without_recursion():
     told = plan(100_000, 31 * 2048, 2048, 2 * 2048)
     assert told.kept == 24 and told.factor < 5
     runs: list = []
-    step, n = Shift(), 20_000  # the test itself is shorter; the benchmark runs all
+    step, n = RULE, 20_000  # the test itself is shorter; the benchmark runs all
     slope = dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, c, n, memory=31 * 2048, record=runs.append)))(u)[1]
     assert np.max(np.abs(slope - 1)) < 1e-9 and runs[-1].steps == n
 
@@ -193,7 +150,7 @@ def peak(call):
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("step", [Shift(), Plain()], ids=["plain forms", "tape"])
+@KINDS
 @pytest.mark.parametrize("keep", ["last", "all"])
 def test_peak_is_the_trajectory(step, keep):
     u, n = np.random.default_rng(0).random(20_000), 100
@@ -209,30 +166,21 @@ def test_peak_is_the_trajectory(step, keep):
     assert used < (1.2 if keep == "last" else 3.3)
 
 
-@pytest.mark.parametrize("step", [Shift(), Plain()], ids=["plain forms", "tape"])
+@KINDS
 @pytest.mark.parametrize("states", [7, 9, 12, 24])
 def test_peak_under_a_budget(step, states):
     u, n = np.random.default_rng(0).random(20_000), 60
     c = np.full(u.shape, 0.5)
     gradient = lambda: dp.value_and_grad(lambda x: anp.sum(dp.rollout(step, *x, n, memory=states * u.nbytes)))((u, c))
     gradient()
-    beside = 5 if isinstance(step, Shift) else 7  # what the step needs by itself
+    beside = 5 if step is RULE else 7  # what the step needs by itself
     assert peak(gradient) < (states + beside) * u.nbytes + 100_000
     plain = peak(lambda: dp.rollout(step, u, c, n, memory=states * u.nbytes))
     assert plain < 7.2 * u.nbytes  # nothing is kept without a gradient
 
 
-class Scaled:
-    """u times c, without a temporary array."""
-
-    def __call__(self, u, c):
-        return u * c
-
-    def forward(self, u, c):
-        return u * c
-
-    def backward(self, u, c, g):
-        return g * c, g * u
+# u times c, without a temporary array.
+SCALED = Rule("scaled", lambda u, c: u * c, lambda nums, ans, u, c: lambda g: tuple(g * (c, u)[num] for num in nums))
 
 
 @pytest.mark.parametrize("keep", ["last", "each"])
@@ -245,7 +193,7 @@ def test_the_budget_is_what_a_step_without_needs_of_its_own_takes(states, params
     v, weights = rng.random(u.shape), np.cos(u)
     for given in (u, v, weights):  # nobody writes into them: the tape of the loss keeps no copies beside the rollout
         given.flags.writeable = False
-    step, runs = Scaled(), []
+    step, runs = SCALED, []
 
     def total(u, v):
         options = {"keep": lambda i, u: anp.sum(u[:3])} if keep == "each" else {}
@@ -265,7 +213,7 @@ def test_a_budget_that_a_little_more_would_help_says_so():
     """100 steps: the numbers of runs are those of the formula, the least budget is found by trying."""
     n, size, runs = 100, U0.nbytes, []
     tight = lambda memory: dp.value_and_grad(
-        lambda u: anp.sum(dp.rollout(Shift(), u, C0, n, memory=memory, record=runs.append))
+        lambda u: anp.sum(dp.rollout(RULE, u, C0, n, memory=memory, record=runs.append))
     )(U0)
     with pytest.warns(
         BudgetWarning,
@@ -285,7 +233,7 @@ def test_a_budget_that_a_little_more_would_help_says_so():
 
 def test_all_states_handed_out_are_states_kept():
     """Whatever the budget: no step is run again."""
-    for step in (Shift(), Plain()):
+    for step in (RULE, plain):
         runs, wanted = [], dp.value_and_grad(lambda x: loss(step, x, "all"))((U0, C0))
         value, slopes = dp.value_and_grad(lambda x: loss(step, x, "all", memory=7 * U0.nbytes, record=runs.append))(
             (U0, C0)
@@ -300,7 +248,7 @@ def test_ten_thousand_steps_at_256(memory):
     u, c = np.random.default_rng(0).random((256, 256)), np.full((256, 256), 0.4)
 
     def gradient(n, memory):
-        return dp.value_and_grad(lambda x: anp.sum(dp.rollout(Shift(), *x, n, memory=memory) ** 2))((u, c))
+        return dp.value_and_grad(lambda x: anp.sum(dp.rollout(RULE, *x, n, memory=memory) ** 2))((u, c))
 
     assert peak(lambda: gradient(10_000, memory)) < (1.0 if memory == "1 GB" else 0.1) * 1e9
     short, full = gradient(1000, memory), gradient(1000, None)

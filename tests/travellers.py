@@ -126,7 +126,7 @@ def of_inverse(inv):
 
 
 def of_step(step, state, params):
-    """A loop of three steps: its own plain forms, and the tape."""
+    """A loop of three steps, and one step."""
     whole = lambda u, p: dp.rollout(step, u, p, 3)
     leaf = lambda u, p: whole(u, p)[0] if isinstance(state, tuple) else whole(u, p)
     if isinstance(state, tuple):

@@ -90,7 +90,7 @@ def rollout(
     with s states kept and at most r runs over each step, n <= (s + r)! / (s! r!) steps go back. The gradient
     has the same bits for every `memory`. A derivative forward costs the memory of one step, that of a gradient (`hvp`)
     twice the memory of the gradient; the gradient of a gradient has all calls of both on its tape. A step with a
-    backward form of its own is one node on the tape.
+    derivative of its own is one made by `differentiable`.
 
     The states gone back through are those of one run that ends, bit by bit, in what was handed out: a step on its
     tape must give the state after it, and states that are run again must lead to those kept. Large ones are compared

@@ -14,10 +14,8 @@ from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.fields import place, surely_finite
 from sparsedp.ledger import active, count, thread
 from sparsedp.progress import shown_steps
-from sparsedp.tape import Rule, isbox, plain
+from sparsedp.tape import Rule, plain
 from sparsedp.trajectory.backward_pass import BackwardPass
-from sparsedp.trajectory.carried import carries, in_plain_forms
-from sparsedp.trajectory.keep import Each
 from sparsedp.trajectory.layout import dense
 from sparsedp.trajectory.record import Record
 from sparsedp.trajectory.schedule import checkpoints
@@ -44,15 +42,13 @@ class Run:
     def __init__(self, loop, keep, slots, rooms, progress, record):
         self.loop, self.keep, self.rooms, self.progress, self.record = loop, keep, rooms, progress, record
         self.slots = None if keep.whole else slots
-        self.carried = loop.inputs is None and carries(loop.step)  # whether the step's own plain forms are used
         self.stored: Any = None  # for the way back: (steps, states with the last one, tapes from the first step on)
         self._end: list = []  # fingerprint of the last state
 
     def forward(self, args):
         """Run all steps; return the arrays to hand out."""
         loop, args = self.loop, list(map(dense, args))
-        self.carried = self.carried and not any(map(isbox, args))  # other traces go through the step as it is called
-        steps = Steps(loop, args, in_plain_forms(loop) if self.carried else loop.step)
+        steps = Steps(loop, args)
         self.keep.start(loop.n, steps.outer, bool(loop.wanted))
         with steps.guarded():
             state, kept, tapes = self._advance(steps)
@@ -119,12 +115,7 @@ class Run:
 
     def backward(self, args, g):
         """Cotangents of the outputs -> those of the arguments that want one, in that order."""
-        if self.carried and any(map(isbox, g)):  # a backward form is for plain values
-            self.carried = False
-            if isinstance(self.keep, Each):
-                self.keep.marks.clear()  # the other form of the step may round otherwise
-            self.forward(args)
-        elif self.stored is None:
+        if self.stored is None:
             end = self._end
             self.forward(args)
             self.compare(self._end, end)

@@ -131,8 +131,6 @@ class Steps:
     loop : Loop
     args : list of arrays
         Variables of state, params and inputs; traced ones belong to outer traces, and every call is on those too.
-    step : callable
-        That of the loop, or another form of it.
 
     Attributes
     ----------
@@ -145,8 +143,8 @@ class Steps:
         That which the step under way begins with.
     """
 
-    def __init__(self, loop, args, step):
-        self.loop, self.step, self.number, self.recorder = loop, step, new_trace(), Recorder()
+    def __init__(self, loop, args):
+        self.loop, self.number, self.recorder = loop, new_trace(), Recorder()
         self.outer, self.last = traces_of(args), None
         self._open = any(layout.open for layout in loop.layouts)
         values, self.p, self.x = loop.split(args)
@@ -199,7 +197,7 @@ class Steps:
         self.last = state
         parts = self._parts(state, values, params)
         given = [leaves(part) for part in parts] if self._open else None
-        result = self.step(*parts)
+        result = self.loop.step(*parts)
         if given is not None:
             _check_entries(parts, given)
         return self.loop.state.take(result, "the step")
