@@ -9,8 +9,21 @@ from sparsedp.constants import is_fixed
 from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.fields import check_function, is_whole
 from sparsedp.recipe import Made
-from sparsedp.tape import dtype_of, fit, is_variable, isbox, plain
-from sparsedp.traces import backward, boxed, forward_root, growing, new_trace, reverse_root, split_box
+from sparsedp.tape import (
+    Recorder,
+    backward,
+    boxed,
+    dtype_of,
+    fit,
+    forward_root,
+    growing,
+    is_variable,
+    isbox,
+    new_trace,
+    plain,
+    reverse_root,
+    split_box,
+)  # fmt: skip
 from sparsedp.tree import copied, flatten, keys, leaves
 
 __all__ = ["NO_JVP", "grad", "hvp", "jvp", "linearised", "pullback", "push", "pushforward", "traced", "value_and_grad",
@@ -86,21 +99,24 @@ def linearised(fun, tree, moving):
 
     ``pull(cotangents)``: of the leaves of the result -> of the leaves of the tree; None where there is none.
     """
-    roots = [reverse_root() if moves else None for moves in moving]
-    result, number = traced(fun, tree, roots)
-    ends, rebuild = flatten(result)
-    pairs = [split_box(end, number) for end in ends]
+    recorder = Recorder()
+    roots = [reverse_root(recorder) if moves else None for moves in moving]
+    try:
+        values, ends, rebuild = traced(fun, tree, roots)
+    finally:
+        nodes = recorder.taken()
 
     def pull(cotangents):
+        sums: dict = {}
         with growing():  # rollouts make tapes on their way back
-            found = backward([node for _, node in pairs], cotangents)
-        return [found.get(root) for root in roots]
+            backward(nodes, ends, cotangents, sums)
+        return [sums.get(root, (None,))[0] for root in roots]
 
-    return [value for value, _ in pairs], rebuild, pull
+    return values, rebuild, pull
 
 
 def traced(fun, tree, roots):
-    """fun(tree) with a box for every root -> (the tree of results, the number of the trace).
+    """fun(tree) with a box for every root -> (leaves of the result, their nodes or None, how to build it).
 
     With a word of advice where NumPy, math or Python refuse a traced value.
     """
@@ -108,7 +124,9 @@ def traced(fun, tree, roots):
     number = new_trace()
     try:
         with growing():
-            return fun(rebuild(boxed(found, roots, number))), number
+            ends, build = flatten(fun(rebuild(boxed(found, roots, number))))
+        pairs = [split_box(end, number) for end in ends]
+        return [value for value, _ in pairs], [node for _, node in pairs], build
     except (TypeError, ValueError, AttributeError) as error:
         said = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
         if isinstance(error, SparsedpError) or not any("ArrayBox" in words for words in said):
@@ -177,11 +195,9 @@ def pushforward(fun, x, tangent):
 def forward(fun, x, tangents):
     """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants)."""
     roots = [None if tangent is None else forward_root(tangent) for tangent in tangents]
-    result, number = traced(fun, x, roots)
-    ends, rebuild = flatten(result)
-    pairs = [split_box(end, number) for end in ends]
-    slopes = [tangent_of(value, None if node is None else node.g) for value, node in pairs]
-    return rebuild(value for value, _ in pairs), rebuild(slopes)
+    values, nodes, rebuild = traced(fun, x, roots)
+    slopes = [tangent_of(value, node and node.g) for value, node in zip(values, nodes, strict=True)]
+    return rebuild(values), rebuild(slopes)
 
 
 def tangent_of(value, slope):

@@ -1,33 +1,294 @@
-"""The tape: rules with hand-written derivatives.
+"""The tape: rules with hand-written derivatives, the traces they are called on, and the way back through a trace.
 
-Only this file talks to autograd's extension interface. All rules go through one primitive (`_call`), all Operators
-through a lighter one (`apply_operator`): a primitive for each rule would stay in autograd's tables for ever.
+Only this file opens autograd. All rules go through one primitive (`_call`), all Operators through a lighter one
+(`apply_operator`): a primitive for each rule would stay in autograd's tables for ever.
 
 Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A x is A^T g.
 """
 
+import gc
 import inspect
+import threading
+from contextlib import contextmanager
 from functools import cached_property, partial, wraps
+from itertools import count as numbers_from
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
-from autograd.core import VJPNode
+from autograd.core import JVPNode, VJPNode, add_outgrads
 from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
-from autograd.tracer import box_types, getval, isbox, new_box
+from autograd.tracer import box_types, getval, isbox, new_box, notrace_primitives, trace_stack
 
-from sparsedp.constants import constant_args, sparing
+from sparsedp.constants import constant, constant_args, sparing
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.ledger import active, count, tell, timed
+from sparsedp.ledger import active, count, tell, thread, timed
 from sparsedp.recipe import Remade
-from sparsedp.shortcuts import NUMBERS, direct, noted
-from sparsedp.tree import leaves
+from sparsedp.shortcuts import (
+    ARRAY,
+    BOX,
+    COPY,
+    ITEM,
+    MAKERS,
+    NUMBERS,
+    OPERATORS,
+    PLAIN,
+    REAL,
+    Part,
+    pull_of,
+    tangent_of,
+)
+from sparsedp.tree import copied, leaves
 
 __all__ = [
-    "Rule", "apply_operator", "called", "cast", "differentiable", "dtype_of", "fit", "innermost", "is_variable",
-    "isbox", "linear", "of_argument", "plain", "through",
+    "Recorder", "ReverseNode", "Rule", "apply_operator", "backward", "boxed", "called", "cast", "differentiable",
+    "dtype_of", "fit", "forward_root", "growing", "innermost", "is_variable", "isbox", "linear", "new_trace",
+    "of_argument", "plain", "reverse_root", "split_box", "through", "traces_of", "untraced",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
+
+
+# ---- traces ----------------------------------------------------------------------------------------------------------
+
+
+class Recorder:
+    """Takes down the calls of reverse-mode traces in order: the backward pass need not sort a graph."""
+
+    weigh: Any = None  # a function of (value, args, nums) that looks at every call
+
+    def __init__(self):
+        self.nodes: list = []
+
+    def taken(self):
+        """The calls since it was asked last: it forgets them, for they know it, and a circle is freed late."""
+        nodes, self.nodes = self.nodes, []
+        return nodes
+
+
+class ReverseNode(VJPNode):
+    """A call on a reverse-mode trace. Its pullback sees the constants of the call as they are now."""
+
+    __slots__ = ("recorder",)
+    parents: Any
+    vjp: Any
+
+    def initialize_root(self, recorder):
+        """Begin a trace."""
+        self.parents, self.vjp, self.recorder = (), None, recorder
+
+    def __init__(self, value, fun, args, options, nums, parents):
+        self.parents, self.recorder = parents, parents[0].recorder
+        if len(nums) < len(args) and fun not in sparing:
+            args = constant_args(args, nums)
+        if options:
+            options = constant(options)
+        self.vjp = None if options else pull_of(fun, value, args, nums)
+        if self.vjp is None:
+            super().__init__(value, fun, args, options, nums, parents)
+        self.recorder.nodes.append(self)
+        if self.recorder.weigh is not None:
+            self.recorder.weigh(value, args, nums)
+
+
+class ForwardNode(JVPNode):
+    """A call on a forward-mode trace."""
+
+    __slots__ = ()
+    g: Any
+
+    def __init__(self, value, fun, args, options, nums, parents):
+        self.g = None if options else tangent_of(fun, value, args, nums, [parent.g for parent in parents])
+        if self.g is None:
+            super().__init__(value, fun, args, options, nums, parents)
+
+
+untraced = notrace_primitives  # by kind of node, functions that leave the tape
+untraced[ReverseNode], untraced[ForwardNode] = untraced[VJPNode], untraced[JVPNode]
+forward_root = ForwardNode.new_root  # a fresh start of a forward-mode trace, with its tangent
+
+
+def reverse_root(recorder):
+    """A fresh start of a reverse-mode trace, whose calls the recorder takes down."""
+    return (thread.witnesses[-1] if thread.witnesses else ReverseNode).new_root(recorder)
+
+
+_numbers = numbers_from(trace_stack.top + 1)
+
+
+def new_trace():
+    """The number of a trace that begins: larger than those of the traces it is nested in, and never given twice."""
+    return next(_numbers)
+
+
+@contextmanager
+def _new_trace():
+    """The same for autograd's own traces.
+
+    autograd counts up and down, for all threads together: of two nested traces the inner one could get the smaller
+    number, and its derivative be that of the other.
+    """
+    yield new_trace()
+
+
+trace_stack.new_trace = _new_trace
+
+
+SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
+_lock = threading.Lock()
+_growing: list[tuple] = []  # thresholds to go back to, one for each tape that grows
+
+
+@contextmanager
+def growing():
+    """While a tape grows: it has no cycles, and every search for cyclic garbage would walk all of it."""
+    with _lock:
+        before = gc.get_threshold()
+        _growing.append(before if not _growing else _growing[0])
+        if 0 < before[0] < SELDOM:
+            gc.set_threshold(SELDOM, *before[1:])
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _growing.pop()
+            if not _growing:
+                gc.set_threshold(*before)
+
+
+def traces_of(values):
+    """The numbers of all traces that lead to some values."""
+    numbers = set()
+    for value in values:
+        while isbox(value):
+            numbers.add(value._trace)
+            value = value._value
+    return numbers
+
+
+def boxed(values, roots, number):
+    """Values -> the same, those with a root on the trace of this number."""
+    return [x if root is None else new_box(x, number, root) for x, root in zip(values, roots, strict=True)]
+
+
+def split_box(value, number):
+    """The value below the box of this trace, and its node (None when it does not depend on x)."""
+    return (value._value, value._node) if isbox(value) and value._trace == number else (value, None)
+
+
+def backward(nodes, ends, cotangents, sums):
+    """Hand cotangents of `ends` back through the calls `nodes`, recorded in order.
+
+    `ends`, `cotangents`: lists, None where there is none. `sums`: {node: (sum so far, whether it may be written to)},
+    to which those of roots, and of calls elsewhere, are added.
+    """
+    for end, g in zip(ends, cotangents, strict=True):
+        if end is not None and g is not None:
+            sums[end] = _added(sums.get(end), g)
+    for node in reversed(nodes):
+        if node in sums:
+            for parent, g in zip(node.parents, node.vjp(sums.pop(node)[0]), strict=True):
+                known = sums.get(parent)
+                sums[parent] = (g, False) if known is None and type(g) in NUMBERS else _added(known, g)
+
+
+def _added(known, g):
+    """(Sum so far, whether it may be written to) or None, a cotangent -> the new pair."""
+    kind = type(g)
+    if kind is Part:
+        if known is not None and known[1] and type(known[0]) is np.ndarray and type(g.g) in REAL:
+            known[0][g.index] += g.g
+            return known
+        whole = _whole(g) if known is None else known[0] + _whole(g)
+        return whole, type(whole) is np.ndarray
+    if known is None or kind is not type(known[0]) or kind not in NUMBERS or known[0].dtype != g.dtype:
+        return add_outgrads(known, g)
+    total = np.add(known[0], g, out=known[0] if known[1] and kind is np.ndarray else None)
+    return total, kind is np.ndarray
+
+
+def _whole(part):
+    """A part of a cotangent, traced or not -> the array around it."""
+
+    def around(g):
+        whole = np.zeros(part.shape)
+        whole[part.index] = g
+        return whole[()]
+
+    g = part.g
+    return linear("entries", around, lambda whole: whole[part.index])[0](g) if isbox(g) else around(g)
+
+
+# ---- calls -----------------------------------------------------------------------------------------------------------
+
+
+def direct(function, asked=False):
+    """A primitive of autograd -> the same, which asks autograd only where traces are nested.
+
+    `asked`: whether operands that are not PLAIN are asked too, as by NumPy's operators; that is left to autograd.
+    """
+    raw = function.fun
+
+    @wraps(function)
+    def call(*args):
+        values, nums, parents, trace = list(args), [], [], None
+        for num, arg in enumerate(args):
+            kind = type(arg)
+            if kind in box_types:
+                value = arg._value
+                if type(value) in box_types or (nums and arg._trace != trace):
+                    return function(*args)
+                values[num], trace = value, arg._trace
+                nums.append(num)
+                parents.append(arg._node)
+            elif asked and kind not in PLAIN:
+                return function(*args)
+        ans = raw(*values)
+        if not nums:
+            return ans
+        return new_box(ans, trace, type(parents[0])(ans, function, values, {}, nums, parents))
+
+    return call
+
+
+def _noted(function, raw, args, nums):
+    """A call whose arguments `nums` are on one trace: `raw` of what is below it, and a node for `function`."""
+    values, parents = list(args), []
+    for num in nums:
+        values[num] = args[num]._value
+        parents.append(args[num]._node)
+    ans = raw(*values)
+    node = type(parents[0])(ans, function, tuple(values), {}, tuple(nums), tuple(parents))
+    return new_box(ans, args[nums[0]]._trace, node)
+
+
+def _install():
+    """Give autograd's traced values quick operators, and its maker of arrays a quick way."""
+
+    def reflected(act):
+        return lambda box, other: act(other, box)
+
+    BOX.shape, BOX.__getitem__ = property(lambda box: np.shape(box._value)), direct(ITEM)
+    for name, function in OPERATORS.items():
+        act = direct(function, asked=True)
+        setattr(BOX, f"__{name}__", act)
+        setattr(BOX, f"__r{name}__", reflected(act))
+    copy = direct(COPY)
+
+    @wraps(COPY)
+    def copy_of(args, options, value):
+        """A number needs no copy."""
+        number = type(value) in box_types and type(value._value) is np.float64 and not (args or options)
+        return value if number else copy(args, options, value)
+
+    for name, function in zip(MAKERS, (copy_of, direct(ARRAY)), strict=True):
+        setattr(anp.numpy_wrapper, name, function)
+
+
+_install()
+
+
+# ---- rules -----------------------------------------------------------------------------------------------------------
 
 
 def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
@@ -78,21 +339,11 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
 
 def _fresh(function):
     """A function of the user, whose results are copied: it may write into the arrays that it has returned."""
-
-    @wraps(function)  # it has the signature of the function
-    def act(*args):
-        result = function(*args)
-        return tuple(map(_copied, result)) if isinstance(result, (tuple, list)) else _copied(result)
-
-    return act
+    return wraps(function)(lambda *args: copied(function(*args)))  # it has the signature of the function
 
 
 def _fresh_pull(vjp):
     return lambda *args: _fresh(vjp(*args))
-
-
-def _copied(value):
-    return value.copy() if isinstance(value, np.ndarray) else value
 
 
 class Rule(Remade):
@@ -145,7 +396,7 @@ def _run(rule, *args):
 
 
 _primitive = primitive(_run)
-_call = direct(_primitive, _run, box_types, new_box)
+_call = direct(_primitive)
 
 
 def through(rule, *args):
@@ -154,7 +405,7 @@ def through(rule, *args):
     Only the innermost trace, if it is a reverse-mode one, gets a node; all others go through those functions.
     """
     nums = [num + 1 for num in innermost(args)]
-    return noted(through, _run, (rule, *args), nums, new_box) if nums else _run(rule, *args)
+    return _noted(through, _run, (rule, *args), nums) if nums else _run(rule, *args)
 
 
 def innermost(values):
@@ -219,6 +470,8 @@ def fit(name, value, cotangent, g):
     shape, wanted = np.shape(plain(cotangent)), np.shape(plain(value))
     if shape != wanted:
         raise ShapeError(f"{name} returned a derivative of shape {shape} where {wanted} is needed")
+    if type(cotangent) is np.ndarray and not isinstance(plain(value), np.ndarray):
+        cotangent = cotangent[()]  # a number, as the value is
     kind, precise = dtype_of(cotangent), dtype_of(value)
     if kind == precise:
         return cotangent
@@ -273,7 +526,7 @@ def _apply(op, u):
 
 
 _operator = primitive(_apply)
-apply_operator = direct(_operator, _apply, box_types, new_box)  # a field through an Operator: half a rule's cost
+apply_operator = direct(_operator)  # a field through an Operator: half a rule's cost
 
 
 def _operator_vjp(argnums, ans, args, kwargs):
@@ -295,7 +548,8 @@ def _operator_jvp(argnums, tangents, ans, args, kwargs):
     return apply_operator(op.tangent, tangent) if isbox(tangent) else op.tangent.apply(tangent)
 
 
-sparing.update((_primitive, _operator, through))
+# Shapes of their constants are all they need, or they call `constant_args` themselves.
+sparing.update((_primitive, _operator, through, anp.add, anp.subtract, anp.concatenate_args, ARRAY, COPY))
 defvjp_argnums(_operator, _operator_vjp)
 defjvp_argnums(_operator, _operator_jvp)
 

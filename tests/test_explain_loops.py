@@ -4,7 +4,7 @@ import autograd.numpy as anp
 import numpy as np
 
 import sparsedp as dp
-from sparsedp.traces import untraced
+from sparsedp.tape import untraced
 
 GRID = dp.Grid((12, 10), size=(1.0, 1.0))
 L = dp.laplacian(GRID, dp.dirichlet)

@@ -101,7 +101,7 @@ BUGS = {
         "tests/test_solvers_use.py::test_a_coefficient_may_be_reused_before_the_pullback",
     ),
     "a product that holds an array which changes later": Bug(
-        "traces.py",
+        "tape.py",
         "            args = constant_args(args, nums)",
         "            pass",
         "tests/test_reused_arrays.py::test_views_of_what_is_written_into",

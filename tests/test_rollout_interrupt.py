@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp import ledger, traces
+from sparsedp import ledger, tape
 from sparsedp.derivative import pullback, pushforward
 from sparsedp.tree import leaves
 
@@ -82,7 +82,7 @@ def told(found):
 def left_over():
     mine = ledger.thread
     kept = len(mine.calls), len(mine.observers), len(mine.loops), len(mine.inner), len(mine.witnesses)
-    return len(ledger.active), *kept, set(traces.untraced)
+    return len(ledger.active), *kept, set(tape.untraced)
 
 
 @pytest.mark.parametrize("job", [gradient, product, twice])

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from sparsedp.ledger import thread
-from sparsedp.tape import called, isbox
-from sparsedp.traces import ReverseNode, untraced
+from sparsedp.tape import ReverseNode, called, isbox, untraced
 
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order", "witnessed"]
 

@@ -5,8 +5,7 @@ import numpy as np
 from sparsedp.derivative import zero_like
 from sparsedp.ledger import active, count
 from sparsedp.progress import shown_steps
-from sparsedp.tape import fit
-from sparsedp.traces import accumulate
+from sparsedp.tape import backward, fit
 from sparsedp.trajectory.layout import refuse_lost, stacked
 from sparsedp.trajectory.record import Growth
 from sparsedp.trajectory.schedule import stride
@@ -74,11 +73,7 @@ class BackwardPass:
     def _pull(self, tape, state, g):
         """Cotangents of the state after a tape -> those of the state before, None if those are not wanted."""
         cotangents, self.steps.last = self.cotangents, state
-        for node, back in zip(tape.ends, g, strict=True):
-            if node is not None and back is not None:
-                known = cotangents.get(node)
-                cotangents[node] = (back if known is None else known[0] + back), False
-        accumulate(cotangents, reversed(tape.nodes))
+        backward(tape.nodes, tape.ends, g, cotangents)
         backs, many = [cotangents.pop(root, NONE)[0] for root in tape.starts], len(g)
         for rows, back in zip(self.inputs, backs[many:], strict=True):
             if back is not None:

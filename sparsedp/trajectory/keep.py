@@ -12,8 +12,7 @@ from sparsedp.constants import constant
 from sparsedp.derivative import linearised
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import frozen
-from sparsedp.tape import dtype_of, is_variable, isbox, plain
-from sparsedp.traces import traces_of
+from sparsedp.tape import dtype_of, is_variable, isbox, plain, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, stacked
 from sparsedp.tree import flatten, leaves
 

@@ -9,8 +9,7 @@ import numpy as np
 from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, surely_finite
-from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
-from sparsedp.traces import traces_of
+from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, traces_of
 from sparsedp.tree import flatten, keys, labels
 
 __all__ = ["Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask", "stacked"]

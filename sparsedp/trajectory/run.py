@@ -19,7 +19,7 @@ from sparsedp.trajectory.backward_pass import BackwardPass
 from sparsedp.trajectory.layout import dense
 from sparsedp.trajectory.record import Record
 from sparsedp.trajectory.schedule import checkpoints
-from sparsedp.trajectory.steps import Steps
+from sparsedp.trajectory.steps import Scale, Steps
 
 __all__ = ["Run", "rollout_rule"]
 
@@ -70,17 +70,17 @@ class Run:
         state, stops = self.keep.see(steps.first), set(checkpoints(n, self.slots) if self.loop.wanted else ())
         # How many tapes there is room for: the first two tell. What goes in besides may be constants, which all
         # steps share: the second one tells. The first shows traced values that the step keeps, too.
-        fit, solves = 2 if self.loop.wanted else 0, thread.solves
+        fit, solves, scale = 2 if self.loop.wanted else 0, thread.solves, Scale()
         for i in shown_steps(self.progress, range(n), "forward"):
             if i in stops:
                 own = self.keep.whole or i <= fit  # nobody else has the result of a step on its tape
                 kept.append(state if own else state.owned())
             if i < fit:
-                recorder.weighs, recorder.bytes, recorder.beside = i < 2, 0, 0
+                scale.bytes, scale.beside, recorder.weigh = 0, 0, scale if i < 2 else None
                 tape, state = steps.taped(state, tapes[-1] if tapes else None)
                 tapes.append(tape)
                 if i < 2:
-                    weight = recorder.bytes - self.loop.state.nbytes + i * recorder.beside
+                    weight = scale.bytes - self.loop.state.nbytes + i * scale.beside
                     fit = min(self.rooms[thread.solves > solves] // max(weight, 1), n if i else 2)
                     del tapes[int(fit) :]
             else:

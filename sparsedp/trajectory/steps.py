@@ -7,12 +7,11 @@ import numpy as np
 
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
-from sparsedp.tape import plain
-from sparsedp.traces import boxed, new_trace, reverse_root, split_box, traces_of
+from sparsedp.tape import Recorder, boxed, new_trace, plain, reverse_root, split_box, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.tree import copied, flatten, leaves
 
-__all__ = ["Loop", "State", "Steps", "Tape"]
+__all__ = ["Loop", "Scale", "State", "Steps", "Tape"]
 
 CALL = 800  # bytes of a node, its closures and tuples: 350 to 1200 were measured
 _REMEDY = {
@@ -63,30 +62,20 @@ class Tape(NamedTuple):
         return None not in ends and all(node.parents for node in ends) and len(set(ends)) == len(ends)
 
 
-class Recorder:
-    """Takes down the calls of a trace; and weighs them while `weighs` is true.
-
-    Counted are the results (`bytes`), and apart from them every array that goes in beside traced values (`beside`); one
-    that many calls use counts once.
-    """
+class Scale:
+    """Weighs the calls of a tape: their results (`bytes`), and arrays beside traced values (`beside`), each once."""
 
     def __init__(self):
-        self.weighs, self.bytes, self.beside = False, 0, 0
-        self.nodes: list = []
+        self.bytes, self.beside = 0, 0
         self._seen: set[int] = set()
 
-    def weigh(self, value, args, nums):
+    def __call__(self, value, args, nums):
         """One call that depends on its arguments `nums`."""
         self.bytes += CALL + getattr(value, "nbytes", 0)
         for arg in leaves([arg for number, arg in enumerate(args) if number not in nums]):  # tuples are of indices
             if isinstance(arg, np.ndarray) and id(arg) not in self._seen:
                 self._seen.add(id(arg))
                 self.beside += arg.nbytes
-
-    def taken(self):
-        """The calls since it was asked last: it forgets them, for they know it, and a circle is freed late."""
-        nodes, self.nodes = self.nodes, []
-        return nodes
 
 
 class Loop:
