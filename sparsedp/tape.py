@@ -231,7 +231,7 @@ def direct(function, asked=False):
 
     @wraps(function)
     def call(*args):
-        values, nums, parents, trace = list(args), [], [], None
+        values, nums, parents, trace = list(args), [], [], None  # type: list, list, list, Any
         for num, arg in enumerate(args):
             kind = type(arg)
             if kind in box_types:

@@ -1,4 +1,4 @@
-"""The backward pass over all steps of a run."""
+"""The backward pass over all steps of a loop."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ class BackwardPass:
 
     Parameters
     ----------
-    run : Run
+    loop : Loop
     steps : Steps
     kept : list of State
         The last one included.
@@ -28,8 +28,8 @@ class BackwardPass:
         Of the steps from the first one on.
     """
 
-    def __init__(self, run, steps, kept, tapes):
-        self.run, self.steps, self.kept, self.tapes = run, steps, kept, tapes
+    def __init__(self, loop, steps, kept, tapes):
+        self.loop, self.steps, self.kept, self.tapes = loop, steps, kept, tapes
         self.recomputed = 0
         self.cotangents: dict = {}  # of params: root -> (sum so far, whether it may be written to)
         pairs = zip(steps.x, steps.input_roots, strict=True)  # of inputs: for each row
@@ -37,14 +37,14 @@ class BackwardPass:
 
     def back(self, g):
         """Cotangents of the outputs -> those of all arguments, None where there is none."""
-        run, steps, tapes, n = self.run, self.steps, self.tapes, self.run.loop.n
-        growth, many = Growth(n, run.loop.truncate), len(self.kept) - 1
-        source = run.keep.source(n, g)
+        loop, steps, tapes, n = self.loop, self.steps, self.tapes, self.loop.n
+        growth, many = Growth(n, loop.truncate), len(self.kept) - 1
+        source = loop.keep.source(n, g)
         state = self.kept.pop()
         total = source(state)
         growth.see(n, total)
-        for i in shown_steps(run.progress, range(n - 1, -1, -1), "backward"):
-            if total is None and not run.keep.along:
+        for i in shown_steps(loop.progress, range(n - 1, -1, -1), "backward"):
+            if total is None and not loop.keep.along:
                 break  # cut by truncation
             tape = tapes.pop() if i + 1 == len(tapes) else None
             end = None if tape else state.marks()  # what is on a tape is not run again
@@ -52,23 +52,23 @@ class BackwardPass:
             if total is not None:
                 if tape is None:
                     tape, after = steps.taped(state)
-                    run.compare(after.marks(), end)
+                    loop.compare(after.marks(), end)
                     del after
                 total = self._pull(tape, state, total)
             del tape
             if i % growth.every == 0:
                 growth.see(i, total)
-            if run.keep.along and (i > 0 or run.loop.wants(0)):
+            if loop.keep.along and (i > 0 or loop.wants(0)):
                 total = _sum(total, source(state))
         if active:
             count("rollout.step", "vjp", n)
             count("rollout.step", "recomputed", self.recomputed)
         record = growth.record(many, self.recomputed)
-        if run.record is not None:
-            run.record(record)
+        if loop.record is not None:
+            loop.record(record)
         params = [self.cotangents.get(root, NONE)[0] for root in steps.roots]
         inputs = [stacked(rows) if rows else None for rows in self.inputs]
-        return [*(total or [None] * len(run.loop.state.places)), *map(_fitted, params, steps.p), *inputs]
+        return [*(total or [None] * len(loop.state.places)), *map(_fitted, params, steps.p), *inputs]
 
     def _pull(self, tape, state, g):
         """Cotangents of the state after a tape -> those of the state before, None if those are not wanted."""
@@ -87,22 +87,19 @@ class BackwardPass:
 
     def _state_at(self, i):
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""
-        run, kept = self.run, self.kept
+        loop, kept = self.loop, self.kept
         state = kept.pop()
         while state.i > i:
             state = kept.pop()
         while state.i < i:
             kept.append(state)
-            free = max(run.slots - len(kept) + 1, 1)
-            state = self._again(state, state.i + stride(i + 1 - state.i, free))
+            free = max(loop.slots - len(kept) + 1, 1)
+            stop = state.i + stride(i + 1 - state.i, free)
+            self.recomputed += stop - state.i
+            while state.i < stop:
+                state = self.steps.forward(state)
+            state = state.owned()
         return state
-
-    def _again(self, state, stop):
-        """Run from a kept state on."""
-        self.recomputed += stop - state.i
-        while state.i < stop:
-            state = self.steps.forward(state)
-        return state.owned()
 
 
 def _fitted(back, value):

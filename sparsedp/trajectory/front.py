@@ -11,9 +11,8 @@ from sparsedp.ledger import thread
 from sparsedp.tape import dtype_of, innermost, is_variable, isbox, plain, through
 from sparsedp.trajectory.keep import All, Each, Last
 from sparsedp.trajectory.layout import Layout, dense
-from sparsedp.trajectory.run import Run, rollout_rule
+from sparsedp.trajectory.run import Loop, Run, rollout_rule
 from sparsedp.trajectory.schedule import budget_within_reach, plan, room_within, slots_within
-from sparsedp.trajectory.steps import Loop
 from sparsedp.tree import leaves
 
 __all__ = ["rollout"]
@@ -128,16 +127,15 @@ def rollout(
     if truncate is not None and not is_whole(truncate, 1):
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
     rooms = (SMALL, SOLVED) if memory is None else (max(room_within(memory, forms[0].nbytes, n, beside), 0),) * 2
-    loop = Loop(step, forms, n, truncate, innermost(args))
-    run = Run(loop, _kind(keep, forms[0]), slots, rooms, progress, record)
+    loop = Loop(step, forms, n, truncate, innermost(args), _kind(keep, forms[0]), slots, rooms, progress, record)
     _check_values(loop, args, bool(traced))
-    if loop.wanted and run.slots:
+    if loop.wanted and loop.slots:
         _warn_of_repeats(memory, forms[0].nbytes, n, beside)
     for told in thread.loops:
         told(step, state, params, inputs, n)
-    outputs = through(rollout_rule, run, *args)
+    outputs = through(rollout_rule, Run(loop), *args)
     count = len(plain(outputs)) if isinstance(plain(outputs), tuple) else None
-    return run.keep.tree([outputs] if count is None else [outputs[k] for k in range(count)])
+    return loop.keep.tree([outputs] if count is None else [outputs[k] for k in range(count)])
 
 
 def _number_of_steps(n):

@@ -6,8 +6,7 @@ gradient says little about the physics, and a GrowthWarning says so.
 """
 
 import warnings
-from itertools import pairwise
-from math import inf, log
+from math import inf, log, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -48,8 +47,8 @@ class Record(NamedTuple):
     kept: int
     recomputed: int
     norms: tuple = ()
-    growth: float = float("nan")
-    amplification: float = float("nan")
+    growth: float = nan
+    amplification: float = nan
 
     @property
     def factor(self):
@@ -78,15 +77,13 @@ class Growth:
 
     def record(self, kept, recomputed):
         """The record of the way back; warns when the cotangent grew too much."""
-        n, cut = self._n, self._truncate
-        first = next((norm for _, norm in self.norms if norm > 0), float("nan"))
-        grown = max((norm / first for _, norm in self.norms), default=first)
-        known = [(i, log(norm)) for i, norm in self.norms if 0 < norm < inf]
-        # Pairs of neighbouring measurements with no cut between them: (steps, growth of the logarithm).
-        pairs = ((i, j, b - a) for (i, a), (j, b) in pairwise(known))
-        pieces = [(i - j, rise) for i, j, rise in pairs if cut is None or (n - i) // cut == (n - j - 1) // cut]
-        steps = sum(length for length, _ in pieces)
-        rate = sum(rise for _, rise in pieces) / steps if steps else float("nan")
+        n, norms = self._n, [norm for _, norm in self.norms]
+        first = next((norm for norm in norms if norm > 0), nan)
+        grown = max((norm / first for norm in norms), default=nan)
+        # Beyond a cut the cotangent begins anew.
+        whole = [(i, log(norm)) for i, norm in self.norms if 0 < norm < inf and n - i < (self._truncate or inf)]
+        steps = whole[0][0] - whole[-1][0] if whole else 0
+        rate = (whole[-1][1] - whole[0][1]) / steps if steps else nan
         found = Record("backward", n, kept, recomputed, tuple(self.norms), rate, grown)
         if found.flagged:
             thread.grown += 1

@@ -11,7 +11,7 @@ from sparsedp.tape import Recorder, boxed, new_trace, plain, reverse_root, split
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.tree import copied, flatten, leaves
 
-__all__ = ["Loop", "Scale", "State", "Steps", "Tape"]
+__all__ = ["Scale", "State", "Steps", "Tape"]
 
 CALL = 800  # bytes of a node, its closures and tuples: 350 to 1200 were measured
 _REMEDY = {
@@ -43,8 +43,7 @@ class Tape(NamedTuple):
     Attributes
     ----------
     starts : list
-        Nodes of its state, roots or those that the tape before ends with, and roots of its inputs; None where a
-        constant is.
+        Roots of its state and of its inputs; None where a constant is.
     nodes : list
         All calls.
     ends : list
@@ -54,12 +53,6 @@ class Tape(NamedTuple):
     starts: list
     nodes: list
     ends: list
-
-    @property
-    def links(self):
-        """Whether the next tape may begin where this one ends: all results come from calls, each from another one."""
-        ends = self.ends
-        return None not in ends and all(node.parents for node in ends) and len(set(ends)) == len(ends)
 
 
 class Scale:
@@ -76,40 +69,6 @@ class Scale:
             if isinstance(arg, np.ndarray) and id(arg) not in self._seen:
                 self._seen.add(id(arg))
                 self.beside += arg.nbytes
-
-
-class Loop:
-    """What is fixed in a rollout, whoever runs it; the variables are passed in.
-
-    Parameters
-    ----------
-    step : callable
-    layouts : list of Layout
-        Of state, params and, where there are any, inputs.
-    n : int
-    truncate : int or None
-    wanted : list of int
-        The arguments that want a cotangent.
-    """
-
-    def __init__(self, step, layouts, n, truncate, wanted):
-        self.step, self.layouts, self.n, self.truncate, self.wanted = step, layouts, n, truncate, wanted
-        self.state, self.params, self.inputs = [*layouts, None][:3]
-        self.state.rounds = any(any(form.floats) for form in layouts)
-
-    def split(self, args):
-        """Variables of all arguments -> those of state, params and inputs."""
-        first = len(self.state.places)
-        second = first + len(self.params.places)
-        return list(args[:first]), list(args[first:second]), list(args[second:])
-
-    def wants(self, i):
-        """Whether step i hands a cotangent on to its state."""
-        return not self.is_cut(i) if i else any(number < len(self.state.places) for number in self.wanted)
-
-    def is_cut(self, i):
-        """Whether truncation makes state i a constant for the steps after it."""
-        return self.truncate is not None and 0 < i < self.n and (self.n - i) % self.truncate == 0
 
 
 class Steps:
@@ -149,12 +108,10 @@ class Steps:
         values, statics = self._called(state, self._given(state), self.params)
         return State(state.i + 1, self.loop.state.check(values, "the step", self.outer), statics)
 
-    def taped(self, state, before=None):
-        """The same on a tape, linked to that of the step before if it can be: (Tape, the state after this one)."""
-        starts = before.ends if before and before.links else [reverse_root(self.recorder) for _ in state.values]
-        if not self.loop.wants(state.i):
-            starts = [None] * len(starts)
-        starts = [*starts, *(root and reverse_root(self.recorder) for root in self.input_roots)]
+    def taped(self, state):
+        """The same on a tape: (Tape, the state after this one)."""
+        wanted = [self.loop.wants(state.i)] * len(state.values) + self.input_roots
+        starts = [reverse_root(self.recorder) if wants else None for wants in wanted]
         given = boxed(self._given(state), starts, self.number)
         try:
             found, statics = self._called(state, given, self._traced_params)
