@@ -37,21 +37,6 @@ def field(rng, shape, dtype):
     return np.asarray(values, dtype)
 
 
-def row(name, measure, *args, optional=False):
-    """Row of what ``measure(*args)`` returns: a figure, or the reason why it does not apply.
-
-    An error fails, or skips a row that is optional: operators from outside may raise anything.
-    """
-    try:
-        found = measure(*args)
-    except Exception as error:
-        note = f"{type(error).__name__}: {error}"
-        return Row(name, None, None, None, f"refused, {note}") if optional else Row(name, inf, LIMIT, False, note)
-    if isinstance(found, str):
-        return Row(name, None, None, None, found)
-    return Row(name, inf if isnan(found) else float(found), LIMIT, bool(found <= LIMIT))
-
-
 class Probe:
     """An operator under test: random fields for it, and what its rounding errors are measured against.
 
@@ -108,13 +93,23 @@ class Probe:
         for dtype in map(np.dtype, dtypes or KINDS.get(name, DTYPES[: 1 if self.real else 2])):
             # A clean refusal of complex fields is fine where real fields work.
             optional = dtype.kind == "c" and self.real and rows[0].ok is True
-            rows.append(row(f"{name}, {dtype}", self.gap, name, dtype, optional=optional))
+            rows.append(self._row(name, dtype, optional))
         return rows
+
+    def _row(self, name, dtype, optional):
+        """Row of an identity in one dtype; where it is not optional, an error fails: functions may raise anything."""
+        label = f"{name}, {dtype}"
+        if self.size and abs(log10(self.size)) >= DECADES[np.finfo(dtype).dtype.name] / EXPONENTS.get(name, 1):
+            return Row(label, note=f"entries of size {self.size:.1e} leave the range of {dtype}")
+        try:
+            gap = float(self.gap(name, dtype))
+        except Exception as error:
+            note = f"{type(error).__name__}: {error}"
+            return Row(label, note=f"refused, {note}") if optional else Row(label, inf, LIMIT, False, note)
+        return Row(label, inf if isnan(gap) else gap, LIMIT, gap <= LIMIT)
 
     def gap(self, name, dtype):
         """Distance of the two sides of an identity in units of rounding, at worst over entries and seeds."""
-        if self.size and abs(log10(self.size)) >= DECADES[np.finfo(dtype).dtype.name] / EXPONENTS.get(name, 1):
-            return f"entries of size {self.size:.1e} leave the range of {dtype}"
         worst, tolerance = 0.0, 0.0 if name in EXACT else tolerance_of(self.op.structure)
         rounding = max(tolerance, float(np.finfo(dtype).eps))
         for _ in range(self.seeds):
@@ -299,7 +294,7 @@ def twin(op, seeds=3, rng=None):
 
 def _form_rows(probe):
     """Rows: both products in three dtypes, entry by entry."""
-    rows = [row("forms", _forms, probe.op.structure, probe.listed)]
+    rows = [Row("forms", note=_forms(probe.op.structure, probe.listed))]
     for name in FORMS if probe.listed else ():
         rows += probe.rows(name)
     return rows

@@ -72,9 +72,9 @@ class Row(NamedTuple):
     """
 
     name: str
-    figure: float | None
-    limit: float | None
-    ok: bool | None
+    figure: float | None = None
+    limit: float | None = None
+    ok: bool | None = None
     note: str = ""
 
 
