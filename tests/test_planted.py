@@ -321,6 +321,12 @@ BUGS = {
         '(("disagrees", "outside"), "agrees")',
         "tests/test_check_gradient.py",
     ),
+    "a gradient of complex numbers as the tape has it": Bug(
+        "packing.py",
+        "np.conj(g).astype(complex)",
+        "g.astype(complex)",
+        "tests/test_check_audit.py tests/test_minimize.py",
+    ),
     "a plan that counts no step that is run again": Bug(
         "report",
         'recomputation=1.0 + totals["steps recomputed"] / steps if steps else 1.0',
