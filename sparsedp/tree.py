@@ -9,7 +9,7 @@ from math import hypot, isfinite
 import numpy as np
 import scipy.sparse as sp
 
-__all__ = ["copied", "flatten", "keys", "labels", "leaves", "mapped", "norm"]
+__all__ = ["copied", "flatten", "keys", "labels", "leaves", "mapped", "norm", "subscript"]
 
 
 def flatten(tree):
@@ -91,11 +91,16 @@ def labels(tree, root):
     >>> labels({"u": (1.0, 2.0), "n": 3}, "x")
     ["x['u'][0]", "x['u'][1]", "x['n']"]
     """
-    names, fields = keys(tree), getattr(tree, "_fields", None)
+    names = keys(tree)
     if names is None:
         return [root]
-    steps = [f".{fields[name]}" if fields else f"[{name!r}]" for name in names]
-    return [label for name, step in zip(names, steps) for label in labels(tree[name], root + step)]
+    return [label for name in names for label in labels(tree[name], root + subscript(tree, name))]
+
+
+def subscript(tree, name):
+    """A branch and a key of it -> how one would write the entry: ``['u']``, ``[0]``, ``.k`` of a named tuple."""
+    fields = getattr(tree, "_fields", None)
+    return f".{fields[name]}" if fields else f"[{name!r}]"
 
 
 def norm(tree):

@@ -2,6 +2,7 @@
 
 import re
 import sys
+from collections import namedtuple
 
 import autograd.numpy as anp
 import numpy as np
@@ -11,6 +12,7 @@ import sparsedp as dp
 from sparsedp.errors import DerivativeError, GrowthWarning, NonFiniteError, ShapeError
 
 U = np.array([1.0, 2.0, 3.0])
+Pair = namedtuple("Pair", "ink wind")
 SHAPE, VALUE, FINITE, NONE = ShapeError, ValueError, NonFiniteError, DerivativeError
 
 
@@ -179,6 +181,17 @@ TABLE = [
         roll(lambda s, p: {"a": (s["a"], 1.0)}, {"a": U}),
         SHAPE,
         "state['a'] must keep its form: the step made a tuple of length 2 of one leaf; "
+        "return a state like the first one",
+    ),
+    (
+        roll(lambda s, p: Pair(s.ink, s.wind[:2]), Pair(U, U)),
+        SHAPE,
+        "state.wind must keep its form: the step made shape (2,) of shape (3,); return a state like the first one",
+    ),
+    (
+        roll(lambda s, p: (Pair(s[0].ink, (U, U)),), (Pair(U, U),)),
+        SHAPE,
+        "state[0].wind must keep its form: the step made a tuple of length 2 of one leaf; "
         "return a state like the first one",
     ),
     (

@@ -10,7 +10,7 @@ from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, traces_of
-from sparsedp.tree import flatten, keys, labels
+from sparsedp.tree import flatten, keys, labels, subscript
 
 __all__ = ["Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask", "stacked"]
 
@@ -127,7 +127,7 @@ class Layout:
         names = keys(wanted)
         if keys(tree) != names:
             form = _kind(wanted) if names is not None else "one array" if self.bare else "one leaf"
-            raise ShapeError(_changed(_at(self.root, path), form, _kind(tree), when))
+            raise ShapeError(_changed(_at(self._template, self.root, path), form, _kind(tree), when))
         if names is None:
             found.append(tree)
             return
@@ -242,9 +242,11 @@ def _bits(value):
     return hash((flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes(), flat[end:].tobytes()))
 
 
-def _at(root, path):
+def _at(tree, root, path):
     """The name of what lies at a path of keys."""
-    return root + "".join(f"[{key!r}]" for key in path)
+    for key in path:
+        tree, root = tree[key], root + subscript(tree, key)
+    return root
 
 
 def _kind(tree):
