@@ -81,7 +81,7 @@ LONGER = {"solver_in_the_loop.py": 125}  # two solvers, a network and a study
 BUDGETS = {
     "": 182_200,
     "advection": 14_000,
-    "check": 17_700,
+    "check": 14_700,
     "flow": 5_800,
     "integrators": 10_670,
     "kernels": 14_000,
