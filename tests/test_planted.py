@@ -333,6 +333,12 @@ BUGS = {
         "recomputation=1.0",
         "tests/test_explain.py tests/test_explain_loops.py",
     ),
+    "a stress case that passes a gradient of 0": Bug(
+        "report",
+        'return FAILED, inf, "the gradient is 0, the differences are not"',
+        'return PASSED, 0.0, "the gradient is 0"',
+        "tests/test_stress.py::test_a_wrong_gradient_and_a_swallowed_nan_fail",
+    ),
     "a table that leaves a bar in a cell": Bug(
         "report",
         '.replace("|", "\\\\|")',

@@ -190,15 +190,11 @@ def _measured(problem, settings, repeats):
         answer, gradient = answers(result)
     except FAILURES as error:
         return {"status": _failure(error)}, None, None
-    row = {
-        "unknowns": answer.size,
-        **facts,
-        "peak_bytes": peak,
-        "seconds_setup": seconds + total(first.seconds, "setup"),
-    }
+    row = {"unknowns": answer.size, **facts, "peak_bytes": peak, **(times if status == "ok" else {})}
     row |= {name: total(last, kind) for name, kind in COUNTS.items()}
-    row |= times if status == "ok" else {}
-    return row | {"status": status if np.all(np.isfinite(answer)) else "nonfinite"}, answer, gradient
+    row["seconds_setup"] = seconds + total(first.seconds, "setup")
+    row["status"] = status if np.all(np.isfinite(answer)) else "nonfinite"
+    return row, answer, gradient
 
 
 def timed(run):
@@ -230,9 +226,10 @@ def _times(runs, repeats):
     least, result = 0.0, None
     for name, run in zip(("seconds_forward", "seconds_backward"), runs):
         seconds, results = zip(*(timed(run) for _ in range(repeats)))
-        own, result = np.maximum(np.subtract(seconds, least), 0.0), results[-1]
-        least = float(np.min(own))
-        row |= {name: least, f"{name}_median": float(np.median(own)), f"{name}_max": float(np.max(own))}
+        own = np.maximum(np.subtract(seconds, least), 0.0)
+        times = np.quantile(own, (0.0, 0.5, 1.0)).tolist()
+        row |= dict(zip((name, f"{name}_median", f"{name}_max"), times))
+        least, result = times[0], results[-1]
     return row, result
 
 
