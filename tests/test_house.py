@@ -88,7 +88,7 @@ BUDGETS = {
     "network": 3_000,
     "operators": 5_800,
     "optimize": 13_200,
-    "report": 19_400,
+    "report": 18_100,
     "solvers": 40_500,
     "solvers/multigrid": 10_000,
     "structure": 6_700,
