@@ -184,7 +184,7 @@ def _measured(problem, settings, repeats):
     """Settings of one run -> (figures, answer, gradient). What fails keeps a row with its status."""
     try:
         seconds, (runs, facts, answers) = timed(partial(_prepared, problem, settings))
-        status, first, *_, last = _warm(runs[-1])
+        status, first, last = _warm(runs[-1])
         times, result = _times(runs, repeats)
         peak = _peak(runs[-1])
         answer, gradient = answers(result)
@@ -205,16 +205,16 @@ def timed(run):
 
 
 def _warm(run):
-    """Run until the time has settled (compiled code, caches of set-ups, imports) -> [status, calls of each run]."""
-    before, records = inf, []
+    """Run until the time has settled: compiled code, caches -> (status, calls of the first run, of the last)."""
+    before, first = inf, None
     for _ in range(MOST_WARM_UPS):
         with recording() as calls:
             now, _ = timed(run)
-        records.append(calls)
+        first = first or calls
         if before <= SETTLED * now + SHORT:  # it does not fall any more
-            return ["ok", *records]
+            return "ok", first, calls
         before = now
-    return ["not_warm", *records]
+    return "not_warm", first, calls
 
 
 def _times(runs, repeats):
