@@ -220,6 +220,8 @@ def test_values_outside_a_stated_range_are_not_failures():
         words[high] = {row["case"]: row["outcome"] for row in rows}
     assert words[1.9]["all 1.9"] == "passed" and words[1.9]["above its range"] == "degraded"
     assert words[3.0]["all 3"] == "FAILED"
+    alone = dp.stress(lambda a: a**2, 1.5, ranges=(1.0, 2.0), only=["legal range"])
+    assert alone and [row["case"] for row in alone.rows][:2] == ["all 1", "all 1.25"]
     free = dp.stress(loss, {"a": 1.0}, only=["scaling"]).rows
     assert {row["outcome"] for row in free if row["case"] == "times 2^10"} == {"degraded"}
 
