@@ -31,8 +31,7 @@ def dense_weights(rng, inputs, outputs, gain=1.0):
     >>> p["weight"].shape, p["bias"].shape
     ((3, 2), (2,))
     """
-    weight = _normal(rng, (inputs, outputs)) * (gain / np.sqrt(max(inputs, 1)))
-    return {"weight": weight, "bias": np.zeros(outputs)}
+    return _layer(rng, (inputs, outputs), inputs, outputs, gain)
 
 
 def convolution_weights(rng, inputs, outputs, widths, gain=1.0):
@@ -59,15 +58,14 @@ def convolution_weights(rng, inputs, outputs, widths, gain=1.0):
     """
     widths = (widths,) if np.ndim(widths) == 0 else tuple(widths)
     check_widths(widths)
-    fan = max(inputs * int(np.prod(widths)), 1)
-    weight = _normal(rng, (outputs, inputs, *widths)) * (gain / np.sqrt(fan))
-    return {"weight": weight, "bias": np.zeros(outputs)}
+    return _layer(rng, (outputs, inputs, *widths), inputs * int(np.prod(widths)), outputs, gain)
 
 
-def _normal(rng, shape):
+def _layer(rng, shape, fan, outputs, gain):
+    """Weights of which `fan` numbers are summed for each output."""
     if not hasattr(rng, "standard_normal"):
         raise TypeError(f"weights are drawn from a numpy Generator, got {rng!r}; write np.random.default_rng(0)")
-    return rng.standard_normal(shape)
+    return {"weight": rng.standard_normal(shape) * (gain / np.sqrt(max(fan, 1))), "bias": np.zeros(outputs)}
 
 
 def residual_weights(rng, channels, widths, gain=1.0):
