@@ -1,4 +1,4 @@
-r"""Convolution layers in 1-D and 2-D: one fused rule, derivatives of every order by hand.
+r"""Convolution layers in 1-D and 2-D: one rule for three products, derivatives of every order by hand.
 
 With the padded field P x the layer is  y[o, i] = sum_{c, d} w[o, c, d] (P x)[c, i + d] + b[o],  a bilinear map of x
 and w. With the trilinear form T(x, w, g) = sum g . y there are three such maps, each of two of the three:
@@ -54,7 +54,8 @@ def convolution(p, x, padding="periodic"):
     """
     weight, bias = weight_and_bias(p, "convolution")
     _check(np.shape(plain(weight)), np.shape(plain(bias)), np.shape(plain(x)), padding)
-    return _convolution(x, weight, bias, padding)
+    on_cells = anp.reshape(bias, anp.shape(bias) + (1,) * (anp.ndim(x) - 2))  # of each output, or of every sample's
+    return _trilinear(x, weight, 2, anp.shape(weight), padding) + on_cells
 
 
 def weight_and_bias(p, layer):
@@ -128,44 +129,11 @@ def _third(a, b, slot, shape, padding):
 
 
 _trilinear: Rule = by_parts(
-    "convolution, products",
+    "convolution",
     _third,
     (
         lambda g, y, a, b, slot, *rest: _trilinear(b, g, (slot + 1) % 3, *rest),
         lambda g, y, a, b, slot, *rest: _trilinear(g, a, (slot + 2) % 3, *rest),
     ),
     (lambda t, y, a, *rest: _trilinear(t, *rest), lambda t, y, a, b, *rest: _trilinear(a, t, *rest)),
-)
-
-
-def _spread(bias, cells):
-    """One number for each output, or for each of every sample -> the same on all cells."""
-    return anp.reshape(bias, anp.shape(bias) + (1,) * len(cells))
-
-
-def _forward(x, weight, bias, padding):
-    y = _third(x, weight, 2, weight.shape, padding)
-    y += _spread(bias, x.shape[2:])
-    return y
-
-
-def _total(g, y, x, weight, bias, padding):
-    """Cotangent of the bias: the sum over cells, and over samples unless each has its own."""
-    g = anp.sum(g, axis=tuple(range(2, anp.ndim(g))))
-    return g if anp.ndim(bias) == 2 else anp.sum(g, axis=0)
-
-
-_convolution = by_parts(
-    "convolution",
-    _forward,
-    (
-        lambda g, y, x, weight, bias, padding: _trilinear(weight, g, 0, anp.shape(weight), padding),
-        lambda g, y, x, weight, bias, padding: _trilinear(g, x, 1, anp.shape(weight), padding),
-        _total,
-    ),
-    (
-        lambda t, y, x, weight, bias, padding: _trilinear(t, weight, 2, anp.shape(weight), padding),
-        lambda t, y, x, weight, bias, padding: _trilinear(x, t, 2, anp.shape(weight), padding),
-        lambda t, y, x, *rest: _spread(t, anp.shape(y)[2:]) + anp.zeros(anp.shape(y)),
-    ),
 )
