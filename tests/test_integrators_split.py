@@ -8,7 +8,7 @@ import scipy.sparse as sp
 
 import sparsedp as dp
 from sparsedp.derivative import pullback, value_and_grad
-from sparsedp.integrators.exponential import Function, Functions, phi
+from sparsedp.integrators.functions import Function, PhiFunctions, phi
 from sparsedp.ledger import recording
 
 GRID = dp.Grid(16, size=1.0)
@@ -88,7 +88,7 @@ def test_functions_against_the_dense_matrix(power):
     op = dp.laplacian(grid, dp.dirichlet)
     op = dp.power(op, 2) if power else op
     dense = np.array([op(unit.reshape(4, 5)).ravel() for unit in np.eye(20)]).T
-    f = Functions(op, "f")
+    f = PhiFunctions(op, "f")
     z, u = (-1e-4 if power else 0.01), np.random.default_rng(0).standard_normal((4, 5))
     whole = f((Function((1.0,)), Function((0.0, 2.0), 0.5)), z, u, 2 * u).ravel()
     grown = scipy.linalg.expm(z * dense)
@@ -97,7 +97,7 @@ def test_functions_against_the_dense_matrix(power):
 
 
 def test_derivatives_of_functions():
-    f, table = Functions(L, "f"), (Function((1.0, 0.0, 2.0), 0.5), Function((0.0, 1.0)))
+    f, table = PhiFunctions(L, "f"), (Function((1.0, 0.0, 2.0), 0.5), Function((0.0, 1.0)))
     loss = lambda x: anp.sum(f(table, *x) ** 2)
     for z in (0.0, 0.01, 1.0):
         slope = lambda x: anp.sum(anp.sin(value_and_grad(loss)(x)[1][1]) * X) + value_and_grad(loss)(x)[1][0] ** 2

@@ -1,9 +1,7 @@
 """Runge-Kutta steps. An explicit one is a table of numbers; an implicit one a few stages, x of x = b + h f(x, t).
 
-Where the rate is c L u and nothing else, an explicit step of order p in p stages is a polynomial of z L, z = h c, and
-one node on the tape:
-
-    T_p(z) u = u + z L u + ... + (z L)^p u / p!,     dT_p(z) u = L T_{p-1}(z) u dz + T_p(z) du
+Where the rate is c L u and nothing else, an explicit step of order p in p stages is the Taylor polynomial T_p(z L) u,
+z = h c, and one node on the tape (functions.py).
 
 Sources: Heun, Z. Math. Phys. 45 (1900); Kutta, Z. Math. Phys. 46 (1901);
 Shu and Osher, J. Comput. Phys. 77 (1988), the strong-stability-preserving step of order 3.
@@ -46,6 +44,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import ConvergenceError
+from sparsedp.integrators.functions import Taylor, TaylorPolynomials
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import tell
@@ -127,41 +126,10 @@ class Polynomial(Scheme):
 
     def __init__(self, problem, name):
         super().__init__(problem, name, EXPLICIT[name].order)
-        self._rules = [self._rule(transposed) for transposed in (False, True)]
+        self.polynomials = TaylorPolynomials(problem.op, f"stepper({name})")
 
     def __call__(self, u, params, t, h):
-        return self._rules[False](h * self.problem.coefficient(params), u)
-
-    def _rule(self, transposed):
-        """T_p of L, or of L^T, as a rule in (z, u)."""
-        L, orders = self.problem.op.T if transposed else self.problem.op, range(self.order, 0, -1)
-
-        def forward(z, u):
-            z, total = float(z), u  # traced it is a NumPy scalar, which would round float32 otherwise
-            for k in orders:  # Horner's rule
-                total = L.apply(total)
-                total *= z / k
-                total += u
-            return total
-
-        def slope(z, u):
-            total = u
-            for k in orders[1:]:
-                total = u + (z / k) * L(total)
-            return L(total)
-
-        def vjp(nums, ans, z, u):
-            def pull(g):
-                slopes = {0: lambda: anp.sum(g * slope(z, u)), 1: lambda: self._rules[not transposed](z, g)}
-                return tuple(of_argument(slopes[num](), (z, u)[num]) for num in nums)
-
-            return pull
-
-        def jvp(nums, tangents, ans, z, u):
-            pairs = zip(nums, tangents, strict=True)
-            return sum(self._rules[transposed](z, t) if num else t * slope(z, u) for num, t in pairs)
-
-        return Rule(f"stepper({self.name}){'.T' * transposed}", forward, vjp, jvp)
+        return self.polynomials((Taylor(self.order),), h * self.problem.coefficient(params), u)
 
 
 # ---- the linear solve ------------------------------------------------------------------------------------------------

@@ -1,0 +1,223 @@
+"""Functions of z L for an operator L, differentiable in z: one rule for all of them.
+
+A sum f of such functions has a derivative f' of the same kind, and with y = f(z L) b
+
+    dy = f(z L) db + L f'(z L) b dz,     b_bar = f(z L)^T g,     z_bar = g . L f'(z L) b.
+
+Taylor: T_p(x) = 1 + x + ... + x^p / p!, by products with L, for any L; T_p' = T_{p-1}.
+
+Function: sums of phi_k, by transforms, where L is separable:
+
+    phi_0(x) = exp(x),    phi_{k+1}(x) = (phi_k(x) - 1/k!) / x,    phi_k'(x) = phi_k(x) - k phi_{k+1}(x)
+
+Near 0 the formula in the middle loses all digits: there the Taylor series of the highest one is summed and
+the others follow downwards, phi_k = x phi_{k+1} + 1/k!. Sources: Cox and Matthews, J. Comput. Phys. 176
+(2002); Kassam and Trefethen, SIAM J. Sci. Comput. 26 (2005), who name the trouble.
+"""
+
+from functools import lru_cache, partial, reduce
+from math import factorial
+from operator import add
+from typing import Any, NamedTuple
+
+import autograd.numpy as anp
+import numpy as np
+from numpy.polynomial.polynomial import polyval
+
+from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.solvers.separable import SpectralFunction, spectrum
+from sparsedp.tape import Rule, isbox, of_argument
+
+__all__ = ["Function", "PhiFunctions", "Taylor", "TaylorPolynomials", "phi"]
+
+NEAR, TERMS = 3.0, 36  # the series is summed up to |x| = 3, where its terms after the 36th are below rounding
+KEPT = 64  # tables of weights, for a few z
+
+
+class Functions:
+    """combine(functions, z, *fields): the sum of f_j(z L) b_j, differentiable in z and the fields.
+
+    A kind of functions says by `plain` what their values are.
+
+    Parameters
+    ----------
+    op : Operator
+        L.
+    name : str
+        For messages and counts.
+    """
+
+    plain: Any
+
+    def __init__(self, op, name):
+        self.op, self.name = op, name
+        self._rule = lru_cache(None)(self._made)  # rules made once, for every z, step and adjoint
+
+    def __call__(self, functions, z, *fields):
+        return self._rule(functions, False)(z, *fields)
+
+    def _made(self, functions, transposed):
+        """The sum as a rule in (z, *fields)."""
+
+        def forward(z, *fields):
+            return self.plain([functions], z, fields, transposed)[0]
+
+        def slope(z, fields):
+            return self._rule(tuple(f.derivative() for f in functions), transposed)(z, *fields)
+
+        def vjp(nums, ans, z, *fields):
+            chosen = [(functions[num - 1],) for num in nums if num]
+
+            def pull(g):
+                if isbox(g) or isbox(z):
+                    backs = iter([self._rule(row, not transposed)(z, g) for row in chosen])
+                else:  # all at once
+                    backs = iter(self.plain(chosen, z, [g], not transposed))
+                found = [next(backs) if num else anp.sum(g * slope(z, fields)) for num in nums]
+                return tuple(of_argument(back, (z, *fields)[num]) for num, back in zip(nums, found, strict=True))
+
+            return pull
+
+        def jvp(nums, tangents, ans, z, *fields):
+            chosen, moves = [functions[num - 1] for num in nums if num], tangents[nums[0] == 0 :]
+            total = tangents[0] * slope(z, fields) if nums[0] == 0 else 0.0
+            return total + self._rule(tuple(chosen), transposed)(z, *moves) if chosen else total
+
+        return Rule(f"{self.name}{'.T' * transposed}", forward, vjp, jvp)
+
+
+class Taylor(NamedTuple):
+    """L^power T_order(z L); 0 below order 0."""
+
+    order: int
+    power: int = 0
+
+    def derivative(self):
+        """The function of the same kind for d/dz."""
+        return Taylor(self.order - 1, self.power + 1)
+
+
+class TaylorPolynomials(Functions):
+    """By products with L, which may be any operator from a space to itself."""
+
+    def plain(self, rows, z, fields, transposed=False):
+        """[the sum for each row of functions], on plain values, or with the transpose of L."""
+        op, z = (self.op.T if transposed else self.op), float(z)  # a NumPy scalar would round float32
+        # Not by sum(), which starts from 0 with one pass more.
+        return [reduce(add, map(partial(_horner, op, z), row, fields)) for row in rows]
+
+
+def _horner(op, z, function, u):
+    """L^power T_order(z L) u by Horner's rule."""
+    total = u if function.order >= 0 else 0.0 * u
+    for k in range(function.order, 0, -1):
+        total = op.apply(total)
+        total *= z / k
+        total += u
+    for _ in range(function.power):
+        total = op.apply(total)
+    return total
+
+
+def phi(k, x):
+    """[phi_0(x), ..., phi_k(x)] for real x, to a few units of the last digit.
+
+    Examples
+    --------
+    >>> [round(float(value), 6) for value in phi(2, np.array(-1e-9))]
+    [1.0, 1.0, 0.5]
+    """
+    near = np.abs(x) <= NEAR
+    small, large = np.where(near, x, 0.0), np.where(near, NEAR, x)
+    series = [polyval(small, [1 / factorial(n + k) for n in range(TERMS)])]
+    with np.errstate(over="ignore"):
+        upward = [np.exp(large)]
+    for j in range(k):
+        series.insert(0, small * series[0] + 1 / factorial(k - 1 - j))
+        upward.append((upward[j] - 1 / factorial(j)) / large)
+    return [np.where(near, low, high) for low, high in zip(series, upward, strict=True)]
+
+
+class Function(NamedTuple):
+    """L^power f(z L) with f(x) = sum over k of weights[k] phi_k(scale x)."""
+
+    weights: tuple
+    scale: float = 1.0
+    power: int = 0
+
+    def derivative(self):
+        """The function of the same kind for d/dz."""
+        found = [*self.weights, 0.0]
+        for k, weight in enumerate(self.weights):
+            found[k + 1] -= k * weight
+        return Function(tuple(self.scale * weight for weight in found), self.scale, self.power + 1)
+
+    def at_zero(self, op, field):
+        """For z = 0, where f is a number."""
+        for _ in range(self.power):
+            field = op.apply(field)
+        return sum(a / factorial(k) for k, a in enumerate(self.weights)) * field
+
+    def values(self, z, eigenvalues):
+        """On the eigenvalues of L."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = phi(len(self.weights) - 1, self.scale * z * eigenvalues)
+            return eigenvalues**self.power * sum(a * value for a, value in zip(self.weights, found, strict=True) if a)
+
+
+class PhiFunctions(Functions):
+    """By one transform for each field and one back.
+
+    Parameters
+    ----------
+    op : Operator
+        L, separable, or a power of a separable operator.
+    name : str
+
+    Raises
+    ------
+    ValueError
+        If L cannot be diagonalised by transforms.
+    """
+
+    def __init__(self, op, name):
+        super().__init__(op, name)
+        self.found, self.eigenvalues = _diagonalised(op, name)
+        self._table = lru_cache(KEPT)(self._values)  # plain values only, of a few z
+
+    def plain(self, rows, z, fields, transposed=False):
+        """[the sum for each row of functions], on plain values, or with the transpose of L."""
+        op, z = (self.op.T if transposed else self.op), float(z)
+        for field in fields:
+            if np.shape(field) != op.domain.shape:
+                raise ShapeError(
+                    f"{self.name} takes a field on {op.domain.told}, got an array of shape {np.shape(field)}"
+                )
+        if z == 0:  # no transform, and for phi_0 the field itself, bit for bit
+            return [sum(f.at_zero(op, field) for f, field in zip(row, fields, strict=True)) for row in rows]
+        if any(map(np.iscomplexobj, fields)):
+            parts = (self.plain(rows, z, [*map(part, fields)], transposed) for part in (np.real, np.imag))
+            return [real + 1j * imaginary for real, imaginary in zip(*parts, strict=True)]
+        moved = [self.found.forward(np.asarray(field, float), transposed) for field in fields]
+        sums = (sum(c * self._table(f, z) for f, c in zip(row, moved, strict=True)) for row in rows)
+        return [self.found.backward(total, transposed).reshape(op.domain.shape) for total in sums]
+
+    def _values(self, function, z):
+        """The values of a function on the eigenvalues of z L."""
+        values = function.values(z, self.eigenvalues)
+        if not np.all(np.isfinite(values)):
+            raise NonFiniteError(
+                f"{self.name}: exp({z:g} * {self.op.name}) is beyond 1.8e308; take a smaller dt or the other sign"
+            )
+        return values
+
+
+def _diagonalised(op, name):
+    """(Spectrum, eigenvalues) of an operator that is separable, or a function of such a one."""
+    structure = op.structure
+    if isinstance(structure, SpectralFunction) and not structure.transposed:
+        return structure.found, structure.weights
+    found = spectrum(structure) if op.separable else None
+    if found is None:
+        raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}; try imex or tr_bdf2")
+    return found, found.eigenvalues
