@@ -22,12 +22,14 @@ from sparsedp.tape import (
     new_trace,
     plain,
     reverse_root,
-    split_box,
+    split_boxes,
 )  # fmt: skip
 from sparsedp.tree import copied, flatten, keys, leaves
 
-__all__ = ["NO_JVP", "grad", "hvp", "jvp", "linearised", "pullback", "push", "pushforward", "traced", "value_and_grad",
-    "vjp", "zero_like"]  # fmt: skip
+__all__ = [
+    "NO_JVP", "described", "grad", "hvp", "jvp", "linearised", "pullback", "push", "pushforward", "traced",
+    "value_and_grad", "vjp", "zero_like",
+]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
 NO_JVP = (DerivativeError, NotImplementedError)
@@ -125,8 +127,7 @@ def traced(fun, tree, roots):
     try:
         with growing():
             ends, build = flatten(fun(rebuild(boxed(found, roots, number))))
-        pairs = [split_box(end, number) for end in ends]
-        return [value for value, _ in pairs], [node for _, node in pairs], build
+        return *split_boxes(ends, number), build
     except (TypeError, ValueError, AttributeError) as error:
         said = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
         if isinstance(error, SparsedpError) or not any("ArrayBox" in words for words in said):
@@ -165,23 +166,9 @@ def _gradient(leaf, cotangent):
 
 
 def pushforward(fun, x, tangent):
-    """Function of a tree -> its value and its directional derivative (JVP).
+    """`jvp` in forward mode alone: raises one of NO_JVP where a part of `fun` has no forward derivative.
 
-    Parameters
-    ----------
-    fun : callable
-        ``fun(x)``; its result may be a tree.
-    x, tangent : trees of arrays of the same structure
-        The tangent of a leaf that is not floating is ignored.
-
-    Returns
-    -------
-    (value, tangent of value)
-
-    Raises
-    ------
-    ShapeError
-        If the tangent has another structure than `x`, or a leaf of it another shape.
+    The results are not copied.
 
     Examples
     --------
@@ -214,7 +201,8 @@ def zero_like(value):
 
 def _directions(x, tangent):
     """Tangent of each leaf of `x`, None where it is not floating; entries of dicts are paired by name."""
-    names, error = keys(x), ShapeError(f"the tangent must have the structure of x: {_words(x)}, got {_words(tangent)}")
+    names, given = keys(x), f"{described(x)}, got {described(tangent)}"
+    error = ShapeError(f"the tangent must have the structure of x: {given}")
     if names is not None:
         if keys(tangent) != names:
             raise error
@@ -231,12 +219,14 @@ def _is_array(value):
     return isbox(value) or isinstance(value, (np.ndarray, Number))
 
 
-def _words(tree):
+def described(tree):
+    """A tree in words: its kind, and how large it is."""
     if isinstance(tree, dict):
         return f"a dict of {', '.join(map(str, tree)) or 'nothing'}"
     if isinstance(tree, (tuple, list)):
         return f"a {type(tree).__name__} of length {len(tree)}"
-    return f"an array of shape {np.shape(tree)}" if _is_array(tree) else type(tree).__name__
+    array = is_variable(tree) or isinstance(tree, np.ndarray)
+    return f"an array of shape {np.shape(tree)}" if array else type(tree).__name__
 
 
 def jvp(fun, x, tangent):

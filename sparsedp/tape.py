@@ -43,7 +43,7 @@ from sparsedp.tree import copied, leaves
 __all__ = [
     "Recorder", "ReverseNode", "Rule", "apply_operator", "backward", "boxed", "called", "cast", "differentiable",
     "dtype_of", "fit", "forward_root", "growing", "innermost", "is_variable", "isbox", "linear", "new_trace",
-    "of_argument", "plain", "reverse_root", "split_box", "through", "traces_of", "untraced",
+    "of_argument", "plain", "reverse_root", "split_boxes", "through", "traces_of", "untraced",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
@@ -171,9 +171,11 @@ def boxed(values, roots, number):
     return [x if root is None else new_box(x, number, root) for x, root in zip(values, roots, strict=True)]
 
 
-def split_box(value, number):
-    """The value below the box of this trace, and its node (None when it does not depend on x)."""
-    return (value._value, value._node) if isbox(value) and value._trace == number else (value, None)
+def split_boxes(values, number):
+    """Values -> those below the boxes of this trace, and the nodes of the boxes (None where there is none)."""
+    ours = [isbox(value) and value._trace == number for value in values]
+    pairs = list(zip(values, ours, strict=True))
+    return [x._value if box else x for x, box in pairs], [x._node if box else None for x, box in pairs]
 
 
 def backward(nodes, ends, cotangents, sums):
@@ -249,17 +251,6 @@ def direct(function, asked=False):
         return new_box(ans, trace, type(parents[0])(ans, function, values, {}, nums, parents))
 
     return call
-
-
-def _noted(function, raw, args, nums):
-    """A call whose arguments `nums` are on one trace: `raw` of what is below it, and a node for `function`."""
-    values, parents = list(args), []
-    for num in nums:
-        values[num] = args[num]._value
-        parents.append(args[num]._node)
-    ans = raw(*values)
-    node = type(parents[0])(ans, function, tuple(values), {}, tuple(nums), tuple(parents))
-    return new_box(ans, args[nums[0]]._trace, node)
 
 
 def _install():
@@ -404,8 +395,14 @@ def through(rule, *args):
 
     Only the innermost trace, if it is a reverse-mode one, gets a node; all others go through those functions.
     """
-    nums = [num + 1 for num in innermost(args)]
-    return _noted(through, _run, (rule, *args), nums) if nums else _run(rule, *args)
+    nums = innermost(args)
+    if not nums:
+        return _run(rule, *args)
+    values = [arg._value if num in nums else arg for num, arg in enumerate(args)]
+    parents = [args[num]._node for num in nums]
+    ans = _run(rule, *values)
+    node = type(parents[0])(ans, through, (rule, *values), {}, [num + 1 for num in nums], parents)
+    return new_box(ans, args[nums[0]]._trace, node)
 
 
 def innermost(values):

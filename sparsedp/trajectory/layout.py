@@ -7,6 +7,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import constant
+from sparsedp.derivative import described
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, traces_of
@@ -126,8 +127,8 @@ class Layout:
         """The leaves of a tree, at a path of keys; refused where it branches otherwise than `wanted`."""
         names = keys(wanted)
         if keys(tree) != names:
-            form = _kind(wanted) if names is not None else "one array" if self.bare else "one leaf"
-            raise ShapeError(_changed(_at(self._template, self.root, path), form, _kind(tree), when))
+            form = described(wanted) if names is not None else "one array" if self.bare else "one leaf"
+            raise ShapeError(_changed(_at(self._template, self.root, path), form, described(tree), when))
         if names is None:
             found.append(tree)
             return
@@ -155,7 +156,7 @@ class Layout:
             refuse_lost(when)
         refuse_mask(f"{when} made a masked array of {name}", plain(value))
         if not isinstance(plain(value), (np.ndarray, np.generic, float, complex)):
-            raise ShapeError(_changed(name, "one array", _kind(value), when))
+            raise ShapeError(_changed(name, "one array", described(value), when))
         if np.shape(value) != shape:
             raise ShapeError(_changed(name, f"shape {shape}", f"shape {np.shape(value)}", when))
         if self.rounds and dtype_of(value) == np.result_type(dtype, np.float64):
@@ -247,14 +248,6 @@ def _at(tree, root, path):
     for key in path:
         tree, root = tree[key], root + subscript(tree, key)
     return root
-
-
-def _kind(tree):
-    if isinstance(tree, dict):
-        return f"a dict of {', '.join(map(str, tree)) or 'nothing'}"
-    if isinstance(tree, (tuple, list)):
-        return f"a {type(tree).__name__} of length {len(tree)}"
-    return "one array" if isinstance(tree, (np.ndarray, np.generic, float)) or isbox(tree) else type(tree).__name__
 
 
 def _changed(name, wanted, given, when):

@@ -157,7 +157,7 @@ class Run:
             count("rollout", "bytes", len(kept) * loop.state.nbytes)
         if loop.record is not None:
             loop.record(Record("forward", loop.n, len(kept), 0))
-        return loop.keep.finish()
+        return loop.keep.finish(state)
 
     def backward(self, args, g):
         """Cotangents of the outputs -> those of the arguments that want one, in that order."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
-from sparsedp.tape import Recorder, boxed, new_trace, plain, reverse_root, split_box, traces_of
+from sparsedp.tape import Recorder, boxed, new_trace, plain, reverse_root, split_boxes, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.tree import copied, flatten, leaves
 
@@ -117,9 +117,8 @@ class Steps:
             found, statics = self._called(state, given, self._traced_params)
         finally:
             nodes = self.recorder.taken()
-        pairs = [split_box(value, self.number) for value in found]
-        ends = [node for _, node in pairs]
-        values = self.loop.state.check([value for value, _ in pairs], "the step", self.outer)
+        values, ends = split_boxes(found, self.number)
+        values = self.loop.state.check(values, "the step", self.outer)
         # What is on no tape may be an array that the step uses again.
         values = [value if node else owned(value) for value, node in zip(values, ends, strict=True)]
         return Tape(starts, nodes, ends), State(state.i + 1, values, statics)
