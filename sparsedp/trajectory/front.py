@@ -123,14 +123,15 @@ def rollout(
         args = constant_args(args, traced)
     wanted = [any(map(isbox, leaves(tree))) for tree in (params, inputs)]
     beside = sum((1 + flag) * form.nbytes for form, flag in zip(forms[1:], wanted))  # a copy, a gradient
-    slots = None if memory is None else slots_within(memory, forms[0].nbytes, n, beside)
+    sizes = forms[0].nbytes, n, beside
+    slots = None if memory is None else slots_within(memory, *sizes)
     if truncate is not None and not is_whole(truncate, 1):
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
-    rooms = (SMALL, SOLVED) if memory is None else (max(room_within(memory, forms[0].nbytes, n, beside), 0),) * 2
+    rooms = (SMALL, SOLVED) if memory is None else (max(room_within(memory, *sizes), 0),) * 2
     loop = Loop(step, forms, n, truncate, innermost(args), _kind(keep, forms[0]), slots, rooms, progress, record)
     _check_values(loop, args, bool(traced))
     if loop.wanted and loop.slots:
-        _warn_of_repeats(memory, forms[0].nbytes, n, beside)
+        _warn_of_repeats(memory, *sizes)
     for told in thread.loops:
         told(step, state, params, inputs, n)
     outputs = through(rollout_rule, Run(loop), *args)
@@ -148,7 +149,7 @@ def _number_of_steps(n):
 
 def _variables(tree, layout):
     found = leaves(tree)
-    return [found[place] if isbox(found[place]) else dense(found[place]) for place in layout.places]
+    return [dense(found[place]) for place in layout.places]
 
 
 def _check_inputs(inputs, n):

@@ -1,7 +1,6 @@
 """Where the numbers of a state lie in its tree, and whether another tree has the same form."""
 
 from functools import cached_property
-from math import prod
 
 import autograd.numpy as anp
 import numpy as np
@@ -13,7 +12,7 @@ from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, traces_of
 from sparsedp.tree import flatten, keys, labels, subscript
 
-__all__ = ["Layout", "dense", "fingerprint", "owned", "refuse_lost", "refuse_mask", "stacked"]
+__all__ = ["Layout", "dense", "fingerprint", "is_finite", "owned", "refuse_lost", "refuse_mask", "stacked"]
 
 
 FOLD = 509  # words to a line of a fingerprint: a prime, so that a field that was shifted has another one
@@ -42,6 +41,8 @@ class Layout:
         Some branch is a dict or a list, whose entries could be changed.
     shapes, dtypes, floats : list
         Of the variable leaves.
+    nbytes : int
+        Of all of them.
     rounds : bool
         Whether a step may widen float32 to float64, and is rounded: beside numbers of Python, which are
         traced as float64, autograd widens what NumPy does not.
@@ -65,6 +66,7 @@ class Layout:
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
         self.shapes = [np.shape(leaf) for leaf in variables]
         self.dtypes = [dtype_of(leaf) for leaf in variables]
+        self.nbytes = sum(np.asarray(leaf).nbytes for leaf in variables)
 
     def _others(self, found):
         """All leaves, None in place of the variables, as constants."""
@@ -79,11 +81,6 @@ class Layout:
     def names(self):
         """Names of the variables."""
         return [self.labels[place] for place in self.places]
-
-    @cached_property
-    def nbytes(self):
-        """Bytes of the variables."""
-        return sum(prod(shape) * dtype.itemsize for shape, dtype in zip(self.shapes, self.dtypes, strict=True))
 
     def build(self, variables, statics=None):
         """Variables and the other leaves -> the tree."""
@@ -175,10 +172,11 @@ class Layout:
             if not surely_finite(value):
                 check_finite(f"{self.names[number]} of {owner}", value)
 
-    def is_finite(self, values):
-        """Whether all variables are finite."""
-        values = list(map(plain, values))
-        return all(surely_finite(value) or bool(np.all(np.isfinite(value))) for value in values)
+
+def is_finite(value):
+    """Whether an array or number, plain or traced, holds neither NaN nor infinity."""
+    value = plain(value)
+    return surely_finite(value) or bool(np.all(np.isfinite(value)))
 
 
 def _is_open(tree):

@@ -11,12 +11,12 @@ import numpy as np
 
 from sparsedp.derivative import zero_like
 from sparsedp.errors import DerivativeError, NonFiniteError
-from sparsedp.fields import place, surely_finite
+from sparsedp.fields import place
 from sparsedp.ledger import active, count, thread
 from sparsedp.progress import shown_steps
 from sparsedp.tape import Rule, plain
 from sparsedp.trajectory.backward_pass import BackwardPass
-from sparsedp.trajectory.layout import dense
+from sparsedp.trajectory.layout import dense, is_finite
 from sparsedp.trajectory.record import Record
 from sparsedp.trajectory.schedule import checkpoints
 from sparsedp.trajectory.steps import Scale, Steps
@@ -117,10 +117,7 @@ class Loop:
 
     def check_gradient(self, number, slope, g):
         """Refuse a gradient that is not finite, unless the cotangents given were not."""
-        slope = plain(slope)
-        if slope is None or surely_finite(slope) or np.all(np.isfinite(slope)):
-            return
-        if all(np.all(np.isfinite(plain(leaf))) for leaf in g):
+        if slope is not None and not is_finite(slope) and all(map(is_finite, g)):
             name = [name for layout in self.layouts for name in layout.names][number]
             raise NonFiniteError(
                 f"the way back through {self.n} steps of rollout makes the gradient in {name} NaN or infinite; "
@@ -147,7 +144,7 @@ class Run:
         loop.keep.start(loop.n, steps.outer, bool(loop.wanted))
         with steps.guarded():
             state, kept, tapes = loop.advance(steps)
-        if not loop.state.is_finite(state.values):
+        if not all(map(is_finite, state.values)):
             loop.refuse(steps)
         if loop.wanted:
             self._end = state.marks()
