@@ -15,6 +15,7 @@ beta(s-1, r-1) <= n - m <= beta(s-1, r).
 
 import re
 from bisect import bisect_left
+from math import comb
 
 from sparsedp.fields import is_number
 from sparsedp.trajectory.record import Record
@@ -38,12 +39,7 @@ SLOW = 3  # times as many steps run as with a budget up to twice as large: worth
 
 def beta(s, r):
     """Number of steps that s kept states and r runs can reverse; 0 where r or s is negative."""
-    if s < 0 or r < 0:
-        return 0
-    total = 1
-    for k in range(1, min(s, r) + 1):
-        total = total * (max(s, r) + k) // k
-    return total
+    return comb(s + r, r) if s >= 0 <= r else 0
 
 
 def repetitions(n, s):
