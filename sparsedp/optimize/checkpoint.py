@@ -33,7 +33,6 @@ class Checkpoint:
         self._settings = settings
         self._latest: Any = None  # what is to be written
         self._written, self._cost = -np.inf, 0.0
-        self._batches = ""  # a hash of all batches so far
         self.told = ""
 
     def resume(self, template, trials, watch):
@@ -50,7 +49,7 @@ class Checkpoint:
             return None
         self._folder.mkdir(parents=True, exist_ok=True)
         self._settings = {name: fingerprint(value) for name, value in self._settings.items()}
-        self._settings["loss at the start"] = _bits(template.trial)
+        self._settings |= {"loss at the start": _bits(template.trial), "list of batches": ""}
         found, skipped = self._load()
         for number in range(found["iteration"] + 1 if found else 1):
             self._pass(trials.batches, number)
@@ -60,7 +59,6 @@ class Checkpoint:
         self.told = f"resumed from iteration {found['iteration']} in {self._folder}{skipped}"
         for name, value in self._settings.items():
             self._check(name, value == found["settings"].get(name))
-        self._check("list of batches", found["batches"] == self._batches)
         state = flatten(template)[1](found["state"])
         trials.iteration = found["iteration"]
         again = trials(state.trial.vector)
@@ -90,7 +88,8 @@ class Checkpoint:
             )
 
     def _pass(self, batches, number):
-        self._batches = _digest((self._batches + fingerprint(batches.at(number))).encode())
+        so_far = self._settings["list of batches"] + fingerprint(batches.at(number))
+        self._settings = {**self._settings, "list of batches": _digest(so_far.encode())}
 
     def save(self, state, trials, watch):
         """Write the state down, unless that was done a moment ago and the run goes on."""
@@ -98,7 +97,7 @@ class Checkpoint:
             return
         self._pass(trials.batches, watch.iteration)
         self._latest = {
-            "iteration": watch.iteration, "settings": self._settings, "batches": self._batches,
+            "iteration": watch.iteration, "settings": self._settings,
             "evaluations": trials.count, "state": leaves(state), "best": list(trials.best),
         }  # fmt: skip
         if SHARE * (time.perf_counter() - self._written) >= self._cost or watch.message:
