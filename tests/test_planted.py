@@ -296,6 +296,12 @@ BUGS = {
         "np.sqrt(square)",
         "tests/test_minimize.py tests/test_minimize_inside.py",
     ),
+    "a wrong derivative that passes for rounding": Bug(
+        "optimize",
+        "hopeless = falls[0] <= 100",
+        "hopeless = falls[-1] <= 100",
+        "tests/test_minimize_refusals.py",
+    ),
     "a step across a bound": Bug(
         "optimize",
         "np.clip(vector, self.lower, self.upper)",
