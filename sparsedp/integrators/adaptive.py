@@ -154,7 +154,7 @@ class Adaptive(Scheme):
                 f"the rate of {self.name} must be finite at the state given; take a state in its domain"
             )
         length = 0.01 * (size or 1.0) / (speed * float(h)) if speed > 0 else 1.0
-        return min(max(length, 1e3 * LEAST), 1.0) if np.isfinite(length) else 1e-6
+        return min(max(1e3 * LEAST, length), 1.0)
 
     def _allowed(self, length, left):
         """At most what is left, and not just short of it."""
@@ -198,10 +198,9 @@ class Adaptive(Scheme):
 
     def _followed(self, path, given):
         """The state at the end of the path, with a derivative that is judged."""
-        known, sizes = untraced(given), self.sizes(path[0].u)
-        start = Moving(given, isbox, lambda place, leaf: sizes[place] if place < len(sizes) else _size(leaf))
-        far = self.sizes(path[0].u, path[-1].new)
-        end = Moving(path[-1].new, is_variable, lambda place, leaf: far[place])
+        known = untraced(given)
+        start = Moving(given, isbox, [*self.sizes(path[0].u), *map(_size, leaves(known[1:]))])
+        end = Moving(path[-1].new, is_variable, self.sizes(path[0].u, path[-1].new))
         slopes = self._slopes(path, *known[1:])
         spread, judge = self._doors(len(path))
         entered = spread(start.off(given))
@@ -280,16 +279,15 @@ class Moving:
     tree : tree
     moves : callable
         Whether a leaf has a derivative.
-    sizes : callable
-        ``sizes(place, leaf)``: the unit of each entry; 1 for 0.
+    sizes : list
+        For each leaf the unit of each entry; 1 for 0.
     """
 
     def __init__(self, tree, moves, sizes):
         self.found, self.rebuild = flatten(tree)
-        known = [(place, plain(leaf)) for place, leaf in enumerate(self.found) if moves(leaf)]
-        sizes = [sizes(*pair) for pair in known]
-        self.moving = [(*pair, np.where(size > 0, size, 1.0)) for pair, size in zip(known, sizes, strict=True)]
-        shapes = [np.shape(leaf) for _, leaf in known for _ in range(1 + np.iscomplexobj(leaf))]
+        rows = enumerate(zip(self.found, sizes, strict=True))
+        self.moving = [(n, plain(leaf), np.where(size > 0, size, 1.0)) for n, (leaf, size) in rows if moves(leaf)]
+        shapes = [np.shape(leaf) for _, leaf, _ in self.moving for _ in range(1 + np.iscomplexobj(leaf))]
         self.space = Space(sum(map(prod, shapes)), parts=shapes)
 
     def off(self, tree):
@@ -332,5 +330,5 @@ def _bend(u, rows):
 
 def _size(leaf):
     """What a relative change is relative to: the entry itself, and where it is 0, the largest one."""
-    size = np.abs(np.asarray(leaf))
+    size = np.abs(leaf) if is_variable(leaf) else 1.0
     return np.where(size > 0, size, np.max(size, initial=0.0))

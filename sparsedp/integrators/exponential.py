@@ -9,6 +9,7 @@ Acta Numerica 19 (2010), section 2.2, exponential quadrature.
 from math import factorial
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from sparsedp.integrators.functions import Function, PhiFunctions
 from sparsedp.integrators.problem import later
@@ -30,10 +31,9 @@ def quadrature(nodes, start, stop):
 
     Of the Lagrange polynomials of the nodes; that of x^k over 0 < x < 1 is k! phi_{k+1}(z L).
     """
-    part = np.polynomial.Polynomial([start, stop - start])
     found = []
     for values in np.eye(len(nodes)):
-        line = np.polynomial.Polynomial(np.linalg.solve(np.vander(nodes, increasing=True), values))(part)
+        line = Polynomial.fit(nodes, values, len(nodes) - 1, domain=(start, stop), window=(0.0, 1.0))
         weights = (float((stop - start) * factorial(k) * a) for k, a in enumerate(line.coef))
         found.append(Function((0.0, *weights), stop - start))
     return tuple(found)
