@@ -17,12 +17,12 @@ from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.stencils import along, differences, means, pick, slopes, wall_slopes
+from sparsedp.recipe import Made
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Mask, compose, total
-from sparsedp.tape import Rule
 from sparsedp.tree import copied
 
 __all__ = ["convection", "face_laplacian", "face_lift"]
@@ -134,8 +134,7 @@ def convection(grid, boundary=no_slip, solid=None):
     Each component of v and the velocity w that carries it are averaged to the sides of its control
     volume. The flux form conserves momentum and, where w has no divergence, energy.
 
-        N(v, w) = C ((A v) (B w)),   N' = C ((A dv) (B w) + (A v) (B dw)),
-        cotangents of v and w: A^T ((B w) C^T g) and B^T ((A v) C^T g)
+        N(v, w) = C ((A v) (B w))
 
     Parameters
     ----------
@@ -146,9 +145,9 @@ def convection(grid, boundary=no_slip, solid=None):
 
     Returns
     -------
-    Rule
+    callable
         ``convect(v, w)`` with two face fields [velocity] -> faces [velocity^2 / length], 0 on faces that
-        are not free; differentiable in both, to every order; one node on the tape. Order 2.
+        are not free; differentiable in both, to every order. Order 2.
 
     Raises
     ------
@@ -188,23 +187,11 @@ def convection(grid, boundary=no_slip, solid=None):
     A = Operator(Kronecker(flux, faces.parts, carried), faces, sites, "carried")
     B = Operator(Kronecker(flux, faces.parts, carrier), faces, sites, "carrier")
     C = Operator(compose(free, Kronecker(faces.parts, flux, gain)), sites, faces, "gain")
-    return _bilinear("convection", A, B, C, (convection, copied((grid, boundary, solid))))
 
+    def convect(v, w):
+        return C(A(v) * B(w))
 
-def _bilinear(name, A, B, C, made):
-    """The rule of C((A v) (B w)), and what makes it again."""
-
-    def vjp(nums, ans, v, w):
-        def pull(g):
-            g = C.T(g)
-            return tuple(B.T(A(v) * g) if num else A.T(B(w) * g) for num in nums)
-
-        return pull
-
-    def jvp(nums, tangents, ans, v, w):
-        return C(sum(A(v) * B(t) if num else A(t) * B(w) for num, t in zip(nums, tangents, strict=True)))
-
-    return Rule(name, lambda v, w: C(A(v) * B(w)), vjp, jvp, made=made)
+    return Made(convect, convection, *copied((grid, boundary, solid)))
 
 
 # ------------------------------------------------------------ the factors

@@ -132,12 +132,13 @@ class FlowStep(Remade):
     def __init__(self, grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary):
         self.grid, self.dt, self.viscosity, self.force = grid, dt, viscosity, force
         self.project = projection(grid, solid, boundary)
-        _, solid, boundary, _ = self.project.structure.setup.made  # copies, as of the walls: the caller may change them
+        setup = self.project.structure.setup
+        _, solid, boundary, _ = setup.made  # copies, as of the walls: the caller may change them
         walls = constant(walls)
         self.made = grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
         self.pressure = self.project.pressure
-        self.slope = gradient(grid, self.project.structure.setup.pressure_conditions, solid)
-        self.kept = mask(grid.faces, self.project.structure.setup.open)
+        self.slope = gradient(grid, setup.pressure_conditions, solid)
+        self.kept = mask(grid.faces, setup.open)
         self.convect: Any = convection(grid, boundary, solid) if convective else None
         self.laplacian: Any = None
         if viscosity:
