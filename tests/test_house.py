@@ -92,7 +92,7 @@ BUDGETS = {
     "solvers": 40_500,
     "solvers/multigrid": 10_000,
     "structure": 6_700,
-    "trajectory": 10_600,
+    "trajectory": 9_250,
 }
 EXTRAS = ("numba", "matplotlib", "tqdm")  # foreign libraries that need not be there
 LAZY = ("pyamg", "numba", "matplotlib", "tqdm", "scipy", "autograd", "numpy")  # not touched by `import sparsedp`
