@@ -88,7 +88,7 @@ BUDGETS = {
     "network": 2_650,
     "operators": 5_800,
     "optimize": 12_000,
-    "report": 18_100,
+    "report": 18_150,
     "solvers": 39_900,
     "solvers/multigrid": 10_000,
     "structure": 6_500,
