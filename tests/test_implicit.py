@@ -10,8 +10,8 @@ import sparsedp as dp
 from sparsedp.derivative import pullback, pushforward, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError
 from sparsedp.ledger import recording
-from sparsedp.solvers.equation import Equation
 from sparsedp.solvers.jacobian import Jacobians, Linearisation
+from sparsedp.solvers.newton import Equation
 from sparsedp.solvers.roots import implicit
 from sparsedp.tape import isbox, plain
 from sparsedp.tree import leaves

@@ -24,10 +24,9 @@ from sparsedp.errors import DerivativeError
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import tell, thread
 from sparsedp.recipe import Remade
-from sparsedp.solvers.equation import Equation, Layout, vary
 from sparsedp.solvers.inverses import check_settings
 from sparsedp.solvers.jacobian import Jacobians
-from sparsedp.solvers.newton import Newton
+from sparsedp.solvers.newton import Equation, Layout, Newton, vary
 from sparsedp.solvers.solve import Run, SolveLog
 from sparsedp.tape import Rule, plain
 
