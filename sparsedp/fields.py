@@ -39,7 +39,7 @@ def field_array(op, u, batch=False):
         u = _array(op, u)
     shape = op.domain.shape
     if u.shape != shape and not (batch and u.shape[-len(shape) :] == shape):
-        raise ShapeError(f"{op.name} takes a field on {op.domain.told}, got an array of shape {u.shape}")
+        raise ShapeError(f"{op.name} takes a field on {op.domain.described}, got an array of shape {u.shape}")
     if u.dtype.char not in "dfDF":
         if u.dtype.kind not in "biu":
             raise TypeError(f"{op.name} takes float or complex numbers, got dtype {u.dtype}; write u.astype(float)")
@@ -54,7 +54,9 @@ def _array(op, u):
         return np.asarray(u)
     except ValueError:  # a list of arrays of different shapes
         parts = "grid.join(*parts)" if op.domain.kind == "faces" else "op.domain.join(*parts)"
-        raise ShapeError(f"{op.name} takes one array on {op.domain.told}, got {len(u)} parts; write {parts}") from None
+        raise ShapeError(
+            f"{op.name} takes one array on {op.domain.described}, got {len(u)} parts; write {parts}"
+        ) from None
 
 
 def check_plain(name, *values):

@@ -1,4 +1,4 @@
-"""The ledger: how often each rule, operator and solve was called, and what it told. `explain` prints it.
+"""The ledger: how often each rule, operator and solve was called, and what was noted of it. `explain` prints it.
 
 Kinds of calls: forward, vjp, jvp; of solves: solve, adjoint, iterations, setup, reused, hierarchy, skipped
 (nothing to solve); of operators: assembled (its matrix was built). A time loop counts its steps as forward, vjp
@@ -13,7 +13,7 @@ from threading import local
 from time import perf_counter
 from typing import Any
 
-__all__ = ["Calls", "active", "count", "recording", "spent", "tell", "thread", "timed"]
+__all__ = ["Calls", "active", "count", "recording", "note", "spent", "thread", "timed"]
 
 
 class Thread(local):
@@ -23,10 +23,10 @@ class Thread(local):
     ----------
     calls : list of Calls
         The open `recording()` blocks.
-    observers : list
+    solve_hooks : list
         Who takes part in every solve, the last one first; asked inside recordings only.
-    loops : list of callables
-        Who is told of every time loop before it runs: called with (step, state, params, inputs, n).
+    loop_hooks : list of callables
+        Called for every time loop before it runs, with (step, state, params, inputs, n).
     witnesses : list of types
         Kinds of nodes of a tape that see what they stand for; the last one is used.
     solves : int
@@ -39,8 +39,8 @@ class Thread(local):
 
     def __init__(self):
         self.calls: list[Calls] = []
-        self.observers: list[Any] = []
-        self.loops: list[Any] = []
+        self.solve_hooks: list[Any] = []
+        self.loop_hooks: list[Any] = []
         self.witnesses: list[Any] = []
         self.inner: list[float] = []
         self.solves = self.grown = 0
@@ -51,12 +51,12 @@ active: list[None] = []  # one for each open block of any thread: while it is em
 
 
 class Calls(Counter):
-    """Counts by (name, kind). `seconds` by the same keys, without the calls inside; `told` and `actors` by name."""
+    """Counts by (name, kind). `seconds` by the same keys, without the calls inside; `notes` and `actors` by name."""
 
     def __init__(self, *counts):
         super().__init__(*counts)
         self.seconds: Counter = Counter()
-        self.told: dict[tuple, Counter] = {}
+        self.notes: dict[tuple, Counter] = {}
         self.actors: dict[str, dict] = {}
 
 
@@ -93,10 +93,10 @@ def count(name, kind, times=1):
         calls[name, kind] += times
 
 
-def tell(name, what, value):
+def note(name, what, value):
     """Note a fact about `name`, such as the method that was chosen. Callers test `active` first."""
     for calls in thread.calls:
-        calls.told.setdefault((name, what), Counter())[value] += 1
+        calls.notes.setdefault((name, what), Counter())[value] += 1
 
 
 def timed(name, kind, function, *args):

@@ -97,7 +97,7 @@ class Space(Frozen, Uncached):
             If `v` has another shape.
         """
         if np.shape(v) != self.shape:
-            raise ShapeError(f"split takes a field on {self.told}, got an array of shape {np.shape(v)}")
+            raise ShapeError(f"split takes a field on {self.described}, got an array of shape {np.shape(v)}")
         if isbox(v):
             return tuple(rule(v) for rule in self._parted)
         check_plain("split", v)
@@ -156,7 +156,7 @@ class Space(Frozen, Uncached):
     __repr__ = __str__
 
     @property
-    def told(self):
+    def described(self):
         """Its name for messages, with the shape of a field where the name does not show it: faces are flat."""
         shape = self.shape if self.grid is None else self.grid.shape
         return str(self) if shape == self.shape else f"{self} of shape {self.shape}"

@@ -22,7 +22,7 @@ from autograd.tracer import box_types, getval, isbox, new_box, notrace_primitive
 
 from sparsedp.constants import constant, constant_args, sparing
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.ledger import active, count, tell, thread, timed
+from sparsedp.ledger import active, count, note, thread, timed
 from sparsedp.recipe import Remade
 from sparsedp.shortcuts import (
     ARRAY,
@@ -437,7 +437,7 @@ def _tell_unasked(rule, nums, values):
     names = list(rule._signature.parameters)
     for num, value in enumerate(values):
         if num not in nums and is_variable(value):
-            tell(rule.name, "not asked", names[min(num, len(names) - 1)])
+            note(rule.name, "not asked", names[min(num, len(names) - 1)])
 
 
 def _call_jvp(argnums, tangents, ans, args, kwargs):

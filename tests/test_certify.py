@@ -115,7 +115,7 @@ def test_text_data_and_state():
     for words in ("gradient off by about", "from forward solves", "from adjoint solves", "advice:"):
         assert words in text
     assert json.loads(json.dumps(found.to_dict()))["advice"] == found.advice and repr(found) == text
-    assert not thread.observers and solve.solver.system.rtol == 1e-4
+    assert not thread.solve_hooks and solve.solver.system.rtol == 1e-4
     with pytest.raises(AttributeError, match="a certificate is frozen; value cannot be set"):
         found.value = 0.0
     with pytest.raises(
@@ -124,7 +124,7 @@ def test_text_data_and_state():
         dp.certify(lambda u: anp.sum(u), B, target=2)
     with pytest.raises(ZeroDivisionError):
         dp.certify(lambda u: 1 / 0, B)
-    assert not thread.observers
+    assert not thread.solve_hooks
 
 
 # ---- tolerances for an optimizer -----------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.ledger import count, tell
+from sparsedp.ledger import count, note
 
 GRID = dp.Grid((12, 10), size=(1.0, 1.0))
 G, D = dp.gradient(GRID, dp.dirichlet), dp.divergence(GRID)
@@ -237,7 +237,7 @@ def test_others_report_through_the_ledger():
         count("rollout.step", "forward", 10)
         count("rollout.step", "recomputed", 5)
         count("rollout", "bytes", 1000)
-        tell("rollout", "skipped", "nu = 0, no diffusion solve")
+        note("rollout", "skipped", "nu = 0, no diffusion solve")
         return u**2
 
     square = dp.differentiable("rollout", advance, lambda nums, ans, u: lambda g: (2 * u * g,))

@@ -191,7 +191,7 @@ class PhiFunctions(Functions):
         for field in fields:
             if np.shape(field) != op.domain.shape:
                 raise ShapeError(
-                    f"{self.name} takes a field on {op.domain.told}, got an array of shape {np.shape(field)}"
+                    f"{self.name} takes a field on {op.domain.described}, got an array of shape {np.shape(field)}"
                 )
         if z == 0:  # no transform, and for phi_0 the field itself, bit for bit
             return [sum(f.at_zero(op, field) for f, field in zip(row, fields, strict=True)) for row in rows]

@@ -47,7 +47,7 @@ from sparsedp.errors import ConvergenceError
 from sparsedp.integrators.functions import Taylor, TaylorPolynomials
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
-from sparsedp.ledger import tell
+from sparsedp.ledger import note
 from sparsedp.operator import Operator
 from sparsedp.solvers.inverses import build
 from sparsedp.solvers.roots import implicit
@@ -185,7 +185,7 @@ class Resolvent:
     def _solved(self, z, b, transposed, checked):
         if z == 0:
             if recordings:
-                tell(self._checked.name, "skipped", "dt or coefficient 0, no solve and no set-up")
+                note(self._checked.name, "skipped", "dt or coefficient 0, no solve and no set-up")
             return np.array(b, dtype=np.result_type(b, np.float32))  # whole numbers become floating ones
         inv = self._inverse(float(z))
         inv = inv.T if transposed else inv if checked else inv.tangent

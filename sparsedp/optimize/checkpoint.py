@@ -33,7 +33,7 @@ class Checkpoint:
         self._settings = settings
         self._latest: Any = None  # what is to be written
         self._written, self._cost = -np.inf, 0.0
-        self.told = ""
+        self.resumed = ""
 
     def resume(self, template, trials, watch):
         """The last state of the folder, put into trials and watch too; None when there is none.
@@ -54,9 +54,9 @@ class Checkpoint:
         for number in range(found["iteration"] + 1 if found else 1):
             self._pass(trials.batches, number)
         if not found:
-            self.told = f"nothing to resume in {self._folder}{skipped}"
+            self.resumed = f"nothing to resume in {self._folder}{skipped}"
             return None
-        self.told = f"resumed from iteration {found['iteration']} in {self._folder}{skipped}"
+        self.resumed = f"resumed from iteration {found['iteration']} in {self._folder}{skipped}"
         for name, value in self._settings.items():
             self._check(name, value == found["settings"].get(name))
         state = flatten(template)[1](found["state"])

@@ -171,7 +171,7 @@ def minimize(
     return Minimum(
         x=x, value=trials.best.value, history=tuple(watch.history), method=method,
         message=watch.message or f"stopped after {watch.iteration} iterations, as maxiter asks",
-        converged=watch.converged, evaluations=trials.count, resumed=kept.told, covariance=covariance,
+        converged=watch.converged, evaluations=trials.count, resumed=kept.resumed, covariance=covariance,
     )  # fmt: skip
 
 
@@ -195,7 +195,7 @@ def _run(stepper, trials, watch, kept, start, steps):
         watch(state.trial)
         kept.save(state, trials, watch)
         if not isinstance(steps, range):
-            steps.set_postfix_str(watch.history[-1].told())
+            steps.set_postfix_str(watch.history[-1].summary())
 
 
 def _composed(loss, inner):

@@ -53,7 +53,7 @@ class Record(NamedTuple):
     failed: tuple[Failure, ...] = ()
     solves: int = 0
 
-    def told(self):
+    def summary(self):
         """A few words for a progress bar."""
         refused = f", {len(self.failed)} refused" if self.failed else ""
         return f"loss {self.value:.6g}, gradient {self.gradient_norm:.1e}{refused}"

@@ -89,10 +89,10 @@ class Trials:
             When there is none; "rounding" when the first was not expected to fall by more than that.
         """
         falls: list = []
-        for vector, fall, told in tries:
+        for vector, fall, mark in tries:
             trial = self(vector, here.value)
             if trial.value < here.value and here.value - trial.value >= ENOUGH * fall:
-                return trial, (here.value - trial.value) / fall if fall > 0 else 0.0, told
+                return trial, (here.value - trial.value) / fall if fall > 0 else 0.0, mark
             falls.append(abs(fall))
             if falls[-1] <= here.rounding:  # below 0 where bounds turn a long step uphill: a shorter one may do
                 break

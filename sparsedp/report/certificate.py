@@ -82,12 +82,12 @@ class RecordedSolves(dict):
 
     def run(self, function, x):
         """function(x), with its solves recorded."""
-        thread.observers.append(self)
+        thread.solve_hooks.append(self)
         try:
             with recording() as calls:
                 return function(x)
         finally:
-            thread.observers.pop()
+            thread.solve_hooks.pop()
             self.iterations = total(calls, "iterations")
 
     def linear(self, solver, b, transposed, checked, start):

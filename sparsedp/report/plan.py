@@ -165,7 +165,7 @@ def _rows(calls):
 
 def _how(calls, name):
     """Form or method, and why."""
-    words = list(calls.told.get((name, "method"), ()))
+    words = list(calls.notes.get((name, "method"), ()))
     for actor in calls.actors.get(name, {}).values():
         if hasattr(actor, "engine"):
             words.append(f"{actor.engine.method}: {actor.reason}")
@@ -193,7 +193,7 @@ def _gradient(x, asked):
 
 def _skipped(calls, forward, gradient):
     """Derivatives, matrices, hierarchies and solves that nobody needed."""
-    for (name, what), facts in calls.told.items():
+    for (name, what), facts in calls.notes.items():
         if what == "not asked":
             yield f"derivative of {name} in {', '.join(map(str, facts))}: not asked"
         if what == "skipped":

@@ -170,15 +170,15 @@ def write_report(source, folder, force=False):
     verdict = next(word for word in MEANING if word in words)
     page, lines = [f"# {source.name}: {verdict}", "", MEANING[verdict]], []
     for chapter, result in zip(CHAPTERS, results):
-        told, files = [f"{chapter.subject}: {chapter.failed}, {result}"], []
+        sentences, files = [f"{chapter.subject}: {chapter.failed}, {result}"], []
         if isinstance(result, Result):
             left_out = (f"{chapter.subject} left out: {sentence}" for sentence in getattr(result, "left_out", ()))
-            told = [*chapter.tell(result), *left_out]
+            sentences = [*chapter.tell(result), *left_out]
             text, stem = f"# {chapter.title}\n\n{result.markdown()}", getattr(result, "stem", chapter.stem)
             files = write_table(folder, stem, text, result.csv(), chapter.draw(result))
         links = (f"{'!' if path.suffix == '.png' else ''}[{path.name}]({path.name})" for path in files)
-        page += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in told), "", *links]
-        lines += told
+        page += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in sentences), "", *links]
+        lines += sentences
     write_file(folder / PAGE, "\n".join([*page, ""]))
     return verdict, lines
 

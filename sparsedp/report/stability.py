@@ -58,13 +58,13 @@ def _first_rollout(loss, x):
             rest = () if inputs is None else (first,)
             raise Loop(lambda state: step(state, params, *rest), state)
 
-    thread.loops.append(leave)
+    thread.loop_hooks.append(leave)
     try:
         loss(x)
     except Loop as loop:
         return loop.args
     finally:
-        thread.loops.remove(leave)
+        thread.loop_hooks.remove(leave)
     return None
 
 

@@ -201,7 +201,7 @@ class EllipticSolver(ParametricSolver):
         if values.shape not in ((), space.shape):
             advice = "; write harmonic_average(grid)(k)" if values.shape == self.D.codomain.shape else ""
             raise ShapeError(
-                f"k takes a number or a field on {space.told}, got an array of shape {values.shape}{advice}"
+                f"k takes a number or a field on {space.described}, got an array of shape {values.shape}{advice}"
             )
         if values.dtype.kind not in "biuf":
             instead = "k.real" if values.dtype.kind == "c" else "np.asarray(k, float)"

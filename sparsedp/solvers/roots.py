@@ -22,7 +22,7 @@ import numpy as np
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError
 from sparsedp.ledger import active as recordings
-from sparsedp.ledger import tell, thread
+from sparsedp.ledger import note, thread
 from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import check_settings
 from sparsedp.solvers.jacobian import Jacobians
@@ -172,10 +172,10 @@ class Root(Remade):
     # ------------------------------------------------------------ the root as a rule of the parameters
 
     def _newton(self, equation, guess, *leaves):
-        solved = thread.observers[-1].root if recordings and thread.observers else Root.solved
+        solved = thread.solve_hooks[-1].root if recordings and thread.solve_hooks else Root.solved
         x = solved(self, equation, guess, leaves)
         if recordings:
-            tell(self.name, "method", f"Newton's method, Jacobian {self._jacobians.way or 'not needed'}")
+            note(self.name, "method", f"Newton's method, Jacobian {self._jacobians.way or 'not needed'}")
         return x
 
     def corrected(self, equation, x, leaves, share, kept=0.0):

@@ -105,8 +105,8 @@ class Solver(Remade):
             return self._in_parts(b, transposed, checked, start)
         if self.system.complex:
             b = b.astype(complex)
-        if thread.observers:
-            return thread.observers[-1].linear(self, b, transposed, checked, start)
+        if thread.solve_hooks:
+            return thread.solve_hooks[-1].linear(self, b, transposed, checked, start)
         return self.solved(b, transposed, checked, start)
 
     def solved(self, b, transposed=False, checked=True, start=None, rtol=None):

@@ -132,8 +132,8 @@ def rollout(
     _check_values(loop, args, bool(traced))
     if loop.wanted and loop.slots:
         _warn_of_repeats(memory, *sizes)
-    for told in thread.loops:
-        told(step, state, params, inputs, n)
+    for hook in thread.loop_hooks:
+        hook(step, state, params, inputs, n)
     outputs = through(rollout_rule, Run(loop), *args)
     count = len(plain(outputs)) if isinstance(plain(outputs), tuple) else None
     return loop.keep.tree([outputs] if count is None else [outputs[k] for k in range(count)])

@@ -138,8 +138,8 @@ def plan(n, memory, state_bytes, beside=0):
 
     Examples
     --------
-    >>> told = plan(10_000, "100 MB", 256 * 256 * 8)
-    >>> told.kept, told.recomputed
+    >>> schedule = plan(10_000, "100 MB", 256 * 256 * 8)
+    >>> schedule.kept, schedule.recomputed
     (181, 9818)
     """
     slots = max(n, 1) if memory is None else slots_within(memory, state_bytes, n, beside)
