@@ -101,3 +101,13 @@ def test_fixed_entries_corners_and_no_room():
     assert np.array_equal(still.x, np.full(3, 0.5)) and still.converged and still.evaluations == 1
     single = dp.minimize(valley, np.zeros(4, np.float32), bounds=(-1.0, 0.7))
     assert single.x.dtype == np.float32 and np.all(single.x <= np.float32(0.7))
+
+
+def test_a_real_bound_on_a_complex_leaf_bounds_both_parts():
+    """As a number does; it was refused by NumPy's broadcasting, in words about shapes."""
+    goal = np.array([2.0 + 3.0j, -1.0 + 0.25j])
+    bounds = {"z": np.zeros(2)}, {"z": np.array([1.0, 0.5])}
+    best = dp.minimize(lambda x: anp.sum(anp.abs(x["z"] - goal) ** 2), {"z": np.zeros(2, complex)}, bounds=bounds)
+    assert np.allclose(best.x["z"], [1.0 + 1.0j, 0.25j])
+    best = dp.minimize(lambda z: anp.sum(anp.abs(z - goal) ** 2), np.zeros(2, complex), bounds=(0.0, 1.0 + 2.0j))
+    assert np.allclose(best.x, [1.0 + 2.0j, 0.25j])

@@ -81,7 +81,7 @@ def told(found):
 
 def left_over():
     mine = ledger.thread
-    kept = len(mine.calls), len(mine.observers), len(mine.loops), len(mine.inner), len(mine.witnesses)
+    kept = len(mine.calls), len(mine.solve_hooks), len(mine.loop_hooks), len(mine.inner), len(mine.witnesses)
     return len(ledger.active), *kept, set(tape.untraced)
 
 

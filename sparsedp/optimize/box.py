@@ -64,11 +64,14 @@ def _side(side, packing, start, without):
             f"a bound must be a number or have the structure of start, got {len(given)} leaves where start has "
             f"{len(wanted)}; write one number, or a tree like start"
         )
-    return packing.pack_leaves([_full(np.shape(x), without if b is None else b) for x, b in zip(wanted, given)])
+    return packing.pack_leaves([_full(x, without if b is None else b) for x, b in zip(wanted, given)])
 
 
-def _full(shape, bound):
+def _full(x, bound):
+    """A bound for every entry of x; a real one bounds both parts of a complex entry."""
+    if np.iscomplexobj(x) and not np.iscomplexobj(bound):
+        bound = bound * (1 + 1j)
     try:
-        return np.full(shape, bound)
+        return np.full(np.shape(x), bound)
     except ValueError:
-        raise ShapeError(f"a bound of shape {np.shape(bound)} does not fit start, of shape {shape}") from None
+        raise ShapeError(f"a bound of shape {np.shape(bound)} does not fit start, of shape {np.shape(x)}") from None

@@ -42,8 +42,8 @@ class Descent:
     residuals = False
 
     def __init__(self, rate=None, momentum=0.0, line_search=None):
-        if rate is not None and not is_positive(rate):
-            raise ValueError(f"gd needs a positive rate, got {rate}; leave it out and it is searched for")
+        if rate is not None:
+            check_positive("gd", "rate", rate, "leave it out and it is searched for")
         if not (is_number(momentum) and 0 <= momentum < 1):
             raise ValueError(f"gd needs a momentum from 0 to below 1, got {momentum}; leave it out for none")
         if line_search not in (None, "backtracking"):
@@ -109,9 +109,10 @@ def admissible(point, step, share, trials):
     raise Stuck("no admissible point along the step")
 
 
-def is_positive(value):
-    """Whether a value is a number above 0, and finite."""
-    return is_number(value) and 0 < value < np.inf
+def check_positive(method, name, value, advice):
+    """Refuse what is not a number above 0, and finite."""
+    if not (is_number(value) and 0 < value < np.inf):
+        raise ValueError(f"{method} needs a positive {name}, got {value!r}; {advice}")
 
 
 class AdamState(NamedTuple):
@@ -145,12 +146,10 @@ class Adam:
     residuals, searches = False, False
 
     def __init__(self, rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8):
-        if not is_positive(rate):
-            raise ValueError(f"adam needs a positive rate, got {rate}; the default is 1e-3")
+        check_positive("adam", "rate", rate, "the default is 1e-3")
         if np.shape(betas) != (2,) or not all(is_number(beta) and 0 <= beta < 1 for beta in betas):
             raise ValueError(f"adam needs two betas from 0 to below 1, got {betas}; the default is (0.9, 0.999)")
-        if not is_positive(epsilon):
-            raise ValueError(f"adam needs a positive epsilon, got {epsilon}; the default is 1e-8")
+        check_positive("adam", "epsilon", epsilon, "the default is 1e-8")
         self.rate, self.betas, self.epsilon = rate, tuple(betas), epsilon
 
     def begin(self, first):

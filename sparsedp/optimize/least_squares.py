@@ -10,7 +10,7 @@ import scipy.linalg
 from scipy.sparse.linalg import LinearOperator, lsmr
 
 from sparsedp.optimize.directions import Family, form_of
-from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked, is_positive
+from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked, check_positive
 from sparsedp.optimize.result import Trial
 from sparsedp.tree import norm
 
@@ -96,8 +96,7 @@ class LevenbergMarquardt(GaussNewton):
     """
 
     def __init__(self, damping=1e-3, apart=False, dense=None):
-        if not is_positive(damping):
-            raise ValueError(f"levenberg_marquardt needs a positive damping, got {damping!r}; the default is 1e-3")
+        check_positive("levenberg_marquardt", "damping", damping, "the default is 1e-3")
         super().__init__(apart, dense)
         self.damping = damping
 
@@ -143,8 +142,7 @@ class HalfInverse(GaussNewton):
     searches = False
 
     def __init__(self, rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto"):
-        if not is_positive(rate):
-            raise ValueError(f"half_inverse needs a positive rate, got {rate!r}; the default is 1")
+        check_positive("half_inverse", "rate", rate, "the default is 1")
         super().__init__(apart, form_of(form))
         self.rate, self._family = rate, Family(power, 0.0, truncation, rank)
 

@@ -3,7 +3,7 @@
 import autograd.numpy as anp
 
 from sparsedp.errors import ShapeError
-from sparsedp.optimize.first_order import Descent, is_positive
+from sparsedp.optimize.first_order import Descent, check_positive
 from sparsedp.tape import differentiable, plain
 
 __all__ = ["PhysicalGradient", "physical_gradient"]
@@ -58,18 +58,17 @@ def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
     >>> round(1.0 - update, 12)  # x - update is the solution
     2.0
     """
-    if not is_positive(rate):
-        raise ValueError(f"physical_gradient needs a positive rate, got {rate!r}; the default is 1")
+    check_positive("physical_gradient", "rate", rate, "the default is 1")
     rate = float(rate)
 
     def vjp(nums, y, x):
         def pull(g):
-            start = inverse(plain(y) - rate * plain(g), plain(x))
-            if anp.shape(start) != anp.shape(plain(x)):
-                raise ShapeError(
-                    f"the inverse of {name} must return an x of shape {anp.shape(plain(x))}, got {anp.shape(start)}"
-                )
-            return (plain(x) - start,)
+            here = plain(x)
+            start = inverse(plain(y) - rate * plain(g), here)
+            wanted, got = anp.shape(here), anp.shape(start)
+            if got != wanted:
+                raise ShapeError(f"the inverse of {name} must return an x of shape {wanted}, got {got}")
+            return (here - start,)
 
         return pull
 
