@@ -77,22 +77,27 @@ def interpolate(samples, w, scale, axes, tables, g, out, bounds, start, stop):
     for left in range(start * TILE, min(stop * TILE, w.shape[1]), TILE):
         right = min(left + TILE, w.shape[1])
         _stencils(w, scale, axes, tables, left, right, room)
-        many = right - left
-        out[:, left:right] = 0.0
-        bounds[0, left:right], bounds[1, left:right] = np.inf, -np.inf
+        many, least, greatest = right - left, bounds[0, left:right], bounds[1, left:right]
+        for axis in range(len(out)):
+            for j in range(left, right):
+                out[axis, j] = 0.0
+        for j in range(least.size):
+            least[j], greatest[j] = np.inf, -np.inf
         for i in range(begin[0], axes[0, 4]):
             for k in range(begin[1], axes[1, 4]):
-                rows[:2] = 0.0
+                for j in range(many):
+                    value[j] = slope[j] = 0.0
                 near = samples[i * axes[0, 1] + k * axes[1, 1] :]
                 for m in range(begin[2], 4 - begin[2], 2):  # in pairs: half the passes over the sums
-                    line, (a, b), (c, d) = near[m:], weights[0, 2, m : m + 2], weights[1, 2, m : m + 2]
+                    line, a, b = near[m:], weights[0, 2, m], weights[0, 2, m + 1]
+                    c, d = weights[1, 2, m], weights[1, 2, m + 1]
                     for j in range(many):
                         one, two = line[first[j]], line[first[j] + np.uint64(1)]
                         value[j] += a[j] * one + b[j] * two
                         if slopes:
                             slope[j] += c[j] * one + d[j] * two
                 for m in range(1, 3 if 0 < i < 3 and 0 < k < 3 else 1):
-                    line, least, greatest = near[m:], bounds[0, left:right], bounds[1, left:right]
+                    line = near[m:]
                     for j in range(least.size):
                         sample = line[first[j]]
                         least[j], greatest[j] = min(least[j], sample), max(greatest[j], sample)
