@@ -144,7 +144,7 @@ BUILDERS = {
         stepped,
     ),
     "stepper, error control": (
-        (np.array(1e-4), 0.1 * CELLS),
+        (np.array(1e-3), 0.1 * CELLS),
         lambda tolerance, floor: dp.stepper("heun", lambda u, p: -p * u**2, 0.5, tolerance=tolerance, floor=floor),
         stepped,
     ),
