@@ -418,7 +418,7 @@ def _call_vjp(argnums, ans, args, kwargs):
         raise DerivativeError(f"{rule.name} has no VJP; give differentiable(...) a vjp")
     values = constant_args(args[1:], nums)
     if active:
-        _tell_unasked(rule, nums, values)
+        _note_unasked(rule, nums, values)
     pull = rule.vjp(nums, ans, *values)
 
     def checked_pull(g):
@@ -432,7 +432,7 @@ def _call_vjp(argnums, ans, args, kwargs):
     return checked_pull
 
 
-def _tell_unasked(rule, nums, values):
+def _note_unasked(rule, nums, values):
     """The arguments that could have a derivative, and whose derivative nobody asks for."""
     names = list(rule._signature.parameters)
     for num, value in enumerate(values):
