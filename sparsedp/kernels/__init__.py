@@ -20,6 +20,7 @@ __all__ = [
     "kronecker_sum",
     "run",
     "set_threads",
+    "summed",
     "sweep",
     "threads",
 ]
@@ -124,11 +125,21 @@ def kronecker_sum(u, out, axes, shift):
     >>> out
     array([[[ 0.,  1., -6.]]])
     """
-    bands = [np.zeros((3, n)) if axis is None else np.stack(axis) for n, axis in zip(u.shape, axes, strict=True)]
-    rows, inner = u.shape[0] * u.shape[1], bands[2][:, 1:-1]
-    given = u, out, *bands, (inner == inner[:, :1]).all(), shift
-    if not u.size or not run("stencil", "kronecker_sum", rows, u.size, threads(), *given):
-        reference.kronecker_sum(u, out, axes, shift)
+    summed(u.shape, axes, shift)(u, out)
+
+
+def summed(shape, axes, shift):
+    """Three tridiagonal matrices -> `kronecker_sum` as a function (u, out): what its loop reads is made ready once."""
+    bands = [np.zeros((3, n)) if axis is None else np.stack(axis) for n, axis in zip(shape, axes, strict=True)]
+    inner = bands[2][:, 1:-1]
+    uniform, rows = (inner == inner[:, :1]).all(), shape[0] * shape[1]
+
+    def act(u, out, *_):
+        given = u.reshape(shape), out.reshape(shape)
+        if not u.size or not run("stencil", "kronecker_sum", rows, u.size, threads(), *given, *bands, uniform, shift):
+            reference.kronecker_sum(*given, axes, shift)
+
+    return act
 
 
 def along_axis(u, out, rows, scale, accumulate):

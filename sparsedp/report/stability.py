@@ -69,7 +69,7 @@ def _first_rollout(loss, x):
 
 
 def _measured(advance, state):
-    change, steps = np.random.default_rng(SEED).standard_normal(Point(state).vector.size), []
+    change, steps = np.random.default_rng(SEED).standard_normal(Point(state).size), []
     for _ in range(STEPS):
         before = change / norm(change)
         state, moved = jvp(advance, state, Point(state).unpack(before))

@@ -186,12 +186,11 @@ class Kronecker(Structure):
 
 def _fused_pass(terms, shape):
     """Three-point terms of a block -> the function (u, out, False) that adds them up in one pass over memory."""
-    view, first = (1,) * (3 - len(shape)) + shape, 3 - len(shape)
-    shift, axes = sum(term.scale for term in terms if not term.axes), [None] * 3
+    shift, axes, first = sum(term.scale for term in terms if not term.axes), [None] * 3, 3 - len(shape)
     for term in terms:
         for axis in term.axes:
             axes[first + axis] = term.factors[axis].scaled(term.scale).tridiagonal
-    return lambda u, out, _: kernels.kronecker_sum(u.reshape(view), out.reshape(view), axes, shift)
+    return kernels.summed((1,) * first + shape, axes, shift)
 
 
 def _pass(term, shape):
