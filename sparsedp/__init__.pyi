@@ -2,6 +2,7 @@ from . import check as check
 from . import errors as errors
 from . import network as network
 from . import report as report
+from .advection.finite_volumes import conservation_law as conservation_law
 from .advection.front import transport as transport
 from .blackbox import adopt as adopt
 from .conditions import dirichlet as dirichlet

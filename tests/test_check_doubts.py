@@ -68,6 +68,26 @@ def test_several_kinks_at_once_follow_a_convention():
     assert AUDIT(clipped, X, gradient=wrong).verdict == "disagrees"
 
 
+def test_a_point_where_every_line_is_straight_but_no_derivative_exists():
+    """Differences along two directions do not add up there; a gradient that is wrong beside it too is wrong."""
+    weights = np.random.default_rng(4).standard_normal(6)
+
+    def loss(u):
+        x, y = u[::2], u[1::2]
+        return anp.sum(weights * x**3 / (x**2 + y**2 + 1e-300)) + 3 * anp.sum(u)
+
+    def slope(u):
+        x, y = u[::2], u[1::2]
+        square = np.where(x**2 + y**2 > 0, x**2 + y**2, 1.0)
+        pairs = np.stack([(x**4 + 3 * x**2 * y**2) / square**2, -2 * x**3 * y / square**2])
+        return 3 + np.ravel(weights * pairs, "F")
+
+    zero = np.zeros(12)
+    assert "parts of a direction" in AUDIT(loss, zero, gradient=slope).reason
+    assert AUDIT(loss, zero, gradient=slope).verdict == "inconclusive"
+    assert AUDIT(loss, zero, gradient=lambda u: slope(u) + 0.1).verdict == "disagrees"
+
+
 # ---- ripples --------------------------------------------------------------------------------------------------------
 
 

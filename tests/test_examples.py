@@ -6,7 +6,7 @@ import pytest
 from scripts import EXAMPLES, example, marks, run
 from sources import ROOT
 
-LINES = {"solver_in_the_loop.py": 125}  # two solvers, a network and a study; the others stay below 60
+LINES = {"solver_in_the_loop.py": 125, "conservation_laws.py": 150}  # several studies; the others stay below 60
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in EXAMPLES])
@@ -30,6 +30,16 @@ def test_heat_rod():
     assert "verdict: agrees" in printed
     before, after = map(float, re.search(r"loss (\S+) -> (\S+)", printed).groups())
     assert after < before / 10
+
+
+@example("conservation_laws.py")
+def test_conservation_laws():
+    """With 100 cells: shocks where they belong, water conserved, the pressure found again."""
+    printed = run("conservation_laws.py")
+    tube, dam = map(float, re.findall(r"mean error of the d\w+ (\S+?),? ?(?:water|$)", printed, re.MULTILINE))
+    assert tube < 0.008 and dam < 0.005
+    assert float(re.search(r"water lost (\S+)", printed)[1]) < 1e-14
+    assert abs(float(re.search(r"on the left: (\S+)", printed)[1]) - 1) < 1e-4
 
 
 @example("two_families.py")

@@ -75,6 +75,14 @@ def weigh(r):
     return 0.25 * r
 
 
+def burgers_flux(u, params, axis):
+    return 0.5 * params * u**2
+
+
+def burgers_speed(u, params, axis):
+    return anp.max(anp.abs(params * u), axis=0)
+
+
 def push(v, params):
     return -params * v
 
@@ -235,6 +243,8 @@ def travellers():
         move = dp.transport(GRID, scheme, solid=SOLID)
         u, v = numbers(GRID.shape), 0.3 * numbers(GRID.faces.size)
         yield "transport", scheme, move, lambda move, u=u, v=v: bits(move, u, v, 0.1)
+    law = dp.conservation_law(BOX, burgers_flux, burgers_speed, source=push)
+    yield "conservation_law", "", law, lambda law: bits(law, numbers((2, *BOX.shape)), 0.3)
     yield "flow_step", "", dp.flow_step(GRID, 0.01, 0.1, push, solid=SOLID), of_flow
     yield "flow_step", "implicit", dp.flow_step(BOX, 0.01, 0.1, implicit=True, convective=False), of_flow
     lid = dp.face_lift(GRID)

@@ -184,7 +184,9 @@ def _look_beside(trials, judged):
         if verdict(*looked_at(other, RANDOM, generator(None)))[0] != "disagrees":
             for one in judged:
                 if one.word in ("outside", "disagrees"):
-                    one.learn(word="kink", note="several kinks; beside them nothing speaks against the gradient")
+                    one.learn(
+                        word="kink", note="kinks, or parts of a direction that do not add up; beside x all agrees"
+                    )
 
 
 # ------------------------------------------------------------ other ways to a derivative

@@ -377,7 +377,23 @@ def looked_at(trials, count, rng, wanted=None):
 def at_kinks(judged):
     """Whether kinks may explain what speaks against a gradient; one that is far in one direction is seen in others."""
     words = {one.word for one in judged}
-    return "outside" in words or {"disagrees", "kink"} <= words
+    return "outside" in words or {"disagrees", "kink"} <= words or any(map(_bent, judged))
+
+
+def _bent(found):
+    """Whether the differences along two parts of a direction do not add up to those along the whole.
+
+    Then there is no derivative, though every line through x is straight: x^3 / (x^2 + y^2) at 0, or a limited slope
+    where neighbours are equal.
+    """
+    line, part = found.line, found.line.direction.copy()
+    entries = np.flatnonzero(part)
+    if found.word != "disagrees" or entries.size < 2:
+        return False
+    part[entries[::2]] = 0.0
+    parts = [measured(Line(line.name, d, line.trials), False) for d in (part, line.direction - part)]
+    gap = found.difference - sum(one.difference for one in parts)
+    return abs(gap) > max(SEES * found.size, FAR * (found.bar + sum(one.bar for one in parts)))
 
 
 def forward_mode(loss, judged):

@@ -1,0 +1,369 @@
+"""conservation_law: du/dt = -div F(u) + S(u) for any number of fields, by finite volumes with limited slopes.
+
+Along an axis with the widths h of its cells, and for each of the fields,
+
+    du_i/dt = (F_i - F_(i+1)) / h_i + S_i.
+
+At face i the two cells around it offer two values: u_lower = u_(i-1) + ahead and u_upper = u_i - behind, with the
+limited slopes of a scheme of `dp.transport`. The flux between them is that of Harten, Lax and van Leer: with the
+slowest and the fastest wave, a = min(0, slow), b = max(0, fast) over both values,
+
+    F = (b F(u_lower) - a F(u_upper) + a b (u_upper - u_lower)) / (b - a).
+
+With one speed s for both directions, a = -s and b = s, this is Rusanov's flux.
+
+Two ghost cells stand beyond each end of an axis: they go round where it is periodic, repeat the last cell (outflow),
+mirror the cells with the momentum across the wall turned round (free_slip), or hold what is given (inflow).
+
+Steady states: with an equilibrium e the slopes are those of u - e, and what the same formulas make of e itself is taken
+away. So e stays as it is, to the last bit: a lake at rest over any ground, a gas at rest in its weight.
+
+Everything but the limiter is arithmetic on the tape: its derivatives of every order are those of autograd, and those of
+the user's flux, speed and source. The limiter is one rule, with the derivatives that stand beside its formula.
+"""
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.conditions import free_slip, outflow, resolve
+from sparsedp.conditions import inflow as inflow_side
+from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.fields import check_plain, check_takes, is_whole
+from sparsedp.grid import AXES, check_grid
+from sparsedp.kernels.fluxes import SCHEMES
+from sparsedp.recipe import Remade
+from sparsedp.tape import Rule, cast, dtype_of, linear, plain
+from sparsedp.tree import mapped
+
+__all__ = ["ConservationLaw", "conservation_law"]
+
+GHOSTS = 2  # cells beyond each end: the slope in the first of them needs the second
+GHOST_CELLS = (0, GHOSTS), (-GHOSTS, None)  # of the lower and of the upper end
+
+
+def conservation_law(
+    grid, flux, speed, *, scheme="van_leer", boundary=outflow, momentum=None, inflow=None, source=None, equilibrium=None
+):
+    """Grid, flux F(u), speed of its waves -> the rate of change, ``law(u, params)``: -div F(u) + S(u).
+
+    Parameters
+    ----------
+    grid : Grid
+    flux : callable
+        ``flux(u, params, axis)``: the flux along an axis (0 is x) [unit length / time], of the shape of u. u holds
+        values at faces, first those below all of them, then those above: longer along the axis than the state is.
+        Coefficients that depend on the place are further fields of the state, with a flux of 0.
+    speed : callable
+        ``speed(u, params, axis)``: how fast the fastest wave travels along an axis [length / time], one number for each
+        point, the field's axis left out (Rusanov's flux); or a pair, the slowest and the fastest with their signs
+        (the flux of Harten, Lax and van Leer, which smears less).
+    scheme : str
+        How values at faces are found: "van_leer" (limited slopes, second order), "upwind" (first order), or another
+        one of `dp.transport`.
+    boundary : condition, or dict of conditions
+        outflow: waves leave. free_slip: a wall, needs `momentum`. inflow: what `inflow` says.
+    momentum : int or tuple of int, optional
+        Which field is the momentum along each axis: it changes its sign at walls.
+    inflow : number, array, or callable, optional
+        The state beyond sides of inflow, in a shape that fits the state's; or ``inflow(params, axis, side)``, side 0
+        (lower) or 1 (upper).
+    source : callable, optional
+        ``source(u, params)``: S(u) in the cells [unit / time], of the shape of u.
+    equilibrium : array or callable, optional
+        A state, or ``equilibrium(params)``, that is to stay exactly as it is.
+
+    Returns
+    -------
+    ConservationLaw
+        ``law(u, params=None)``: the rate, a `rate` of `stepper`. u of shape (fields, *grid.shape), or grid.shape
+        for one field; differentiable in u and params. ``law.time_step(u, params)``: a stable dt.
+
+    Raises
+    ------
+    ValueError
+        If scheme, boundary or momentum is none of the above, or something is missing.
+    ShapeError
+        If the state, or what a function returns, has the wrong shape.
+    NonFiniteError
+        If a speed is NaN or infinite: often a density or a depth has become negative.
+    TypeError
+        If a function is none, or the state holds no real numbers.
+
+    Notes
+    -----
+    Order: 2 where the solution is smooth and has no extremum (van_leer), 1 at shocks.
+    Steps: "ssprk3" of `stepper` with a dt of `law.time_step` keeps what one step of Euler keeps; there is no check
+    of dt beyond that of a finite state.
+    Derivatives: limiters, shocks and the largest of two speeds have kinks; `check.gradient` says "inconclusive" there.
+
+    Source
+    ------
+    A. Harten, P. D. Lax, B. van Leer, SIAM Review 25 (1983) 35-61.
+    B. van Leer, J. Comput. Phys. 32 (1979) 101-136.
+    J. P. Berberich, P. Chandrashekar, C. Klingenberg, Computers & Fluids 219 (2021) 104858 (equilibrium).
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> grid = Grid(4, periodic=True)
+    >>> law = conservation_law(grid, lambda u, p, axis: u**2 / 2, lambda u, p, axis: u, scheme="upwind")
+    >>> law(np.array([1.0, 1.0, 2.0, 1.0]))
+    array([ 0. , -0.5, -0.5,  1. ])
+    """
+    check_grid("conservation_law", grid)
+    if scheme not in SCHEMES:
+        raise ValueError(f"conservation_law takes scheme from {', '.join(SCHEMES)}, got {scheme!r}; write one of them")
+    for name, function, count in (("flux", flux, 3), ("speed", speed, 3), ("source", source, 2)):
+        if not callable(function) and (function is not None or name != "source"):
+            raise TypeError(f"{name} must be a function, got {type(function).__name__}; write {_example(name, count)}")
+        check_takes(f"conservation_law, as {name},", function, count, _example(name, count))
+    sides = resolve(grid, boundary, outflow)
+    conditions = {side for pair in sides for side in pair or ()}
+    for side in conditions - {outflow, free_slip, inflow_side}:
+        raise ValueError(f"conservation_law takes outflow, free_slip or inflow, got {side}; write one of them")
+    if (inflow_side in conditions) != (inflow is not None):
+        words = "inflow at a side needs inflow=" if inflow is None else "inflow= needs a side with dp.inflow"
+        raise ValueError(f"conservation_law got one of two: {words}; give both or none")
+    momentum = _momentum(grid, momentum) if free_slip in conditions else None
+    return ConservationLaw(grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium)
+
+
+def _example(name, count):
+    return f"lambda {', '.join(('u', 'params', 'axis')[:count])}: ..."
+
+
+def _momentum(grid, momentum):
+    """Numbers of the fields that are the momentum along each axis."""
+    fields = momentum if isinstance(momentum, (tuple, list)) else (momentum,)
+    if len(fields) != grid.dim or not all(field is not None and is_whole(field, 0) for field in fields):
+        raise ValueError(
+            f"conservation_law at a free_slip wall needs momentum, the number of a field for each axis, "
+            f"got {momentum!r}; write for example momentum={tuple(range(1, grid.dim + 1))}"
+        )
+    return tuple(map(int, fields))
+
+
+class ConservationLaw(Remade):
+    """The rate of change of a conservation law, made by `conservation_law`. Call it: ``law(u, params=None)``."""
+
+    name = "conservation_law"
+
+    def __init__(self, grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium):
+        self.given = grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium
+        self.grid, self.flux, self.speed, self.source, self.equilibrium = grid, flux, speed, source, equilibrium
+        self.axes = [
+            Axis(grid, axis, sides[axis] or (), momentum and momentum[axis], inflow, SCHEMES[scheme])
+            for axis in range(grid.dim if grid.cells.size else 0)
+        ]
+
+    def recipe(self):
+        """The call that makes it again: see recipe.py."""
+        return ConservationLaw, self.given
+
+    def __call__(self, u, params=None):
+        """State -> its rate of change.
+
+        Parameters
+        ----------
+        u : array, shape (fields, *grid.shape) or grid.shape
+        params : tree, optional
+            What flux, speed and source get.
+
+        Returns
+        -------
+        array like u
+        """
+        u = self._state(u)
+        rate, e = self._rate, self.equilibrium
+        if e is None:
+            return cast(rate(u, None, params), dtype_of(u))
+        e = _shaped("equilibrium", e(params) if callable(e) else e, u)
+        return cast(rate(u, e, params) - rate(e, e, params), dtype_of(u))
+
+    def _state(self, u):
+        """The state, of floating numbers."""
+        check_plain(self.name, u)
+        u, shape = u if hasattr(u, "shape") else np.asarray(u), self.grid.shape
+        if u.shape[-len(shape) :] != shape or u.ndim > len(shape) + 1:
+            raise ShapeError(f"conservation_law takes u of shape (fields, {', '.join(map(str, shape))}), got {u.shape}")
+        kind = dtype_of(u)
+        if kind.kind not in "biuf":
+            raise TypeError(f"conservation_law takes real numbers as u, got dtype {kind}; write u.real")
+        return u if kind.kind == "f" else u * 1.0
+
+    def _rate(self, u, e, params):
+        """The rate; of an equilibrium e only the slopes take notice."""
+        total = np.zeros(u.shape) if self.source is None else _shaped("source", self.source(u, params), u)
+        for axis in self.axes:
+            padded = axis.padded(u, params)
+            if e is None:
+                lower, upper = axis.beside_faces(padded)
+            else:
+                rest = axis.pad(e)
+                lower, upper = (values + axis.between(rest) for values in axis.beside_faces(padded - rest))
+            f = self._flux(axis, lower, upper, params)
+            total = total + (axis.part(f, 0, -1) - axis.part(f, 1)) / axis.widths
+        return total
+
+    def _flux(self, axis, lower, upper, params):
+        """The values below and above each face -> the flux of Harten, Lax and van Leer."""
+        both = anp.concatenate([lower, upper], axis.place)
+        f_lower, f_upper = axis.halves(_shaped("flux", self.flux(both, params, axis.number), both))
+        slow, fast = map(axis.halves, self._speeds(axis.number, both, params))
+        a, b = anp.minimum(anp.minimum(*slow), 0.0), anp.maximum(anp.maximum(*fast), 0.0)
+        rest = plain(a) == plain(b)  # nothing moves: the mean
+        width = b - a + rest
+        share = (b + 0.5 * rest) / width
+        return share * f_lower + (1.0 - share) * f_upper + a * b / width * (upper - lower)
+
+    def _speeds(self, axis, u, params):
+        """The slowest and the fastest wave along an axis."""
+        given = self.speed(u, params, axis)
+        given = given if isinstance(given, tuple) else (-given, given)
+        for speed in map(plain, given):
+            _shaped("speed", speed, u[(0,) * (u.ndim - self.grid.dim)])
+            if not np.all(np.isfinite(speed)):
+                raise NonFiniteError(
+                    f"the speed of a conservation_law is NaN or infinite along {AXES[axis]}: the state has left where "
+                    "it has waves (a density or a depth below 0?); take a smaller dt"
+                )
+        return given
+
+    def time_step(self, u, params=None, cfl=0.4):
+        """State -> a stable dt: `cfl` over the largest sum over the axes of speed / width.
+
+        Parameters
+        ----------
+        u : array
+            As for the call; the values in the cells count.
+        params : tree, optional
+        cfl : float
+            Up to 0.5 for limited slopes, up to 1 for "upwind".
+
+        Returns
+        -------
+        float [time]
+            Infinite where nothing moves. Not differentiated.
+        """
+        u, params = mapped(plain, (self._state(u), params))
+        speeds = [np.max(np.abs(self._speeds(axis.number, u, params)), axis=0) / axis.widths for axis in self.axes]
+        most = np.max(sum(speeds), initial=0.0)
+        return float(cfl / most) if most else np.inf
+
+    def __repr__(self):
+        return f"<conservation_law {self.given[3]}: {self.grid.cells}>"
+
+
+def _shaped(name, value, u):
+    """What a function of the user returned, of the shape of u."""
+    if np.shape(value) != np.shape(u):
+        raise ShapeError(f"the {name} of a conservation_law must have shape {np.shape(u)} here, got {np.shape(value)}")
+    return value
+
+
+class Axis:
+    """What a conservation law does along one axis of the grid.
+
+    Parameters
+    ----------
+    grid : Grid
+    number : int
+        Of the axis.
+    sides : pair of FlowCondition, or () where the axis is periodic
+    momentum : int or None
+        The field that changes its sign at walls.
+    inflow : as `conservation_law` takes it
+    scheme : Scheme
+    """
+
+    def __init__(self, grid, number, sides, momentum, inflow, scheme):
+        self.number, self.place, self.dim = number, number - grid.dim, grid.dim
+        self.sides, self.momentum, self.inflow = sides, momentum, inflow
+        line, n = grid.widths[number], grid.shape[number]
+        beyond = np.arange(-GHOSTS, n + GHOSTS)
+        self.cell = beyond % n  # what a place of the padded line repeats
+        for upper, side in enumerate(sides):
+            ghosts = slice(*GHOST_CELLS[upper])
+            mirrored = 2 * n * upper - 1 - beyond[ghosts]
+            self.cell[ghosts] = np.clip(mirrored, 0, n - 1) if side is free_slip else upper * (n - 1)
+        self.pad, _ = linear("ghost_cells", self._pad, self._unpad)
+        self.widths, padded = self._along(line), line[self.cell]
+        gaps = padded[1:] + padded[:-1]
+        self.distances = [self._along(gap / padded[1:-1]) for gap in (gaps[:-1], gaps[1:])]
+        ends = () if scheme.limiter is None else (0,) if scheme.symmetric else (0, 1)
+        self.limiters = [self._limiter(scheme.limiter, end) for end in ends]
+
+    def _along(self, line):
+        """Numbers along this axis, shaped so that they fit fields; one number where all are the same."""
+        return line[0] if np.all(line == line[0]) else line.reshape(-1, *[1] * (-1 - self.place))
+
+    def part(self, x, start, stop=None):
+        """The places from start to stop along this axis."""
+        return x[(Ellipsis, slice(start, stop), *[slice(None)] * (-1 - self.place))]
+
+    def halves(self, x):
+        """What `_flux` put one after the other."""
+        n = x.shape[self.place] // 2
+        return self.part(x, 0, n), self.part(x, n)
+
+    def padded(self, u, params):
+        """The field with its ghost cells, and what flows in."""
+        field = self.pad(u)
+        if inflow_side not in self.sides:
+            return field
+        pieces = [self.part(field, *GHOST_CELLS[0]), u, self.part(field, *GHOST_CELLS[1])]
+        for upper, side in enumerate(self.sides):
+            if side is inflow_side:
+                value = self.inflow(params, self.number, upper) if callable(self.inflow) else self.inflow
+                if np.ndim(value) == 1 and u.ndim > self.dim:  # a number for each field
+                    value = anp.reshape(value, (-1,) + (1,) * self.dim)
+                ghosts = value + 0.0 * plain(pieces[2 * upper])
+                pieces[2 * upper] = _shaped("inflow", ghosts, pieces[2 * upper])
+        return anp.concatenate(pieces, self.place)
+
+    def _turned(self, x):
+        """The momentum in the ghost cells of walls changes its sign. The array itself."""
+        for side, ghosts in zip(self.sides, GHOST_CELLS, strict=False):
+            if side is free_slip:
+                self.part(x[self.momentum], *ghosts)[...] *= -1
+        return x
+
+    def _pad(self, u):
+        return self._turned(np.take(u, self.cell, self.place))
+
+    def _unpad(self, g):
+        g = self._turned(g.copy())
+        u = self.part(g, GHOSTS, -GHOSTS).copy()
+        for k in (*range(GHOSTS), *range(-GHOSTS, 0)):
+            self.part(u, self.cell[k], self.cell[k] + 1)[...] += self.part(g, k, k + 1 or None)
+        return u
+
+    def between(self, padded):
+        """Cells with ghost cells -> the means at the faces."""
+        return 0.5 * (self.part(padded, 1, -2) + self.part(padded, 2, -1))
+
+    def beside_faces(self, padded):
+        """Cells with ghost cells -> the values below and above each face."""
+        lower, upper = self.part(padded, 1, -2), self.part(padded, 2, -1)
+        if not self.limiters:
+            return lower, upper
+        step = self.part(padded, 1) - self.part(padded, 0, -1)
+        below, above = self.part(step, 0, -1), self.part(step, 1)
+        ends = [limiter(below, above) for limiter in self.limiters]
+        return lower + self.part(ends[0], 0, -1), upper - self.part(ends[-1], 1)
+
+    def _limiter(self, limiter, end):
+        """A rule: differences to the cells below and above -> what the upper (0) or lower (1) end differs by."""
+
+        def slopes(a, b):
+            return limiter(a, b, *self.distances)[2 + 2 * end :][:2]
+
+        def vjp(nums, ans, a, b):
+            pair = slopes(a, b)
+            return lambda g: tuple(g * pair[num] for num in nums)
+
+        def jvp(nums, tangents, ans, a, b):
+            pair = slopes(a, b)
+            return sum(pair[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
+
+        return Rule("limiter", lambda a, b: limiter(a, b, *self.distances)[end], vjp, jvp)

@@ -1,0 +1,337 @@
+"""conservation_law: published shocks and waves, steady states, walls, orders, derivatives, refusals."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import sparsedp as dp
+
+GAMMA, GRAVITY = 1.4, 9.81
+
+
+def pressure(u):
+    momentum = u[1:-1]
+    return (GAMMA - 1) * (u[-1] - 0.5 * anp.sum(momentum**2, axis=0) / u[0])
+
+
+def euler_flux(u, params, axis):
+    v, p = u[1 + axis] / u[0], pressure(u)
+    rows = [u[k] * v + (p if k == 1 + axis else 0.0) for k in range(len(u) - 1)]
+    return anp.stack([*rows, v * (u[-1] + p)])
+
+
+def euler_speed(u, params, axis):
+    v, c = u[1 + axis] / u[0], anp.sqrt(GAMMA * pressure(u) / u[0])
+    return v - c, v + c
+
+
+def water_flux(u, params, axis):
+    v = u[1 + axis] / u[0]
+    rows = [u[k] * v for k in range(len(u))]
+    rows[1 + axis] = rows[1 + axis] + 0.5 * GRAVITY * u[0] ** 2
+    return anp.stack(rows)
+
+
+def water_speed(u, params, axis):
+    v, c = u[1 + axis] / u[0], anp.sqrt(GRAVITY * u[0])
+    return v - c, v + c
+
+
+def rusanov(speed):
+    return lambda u, params, axis: anp.maximum(*map(anp.abs, speed(u, params, axis)))
+
+
+def run(law, u, end, cfl=0.4, params=None):
+    """The state at a time, with steps of the right length for the first state."""
+    steps = int(np.ceil(2.2 * end / law.time_step(u, params, cfl)))
+    return dp.rollout(dp.stepper("ssprk3", law, end / steps), u, params, steps)
+
+
+def sod(x, time):
+    """Density of Sod's tube (J. Comput. Phys. 27, 1978) by the exact solution: fan, contact, shock."""
+    left, right, wave = (1.0, 1.0), (0.125, 0.1), (GAMMA - 1) / (GAMMA + 1)
+    cl, cr = (np.sqrt(GAMMA * p / rho) for rho, p in (left, right))
+    a, b = 2 / ((GAMMA + 1) * right[0]), wave * right[1]
+
+    def excess(p):
+        expansion = 2 * cl / (GAMMA - 1) * ((p / left[1]) ** ((GAMMA - 1) / 2 / GAMMA) - 1)
+        return expansion + (p - right[1]) * np.sqrt(a / (p + b))
+
+    p = brentq(excess, 0.1, 1)
+    v = (p - right[1]) * np.sqrt(a / (p + b))
+    behind_fan = left[0] * (p / left[1]) ** (1 / GAMMA)
+    behind_shock = right[0] * (p / right[1] + wave) / (wave * p / right[1] + 1)
+    shock = cr * np.sqrt((GAMMA + 1) / 2 / GAMMA * p / right[1] + (GAMMA - 1) / 2 / GAMMA)
+    s, c = (x - 0.5) / time, cl * (p / left[1]) ** ((GAMMA - 1) / 2 / GAMMA)
+    fan = left[0] * np.maximum(2 / (GAMMA + 1) - wave / cl * s, 0) ** (2 / (GAMMA - 1))
+    return np.select([s < -cl, s < v - c, s < v, s < shock], [left[0], fan, behind_fan, behind_shock], right[0])
+
+
+@pytest.mark.parametrize(("speed", "most"), [(euler_speed, 0.002), (rusanov(euler_speed), 0.0023)])
+def test_sod(speed, most):
+    """Mean error of the density at 400 cells; 0.004 is what the field asks for."""
+    grid = dp.Grid(400, size=1.0)
+    (x,) = grid.centres()
+    start = np.stack([np.where(x < 0.5, 1.0, 0.125), 0 * x, np.where(x < 0.5, 1.0, 0.1) / (GAMMA - 1)])
+    end = run(dp.conservation_law(grid, euler_flux, speed), start, 0.2)
+    assert np.mean(np.abs(end[0] - sod(x, 0.2))) < most
+    assert np.sum(end[0]) == pytest.approx(np.sum(start[0]), rel=1e-13)  # nothing has reached the ends
+
+
+def stoker(x, time, deep, shallow):
+    """Depth after a dam broke at x = 0 (Stoker, Water Waves, 1957)."""
+
+    def excess(h):
+        return 2 * (np.sqrt(GRAVITY * deep) - np.sqrt(GRAVITY * h)) - (h - shallow) * np.sqrt(
+            GRAVITY * (h + shallow) / (2 * h * shallow)
+        )
+
+    h = brentq(excess, shallow, deep)
+    v, c, s = 2 * (np.sqrt(GRAVITY * deep) - np.sqrt(GRAVITY * h)), np.sqrt(GRAVITY * deep), x / time
+    fan = (2 * c - s) ** 2 / 9 / GRAVITY
+    shock = h * v / (h - shallow)
+    return np.select([s < -c, s < v - np.sqrt(GRAVITY * h), s < shock], [deep, fan, h], shallow)
+
+
+def test_dam_break():
+    errors = []
+    for n in (100, 200):
+        grid = dp.Grid(n, size=2.0, origin=-1.0)
+        (x,) = grid.centres()
+        law = dp.conservation_law(grid, water_flux, water_speed, boundary=dp.free_slip, momentum=1)
+        end = run(law, np.stack([np.where(x < 0, 1.0, 0.2), 0 * x]), 0.2)
+        errors.append(np.mean(np.abs(end[0] - stoker(x, 0.2, 1.0, 0.2))))
+    assert errors[1] < 0.0025
+    assert np.log2(errors[0] / errors[1]) > 0.75  # a shock: order 1
+
+
+@pytest.mark.parametrize("dim", [1, 2])
+def test_lake_at_rest(dim):
+    """Water over hills stays at rest to the last bit; without the equilibrium it does not."""
+    grid = dp.Grid((24, 16)[:dim], size=(2.0, 1.5)[:dim])
+    ground = 0.3 * np.exp(-10 * sum((x - 0.8) ** 2 for x in grid.centres()))
+    slopes = np.stack(np.gradient(ground, *(1 / 12, 1.5 / 16)[:dim])).reshape(dim, *grid.shape)
+
+    def weight(u, params):
+        return anp.concatenate([0 * u[:1], -GRAVITY * u[0] * slopes])
+
+    lake = np.stack([1.0 - ground, *[0 * ground] * dim])
+    given = dict(boundary=dp.free_slip, momentum=tuple(range(1, 1 + dim)), source=weight)
+    still = dp.conservation_law(grid, water_flux, water_speed, equilibrium=lake, **given)
+    assert np.array_equal(run(still, lake, 0.05), lake)
+    assert np.max(np.abs(dp.conservation_law(grid, water_flux, water_speed, **given)(lake))) > 1e-3
+    wave = lake + 1e-6 * np.sin(3 * grid.centres()[0]) * (np.arange(1 + dim) == 0).reshape(-1, *[1] * dim)
+    moved = run(still, wave, 0.05)
+    assert np.sum(moved[0]) == pytest.approx(np.sum(wave[0]), rel=1e-14)
+    assert 1e-8 < np.max(np.abs(moved - lake)) < 3e-6 * np.sqrt(GRAVITY)
+    called = dp.conservation_law(grid, water_flux, water_speed, equilibrium=lambda params: lake, **given)
+    np.testing.assert_array_equal(called(wave), still(wave))
+
+
+def test_wave_of_euler_in_a_plane():
+    """A wave of density is carried along the diagonal of a periodic box: order 2, and everything is conserved."""
+    errors = []
+    for n in (32, 64):
+        grid = dp.Grid((n, n), size=1.0, periodic=True)
+        x, y = grid.centres()
+
+        def state(time, x=x, y=y):
+            rho, one = 1 + 0.2 * np.sin(2 * np.pi * (x + y - 2 * time)), 1 + 0 * x
+            return np.stack([rho, rho, rho, one / (GAMMA - 1) + rho])
+
+        end = run(dp.conservation_law(grid, euler_flux, euler_speed), state(0.0), 0.1)
+        errors.append(np.mean(np.abs(end[0] - state(0.1)[0])))
+        sums = np.sum(end, axis=(1, 2)), np.sum(state(0.0), axis=(1, 2))
+        np.testing.assert_allclose(*sums, rtol=1e-13)
+    assert np.log2(errors[0] / errors[1]) > 1.7
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_every_axis_is_the_same(axis):
+    """A flow along any axis of a box with walls, inflow and stretched cells is the one-dimensional one."""
+    widths = np.linspace(0.5, 1.5, 12)
+    line = dp.Grid(12, spacing=[widths])
+    shape, spacing = [2, 3, 2], [1.0, 1.0, 1.0]
+    shape[axis], spacing[axis] = 12, widths
+    box = dp.Grid(tuple(shape), spacing=spacing)
+    u = np.stack([1.0 + 0.2 * np.sin(np.arange(12)), 0.1 * np.cos(np.arange(12))])
+    sides = (dp.inflow, dp.free_slip)
+    one = dp.conservation_law(line, water_flux, water_speed, boundary={"x": sides}, momentum=1, inflow=[1.2, 0.3])(u)
+    fields = np.zeros((4, 12))
+    fields[0], fields[1 + axis] = u
+    given, inside = np.zeros(4), [1, 1, 1]
+    given[0], given[1 + axis], inside[axis] = 1.2, 0.3, 12
+    conditions = {"xyz"[a]: sides if a == axis else dp.free_slip for a in range(3)}
+    law = dp.conservation_law(
+        box, water_flux, water_speed, boundary=conditions, momentum=(1, 2, 3), inflow=lambda params, axis, side: given
+    )
+    rate = law(fields.reshape(4, *inside) + np.zeros((4, *shape)))
+    lines = np.moveaxis(rate, 1 + axis, -1).reshape(4, -1, 12)
+    np.testing.assert_allclose(lines[[0, 1 + axis]], np.repeat(one[:, None], lines.shape[1], 1), rtol=1e-13, atol=1e-13)
+    others = [k for k in (1, 2, 3) if k != 1 + axis]
+    assert np.all(lines[others] == 0)
+
+
+def twin(u, widths, flux, speed):
+    """The same on a line with walls, in slices of autograd.numpy: van Leer's limiter, HLL."""
+    u = anp.concatenate([u[:, 1::-1] * [[1], [-1]], u, u[:, :-3:-1] * [[1], [-1]]], 1)
+    h = np.concatenate([widths[1::-1], widths, widths[:-3:-1]])
+    step = u[:, 1:] - u[:, :-1]
+    a, b = step[:, :-1], step[:, 1:]
+    c, e = (h[1:-1] + h[:-2]) / h[1:-1], (h[1:-1] + h[2:]) / h[1:-1]
+    q = a / anp.where(a * b > 0, a + b, 1.0)
+    p, m = 1 - q, (c + e - 2) * c * e
+    share = q * p * (q * e**2 + p * c**2) / (q * q * e**2 + m * q * p + p * p * c**2)
+    slope = anp.where(a * b > 0, (a + b) * share, 0.0)
+    lower, upper = u[:, 1:-2] + slope[:, :-1], u[:, 2:-1] - slope[:, 1:]
+    (s0, f0), (s1, f1) = speed(lower, None, 0), speed(upper, None, 0)
+    a, b = anp.minimum(anp.minimum(s0, s1), 0.0), anp.maximum(anp.maximum(f0, f1), 0.0)
+    f = (b * flux(lower, None, 0) - a * flux(upper, None, 0) + a * b * (upper - lower)) / (b - a)
+    return (f[:, :-1] - f[:, 1:]) / widths
+
+
+def test_twin_and_derivatives():
+    widths = np.linspace(0.5, 1.5, 9)
+    grid = dp.Grid(9, spacing=[widths])
+    law = dp.conservation_law(grid, water_flux, water_speed, boundary=dp.free_slip, momentum=1)
+    rng = np.random.default_rng(0)
+    u, g, t = np.stack([1 + 0.3 * rng.random(9), rng.random(9) - 0.5]), rng.random((2, 9)), rng.random((2, 9))
+
+    def other(u):
+        return twin(u, widths, water_flux, water_speed)
+
+    np.testing.assert_allclose(law(u), other(u), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(dp.vjp(law, u)[1](g), dp.vjp(other, u)[1](g), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(dp.jvp(law, u, t)[1], dp.jvp(other, u, t)[1], rtol=1e-12, atol=1e-12)
+
+    def loss(act):
+        return lambda u: anp.sum(g * act(u) ** 2)
+
+    np.testing.assert_allclose(dp.hvp(loss(law), u, t), dp.hvp(loss(other), u, t), rtol=1e-10, atol=1e-10)
+
+
+def test_gradient_in_params_inflow_source_and_equilibrium():
+    grid = dp.Grid((5, 4), size=1.0, periodic=(False, True))
+    x, y = grid.centres()
+
+    def flux(u, params, axis):
+        return 0.5 * params["speed"] * u**2
+
+    law = dp.conservation_law(
+        grid,
+        flux,
+        lambda u, params, axis: anp.abs(params["speed"] * u),
+        boundary={"x": (dp.inflow, dp.outflow)},
+        inflow=lambda params, axis, side: params["in"],
+        source=lambda u, params: params["drag"] * u,
+        equilibrium=lambda params: params["still"] * (2 + x),
+    )
+    start = {"speed": 0.7, "in": 1.1, "drag": -0.2, "still": 0.4}
+    u = 1.5 + 0.3 * np.sin(3 * x + 2) * np.cos(2 * y)
+    assert dp.check.gradient(lambda p: anp.sum(law(u, p) ** 2), start).verdict == "agrees"
+    assert dp.check.gradient(lambda u: anp.sum(law(u, start) ** 2), u).verdict == "agrees"
+
+
+def test_audit_of_a_kink():
+    """Where neighbours are equal the limiter has a kink: the check says so."""
+    grid = dp.Grid(8, periodic=True)
+    law = dp.conservation_law(grid, lambda u, p, axis: u**2 / 2, lambda u, p, axis: anp.abs(u))
+    weights = np.sin(np.arange(8.0))
+    assert dp.check.gradient(lambda u: anp.sum(weights * law(u)), np.ones(8)).verdict == "inconclusive"
+
+
+@pytest.mark.parametrize("shape", [(1,), (2,), (1, 1), (0,), (3, 0)])
+def test_smallest_grids(shape):
+    for periodic in (False, True):
+        grid = dp.Grid(shape, size=1.0, periodic=periodic)
+        law = dp.conservation_law(grid, lambda u, p, axis: u, lambda u, p, axis: 1 + 0 * u)
+        u = np.arange(1.0, 1 + np.prod(shape)).reshape(shape)
+        rate = law(u)
+        assert rate.shape == shape
+        assert abs(np.sum(rate)) < 1e-12 if periodic else True
+        assert dp.grad(lambda u, law=law: anp.sum(law(u) ** 2))(u).shape == shape
+
+
+def test_dtypes():
+    law = dp.conservation_law(dp.Grid(8, periodic=True), lambda u, p, axis: 2 * u, lambda u, p, axis: 2 + 0 * u)
+    u = np.sin(np.arange(8.0))
+    single = law(u.astype(np.float32))
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, law(u), rtol=1e-5, atol=1e-5)
+    assert law(np.arange(8)).dtype == np.float64
+    assert dp.grad(lambda u: anp.sum(law(u) ** 2))(u.astype(np.float32)).dtype == np.float32
+
+
+def test_time_step():
+    grid = dp.Grid((4, 5), size=(1.0, 2.0))
+    law = dp.conservation_law(grid, lambda u, p, axis: u, lambda u, p, axis: (axis + 1.0) * u)
+    assert law.time_step(np.ones((4, 5))) == pytest.approx(0.4 / (1 / 0.25 + 2 / 0.4))
+    assert law.time_step(np.zeros((4, 5))) == np.inf
+    assert repr(law) == "<conservation_law van_leer: cells(4, 5)>"
+
+
+def test_what_is_at_rest_stays():
+    """Where no wave moves the flux is the mean of both sides: of a constant pressure nothing is left."""
+    grid = dp.Grid(6)
+    law = dp.conservation_law(grid, lambda u, p, axis: 3 + 0 * u, lambda u, p, axis: 0 * u)
+    assert np.array_equal(law(np.arange(6.0)), np.zeros(6))
+
+
+LINE = dp.Grid(4)
+
+
+def carry(u, params, axis):
+    return u
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (dict(scheme="weno"), "conservation_law takes scheme from upwind, van_leer, got 'weno'; write one of them"),
+        (dict(boundary=dp.no_slip), "conservation_law takes outflow, free_slip or inflow, got no_slip"),
+        (
+            dict(boundary=dp.free_slip),
+            "needs momentum, the number of a field for each axis, got None; write for example",
+        ),
+        (dict(boundary=dp.inflow), "inflow at a side needs inflow="),
+        (dict(inflow=1.0), "inflow= needs a side with dp.inflow"),
+    ],
+)
+def test_refused_settings(given, message):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        dp.conservation_law(LINE, carry, carry, **given)
+
+
+def test_refused_functions():
+    with pytest.raises(TypeError, match="flux must be a function, got ndarray; write lambda u, params, axis: ..."):
+        dp.conservation_law(LINE, np.ones(4), carry)
+    with pytest.raises(TypeError, match="conservation_law, as speed, calls a function with 3 arguments, got one that"):
+        dp.conservation_law(LINE, carry, lambda u: u)
+    with pytest.raises(TypeError, match="conservation_law takes a Grid"):
+        dp.conservation_law((4,), carry, carry)
+
+
+def test_refused_values():
+    law = dp.conservation_law(LINE, carry, carry)
+    with pytest.raises(dp.errors.ShapeError, match=r"conservation_law takes u of shape \(fields, 4\), got \(5,\)"):
+        law(np.ones(5))
+    with pytest.raises(TypeError, match="conservation_law takes real numbers as u, got dtype complex128; write u.real"):
+        law(np.ones(4, complex))
+    with pytest.raises(TypeError, match="got a masked array; fill it first"):
+        law(np.ma.ones(4))
+    with pytest.raises(dp.errors.NonFiniteError, match="NaN or infinite along x: the state has left where"):
+        law(np.array([1.0, np.nan, 1.0, 1.0]))
+    with pytest.raises(
+        dp.errors.ShapeError, match=r"speed of a conservation_law must have shape \(10,\) here, got \(\)"
+    ):
+        dp.conservation_law(LINE, carry, lambda u, p, axis: 1.0)(np.ones(4))
+    with pytest.raises(dp.errors.ShapeError, match=r"flux of a conservation_law must have shape \(10,\) here"):
+        dp.conservation_law(LINE, lambda u, p, axis: 1.0, carry)(np.ones(4))
+    with pytest.raises(dp.errors.ShapeError, match=r"the source of a conservation_law must have shape \(4,\) here"):
+        dp.conservation_law(LINE, carry, carry, source=lambda u, p: 1.0)(np.ones(4))
+    with pytest.raises(dp.errors.ShapeError, match="the equilibrium of a conservation_law must have"):
+        dp.conservation_law(LINE, carry, carry, equilibrium=np.ones(3))(np.ones(4))
+    given = dp.conservation_law(LINE, carry, carry, boundary=dp.inflow, inflow=np.ones((3, 2)))
+    with pytest.raises(dp.errors.ShapeError, match=r"inflow of a conservation_law must have shape \(2,\)"):
+        given(np.ones(4))
