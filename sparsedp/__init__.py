@@ -34,6 +34,7 @@ _WINDOW = {
     "flow.pressure": "projection",
     "flow.stepping": "flow_step",
     "integrators.front": "stepper",
+    "integrators.leapfrog": "sponge",
     "trajectory.front": "rollout",
     "optimize.directions": "update_direction",
     "optimize.loop": "minimize",

@@ -24,6 +24,7 @@ from .flow.pressure import projection as projection
 from .flow.stepping import flow_step as flow_step
 from .grid import Grid as Grid
 from .integrators.front import stepper as stepper
+from .integrators.leapfrog import sponge as sponge
 from .kernels import set_threads as set_threads
 from .operator import Operator as Operator
 from .operators.boundary import diagonal as diagonal

@@ -34,6 +34,7 @@ SMALL = {
     "half_inverse.py": "1",
     "inverse_heat.py": "6",
     "control.py": "2",
+    "full_waveform.py": "24",
     "conservation_laws.py": "100",
     "conductivity_design.py": "200",
     "residual_or_physics.py": "10",

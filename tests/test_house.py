@@ -75,15 +75,19 @@ DOORS = [
 TALKS = r"report/.*|__main__\.py"  # may print
 NOWHERE = {"utils.py", "util.py", "helpers.py", "helper.py", "misc.py", "common.py"}
 LENGTHS = {"sparsedp": 600, "tests": 600, "benchmarks": 300, "examples": 60}
-LONGER = {"solver_in_the_loop.py": 125, "conservation_laws.py": 150}  # two solvers, a network and a study
+LONGER = {
+    "solver_in_the_loop.py": 125,
+    "conservation_laws.py": 150,
+    "full_waveform.py": 100,
+}  # two solvers, a network and a study
 # Nodes of the syntax tree that each room may have, docstrings left out; what a line says is free, what it does is not.
 # They may be lowered at any time, and raised only with a sentence on what that buys. "": the whole package.
 BUDGETS = {
-    "": 176_700,  # conservation laws: 2 800
+    "": 177_950,  # conservation laws: 2 800; leapfrog and sponge: 1 250
     "advection": 16_800,  # 14 000 for transport, and conservation laws
     "check": 14_850,
     "flow": 5_650,
-    "integrators": 10_600,
+    "integrators": 11_850,  # leapfrog and sponge: 1 250
     "kernels": 14_000,
     "network": 2_650,
     "operators": 5_800,

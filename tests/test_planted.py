@@ -42,6 +42,12 @@ BUGS = {
         "                self.part(x[self.momentum], *ghosts)[...] *= 1",
         "tests/test_conservation_law.py",
     ),
+    "a leapfrog that uses the old velocity": Bug(
+        "integrators",
+        "        q = _advanced(q, g(p, params), h, z)\n        return _advanced(p, f(q, params), h, s), q",
+        "        new = _advanced(q, g(p, params), h, z)\n        return _advanced(p, f(q, params), h, s), new",
+        "tests/test_leapfrog.py",
+    ),
     "a missing 1/h": Bug(
         "operators",
         "    step = 1 / grid.spacings(axis)[face]",

@@ -226,6 +226,8 @@ def travellers():
     yield from ((label.split()[0], label, op, of_operator) for label, op in operators())
     yield from (("stepper", method, *stepped(method)) for method in STEPS)
     yield from (("stepper", f"{method}, tolerance", *stepped(method, 1e-3)) for method in STEPS if method != "ssprk3")
+    leapfrog = dp.stepper("leapfrog", (push, push), 0.1, damping=(1.0, numbers(12) ** 2))
+    yield "stepper", "leapfrog", leapfrog, partial(of_step, state=(numbers(12), numbers(12, 1)), params=0.4)
     solve = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
     k, b = np.exp(numbers(GRID.faces.size)), numbers(GRID.shape)
     yield "elliptic_solver", "", solve, lambda solve: bits(solve, k, b, 0.5)
@@ -271,5 +273,5 @@ NOTHING_TO_CALL = {
     "Grid", "Space", "Operator", "dirichlet", "neumann", "robin", "no_slip", "free_slip", "inflow", "outflow",
     "rollout", "minimize", "update_direction",
     "set_threads", "convergence", "v_curve", "animate", "plot", "certify", "stress", "workprec", "explain", "check",
-    "errors", "report", "vjp", "jvp", "hvp",
+    "errors", "report", "vjp", "jvp", "hvp", "sponge",
 }  # fmt: skip

@@ -7,6 +7,7 @@ from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.fields import check_finite, is_number, rounded_down, surely_finite
 from sparsedp.integrators.adaptive import Adaptive
 from sparsedp.integrators.exponential import Exponential
+from sparsedp.integrators.leapfrog import Leapfrog, Staggered
 from sparsedp.integrators.problem import Problem, like, positive
 from sparsedp.integrators.runge_kutta import EXPLICIT, IMPLICIT, Explicit, Linear, Nonlinear, Polynomial
 from sparsedp.recipe import Remade
@@ -17,7 +18,7 @@ from sparsedp.tree import copied, leaves
 
 __all__ = ["METHODS", "Step", "stepper"]
 
-METHODS = (*EXPLICIT, *IMPLICIT, "etdrk4")
+METHODS = (*EXPLICIT, *IMPLICIT, "etdrk4", "leapfrog")
 KEPT = {False: 2, True: 12}  # set-ups of linear steps, without and with error control
 ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
 DENSE_UP_TO = 64
@@ -35,6 +36,7 @@ def stepper(
     floor=None,
     unstable="raise",
     jacobian=None,
+    damping=None,
     solver="auto",
     rtol=1e-10,
     maxiter=None,
@@ -52,12 +54,15 @@ def stepper(
         tr_bdf2                 2     L-stable, two stages with one factor
         imex                    2     `linear` and source implicit (L-stable), the rate explicit
         etdrk4                  4     `linear` exact by transforms (separable only), the rate explicit
+        leapfrog                2     waves: two fields, each moved by the other, half a step apart; reversible
         ======================= ===== ==============================================================
     rate : callable or Operator
         u' = ``rate(u, params)``, or ``rate(u, params, t)``: then the state is the pair (u, t). Written with
         autograd.numpy, Operators and other rules; u an array or a tree of arrays. An Operator L means
         u' = c L u, with the number c >= 0 as params (None: 1). What changes from call to call belongs into params:
         implicit methods run the rate again on the way back.
+        leapfrog: a pair of rates, p' = ``f(q, params)`` and q' = ``g(p, params)``, for the state (p, q): p at the
+        times of the steps, q half a step before, on entry and on return.
     dt : float, traced number, or function of params
         Length of a step [time], > 0. To differentiate in dt inside a loop write ``lambda params: params["dt"]``.
     linear : Operator or (Operator, coefficient), optional
@@ -80,6 +85,8 @@ def stepper(
     jacobian : callable, optional
         ``jacobian(u, params)`` (or with t): the derivative of the rate in u, for implicit steps of a
         nonlinear rate. Default: found by colouring.
+    damping : pair, optional
+        Of leapfrog: the rates at which both fields die out [1 / time], such as `sponge` makes; None for none.
     solver, rtol, maxiter, **options
         `method`, tolerance and options of `inverse` (linear problems) or `implicit` (nonlinear ones).
 
@@ -132,20 +139,32 @@ def stepper(
         raise ValueError(f"unstable must be 'raise' or 'allow', got {unstable!r}")
     known = {word: value for word, value in options.items() if word != "sparsity"}  # which `implicit` takes
     settings = check_settings(solver, rtol, maxiter, "raise", known) | dict(options=given["options"])
-    if (method in EXPLICIT or method == "etdrk4") and (options or jacobian is not None):
+    if (method in EXPLICIT or method in ("etdrk4", "leapfrog")) and (options or jacobian is not None):
         raise TypeError(f"{method} solves nothing; leave out {', '.join([*options] or ['jacobian'])}")
     if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
         raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
     if not all(map(_is_floor, leaves(floor))):
         raise ValueError(f"floor must hold numbers >= 0, in the units of u, got {floor!r}; write for example 1e-3")
     dt = dt if callable(dt) else positive(dt, "dt")
-    problem = Problem(rate, given["linear"], source, timed)
+    problem = _problem(method, given)
     scheme, largest = _scheme(method, problem, jacobian, settings, KEPT[tolerance is not None]), np.inf
     if tolerance is not None:
         scheme = Adaptive(scheme, float(tolerance), given["floor"])
     elif method in EXPLICIT and problem.op is not None and unstable == "raise":
         largest = largest_step(problem.op, EXPLICIT[method].reach)
     return Step(method, problem, dt, scheme, largest, given)
+
+
+def _problem(method, given):
+    """What is integrated."""
+    if method != "leapfrog":
+        if given["damping"] is not None:
+            raise TypeError(f"{method} takes no damping; put it into the rate, or write method 'leapfrog'")
+        return Problem(given["rate"], given["linear"], given["source"], given["timed"])
+    unused = [word for word in ("linear", "source", "timed", "tolerance", "jacobian") if given[word] is not None]
+    if unused:
+        raise TypeError(f"leapfrog does not use {', '.join(unused)}; leave it out")
+    return Staggered(given["rate"], given["damping"])
 
 
 def _is_floor(leaf):
@@ -158,6 +177,8 @@ def _remade(given):
 
 
 def _scheme(method, problem, jacobian, settings, kept):
+    if method == "leapfrog":
+        return Leapfrog(problem)
     if method in EXPLICIT:
         return (Polynomial if problem.linear and problem.source is None else Explicit)(problem, method)
     if method in ("imex", "etdrk4") and problem.op is None:
@@ -242,6 +263,19 @@ class Step(Remade):
                 "take smaller steps or an implicit method"
             )
         return (new, t + h) if self.problem.timed else new
+
+    def back(self, state, params=None, *inputs):
+        """The state before a step of leapfrog without damping: the step turned round, to rounding.
+
+        Parameters
+        ----------
+        state, params, *inputs
+            As for the step itself; `state` is what it returned.
+        """
+        if self.method != "leapfrog":
+            raise ValueError(f"{self.name} cannot be reversed; write 'leapfrog'")
+        params = (params, *inputs) if inputs else params
+        return like(self.scheme.back(state, params, self.dt(params) if callable(self.dt) else self.dt), state)
 
     def _check_stable(self, h, c):
         """Refuse a step that would grow without bound."""

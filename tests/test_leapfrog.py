@@ -1,0 +1,180 @@
+"""leapfrog and sponge: orders, energy, the way back, damping, echoes, derivatives, refusals."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+
+def strings(n, dt, damping=None, periodic=True):
+    """Waves p' = -c^2 div v, v' = -grad p on a line; params: c."""
+    grid = dp.Grid(n, size=1.0, periodic=periodic)
+    D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
+    rates = (lambda v, c: -(c**2) * D(v)), (lambda p, c: -inside(G(p)))
+    return grid, dp.stepper("leapfrog", rates, dt, damping=damping)
+
+
+def standing(grid, time, dt):
+    """p = cos(2 pi c t) cos(2 pi x) with c = 1; v half a step before."""
+    (x,), (y,) = grid.centres(), grid.face_centres(0)
+    wave = 2 * np.pi
+    return np.cos(wave * time) * np.cos(wave * x), np.sin(wave * (time - dt / 2)) * np.sin(wave * y)
+
+
+def test_order_two():
+    errors = []
+    for n in (20, 40, 80):
+        dt = 0.5 / n
+        grid, step = strings(n, dt)
+        p, v = dp.rollout(step, standing(grid, 0.0, dt), 1.0, n)
+        right = standing(grid, 0.5, dt)
+        errors.append(max(np.max(np.abs(p - right[0])), np.max(np.abs(v - right[1]))))
+    rates = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert np.all(np.abs(rates - 2) < 0.1)
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_exact_at_the_limit():
+    """With c dt = h the scheme follows the waves exactly (Courant, Friedrichs, Lewy, 1928); beyond it blows up."""
+    grid, step = strings(20, 0.05)
+    start = standing(grid, 0.0, 0.05)
+    p, v = dp.rollout(step, start, 1.0, 20)
+    np.testing.assert_allclose(p, start[0], atol=1e-13)
+    np.testing.assert_allclose(v, start[1], atol=1e-13)
+    with pytest.raises(
+        dp.errors.NonFiniteError, match="NaN or infinity from a finite state with dt = 0.05; take smaller steps"
+    ):
+        dp.rollout(step, start, 1.5, 2000)
+
+
+def test_nothing_is_lost_in_ten_thousand_steps():
+    grid, step = strings(32, 0.02)
+    rng = np.random.default_rng(0)
+    state = rng.standard_normal(32), rng.standard_normal(32)
+    energy = lambda state: sum(float(np.sum(x**2)) for x in state)
+    drift = [energy(step(s, 1.0)) for s in (state, dp.rollout(step, state, 1.0, 10_000))]
+    assert 0.5 < drift[1] / drift[0] < 2  # a second-order shadow of it is conserved, it swings around that
+    p, v = dp.rollout(step, state, 1.0, 10_000)
+    shadow = lambda p, v: np.sum(p**2) + np.sum(v * step((p, v), 1.0)[1])
+    assert shadow(p, v) == pytest.approx(shadow(*state), rel=1e-9)
+
+
+def test_a_step_back():
+    grid, step = strings(12, 0.03)
+    rng = np.random.default_rng(0)
+    state = rng.standard_normal(12), rng.standard_normal(12)
+    new = step(state, 1.2)
+    for one, other in zip(step.back(new, 1.2), state, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-14)
+    with pytest.raises(ValueError, match="leapfrog step with damping cannot be reversed"):
+        strings(12, 0.03, (1.0, 1.0))[1].back(new, 1.2)
+    with pytest.raises(ValueError, match=r"stepper\(rk4\) cannot be reversed; write 'leapfrog'"):
+        dp.stepper("rk4", lambda u, c: u, 0.1).back(1.0, None)
+
+
+def test_damping_is_stable_at_any_rate():
+    """Uniform damping: both fields die out as exp(-s t), and at huge rates they never grow."""
+    grid, step = strings(40, 0.0025, (0.5, 0.5))
+    p, _ = dp.rollout(step, standing(grid, 0.0, 0.0025), 1.0, 400)
+    exact = np.exp(-0.5) * standing(grid, 1.0, 0.0025)[0]
+    assert np.max(np.abs(p - exact)) < 2e-3
+    grid, step = strings(40, 0.02, (1e6, 1e6))
+    start = standing(grid, 0.0, 0.02)
+    assert np.max(np.abs(dp.rollout(step, start, 1.0, 50)[0])) < 1.001
+
+
+def test_trees_and_inputs():
+    """The fields may be trees; what enters from step to step is an input."""
+    rates = (lambda q, c: {"a": q["b"], "c": 0 * q["b"] + c[1]}), (lambda p, c: {"b": -c[0] * p["a"]})
+    step = dp.stepper("leapfrog", rates, 0.1, damping=({"a": 0.0, "c": 0.0}, {"b": 0.0}))
+    state = {"a": 1.0, "c": 0.0}, {"b": 0.0}
+    p, q = dp.rollout(step, state, 2.0, 3, inputs=np.array([1.0, 2.0, 3.0]))
+    assert p["c"] == pytest.approx(0.6)
+    assert (
+        dp.check.gradient(lambda c: dp.rollout(step, state, c, 3, inputs=np.ones(3))[0]["a"], 2.0).verdict == "agrees"
+    )
+
+
+@pytest.mark.parametrize("damped", [False, True])
+def test_derivatives(damped):
+    """Against a loop in autograd.numpy, in state and params, to second order."""
+    n, dt = 8, 0.05
+    rng = np.random.default_rng(1)
+    sigma = 3 * rng.random(n) * damped, 3 * rng.random(n) * damped
+    grid, step = strings(n, dt, sigma if damped else None)
+    state, weights = (rng.standard_normal(n), rng.standard_normal(n)), rng.standard_normal(n)
+
+    def twin(p, v, c):
+        for _ in range(5):
+            new = v - dt * (p - anp.roll(p, 1)) * n
+            v = (new - 0.5 * dt * sigma[1] * v) / (1 + 0.5 * dt * sigma[1])
+            new = p - dt * c**2 * (anp.roll(v, -1) - v) * n
+            p = (new - 0.5 * dt * sigma[0] * p) / (1 + 0.5 * dt * sigma[0])
+        return anp.sum(weights * p**2)
+
+    ours = lambda x: anp.sum(weights * dp.rollout(step, x[:2], x[2], 5)[0] ** 2)
+    other = lambda x: twin(*x)
+    x, t = (*state, np.array(1.3)), (weights, weights[::-1].copy(), np.array(0.3))
+    assert ours(x) == pytest.approx(other(x), rel=1e-13)
+    for one, two in ((dp.grad(ours)(x), dp.grad(other)(x)), (dp.hvp(ours, x, t), dp.hvp(other, x, t))):
+        for a, b in zip(one, two, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
+
+
+def pulse(cells, deep, steps):
+    """A round pulse in a box of `cells` and a sponge around; the pressure in the box at the end."""
+    n = cells + 2 * deep
+    grid = dp.Grid((n, n))
+    D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
+    rates = (lambda v, _: -D(v)), (lambda p, _: -inside(G(p)))
+    x, y = (c - n / 2 for c in grid.centres())
+    square = (x**2 + y**2) / 18
+    step = dp.stepper("leapfrog", rates, 0.5, damping=dp.sponge(grid, deep, 1.0) if deep < 60 else None)
+    return dp.rollout(step, ((1 - square) * np.exp(-square), np.zeros(grid.faces.size)), None, steps)[0][
+        deep : n - deep, deep : n - deep
+    ]
+
+
+@pytest.mark.parametrize(("deep", "most"), [(20, 6e-4), (30, 2e-4)])
+def test_echo_of_a_sponge(deep, most):
+    """Against a box so large that nothing comes back (wavelength about 13 cells; the pulse is 1 high)."""
+    assert np.max(np.abs(pulse(30, deep, 120) - pulse(30, 65, 120))) < most
+
+
+def test_sponge_on_some_sides():
+    grid = dp.Grid((8, 6), size=(4.0, 3.0), origin=(1.0, 0.0), periodic=(False, True))
+    inside, between = dp.sponge(grid, {"x": (0, 3)}, 2.0, echo=0.01)
+    assert inside.shape == (8, 6) and between.shape == (grid.faces.size,)
+    assert np.all(inside[:5] == 0) and np.all(inside[5:] > 0)
+    depth = (np.array([0.25, 0.75, 1.25]) / 1.5) ** 2 / 1.5
+    np.testing.assert_allclose(inside[5:, 0], 1.5 * 2.0 * np.log(100) * depth)
+    assert not np.any(dp.sponge(grid, 0, 1.0)[0])
+    everywhere = dp.sponge(dp.Grid((5, 4)), 2, 1.0)[0]
+    np.testing.assert_allclose(everywhere, everywhere[::-1, ::-1])
+
+
+def test_refusals():
+    rates = (lambda v, c: v), (lambda p, c: p)
+    with pytest.raises(TypeError, match="leapfrog needs a pair of rates, got function; write"):
+        dp.stepper("leapfrog", rates[0], 0.1)
+    with pytest.raises(TypeError, match="leapfrog does not use linear; leave it out"):
+        dp.stepper("leapfrog", rates, 0.1, linear=dp.laplacian(dp.Grid(3)))
+    with pytest.raises(TypeError, match="rk4 takes no damping; put it into the rate, or write method 'leapfrog'"):
+        dp.stepper("rk4", rates[0], 0.1, damping=(1.0, 1.0))
+    with pytest.raises(TypeError, match="damping needs a pair, for both fields of the state, got float"):
+        dp.stepper("leapfrog", rates, 0.1, damping=1.0)
+    with pytest.raises(ValueError, match=r"damping needs finite rates >= 0 \[1 / time\]; take dp.sponge"):
+        dp.stepper("leapfrog", rates, 0.1, damping=(-1.0, 0.0))
+    step = dp.stepper("leapfrog", rates, 0.1, damping=((1.0, 2.0), None))
+    with pytest.raises(TypeError, match=r"the state of leapfrog is a pair of fields, got ndarray; write \(p, v\)"):
+        step(np.ones(3))
+    with pytest.raises(dp.errors.ShapeError, match="damping has 2 parts for a field of 1; give one for each"):
+        step((np.ones(3), np.ones(3)))
+    step = dp.stepper("leapfrog", (rates[0], lambda p, c: (p, p)), 0.1, damping=(None, 1.0))
+    with pytest.raises(dp.errors.ShapeError, match="a rate has 2 parts for a field of 1; give one for each"):
+        step((np.ones(3), np.ones(3)))
+    with pytest.raises(ValueError, match="sponge on x needs 0 to 4 cells, got 5"):
+        dp.sponge(dp.Grid(4), 5, 1.0)
+    with pytest.raises(ValueError, match="sponge needs a speed > 0 and an echo between 0 and 1, got 0 and 0.001"):
+        dp.sponge(dp.Grid(4), 2, 0)
