@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sparsedp.grid import AXES, real_numbers
-from sparsedp.recipe import Frozen
+from sparsedp.recipe import Value
 
 __all__ = [
     "Condition", "FlowCondition", "check_condition", "dirichlet", "free_slip", "inflow", "neumann", "no_slip",
@@ -22,7 +22,7 @@ __all__ = [
 ]  # fmt: skip
 
 
-class Condition(Frozen):
+class Condition(Value):
     """a u + b du/dn = value on a wall. Frozen, equal by value. Use dirichlet, neumann or robin."""
 
     choices = "dirichlet, neumann, robin(a, b)"
@@ -32,14 +32,12 @@ class Condition(Frozen):
     def __init__(self, a, b):
         vars(self).update(a=a, b=b)
 
-    def __eq__(self, other):
-        return vars(self) == vars(other) if isinstance(other, Condition) else NotImplemented
-
-    def __hash__(self):
-        return hash((self.a, self.b))
+    @property
+    def _key(self):
+        return self.a, self.b
 
     def __repr__(self):
-        return {(1.0, 0.0): "dirichlet", (0.0, 1.0): "neumann"}.get((self.a, self.b), f"robin({self.a:g}, {self.b:g})")
+        return {(1.0, 0.0): "dirichlet", (0.0, 1.0): "neumann"}.get(self._key, f"robin({self.a:g}, {self.b:g})")
 
 
 dirichlet = Condition(1.0, 0.0)

@@ -80,10 +80,10 @@ def _copied(value):
         return _frozen_copy(value)
     owner = value if value.base is None else value.base
     view = id(owner), value.shape, value.strides
-    known = copies.get(view)
-    if known is None or not _same_bits(known, value):
-        known = copies[view] = _frozen_copy(value)
-    return known
+    earlier = copies.get(view)
+    if earlier is None or not _same_bits(earlier, value):
+        earlier = copies[view] = _frozen_copy(value)
+    return earlier
 
 
 def _frozen_copy(value):
@@ -92,14 +92,12 @@ def _frozen_copy(value):
     return copy
 
 
-def _same_bits(known, value):
+def _same_bits(earlier, value):
     """Whether two arrays of one shape hold the same bits: 0.0 and -0.0 have different reciprocals."""
-    if known.dtype != value.dtype or type(known) is not type(value):
+    if earlier.dtype != value.dtype or type(earlier) is not type(value):
         return False
     if value.dtype.kind == "c":
-        return _same_bits(known.real, value.real) and _same_bits(known.imag, value.imag)
-    known, value = known.view(BITS[value.itemsize]), value.view(BITS[value.itemsize])
-    if not (known.flags.c_contiguous and value.flags.c_contiguous):
-        return bool((known == value).all())
-    known, value = known.reshape(-1), value.reshape(-1)
-    return all((known[k : k + CHUNK] == value[k : k + CHUNK]).all() for k in range(0, known.size, CHUNK))
+        return _same_bits(earlier.real, value.real) and _same_bits(earlier.imag, value.imag)
+    earlier, value = earlier.view(BITS[value.itemsize]), value.view(BITS[value.itemsize])
+    rows = max(1, CHUNK * len(value) // value.size)
+    return all((earlier[k : k + rows] == value[k : k + rows]).all() for k in range(0, len(value), rows))

@@ -17,8 +17,8 @@ from math import prod
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.recipe import Frozen, Uncached
-from sparsedp.space import Space
+from sparsedp.recipe import Uncached, Value
+from sparsedp.space import Space, whole_lengths
 
 __all__ = [
     "AXES",
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 
-class Grid(Frozen, Uncached):
+class Grid(Value, Uncached):
     """A box of cells in 1-D, 2-D or 3-D, with uniform or stretched spacing. Frozen, equal by value.
 
     Parameters
@@ -151,7 +151,7 @@ class Grid(Frozen, Uncached):
         if on_nodes is None:
             raise ShapeError(f"values on {kind} have no volumes; take those of grid.cells, faces, nodes or edges")
         lengths = [self.spacings(a) if a in on_nodes else self.widths[a] for a in range(self.dim)]
-        return _outer(lengths)
+        return reduce(np.multiply.outer, lengths)
 
     def split(self, v):
         """Face field (or 3-D edge field; in 2-D write ``grid.edges.split``) -> tuple of components. Differentiable.
@@ -276,14 +276,6 @@ class Grid(Frozen, Uncached):
     def _key(self):
         return self.shape, self.periodic, self.origin, tuple(widths.tobytes() for widths in self.widths)
 
-    def __eq__(self, other):
-        if not isinstance(other, Grid):
-            return NotImplemented
-        return self is other or self._key == other._key
-
-    def __hash__(self):
-        return hash(self._key)
-
     def __repr__(self):
         words = [" x ".join(map(str, self.shape)) + " cells", "size " + " x ".join(f"{size:.6g}" for size in self.size)]
         if any(self.origin):
@@ -292,10 +284,6 @@ class Grid(Frozen, Uncached):
             if any(flags):
                 words.append(f"{word} in {', '.join(compress(AXES, flags))}")
         return f"Grid({', '.join(words)})"
-
-
-def _outer(lines):
-    return reduce(np.multiply.outer, lines, np.ones(()))
 
 
 def check_grid(name, grid):
@@ -312,11 +300,10 @@ AXES = ("x", "y", "z")
 
 def lengths(shape):
     """Shape argument -> tuple of one to three lengths."""
-    shape = (shape,) if np.ndim(shape) == 0 else tuple(shape)
-    whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 0 for n in shape)
-    if not (whole and 1 <= len(shape) <= 3):
+    entries = whole_lengths(shape)
+    if entries is None or not 1 <= len(entries) <= 3:
         raise ShapeError(f"a grid needs one to three whole lengths >= 0, got shape {shape}; write Grid((8, 6))")
-    return tuple(int(n) for n in shape)
+    return entries
 
 
 def node_axes(kind, component, dim):
@@ -365,32 +352,26 @@ def flag(entry, shape):
 def cell_widths(shape, size, spacing):
     """Size or spacing argument -> tuple of read-only arrays of cell widths, one for each axis."""
     if size is not None:
-        extents = per_axis(size, shape, "size")
-        widths = [
-            np.full(n, finite_number(extent, "size") / max(n, 1)) for n, extent in zip(shape, extents, strict=True)
-        ]
-        _positive("size", [float(extent) for extent in extents])
-    else:
-        if len(shape) == 1 and isinstance(spacing, np.ndarray) and spacing.ndim == 1:
-            spacing = [spacing]  # in 1-D an array is the widths themselves
-        entries = per_axis(1.0 if spacing is None else spacing, shape, "spacing")
-        widths = [_axis_widths(n, entry, axis) for n, entry, axis in zip(shape, entries, AXES, strict=False)]
-    for line in widths:
-        _positive("spacing", line)
-        line.flags.writeable = False
-    return tuple(widths)
+        extents = [finite_number(extent, "size") for extent in per_axis(size, shape, "size")]
+        _check_positive("size", np.array(extents))
+        spacing = [extent / max(n, 1) for n, extent in zip(shape, extents, strict=True)]
+    elif len(shape) == 1 and isinstance(spacing, np.ndarray) and spacing.ndim == 1:
+        spacing = [spacing]  # in 1-D an array is the widths themselves
+    entries = per_axis(1.0 if spacing is None else spacing, shape, "spacing")
+    return tuple(_axis_widths(n, entry, axis) for n, entry, axis in zip(shape, entries, AXES, strict=False))
 
 
 def _axis_widths(n, entry, axis):
     line = np.array(real_numbers(entry, "spacing", "spacing=0.5"), dtype=float)
-    if line.ndim == 0:
-        return np.full(n, float(line))
-    if line.shape != (n,):
+    if line.shape not in ((), (n,)):
         raise ShapeError(f"spacing along {axis} needs {n} cell widths, got an array of shape {line.shape}")
+    _check_positive("spacing", line)
+    line = np.full(n, line)
+    line.flags.writeable = False
     return line
 
 
-def _positive(name, numbers):
-    for number in numbers:
-        if not (np.isfinite(number) and number > 0):
-            raise ValueError(f"{name} must be positive and finite, got {number}")
+def _check_positive(name, numbers):
+    wrong = ~((numbers > 0) & (numbers < np.inf))  # NaN too
+    if np.any(wrong):
+        raise ValueError(f"{name} must be positive and finite, got {numbers[wrong][0]}")

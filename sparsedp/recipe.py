@@ -7,7 +7,7 @@ from threading import local
 from types import MethodType
 from typing import Any
 
-__all__ = ["Frozen", "Made", "Remade", "Uncached"]
+__all__ = ["Frozen", "Made", "Remade", "Uncached", "Value"]
 
 
 class Remade:
@@ -99,3 +99,17 @@ class Frozen:
 
     def __setattr__(self, name, value):
         raise AttributeError(f"{type(self).__name__} is frozen; make a new one instead of setting {name}")
+
+
+class Value(Frozen):
+    """A frozen object that equals every other of its class with the same `_key`."""
+
+    _key: Any
+
+    def __eq__(self, other):
+        if type(other) is not type(self):
+            return NotImplemented
+        return self is other or self._key == other._key
+
+    def __hash__(self):
+        return hash(self._key)

@@ -10,13 +10,13 @@ import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import check_plain
-from sparsedp.recipe import Frozen, Uncached
+from sparsedp.recipe import Uncached, Value
 from sparsedp.tape import dtype_of, isbox, linear
 
-__all__ = ["Space", "fits"]
+__all__ = ["Space", "fits", "whole_lengths"]
 
 
-class Space(Frozen, Uncached):
+class Space(Value, Uncached):
     """The place of a field: the cells, faces, nodes or edges of a grid, or a plain shape.
 
     Parameters
@@ -51,11 +51,10 @@ class Space(Frozen, Uncached):
     parts: tuple[tuple[int, ...], ...]
 
     def __init__(self, shape, kind="space", grid=None, parts=None):
-        shape = (shape,) if np.ndim(shape) == 0 else tuple(shape)
-        if not all(isinstance(n, (int, np.integer)) and n >= 0 for n in shape):
+        entries = whole_lengths(shape)
+        if entries is None:
             raise ShapeError(f"a space needs whole lengths >= 0, got {shape}; write Space(7) or Space((2, 3))")
-        shape = tuple(map(int, shape))
-        vars(self).update(shape=shape, kind=kind, grid=grid, parts=(shape,) if parts is None else tuple(parts))
+        vars(self).update(shape=entries, kind=kind, grid=grid, parts=(entries,) if parts is None else tuple(parts))
 
     @cached_property
     def size(self):
@@ -124,12 +123,12 @@ class Space(Frozen, Uncached):
         if len(parts) != len(self.parts):
             raise ShapeError(f"join on {self} takes {len(self.parts)} components, got {len(parts)}")
         check_plain("join", *parts)
-        found = [
+        components = [
             part if np.shape(part) == shape else _broadcast(self, part, shape)
             for part, shape in zip(parts, self.parts, strict=True)
         ]
-        numpy = anp if any(map(isbox, found)) else np  # the same, without the tape
-        return numpy.reshape(numpy.concatenate([numpy.reshape(part, (-1,)) for part in found]), self.shape)
+        numpy = anp if any(map(isbox, components)) else np  # the same, without the tape
+        return numpy.reshape(numpy.concatenate([numpy.reshape(part, (-1,)) for part in components]), self.shape)
 
     @cached_property
     def _parted(self):
@@ -141,13 +140,9 @@ class Space(Frozen, Uncached):
         """Start, end and shape of each component in the flat array."""
         return list(zip(self.offsets, self.offsets[1:], self.parts))
 
-    def __eq__(self, other):
-        if not isinstance(other, Space):
-            return NotImplemented
-        return self is other or (self.shape, self.kind, self.grid) == (other.shape, other.kind, other.grid)
-
-    def __hash__(self):
-        return hash((self.shape, self.kind, self.grid))
+    @cached_property
+    def _key(self):
+        return self.shape, self.kind, self.grid
 
     def __str__(self):
         shape = self.grid.shape if self.grid is not None else self.shape
@@ -160,6 +155,13 @@ class Space(Frozen, Uncached):
         """Its name for messages, with the shape of a field where the name does not show it: faces are flat."""
         shape = self.shape if self.grid is None else self.grid.shape
         return str(self) if shape == self.shape else f"{self} of shape {self.shape}"
+
+
+def whole_lengths(shape):
+    """A length or a sequence of them -> tuple of int, or None where one is no whole number >= 0."""
+    shape = (shape,) if np.ndim(shape) == 0 else tuple(shape)
+    whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 0 for n in shape)
+    return tuple(map(int, shape)) if whole else None
 
 
 def fits(one, other):

@@ -21,26 +21,20 @@ def flatten(tree):
 
     Returns
     -------
-    found : list
+    entries : list
         The leaves, from left to right.
     rebuild : callable
-        ``rebuild(found)`` is equal to ``tree``; it takes any iterable of as many leaves.
+        ``rebuild(entries)`` is equal to ``tree``; it takes any iterable of as many leaves.
 
     Examples
     --------
-    >>> found, rebuild = flatten({"a": (1.0, 2.0), "b": None})
-    >>> found
+    >>> entries, rebuild = flatten({"a": (1.0, 2.0), "b": None})
+    >>> entries
     [1.0, 2.0, None]
     >>> rebuild([3.0, 4.0, 5.0])
     {'a': (3.0, 4.0), 'b': 5.0}
     """
-    found: list = []
-    _collect(tree, found)
-
-    def rebuild(values):
-        return _build(tree, iter(values))
-
-    return found, rebuild
+    return leaves(tree), lambda values: _build(tree, iter(values))
 
 
 def copied(tree):
@@ -58,8 +52,7 @@ def mapped(function, tree, *others):
     """
     if not isinstance(tree, (tuple, list, dict)):
         return function(tree, *others)
-    found, rebuild = flatten(tree)
-    return rebuild(map(function, found, *map(leaves, others)))
+    return _build(tree, map(function, leaves(tree), *map(leaves, others)))
 
 
 def leaves(tree):
@@ -78,9 +71,8 @@ def leaves(tree):
     >>> leaves([1, (2, {"x": 3})])
     [1, 2, 3]
     """
-    found: list = []
-    _collect(tree, found)
-    return found
+    names = keys(tree)
+    return [tree] if names is None else [leaf for name in names for leaf in leaves(tree[name])]
 
 
 def labels(tree, root):
@@ -135,20 +127,10 @@ def keys(tree):
     return range(len(tree)) if isinstance(tree, (tuple, list)) else None
 
 
-def _collect(tree, found):
-    names = keys(tree)
-    if names is None:
-        found.append(tree)
-    else:
-        for name in names:
-            _collect(tree[name], found)
-
-
 def _build(tree, values):
     if isinstance(tree, dict):
         return type(tree)((key, _build(branch, values)) for key, branch in tree.items())
-    if isinstance(tree, tuple) and hasattr(tree, "_fields"):
-        return type(tree)(*(_build(branch, values) for branch in tree))
     if isinstance(tree, (tuple, list)):
-        return type(tree)(_build(branch, values) for branch in tree)
+        branches = [_build(branch, values) for branch in tree]
+        return type(tree)(*branches) if hasattr(tree, "_fields") else type(tree)(branches)
     return next(values)

@@ -27,7 +27,7 @@ TABLE = [
         SHAPE,
         "a grid needs one to three whole lengths >= 0, got shape (2, 2, 2, 2); write Grid((8, 6))",
     ),
-    (lambda: dp.Grid(2.5), SHAPE, "a grid needs one to three whole lengths >= 0, got shape (2.5,); write Grid((8, 6))"),
+    (lambda: dp.Grid(2.5), SHAPE, "a grid needs one to three whole lengths >= 0, got shape 2.5; write Grid((8, 6))"),
     (
         lambda: dp.Grid((2.5,)),
         SHAPE,
@@ -92,11 +92,11 @@ TABLE = [
         SHAPE,
         "join on faces(2, 2) needs components ((3, 2), (2, 3)), got one of shape (7,)",
     ),
-    (lambda: dp.Space(-1), SHAPE, "a space needs whole lengths >= 0, got (-1,); write Space(7) or Space((2, 3))"),
+    (lambda: dp.Space(-1), SHAPE, "a space needs whole lengths >= 0, got -1; write Space(7) or Space((2, 3))"),
     (
         lambda: dp.Space(2.5),
         SHAPE,
-        "a space needs whole lengths >= 0, got (2.5,); write Space(7) or Space((2, 3))",
+        "a space needs whole lengths >= 0, got 2.5; write Space(7) or Space((2, 3))",
     ),
     (lambda: setattr(LINE, "dim", 2), AttributeError, "Grid is frozen; make a new one instead of setting dim"),
     (lambda: setattr(LINE.cells, "x", 2), AttributeError, "Space is frozen; make a new one instead of setting x"),
