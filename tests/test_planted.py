@@ -216,8 +216,8 @@ BUGS = {
     ),
     "a function of an operator that is not transposed": Bug(
         "solvers",
-        "self.found.apply(self.weights, x, self.transposed)",
-        "self.found.apply(self.weights, x, False)",
+        "self.spectrum.apply(self.weights, x, self.transposed)",
+        "self.spectrum.apply(self.weights, x, False)",
         "tests/test_spectral.py",
     ),
     "the wrong sign in the derivative of a shift": Bug(

@@ -93,6 +93,10 @@ def test_powers():
     np.testing.assert_allclose(root(root(x)), op(x), rtol=1e-12)
     np.testing.assert_allclose(dp.power(op, -1)(op(x)), x, rtol=1e-12)
     np.testing.assert_allclose(dp.power(op, 0)(x), x, rtol=1e-12)
+    matrix, u = op.matrix.toarray(), x.reshape(-1)  # functions of functions of it
+    spread, back = dp.exponential(dp.power(op, 2), -1e-3), dp.power(dp.exponential(op, -0.1), -1)
+    np.testing.assert_allclose(spread @ u, scipy.linalg.expm(-1e-3 * matrix @ matrix) @ u, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(back @ u, scipy.linalg.expm(0.1 * matrix) @ u, rtol=1e-11)
     mean_free = x - x.mean()
     pure = -dp.laplacian(dp.Grid((4, 3)))
     np.testing.assert_allclose(dp.power(pure, -1)(pure(x)), mean_free, rtol=1e-12, atol=1e-13)

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.solvers.separable import SpectralFunction, spectrum
+from sparsedp.solvers.separable import diagonalised
 from sparsedp.tape import Rule, isbox, of_argument
 
 __all__ = ["Function", "PhiFunctions", "Taylor", "TaylorPolynomials", "phi"]
@@ -182,7 +182,7 @@ class PhiFunctions(Functions):
 
     def __init__(self, op, name):
         super().__init__(op, name)
-        self.found, self.eigenvalues = _diagonalised(op, name)
+        self.found, self.eigenvalues = diagonalised(op, name, "; try imex or tr_bdf2")
         self._table = lru_cache(KEPT)(self._values)  # plain values only, of a few z
 
     def plain(self, rows, z, fields, transposed=False):
@@ -210,14 +210,3 @@ class PhiFunctions(Functions):
                 f"{self.name}: exp({z:g} * {self.op.name}) is beyond 1.8e308; take a smaller dt or the other sign"
             )
         return values
-
-
-def _diagonalised(op, name):
-    """(Spectrum, eigenvalues) of an operator that is separable, or a function of such a one."""
-    structure = op.structure
-    if isinstance(structure, SpectralFunction) and not structure.transposed:
-        return structure.found, structure.weights
-    found = spectrum(structure) if op.separable else None
-    if found is None:
-        raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}; try imex or tr_bdf2")
-    return found, found.eigenvalues

@@ -34,6 +34,7 @@ __all__ = [
     "Separable",
     "SpectralFunction",
     "Spectrum",
+    "diagonalised",
     "exponential",
     "power",
     "separable_engine",
@@ -387,16 +388,15 @@ class SpectralFunction(Structure):
 
     has_entries = takes_complex = False
 
-    def __init__(self, found, weights, transposed=False):
-        self.found, self.weights, self.transposed = found, weights, transposed
-        size = int(np.prod(found.shape))
-        self.shape = (size, size)
+    def __init__(self, spectrum, weights, transposed=False):
+        self.spectrum, self.weights, self.transposed = spectrum, weights, transposed
+        self.shape = (prod(spectrum.shape),) * 2
 
     def act(self, x, out):
-        out[...] = self.found.apply(self.weights, x, self.transposed)
+        out[...] = self.spectrum.apply(self.weights, x, self.transposed)
 
     def transpose(self):
-        return SpectralFunction(self.found, self.weights, not self.transposed)
+        return SpectralFunction(self.spectrum, self.weights, not self.transposed)
 
 
 def exponential(op, time=1.0):
@@ -405,7 +405,7 @@ def exponential(op, time=1.0):
     Parameters
     ----------
     op : Operator
-        A Kronecker sum from a space to itself (``op.separable``), such as a laplacian.
+        A Kronecker sum from a space to itself (``op.separable``), such as a laplacian; or a power of one.
     time : float
         Finite [1 / unit of the operator].
 
@@ -434,11 +434,12 @@ def exponential(op, time=1.0):
     >>> print(np.round(spread(np.array([1.0, 3.0])), 6))
     [2. 2.]
     """
-    found = _spectrum(op, "exponential", "time", time, 0.1)
+    axes, values = diagonalised(op, "exponential")
+    _check_number("exponential", "time", time, 0.1)
     with np.errstate(over="ignore"):
-        weights = np.exp(time * found.eigenvalues)
+        weights = np.exp(time * values)
     name = f"exp({time:g} * {op.name})"
-    return _function(op, found, weights, name, f"{name} is beyond 1.8e308; take a shorter time or the other sign")
+    return _function(op, axes, weights, name, f"{name} is beyond 1.8e308; take a shorter time or the other sign")
 
 
 def power(op, exponent):
@@ -447,7 +448,7 @@ def power(op, exponent):
     Parameters
     ----------
     op : Operator
-        A Kronecker sum from a space to itself (``op.separable``).
+        A Kronecker sum from a space to itself (``op.separable``); or an exponential of one.
     exponent : float
         Whole, or any number when no eigenvalue is negative. On the null space a negative exponent
         gives 0: the generalised inverse.
@@ -472,31 +473,38 @@ def power(op, exponent):
     >>> print(np.round(root(root(np.array([1.0, 2.0, 4.0]))), 6))
     [-1. -1.  2.]
     """
-    found = _spectrum(op, "power", "exponent", exponent, 0.5)
-    values = found.eigenvalues
+    axes, values = diagonalised(op, "power")
+    _check_number("power", "exponent", exponent, 0.5)
     if exponent != int(exponent) and np.any(values < 0):
         raise ValueError(f"{op.name} has eigenvalues down to {values.min():.1e}; a fractional power needs them >= 0")
     zero = values == 0
     with np.errstate(over="ignore"):
         weights = np.where(zero, 1.0 if exponent == 0 else 0.0, np.where(zero, 1.0, values) ** float(exponent))
     refusal = f"{op.name} to the power {exponent:g} is beyond 1.8e308; rescale the operator"
-    return _function(op, found, weights, f"({op.name})^{exponent:g}", refusal)
+    return _function(op, axes, weights, f"({op.name})^{exponent:g}", refusal)
 
 
-def _spectrum(op, name, what, number, example):
-    """The Spectrum of an operator, of which the function `name` with this number is wanted."""
-    found = spectrum(op.structure) if op.separable else None
-    if found is None:
-        raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}")
+def diagonalised(op, name, advice=""):
+    """(Spectrum, eigenvalues) of an operator that is separable, or a function of such a one; `name` needs them."""
+    structure = op.structure
+    if isinstance(structure, SpectralFunction) and not structure.transposed:
+        return structure.spectrum, structure.weights
+    axes = spectrum(structure) if op.separable else None
+    if axes is None:
+        raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}{advice}")
+    return axes, axes.eigenvalues
+
+
+def _check_number(name, what, number, example):
+    """Refuse what is not one finite number."""
     if not is_number(number):
         raise TypeError(f"{name} needs one real number as {what}, got {number!r}; write for example {example}")
     if not np.isfinite(number):
         raise NonFiniteError(f"{name} needs a finite {what}, got {number}")
-    return found
 
 
-def _function(op, found, weights, name, refusal):
+def _function(op, axes, weights, name, refusal):
     """The Operator with these weights in place of the eigenvalues; refused when they are beyond the range of floats."""
     if not np.all(np.isfinite(weights)):
         raise NonFiniteError(refusal)
-    return Operator(SpectralFunction(found, weights), op.domain, op.codomain, name)
+    return Operator(SpectralFunction(axes, weights), op.domain, op.codomain, name)
