@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_finite
+from sparsedp.fields import check_finite, check_function
 from sparsedp.ledger import active, count
 from sparsedp.recipe import Remade
 from sparsedp.solvers.cache import Cache
@@ -87,8 +87,7 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     >>> value_and_grad(lambda x: anp.sum(shift(x)))(np.array([1.0, 2.0, 3.0]))
     (14.0, array([2., 4., 6.]))
     """
-    if not callable(f):
-        raise TypeError(f"adopt takes a function of one array, got {type(f).__name__}; write dp.adopt(lambda x: ...)")
+    check_function("adopt", f, "dp.adopt(lambda x: ...)")
     if derivative not in ("auto", "complex", "difference"):
         raise ValueError(f"derivative must be auto, complex or difference, got {derivative!r}")
     return Adopted(f, sparsity, derivative, name or getattr(f, "__name__", "simulator"))
@@ -108,10 +107,10 @@ class Adopted(Remade):
     _shapes: Any
     _coloured: Any
 
-    def __init__(self, f, sparsity, derivative, name, found=(None, "", None)):
+    def __init__(self, f, sparsity, derivative, name, jacobian=(None, "", None)):
         self._f, self._derivative, self.name = f, derivative, name
         self._sparsity = None if sparsity is None else pattern_like(sparsity)
-        self._shapes, self.way, self._coloured = found
+        self._shapes, self.way, self._coloured = jacobian
         self.way = self.way or {"auto": "", "complex": STEP, "difference": DIFFERENCES}[derivative]
         self.runs = 0
         self._points, self._alone = Cache(), RLock()  # foreign code may work in arrays of its own: one thread at a time
@@ -125,8 +124,8 @@ class Adopted(Remade):
     def recipe(self):
         """The call that makes it again: see recipe.py."""
         # The pattern found so far travels too: it took many runs.
-        found = self._shapes, self.way, self._coloured
-        return Adopted, (self._f, self._sparsity, self._derivative, self.name, found)
+        jacobian = self._shapes, self.way, self._coloured
+        return Adopted, (self._f, self._sparsity, self._derivative, self.name, jacobian)
 
     def __call__(self, x):
         return self._rule(x)
@@ -161,7 +160,7 @@ class Adopted(Remade):
                 f"{self.name} is adopted: its Jacobian is known, its second derivative is not; use a method with "
                 "first derivatives, or write the function with autograd.numpy"
             )
-        matrix, again = self._known(x)
+        matrix, again = self._at(x)
         if x.dtype == float and not np.array_equal(again, plain(y)):
             raise DerivativeError(
                 f"{self.name} gives another result for the same argument than before; it must depend on its argument "
@@ -185,9 +184,9 @@ class Adopted(Remade):
         -------
         csr_array, (y.size, x.size)
         """
-        return self._known(plain(x))[0]
+        return self._at(plain(x))[0]
 
-    def _known(self, x):
+    def _at(self, x):
         """The Jacobian at a point, and the result there."""
         x = np.asarray(x, dtype=float)
         with self._alone:
@@ -222,15 +221,15 @@ class Adopted(Remade):
 
     def _patterns(self, x, y):
         """Patterns to be tried at x, coloured, the cheapest first; each has the entries known from earlier points."""
-        rows, columns, known = y.size, x.size, self._sparsity
+        rows, columns, earlier = y.size, x.size, self._sparsity
         grid = self._shapes[0] if self._shapes[0] == self._shapes[1] else None
         if self._coloured is not None:
             yield self._coloured
-            known = self._coloured.pattern
-        elif known is not None:
-            if known.shape != (rows, columns):
-                raise ShapeError(f"the sparsity of {self.name} must have shape {(rows, columns)}, got {known.shape}")
-            yield Coloured(known, grid, by_rows=False)
+            earlier = self._coloured.pattern
+        elif earlier is not None:
+            if earlier.shape != (rows, columns):
+                raise ShapeError(f"the sparsity of {self.name} must have shape {(rows, columns)}, got {earlier.shape}")
+            yield Coloured(earlier, grid, by_rows=False)
         elif not np.array_equal(self._flat(x), y):
             raise DerivativeError(f"{self.name} gives two results for one argument; fix its random state first")
         if self._sparsity is not None:
@@ -242,13 +241,13 @@ class Adopted(Remade):
         ]
 
         def coloured(pattern):
-            return Coloured(pattern if known is None else pattern_like(pattern + known), grid, by_rows=False)
+            return Coloured(pattern if earlier is None else pattern_like(pattern + earlier), grid, by_rows=False)
 
         guess = None if grid is None else stencil_pattern(products, grid)
         if guess is not None:
             yield coloured(guess)
-        found = find_pattern(products, rows, columns)
-        yield coloured(dense_pattern(rows, columns) if found is None else found)
+        sparse = find_pattern(products, rows, columns)
+        yield coloured(dense_pattern(rows, columns) if sparse is None else sparse)
 
     # ------------------------------------------------------------ one Jacobian
 

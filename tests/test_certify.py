@@ -116,7 +116,7 @@ def test_text_data_and_state():
         assert words in text
     assert json.loads(json.dumps(found.to_dict()))["advice"] == found.advice and repr(found) == text
     assert not thread.solve_hooks and solve.solver.system.rtol == 1e-4
-    with pytest.raises(AttributeError, match="a certificate is frozen; value cannot be set"):
+    with pytest.raises(AttributeError, match="Certificate is frozen; make a new one instead of setting value"):
         found.value = 0.0
     with pytest.raises(
         ValueError, match="certify needs a target between 0 and 1, got 2; write for example target=0.01"

@@ -137,5 +137,5 @@ def test_own_steps_and_bad_arguments():
         AUDIT(lambda u: u, X, gradient=lambda u: u)
     with pytest.raises(dp.errors.DerivativeError, match="the loss must be real"):
         AUDIT(lambda u: 1j * np.sum(u), X, gradient=lambda u: u)
-    with pytest.raises(AttributeError, match="an audit is frozen; verdict cannot be set"):
+    with pytest.raises(AttributeError, match="Audit is frozen; make a new one instead of setting verdict"):
         AUDIT(smooth, X).verdict = "agrees"

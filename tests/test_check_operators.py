@@ -304,7 +304,7 @@ def test_order_that_is_wrong_unknown_or_undefined():
 
 
 def test_results_are_frozen():
-    with pytest.raises(AttributeError, match="a finding is frozen; rows cannot be set"):
+    with pytest.raises(AttributeError, match="Summary is frozen; make a new one instead of setting rows"):
         dp.check.transpose(RIGHT["gradient"]).rows = ()
-    with pytest.raises(AttributeError, match="a refinement is frozen; errors cannot be set"):
+    with pytest.raises(AttributeError, match="Refinement is frozen; make a new one instead of setting errors"):
         dp.check.order(lambda n: 1 / n).errors = ()

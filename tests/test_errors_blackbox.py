@@ -34,7 +34,7 @@ def second():
 WRONG = [
     (
         lambda: dp.adopt(3.0), TypeError,
-        r"adopt takes a function of one array, got float; write dp.adopt\(lambda x: ...\)",
+        r"adopt takes a function, got float; write dp.adopt\(lambda x: ...\)",
     ),
     (first(np.sin, derivative="exact"), ValueError, "derivative must be auto, complex or difference, got 'exact'"),
     (first(drifting), DerivativeError, "drifting gives two results for one argument; fix its random state first"),

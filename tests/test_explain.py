@@ -257,7 +257,7 @@ def test_text_and_data():
     assert data["left_out"] == plan.left_out and repr(plan) == text
     assert all(row["seconds"] >= 0 for row in plan.rows)
     assert sum(row["seconds"] for row in plan.rows) <= sum(plan.seconds)
-    with pytest.raises(AttributeError, match="a plan is frozen; value cannot be set"):
+    with pytest.raises(AttributeError, match="Plan is frozen; make a new one instead of setting value"):
         plan.value = 1.0
     assert plan.counts["never", "called"] == 0
 

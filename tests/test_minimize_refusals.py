@@ -116,5 +116,5 @@ def test_the_result_is_frozen_and_shares_nothing():
     x.flags.writeable = False
     best = dp.minimize(bowl, x)
     assert not np.may_share_memory(best.x, x) and best.x.flags.writeable
-    with pytest.raises(AttributeError, match="the result of minimize is frozen; x cannot be set"):
+    with pytest.raises(AttributeError, match="Minimum is frozen; make a new one instead of setting x"):
         best.x = 1

@@ -132,8 +132,8 @@ BUGS = {
     ),
     "a checkpoint that misses a vector of the optimizer": Bug(
         "optimize",
-        '        state = flatten(template)[1](found["state"])',
-        '        state = flatten(template)[1](found["state"])\n'
+        '        state = flatten(template)[1](content["state"])',
+        '        state = flatten(template)[1](content["state"])\n'
         "        state = state._replace(**{state._fields[1]: template[1]})",
         "tests/test_resume.py",
     ),

@@ -51,6 +51,6 @@ def test_files(tmp_path):
 def test_results_are_frozen_and_print_themselves():
     assert all(issubclass(kind, Result) for kind in (Plan, Certificate, Stress, Rows))
     found = dp.stress(lambda x: x**2, 1.5, only=["as given"])
-    with pytest.raises(AttributeError, match="a stress is frozen; rows cannot be set"):
+    with pytest.raises(AttributeError, match="Stress is frozen; make a new one instead of setting rows"):
         found.rows = []
     assert repr(found) == str(found)

@@ -269,7 +269,6 @@ class Audit(Result):
         How often the loss was evaluated.
     """
 
-    _word = "an audit"
     _plain = (*"verdict reason digits culprit hessian value evaluations size notes lines rows".split(),)
 
     @property

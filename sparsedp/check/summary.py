@@ -8,27 +8,25 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp.recipe import Frozen
+
 __all__ = ["Result", "Row", "Summary", "csv_text", "table", "text_of"]
 
 
-class Result:
+class Result(Frozen):
     """What an instrument gives: frozen, as plain data, as text; true unless it has a verdict other than "agrees".
 
     The attributes are the values it is made with; the docstring of each kind lists them, and nothing else does.
     """
 
-    _word = ""  # what it is called; default: its class
     _columns: tuple = ()  # of its table as CSV; default: those of the first row
     _plain: tuple = ()  # names of the attributes that are plain data; default: all that were given
 
     def __init__(self, **values):
-        self.__dict__.update(values)
+        vars(self).update(values)
 
     def __getattr__(self, name):  # also tells type checkers that there are attributes which no class body names
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"{self._word or f'a {type(self).__name__.lower()}'} is frozen; {name} cannot be set")
 
     @property
     def ok(self):
@@ -93,7 +91,6 @@ class Summary(Result):
         Inconclusive where nothing could be tested.
     """
 
-    _word = "a finding"
     _plain = ("title", "verdict", "limit", "worst", "rows")
 
     limit = 10.0

@@ -58,15 +58,15 @@ def weigh(x, g, shape):
     With a leading axis of samples in `shape` the samples are kept apart.
     """
     rows = g.reshape(*g.shape[:2], prod(g.shape[2:]))
-    found = np.zeros((shape[-2], *shape[:-2], shape[-1]), np.result_type(x, g))
-    totals = found.reshape(*found.shape[:-2], -1)
+    filters = np.zeros((shape[-2], *shape[:-2], shape[-1]), np.result_type(x, g))
+    totals = filters.reshape(*filters.shape[:-2], -1)
     for some, shift, part in _shifted(x, shape[-2:]):
         products = rows[some] @ np.swapaxes(part, 1, 2)
         if len(shape) == 5:
             totals[shift, some] = products
         else:
             totals[shift] += products.sum(axis=0)
-    return np.ascontiguousarray(np.moveaxis(found, 0, -2))
+    return np.ascontiguousarray(np.moveaxis(filters, 0, -2))
 
 
 def _shifted(x, widths):

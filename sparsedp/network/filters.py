@@ -63,9 +63,9 @@ def weight_and_bias(p, layer):
     try:
         return p["weight"], p["bias"]
     except (KeyError, TypeError, IndexError):
-        found = ", ".join(map(str, p)) if isinstance(p, dict) else type(p).__name__
+        names = ", ".join(map(str, p)) if isinstance(p, dict) else type(p).__name__
         raise TypeError(
-            f"{layer} takes the dict of one layer, with weight and bias, got {found}; write p['name'] of that layer"
+            f"{layer} takes the dict of one layer, with weight and bias, got {names}; write p['name'] of that layer"
         ) from None
 
 

@@ -143,7 +143,7 @@ def load(path):
     >>> load(file)
     (1.5, None)
     """
-    found = load_tree(path, FORMAT)
-    if found is None:
+    content = load_tree(path, FORMAT)
+    if content is None:
         raise ValueError(f"{path} was not written by dp.network.save, or is damaged; write it anew")
-    return found[0]
+    return content[0]

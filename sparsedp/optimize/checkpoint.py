@@ -50,30 +50,30 @@ class Checkpoint:
         self._folder.mkdir(parents=True, exist_ok=True)
         self._settings = {name: fingerprint(value) for name, value in self._settings.items()}
         self._settings |= {"loss at the start": _bits(template.trial), "list of batches": ""}
-        found, skipped = self._load()
-        for number in range(found["iteration"] + 1 if found else 1):
+        content, skipped = self._load()
+        for number in range(content["iteration"] + 1 if content else 1):
             self._pass(trials.batches, number)
-        if not found:
+        if not content:
             self.resumed = f"nothing to resume in {self._folder}{skipped}"
             return None
-        self.resumed = f"resumed from iteration {found['iteration']} in {self._folder}{skipped}"
+        self.resumed = f"resumed from iteration {content['iteration']} in {self._folder}{skipped}"
         for name, value in self._settings.items():
-            self._check(name, value == found["settings"].get(name))
-        state = flatten(template)[1](found["state"])
-        trials.iteration = found["iteration"]
+            self._check(name, value == content["settings"].get(name))
+        state = flatten(template)[1](content["state"])
+        trials.iteration = content["iteration"]
         again = trials(state.trial.vector)
         self._check("loss at the last point", not again.refused and _bits(again) == _bits(state.trial))
-        trials.best, trials.count = Trial(*found["best"]), found["evaluations"]
-        watch.resume([_record(row) for row in found["history"]])
+        trials.best, trials.count = Trial(*content["best"]), content["evaluations"]
+        watch.resume([_record(row) for row in content["history"]])
         return state
 
     def _load(self):
         """The newest state that is whole, empty without one, and words on files that were skipped."""
         skipped = [f"; skipped {path.name}: an unfinished write" for path in self._folder.glob(f"*{UNFINISHED}")]
         for path in self._states():
-            found = load_tree(path, FORMAT)
-            if found:
-                return found[0], "".join(skipped)
+            content = load_tree(path, FORMAT)
+            if content:
+                return content[0], "".join(skipped)
             skipped.append(f"; skipped {path.name}: damaged, or not a state of sparsedp")
         return {}, "".join(skipped)
 
@@ -121,8 +121,8 @@ def _digest(content):
 
 def fingerprint(tree):
     """Any value -> a hash of its kind and content: of its structure, of every leaf, of a function its name."""
-    found, rebuild = flatten(tree)
-    return _digest("\n".join([repr(rebuild(range(len(found)))), *map(_word, found)]).encode())
+    entries, rebuild = flatten(tree)
+    return _digest("\n".join([repr(rebuild(range(len(entries)))), *map(_word, entries)]).encode())
 
 
 def _word(leaf):

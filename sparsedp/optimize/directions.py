@@ -216,5 +216,5 @@ def update_direction(outputs, x, g=None, method="auto", apart=False, **options):
         shape = linearised.value.shape
         raise ShapeError(f"the cotangent must have the shape {shape} of the outputs, got {np.shape(g)}")
     check_finite("the cotangent", g)
-    found = family(linearised, np.asarray(g, dtype=float).reshape(-1))
-    return found._replace(step=packing.unpack(found.step))
+    direction = family(linearised, np.asarray(g, dtype=float).reshape(-1))
+    return direction._replace(step=packing.unpack(direction.step))

@@ -60,11 +60,11 @@ class Descent:
         """One iteration. Raises Stuck when no admissible point is found."""
         slope = trials.downhill(state.trial)
         step = self.momentum * state.velocity - state.rate * slope
-        if self.searches and np.dot(step, slope) >= 0:
-            step = -state.rate * slope  # momentum that goes uphill is dropped
         if not self.searches:
-            trial, share = admissible(state.trial.vector, step, state.share, trials)
-            return DescentState(trial, share * step, state.rate, min(1.0, 2 * share))
+            trial, share, larger = admissible(state.trial.vector, step, state.share, trials)
+            return DescentState(trial, share * step, state.rate, larger)
+        if np.dot(step, slope) >= 0:
+            step = -state.rate * slope  # momentum that goes uphill is dropped
         # Halve the step until the loss falls; a full step that does is tried at twice the length next time.
         trial, share = backtracked(state.trial, step, trials, "the gradient")
         return DescentState(trial, share * step, state.rate * (share if share < 1 else 2.0), 1.0)
@@ -73,8 +73,8 @@ class Descent:
 def first_length(first):
     """Length of the first step: |f| / |g|, which brings a linear loss to 0, at most |x|, whichever is known."""
     slope, size = norm(first.slope), norm(first.vector)
-    known = [length for length in (abs(first.value) / slope if slope else 0.0, size) if 0 < length < np.inf]
-    return min(known, default=1.0)
+    lengths = abs(first.value) / slope if slope else 0.0, size
+    return min((length for length in lengths if 0 < length < np.inf), default=1.0)
 
 
 def backtracked(here, step, trials, along):
@@ -99,12 +99,12 @@ def backtracked(here, step, trials, along):
 def admissible(point, step, share, trials):
     """The trial at point + share * step, and the share; halved until the loss has a value there.
 
-    The next iteration tries twice the share, so that a wall does not cost all halvings every time.
+    Also the share for the next iteration, twice as large, so that a wall does not cost all halvings every time.
     """
     for _ in range(HALVINGS):
         trial = trials(trials.box.inside(point + share * step))
         if not trial.refused:
-            return trial, share
+            return trial, share, min(1.0, 2 * share)
         share *= 0.5
     raise Stuck("no admissible point along the step")
 
@@ -164,5 +164,5 @@ class Adam:
         mean = b1 * state.mean + (1 - b1) * slope
         square = b2 * state.square + (1 - b2) * slope**2
         step = -self.rate * (mean / (1 - b1**count)) / (np.sqrt(square / (1 - b2**count)) + self.epsilon)
-        trial, share = admissible(state.trial.vector, step, state.share, trials)
-        return AdamState(trial, mean, square, count, state.scale, min(1.0, 2 * share))
+        trial, _, larger = admissible(state.trial.vector, step, state.share, trials)
+        return AdamState(trial, mean, square, count, state.scale, larger)

@@ -150,5 +150,5 @@ class HalfInverse(GaussNewton):
         """One iteration, on the batch of the present one."""
         linearised = trials.linearised(state.trial)
         step = -self.rate * self._family(linearised, linearised.flat).step
-        trial, share = admissible(state.trial.vector, step, state.share, trials)
-        return SquaresState(trial, share=min(1.0, 2 * share))
+        trial, _, larger = admissible(state.trial.vector, step, state.share, trials)
+        return SquaresState(trial, share=larger)

@@ -146,8 +146,8 @@ class Linearised:
         jacobian = jacobian.reshape(self.shape)
         # A function that looks at one copy alone gives outputs of the right shape and wrong rows.
         probe = np.cos(np.arange(self.shape[0]))
-        found, known = self._free * (probe @ jacobian), self.pull(probe)
-        if not np.linalg.norm(found - known) <= 1e-6 * np.linalg.norm(known):
+        by_rows, by_tape = self._free * (probe @ jacobian), self.pull(probe)
+        if not np.linalg.norm(by_rows - by_tape) <= 1e-6 * np.linalg.norm(by_tape):
             raise ShapeError(NOT_APART.format(samples))
         return jacobian
 

@@ -145,11 +145,14 @@ def minimize(
     if batches.varied and stepper.searches:
         raise ValueError(f"{method} compares losses and cannot use batches; write method='adam', or give gd a rate")
     for inner in (getattr(stepper, "rule", None), project):
-        loss = loss if inner is None else _composed(loss, inner)
+        if inner is not None:
+            loss = _composed(loss, inner)
     box = Box.of(bounds, packing, start)
     trials = Trials(loss, gradient, packing, box, batches, stepper if stepper.residuals else None)
-    sides = box.lower, box.upper
-    settings = {"method": method, "set of options": sorted(options.items()), "pair of bounds": sides, "start": start}
+    settings = {
+        "method": method, "set of options": sorted(options.items()), "pair of bounds": (box.lower, box.upper),
+        "start": start,
+    }  # fmt: skip
     kept = Checkpoint(checkpoint, settings)
     covariance = None
     watch = Watch(trials, packing, tolerance, callback)
@@ -205,8 +208,8 @@ def _composed(loss, inner):
 def _stepper(method, options):
     if method not in tuple(METHODS):
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    known = list(inspect.signature(METHODS[method]).parameters)
+    names = list(inspect.signature(METHODS[method]).parameters)
     for name in options:
-        if name not in known:
-            raise TypeError(f"{method} has no option {name!r}; it has {', '.join(known)}")
+        if name not in names:
+            raise TypeError(f"{method} has no option {name!r}; it has {', '.join(names)}")
     return METHODS[method](**options)

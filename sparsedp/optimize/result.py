@@ -4,6 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp.recipe import Frozen
+
 __all__ = ["Failure", "Minimum", "Record", "Stuck", "Trial"]
 
 SHOWN = 6  # lines of the history at each end
@@ -59,7 +61,7 @@ class Record(NamedTuple):
         return f"loss {self.value:.6g}, gradient {self.gradient_norm:.1e}{refused}"
 
 
-class Minimum:
+class Minimum(Frozen):
     """The result of `minimize`. Frozen.
 
     Attributes
@@ -95,10 +97,7 @@ class Minimum:
     covariance: Any
 
     def __init__(self, **parts):
-        self.__dict__.update(parts)
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"the result of minimize is frozen; {name} cannot be set")
+        vars(self).update(parts)
 
     def __str__(self):
         last = self.history[-1]
