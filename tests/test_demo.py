@@ -39,7 +39,7 @@ def demo(folder, *arguments, **options):
 def finished(tmp_path_factory):
     """One small run with the default terrain, shared by the tests that look at it."""
     folder = tmp_path_factory.mktemp("demo")
-    return folder / "sparsedp-demo", demo(folder, "--size", "24")
+    return folder / "sparsedp-demo", demo(folder, "--size", "16")
 
 
 def test_it_ends_well(finished):
@@ -63,7 +63,7 @@ def test_it_prints_a_line_for_each_iteration(finished):
 def test_table(finished):
     with open(finished[0] / "table.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert [int(row["unknowns"]) for row in rows] == [12 * 10, 18 * 15, 24 * 20]
+    assert [int(row["unknowns"]) for row in rows] == [8 * 7, 12 * 10, 16 * 14]
     for row in rows:
         assert float(row["error"]) < 0.8
         assert float(row["gradient_error"]) < 1e-6
@@ -75,13 +75,13 @@ def test_table(finished):
 
 def test_recovered_field(finished):
     found = np.load(finished[0] / "recovered.npy", allow_pickle=False)
-    assert found.shape == (24, 20) and np.all(np.isfinite(found))
+    assert found.shape == (16, 14) and np.all(np.isfinite(found))
 
 
 def test_nothing_is_overwritten_unasked(finished):
     folder, _ = finished
     before = {name: (folder / name).read_bytes() for name in os.listdir(folder)}
-    again = demo(folder.parent, "--size", "24")
+    again = demo(folder.parent, "--size", "16")
     assert again.returncode == 2 and again.stdout == ""
     assert re.fullmatch(r"sparsedp: .* is there already; [^\n]*\n", again.stderr)
     assert before == {name: (folder / name).read_bytes() for name in os.listdir(folder)}

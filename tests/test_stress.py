@@ -41,10 +41,19 @@ def number(d, nu=1.0):
     return {"dt": d / 24**2 / nu, "nu": nu}
 
 
-def test_a_stable_step_passes():
-    result = dp.stress(explicit, number(0.4))
-    assert result and result.counts["FAILED"] == 0 and not result.failures
-    assert ("growth in one step", "passed", "") in notes(result, "as given")
+shared = pytest.mark.xdist_group("stress")  # most of them look at one run
+
+
+@pytest.fixture(scope="module")
+def stable():
+    """All cases of a step that is small enough, its map included."""
+    return dp.stress(explicit, number(0.4), ranges={"nu": (0.5, 1.0)})
+
+
+@shared
+def test_a_stable_step_passes(stable):
+    assert stable and stable.counts["FAILED"] == 0 and not stable.failures
+    assert ("growth in one step", "passed", "") in notes(stable, "as given")
 
 
 @pytest.mark.parametrize("d", [0.52, 0.6, 3.0])
@@ -175,9 +184,9 @@ def test_implicit_diffusion_passes_and_has_a_map():
 # ---- the value ------------------------------------------------------------------------------------------------------
 
 
-def test_what_it_is_as_data_and_text():
-    result = dp.stress(explicit, number(0.4), ranges={"nu": (0.5, 1.0)})
-    data = result.to_dict()
+@shared
+def test_what_it_is_as_data_and_text(stable):
+    result, data = stable, stable.to_dict()
     assert data["counts"] == result.counts and len(data["rows"]) == len(result.rows)
     assert sum(result.counts.values()) == len(result.rows)
     assert len(result.csv().splitlines()) == len(result.rows) + 1
@@ -186,16 +195,16 @@ def test_what_it_is_as_data_and_text():
     assert np.shape(data["map"]["factors"]) == (9, 9)
 
 
-def test_the_map_knows_the_limit_of_euler():
-    found = dp.stress(explicit, number(0.4), only=["time step and viscosity"]).map
-    d = found.time_steps[:, None] * found.viscosities * 24**2
-    assert np.all(found.factors[d < 0.49] <= 1.001) and np.all(found.factors[d > 0.55] > 1.1)
+@shared
+def test_the_map_knows_the_limit_of_euler(stable):
+    d = stable.map.time_steps[:, None] * stable.map.viscosities * 24**2
+    assert np.all(stable.map.factors[d < 0.49] <= 1.001) and np.all(stable.map.factors[d > 0.55] > 1.1)
 
 
-def test_the_picture():
+@shared
+def test_the_picture(stable):
     plots = pytest.importorskip("matplotlib") and __import__("sparsedp.report.plots", fromlist=["figure"])
-    result = dp.stress(explicit, number(0.4), only=["time step and viscosity"])
-    assert result.plot(plots.figure().add_subplot()).get_ylabel() == "dt"
+    assert stable.plot(plots.figure().add_subplot()).get_ylabel() == "dt"
 
 
 # ---- the table of cases ---------------------------------------------------------------------------------------------
