@@ -204,27 +204,23 @@ class Grid(Value, Uncached):
         on_edges = self.dim == 3 and tuple(map(np.shape, parts)) == self.edges.parts
         return (self.edges if on_edges else self.faces).join(*parts)
 
-    @cached_property
-    def _node_coordinates(self):
-        ends = [np.concatenate([[0.0], np.cumsum(widths)]) for widths in self.widths]
-        return tuple(start + end for start, end in zip(self.origin, ends, strict=True))
-
     def coordinates(self, axis, at="cells"):
-        """1-D coordinates along one axis [length]: of the `cells` (centres) or of the `nodes`.
+        """1-D coordinates along one axis [length]: of the `cells` (centres), the `nodes`, or the `ends` of cells.
 
         Parameters
         ----------
         axis : int
-        at : "cells" or "nodes"
+        at : "cells", "nodes" or "ends"
+            Ends of cells are nodes, and on a periodic axis one more: where the last cell ends.
 
         Returns
         -------
         array, shape (n,)
         """
-        nodes = self._node_coordinates[axis]
-        if at == "nodes":
-            return nodes[: self.node_count(axis)].copy()
-        return 0.5 * (nodes[:-1] + nodes[1:])
+        ends = self.origin[axis] + np.append(0.0, np.cumsum(self.widths[axis]))
+        if at == "cells":
+            return 0.5 * (ends[:-1] + ends[1:])
+        return ends[: self.node_count(axis)] if at == "nodes" else ends
 
     def centres(self):
         """Coordinates of the cell centres: a tuple of `dim` full arrays, also in 1-D.

@@ -11,7 +11,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.check.properties import facts_of
-from sparsedp.check.summary import Row, Summary
+from sparsedp.check.summary import Row, Summary, error_text
 from sparsedp.check.sweep import generator
 from sparsedp.derivative import hvp, pullback, pushforward
 from sparsedp.errors import DerivativeError
@@ -104,7 +104,7 @@ class Probe:
         try:
             gap = float(self.gap(name, dtype))
         except Exception as error:
-            note = f"{type(error).__name__}: {error}"
+            note = error_text(error)
             return Row(label, note=f"refused, {note}") if optional else Row(label, inf, LIMIT, False, note)
         return Row(label, inf if isnan(gap) else gap, LIMIT, gap <= LIMIT)
 
@@ -379,9 +379,7 @@ def operator(op, seeds=3, rng=None):
         try:
             probe = Probe(op, seeds, rng)
         except Exception as error:  # a foreign function may raise anything
-            return OperatorSummary(
-                op, None, [Row("application", inf, LIMIT, False, f"{type(error).__name__}: {error}")]
-            )
+            return OperatorSummary(op, None, [Row("application", inf, LIMIT, False, error_text(error))])
         return OperatorSummary(op, probe, _rows(probe))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparsedp.recipe import Frozen
 
-__all__ = ["Result", "Row", "Summary", "csv_text", "table", "text_of"]
+__all__ = ["Result", "Row", "Summary", "csv_text", "error_text", "table", "text_of"]
 
 
 class Result(Frozen):
@@ -114,6 +114,11 @@ class Summary(Result):
         limits = ["" if row.limit is None else f"<= {row.limit:g}" for row in self.rows]
         cells = [(*row[:2], limit, words[row.ok], row.note) for row, limit in zip(self.rows, limits)]
         return "\n".join([*self._head(), table(cells)])
+
+
+def error_text(error):
+    """An error in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def text_of(value):

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp.check.summary import error_text
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
 from sparsedp.ledger import recording, thread
 from sparsedp.packing import Packing, joined
@@ -251,7 +252,7 @@ class Line:
         try:
             value = self.trials.value(self.point.tree(arrays))
         except REFUSALS as error:
-            return np.nan, change, f"{type(error).__name__}: {error}"
+            return np.nan, change, error_text(error)
         return value, change, "" if np.isfinite(value) else "the loss overflows"
 
     def sweep(self, steps):

@@ -39,9 +39,9 @@ ROUNDING = 1e-14  # of the value
 
 def distance(one, other, unit=None):
     """Euclidean distance of two trees, relative to a third: by default the second; None counts for nothing."""
-    found, wanted = ([np.shape(leaf) for leaf in leaves(tree)] for tree in (one, other))
-    if found != wanted:
-        raise ValueError(f"workprec cannot compare shapes {found} with {wanted}; give compare=function(found, wanted)")
+    shapes, wanted = ([np.shape(leaf) for leaf in leaves(tree)] for tree in (one, other))
+    if shapes != wanted:
+        raise ValueError(f"workprec cannot compare shapes {shapes} with {wanted}; give compare=function(result, exact)")
     gaps = [np.subtract(a, b) for a, b in zip(leaves(one), leaves(other)) if a is not None]
     return norm(gaps) / (norm(other if unit is None else unit) or 1.0)
 
@@ -183,8 +183,8 @@ def certify(loss, x, target=TARGET):
     >>> from sparsedp import Grid, dirichlet, inverse, laplacian
     >>> solve = inverse(-laplacian(Grid((16, 16)), dirichlet), "krylov", rtol=1e-3)
     >>> b = np.ones((16, 16))
-    >>> found = certify(lambda b: anp.sum(solve(b) ** 2), b)
-    >>> bool(1e-6 < found.gradient_error < 1e-2), list(found.causes)
+    >>> certificate = certify(lambda b: anp.sum(solve(b) ** 2), b)
+    >>> bool(1e-6 < certificate.gradient_error < 1e-2), list(certificate.causes)
     (True, ['forward solves', 'adjoint solves'])
     """
     if not (is_number(target) and 0 < target < 1):
@@ -201,9 +201,9 @@ def certify(loss, x, target=TARGET):
     error, names = distance(slope, gradient), dict.fromkeys(map(_solver, solves))
     rows = []
     for name in names:
-        own = slope if len(names) == 1 else corrected(lambda key, name=name: _solver(key) == name)
-        mine = [(key[1], solve) for key, solve in solves.items() if _solver(key) == name]
-        rows.append(_row(name, distance(own, gradient), mine))
+        alone = slope if len(names) == 1 else corrected(lambda key, name=name: _solver(key) == name)
+        pairs = [(key[1], solve) for key, solve in solves.items() if _solver(key) == name]
+        rows.append(_row(name, distance(alone, gradient), pairs))
     best = RecordedSolves(left).run(loss, x)  # once more: a value tells its own error, and that of the correction
     return Certificate(
         value=value, gradient=gradient, corrected_value=best, corrected_gradient=slope, gradient_error=error,
@@ -221,8 +221,8 @@ def _row(name, error, solves):
     row = {"solver": name, "rtol": max(solve.rtol for _, solve in solves), "error": error}
     row["iterative"] = any(solve.iterative for _, solve in solves)
     for kind in ("forward", "adjoint"):
-        own = [np.linalg.norm(solve.r) / (solve.size or inf) for way, solve in solves if way == kind]
-        row |= {kind: len(own), f"{kind} residual": float(max(own, default=0.0))}
+        residuals = [np.linalg.norm(solve.r) / (solve.size or inf) for way, solve in solves if way == kind]
+        row |= {kind: len(residuals), f"{kind} residual": float(max(residuals, default=0.0))}
     return row
 
 

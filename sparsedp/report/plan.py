@@ -183,8 +183,7 @@ def _applied(actor):
 
 
 def _gradient(x, asked):
-    found = leaves(x)
-    fixed = len(found) - sum(map(is_variable, found))
+    fixed = sum(not is_variable(leaf) for leaf in leaves(x))
     if not asked:
         yield "the gradient: not asked, nothing taped"
     elif fixed:

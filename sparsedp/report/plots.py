@@ -74,7 +74,9 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, cmap="viridis", 
     low, high = limits or _range(u)
     for view, values, axes in [(ax, u, (0, 1))] if grid.dim == 2 else _slices(grid, u, kind, ax):
         # pcolormesh wants rows along y, so the array is turned here and nowhere else.
-        lines, options = [_lines(grid, a, kind) for a in axes], {"vmin": low, "vmax": high, "cmap": cmap}
+        # It takes nodes, or the ends of cells.
+        lines = [grid.coordinates(a, "nodes" if kind == "nodes" else "ends") for a in axes]
+        options = {"vmin": low, "vmax": high, "cmap": cmap}
         image = view.pcolormesh(*lines, values.T, shading="auto", rasterized=True, **options)
         view.set(aspect="equal", xlabel=grid.axes[axes[0]], ylabel=grid.axes[axes[1]])
     bar = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the map, whatever its shape
@@ -127,9 +129,8 @@ def animate(grid, frames, path, title=None, limits=None, cmap="viridis", rate=12
     for frame in frames:
         picture, pixels = figure(), io.BytesIO()
         plot(grid, frame, ax=picture.add_subplot(), title=title, limits=limits, cmap=cmap)
-        picture.savefig(pixels, format="rgba", dpi="figure")
-        raw = image.frombytes("RGBA", picture.canvas.get_width_height(), pixels.getvalue())
-        images.append(raw.convert("RGB").quantize(256))
+        picture.savefig(pixels, format="png", dpi="figure")
+        images.append(image.open(pixels).convert("RGB").quantize(256))
     options = {"save_all": True, "append_images": images[1:], "duration": round(1000 / rate), "loop": 0}
     film = partial(images[0].save, format="GIF", **options)
     film(path) if hasattr(path, "write") else write_file(path, film)
@@ -155,13 +156,6 @@ def _scalar(grid, u, at=None):
 def _range(u):
     finite = u[np.isfinite(u)]
     return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-
-
-def _lines(grid, axis, kind):
-    """The coordinates that pcolormesh takes along one axis: of nodes, or of the corners of cells."""
-    if kind == "nodes":
-        return grid.coordinates(axis, kind)
-    return grid.origin[axis] + np.append(0.0, np.cumsum(grid.widths[axis]))
 
 
 def _slices(grid, u, kind, ax):

@@ -5,6 +5,7 @@ The folder gets Markdown, CSV and pictures of each instrument, and a page that s
 
 import contextlib
 import inspect
+import json
 import os
 import re
 import runpy
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sparsedp import check
+from sparsedp.check.summary import error_text
 from sparsedp.files import write_file
 from sparsedp.report import plots
 from sparsedp.report.certificate import certify
@@ -69,18 +71,18 @@ def load(target):
     if parts is None:
         raise ValueError(f"{target!r} names no scene; write FILE.py:loss, or FILE.py:loss:start")
     file, loss, start = Path(parts[1]), parts[2] or "loss", parts[3]
-    found = _run(file)
-    if not callable(found.get(loss)):
+    names = _run(file)
+    if not callable(names.get(loss)):
         raise ValueError(f"{file} has no function {loss!r}; write {file}:NAME of the function to examine")
-    place = next((name for name in ([start] if start else STARTS) if name in found), None)
+    place = next((name for name in ([start] if start else STARTS) if name in names), None)
     if place is None:
         raise ValueError(f"{file} has no {start or ' or '.join(STARTS)!r}, the point; write {file}:{loss}:NAME")
     name = file.stem if loss == "loss" else f"{file.stem}-{loss}"
-    options = [found.get(key, {}) for key in OPTIONS]
+    options = [names.get(key, {}) for key in OPTIONS]
     for key, given in zip(OPTIONS, options):
         if not isinstance(given, dict):
             raise ValueError(f"{key} in {file} must be a dict of arguments, got {type(given).__name__}")
-    return Source(name, _of_one(found[loss], found[place]), found[place], *options)
+    return Source(name, _of_one(names[loss], names[place]), names[place], *options)
 
 
 @contextlib.contextmanager
@@ -188,7 +190,7 @@ def _attempt(run, source):
     try:
         return run(source)
     except Exception as error:  # the loss is the user's: it may raise anything
-        return " ".join(f"{type(error).__name__}: {error}".split())
+        return error_text(error)
 
 
 def _audit(audit):
@@ -204,7 +206,8 @@ def _workprec(table):
         if row is None:
             yield f"error against run time: no method reaches {words}, see {table.stem}.md"
             return
-        yield f"fastest at {words}: {row['method']} ({words_of(row)}), {table.seconds(row, table.judged):.1e} s"
+        settings = words_of(json.loads(row["settings"]))
+        yield f"fastest at {words}: {row['method']} ({settings}), {table.seconds(row, table.judged):.1e} s"
 
 
 def _certificate(certificate):

@@ -13,6 +13,7 @@ import numpy as np
 
 from sparsedp.check.judge import judgement
 from sparsedp.check.operators import layouts
+from sparsedp.check.summary import error_text
 from sparsedp.check.sweep import Line, Point, Trials, generator, rms
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
@@ -120,8 +121,7 @@ def run(loss, x):
     except Exception as error:  # a scene may raise anything: its row shows it
         chance = isinstance(error, (np.linalg.LinAlgError, UnicodeError))
         typed = isinstance(error, (SparsedpError, ValueError, TypeError)) and not chance
-        words = " ".join(f"{type(error).__name__}: {error}".split())
-        return Outcome(nan, [], (REFUSED if typed else DEGRADED, nan, words))
+        return Outcome(nan, [], (REFUSED if typed else DEGRADED, nan, error_text(error)))
     return Outcome(float(value), [np.asarray(g) for g in leaves(gradient) if g is not None], (), thread.grown > grown)
 
 

@@ -47,13 +47,10 @@ def text_table(rows, names):
 
 def markdown_table(rows, names):
     """Table -> lines of Markdown."""
-    cells = [[" ".join(text.split()).replace("|", "\\|") for text in line] for line in (names, *_texts(rows, names))]
+    lines = [names, *([text_of(row.get(name)) for name in names] for row in rows)]
+    cells = [[" ".join(text.split()).replace("|", "\\|") for text in line] for line in lines]
     head, *body = [f"| {' | '.join(line)} |" for line in cells]
     return [head, f"|{'---|' * len(names)}", *body]
-
-
-def _texts(rows, names):
-    return [[text_of(row.get(name)) for name in names] for row in rows]
 
 
 def write_table(folder, stem, markdown, csv, draw=None):

@@ -63,7 +63,7 @@ def workprec(
         replace those of the row: of two the second is used, and its distance from the first is the error of
         the reference. Default: the errors are NaN.
     compare : callable, optional
-        ``compare(found, wanted)`` -> error of a gradient or an answer. Default: Euclidean, relative.
+        ``compare(result, exact)`` -> error of a gradient or an answer. Default: Euclidean, relative.
     repeats : int
         Timed runs after the warm ones; the least counts.
     file : path, optional
@@ -116,11 +116,11 @@ def workprec(
     finished = {tuple(map(row.get, KEY)): row for row in _stored(file)}
     other = sum(row["versions"] != now for row in finished.values())
     skipped = [f"{other} rows of {Path(file).name} from other versions: run again"] if other else []
-    for (method, own), *values in itertools.product(methods.items(), *over.values()):
-        settings = dict(zip(over, values)) | own
+    for (method, choice), *values in itertools.product(methods.items(), *over.values()):
+        settings = dict(zip(over, values)) | choice
         reason = skip and skip(str(method), settings)
         if reason:
-            skipped.append(f"{method} with {_words(settings)}: {reason}")
+            skipped.append(f"{method} with {words_of(settings)}: {reason}")
             continue
         key = scene, str(method), _text_of(settings), str(seed), now
         if key not in finished:
@@ -133,12 +133,8 @@ def workprec(
     return Rows(scene=scene, over=tuple(over), rows=rows, left_out=skipped)
 
 
-def words_of(row):
-    """The settings of a row in words."""
-    return _words(json.loads(row["settings"]))
-
-
-def _words(settings):
+def words_of(settings):
+    """Settings in words."""
     return ", ".join(f"{name}={value}" for name, value in settings.items()) or "no settings"
 
 
@@ -148,13 +144,13 @@ def _text_of(settings):
 
 def _versions():
     """Python and the libraries that figures depend on, in words."""
-    found = [f"python {platform.python_version()}"]
+    words = [f"python {platform.python_version()}"]
     for name in ("sparsedp", "numpy", "scipy", "autograd", "pyamg", "numba"):
         try:
-            found.append(f"{name} {version(name)}")
+            words.append(f"{name} {version(name)}")
         except PackageNotFoundError:
-            found.append(f"{name} -")
-    return " ".join(found)
+            words.append(f"{name} -")
+    return " ".join(words)
 
 
 # ---------------------------------------------------------------- one run: timed, weighed, counted
@@ -226,8 +222,7 @@ def _times(runs, repeats):
     least, result = 0.0, None
     for name, run in zip(("seconds_forward", "seconds_backward"), runs):
         seconds, results = zip(*(timed(run) for _ in range(repeats)))
-        own = np.maximum(np.subtract(seconds, least), 0.0)
-        times = np.quantile(own, (0.0, 0.5, 1.0)).tolist()
+        times = np.quantile(np.maximum(np.subtract(seconds, least), 0.0), (0.0, 0.5, 1.0)).tolist()
         row |= dict(zip((name, f"{name}_median", f"{name}_max"), times))
         least, result = times[0], results[-1]
     return row, result
@@ -270,23 +265,23 @@ def _errors(exact, compare, shared, answer, gradient):
 
 def _exact(problem, given, compare):
     """The reference in any of its forms -> function of the shared settings: (answer, gradient, error of both)."""
-    known: dict = {}  # by the settings, in words: found once for all methods
+    results: dict = {}  # by the settings, in words: one for all methods
 
-    def found(shared):
+    def result_of(shared):
         if given is None:
             return None, None, nan
         if callable(given) or isinstance(given, tuple):
             return *(given(**shared) if callable(given) else given), 0.0
-        tasks = [_prepared(problem, shared | own) for own in ([given] if isinstance(given, dict) else given)]
+        tasks = [_prepared(problem, shared | finer) for finer in ([given] if isinstance(given, dict) else given)]
         *coarser, finest = [answers(runs[-1]()) for runs, _, answers in tasks]
         gaps = [compare(a, b) for rough in coarser for a, b in zip(rough, finest) if a is not None]
         return *finest, max(gaps, default=nan)
 
     def exact(shared):
         words = _text_of(shared)
-        if words not in known:
-            known[words] = found(shared)
-        return known[words]
+        if words not in results:
+            results[words] = result_of(shared)
+        return results[words]
 
     return exact
 

@@ -16,7 +16,7 @@ from numpy.random import default_rng
 
 import sparsedp as dp
 
-__all__ = ["NOISE", "Ground", "Survey", "objective", "regulariser", "survey"]
+__all__ = ["NOISE", "Ground", "Survey", "centres_of", "objective", "regulariser", "survey"]
 
 RIVERS = {"x": dp.dirichlet, "y": dp.neumann}
 RADIUS = 0.05  # of the gravel pack around a well [longest side]
@@ -81,7 +81,7 @@ class Survey(NamedTuple):
 
 def survey(grid, logk):
     """Hidden ground -> Survey. It is made on a grid of its own, finer than those that invert it."""
-    wells, sensors = lattice(WELLS, grid.size), lattice(SENSORS, grid.size)
+    wells, sensors = (centres_of(dp.Grid(counts, size=grid.size)) for counts in (WELLS, SENSORS))
     exact = Ground(grid, wells, sensors).readings(logk)
     noise = NOISE * np.sqrt(np.mean(exact**2, axis=1, keepdims=True))
     # Uniform numbers of standard deviation 1: their stream is the same with every version of NumPy.
@@ -89,7 +89,6 @@ def survey(grid, logk):
     return Survey(wells, sensors, exact + noise * spread, noise)
 
 
-def lattice(counts, size):
-    """Points in regular rows over the box, shape (m, 2)."""
-    lines = [(np.arange(n) + 0.5) / n * extent for n, extent in zip(counts, size)]
-    return np.stack([full.ravel() for full in np.meshgrid(*lines, indexing="ij")], axis=1)
+def centres_of(grid):
+    """The centres of the cells of a grid as points, shape (m, 2)."""
+    return np.stack([centres.ravel() for centres in grid.centres()], axis=1)

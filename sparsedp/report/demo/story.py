@@ -70,9 +70,9 @@ def prepare(terrain, grids):
 
 
 class Recovery(NamedTuple):
-    """What one grid found: the log-conductivity, its row of the table, and the errors after each iteration."""
+    """What one grid gives: the log-conductivity, its row of the table, and the errors after each iteration."""
 
-    found: np.ndarray
+    logk: np.ndarray
     row: dict
     curve: np.ndarray  # seconds, errors
 
@@ -137,17 +137,17 @@ def tell(study, folder, force):
         If one has come there during the run, and `force` is not set.
     """
     print(INTRODUCTION.format(s=study, d=study.data, noise=100 * NOISE), flush=True)
-    found = [recover(study, grid) for grid in study.grids]
-    rows = [one.row for one in found]
+    recoveries = [recover(study, grid) for grid in study.grids]
+    rows, logk = [one.row for one in recoveries], recoveries[-1].logk
     print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
     print(text_table(rows, SHOWN), end="\n\n")
     claim(folder, FILES, force)  # once more: it is a while since the run began
     write_file(folder / "table.csv", csv_text(rows))
-    write_file(folder / "recovered.npy", lambda stream: np.save(stream, found[-1].found, allow_pickle=False))
+    write_file(folder / "recovered.npy", lambda stream: np.save(stream, logk, allow_pickle=False))
     try:
         plots.write_picture(folder / "truth.png", partial(_map, study, "Hidden ground", study.truth))
-        plots.write_picture(folder / "recovery.png", partial(_map, study, "Recovered", found[-1].found))
-        plots.write_picture(folder / "convergence.png", partial(_convergence, found))
+        plots.write_picture(folder / "recovery.png", partial(_map, study, "Recovered", logk))
+        plots.write_picture(folder / "convergence.png", partial(_convergence, recoveries))
     except ImportError as error:
         print(f"No pictures: {error}")
     print(f"Written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
@@ -171,7 +171,7 @@ def _map(study, title, field, ax):
     return ax
 
 
-def _convergence(found, ax):
+def _convergence(recoveries, ax):
     """Error against run time, one curve for each grid."""
-    lines = {f"{one.row['grid']} cells": one.curve for one in found}
+    lines = {f"{one.row['grid']} cells": one.curve for one in recoveries}
     return plots.curves(lines, ax, "run time [s]", "relative error of log conductivity (flat start: 1)")

@@ -12,6 +12,7 @@ import numpy as np
 import sparsedp as dp
 from sparsedp.fields import check_finite
 from sparsedp.report import plots
+from sparsedp.report.demo.scene import centres_of
 
 __all__ = ["Terrain", "hidden_ground", "load", "read_field", "remap"]
 
@@ -85,8 +86,7 @@ def remap(source, grid):
     ratio = max(n / m for n, m in zip(source.shape, grid.shape))
     parts = int(np.clip(np.ceil(ratio), 1, FINEST))
     fine = dp.Grid(tuple(parts * m for m in grid.shape), size=grid.size)
-    points = np.stack([centre.ravel() for centre in fine.centres()], axis=1)
-    return dp.restrict(fine, parts) @ dp.sample(source, points)
+    return dp.restrict(fine, parts) @ dp.sample(source, centres_of(fine))
 
 
 def hidden_ground(grid, terrain):
