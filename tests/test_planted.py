@@ -48,6 +48,18 @@ BUGS = {
         "        new = _advanced(q, g(p, params), h, z)\n        return _advanced(p, f(q, params), h, s), new",
         "tests/test_leapfrog.py",
     ),
+    "a force that acts on walls": Bug(
+        "flow",
+        "a = a + self.free(self._pushed(",
+        "a = a + (self._pushed(",
+        "tests/test_flow.py",
+    ),
+    "the rate of a scalar that is not carried on": Bug(
+        "flow",
+        "ahead = u + self.flow.dt * (1.5 * rate - 0.5 * before)",
+        "ahead = u + self.flow.dt * rate",
+        "tests/test_flow_scalars.py",
+    ),
     "a missing 1/h": Bug(
         "operators",
         "    step = 1 / grid.spacings(axis)[face]",

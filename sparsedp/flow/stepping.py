@@ -7,20 +7,33 @@ with a(v) = force(v) - div(v v), and + nu (L v + B) in place of the last term wh
 Adams-Bashforth for what is explicit, the trapezoidal rule for an implicit viscosity, and a pressure that is corrected,
 not found anew (incremental).
 Source: van Kan, SIAM J. Sci. Stat. Comput. 7 (1986), second order pressure correction.
+
+Scalars, such as heat or dye, go along in the same way, with the velocity of the same time:
+
+    s_next = s + dt (3/2 r(s, v) - 1/2 r_before) + dt k (L (s + s_next) / 2 + D B),    r = source - D(v (A s + W)),
+
+and + k (L s + D B) in r where diffusion is explicit; B and W bring in what the walls hold, to slopes and to faces.
+
+Convection is explicit. A wave that moves by the Courant number c in a step and is damped by d = dt nu k^2 grows, under
+Adams-Bashforth, by the largest root |z| of
+
+    z^2 - z = (3/2 z - 1/2) (i c - d),      or, with implicit damping,  (z^2 - z) + d z (z + 1) / 2 = (3/2 z - 1/2) i c.
 """
 
 from typing import Any
 
 import numpy as np
 
-from sparsedp.conditions import no_slip
+from sparsedp.conditions import neumann, no_slip, outflow, resolve
 from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import check_function, is_number, rounded_down
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
-from sparsedp.operators.boundary import identity, mask
-from sparsedp.operators.difference import gradient
+from sparsedp.flow.setup import faces_that
+from sparsedp.operators.boundary import identity, lift, mask
+from sparsedp.operators.difference import divergence, gradient, laplacian
+from sparsedp.operators.transfer import average
 from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import inverse
 from sparsedp.tape import dtype_of, isbox, plain
@@ -28,6 +41,9 @@ from sparsedp.tape import dtype_of, isbox, plain
 __all__ = ["FlowStep", "flow_step"]
 
 ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
+SCALAR = "diffusivity", "boundary", "values", "source"
+GROWTH = 1.02  # of a wave in one step, that is taken: Adams-Bashforth without damping always has a little
+SURE = 0.5  # Courant number up to which no wave grows by that much
 
 
 def flow_step(
@@ -41,6 +57,8 @@ def flow_step(
     convective=True,
     walls=None,
     solid_boundary=no_slip,
+    scalars=None,
+    unstable="raise",
 ):
     """Grid -> ``step(state, params)`` of incompressible flow, of order 2 in space and time.
 
@@ -61,13 +79,21 @@ def flow_step(
         False: Stokes flow, no div(v v).
     walls : array, optional
         What moving walls add, ``face_lift(grid, boundary)(values)``.
+    scalars : dict, optional
+        Of cell fields that the flow carries: ``{"heat": {"diffusivity": 0.1, "boundary": {"x": dp.dirichlet},
+        "values": values, "source": lambda s, params: ...}}``, all four optional: a number >= 0 [length^2 / time], a
+        condition or dict (default neumann), wall values as `lift` takes them, a rate [scalar / time] that gets the dict
+        of all scalars. The force is then ``force(v, s, params)``.
+    unstable : "raise" or "allow"
+        What to do when a step is so long that waves would grow.
 
     Returns
     -------
     FlowStep
         ``step.start(v, params=None)`` makes the first state, a dict of the velocity "v" [velocity], the pressure "p"
         [velocity^2] and the acceleration before "a"; ``step(state, params)`` the next one. For `rollout`. The params
-        are those of the force.
+        are those of the force. With scalars ``step.start(v, params, s)``, s a dict of fields: the state has them as
+        "s", and their rates before as "r".
 
     Raises
     ------
@@ -80,13 +106,13 @@ def flow_step(
     NonFiniteError
         If dt or the viscosity is NaN or infinite; on use, if the velocity is.
     UnstableStepError
-        If dt is beyond what explicit viscosity allows.
+        If dt is beyond what explicit viscosity or diffusivity allows; on use, beyond what convection allows.
 
     Notes
     -----
     A step of explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth); a longer one is refused.
-    Convection is explicit and no step is refused for it: where there is little viscosity, keep dt times the sum over
-    axes of the largest |v| / h below 0.5. A longer step grows until the velocity overflows.
+    Convection is explicit: with c, dt times the largest sum over the axes of |v| / h in a cell, a step is refused where
+    waves would grow by more than 2 % in it. Without viscosity that is c > 0.53; viscosity allows more.
     Cost: one pressure solve, and one solve for implicit viscosity; the same again backward.
     Source: van Kan, SIAM J. Sci. Stat. Comput. 7 (1986).
 
@@ -110,8 +136,17 @@ def flow_step(
             f"flow_step takes walls on {grid.faces}, got an array of shape {np.shape(plain(walls))}; write "
             "face_lift(grid, boundary)(values)"
         )
+    if unstable not in ("raise", "allow"):
+        raise ValueError(f"unstable must be 'raise' or 'allow', got {unstable!r}")
+    for name, given in (scalars or {}).items():
+        if not isinstance(given, dict) or not given.keys() <= set(SCALAR):
+            raise ValueError(f"scalar {name!r} of flow_step needs a dict of {', '.join(SCALAR)}, got {given!r}")
+        _check_constant(f"diffusivity of {name!r}", given.get("diffusivity", 0.0), ">= 0")
+        if given.get("source") is not None:
+            check_function("flow_step", given["source"], "source=lambda s, params: ...")
     viscosity = viscosity if callable(viscosity) else float(viscosity)
-    return FlowStep(grid, float(dt), viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary)
+    given = grid, float(dt), viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
+    return FlowStep(*given, scalars or {}, unstable)
 
 
 def _check_constant(name, number, least):
@@ -129,64 +164,88 @@ def _check_constant(name, number, least):
 class FlowStep(Remade):
     """A step of incompressible flow, made by `flow_step`. What the scene does not need is None."""
 
-    def __init__(self, grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary):
-        self.grid, self.dt, self.viscosity, self.force = grid, dt, viscosity, force
+    def __init__(
+        self,
+        grid,
+        dt,
+        viscosity,
+        force,
+        boundary,
+        solid,
+        implicit,
+        convective,
+        walls,
+        solid_boundary,
+        scalars,
+        unstable,
+    ):
+        self.grid, self.dt, self.force = grid, dt, force
         self.project = projection(grid, solid, boundary)
         setup = self.project.structure.setup
         _, solid, boundary, _ = setup.made  # copies, as of the walls: the caller may change them
-        walls = constant(walls)
+        walls, scalars = constant(walls), constant(scalars)
         self.made = grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
-        self.pressure = self.project.pressure
+        self.made, self.strict, self.implicit = (*self.made, scalars, unstable), unstable == "raise", implicit
+        self.pressure, self.divergence = self.project.pressure, divergence(grid)
         self.slope = gradient(grid, setup.pressure_conditions, solid)
         self.kept = mask(grid.faces, setup.open)
+        # A force is for faces that are free: an implicit viscosity would carry it from the others into the fluid.
+        self.free = mask(
+            grid.faces, faces_that(grid, resolve(grid, boundary, no_slip), solid, lambda side: side == outflow)
+        )
         self.convect: Any = convection(grid, boundary, solid) if convective else None
-        self.laplacian: Any = None
+        self.viscous: Any = None
         if viscosity:
-            self.laplacian = face_laplacian(grid, boundary, solid, solid_boundary)
-        self.walls = walls if viscosity else None
-        self.relax: Any = None
-        if implicit and viscosity:
-            self.relax = inverse(identity(grid.faces) - (0.5 * dt * viscosity) * self.laplacian)
-        elif viscosity:
-            rows = self.laplacian.structure.magnitude()(np.ones(grid.faces.size))
-            self._steepest = float(np.max(rows, initial=0.0))  # no eigenvalue is beyond the largest sum of a row
-            if not callable(viscosity):
-                self._check_stable(viscosity)
+            op = face_laplacian(grid, boundary, solid, solid_boundary)
+            self.viscous = Diffusion("viscosity", viscosity, op, walls, self)
+        self.scalars = {name: Scalar(name, solid, self, **given) for name, given in scalars.items()}
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
         return FlowStep, self.made
 
-    def start(self, v, params=None):
-        """Velocity -> the first state: made incompressible, the pressure still unknown."""
-        v = self.project(v)
-        return {"v": v, "p": np.zeros(self.grid.shape), "a": self.acceleration(v, params)}
+    def start(self, v, params=None, s=None):
+        """Velocity and scalars -> the first state: made incompressible, the pressure still unknown."""
+        v, s = self.project(v), {} if s is None else s
+        if not isinstance(s, dict) or s.keys() != self.scalars.keys():
+            raise ShapeError(
+                f"flow_step needs the scalars {sorted(self.scalars)}, got {s!r}; write step.start(v, params, s)"
+            )
+        state = {"v": v, "p": np.zeros(self.grid.shape), "a": self.acceleration(v, params, s)}
+        return state | ({"s": s, "r": self._rates(v, s, params)} if s else {})
 
     def __call__(self, state, params=None):
-        if not isinstance(state, dict) or state.keys() != {"v", "p", "a"}:
-            raise ShapeError("flow_step takes a dict of v, p and a as its state; make it with step.start")
-        v, p, dt = state["v"], state["p"], self.dt
-        a = self.acceleration(v, params)
+        parts = ["v", "p", "a", *(["s", "r"] if self.scalars else [])]
+        if not isinstance(state, dict) or state.keys() != set(parts):
+            words = f"{', '.join(parts[:-1])} and {parts[-1]}"
+            raise ShapeError(f"flow_step takes a dict of {words} as its state; make it with step.start")
+        v, p, s, dt = state["v"], state["p"], state.get("s", {}), self.dt
+        if self.convect is not None and self.strict:
+            self._check_convection(v)
+        a = self.acceleration(v, params, s)
         ahead = v + dt * (1.5 * a - 0.5 * state["a"] - self.slope(p))
-        if self.relax is not None:
-            half = self.laplacian(v) if self.walls is None else self.laplacian(v) + 2.0 * self.walls  # of v and of v*
-            ahead = self.relax(ahead + (0.5 * dt * self.viscosity) * half)
+        if self.viscous is not None:
+            ahead = self.viscous.relaxed(ahead, v)
         q = self.pressure(ahead)
-        return {"v": self.kept(ahead) + self.slope(q), "p": p - q / dt, "a": a}
+        new = {"v": self.kept(ahead) + self.slope(q), "p": p - q / dt, "a": a}
+        if s:
+            new["r"] = self._rates(v, s, params)
+            new["s"] = {k: one.step(s[k], new["r"][k], state["r"][k]) for k, one in self.scalars.items()}
+        return new
 
-    def acceleration(self, v, params):
+    def _rates(self, v, s, params):
+        return {name: one.rate(v, s, params) for name, one in self.scalars.items()}
+
+    def acceleration(self, v, params, s=None):
         """a(v): what is explicit, of those parts that the scene has."""
         a = 0.0 * v if self.convect is None else -self.convect(v, v)
         if self.force is not None:
-            a = a + self._pushed(v, params)
-        if self.laplacian is not None and self.relax is None:
-            bend = self.laplacian(v) if self.walls is None else self.laplacian(v) + self.walls
-            a = a + self._number(params) * bend
-        return a
+            a = a + self.free(self._pushed(v, params, *([s] if self.scalars else [])))
+        return a if self.viscous is None else a + self.viscous.rate(v, params)
 
-    def _pushed(self, v, params):
+    def _pushed(self, v, params, *scalars):
         """The force; a number is the same on all faces."""
-        force = self.force(v, params)
+        force = self.force(v, *scalars, params)
         if np.shape(plain(force)) == ():
             return force * np.ones(v.shape, dtype_of(v))
         if np.shape(plain(force)) != v.shape:
@@ -196,32 +255,127 @@ class FlowStep(Remade):
             )
         return force
 
-    def _number(self, params):
-        """The explicit viscosity."""
-        if not callable(self.viscosity):
-            return self.viscosity
-        found = self.viscosity(params)
-        if not is_number(plain(found)) or not 0 <= plain(found) < np.inf:
-            raise ValueError(f"the viscosity in flow_step must be a finite number >= 0, got {plain(found)}")
-        self._check_stable(float(plain(found)))
-        return found
-
-    def _check_stable(self, viscosity):
-        """Adams-Bashforth is stable for dt nu |lambda| <= 1."""
-        rate = viscosity * self._steepest
-        if self.dt * rate > 1 + ROUNDING:
-            raise UnstableStepError(
-                f"flow_step is unstable for viscosity = {viscosity:.6g} with dt = {self.dt:.12g}: the largest "
-                f"stable dt is {rounded_down(1 / rate)}; take smaller steps or write implicit=True"
-            )
+    def _check_convection(self, v):
+        """Refuse a step in which a wave that the flow carries would grow."""
+        passing = self.divergence.structure.magnitude()(np.abs(plain(v)).astype(float))  # twice the mean |v| / h
+        fastest = 0.5 * float(np.max(passing, initial=0.0))
+        if SURE < self.dt * fastest < np.inf:
+            terms = [self.viscous, *(one.diffused for one in self.scalars.values())]
+            growth = max(_growth(self.dt * fastest, term.damping if term else 0.0, self.implicit) for term in terms)
+            if growth > GROWTH:
+                raise UnstableStepError(
+                    f"flow_step is unstable for this velocity with dt = {self.dt:.12g}: waves grow by {growth - 1:.0%} "
+                    f"a step, at a Courant number of {self.dt * fastest:.3g}; dt = {rounded_down(SURE / fastest)} is "
+                    "safe, or write unstable='allow'"
+                )
 
     def __repr__(self):
         parts = {
             "convection": self.convect,
-            "viscosity": self.laplacian,
-            "implicit": self.relax,
+            "viscosity": self.viscous,
+            "implicit": self.viscous and self.viscous.relax,
             "force": self.force,
-            "moving walls": self.walls,
+            "moving walls": self.viscous and self.viscous.held,
+            "scalars": self.scalars or None,
         }
         words = [word for word, part in parts.items() if part is not None]
         return f"<flow step on {self.grid}: {', '.join(['pressure', *words])}>"
+
+
+class Diffusion:
+    """A term nu (L u + held) of a flow step: the trapezoidal rule, or a rate.
+
+    Parameters
+    ----------
+    name : str
+        Of nu in messages.
+    number : number or callable
+        nu.
+    op : Operator
+        L.
+    held : array or None
+        What walls add to L u.
+    flow : FlowStep
+
+    Attributes
+    ----------
+    relax : Operator or None
+        The solve of the trapezoidal rule.
+    damping : float
+        dt nu |L|; 0 where nu is a function.
+    """
+
+    def __init__(self, name, number, op, held, flow):
+        self.name, self.number, self.op, self.held, self.flow = name, number, op, held, flow
+        rows = op.structure.magnitude()(np.ones(op.domain.size))  # no eigenvalue is beyond the largest sum of a row
+        self._steepest, self.relax = float(np.max(rows, initial=0.0)), None
+        self.damping = 0.0 if callable(number) else flow.dt * number * self._steepest
+        if flow.implicit:
+            self.relax = inverse(identity(op.domain) - (0.5 * flow.dt * number) * op)
+        elif not callable(number):
+            self._check_stable(number)
+
+    def rate(self, u, params):
+        """nu (L u + held); 0 where the trapezoidal rule takes it."""
+        if self.relax is not None:
+            return 0.0
+        number = self.number
+        if callable(number):
+            number = number(params)
+            if not is_number(plain(number)) or not 0 <= plain(number) < np.inf:
+                raise ValueError(f"the viscosity in flow_step must be a finite number >= 0, got {plain(number)}")
+            self._check_stable(float(plain(number)))
+        return number * (self.op(u) if self.held is None else self.op(u) + self.held)
+
+    def relaxed(self, ahead, u):
+        """The new field, from that which all other terms lead to, and the old one u."""
+        if self.relax is None:
+            return ahead
+        half = self.op(u) if self.held is None else self.op(u) + 2.0 * self.held  # of the old and of the new field
+        return self.relax(ahead + (0.5 * self.flow.dt * self.number) * half)
+
+    def _check_stable(self, number):
+        """Adams-Bashforth is stable for dt nu |lambda| <= 1."""
+        rate, dt = number * self._steepest, self.flow.dt
+        if self.flow.strict and dt * rate > 1 + ROUNDING:
+            raise UnstableStepError(
+                f"flow_step is unstable for {self.name} = {number:.6g} with dt = {dt:.12g}: the largest "
+                f"stable dt is {rounded_down(1 / rate)}; take smaller steps or write implicit=True"
+            )
+
+
+class Scalar:
+    """A cell field that the flow carries; the last four arguments as `flow_step` takes them."""
+
+    def __init__(self, name, solid, flow, diffusivity=0.0, boundary=neumann, values=None, source=None):
+        grid, self.name, self.flow, self.source = flow.grid, name, flow, source
+        self.mean, self.held, self.diffused, bend = average(grid, boundary), 0.0, None, None  # type: Any, Any, Any, Any
+        if values is not None:
+            slopes, normal = lift(grid, boundary)(values), flow.divergence.T(np.ones(grid.shape))
+            bend = flow.divergence(slopes)
+            self.held = np.divide(slopes, 2 * normal, out=np.zeros_like(slopes), where=slopes != 0)  # the wall's value
+        if diffusivity:
+            op = laplacian(grid, boundary, solid)
+            self.diffused = Diffusion(f"diffusivity of {name!r}", float(diffusivity), op, bend, flow)
+
+    def rate(self, v, s, params):
+        """What is explicit."""
+        u = s[self.name]
+        rate = -self.flow.divergence(v * (self.mean(u) + self.held))
+        if self.source is not None:
+            rate = rate + self.source(s, params)
+        return rate if self.diffused is None else rate + self.diffused.rate(u, params)
+
+    def step(self, u, rate, before):
+        """The field after a step."""
+        ahead = u + self.flow.dt * (1.5 * rate - 0.5 * before)
+        return ahead if self.diffused is None else self.diffused.relaxed(ahead, u)
+
+
+def _growth(courant, damping, implicit):
+    """The largest growth of a wave in a step: see the head of this file."""
+    angle = np.linspace(0.0, np.pi, 65)
+    c, d = 1j * courant * np.sin(angle), damping * np.sin(angle / 2) ** 2
+    a, b, e = (1 + d / 2, 1 - d / 2 + 1.5 * c, 0.5 * c) if implicit else (1.0, 1 + 1.5 * (c - d), 0.5 * (c - d))
+    root = np.sqrt(b**2 - 4 * a * e)
+    return float(np.max(np.maximum(np.abs(b + root), np.abs(b - root)) / (2 * a)))
