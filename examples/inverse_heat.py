@@ -29,16 +29,21 @@ def physical(y):
     return -dp.value_and_grad(lambda x: 0.5 * np.sum((rule(x) - y) ** 2))(0 * y)[1]
 
 
-def piecewise(y, weight=1e-8, rho=1e-7):
-    """x >= 0 that makes |heat(x) - y|^2 / 2 + weight |jumps of x| small: 300 rounds of three easy steps (ADMM)."""
-    split = owed = np.zeros((3, 64, 64))
-    for _ in range(300):
-        a, b, c = rho * (split - owed)
-        x = waves(1 / (fade**2 + rho * (1 + bend)), waves(fade, y) + np.roll(a, 1, 0) - a + np.roll(b, 1, 1) - b + c)
-        full = np.stack([np.roll(x, -1, 0) - x, np.roll(x, -1, 1) - x, x]) + owed
-        soft = np.sign(full[:2]) * np.maximum(abs(full[:2]) - weight / rho, 0)
-        owed = full - (split := np.concatenate([soft, np.maximum(full[2:], 0)]))
-    return split[2]
+def piecewise(y, weight=1e-8):
+    """x >= 0 that makes |heat(x) - y|^2 / 2 + weight |jumps of x| small; both terms are diagonal in waves."""
+    blurred = waves(fade, y)
+
+    def inner(target, rho, x):  # the x that fits y, and jumps and values of which are near the target
+        a, b, c = rho * target
+        return waves(1 / (fade**2 + rho * (1 + bend)), blurred + np.roll(a, 1, 0) - a + np.roll(b, 1, 1) - b + c)
+
+    best = dp.minimize(
+        lambda x: 0.5 * np.sum((heat(x) - y) ** 2), np.zeros(grid.shape), "admm", 300, 1e-4,
+        weight=weight, rho=1e-7, inner=inner,
+        operator=lambda x: np.stack([np.roll(x, -1, 0) - x, np.roll(x, -1, 1) - x, x]),
+        prox=lambda v, t: np.concatenate([np.sign(v[:2]) * np.maximum(abs(v[:2]) - t, 0), np.maximum(v[2:], 0)]),
+    )  # fmt: skip
+    return np.maximum(best.x, 0)
 
 
 hidden = [rectangles() for _ in range(count)]

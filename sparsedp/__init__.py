@@ -23,6 +23,7 @@ _WINDOW = {
     "operators.difference": "curl divergence gradient laplacian upwind",
     "operators.transfer": "average component prolong restrict sample",
     "operators.harmonic": "harmonic_average",
+    "optimize.regularization": "smoothness total_variation",
     "operators.boundary": "diagonal identity interior lift mask",
     "solvers.inverses": "inverse",
     "solvers.parametric": "elliptic_solver matrix_solver",

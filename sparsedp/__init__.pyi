@@ -49,6 +49,8 @@ from .operators.transfer import sample as sample
 from .optimize.directions import update_direction as update_direction
 from .optimize.loop import minimize as minimize
 from .optimize.physical import physical_gradient as physical_gradient
+from .optimize.regularization import smoothness as smoothness
+from .optimize.regularization import total_variation as total_variation
 from .report.certificate import certified as certified
 from .report.certificate import certify as certify
 from .report.plan import explain as explain

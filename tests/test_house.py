@@ -78,12 +78,13 @@ LENGTHS = {"sparsedp": 600, "tests": 600, "benchmarks": 300, "examples": 60}
 LONGER = {
     "solver_in_the_loop.py": 125,
     "conservation_laws.py": 150,
+    "inverse_heat.py": 70,
     "full_waveform.py": 100,
 }  # two solvers, a network and a study
 # Nodes of the syntax tree that each room may have, docstrings left out; what a line says is free, what it does is not.
 # They may be lowered at any time, and raised only with a sentence on what that buys. "": the whole package.
 BUDGETS = {
-    "": 178_850,  # conservation laws: 2 800; leapfrog and sponge: 1 250; scalars of a flow: 1 450
+    "": 180_200,  # what scenes of the second edition added is said room by room
     "advection": 16_800,  # 14 000 for transport, and conservation laws
     "check": 14_850,
     "flow": 7_100,  # scalars and the Courant limit of flow_step: 1 450
@@ -91,7 +92,7 @@ BUDGETS = {
     "kernels": 14_000,
     "network": 2_650,
     "operators": 5_800,
-    "optimize": 12_000,
+    "optimize": 13_350,  # admm: 500; total_variation, smoothness: 400
     "report": 17_950,
     "solvers": 39_900,
     "solvers/multigrid": 10_000,

@@ -60,6 +60,18 @@ BUGS = {
         "ahead = u + self.flow.dt * rate",
         "tests/test_flow_scalars.py",
     ),
+    "a variation that counts walls": Bug(
+        "optimize",
+        "abs(divergence(grid).matrix) @ inside.matrix != 0",
+        "abs(divergence(grid).matrix) != 0",
+        "tests/test_regularization.py",
+    ),
+    "a threshold that pushes the wrong way": Bug(
+        "optimize",
+        "np.maximum(np.abs(v) - t, 0.0)",
+        "np.maximum(np.abs(v) + t, 0.0)",
+        "tests/test_regularization.py",
+    ),
     "a missing 1/h": Bug(
         "operators",
         "    step = 1 / grid.spacings(axis)[face]",

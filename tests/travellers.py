@@ -245,6 +245,8 @@ def travellers():
         move = dp.transport(GRID, scheme, solid=SOLID)
         u, v = numbers(GRID.shape), 0.3 * numbers(GRID.faces.size)
         yield "transport", scheme, move, lambda move, u=u, v=v: bits(move, u, v, 0.1)
+    yield "total_variation", "", dp.total_variation(GRID, 0.1, SOLID), lambda tv: bits(tv, numbers(GRID.shape))
+    yield "smoothness", "", dp.smoothness(GRID, SOLID), lambda h1: bits(h1, numbers(GRID.shape))
     law = dp.conservation_law(BOX, burgers_flux, burgers_speed, source=push)
     yield "conservation_law", "", law, lambda law: bits(law, numbers((2, *BOX.shape)), 0.3)
     yield "flow_step", "", dp.flow_step(GRID, 0.01, 0.1, push, solid=SOLID), of_flow

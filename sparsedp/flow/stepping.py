@@ -184,8 +184,8 @@ class FlowStep(Remade):
         setup = self.project.structure.setup
         _, solid, boundary, _ = setup.made  # copies, as of the walls: the caller may change them
         walls, scalars = constant(walls), constant(scalars)
-        self.made = grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
-        self.made, self.strict, self.implicit = (*self.made, scalars, unstable), unstable == "raise", implicit
+        given = grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
+        self.made, self.strict, self.implicit = (*given, scalars, unstable), unstable == "raise", implicit
         self.pressure, self.divergence = self.project.pressure, divergence(grid)
         self.slope = gradient(grid, setup.pressure_conditions, solid)
         self.kept = mask(grid.faces, setup.open)

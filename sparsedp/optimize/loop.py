@@ -14,6 +14,7 @@ from sparsedp.optimize.newton import NewtonCG
 from sparsedp.optimize.physical import PhysicalGradient
 from sparsedp.optimize.quasi_newton import Quasi
 from sparsedp.optimize.result import Minimum, Stuck
+from sparsedp.optimize.sparse_terms import admm
 from sparsedp.optimize.trials import Trials
 from sparsedp.optimize.watch import Watch
 from sparsedp.progress import shown_steps
@@ -59,8 +60,8 @@ def minimize(
     start : array, number, or any nesting of them in tuples, lists and dicts
         Not modified. Leaves that are not floating stay as they are.
     method : str
-        "lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "levenberg_marquardt", "half_inverse" or
-        "physical_gradient".
+        "lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "levenberg_marquardt", "half_inverse",
+        "physical_gradient"; or "admm", which adds weight |K x|_1 to the loss: few entries, few jumps.
     maxiter : int
         Most iterations; 0 evaluates the start and returns it.
     tolerance : float or callable
@@ -93,6 +94,10 @@ def minimize(
         physical_gradient: physics, inverse, rate=1.0. apart=True: residuals along axis 0 are samples, and the loss
         takes every leaf of x with a leading axis of copies, one for each (a few products give the whole Jacobian).
         dense: whether the Jacobian is formed; None: when it is small. truncation, rank: see `update_direction`.
+        admm: weight, operator=None (K, linear, from x to an array; x itself where None), rho=None (the penalty at
+        first), inner=10 (steps of lbfgs in a round, or ``inner(target, rho, x)`` -> the x that minimizes loss(x) +
+        rho/2 |K x - target|^2), prox=None (``prox(v, t)`` instead of the soft threshold). Its iterations are rounds,
+        and a tolerance of 1e-4 is usual.
 
     Returns
     -------
@@ -129,11 +134,20 @@ def minimize(
     check_function("minimize", loss, "lambda x: np.sum(x**2)")
     if callback is not None:
         check_function("callback of minimize", callback, "lambda record, x: False")
-    stepper = _stepper(method, options)
+    stepper = _stepper(method, options) if method != "admm" else None
     if not is_whole(maxiter, 0):
         raise ValueError(f"minimize needs maxiter >= 0, a whole number, got {maxiter!r}; the default is 100")
     if not callable(tolerance) and not (is_number(tolerance) and tolerance >= 0):
         raise ValueError(f"minimize needs a tolerance >= 0, got {tolerance!r}; the default is 1e-8")
+    if stepper is None:
+        unused = dict(progress=progress, gradient=gradient, project=project, batches=batches, checkpoint=checkpoint)
+        for name in [
+            *(name for name, value in unused.items() if value),
+            *(["tolerance"] if callable(tolerance) else []),
+        ]:
+            raise TypeError(f"admm does not use {name}; leave it out")
+        _check_options(method, options, list(inspect.signature(admm).parameters)[7:])
+        return admm(minimize, loss, start, maxiter, tolerance, callback, bounds, **options)
     if hasattr(tolerance, "inside"):  # it takes part in the evaluations
         if checkpoint is not None:
             raise ValueError(
@@ -207,9 +221,12 @@ def _composed(loss, inner):
 
 def _stepper(method, options):
     if method not in tuple(METHODS):
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    names = list(inspect.signature(METHODS[method]).parameters)
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, admm, got {method!r}")
+    _check_options(method, options, list(inspect.signature(METHODS[method]).parameters))
+    return METHODS[method](**options)
+
+
+def _check_options(method, options, names):
     for name in options:
         if name not in names:
             raise TypeError(f"{method} has no option {name!r}; it has {', '.join(names)}")
-    return METHODS[method](**options)

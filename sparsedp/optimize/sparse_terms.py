@@ -1,0 +1,87 @@
+"""Sparse terms: loss(x) + weight |K x|_1 by alternating directions (ADMM).
+
+With z = K x and a scaled multiplier w, each round takes
+
+    x = argmin loss(x) + rho / 2 |K x - z + w|^2,    z = prox(K x + w, weight / rho),    w = w + K x - z,
+
+prox being the soft threshold sign(v) max(|v| - t, 0) of the 1-norm, or what the user gives. rho is balanced so that
+both residuals, K x - z and rho K^T (z - z_before), fall alike, each relative to its terms: the units of the loss do not
+matter. Converged when both are small.
+
+Source: S. Boyd, N. Parikh, E. Chu, B. Peleato, J. Eckstein, Foundations and Trends in Machine Learning 3 (2011) 1-122;
+B. Wohlberg, arXiv:1704.06209 (2017) (relative residuals).
+"""
+
+import time
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.derivative import vjp
+from sparsedp.errors import ShapeError
+from sparsedp.fields import is_number
+from sparsedp.ledger import thread
+from sparsedp.optimize.result import Minimum, Record
+from sparsedp.tree import norm
+
+__all__ = ["admm"]
+
+BALANCE, STEP = 10.0, 2.0  # ratio of the residuals beyond which rho changes by this factor
+SETTLED = 50  # rounds after which it stays
+
+
+def admm(
+    search, loss, start, maxiter, tolerance, callback, bounds, weight, operator=None, rho=None, inner=10, prox=None
+):
+    """The method "admm" of `minimize`, which is `search`: see there."""
+    for name, value in (("weight", weight), ("rho", 1.0 if rho is None else rho)):
+        if not (is_number(value) and 0 < value < np.inf):
+            raise ValueError(f"admm needs {name} > 0, got {value!r}")
+    K = (lambda x: 1.0 * x) if operator is None else operator
+    prox = prox or (lambda v, t: np.sign(v) * np.maximum(np.abs(v) - t, 0.0))
+    x, clock, solves, count = start, time.perf_counter(), thread.solves, 0
+    history: list = []
+    z = np.asarray(K(x))
+    w = np.zeros(z.shape)
+    if rho is None:  # so that the threshold is a typical entry, or 1 where all are 0
+        rho = weight / (float(np.mean(np.abs(z))) or 1.0)
+    message, converged = f"stopped after {maxiter} rounds, as maxiter asks", False
+
+    def seen(residual):
+        value = float(loss(x)) + weight * float(np.sum(np.abs(K(x))))
+        now = time.perf_counter() - clock
+        history.append(Record(len(history), value, residual, now, count, (), thread.solves - solves))
+        return callback is not None and len(history) > 1 and callback(history[-1], x)
+
+    seen(np.inf)
+    for number in range(int(maxiter)):
+        target = z - w
+        if callable(inner):
+            x, count = inner(target, rho, x), count + 1
+        else:
+
+            def split(x, target=target, rho=rho):
+                return loss(x) + 0.5 * rho * anp.sum((K(x) - target) ** 2)
+
+            best = search(split, x, maxiter=inner, bounds=bounds, tolerance=1e-6)
+            x, count = best.x, count + best.evaluations
+        image, pull = vjp(K, x)
+        if np.shape(image) != z.shape:
+            raise ShapeError(f"the operator of admm gave shape {np.shape(image)} after {z.shape}; it must not change")
+        before, z = z, prox(image + w, weight / rho)
+        w = w + image - z
+        primal = norm(image - z) / (max(norm(image), norm(z)) or 1.0)
+        dual = norm(pull(z - before)) / (norm(pull(w)) or 1.0)
+        if seen(primal):
+            message = "stopped by the callback"
+            break
+        if max(primal, dual) <= tolerance:
+            message, converged = f"converged: both residuals are below {tolerance:g} of their terms", True
+            break
+        if number < SETTLED and max(primal, dual) > BALANCE * min(primal, dual):
+            factor = STEP if primal > dual else 1 / STEP
+            rho, w = rho * factor, w / factor
+    return Minimum(
+        x=x, value=history[-1].value, history=tuple(history), method="admm", message=message, converged=converged,
+        evaluations=count, resumed="", covariance=None,
+    )  # fmt: skip

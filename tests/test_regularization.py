@@ -1,0 +1,131 @@
+"""total_variation, smoothness and the method admm: values by hand, walls and obstacles, edges, optimality."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+GRIDS = [
+    dp.Grid(7, spacing=[np.linspace(0.5, 2.0, 7)]),
+    dp.Grid((5, 6), size=(1.0, 3.0), periodic=(False, True)),
+    dp.Grid((3, 4, 2), size=1.0),
+]
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_a_ramp_counts_the_same_everywhere(grid):
+    x = grid.centres()[0]
+    slope, volume = 3.0, np.sum(grid.volumes)
+    assert dp.total_variation(grid, 1e-9)(slope * x) == pytest.approx(slope * volume, rel=1e-8)
+    assert dp.smoothness(grid)(slope * x) == pytest.approx(0.5 * slope**2 * volume, rel=1e-12)
+    assert dp.total_variation(grid, 1.0)(5.0 + 0 * x) == 0
+
+
+def by_hand(grid, u, eps, solid):
+    """The sum over cells in loops, for unit cells in 2-D."""
+    total = smooth = 0.0
+    n, m = u.shape
+    for i in range(n):
+        for j in range(m):
+            square = 0.0
+            for neighbours in (((i - 1, j), (i + 1, j)), ((i, j - 1), (i, j + 1))):
+                jumps = [(u[p] - u[i, j]) ** 2 for p in neighbours if 0 <= p[0] < n and 0 <= p[1] < m and not solid[p]]
+                square += sum(jumps) / max(len(jumps), 1)
+            if not solid[i, j]:
+                total, smooth = total + np.sqrt(square + eps**2) - eps, smooth + 0.5 * square
+    return total, smooth
+
+
+def test_obstacles_are_left_out():
+    grid, rng = dp.Grid((5, 4)), np.random.default_rng(0)
+    solid = np.zeros(grid.shape, bool)
+    solid[1:3, 2] = solid[4, 0] = True
+    u = rng.standard_normal(grid.shape)
+    tv, h1 = dp.total_variation(grid, 0.1, solid), dp.smoothness(grid, solid)
+    assert (tv(u), h1(u)) == pytest.approx(by_hand(grid, u, 0.1, solid), rel=1e-13)
+    other = np.where(solid, 1e6, u)
+    assert (tv(other), h1(other)) == pytest.approx((tv(u), h1(u)), rel=1e-12)
+    solid[:] = True
+    assert dp.smoothness(grid, solid)(u) == 0
+
+
+@pytest.mark.parametrize("make", [lambda grid: dp.total_variation(grid, 5.0), dp.smoothness])
+@pytest.mark.parametrize("grid", GRIDS[1:])
+def test_derivatives(grid, make):
+    term, u = make(grid), np.random.default_rng(0).standard_normal(grid.shape)
+    found = dp.check.gradient(lambda u: term(u) + anp.sum(u**2), u)  # of a constant it sees rounding alone
+    assert found.verdict == "agrees" and found.hessian == "agrees"
+
+
+def test_refused_numbers():
+    for eps in (0.0, -1.0, np.nan, np.inf, "1"):
+        with pytest.raises(ValueError, match="total_variation needs eps > 0, a slope that counts as small, got"):
+            dp.total_variation(GRIDS[0], eps)
+    with pytest.raises(TypeError, match="smoothness takes a Grid"):
+        dp.smoothness(3)
+
+
+# ---- admm ----
+
+
+def test_admm_soft_thresholds():
+    """|x - y|^2 / 2 + weight |x|_1 has its minimum at the soft threshold of y."""
+    y = np.array([3.0, -0.2, 0.5, -2.0, 0.0])
+    best = dp.minimize(lambda x: 0.5 * anp.sum((x - y) ** 2), 0 * y, "admm", tolerance=1e-9, weight=0.5)
+    np.testing.assert_allclose(best.x, np.sign(y) * np.maximum(abs(y) - 0.5, 0), atol=1e-7)
+    assert best.converged and best.method == "admm" and "both residuals" in str(best)
+    assert best.value == pytest.approx(0.5 * np.sum((best.x - y) ** 2) + 0.5 * np.sum(np.abs(best.x)), rel=1e-9)
+
+
+@pytest.mark.parametrize("inner", [10, "exact"])
+def test_admm_is_optimal_for_jumps(inner):
+    """Subgradient: K^T s = -grad / weight with |s| <= 1, and s = sign(K x) where K x is not 0."""
+    n = 12 if inner == 10 else 40
+    grid, rng = dp.Grid(n), np.random.default_rng(0)
+    G = dp.interior(grid) @ dp.gradient(grid)
+    y = np.where(grid.centres()[0] < n / 3, 1.0, -0.5) + 0.1 * rng.standard_normal(n)
+    if inner == "exact":
+        one = np.eye(n)
+        matrix = G.matrix.toarray()
+        inner = lambda target, rho, x: np.linalg.solve(one + rho * matrix.T @ matrix, y + rho * matrix.T @ target)
+    loss = lambda x: 0.5 * anp.sum((x - y) ** 2)
+    tolerance = 1e-5 if inner == 10 else 1e-7
+    best = dp.minimize(loss, 0 * y, "admm", maxiter=2000, tolerance=tolerance, weight=0.3, operator=G, inner=inner)
+    assert best.converged
+    s = np.cumsum(best.x - y) / 0.3  # on the inner faces
+    jumps = G(best.x)[1:-1]
+    assert np.max(np.abs(s)) < 1 + 1e-3
+    steep = np.abs(jumps) > 1e-4
+    assert 1 <= np.count_nonzero(steep) < 6
+    np.testing.assert_allclose(s[:-1][steep], np.sign(jumps[steep]), atol=1e-2)
+
+
+def test_admm_keeps_bounds_and_takes_another_prox():
+    y = np.array([3.0, -0.2, 0.5, -2.0])
+    loss = lambda x: 0.5 * anp.sum((x - y) ** 2)
+    best = dp.minimize(loss, 0 * y, "admm", tolerance=1e-8, weight=0.1, bounds=(0.0, 2.0))
+    np.testing.assert_allclose(best.x, [2.0, 0.0, 0.4, 0.0], atol=1e-5)
+    best = dp.minimize(loss, 0 * y, "admm", tolerance=1e-8, weight=0.1, prox=lambda v, t: np.maximum(v, 0))
+    np.testing.assert_allclose(best.x, np.maximum(y, 0), atol=1e-6)
+
+
+def test_admm_stops_when_asked():
+    loss, seen = lambda x: anp.sum((x - 1) ** 2), []
+    best = dp.minimize(loss, np.zeros(3), "admm", maxiter=3, tolerance=0.0, weight=0.1)
+    assert len(best.history) == 4 and best.message == "stopped after 3 rounds, as maxiter asks"
+    call = lambda record, x: seen.append(record) or len(seen) == 2
+    best = dp.minimize(loss, np.zeros(3), "admm", tolerance=0.0, callback=call, weight=0.1)
+    assert len(best.history) == 3 and best.message == "stopped by the callback"
+
+
+def test_admm_refuses():
+    loss = lambda x: anp.sum(x**2)
+    with pytest.raises(ValueError, match="admm needs weight > 0, got -1"):
+        dp.minimize(loss, np.ones(2), "admm", weight=-1)
+    with pytest.raises(TypeError, match="admm has no option 'weights'; it has weight, operator, rho, inner, prox"):
+        dp.minimize(loss, np.ones(2), "admm", weights=1)
+    with pytest.raises(TypeError, match="admm does not use batches; leave it out"):
+        dp.minimize(loss, np.ones(2), "admm", batches=[1], weight=1.0)
+    with pytest.raises(TypeError, match="weight"):
+        dp.minimize(loss, np.ones(2), "admm")
