@@ -12,7 +12,6 @@
 
 from functools import cached_property, reduce
 from itertools import compress
-from math import prod
 
 import numpy as np
 
@@ -104,8 +103,7 @@ class Grid(Value, Uncached):
         return self._stacked("edges")
 
     def _stacked(self, kind):
-        parts = [self._part(kind, axis) for axis in range(self.dim)]
-        return Space(sum(map(prod, parts)), kind, self, parts)
+        return Space(None, kind, self, [self._part(kind, axis) for axis in range(self.dim)])
 
     def _part(self, kind, component):
         """Shape of a component of a space."""

@@ -21,8 +21,8 @@ class Space(Value, Uncached):
 
     Parameters
     ----------
-    shape : int or tuple of int
-        For a space without a grid: ``Space(7)`` holds 7 numbers.
+    shape : int, tuple of int or None
+        For a space without a grid: ``Space(7)`` holds 7 numbers. None: one flat array of all `parts`.
     kind, grid, parts
         Filled in by Grid: a word, the grid, and the shapes of the components.
 
@@ -51,7 +51,7 @@ class Space(Value, Uncached):
     parts: tuple[tuple[int, ...], ...]
 
     def __init__(self, shape, kind="space", grid=None, parts=None):
-        entries = whole_lengths(shape)
+        entries = whole_lengths(sum(map(prod, parts)) if shape is None else shape)
         if entries is None:
             raise ShapeError(f"a space needs whole lengths >= 0, got {shape}; write Space(7) or Space((2, 3))")
         vars(self).update(shape=entries, kind=kind, grid=grid, parts=(entries,) if parts is None else tuple(parts))

@@ -6,7 +6,6 @@ but for what it finds on the way: `u` of `space.size` numbers, `v` of the veloci
 """
 
 from functools import cached_property
-from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,4 +127,4 @@ def wall_space(setting):
         for axis, sides in enumerate(setting.sides)
         for _ in sides or ()
     ]
-    return Space(sum(map(prod, parts)), "walls", setting.grid, parts)
+    return Space(None, "walls", setting.grid, parts)

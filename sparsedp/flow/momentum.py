@@ -123,7 +123,7 @@ def face_lift(grid, boundary=no_slip):
                     factor = differences(grid, a) @ wall_slopes(grid, a, side, dirichlet)
                     blocks[c, len(parts)] = along(a, grid.dim, factor)
                     parts.append(tuple(1 if b == a else n for b, n in enumerate(grid.face_shape(c))))
-    walls = Space(sum(int(np.prod(part)) for part in parts), "moving walls", grid, parts)
+    walls = Space(None, "moving walls", grid, parts)
     structure = compose(Mask(_free(grid, sides, None)), Kronecker(grid.faces.parts, parts, blocks))
     return Operator(structure, walls, grid.faces, "face_lift")
 
@@ -182,7 +182,7 @@ def convection(grid, boundary=no_slip, solid=None):
         carried[number, c], carrier[number, a] = along(a, grid.dim, mean), along(c, grid.dim, other)
         gain[c, number] = along(a, grid.dim, back)
         flux.append(tuple(mean.shape[0] if b == a else n for b, n in enumerate(grid.face_shape(c))))
-    faces, sites = grid.faces, Space(sum(int(np.prod(part)) for part in flux), "fluxes", grid, flux)
+    faces, sites = grid.faces, Space(None, "fluxes", grid, flux)
     free = Mask(_free(grid, sides, solid))
     A = Operator(Kronecker(flux, faces.parts, carried), faces, sites, "carried")
     B = Operator(Kronecker(flux, faces.parts, carrier), faces, sites, "carrier")
@@ -216,13 +216,14 @@ def _second(grid, c, a, sides):
 def _around(grid, c, sides, closed, condition):
     """The Laplacian of component c with the faces `closed` by obstacles, as a matrix: on cells of a grid of its own."""
     spacing = [np.ones(n) if a == c else grid.widths[a] for a, n in enumerate(grid.face_shape(c))]
-    own = Grid(grid.face_shape(c), spacing=spacing, periodic=grid.periodic)
+    lattice = Grid(grid.face_shape(c), spacing=spacing, periodic=grid.periodic)
     named = {name: _conditions(sides[a]) for a, name in enumerate(grid.axes) if sides[a] and a != c}
-    beside = Mask(own.join(*(a != c for a in range(grid.dim))))
-    across = compose(divergence(own).structure, compose(beside, gradient(own, named, closed, condition).structure))
+    beside = Mask(lattice.join(*(a != c for a in range(grid.dim))))
+    slope = gradient(lattice, named, closed, condition).structure
+    across = compose(divergence(lattice).structure, compose(beside, slope))
     # Along its own axis a closed face holds the value of the obstacle itself.
     blocks = {(0, 0): along(c, grid.dim, _second(grid, c, c, sides))}
-    return total(across, Kronecker(own.cells.parts, own.cells.parts, blocks)).explicit()
+    return total(across, Kronecker(lattice.cells.parts, lattice.cells.parts, blocks)).explicit()
 
 
 def _to_centres(grid, c):

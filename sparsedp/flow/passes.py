@@ -78,8 +78,8 @@ class Passes:
 
     def push(self, x, p, out):
         """out = K (x + G p)."""
-        given, found = self._components(x), self._components(out)
-        self.loops.push.compiled(*given, p.reshape(self.cells), *self.outward, *found, 0, 1)
+        before, after = self._components(x), self._components(out)
+        self.loops.push.compiled(*before, p.reshape(self.cells), *self.outward, *after, 0, 1)
 
 
 def compiled(grid, products):

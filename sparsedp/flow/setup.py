@@ -55,8 +55,8 @@ class Setup(Remade):
         # Of the forward solve, and of the adjoint one.
         self.products = self.passes = [Products(*pair, self.open.astype(float)) for pair in maps]
         if self._exact:
-            found = [compiled(grid, products) for products in self.products]
-            self.passes = found if all(found) else self.products
+            passes = [compiled(grid, products) for products in self.products]
+            self.passes = passes if all(passes) else self.products
 
     @property
     def info(self):
@@ -176,9 +176,8 @@ def _exponent(x, source):
 
 def faces_that(grid, sides, solid, open_side):
     """Flat face mask: inside, and on the sides whose condition is open; not beside an obstacle."""
-    found = [np.ones(part, dtype=bool) for part in grid.faces.parts]
-    for axis, pair in enumerate(sides):
+    flat = np.ones(grid.faces.size, dtype=bool)
+    for axis, (pair, part) in enumerate(zip(sides, grid.split(flat), strict=True)):
         for side, condition in zip((0, -1), pair or (), strict=False):
-            np.moveaxis(found[axis], axis, 0)[side] = open_side(condition)
-    flat = np.concatenate([part.ravel() for part in found])
+            np.moveaxis(part, axis, 0)[side] = open_side(condition)  # a view of the flat mask
     return flat if solid is None else flat & ~np.logical_or(*solid_faces(grid, check_solid(grid, solid)))

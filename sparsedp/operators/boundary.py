@@ -55,7 +55,7 @@ def lift(grid, boundary):
         for side, condition in enumerate(sides or ()):
             blocks[axis, len(parts)] = along(axis, grid.dim, wall_slopes(grid, axis, side, condition))
             parts.append(tuple(1 if a == axis else n for a, n in enumerate(grid.shape)))
-    walls = Space(sum(int(np.prod(part)) for part in parts), "walls", grid, parts)
+    walls = Space(None, "walls", grid, parts)
     return Operator(Kronecker(grid.faces.parts, parts, blocks), walls, grid.faces, "lift")
 
 

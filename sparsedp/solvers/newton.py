@@ -71,7 +71,7 @@ class Layout:
         kinds = [np.asarray(leaf).dtype for leaf in found]
         self.dtypes = [kind if kind.kind == "f" else np.dtype(float) for kind in kinds]
         self.scalar = isinstance(guess, (int, float)) and not isinstance(guess, np.generic)
-        self.space = Space(sum(map(np.size, found)), "unknowns", None, self.shapes)
+        self.space = Space(None, "unknowns", None, self.shapes)
         self.size = self.space.size
 
     def flat(self, guess):
