@@ -137,11 +137,12 @@ def resolve(grid, boundary, default=neumann):
     """
     if not hasattr(grid, "periodic"):  # Grid itself stands on a higher floor
         raise TypeError(f"an operator needs a grid first, got {grid!r}; write dp.Grid((8, 6), size=1.0)")
-    named = boundary if isinstance(boundary, dict) else dict.fromkeys(AXES, boundary)
     if isinstance(boundary, dict):
         _check_names(grid, boundary)
+    else:
+        boundary = dict.fromkeys(AXES, boundary)
     return tuple(
-        None if periodic else _sides(axis, named.get(axis, default), type(default))
+        None if periodic else _sides(axis, boundary.get(axis, default), type(default))
         for axis, periodic in zip(AXES, grid.periodic, strict=False)
     )
 

@@ -51,15 +51,13 @@ def constant(value):
     array([1., 2.])
     """
     kind = type(value)
-    if kind is np.ndarray or isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray):
         return value if is_fixed(value) else _copied(value)
     if kind is tuple and all(type(one) in FIXED for one in value):
         return value
     if kind is tuple or kind is list:
         return kind(map(constant, value))
-    if kind is dict:
-        return {name: constant(one) for name, one in value.items()}
-    if isinstance(value, dict):  # in an order of its own, or with a default
+    if isinstance(value, dict):  # it may have an order of its own, or a default
         held = copy(value)
         held.update({name: constant(one) for name, one in value.items()})
         return held

@@ -107,8 +107,8 @@ def surely_finite(value):
 
 def place(index, shape):
     """Number of an entry in C order -> its index: a number in 1-D, else a tuple."""
-    found = tuple(map(int, np.unravel_index(index, shape)))
-    return found[0] if len(found) == 1 else found
+    indices = tuple(map(int, np.unravel_index(index, shape)))
+    return indices[0] if len(indices) == 1 else indices
 
 
 def frozen(value):

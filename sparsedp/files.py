@@ -43,14 +43,14 @@ def write_file(path, content):
     target = Path(os.path.realpath(path))
     part = target.parent / f"{target.name[:40]}.{uuid4().hex[:8]}{UNFINISHED}"  # whoever else writes has another
     try:
-        known = target.exists()
-        if known and not target.is_file():
+        there = target.exists()
+        if there and not target.is_file():
             _write(target, "wb", content)
             return
-        if known:
+        if there:
             open(target, "rb+").close()  # a file that may not be changed is not replaced either
         _write(part, "xb", content)
-        if known:
+        if there:
             shutil.copymode(target, part)
         os.replace(part, target)
         _sync(target.parent)

@@ -117,9 +117,9 @@ def timed(name, kind, function, *args):
         spent(name, kind, whole - thread.inner.pop(), whole)
 
 
-def spent(name, kind, own, whole):
-    """Add the seconds of a call: its own, and those of the calls inside it too."""
+def spent(name, kind, exclusive, inclusive):
+    """Add the seconds of a call: without those of the calls inside it, and with them."""
     if thread.inner:
-        thread.inner[-1] += whole
+        thread.inner[-1] += inclusive
     for calls in thread.calls:
-        calls.seconds[name, kind] += own
+        calls.seconds[name, kind] += exclusive

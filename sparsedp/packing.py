@@ -70,20 +70,20 @@ class Packing:
         """Tree of the same structure -> flat vector of doubles."""
         return self.pack_leaves(leaves(tree))
 
-    def pack_leaves(self, found):
+    def pack_leaves(self, entries):
         """Leaves of a tree of the same structure -> flat vector of doubles."""
-        return joined(compress(found, self._floating))
+        return joined(compress(entries, self._floating))
 
     def slopes(self, gradient):
         """Gradient of the same structure -> its floating leaves, dL/dRe + i dL/dIm of complex ones.
 
         The tape gives dL/dRe - i dL/dIm there. Joined, they are the gradient with respect to the packed vector.
         """
-        found = leaves(gradient)
-        if len(found) != len(self._leaves):
-            numbers = f"{len(found)} leaves where {self.root} has {len(self._leaves)}"
+        slopes = leaves(gradient)
+        if len(slopes) != len(self._leaves):
+            numbers = f"{len(slopes)} leaves where {self.root} has {len(self._leaves)}"
             raise DerivativeError(f"the gradient has {numbers}; return a tree like {self.root}")
-        given = [np.asarray(leaf) for leaf in compress(found, self._floating)]
+        given = [np.asarray(leaf) for leaf in compress(slopes, self._floating)]
         for place, (g, x) in enumerate(zip(given, self.values)):
             if g.shape != x.shape:
                 shapes = f"shape {g.shape} where {x.shape} is needed"

@@ -90,8 +90,10 @@ class Uncached:
     """An object whose cached properties do not travel."""
 
     def __getstate__(self):
-        kept = vars(self).items()
-        return {name: value for name, value in kept if not isinstance(getattr(type(self), name, None), cached_property)}
+        values = vars(self).items()
+        return {
+            name: value for name, value in values if not isinstance(getattr(type(self), name, None), cached_property)
+        }
 
 
 class Frozen:

@@ -185,7 +185,7 @@ def unbeaten(points):
     return best
 
 
-def curves(lines, ax, xlabel, ylabel, title=None):
+def curves(lines, ax, xlabel, ylabel):
     """Named curves -> one log-log picture; the best points reached at any time are marked.
 
     Parameters
@@ -193,7 +193,7 @@ def curves(lines, ax, xlabel, ylabel, title=None):
     lines : dict
         Name -> (x, y), two sequences of positive numbers.
     ax : matplotlib Axes
-    xlabel, ylabel, title : str
+    xlabel, ylabel : str
 
     Returns
     -------
@@ -201,17 +201,16 @@ def curves(lines, ax, xlabel, ylabel, title=None):
     """
     best = unbeaten([point for x, y in lines.values() for point in zip(x, y) if point[1] > 0])
     ax.plot(*np.reshape(best, (-1, 2)).T, color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
-    return _dressed(lines, ax, xlabel, ylabel, title)
+    return _dressed(lines, ax, xlabel, ylabel)
 
 
-def _dressed(lines, ax, xlabel, ylabel, title, xscale="log"):
+def _dressed(lines, ax, xlabel, ylabel, title=None, xscale="log"):
     for name, (x, y) in lines.items():
         heights = np.where(np.greater(y, 0), y, np.nan)  # 0 has no logarithm, and leaves a gap
         ax.plot(x, heights, marker=".", markersize=4, linewidth=1, label=name)
     ax.set(xlabel=xlabel, ylabel=ylabel, title=title, xscale=xscale, yscale="log")
-    if lines:  # a map has none
-        ax.grid(visible=True, color="0.93")
-        ax.legend(frameon=False, fontsize="small")
+    ax.grid(visible=True, color="0.93")
+    ax.legend(frameon=False, fontsize="small")
     return ax
 
 
@@ -313,7 +312,9 @@ def stability_chart(growth, ax):
     image = ax.pcolormesh(*axes, values, vmin=0, vmax=2, cmap="coolwarm", shading="nearest")
     ax.figure.colorbar(image, ax=ax, label="growth factor of a step (2 and more: red)")
     ax.plot(*growth.here[::-1], marker="*", color="black", markersize=12)
-    return _dressed({}, ax, growth.names[1], growth.names[0], "stable: blue; grows: red; refused: grey")
+    words = {"ylabel": growth.names[0], "xlabel": growth.names[1], "title": "stable: blue; grows: red; refused: grey"}
+    ax.set(**words, xscale="log", yscale="log")
+    return ax
 
 
 # ---------------------------------------------------------------- figures and files

@@ -146,8 +146,11 @@ def read_field(path):
     >>> read_field(path)[0]
     array([0.03125, 0.03125, 0.03125, 0.125  ])
     """
-    # A .npy file is mapped into memory, for its header may promise more than it holds.
-    readers: dict[str, Any] = {".npy": partial(np.load, mmap_mode="r"), ".npz": _only_map, ".png": _turned}
+    readers: dict[str, Any] = {
+        ".npy": partial(np.load, mmap_mode="r"),  # mapped into memory: its header may promise more than it holds
+        ".npz": _only_map,
+        ".png": lambda path: plots.read_picture(path)[::-1].T,  # its rows run from the top
+    }
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise ValueError(f"{path} is not a .npy, .npz or .png file; save the field with numpy.save")
@@ -182,8 +185,3 @@ def _only_map(path):
             names = ", ".join(name[:24] for name in list(maps or archive.files)[:4]) or "nothing"
             raise ValueError(f"it needs exactly one 2-D array, got {len(maps)} among {len(archive.files)}: {names}")
     return maps.popitem()[1]
-
-
-def _turned(path):
-    """Path of a picture -> field: its rows run from the top."""
-    return plots.read_picture(path)[::-1].T
