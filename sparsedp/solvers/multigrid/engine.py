@@ -204,6 +204,7 @@ class _Run:
         """The next direction p and its image q -> p . q."""
         engine, layout = self.engine, self.engine.layout
         layout.run(engine.loops.direct, self.p, engine.fine.x, layout.sizes, beta)
+        layout.fill(self.p)
         engine.level.apply(self.p, self.q)
         return float(self.sums.sum())
 
@@ -212,6 +213,7 @@ class _Run:
         engine, layout, light = self.engine, self.engine.layout, self.engine.fine.b
         vectors = self.x, self.p, self.r, self.q, light, self.gauge
         layout.run(engine.loops.update, *vectors, layout.sizes, self.sums, alpha)
+        layout.fill(light)
         return float(np.sqrt(self.sums.sum()))
 
     def rounding(self):

@@ -88,7 +88,7 @@ class Level:
     def apply(self, x, out):
         """out = A x with a unit diagonal, in double precision; x has its ghost cells filled. x . out to sums."""
         self.layout.run(loops.image, self.coupling, x, out, self.pitches, self.layout.sizes, self.sums)
-        return self.layout.wrap(out)
+        return out
 
     def operator(self):
         """A with a unit diagonal, for flat vectors of the cells in natural order."""
@@ -184,11 +184,13 @@ class Transfer:
     def restrict(self, r, out):
         """out = P^T r; r has its ghost cells filled."""
         self.coarse.run(loops.restrict, self.weights, r, out, self.pitches, self.fine.sizes, self.coarse.sizes)
+        self.coarse.fill(out)
         return out
 
     def prolong(self, e, x):
         """x += P e; e has its ghost cells filled."""
         self.fine.run(loops.prolong, self.weights, e, x, self.fine.sizes, self.coarse.sizes)
+        self.fine.fill(x)
         return x
 
 
@@ -255,11 +257,11 @@ class Smoothed:
     def _smooth(self, x, between, factors, sums):
         fields = x, self.b, between, self.r
         self.layout.run(loops.smooth, self.coupling, *fields, factors, self.pitches, self.layout.sizes, sums)
+        self.layout.fill(self.r)
 
     def cycle(self):
         """x = what a V-cycle makes of b -> b . x."""
         self._smooth(self.b, self.x, self.down, self.sums[:0])
-        self.layout.wrap(self.x)
         self.transfer.restrict(self.r, self.below.b)
         self.below.cycle()
         self.transfer.prolong(self.below.x, self.x)

@@ -80,6 +80,11 @@ class Layout:
                 lines[ghosts + n :] = lines[ghosts + np.arange(ghosts) % n]
         return fields
 
+    def fill(self, field):
+        """Fill the ghost cells of a field of numbers along periodic axes, as far as a product with a matrix reads."""
+        if any(self.periodic):
+            self.run(fill, self.sizes, field)
+
     def run(self, loop, *given):
         """A loop over all planes, in the precision of its second array. Fields are long rows to it."""
         loop = loop.single if given[1].dtype == np.float32 else loop
@@ -90,60 +95,10 @@ class Layout:
 TILE, WINDOW = 2048, 16384  # cells that are worked on together: what is written is in cache for what follows
 FAST = {"reassoc", "contract", "nsz"}  # a sum may be taken in any order; NaN and infinity stay what they are
 
-inner = njit(nogil=True, error_model="numpy", cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+helper = njit(nogil=True, error_model="numpy", cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
-@inner
-def copy(out, a):
-    for k in range(out.size):
-        out[k] = a[k]
-
-
-@inner
-def clear(out):
-    for k in range(out.size):  # a slice would not be vectorised
-        out[k] = 0.0
-
-
-@inner
-def add(out, a, x, b, y):
-    """out += a x + b y."""
-    for k in range(out.size):
-        out[k] += a[k] * x[k] + b[k] * y[k]
-
-
-@inner
-def add_both(out, a, x, b, y, c, z, d, w):
-    """out += a x + b y + c z + d w."""
-    for k in range(out.size):
-        out[k] += (a[k] * x[k] + b[k] * y[k]) + (c[k] * z[k] + d[k] * w[k])
-
-
-@inner
-def neighbours(out, c, at, x, place, steps):
-    """out = c x. Where its cells begin: `at` in c, `place` in x."""
-    n, odd = out.size, steps.size % 2
-    clear(out)
-    for m in range(odd):
-        d = steps[m]
-        forward, backward = c[m, at : at + n], c[m, at - d : at - d + n]
-        add(out, forward, x[place + d : place + d + n], backward, x[place - d : place - d + n])
-    for m in range(odd, steps.size, 2):  # two at a time: the sums are read and written half as often
-        d, e = steps[m], steps[m + 1]
-        add_both(
-            out,
-            c[m, at:],
-            x[place + d :],
-            c[m, at - d :],
-            x[place - d :],
-            c[m + 1, at:],
-            x[place + e :],
-            c[m + 1, at - e :],
-            x[place - e :],
-        )
-
-
-@inner
+@helper
 def ghosts(field, place, planes, sizes):
     """Fill the ghost cells of planes along periodic axes but the first."""
     plane, width, _, lines, lead, n, _, around, along = sizes
@@ -159,34 +114,46 @@ def ghosts(field, place, planes, sizes):
                 field[j + n + 1] = field[j + 1]
 
 
-@inner
-def fill(field, start, stop, sizes):
-    """Fill the ghost cells of planes, and the two planes beyond a periodic axis that repeat them."""
-    plane, n = sizes[0], sizes[2]
-    ghosts(field, (GHOST + start) * plane, stop - start, sizes)
-    for g in (-2, -1, n, n + 1):
-        there = g % n
-        if sizes[6] and start <= there < stop:
-            copy(field[(GHOST + g) * plane : (GHOST + g + 1) * plane], field[(GHOST + there) * plane :])
-
-
-@njit(nogil=True, error_model="numpy", cache=True, fastmath=FAST, no_cfunc_wrapper=True)
-def product(a, b):
-    """The scalar product of two rows."""
-    total = 0.0
-    for k in range(a.size):
-        total += a[k] * b[k]
-    return total
-
-
-@inner
+@njit(nogil=True, error_model="numpy", cache=True, fastmath=FAST, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def add_up(sums, a, b, start, stop, sizes):
     """The scalar products of the cells of planes."""
     _, width, _, lines, lead, n = sizes[:6]
     for g in range(start, stop):
-        first, sums[g] = (GHOST + g) * sizes[0] + lead + 1, 0.0
+        first, total = (GHOST + g) * sizes[0] + lead + 1, 0.0
         for at in range(first, first + lines * width, width):
-            sums[g] += product(a[at : at + n], b[at : at + n])
+            left, right = a[at : at + n], b[at : at + n]
+            for k in range(n):
+                total += left[k] * right[k]
+        sums[g] = total
+
+
+@helper
+def combine(out, there, n, c, at, x, place, b, steps, own, rest, share):
+    """out = own x + rest b + share c x on n cells. Where they begin: `there` in out, `at` in c and b, `place` in x."""
+    odd = steps.size % 2
+    for k in range(0, n, TILE):
+        row = out[there + k : there + min(k + TILE, n)]
+        given, right = x[place + k : place + k + row.size], b[at + k : at + k + row.size]
+        for i in range(row.size):  # a slice would not be vectorised
+            row[i] = 0.0
+        for m in range(odd):
+            d = steps[m]
+            forward, ahead = c[m, at + k :], x[place + k + d :]
+            back, behind = c[m, at + k - d :], x[place + k - d :]
+            for i in range(row.size):
+                row[i] += forward[i] * ahead[i] + back[i] * behind[i]
+        for m in range(odd, steps.size, 2):  # two at a time: the sums are read and written half as often
+            d, e = steps[m], steps[m + 1]
+            forward, ahead = c[m, at + k :], x[place + k + d :]
+            back, behind = c[m, at + k - d :], x[place + k - d :]
+            forward2, ahead2 = c[m + 1, at + k :], x[place + k + e :]
+            back2, behind2 = c[m + 1, at + k - e :], x[place + k - e :]
+            for i in range(row.size):
+                row[i] += (forward[i] * ahead[i] + back[i] * behind[i]) + (
+                    forward2[i] * ahead2[i] + back2[i] * behind2[i]
+                )
+        for i in range(row.size):
+            row[i] = own * given[i] + rest * right[i] + share * row[i]
 
 
 # ---- the loops -----------------------------------------------------------------------------------------------------
@@ -200,13 +167,8 @@ def add_up(sums, a, b, start, stop, sizes):
 @kernel("write2 ~write1 write1 index1 index1 write1")
 def image(c, x, out, steps, sizes, sums, start, stop):
     """out = A x; x . out to sums."""
-    end = (GHOST + stop) * sizes[0]
-    for at in range((GHOST + start) * sizes[0], end, TILE):
-        row = out[at : min(at + TILE, end)]
-        given = x[at : at + row.size]
-        neighbours(row, c, at, x, at, steps)
-        for k in range(row.size):
-            row[k] = given[k] - row[k]
+    at = (GHOST + start) * sizes[0]
+    combine(out, at, (stop - start) * sizes[0], c, at, x, at, x, steps, 1.0, 0.0, -1.0)
     add_up(sums, x, out, start, stop, sizes)
 
 
@@ -217,7 +179,6 @@ def direct(p, z, sizes, beta, start, stop):
     row, given = p[at:end], z[at:end]
     for k in range(row.size):
         row[k] = given[k] + beta * row[k]
-    fill(p, start, stop, sizes)
 
 
 @kernel("write1 ~write1 write1 write1 ~write1 ~write1 index1 write1 real", fastmath=FAST)
@@ -236,21 +197,20 @@ def update(x, p, r, q, light, gauge, sizes, sums, alpha, start, stop):
             short[k] = value
             total += (weight[k] * value) ** 2
         sums[g] = total
-    fill(light, start, stop, sizes)
+
+
+@kernel("index1 ~write1")
+def fill(sizes, field, start, stop):
+    """Fill the ghost cells of planes, and the two planes beyond a periodic axis that repeat them."""
+    plane, n = sizes[0], sizes[2]
+    ghosts(field, (GHOST + start) * plane, stop - start, sizes)
+    for g in (-2, -1, n, n + 1):
+        if sizes[6] and start <= g % n < stop:
+            for k in range(plane):
+                field[(GHOST + g) * plane + k] = field[(GHOST + g % n) * plane + k]
 
 
 # ---- levels --------------------------------------------------------------------------------------------------------
-
-
-@inner
-def combined(out, there, n, c, at, x, place, b, steps, own, rest, share):
-    """out = own x + rest b + share c x on n cells. Where they begin: `there` in out, `at` in c and b, `place` in x."""
-    for k in range(0, n, TILE):
-        row = out[there + k : there + min(k + TILE, n)]
-        neighbours(row, c, at + k, x, place + k, steps)
-        given, right = x[place + k : place + k + row.size], b[at + k : at + k + row.size]
-        for i in range(row.size):
-            row[i] = own * given[i] + rest * right[i] + share * row[i]
 
 
 @kernel("~write2 ~write1 ~write1 ~write1 ~write1 ~write1 index1 index1 write1")
@@ -261,31 +221,24 @@ def smooth(c, x, b, between, out, factors, steps, sizes, sums, start, stop):
     """
     plane = sizes[0]
     step = max(2, WINDOW // plane)
-    y = np.zeros((step + 4) * plane, out.dtype)
+    y = np.empty((step + 4) * plane, out.dtype)
+    for k in range(y.size):  # what ghost cells hold must be finite
+        y[k] = 0.0
     for first in range(start, stop, step):
         last, begin = min(first + step, stop), first - 1
         if first > start:
             begin = first + 1
-            copy(y[plane : 3 * plane], y[(step + 1) * plane :])
+            for k in range(plane, 3 * plane):
+                y[k] = y[step * plane + k]
         at, there, planes = (GHOST + begin) * plane, (begin - first + 2) * plane, last + 1 - begin
-        f, g, h = factors[:3]
-        combined(y, there, planes * plane, c, at, x, at, b, steps, f, g, h)
+        combine(y, there, planes * plane, c, at, x, at, b, steps, factors[0], factors[1], factors[2])
         ghosts(y, there, planes, sizes)
         at, n = (GHOST + first) * plane, (last - first) * plane
-        if between.size:
-            copy(between[at : at + n], y[2 * plane :])
-        f, g, h = factors[3:]
-        combined(out, at, n, c, at, y, 2 * plane, b, steps, f, g, h)
+        for k in range(n if between.size else 0):
+            between[at + k] = y[2 * plane + k]
+        combine(out, at, n, c, at, y, 2 * plane, b, steps, factors[3], factors[4], factors[5])
         if sums.size:
             add_up(sums, b, out, first, last, sizes)
-    fill(out, start, stop, sizes)
-
-
-@inner
-def collect(out, a, b, c, x):
-    """To each cell what three cells of a finer line give."""
-    for k in range(out.size):
-        out[k] += a[k] * x[2 * k] + b[k] * x[2 * k + 1] + c[k] * x[2 * k + 2]
 
 
 @kernel("~write2 ~write1 ~write1 index1 index1 index1")
@@ -297,18 +250,13 @@ def restrict(weights, r, out, steps, fine, coarse, start, stop):
             at = (GHOST + g) * coarse[0] + coarse[4] + j * coarse[1] + 1
             place = (GHOST + 2 * g) * fine[0] + fine[4] + 2 * j * fine[1] + 1
             row = out[at : at + n]
-            clear(row)
+            for k in range(n):
+                row[k] = 0.0
             for m in range(0, steps.size, 3):  # those of a fine line
-                collect(row, weights[m, at:], weights[m + 1, at:], weights[m + 2, at:], r[place + steps[m] :])
-    fill(out, start, stop, coarse)
-
-
-@inner
-def spread(out, a, b, c, here, there):
-    """The transpose: each cell, and the one after it, to the cells of a finer line."""
-    for k in range(here.size):
-        out[2 * k] += b[k] * here[k]
-        out[2 * k + 1] += c[k] * here[k] + a[k] * there[k]
+                below, same, above = weights[m, at:], weights[m + 1, at:], weights[m + 2, at:]
+                line = r[place + steps[m] :]
+                for k in range(n):
+                    row[k] += below[k] * line[2 * k] + same[k] * line[2 * k + 1] + above[k] * line[2 * k + 2]
 
 
 @kernel("~write2 ~write1 ~write1 index1 index1")
@@ -324,5 +272,7 @@ def prolong(weights, e, x, fine, coarse, start, stop):
                     at = (GHOST + a) * coarse[0] + coarse[4] + b * coarse[1] + 1
                     m = (g - 2 * a + 1) * rows + (j - 2 * b + rows // 9) * 3
                     same, above, below = weights[m + 1, at:], weights[m + 2, at:], weights[m, at + 1 :]
-                    spread(line, below, same, above, e[at : at + half], e[at + 1 :])
-    fill(x, start, stop, fine)
+                    here, there = e[at : at + half], e[at + 1 :]
+                    for k in range(half):
+                        line[2 * k] += same[k] * here[k]
+                        line[2 * k + 1] += above[k] * here[k] + below[k] * there[k]
