@@ -97,6 +97,27 @@ def imports(module):
     return found
 
 
+KEEPERS = ("__main__.py", "kernels/__init__.py", "kernels/team.py")  # know of numba, have nothing to compile
+
+
+def jitted(module):
+    """Names of the functions of a module that go, or could go, through numba's compiler.
+
+    In a module that imports numba or the maker of kernels these are all that are decorated, by whatever name, and all
+    that are handed on as a value: to njit, to Kernel, in `uses`, in `given`, in a table. Only what is called plainly is
+    Python's. A lambda has no name and counts by its line.
+    """
+    compiles = any(within(name, "numba") or within(name, "sparsedp.kernels.team") for name, _ in imports(module))
+    if not compiles or module.place in KEEPERS:
+        return set()
+    methods = {id(node) for kind in module.nodes(ast.ClassDef) for node in kind.body}
+    called_ones = {id(node.func) for node in module.nodes(ast.Call)}
+    values = {n.id for n in module.nodes(ast.Name) if isinstance(n.ctx, ast.Load) and id(n) not in called_ones}
+    handed_on = {f.name for f in module.nodes(FUNCTION) if f.name in values and id(f) not in methods}
+    decorated = {f.name for f in module.nodes(FUNCTION) if f.decorator_list}
+    return handed_on | decorated | {f"lambda:{node.lineno}" for node in module.nodes(ast.Lambda)}
+
+
 def within(name, prefix):
     """True when a dotted name is the prefix or lies under it."""
     return name == prefix or name.startswith(prefix + ".")

@@ -1,11 +1,14 @@
 """Kernels and the process they run in: threads, forks, and an environment without numba."""
 
+import gc
+import importlib
 import os
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from sources import PACKAGE, jitted, modules
 
 from sparsedp import kernels
 
@@ -69,3 +72,22 @@ if not child:
 sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
     assert run(code).returncode == 0
+
+
+@NUMBA
+@pytest.mark.whole
+def test_numba_compiles_what_the_house_counts():
+    """Every function of the package that numba holds when all loops are compiled is one that test_house.py sees."""
+    from numba.core.dispatcher import Dispatcher
+
+    from sparsedp.kernels import team
+
+    counted = {(str(module.path), name) for module in modules() for name in jitted(module)}
+    for module in modules():
+        if jitted(module):
+            importlib.import_module(module.name)
+    assert all(loop.compiled for loop in team.loops if loop.loop.__code__.co_filename.startswith(str(PACKAGE)))
+    functions = (thing.py_func for thing in gc.get_objects() if isinstance(thing, Dispatcher))
+    seen = {(f.__code__.co_filename, f.__code__.co_name) for f in functions}
+    seen = {(path, name) for path, name in seen if path.startswith(str(PACKAGE))}
+    assert seen == counted

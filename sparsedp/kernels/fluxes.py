@@ -42,7 +42,7 @@ __all__ = [
 
 TILE = 512  # cells that are worked on at a time: what one loop leaves in a line, the next finds in the cache
 LINE = TILE + 72  # of lines that start a power of 2 apart the cache keeps few
-NONE, ONE, TWO = (uint64(k * LINE) for k in range(3))  # where lines start
+NONE, ONE, TWO, THREE = (uint64(k * LINE) for k in range(4))  # where lines start
 
 
 # Columns of `axes`, which has a row for each axis of a component: its cells; the distance of neighbours in the field;
@@ -55,7 +55,7 @@ ITSELF, ROUND = -1, -2  # beyond the end of an axis is the value of the cell its
 
 # Rows of `table`: 1 over the length for the lower and for the upper side of a cell, as the cell has it (OWN) and as the
 # cell beyond has it (THEIRS); c and e (DISTANCE).
-OWN, THEIRS, DISTANCE = 0, 2, 4
+OWN, THEIRS, DISTANCE = int64(0), int64(2), int64(4)  # one type: `weigh` is compiled once
 
 
 def van_leer(a, b, c, e):
@@ -102,77 +102,49 @@ SCHEMES = {"upwind": Scheme(), "van_leer": Scheme(van_leer, stages=(0.0, 0.5), m
 class Side(NamedTuple):
     """One side of the cells of a piece; all places for the first cell of the tile, unsigned."""
 
+    begin: Any  # the cells of the tile from here
+    end: Any  # to here
     beyond: Any  # where the cell on the other side is, in the field
     speed: Any  # where the velocity is
     wall: Any  # where the inflow is
+    column: Any  # of the table
     inner: float  # 0.0 where nothing but a wall is there: `beyond` is then the cell itself
     shown: float  # 0.0 where inflow is given at that wall
 
 
 def tile_of(axes, part):
-    """The first cell of a tile, and how many there are."""
+    """The first cell of a tile, and how many there are; the same as unsigned numbers."""
     length = axes[-1, N]
     tiles = -(-length // TILE)
     left = part % tiles * TILE
-    return part // tiles * length + left, min(length - left, TILE)
+    first, size = part // tiles * length + left, min(length - left, TILE)
+    return first, size, uint64(first), uint64(size)
 
 
-def pieces_of(axes, a):
-    """How many pieces a tile has along an axis; across rows it is one."""
-    return 3 if a == len(axes) - 1 else 1
+def side_of(axes, a, number, upper, first, size):
+    """The lower or the upper side of the cells of a tile.
 
-
-def place_of(axes, a, first):
-    """Where a cell stands along an axis, and how many blocks of lines of cells along it come before its own."""
-    through = first // axes[a, STRIDE]
-    block = through // axes[a, N]
-    return through - block * axes[a, N], block
-
-
-def side_of(axes, a, upper, at_end, where, begin, first):
-    """What is beyond the lower or the upper side of the cells of a piece, at an end of the axis or not."""
-    stride, wall = axes[a, STRIDE], axes[a, WALL + upper]
-    step, walls = (2 * upper - 1) * stride, wall != ROUND
-    if at_end:
-        step *= 0 if walls else 1 - axes[a, N]
-    speed = axes[a, SPEED] + first + where * axes[a, EXTRA] + upper * axes[a, ON_SIDES] * (stride if walls else step)
-    closed, place = at_end and walls, wall + where * stride + first % stride - begin
-    return Side(uint64(first + step), uint64(speed), uint64(place), 1.0 - closed, 1.0 - (closed and wall >= 0))
-
-
-def sides_of(axes, a, number, first, size, where):
-    """Of a tile, the cells between the ends of a row (0), at the lower (1), at the upper end (2), and their sides."""
-    (place, block), last, begin, end = where, axes[a, N] - 1, 0, size
-    if pieces_of(axes, a) > 1:
+    Those of the last axis are three pieces: between the ends of a row (0), the lower (1), the upper end (2).
+    """
+    n, stride, wall = axes[a, N], axes[a, STRIDE], axes[a, WALL + upper]
+    through = first // stride
+    block = through // n
+    place, begin, end = through - block * n, 0, size
+    at_end = place == (n - 1) * upper
+    if a == len(axes) - 1:
         start = 1 if place == 0 else 0
-        stop = max(size - 1, start) if place + size > last else size
+        stop = max(size - 1, start) if place + size == n else size
         begin, end = ((start, stop), (0, start), (stop, size))[number]
-        place, last = (place + begin, last + begin - end + 1)
-    below = side_of(axes, a, int64(0), place == 0, block, begin, first)  # of one type: compiled once
-    return uint64(begin), uint64(end), below, side_of(axes, a, int64(1), place == last, block, begin, first)
-
-
-def weigh(lines, line, x, start, table, row, axes, a, place, free, c, b, e):
-    """A line gets x times what a row of the table holds for the cells of a piece; 0 on closed sides."""
-    at, side = uint64(axes[a, COLUMN] + axes[a, VARIES] * place), 2 * a + row % 2
-    if pieces_of(axes, a) * axes[a, VARIES] > 1:
-        for j in range(b, e):
-            lines[line + j] = x[start + j] * table[row, at + j]
-    else:
-        for j in range(b, e):
-            lines[line + j] = x[start + j] * table[row, at]
-    for j in range(b, e if free.size else b):
-        lines[line + j] *= free[side, c + j]
-
-
-def differences(partials, a, c, asked, size):
-    """What is asked of behind and ahead -> the cotangents of a and b, in place of the derivatives of the last slope."""
-    last = partials.shape[1] - 1
-    for by in range(2):
-        for j in range(size):
-            partials[a, last, by, c + j] = (
-                partials[a, 0, by, c + j] * asked[0, j] + partials[a, last, by, c + j] * asked[1, j]
-            )
+        at_end = number == 1 + upper or number * n == 1
+    walls, step = wall != ROUND, (2 * upper - 1) * stride
+    closed = at_end and walls
+    if at_end:
+        step *= 0 if walls else 1 - n
+    speed = axes[a, SPEED] + first + block * axes[a, EXTRA] + upper * axes[a, ON_SIDES] * (stride if walls else step)
+    where = wall + (block - through) * stride + first - begin
+    column, shown = axes[a, COLUMN] + axes[a, VARIES] * place, 1.0 - (closed and wall >= 0)
+    low, high, beyond = uint64(begin), uint64(end), uint64(first + step)
+    return Side(low, high, beyond, uint64(speed), uint64(where), uint64(column), 1.0 - closed, shown)
 
 
 def share(flow):
@@ -180,10 +152,23 @@ def share(flow):
     return 0.5 * (flow > 0.0) + 0.5 * (flow >= 0.0)
 
 
+def weigh(lines, line, x, start, table, row, axes, a, side, free, c):
+    """A line gets x times what a row of the table holds for the cells of a piece; 0 on closed sides."""
+    b, e, at = side.begin, side.end, side.column
+    if a == len(axes) - 1 and axes[a, VARIES]:
+        for j in range(b, e):
+            lines[line + j] = x[start + j] * table[row, at + j]
+    else:
+        for j in range(b, e):
+            lines[line + j] = x[start + j] * table[row, at]
+    for j in range(b, e if free.size else b):
+        lines[line + j] *= free[2 * a + row % 2, c + j]
+
+
 limiter = van_leer  # in the loop over slopes: stands for the function of the scheme it is compiled for
 # A product and a sum are one instruction: the same bits everywhere.
 OPTIONS: dict[str, Any] = {
-    "uses": (tile_of, pieces_of, place_of, side_of, sides_of, weigh, differences, share),
+    "uses": (tile_of, side_of, weigh, share),
     "fastmath": {"contract"},
 }
 
@@ -209,29 +194,28 @@ def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, ou
     memory, lines, uneven, many = np.empty((2, LINE)), np.empty(2 * LINE), axes[0, UNEVEN], slopes.shape[1]
     leaves, enters, speed = memory[0], memory[1], lines if uneven else w
     for part in range(start, stop):
-        first, length = tile_of(axes, part)
-        c, size, bad = uint64(first), uint64(length), 0
+        (first, length, c, size), bad = tile_of(axes, part), 0
         for j in range(size):
             leaves[j] = 0.0
             enters[j] = 0.0
         for a in range(len(axes)):
-            where = place_of(axes, a, first)
             ratio = dt if uneven else dt * table[OWN, axes[a, COLUMN]]
-            for number in range(pieces_of(axes, a)):
-                b, e, below, above = sides_of(axes, a, number, first, length, where)
+            for number in range(3 if a == len(axes) - 1 else 1):
+                below = side_of(axes, a, number, int64(0), first, length)  # of one type: compiled once
+                above = side_of(axes, a, number, int64(1), first, length)
+                b, e, i, k, m, h = below.begin, below.end, below.beyond, above.beyond, below.speed, above.speed
                 if b == e:
                     continue
-                i, k, m, h = below.beyond, above.beyond, below.speed, above.speed
                 if uneven:
-                    for upper, (line, begin) in enumerate(((NONE, m), (ONE, h))):
-                        weigh(lines, line, w, begin, table, OWN + upper, axes, a, where[0], free, c, b, e)
+                    weigh(lines, NONE, w, m, table, OWN, axes, a, below, free, c)
+                    weigh(lines, ONE, w, h, table, OWN + 1, axes, a, above, free, c)
                     m, h = NONE, ONE
                 for j in range(b, e):
                     low, high = ratio * speed[m + j], -ratio * speed[h + j]  # into the cells
                     leaves[j] += max(low, 0.0) + max(high, 0.0) - flux * (low + high)
                     enters[j] += max(low, 0.0) * (below.shown * u[i + j]) + max(high, 0.0) * (above.shown * u[k + j])
                 for upper in range(2 if slopes.size or below.shown * above.shown == 0.0 else 0):
-                    (i, _, wall, inner, shown), m, sign = (above, h, -ratio) if upper else (below, m, ratio)
+                    (_, _, i, _, wall, _, inner, shown), m, sign = (above, h, -ratio) if upper else (below, m, ratio)
                     for j in range(b, b if shown else e):
                         enters[j] += max(sign * speed[m + j], 0.0) * inflow[wall + j]
                     for j in range(b, e if slopes.size else b):
@@ -255,60 +239,64 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
 
     gu, gw: empty where they are not wanted. The cotangents of a and b are left in the last slopes of `partials`.
     """
-    memory, lines, uneven, rest = np.empty((4, LINE)), np.empty(2 * LINE), axes[0, UNEVEN], 1.0 - flux
-    field, line, asked, given, many = memory[0], memory[1], memory[2:], lines if uneven else g, slopes.shape[1]
+    memory, lines, uneven, rest = np.empty((3, LINE)), np.empty(4 * LINE), axes[0, UNEVEN], 1.0 - flux
+    field, asked, given, many = memory[0], memory[1:], lines if uneven else g, slopes.shape[1]
     for part in range(start, stop):
-        first, length = tile_of(axes, part)
-        c, size = uint64(first), uint64(length)
+        first, length, c, size = tile_of(axes, part)
         for j in range(size):
             field[j] = g[c + j]
         for a in range(len(axes)):
-            where, on_sides, cells = place_of(axes, a, first), axes[a, ON_SIDES], uint64(axes[a, SPEED])
+            on_sides, cells = axes[a, ON_SIDES], uint64(axes[a, SPEED])
             ratio = dt if uneven else dt * table[OWN, axes[a, COLUMN]]
-            for number in range(pieces_of(axes, a)):
-                b, e, below, above = sides_of(axes, a, number, first, length, where)
+            for number in range(3 if a == len(axes) - 1 else 1):
+                below = side_of(axes, a, number, int64(0), first, length)
+                above = side_of(axes, a, number, int64(1), first, length)
+                b, e, m, h = below.begin, below.end, below.speed, above.speed
                 if b == e:
                     continue
+                x, y, i, k = c, c, below.beyond, above.beyond  # what cells and those beyond want of a flow of 1
+                o, p = (m, h) if on_sides else (cells + i, cells + k)
+                if uneven:
+                    weigh(lines, NONE, g, c, table, OWN, axes, a, below, free, c)
+                    weigh(lines, ONE, g, c, table, OWN + 1, axes, a, above, free, c)
+                    weigh(lines, TWO, g, i, table, THEIRS, axes, a, below, free, c)
+                    weigh(lines, THREE, g, k, table, THEIRS + 1, axes, a, above, free, c)
+                    x, y, i, k = NONE, ONE, TWO, THREE
+                for j in range(b, e if gu.size else b):
+                    low, high = ratio * w[m + j], -ratio * w[h + j]  # into the cells
+                    more = below.inner * max(-ratio * w[o + j], 0.0) * given[i + j]
+                    more += above.inner * max(ratio * w[p + j], 0.0) * given[k + j]
+                    less = (max(low, 0.0) - flux * low) * given[x + j] + (max(high, 0.0) - flux * high) * given[y + j]
+                    field[j] += more - less
                 for upper in range(2):
-                    z, m, wall, inner, shown = above if upper else below
-                    # where the cells and those beyond have what they want of a flow of 1
-                    x, i, sign = c, z, 1.0 - 2.0 * upper
-                    if uneven:
-                        for row, (at, begin) in enumerate(((NONE, c), (ONE, z))):
-                            weigh(lines, at, g, begin, table, OWN + 2 * row + upper, axes, a, where[0], free, c, b, e)
-                        x, i = NONE, ONE
-                    o, into = (m if on_sides else cells + z), sign * ratio
-                    for j in range(b, e if gu.size else b):
-                        more, flow = inner * max(-into * w[o + j], 0.0) * given[i + j], into * w[m + j]
-                        field[j] += more - (max(flow, 0.0) - flux * flow) * given[x + j]
+                    (_, _, z, m, wall, _, inner, shown), sign = (above, -1.0) if upper else (below, 1.0)
+                    x, i, o, into = (y, k, p, -ratio) if upper else (x, i, o, ratio)
+                    target, at = (field, NONE) if shown else (ginflow, wall)
                     for j in range(b, b if inner or not gu.size else e):
-                        more = max(into * w[m + j], 0.0) * given[x + j]
-                        if shown:
-                            field[j] += more
-                        else:
-                            ginflow[wall + j] += more
+                        target[at + j] += max(into * w[m + j], 0.0) * given[x + j]
                     for j in range(b, e if partials.size else b):
                         more = inner * max(-into * w[o + j], 0.0) * given[i + j]
                         asked[upper, j] = sign * (max(-into * w[m + j], 0.0) * given[x + j] - more)
                     if not gw.size or upper and on_sides and inner:
                         continue  # the velocity on an upper side is that on the lower side of the cell beyond
                     back, added = on_sides * inner, not fresh or upper > on_sides
-                    for j in range(b, e):  # the value at the side is that of the cell it comes from
+                    for j in range(b, e):  # the value at the side is that of the cell it comes from, at rest the mean
                         near = share(sign * w[m + j])
                         value = near * (shown * u[z + j]) + (1.0 - near) * u[c + j]
-                        mine, theirs = given[x + j], back * given[i + j]
-                        line[j] = into * (mine * (value - rest * u[c + j]) - theirs * (value - rest * u[z + j]))
+                        mine, theirs = value - rest * u[c + j], value - rest * u[z + j]
+                        total = into * (mine * given[x + j] - back * given[i + j] * theirs)
+                        gw[m + j] = total + gw[m + j] if added else total
                     for j in range(b, b if shown else e):
-                        line[j] += into * given[x + j] * (share(sign * w[m + j]) * inflow[wall + j])
+                        gw[m + j] += into * given[x + j] * (share(sign * w[m + j]) * inflow[wall + j])
                     for j in range(b, e if slopes.size else b):
                         near = share(sign * w[m + j])
                         slope = near * inner * slopes[a, (1 - upper) % many, z + j]
                         slope -= (1.0 - near) * slopes[a, upper % many, c + j]
-                        line[j] += ratio * (given[x + j] - back * given[i + j]) * slope
-                    for j in range(b, e):
-                        gw[m + j] = line[j] + gw[m + j] if added else line[j]
-            if partials.size:
-                differences(partials, a, c, asked, size)
+                        gw[m + j] += ratio * (given[x + j] - back * given[i + j]) * slope
+            for by in range(2 if partials.size else 0):  # what is asked of behind and ahead -> cotangents of a and b
+                for j in range(size):
+                    total = partials[a, 0, by, c + j] * asked[0, j]
+                    partials[a, many - 1, by, c + j] = total + partials[a, many - 1, by, c + j] * asked[1, j]
         for j in range(size if gu.size else NONE):
             gu[c + j] = field[j]
 
@@ -318,14 +306,11 @@ def jumps(partials, free, axes, gu, ginflow, start, stop):
     """The cotangents of a and b, the differences to the cells below and above, are added to those of u and inflow."""
     line, last = np.empty(LINE), partials.shape[1] - 1
     for part in range(start, stop):
-        first, length = tile_of(axes, part)
-        c = uint64(first)
+        first, length, c, _ = tile_of(axes, part)
         for a in range(len(axes)):
-            where = place_of(axes, a, first)
-            for number in range(2 * pieces_of(axes, a)):
-                b, e, below, above = sides_of(axes, a, number // 2, first, length, where)
+            for number in range(6 if a == len(axes) - 1 else 2):
                 upper, sign = number % 2, 1.0 - 2.0 * (number % 2)
-                i, _, wall, inner, shown = above if upper else below
+                b, e, i, _, wall, _, inner, shown = side_of(axes, a, number // 2, upper, first, length)
                 if shown and not inner:
                     continue  # the difference to a ghost cell that repeats the cell is 0
                 for j in range(b, e):
@@ -343,20 +328,17 @@ def _slopes(u, inflow, free, table, axes, slopes, partials, start, stop):
     memory, found, lines = np.empty((2, LINE)), np.empty((6, LINE)), np.ones(3 * LINE)
     many, every = slopes.shape[1], free[:, :0]
     for part in range(start, stop):
-        first, length = tile_of(axes, part)
-        c, size = uint64(first), uint64(length)
+        first, length, c, size = tile_of(axes, part)
         for a in range(len(axes)):
-            where = place_of(axes, a, first)
-            for number in range(2 * pieces_of(axes, a)):
-                b, e, below, above = sides_of(axes, a, number // 2, first, length, where)
+            for number in range(6 if a == len(axes) - 1 else 2):
                 upper, sign = number % 2, 1.0 - 2.0 * (number % 2)
-                i, _, wall, _, shown = above if upper else below
+                side = side_of(axes, a, number // 2, upper, first, length)
+                b, e, i, _, wall, _, _, shown = side
                 for j in range(b, e):
                     memory[upper, j] = sign * (u[c + j] - (u[i + j] if shown else inflow[wall + j]))
                 for j in range(b, e if free.size else b):
                     memory[upper, j] *= free[2 * a + upper, c + j]
-                line = uint64(upper * LINE)
-                weigh(lines, line, lines, TWO, table, DISTANCE + upper, axes, a, where[0], every, c, b, e)
+                weigh(lines, uint64(upper * LINE), lines, TWO, table, DISTANCE + upper, axes, a, side, every, c)
             for j in range(size if partials.size else NONE):
                 results = limiter(memory[0, j], memory[1, j], lines[j], lines[ONE + j])
                 found[1, j], found[0, j], found[4, j], found[5, j], found[2, j], found[3, j] = results

@@ -18,23 +18,21 @@ __all__ = ["interpolate", "scatter"]
 
 
 @njit(error_model="numpy")
-def _room():
-    """For a tile: first samples of the stencils, weights (value and slope, axis, sample), samples that count, rows."""
-    return np.empty(TILE, np.uint64), np.ones((2, 3, 4, TILE)), np.ones(3, np.int64), np.empty((3, TILE))
-
-
-@njit(error_model="numpy")
-def _stencils(w, scale, axes, tables, left, right, room):
+def _stencils(w, scale, axes, tables, left, right, first, begin, weights, rows):
     """Departure points of the points left:right -> first sample of each stencil, weights of the samples by axis.
 
-    There are always three axes: the weights of those that the field does not have stay 1. `begin` says which of the
+    There are always three axes: the weights of those that the field does not have are 1. `begin` says which of the
     four samples is the first that counts: for slopes at the points it is the one before the cell.
     """
-    many, dim, (first, weights, begin, rows) = right - left, len(w), room
+    many, dim = right - left, len(w)
     number, rest, fraction = rows[0, :many], rows[1, :many], rows[2, :many]
     for j in range(number.size):
         rest[j] = left + j
         number[j] = 0.0
+    for line in range(3 - dim):
+        begin[line], weight = 1, weights[0, line, 1]
+        for j in range(number.size):
+            weight[j] = 1.0
     for axis in range(dim - 1, -1, -1):
         line = axis + 3 - dim
         n, stride, periodic, start, _ = axes[line]
@@ -71,12 +69,13 @@ def interpolate(samples, w, scale, axes, tables, g, out, bounds, start, stop):
     `tables` has the weights of the value. With those of the slope too, out[axis] = -scale g times the slope of the
     interpolant along the axis: the derivative of g . (W samples) in w.
     """
-    room, dim, slopes = _room(), len(w), len(tables) > 1
-    first, weights, begin, rows = room
+    first, begin = np.empty(TILE, np.uint64), np.empty(3, np.int64)
+    weights, rows = np.empty((2, 3, 4, TILE)), np.empty((3, TILE))  # of value and slope by axis and sample
+    dim, slopes = len(w), len(tables) > 1
     value, slope, _ = rows
     for left in range(start * TILE, min(stop * TILE, w.shape[1]), TILE):
         right = min(left + TILE, w.shape[1])
-        _stencils(w, scale, axes, tables, left, right, room)
+        _stencils(w, scale, axes, tables, left, right, first, begin, weights, rows)
         many, least, greatest = right - left, bounds[0, left:right], bounds[1, left:right]
         for axis in range(len(out)):
             for j in range(left, right):
@@ -117,10 +116,11 @@ def interpolate(samples, w, scale, axes, tables, g, out, bounds, start, stop):
 @kernel("read2 read1 index2 read3 read1 write1")
 def scatter(w, scale, axes, tables, g, samples, start, stop):
     """samples += W^T g: for one thread, as points share samples."""
-    room = first, weights, begin, rows = _room()
+    first, begin = np.empty(TILE, np.uint64), np.empty(3, np.int64)
+    weights, rows = np.empty((2, 3, 4, TILE)), np.empty((3, TILE))  # of value and slope by axis and sample
     for left in range(start * TILE, min(stop * TILE, w.shape[1]), TILE):
         right = min(left + TILE, w.shape[1])
-        _stencils(w, scale, axes, tables, left, right, room)
+        _stencils(w, scale, axes, tables, left, right, first, begin, weights, rows)
         given, share = g[left:right], rows[0]
         for i in range(begin[0], axes[0, 4]):
             for k in range(begin[1], axes[1, 4]):

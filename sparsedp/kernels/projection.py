@@ -5,8 +5,6 @@ x0, x1, x2 are the components of a face field, in three axes; a component is emp
 periodic axis the last cell and the first face meet round the end.
 """
 
-from numba import njit
-
 from sparsedp.kernels.team import kernel
 
 __all__ = ["net_flow", "push"]
@@ -40,25 +38,20 @@ def net_flow(x, x0, x1, x2, lines0, lines1, lines2, b, start, stop):
     return total, whole
 
 
-@njit(error_model="numpy")
-def _across(x, p, lines, out):
-    """`push` for faces across the middle axis."""
-    n = p.shape[1]
-    for i in range(out.shape[0]):
-        for f in range(out.shape[1]):
-            a, b, c = lines[0, f], lines[1, f], lines[2, f]
-            given, result, low, high = x[i, f], out[i, f], p[i, (f - 1) % n], p[i, f % n]
-            for j in range(result.size):
-                result[j] = a * given[j] + b * low[j] + c * high[j]
-
-
 @kernel("read3 read3 read3 read3 read2 read2 read2 write3 write3 write3")
 def push(x0, x1, x2, p, lines0, lines1, lines2, out0, out1, out2, start, stop):
     """out = keep x + below p[f - 1] + above p[f]; the rows of `lines` hold keep, below and above of the faces."""
     n0, n1, n2 = p.shape
     plate = 1, len(out0), n1 * n2
-    _across(x0.reshape(plate), p.reshape(1, n0, n1 * n2), lines0, out0.reshape(plate))
-    _across(x1, p, lines1, out1)
+    first = x0.reshape(plate), p.reshape(1, n0, n1 * n2), lines0, out0.reshape(plate)  # as if the axis were the second
+    for faces, cells, lines, out in (first, (x1, p, lines1, out1)):
+        n = cells.shape[1]
+        for i in range(out.shape[0]):
+            for f in range(out.shape[1]):
+                a, b, c = lines[0, f], lines[1, f], lines[2, f]
+                given, result, low, high = faces[i, f], out[i, f], cells[i, (f - 1) % n], cells[i, f % n]
+                for j in range(result.size):
+                    result[j] = a * given[j] + b * low[j] + c * high[j]
     for i in range(n0):
         for k in range(n1):
             x, out, here = x2[i, k], out2[i, k], p[i, k]

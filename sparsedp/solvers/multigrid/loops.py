@@ -131,29 +131,26 @@ def add_up(sums, a, b, start, stop, sizes):
 def combine(out, there, n, c, at, x, place, b, steps, own, rest, share):
     """out = own x + rest b + share c x on n cells. Where they begin: `there` in out, `at` in c and b, `place` in x."""
     odd = steps.size % 2
-    for k in range(0, n, TILE):
-        row = out[there + k : there + min(k + TILE, n)]
-        given, right = x[place + k : place + k + row.size], b[at + k : at + k + row.size]
-        for i in range(row.size):  # a slice would not be vectorised
-            row[i] = 0.0
+    for left in range(0, n, TILE):
+        row = out[there + left : there + min(left + TILE, n)]
+        f, h = at + left, place + left  # the first cell in c and b, and in x
+        for k in range(row.size):  # a slice would not be vectorised
+            row[k] = 0.0
         for m in range(odd):
             d = steps[m]
-            forward, ahead = c[m, at + k :], x[place + k + d :]
-            back, behind = c[m, at + k - d :], x[place + k - d :]
-            for i in range(row.size):
-                row[i] += forward[i] * ahead[i] + back[i] * behind[i]
+            forward, ahead, backward, behind = c[m, f:], x[h + d :], c[m, f - d :], x[h - d :]
+            for k in range(row.size):
+                row[k] += forward[k] * ahead[k] + backward[k] * behind[k]
         for m in range(odd, steps.size, 2):  # two at a time: the sums are read and written half as often
             d, e = steps[m], steps[m + 1]
-            forward, ahead = c[m, at + k :], x[place + k + d :]
-            back, behind = c[m, at + k - d :], x[place + k - d :]
-            forward2, ahead2 = c[m + 1, at + k :], x[place + k + e :]
-            back2, behind2 = c[m + 1, at + k - e :], x[place + k - e :]
-            for i in range(row.size):
-                row[i] += (forward[i] * ahead[i] + back[i] * behind[i]) + (
-                    forward2[i] * ahead2[i] + back2[i] * behind2[i]
-                )
-        for i in range(row.size):
-            row[i] = own * given[i] + rest * right[i] + share * row[i]
+            forward, ahead, backward, behind = c[m, f:], x[h + d :], c[m, f - d :], x[h - d :]
+            upward, above, downward, below = c[m + 1, f:], x[h + e :], c[m + 1, f - e :], x[h - e :]
+            for k in range(row.size):
+                one = forward[k] * ahead[k] + backward[k] * behind[k]
+                row[k] += one + (upward[k] * above[k] + downward[k] * below[k])
+        given, right = x[h : h + row.size], b[f : f + row.size]
+        for k in range(row.size):
+            row[k] = own * given[k] + rest * right[k] + share * row[k]
 
 
 # ---- the loops -----------------------------------------------------------------------------------------------------
