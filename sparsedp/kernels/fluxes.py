@@ -113,28 +113,31 @@ class Side(NamedTuple):
 
 
 def tile_of(axes, part):
-    """The first cell of a tile, and how many there are; the same as unsigned numbers."""
+    """Of a tile the row, the first cell, and how many there are; these two as unsigned numbers once more."""
     length = axes[-1, N]
     tiles = -(-length // TILE)
-    left = part % tiles * TILE
-    first, size = part // tiles * length + left, min(length - left, TILE)
-    return first, size, uint64(first), uint64(size)
+    row, left = part // tiles, part % tiles * TILE
+    first, size = row * length + left, min(length - left, TILE)
+    return row, first, size, uint64(first), uint64(size)
 
 
-def side_of(axes, a, number, upper, first, size):
+def side_of(axes, a, number, upper, tile):
     """The lower or the upper side of the cells of a tile.
 
     Those of the last axis are three pieces: between the ends of a row (0), the lower (1), the upper end (2).
     """
-    n, stride, wall = axes[a, N], axes[a, STRIDE], axes[a, WALL + upper]
-    through = first // stride
-    block = through // n
+    n, stride, wall, (block, first, size, _, _) = axes[a, N], axes[a, STRIDE], axes[a, WALL + upper], tile
+    through = first
+    if a < len(axes) - 1:  # divisions take most of the time here
+        through = first // stride
+        block = through // n
     place, begin, end = through - block * n, 0, size
     at_end = place == (n - 1) * upper
     if a == len(axes) - 1:
         start = 1 if place == 0 else 0
         stop = max(size - 1, start) if place + size == n else size
-        begin, end = ((start, stop), (0, start), (stop, size))[number]
+        begin = 0 if number == 1 else stop if number == 2 else start
+        end = start if number == 1 else size if number == 2 else stop
         at_end = number == 1 + upper or number * n == 1
     walls, step = wall != ROUND, (2 * upper - 1) * stride
     closed = at_end and walls
@@ -194,15 +197,16 @@ def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, ou
     memory, lines, uneven, many = np.empty((2, LINE)), np.empty(2 * LINE), axes[0, UNEVEN], slopes.shape[1]
     leaves, enters, speed = memory[0], memory[1], lines if uneven else w
     for part in range(start, stop):
-        (first, length, c, size), bad = tile_of(axes, part), 0
+        tile = _, _, _, c, size = tile_of(axes, part)
+        bad = 0
         for j in range(size):
             leaves[j] = 0.0
             enters[j] = 0.0
         for a in range(len(axes)):
             ratio = dt if uneven else dt * table[OWN, axes[a, COLUMN]]
             for number in range(3 if a == len(axes) - 1 else 1):
-                below = side_of(axes, a, number, int64(0), first, length)  # of one type: compiled once
-                above = side_of(axes, a, number, int64(1), first, length)
+                below = side_of(axes, a, number, int64(0), tile)  # of one type: compiled once
+                above = side_of(axes, a, number, int64(1), tile)
                 b, e, i, k, m, h = below.begin, below.end, below.beyond, above.beyond, below.speed, above.speed
                 if b == e:
                     continue
@@ -242,15 +246,15 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
     memory, lines, uneven, rest = np.empty((3, LINE)), np.empty(4 * LINE), axes[0, UNEVEN], 1.0 - flux
     field, asked, given, many = memory[0], memory[1:], lines if uneven else g, slopes.shape[1]
     for part in range(start, stop):
-        first, length, c, size = tile_of(axes, part)
+        tile = _, _, _, c, size = tile_of(axes, part)
         for j in range(size):
             field[j] = g[c + j]
         for a in range(len(axes)):
             on_sides, cells = axes[a, ON_SIDES], uint64(axes[a, SPEED])
             ratio = dt if uneven else dt * table[OWN, axes[a, COLUMN]]
             for number in range(3 if a == len(axes) - 1 else 1):
-                below = side_of(axes, a, number, int64(0), first, length)
-                above = side_of(axes, a, number, int64(1), first, length)
+                below = side_of(axes, a, number, int64(0), tile)
+                above = side_of(axes, a, number, int64(1), tile)
                 b, e, m, h = below.begin, below.end, below.speed, above.speed
                 if b == e:
                     continue
@@ -306,11 +310,11 @@ def jumps(partials, free, axes, gu, ginflow, start, stop):
     """The cotangents of a and b, the differences to the cells below and above, are added to those of u and inflow."""
     line, last = np.empty(LINE), partials.shape[1] - 1
     for part in range(start, stop):
-        first, length, c, _ = tile_of(axes, part)
+        tile = _, _, _, c, _ = tile_of(axes, part)
         for a in range(len(axes)):
             for number in range(6 if a == len(axes) - 1 else 2):
                 upper, sign = number % 2, 1.0 - 2.0 * (number % 2)
-                b, e, i, _, wall, _, inner, shown = side_of(axes, a, number // 2, upper, first, length)
+                b, e, i, _, wall, _, inner, shown = side_of(axes, a, number // 2, upper, tile)
                 if shown and not inner:
                     continue  # the difference to a ghost cell that repeats the cell is 0
                 for j in range(b, e):
@@ -328,11 +332,11 @@ def _slopes(u, inflow, free, table, axes, slopes, partials, start, stop):
     memory, found, lines = np.empty((2, LINE)), np.empty((6, LINE)), np.ones(3 * LINE)
     many, every = slopes.shape[1], free[:, :0]
     for part in range(start, stop):
-        first, length, c, size = tile_of(axes, part)
+        tile = _, _, _, c, size = tile_of(axes, part)
         for a in range(len(axes)):
             for number in range(6 if a == len(axes) - 1 else 2):
                 upper, sign = number % 2, 1.0 - 2.0 * (number % 2)
-                side = side_of(axes, a, number // 2, upper, first, length)
+                side = side_of(axes, a, number // 2, upper, tile)
                 b, e, i, _, wall, _, _, shown = side
                 for j in range(b, e):
                     memory[upper, j] = sign * (u[c + j] - (u[i + j] if shown else inflow[wall + j]))

@@ -59,7 +59,7 @@ def _stencils(w, scale, axes, tables, left, right, first, begin, weights, rows):
                     t = fraction[j]
                     weight[j] = ((d * t + c) * t + b) * t + a if t != 0.0 else at_point
     for j in range(number.size):
-        first[j] = np.uint64(number[j])
+        first[j] = np.int64(number[j])
 
 
 @kernel("read1 read2 read1 index2 read3 read1 write2 write2")
@@ -69,8 +69,8 @@ def interpolate(samples, w, scale, axes, tables, g, out, bounds, start, stop):
     `tables` has the weights of the value. With those of the slope too, out[axis] = -scale g times the slope of the
     interpolant along the axis: the derivative of g . (W samples) in w.
     """
-    first, begin = np.empty(TILE, np.uint64), np.empty(3, np.int64)
-    weights, rows = np.empty((2, 3, 4, TILE)), np.empty((3, TILE))  # of value and slope by axis and sample
+    first, begin = np.empty(TILE, np.int64), np.empty(3, np.int64)
+    weights, rows = np.empty((2, 3, 4, TILE)), np.empty((1, 1, 3, TILE))[0, 0]  # of value and slope by axis and sample
     dim, slopes = len(w), len(tables) > 1
     value, slope, _ = rows
     for left in range(start * TILE, min(stop * TILE, w.shape[1]), TILE):
@@ -91,15 +91,17 @@ def interpolate(samples, w, scale, axes, tables, g, out, bounds, start, stop):
                     line, a, b = near[m:], weights[0, 2, m], weights[0, 2, m + 1]
                     c, d = weights[1, 2, m], weights[1, 2, m + 1]
                     for j in range(many):
-                        one, two = line[first[j]], line[first[j] + np.uint64(1)]
+                        place = np.uint64(first[j])
+                        one, two = line[place], line[place + np.uint64(1)]
                         value[j] += a[j] * one + b[j] * two
                         if slopes:
                             slope[j] += c[j] * one + d[j] * two
                 for m in range(1, 3 if 0 < i < 3 and 0 < k < 3 else 1):
                     line = near[m:]
                     for j in range(least.size):
-                        sample = line[first[j]]
-                        least[j], greatest[j] = min(least[j], sample), max(greatest[j], sample)
+                        sample = line[np.uint64(first[j])]
+                        least[j] = sample if sample < least[j] else least[j]
+                        greatest[j] = sample if sample > greatest[j] else greatest[j]
                 for axis in range(len(out)):  # its factor is the slope, the others are values
                     steep = axis + 3 - dim if slopes else -1
                     a, b, c = weights[int(steep == 0), 0, i], weights[int(steep == 1), 1, k], rows[int(steep == 2)]
@@ -116,8 +118,8 @@ def interpolate(samples, w, scale, axes, tables, g, out, bounds, start, stop):
 @kernel("read2 read1 index2 read3 read1 write1")
 def scatter(w, scale, axes, tables, g, samples, start, stop):
     """samples += W^T g: for one thread, as points share samples."""
-    first, begin = np.empty(TILE, np.uint64), np.empty(3, np.int64)
-    weights, rows = np.empty((2, 3, 4, TILE)), np.empty((3, TILE))  # of value and slope by axis and sample
+    first, begin = np.empty(TILE, np.int64), np.empty(3, np.int64)
+    weights, rows = np.empty((2, 3, 4, TILE)), np.empty((1, 1, 3, TILE))[0, 0]  # of value and slope by axis and sample
     for left in range(start * TILE, min(stop * TILE, w.shape[1]), TILE):
         right = min(left + TILE, w.shape[1])
         _stencils(w, scale, axes, tables, left, right, first, begin, weights, rows)
@@ -130,4 +132,4 @@ def scatter(w, scale, axes, tables, g, samples, start, stop):
                 for m in range(begin[2], axes[2, 4]):
                     line, weight = samples[i * axes[0, 1] + k * axes[1, 1] + m :], weights[0, 2, m]
                     for j in range(given.size):
-                        line[first[j]] += weight[j] * share[j]
+                        line[np.uint64(first[j])] += weight[j] * share[j]
