@@ -12,12 +12,12 @@ import numpy as np
 from numba import njit
 
 from sparsedp.kernels.departure import PAD, TILE
-from sparsedp.kernels.team import kernel
+from sparsedp.kernels.team import INNER, kernel
 
 __all__ = ["interpolate", "scatter"]
 
 
-@njit(error_model="numpy")
+@njit(**INNER)
 def _stencils(w, scale, axes, tables, left, right, first, begin, weights, rows):
     """Departure points of the points left:right -> first sample of each stencil, weights of the samples by axis.
 

@@ -12,9 +12,12 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 from types import FunctionType
 
-__all__ = ["SERIAL", "Kernel", "kernel", "loops"]
+__all__ = ["INNER", "SERIAL", "Kernel", "kernel", "loops"]
 
 SERIAL = 524_288  # numbers: below, a few tenths of a millisecond, a second thread costs more than it brings
+
+# Of functions that only compiled ones call: Python could not call them, which saves compiling how it would.
+INNER = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 loops: list["Kernel"] = []  # all that the imported modules define
 
@@ -66,7 +69,7 @@ def _with_compiled(functions):
     names = dict(functions[0].__globals__)
     for function in functions:
         own = FunctionType(function.__code__, names, function.__name__)
-        names[function.__name__] = njit(error_model="numpy", forceinline=True, fastmath={"contract"})(own)
+        names[function.__name__] = njit(forceinline=True, fastmath={"contract"}, **INNER)(own)
     return names
 
 

@@ -11,7 +11,7 @@ import itertools
 import numpy as np
 from numba import njit
 
-from sparsedp.kernels.team import kernel
+from sparsedp.kernels.team import INNER, kernel
 
 __all__ = ["GHOST", "Layout", "direct", "image", "prolong", "restrict", "smooth", "steps_around", "update"]
 
@@ -95,7 +95,7 @@ class Layout:
 TILE, WINDOW = 2048, 16384  # cells that are worked on together: what is written is in cache for what follows
 FAST = {"reassoc", "contract", "nsz"}  # a sum may be taken in any order; NaN and infinity stay what they are
 
-helper = njit(nogil=True, error_model="numpy", cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+helper = njit(cache=True, **INNER)
 
 
 @helper
@@ -114,7 +114,7 @@ def ghosts(field, place, planes, sizes):
                 field[j + n + 1] = field[j + 1]
 
 
-@njit(nogil=True, error_model="numpy", cache=True, fastmath=FAST, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@njit(cache=True, fastmath=FAST, **INNER)
 def add_up(sums, a, b, start, stop, sizes):
     """The scalar products of the cells of planes."""
     _, width, _, lines, lead, n = sizes[:6]
