@@ -68,14 +68,14 @@ def pullback(fun, x):
     >>> pull(1.0)
     (5.0, 2.0)
     """
-    found, rebuild = flatten(x)
-    moving = list(map(is_variable, found))
+    entries, rebuild = flatten(x)
+    moving = list(map(is_variable, entries))
     if not any(moving):
-        kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in found})
+        kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in entries})
         raise DerivativeError(
             f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write x.astype(float)"
         )
-    found = [_apart_from_caller(leaf) if moves else leaf for leaf, moves in zip(found, moving, strict=True)]
+    entries = [_apart_from_caller(leaf) if moves else leaf for leaf, moves in zip(entries, moving, strict=True)]
 
     def one_array(x):
         result = fun(x)
@@ -85,12 +85,12 @@ def pullback(fun, x):
             )
         return result
 
-    (value,), _, back = linearised(one_array, rebuild(found), moving)
+    (value,), _, back = linearised(one_array, rebuild(entries), moving)
 
     def pull(g):
         if np.shape(g) != np.shape(value):
             raise ShapeError(f"the cotangent must have the shape {np.shape(value)} of the value, got {np.shape(g)}")
-        slopes = zip(found, moving, back([g]), strict=True)
+        slopes = zip(entries, moving, back([g]), strict=True)
         return rebuild(_apart([_gradient(leaf, slope) if moves else None for leaf, moves, slope in slopes], g))
 
     return _apart_from_caller(value), pull
@@ -122,11 +122,11 @@ def traced(fun, tree, roots):
 
     With a word of advice where NumPy, math or Python refuse a traced value.
     """
-    found, rebuild = flatten(tree)
+    entries, rebuild = flatten(tree)
     number = new_trace()
     try:
         with growing():
-            ends, build = flatten(fun(rebuild(boxed(found, roots, number))))
+            ends, build = flatten(fun(rebuild(boxed(entries, roots, number))))
         return *split_boxes(ends, number), build
     except (TypeError, ValueError, AttributeError) as error:
         said = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
@@ -290,8 +290,8 @@ def hvp(loss, x, tangent):
     (10.0, 4.0)
     """
     product = jvp(grad(loss), x, tangent)[1]
-    found, rebuild = flatten(product)
-    return rebuild([float(p) if isinstance(u, float) and not isbox(p) else p for p, u in zip(found, leaves(x))])
+    entries, rebuild = flatten(product)
+    return rebuild([float(p) if isinstance(u, float) and not isbox(p) else p for p, u in zip(entries, leaves(x))])
 
 
 def push(fun, tree, tangents):

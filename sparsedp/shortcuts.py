@@ -1,20 +1,20 @@
-"""Derivatives of the commonest calls on a tape: arithmetic of equal shapes, entries of arrays, arrays made of numbers.
+"""Derivatives of the commonest calls on a tape: arithmetic, entries of arrays, arrays made of numbers.
 
-autograd knows them all, and takes ten times as long: it is ready for broadcasting, other dtypes and traces inside
-traces. What is here serves float64 alone; without it a gradient of small steps takes twice the time
+autograd knows them all, and takes three to ten times as long: it is ready for all kinds of broadcasting, other dtypes
+and traces inside traces. What is here serves float64 alone; without it a gradient of small steps takes twice the time
 (benchmarks/burgers.py, 200 steps of rk4).
 """
 
 import operator
-from functools import partial
 from inspect import unwrap
-from typing import Any, NamedTuple
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
 
 __all__ = [
-    "ARRAY", "BOX", "COPY", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part", "REAL", "pull_of", "tangent_of",
+    "ACTS", "ARRAY", "BOX", "COPY", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part", "REAL",
+    "pull_of", "tangent_of",
 ]  # fmt: skip
 
 FLOAT = np.dtype(float)
@@ -28,30 +28,40 @@ OPERATORS = {
 MAKERS = "_array_from_scalar_or_array", "array_from_args"  # what anp.array calls
 BOX = anp.numpy_boxes.ArrayBox
 ITEM = unwrap(BOX.__getitem__)
+ACTS = {  # of NumPy's numbers the operators of Python have the same bits and take a tenth of the time
+    anp.add: operator.add, anp.subtract: operator.sub, anp.multiply: operator.mul,
+    anp.true_divide: operator.truediv, ITEM: operator.getitem,
+}  # fmt: skip
 COPY, ARRAY = (unwrap(getattr(anp.numpy_wrapper, name)) for name in MAKERS)
-RESHAPED = {ITEM, ARRAY}
+
+# What of two operands a derivative needs -> what is held of them.
+HELD: dict[tuple, Any] = {
+    (): lambda args: (),
+    (0,): lambda args: (args[0], None),
+    (1,): lambda args: (None, args[1]),
+    (0, 1): lambda args: args,
+}
 
 
-class Part(NamedTuple):
-    """A cotangent or tangent that is zero outside ``whole[index]``, and g there."""
+class Part(tuple):
+    """(g, index, shape): a cotangent that is zero outside ``whole[index]``, and g there."""
 
-    g: Any
-    index: Any
-    shape: tuple
+    __slots__ = ()
 
 
 def pull_of(fun, value, args, nums):
-    """A call ``value = fun(*args)`` -> the function from g to the cotangents of args `nums`; None: autograd knows."""
+    """A call ``value = fun(*args)`` -> (pull, held), or None: autograd knows.
+
+    ``pull(g, *held)``: the cotangents of args `nums`.
+    """
     formulas = FORMULAS.get(fun)  # autograd's own: a primitive that a user made of NumPy's has other derivatives
-    if formulas is None or value.dtype is not FLOAT:
+    if formulas is None or type(value) not in NUMBERS or value.dtype is not FLOAT:
         return None
-    shape = None if fun in RESHAPED else value.shape
     for num in nums:
         arg = args[num]
-        if type(arg) not in NUMBERS or arg.dtype is not FLOAT or (shape is not None and arg.shape != shape):
+        if type(arg) not in NUMBERS or arg.dtype is not FLOAT:
             return None
-    pull = formulas[0](nums, *args)
-    return pull and (lambda g: pull(g if getattr(g, "dtype", FLOAT) is FLOAT else _real(g)))
+    return formulas[0](value, nums, args)
 
 
 def tangent_of(fun, value, args, nums, tangents):
@@ -66,44 +76,61 @@ def tangent_of(fun, value, args, nums, tangents):
     return tangent if np.shape(tangent) == value.shape else None
 
 
-def _real(g):
-    """Beside complex values autograd hands complex cotangents on to real ones."""
-    return anp.real(g) if g.dtype.kind == "c" else g
+def _entrywise(*acts):
+    """Formulas of a function entry by entry: for each operand its derivative ``act(g, *args)``, and what that needs.
 
-
-def _of_two(factor):
-    """factor(num, x, y), the derivative in an operand as a function of g that holds no array in vain -> both formulas.
-
-    Entry by entry, a derivative is its own transpose.
+    A derivative is its own transpose. What is needed is a key of HELD: no array is held in vain.
     """
+    act, other = acts[0][0], acts[-1][0]
+    pulls = {
+        (0,): (lambda g, *args: (act(g, *args),), HELD[acts[0][1]]),
+        (1,): (lambda g, *args: (other(g, *args),), HELD[acts[-1][1]]),
+        (0, 1): (lambda g, *args: (act(g, *args), other(g, *args)), HELD[acts[0][1] and (0, 1)]),
+    }
 
-    def back(nums, x, y):
-        one = factor(nums[0], x, y)
-        if len(nums) == 1:
-            return lambda g: (one(g),)
-        other = factor(1, x, y)
-        return lambda g: (one(g), other(g))
+    def back(value, nums, args):
+        if nums[-1] >= len(acts):
+            return None
+        (pull, hold), shape = pulls[nums], value.shape
+        for num in nums:
+            if args[num].shape != shape:
+                break
+        else:
+            return pull, hold(args)
+        many = [value.ndim - args[num].ndim for num in nums]
+        if any(shape[first:] != args[num].shape for num, first in zip(nums, many)):
+            return None
+        return (lambda g, *args: [_summed(back, first) for back, first in zip(pull(g, *args), many)]), hold(args)
 
-    def forth(value, nums, tangents, x, y):
-        g = factor(nums[0], x, y)(tangents[0])
-        return g + factor(1, x, y)(tangents[1]) if len(nums) == 2 else g
+    def forth(value, nums, tangents, *args):
+        if nums[-1] >= len(acts):
+            return None
+        parts = [acts[num][0](tangent, *args) for num, tangent in zip(nums, tangents)]
+        return parts[0] + parts[1] if len(nums) == 2 else parts[0]
 
     return back, forth
 
 
-def _same(g):
+def _summed(g, many):
+    """A cotangent summed over its first axes."""
+    for _ in range(many):
+        g = g.sum(axis=0)
     return g
 
 
-def _item(nums, x, index):
+def _item(value, nums, args):
+    x, index = args
     if type(index) not in BASIC and not (type(index) is tuple and all(type(one) in BASIC for one in index)):
         return None
-    shape = x.shape
-    return lambda g: (Part(g, index, shape),)
+    return _part, ((index, x.shape),)
 
 
-def _array(nums, positional, options, *entries):
-    return None if positional or options else lambda g: [g[num - 2] for num in nums]
+def _part(g, place):
+    return (Part((g, *place)),)
+
+
+def _array(value, nums, args):
+    return None if args[0] or args[1] else (lambda g: [g[num - 2] for num in nums], ())
 
 
 def _array_along(value, nums, tangents, positional, options, *entries):
@@ -115,12 +142,14 @@ def _array_along(value, nums, tangents, positional, options, *entries):
     return along
 
 
-# Of a function of autograd: the pullback, from (nums, *args), and the tangent, from (value, nums, tangents, *args).
+# Of a function of autograd: (pull, held) from (value, nums, args), the tangent from (value, nums, tangents, *args).
 FORMULAS: dict[Any, Any] = {
-    anp.add: _of_two(lambda num, x, y: _same),
-    anp.subtract: _of_two(lambda num, x, y: operator.neg if num else _same),
-    anp.multiply: _of_two(lambda num, x, y: partial(operator.mul, x if num else y)),
-    anp.negative: (lambda nums, x: lambda g: (-g,), lambda value, nums, tangents, x: -tangents[0]),
+    anp.add: _entrywise((lambda g, *args: g, ()), (lambda g, *args: g, ())),
+    anp.subtract: _entrywise((lambda g, *args: g, ()), (lambda g, *args: -g, ())),
+    anp.multiply: _entrywise((lambda g, x, y: y * g, (1,)), (lambda g, x, y: x * g, (0,))),
+    anp.true_divide: _entrywise((lambda g, x, y: g / y, (1,)), (lambda g, x, y: -g * x / y**2, (0, 1))),
+    anp.power: _entrywise((lambda g, x, y: g * y * x ** np.where(y, y - 1, 1.0), (0, 1))),
+    anp.negative: _entrywise((lambda g, *args: -g, ())),
     ITEM: (_item, lambda value, nums, tangents, x, index: tangents[0][index]),
     ARRAY: (_array, _array_along),
 }

@@ -25,9 +25,11 @@ from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, note, thread, timed
 from sparsedp.recipe import Remade
 from sparsedp.shortcuts import (
+    ACTS,
     ARRAY,
     BOX,
     COPY,
+    FLOAT,
     ITEM,
     MAKERS,
     NUMBERS,
@@ -55,8 +57,6 @@ plain = getval  # the value below all boxes
 class Recorder:
     """Takes down the calls of reverse-mode traces in order: the backward pass need not sort a graph."""
 
-    weigh: Any = None  # a function of (value, args, nums) that looks at every call
-
     def __init__(self):
         self.nodes: list = []
 
@@ -67,28 +67,40 @@ class Recorder:
 
 
 class ReverseNode(VJPNode):
-    """A call on a reverse-mode trace. Its pullback sees the constants of the call as they are now."""
+    """A call on a reverse-mode trace. Its pullback sees the constants of the call as they are now.
 
-    __slots__ = ("recorder",)
+    ``vjp(g, *held)``: the cotangents of the parents.
+    """
+
+    __slots__ = ("held", "recorder")
     parents: Any
     vjp: Any
+    held: Any
 
     def initialize_root(self, recorder):
         """Begin a trace."""
-        self.parents, self.vjp, self.recorder = (), None, recorder
+        self.parents, self.vjp, self.held, self.recorder = (), None, (), recorder
 
     def __init__(self, value, fun, args, options, nums, parents):
         self.parents, self.recorder = parents, parents[0].recorder
-        if len(nums) < len(args) and fun not in sparing:
-            args = constant_args(args, nums)
-        if options:
-            options = constant(options)
-        self.vjp = None if options else pull_of(fun, value, args, nums)
-        if self.vjp is None:
-            super().__init__(value, fun, args, options, nums, parents)
+        quick = None if options else pull_of(fun, value, args, nums)
+        if quick is not None:
+            self.vjp, held = quick
+            self.held = constant_args(held, nums) if len(nums) < len(held) else held
+        else:
+            if len(nums) < len(args) and fun not in sparing:
+                args = constant_args(args, nums)
+            super().__init__(value, fun, args, constant(options), nums, parents)
+            self.held = ()
+            if getattr(plain(value), "dtype", FLOAT).kind == "c":
+                self._keep_real(args, nums)
         self.recorder.nodes.append(self)
-        if self.recorder.weigh is not None:
-            self.recorder.weigh(value, args, nums)
+
+    def _keep_real(self, args, nums):
+        """Beside complex values autograd hands complex cotangents on to real ones."""
+        pull, real = self.vjp, [dtype_of(args[num]).kind != "c" for num in nums]
+        if any(real):
+            self.vjp = lambda g: [anp.real(back) if one else back for one, back in zip(real, pull(g), strict=True)]
 
 
 class ForwardNode(JVPNode):
@@ -188,52 +200,51 @@ def backward(nodes, ends, cotangents, sums):
         if end is not None and g is not None:
             sums[end] = _added(sums.get(end), g)
     for node in reversed(nodes):
-        if node in sums:
-            for parent, g in zip(node.parents, node.vjp(sums.pop(node)[0]), strict=True):
-                known = sums.get(parent)
-                sums[parent] = (g, False) if known is None and type(g) in NUMBERS else _added(known, g)
+        total = sums.pop(node, None)
+        if total is not None:
+            for parent, g in zip(node.parents, node.vjp(total[0], *node.held), strict=True):
+                total = sums.get(parent)
+                sums[parent] = (g, False) if total is None and type(g) in NUMBERS else _added(total, g)
 
 
-def _added(known, g):
+def _added(total, g):
     """(Sum so far, whether it may be written to) or None, a cotangent -> the new pair."""
     kind = type(g)
     if kind is Part:
-        if known is not None and known[1] and type(known[0]) is np.ndarray and type(g.g) in REAL:
-            known[0][g.index] += g.g
-            return known
-        whole = _whole(g) if known is None else known[0] + _whole(g)
+        g, index, _ = part = g
+        if total is not None and total[1] and type(total[0]) is np.ndarray and type(g) in REAL:
+            total[0][index] += g
+            return total
+        whole = _whole(*part) if total is None else total[0] + _whole(*part)
         return whole, type(whole) is np.ndarray
-    if known is None or kind is not type(known[0]) or kind not in NUMBERS or known[0].dtype != g.dtype:
-        return add_outgrads(known, g)
-    total = np.add(known[0], g, out=known[0] if known[1] and kind is np.ndarray else None)
-    return total, kind is np.ndarray
+    if total is None or kind is not type(total[0]) or kind not in NUMBERS or total[0].dtype != g.dtype:
+        return add_outgrads(total, g)
+    if kind is np.float64:
+        return total[0] + g, False
+    return np.add(total[0], g, out=total[0] if total[1] else None), True
 
 
-def _whole(part):
+def _whole(g, index, shape):
     """A part of a cotangent, traced or not -> the array around it."""
 
     def around(g):
-        whole = np.zeros(part.shape)
-        whole[part.index] = g
+        whole = np.zeros(shape)
+        whole[index] = g
         return whole[()]
 
-    g = part.g
-    return linear("entries", around, lambda whole: whole[part.index])[0](g) if isbox(g) else around(g)
+    return linear("entries", around, lambda whole: whole[index])[0](g) if isbox(g) else around(g)
 
 
 # ---- calls -----------------------------------------------------------------------------------------------------------
 
 
-def direct(function, asked=False):
-    """A primitive of autograd -> the same, which asks autograd only where traces are nested.
-
-    `asked`: whether operands that are not PLAIN are asked too, as by NumPy's operators; that is left to autograd.
-    """
+def direct(function):
+    """A primitive of autograd -> the same, which asks autograd only where traces are nested."""
     raw = function.fun
 
     @wraps(function)
     def call(*args):
-        values, nums, parents, trace = list(args), [], [], None  # type: list, list, list, Any
+        values, nums, parents, trace = list(args), (), [], None  # type: list, Any, list, Any
         for num, arg in enumerate(args):
             kind = type(arg)
             if kind in box_types:
@@ -241,14 +252,39 @@ def direct(function, asked=False):
                 if type(value) in box_types or (nums and arg._trace != trace):
                     return function(*args)
                 values[num], trace = value, arg._trace
-                nums.append(num)
+                nums = (*nums, num)
                 parents.append(arg._node)
-            elif asked and kind not in PLAIN:
-                return function(*args)
         ans = raw(*values)
         if not nums:
             return ans
         return new_box(ans, trace, type(parents[0])(ans, function, values, {}, nums, parents))
+
+    return call
+
+
+def _of_two(function):
+    """The same for two operands. One that is not PLAIN may act itself, as NumPy's operators ask: left to autograd."""
+    raw = function.fun
+    quick = ACTS.get(function, raw)
+
+    @wraps(function)
+    def call(x, y):
+        if type(x) is BOX:
+            a, trace, nums, parents = x._value, x._trace, (0,), (x._node,)  # type: Any, Any, tuple, tuple
+            if type(y) is BOX and y._trace == trace:
+                b, nums, parents = y._value, (0, 1), (x._node, y._node)
+            elif type(y) in PLAIN:
+                b = y
+            else:
+                return function(x, y)
+        elif type(x) in PLAIN:
+            a, b, trace, nums, parents = x, y._value, y._trace, (1,), (y._node,)
+        else:
+            return function(x, y)
+        if type(a) is BOX or type(b) is BOX:
+            return function(x, y)
+        ans = quick(a, b) if type(a) in NUMBERS or type(b) in NUMBERS else raw(a, b)
+        return new_box(ans, trace, type(parents[0])(ans, function, (a, b), {}, nums, parents))
 
     return call
 
@@ -259,9 +295,9 @@ def _install():
     def reflected(act):
         return lambda box, other: act(other, box)
 
-    BOX.shape, BOX.__getitem__ = property(lambda box: np.shape(box._value)), direct(ITEM)
+    BOX.shape, BOX.__getitem__ = property(lambda box: np.shape(box._value)), _of_two(ITEM)
     for name, function in OPERATORS.items():
-        act = direct(function, asked=True)
+        act = _of_two(function)
         setattr(BOX, f"__{name}__", act)
         setattr(BOX, f"__r{name}__", reflected(act))
     copy = direct(COPY)

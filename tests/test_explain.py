@@ -293,5 +293,8 @@ def test_held_arrays_are_found_in_any_container():
     if False:
         unset = 0.0
     kept = {"a": [np.ones(3), (np.ones(4),)], "b": np.ones((2, 2))[0]}
-    nodes = [SimpleNamespace(vjp=partial(lambda g, k: g, k=kept)), SimpleNamespace(vjp=late)]
-    assert bytes_held(nodes) == 8 * (3 + 4 + 4)
+    nodes = [
+        SimpleNamespace(vjp=partial(lambda g, k: g, k=kept), held=()),
+        SimpleNamespace(vjp=late, held=(np.ones(5),)),
+    ]
+    assert bytes_held(nodes) == 8 * (3 + 4 + 4 + 5)

@@ -152,7 +152,9 @@ def peak(call):
 
 @KINDS
 @pytest.mark.parametrize("keep", ["last", "all"])
-def test_peak_is_the_trajectory(step, keep):
+def test_peak_is_the_trajectory(step, keep, monkeypatch):
+    """Where tapes have no room beside it."""
+    monkeypatch.setattr("sparsedp.trajectory.front.ROOM", 2**22)
     u, n = np.random.default_rng(0).random(20_000), 100
     c = np.full(u.shape, 0.5)
     weights = np.ones(()) if keep == "last" else np.ones((n + 1, 1))

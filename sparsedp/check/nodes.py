@@ -85,10 +85,10 @@ def calls_seen():
         node, pull = Node(*call), tape_node.vjp
         (running[-1].inner if running else found).append(node)
 
-        def watched(g):
+        def watched(*g):
             running.append(node)
             try:
-                return pull(g)
+                return pull(*g)
             finally:
                 running.pop()
 
@@ -112,7 +112,7 @@ def bytes_held(nodes):
     """
     buffers: dict[int, int] = {}
     seen: set[int] = set()
-    waiting: list = [(node.vjp, 0) for node in nodes]
+    waiting: list = [(part, 0) for node in nodes for part in (node.vjp, node.held)]
     while waiting:
         thing, depth = waiting.pop()
         if isinstance(thing, np.ndarray):

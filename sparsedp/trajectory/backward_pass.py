@@ -38,52 +38,60 @@ class BackwardPass:
     def back(self, g):
         """Cotangents of the outputs -> those of all arguments, None where there is none."""
         loop, steps, tapes, n = self.loop, self.steps, self.tapes, self.loop.n
-        growth, many = Growth(n, loop.truncate), len(self.kept) - 1
+        growth = Growth(loop)
         source = loop.keep.source(n, g)
         state = self.kept.pop()
         total = source(state)
         growth.see(n, total)
         for i in shown_steps(loop.progress, range(n - 1, -1, -1), "backward"):
+            if i >= state.i:
+                continue  # it was on the tape of a later one
             if total is None and not loop.keep.along:
                 break  # cut by truncation
-            tape = tapes.pop() if i + 1 == len(tapes) else None
-            end = None if tape else state.marks()  # what is on a tape is not run again
-            state = self._state_at(i)
-            if total is not None:
-                if tape is None:
-                    tape, after = steps.taped(state)
+            if len(tapes) and tapes[-1].steps[-1][0].i == i:
+                tape = tapes.pop()  # what is on a tape is not run again
+                state = tape.steps[0][0]
+            else:
+                tape, end = None, state.marks()
+                state = self._state_at(i)
+                if total is not None:
+                    tape, after = steps.taped(state, i + 1)
                     loop.compare(after.marks(), end)
                     del after
-                total = self._pull(tape, state, total)
+            if total is not None:
+                total = self._pull(tape, total)
             del tape
-            if i % growth.every == 0:
-                growth.see(i, total)
+            if state.i % loop.every == 0:
+                growth.see(state.i, total)
             if loop.keep.along and (i > 0 or loop.wants(0)):
                 total = _sum(total, source(state))
         if active:
             count("rollout.step", "vjp", n)
             count("rollout.step", "recomputed", self.recomputed)
-        record = growth.record(many, self.recomputed)
+        record = growth.record(loop.kept, self.recomputed)
         if loop.record is not None:
             loop.record(record)
         params = [self.cotangents.get(root, NONE)[0] for root in steps.roots]
         inputs = [stacked(rows) if rows else None for rows in self.inputs]
         return [*(total or [None] * len(loop.state.places)), *map(_fitted, params, steps.p), *inputs]
 
-    def _pull(self, tape, state, g):
+    def _pull(self, tape, g):
         """Cotangents of the state after a tape -> those of the state before, None if those are not wanted."""
-        cotangents, self.steps.last = self.cotangents, state
-        backward(tape.nodes, tape.ends, g, cotangents)
-        backs, many = [cotangents.pop(root, NONE)[0] for root in tape.starts], len(g)
-        for rows, back in zip(self.inputs, backs[many:], strict=True):
-            if back is not None:
-                rows[state.i] = back
-        for root, (back, own) in cotangents.items():
+        cotangents, ends = self.cotangents, tape.ends
+        for state, roots, nodes in reversed(tape.steps):
+            self.steps.last = state
+            backward(nodes, ends, g, cotangents)
+            ends = g = ()
+            for rows, root in zip(self.inputs, roots, strict=True):
+                if root in cotangents:
+                    rows[state.i] = cotangents.pop(root)[0]
+        backs = [cotangents.pop(root, NONE)[0] for root in tape.starts]
+        for root, (back, writable) in cotangents.items():
             if root not in self.steps.roots:
                 refuse_lost("the step")  # in a call of another step
-            if not own and type(back) is np.ndarray:
+            if not writable and type(back) is np.ndarray:
                 cotangents[root] = back.copy(), True
-        return list(map(_fitted, backs, state.values)) if any(tape.starts[:many]) else None
+        return list(map(_fitted, backs, state.values)) if any(tape.starts) else None
 
     def _state_at(self, i):
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""

@@ -11,15 +11,13 @@ from sparsedp.ledger import thread
 from sparsedp.tape import dtype_of, innermost, is_variable, isbox, plain, through
 from sparsedp.trajectory.keep import All, Each, Last
 from sparsedp.trajectory.layout import Layout, dense
-from sparsedp.trajectory.run import Loop, Run, rollout_rule
+from sparsedp.trajectory.run import Loop, Run, count_of, parts, rollout_rule
 from sparsedp.trajectory.schedule import budget_within_reach, plan, room_within, slots_within
 from sparsedp.tree import leaves
 
 __all__ = ["rollout"]
 
-# Bytes that tapes of steps may take, beside the states on them, where no budget is given; and those of steps that solve
-# systems, where running a step again costs more than memory.
-SMALL, SOLVED = 2**22, 2**28
+ROOM = 2**28  # bytes that tapes of steps may take, beside the states on them, where no budget is given
 
 
 def rollout(
@@ -42,8 +40,7 @@ def rollout(
     memory : None, number of bytes, or text such as "200 MB"
         What the rollout may take. None keeps every state. Else as many are kept as fit beside params, inputs
         and their gradients, and the others are run again from those, as rarely as possible. Where all fit, what
-        is left goes to the tapes of the steps (with None 4 MB, 256 MB if they solve systems): such a step runs once,
-        not twice. Not counted:
+        is left goes to the tapes of the steps (with None 256 MB): such a step runs once, not twice. Not counted:
         what one step needs by itself, and what `keep` hands out; with keep="all" no state is run again.
     keep : "last", "all" or callable
         What is handed out: the last state; all n + 1, each array with a new first axis; or the tuple of what
@@ -117,26 +114,25 @@ def rollout(
     _check_inputs(inputs, n)
     example = "lambda state, params: ..." if inputs is None else "lambda state, params, input: ..."
     check_takes("rollout", step, 2 if inputs is None else 3, example)
-    args = [value for tree, form in zip(given.values(), forms, strict=True) for value in _variables(tree, form)]
+    values = [[dense(leaves(tree)[place]) for place in form.places] for tree, form in zip(given.values(), forms)]
+    args = [value for part in values for value in part]
     traced = [k for k, arg in enumerate(args) if isbox(arg)]
     if traced:  # what is kept on the way forward must be what the way back sees
         args = constant_args(args, traced)
-    wanted = [any(map(isbox, leaves(tree))) for tree in (params, inputs)]
-    beside = sum((1 + flag) * form.nbytes for form, flag in zip(forms[1:], wanted))  # a copy, a gradient
+    beside = sum((1 + any(map(isbox, part))) * form.nbytes for form, part in zip(forms[1:], values[1:]))  # a gradient
     sizes = forms[0].nbytes, n, beside
     slots = None if memory is None else slots_within(memory, *sizes)
     if truncate is not None and not is_whole(truncate, 1):
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
-    rooms = (SMALL, SOLVED) if memory is None else (max(room_within(memory, *sizes), 0),) * 2
-    loop = Loop(step, forms, n, truncate, innermost(args), _kind(keep, forms[0]), slots, rooms, progress, record)
-    _check_values(loop, args, bool(traced))
+    room = ROOM if memory is None else room_within(memory, *sizes)
+    loop = Loop(step, forms, n, truncate, innermost(args), _kind(keep, forms[0]), slots, room, progress, record)
+    _check_values(loop, args, traced)
     if loop.wanted and loop.slots:
         _warn_of_repeats(memory, *sizes)
     for hook in thread.loop_hooks:
         hook(step, state, params, inputs, n)
     outputs = through(rollout_rule, Run(loop), *args)
-    count = len(plain(outputs)) if isinstance(plain(outputs), tuple) else None
-    return loop.keep.tree([outputs] if count is None else [outputs[k] for k in range(count)])
+    return loop.keep.tree(parts(outputs, count_of(plain(outputs))))
 
 
 def _number_of_steps(n):
@@ -145,11 +141,6 @@ def _number_of_steps(n):
     if isinstance(n, bool) or not is_whole(n, 0):
         raise ValueError(f"rollout needs n >= 0, a whole number of steps, got {n!r}")
     return int(n)
-
-
-def _variables(tree, layout):
-    found = leaves(tree)
-    return [dense(found[place]) for place in layout.places]
 
 
 def _check_inputs(inputs, n):
@@ -183,13 +174,12 @@ def _kind(keep, layout):
 
 def _check_values(loop, args, traced):
     for layout, values in zip(loop.layouts, loop.split(args), strict=False):
-        layout.check_finite([plain(value) for value in values], "rollout")
-        for number, value in enumerate(values):
-            if dtype_of(value).kind not in "fc":
-                raise DerivativeError(
-                    f"{layout.names[number]} of rollout is traced but holds {dtype_of(value)}; "
-                    "derivatives need floating numbers"
-                )
+        layout.check_finite(list(map(plain, values)), "rollout")
+    for k in traced:
+        if dtype_of(args[k]).kind not in "fc":
+            raise DerivativeError(
+                f"{loop.names[k]} of rollout is traced but holds {dtype_of(args[k])}; derivatives need floating numbers"
+            )
     if traced and not loop.state.places:
         kinds = ", ".join(sorted({str(dtype_of(leaf)) for leaf in loop.state.statics if leaf is not None}))
         raise DerivativeError(

@@ -180,7 +180,7 @@ class Each(Last):
             function = lambda tree: self.function(state.i, tree)
             results, _, pull = linearised(function, given, map(is_variable, leaves(given)))
             self._compare(state.i, results)
-            found = pull([leaf.of(g) if isinstance(leaf, Row) else None for leaf in leaves(self._trees[state.i])])
-            return [found[place] for place in self.layout.places]
+            cotangents = pull([leaf.of(g) if isinstance(leaf, Row) else None for leaf in leaves(self._trees[state.i])])
+            return [cotangents[place] for place in self.layout.places]
 
         return at

@@ -10,7 +10,7 @@ from sparsedp.derivative import described
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, traces_of
-from sparsedp.tree import flatten, keys, labels, subscript
+from sparsedp.tree import flatten, keys, labels, leaves, mapped, subscript
 
 __all__ = ["Layout", "dense", "fingerprint", "is_finite", "owned", "refuse_lost", "refuse_mask", "stacked"]
 
@@ -52,25 +52,20 @@ class Layout:
 
     def __init__(self, tree, root):
         self.root, self.bare = root, is_variable(tree) and not isinstance(tree, np.ma.MaskedArray)
-        found, rebuild = flatten(tree)
-        self.places = [place for place, leaf in enumerate(found) if is_variable(leaf)]
-        variables = [plain(found[place]) for place in self.places]
-        self.statics = self._others(found)
-        # Rebuilt without the variables: what is kept must not hold a trace or a large array.
-        self._template = rebuild(self.statics)
-        self._rebuild = flatten(self._template)[1]
-        for number, leaf in enumerate(found):
+        entries = leaves(tree)
+        self.places = [place for place, leaf in enumerate(entries) if is_variable(leaf)]
+        # Without the variables: what is kept must not hold a trace or a large array.
+        self._template = mapped(_static, tree)
+        self.statics = tuple(leaves(self._template))
+        for number, leaf in enumerate(entries):
             if isinstance(leaf, np.ma.MaskedArray):
                 refuse_mask(f"rollout takes plain arrays, got a masked array as {self.labels[number]}", leaf)
         self.open = _is_open(tree)
+        variables = [plain(entries[place]) for place in self.places]
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
         self.shapes = [np.shape(leaf) for leaf in variables]
         self.dtypes = [dtype_of(leaf) for leaf in variables]
         self.nbytes = sum(np.asarray(leaf).nbytes for leaf in variables)
-
-    def _others(self, found):
-        """All leaves, None in place of the variables, as constants."""
-        return tuple(map(constant, self._filled(found, [None] * len(self.places))))
 
     @cached_property
     def labels(self):
@@ -86,14 +81,14 @@ class Layout:
         """Variables and the other leaves -> the tree."""
         if self.bare:
             return variables[0]
-        return self._rebuild(self._filled(self.statics if statics is None else statics, variables))
+        entries = list(self.statics if statics is None else statics)
+        for place, value in zip(self.places, variables, strict=True):
+            entries[place] = value
+        return self._rebuild(entries)
 
-    def _filled(self, leaves, values):
-        """All leaves, those of the variables replaced."""
-        found = list(leaves)
-        for place, value in zip(self.places, values, strict=True):
-            found[place] = value
-        return found
+    @cached_property
+    def _rebuild(self):
+        return flatten(self._template)[1]
 
     def take(self, tree, when):
         """A tree of the same form -> its variables and its other leaves.
@@ -105,12 +100,14 @@ class Layout:
         """
         if self.bare and not isinstance(tree, (tuple, list, dict)):
             return [tree], self.statics
-        found: list = []
-        self._collect(self._template, tree, (), when, found)
-        variables = [found[place] for place in self.places]
-        if len(variables) == len(found):
+        entries: list = []
+        self._collect(self._template, tree, (), when, entries)
+        variables = [entries[place] for place in self.places]
+        if len(variables) == len(entries):
             return variables, self.statics
-        others = self._others(found)
+        for place in self.places:
+            entries[place] = None
+        others = tuple(map(constant, entries))
         for leaf, static in zip(others, self.statics, strict=True):
             refuse_mask(f"{when} made a masked array of {self.root}", leaf)
             if is_variable(leaf):
@@ -120,17 +117,17 @@ class Layout:
                 )
         return variables, others
 
-    def _collect(self, wanted, tree, path, when, found):
+    def _collect(self, wanted, tree, path, when, entries):
         """The leaves of a tree, at a path of keys; refused where it branches otherwise than `wanted`."""
         names = keys(wanted)
         if keys(tree) != names:
             form = described(wanted) if names is not None else "one array" if self.bare else "one leaf"
             raise ShapeError(_changed(_at(self._template, self.root, path), form, described(tree), when))
         if names is None:
-            found.append(tree)
+            entries.append(tree)
             return
         for name in names:
-            self._collect(wanted[name], tree[name], (*path, name), when, found)
+            self._collect(wanted[name], tree[name], (*path, name), when, entries)
 
     def check(self, values, when, outer=frozenset()):
         """Values of the variables after a step -> the same, contiguous; refuse another shape or dtype.
@@ -171,6 +168,11 @@ class Layout:
         for number, value in enumerate(values):
             if not surely_finite(value):
                 check_finite(f"{self.names[number]} of {owner}", value)
+
+
+def _static(leaf):
+    """A leaf as a constant, None in place of a variable."""
+    return None if is_variable(leaf) else constant(leaf)
 
 
 def is_finite(value):

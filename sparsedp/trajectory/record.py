@@ -1,4 +1,4 @@
-"""What is known of a rollout afterwards: how often steps were run, and how the cotangent grew on its way back.
+"""What is left of a rollout afterwards: how often steps were run, and how the cotangent grew on its way back.
 
 A cotangent that grows by exp(rate) a step is that of a chaotic run: the gradient is exact for these very steps, but
 a change of the start by rounding changes it by about amplification * 1e-16. Nothing is clipped. Beyond LIMIT the
@@ -15,7 +15,7 @@ from sparsedp.errors import GrowthWarning
 from sparsedp.ledger import thread
 from sparsedp.tape import plain
 
-__all__ = ["Growth", "Record"]
+__all__ = ["APART", "Growth", "Record", "SAMPLES"]
 
 LIMIT = 1e8  # half of the digits are gone
 SAMPLES = 32  # measurements of the cotangent in a long run
@@ -64,12 +64,12 @@ class Record(NamedTuple):
 class Growth:
     """Measures the cotangent of the state now and then on the way back."""
 
-    def __init__(self, n, truncate):
-        self._n, self.every, self._truncate = n, max(n // SAMPLES, APART), truncate
+    def __init__(self, loop):
+        self._n, self._truncate = loop.n, loop.truncate
         self.norms: list = []
 
     def see(self, i, g):
-        """The cotangent of state i, before anything enters there; asked where i is a multiple of `every`."""
+        """The cotangent of state i, before anything enters there; asked where i is a multiple of `loop.every`."""
         if g is None:
             return
         norm = max((_largest(plain(leaf)) for leaf in g if leaf is not None), default=0.0)
@@ -81,11 +81,11 @@ class Growth:
         first = next((norm for norm in norms if norm > 0), nan)
         grown = max((norm / first for norm in norms), default=nan)
         # Beyond a cut the cotangent begins anew.
-        whole = [(i, log(norm)) for i, norm in self.norms if 0 < norm < inf and n - i < (self._truncate or inf)]
+        whole = [(i, log(norm)) for i, norm in self.norms if 0 < norm < inf and n - i < self._truncate]
         steps = whole[0][0] - whole[-1][0] if whole else 0
         rate = (whole[-1][1] - whole[0][1]) / steps if steps else nan
-        found = Record("backward", n, kept, recomputed, tuple(self.norms), rate, grown)
-        if found.flagged:
+        result = Record("backward", n, kept, recomputed, tuple(self.norms), rate, grown)
+        if result.flagged:
             thread.grown += 1
             warnings.warn(
                 GrowthWarning(
@@ -94,7 +94,7 @@ class Growth:
                 ),
                 stacklevel=2,
             )
-        return found
+        return result
 
 
 def _largest(g):

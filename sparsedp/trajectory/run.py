@@ -12,16 +12,18 @@ import numpy as np
 from sparsedp.derivative import zero_like
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.fields import place
-from sparsedp.ledger import active, count, thread
+from sparsedp.ledger import active, count
 from sparsedp.progress import shown_steps
 from sparsedp.tape import Rule, plain
 from sparsedp.trajectory.backward_pass import BackwardPass
-from sparsedp.trajectory.layout import dense, is_finite
-from sparsedp.trajectory.record import Record
+from sparsedp.trajectory.layout import is_finite
+from sparsedp.trajectory.record import APART, SAMPLES, Record
 from sparsedp.trajectory.schedule import checkpoints
-from sparsedp.trajectory.steps import Scale, Steps
+from sparsedp.trajectory.steps import Steps
 
-__all__ = ["Loop", "Run", "rollout_rule"]
+__all__ = ["Loop", "Run", "count_of", "parts", "rollout_rule"]
+
+CALL = 800  # bytes of a node, its closures and tuples: 350 to 1200 were measured
 
 
 class Loop:
@@ -39,18 +41,27 @@ class Loop:
     keep : Last, All or Each
     slots : int or None
         How many states may be kept for the way back; None: all.
-    rooms : (int, int)
-        Bytes for tapes that are kept from the way forward; and where a step solves systems.
+    room : int
+        Bytes for tapes that are kept from the way forward.
     progress : bool or str
     record : callable or None
     """
 
-    def __init__(self, step, layouts, n, truncate, wanted, keep, slots, rooms, progress, record):
-        self.step, self.layouts, self.n, self.truncate, self.wanted = step, layouts, n, truncate, wanted
+    def __init__(self, step, layouts, n, truncate, wanted, keep, slots, room, progress, record):
+        self.step, self.layouts, self.n, self.wanted = step, layouts, n, wanted
+        self.truncate = truncate or n + 1
         self.state, self.params, self.inputs = [*layouts, None][:3]
         self.state.rounds = any(any(form.floats) for form in layouts)
-        self.keep, self.rooms, self.progress, self.record = keep, rooms, progress, record
+        self.keep, self.room, self.progress, self.record = keep, room, progress, record
+        self.every = max(n // SAMPLES, APART)
         self.slots = None if keep.whole else slots
+        self.stops = {*checkpoints(n, self.slots), n} if wanted else {0}  # numbers of the states that are kept, and n
+        self.kept = len(self.stops) - 1
+
+    @property
+    def names(self):
+        """Of all variables, as one would write them."""
+        return [name for layout in self.layouts for name in layout.names]
 
     def split(self, args):
         """Variables of all arguments -> those of state, params and inputs."""
@@ -64,31 +75,42 @@ class Loop:
 
     def is_cut(self, i):
         """Whether truncation makes state i a constant for the steps after it."""
-        return self.truncate is not None and 0 < i < self.n and (self.n - i) % self.truncate == 0
+        return 0 < i < self.n and (self.n - i) % self.truncate == 0
 
     def advance(self, steps):
         """(last state, the states kept, the tapes kept) after all steps from the first state."""
-        n, recorder, kept, tapes = self.n, steps.recorder, [], []  # type: Any, Any, list, list
-        state, stops = self.keep.see(steps.first), set(checkpoints(n, self.slots) if self.wanted else ())
-        # How many tapes there is room for: the first two tell. What goes in besides may be constants, which all
-        # steps share: the second one tells. The first shows traced values that the step keeps, too.
-        fit, solves, scale = 2 if self.wanted else 0, thread.solves, Scale()
-        for i in shown_steps(self.progress, range(n), "forward"):
-            if i in stops:
-                own = self.keep.whole or i <= fit  # nobody else has the result of a step on its tape
-                kept.append(state if own else state.owned())
-            if i < fit:
-                scale.bytes, scale.beside, recorder.weigh = 0, 0, scale if i < 2 else None
-                tape, state = steps.taped(state)
-                tapes.append(tape)
-                if i < 2:
-                    weight = scale.bytes - self.state.nbytes + i * scale.beside
-                    fit = min(self.rooms[thread.solves > solves] // max(weight, 1), n if i else 2)
-                    del tapes[int(fit) :]
+        wanted, room = self.wanted, self.room
+        state, tapes, weight = self.keep.see(steps.first), [], 0  # type: Any, list, int
+        kept = [state]
+        for i in shown_steps(self.progress, range(self.n), "forward"):
+            if i < state.i:
+                continue  # it is on the tape of an earlier one
+            # The first step tells what a tape takes, and shows traced values that the step keeps.
+            taped = wanted and (i == 0 or weight <= room)
+            if taped:
+                tape, state = steps.taped(state, self.end(i, room // max(weight, 1) if i else 1))
+                weight = self.weight(tape.steps[-1])
+                room -= weight * len(tape.steps)
+                tapes += [tape] if i or room >= 0 else []
+                del tape
             else:
                 state = steps.forward(state)
             state = self.keep.see(state)
+            if state.i in self.stops:
+                state = state if taped or self.keep.whole else state.owned()
+                kept.append(state)
         return state, kept, tapes
+
+    def weight(self, step):
+        """Bytes of a step on a tape, beside the state that is kept: every call may hold the largest thing there is."""
+        return len(step[2]) * (CALL + max(form.nbytes for form in self.layouts[:2])) - self.state.nbytes
+
+    def end(self, i, most):
+        """Where a tape from state i may end: nobody looks at the states inside, and float64 is not rounded there."""
+        if self.keep.along or any(kind.char != "d" for kind in self.state.dtypes):
+            return i + 1
+        cut = self.n - (self.n - i - 1) // self.truncate * self.truncate
+        return min(i + most, cut, i - i % self.every + self.every)
 
     def refuse(self, steps):
         """Refuse a run that is not finite at its end: NaN stays, so one look tells, and a second run finds the step."""
@@ -105,12 +127,12 @@ class Loop:
                         "take a smaller time step"
                     )
 
-    def compare(self, marks, known):
+    def compare(self, marks, earlier):
         """Refuse a state that is another one than before; both as fingerprints."""
-        if marks != known:
+        if marks != earlier:
             layout = self.state
             names = [*layout.names, *[layout.root] * len(marks)]
-            name = next(name for name, a, b in zip(names, marks, known, strict=False) if a != b)
+            name = next(name for name, a, b in zip(names, marks, earlier, strict=False) if a != b)
             raise DerivativeError(
                 f"the step gives another {name} when it is run again; it must depend on its arguments only"
             )
@@ -118,10 +140,9 @@ class Loop:
     def check_gradient(self, number, slope, g):
         """Refuse a gradient that is not finite, unless the cotangents given were not."""
         if slope is not None and not is_finite(slope) and all(map(is_finite, g)):
-            name = [name for layout in self.layouts for name in layout.names][number]
             raise NonFiniteError(
-                f"the way back through {self.n} steps of rollout makes the gradient in {name} NaN or infinite; "
-                "take fewer steps, or cut it with truncate"
+                f"the way back through {self.n} steps of rollout makes the gradient in {self.names[number]} NaN or "
+                "infinite; take fewer steps, or cut it with truncate"
             )
 
 
@@ -140,7 +161,7 @@ class Run:
 
     def forward(self, args):
         """Run all steps; return the arrays to hand out."""
-        loop, steps = self.loop, Steps(self.loop, list(map(dense, args)))
+        loop, steps = self.loop, Steps(self.loop, args)
         loop.keep.start(loop.n, steps.outer, bool(loop.wanted))
         with steps.guarded():
             state, kept, tapes = loop.advance(steps)
@@ -148,12 +169,12 @@ class Run:
             loop.refuse(steps)
         if loop.wanted:
             self._end = state.marks()
-            self._stored = steps, [*kept, state if loop.keep.whole else state.owned()], tapes
+            self._stored = steps, kept, tapes
         if active:
             count("rollout.step", "forward", loop.n)
-            count("rollout", "bytes", len(kept) * loop.state.nbytes)
+            count("rollout", "bytes", loop.kept * loop.state.nbytes)
         if loop.record is not None:
-            loop.record(Record("forward", loop.n, len(kept), 0))
+            loop.record(Record("forward", loop.n, loop.kept, 0))
         return loop.keep.finish(state)
 
     def backward(self, args, g):
@@ -167,21 +188,31 @@ class Run:
         if loop.slots is not None:  # under a budget they are freed as they are used, and made again if asked again
             self._stored = None
         with steps.guarded("on the way back through step"):
-            found = BackwardPass(loop, steps, list(kept) if self._stored else kept, list(tapes)).back(g)
+            cotangents = BackwardPass(loop, steps, list(kept) if self._stored else kept, list(tapes)).back(g)
         for number in loop.wanted:
-            loop.check_gradient(number, found[number], g)
-        backs = ((found[number], args[number]) for number in loop.wanted)
+            loop.check_gradient(number, cotangents[number], g)
+        backs = ((cotangents[number], args[number]) for number in loop.wanted)
         return tuple(zero_like(value) if back is None else back for back, value in backs)
 
 
-def _one(values):
-    """A rule with one result returns the array, with several a tuple."""
-    return values[0] if len(values) == 1 else values
+def count_of(ans):
+    """How many results a rule has, None where it is one array and no tuple."""
+    return len(ans) if isinstance(ans, tuple) else None
+
+
+def parts(values, many):
+    """The results of a rule or their cotangents as a list."""
+    return [values] if many is None else [values[k] for k in range(many)]
+
+
+def _forward(run, *args):
+    results = run.forward(args)
+    return results if len(results) != 1 else results[0]
 
 
 def _vjp(nums, ans, run, *args):
-    many = len(ans) if isinstance(ans, tuple) else None
-    return lambda g: run.backward(args, [g] if many is None else [g[k] for k in range(many)])
+    many = count_of(ans)
+    return lambda g: run.backward(args, parts(g, many))
 
 
-rollout_rule = Rule("rollout", lambda run, *args: _one(run.forward(args)), _vjp)
+rollout_rule = Rule("rollout", _forward, _vjp)

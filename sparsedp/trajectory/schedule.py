@@ -125,9 +125,9 @@ def room_within(memory, state_bytes, n, beside=0):
 
 def _bytes(memory):
     """Bytes, or a text such as "200 MB" -> bytes."""
-    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*([A-Za-z]+)\s*", memory) if isinstance(memory, str) else None
-    if found and found[2].upper() in UNITS:
-        return int(float(found[1]) * UNITS[found[2].upper()])
+    match = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*([A-Za-z]+)\s*", memory) if isinstance(memory, str) else None
+    if match and match[2].upper() in UNITS:
+        return int(float(match[1]) * UNITS[match[2].upper()])
     if not is_number(memory) or not 0 < memory < float("inf"):
         raise ValueError(f'rollout needs memory as bytes > 0 or a text, got {memory!r}; write for example "200 MB"')
     return int(memory)

@@ -11,9 +11,8 @@ from sparsedp.tape import Recorder, boxed, new_trace, plain, reverse_root, split
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.tree import copied, flatten, leaves
 
-__all__ = ["Scale", "State", "Steps", "Tape"]
+__all__ = ["State", "Steps", "Tape"]
 
-CALL = 800  # bytes of a node, its closures and tuples: 350 to 1200 were measured
 _REMEDY = {
     "state": "return another dict or list",
     "params": "make what changes a part of the state",
@@ -38,37 +37,21 @@ class State(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """One step: its calls in order, so that the backward pass need not sort a graph.
+    """Some steps in order: their calls are in order too, so that the backward pass need not sort a graph.
 
     Attributes
     ----------
     starts : list
-        Roots of its state and of its inputs; None where a constant is.
-    nodes : list
-        All calls.
+        Roots of the first state; None where a constant is.
+    steps : list of (State, list, list)
+        For each step the state before it, the roots of its inputs, and all calls.
     ends : list
-        The nodes of the state after it, None where that does not depend on anything traced.
+        The nodes of the state after the last step, None where that does not depend on anything traced.
     """
 
     starts: list
-    nodes: list
+    steps: list
     ends: list
-
-
-class Scale:
-    """Weighs the calls of a tape: their results (`bytes`), and arrays beside traced values (`beside`), each once."""
-
-    def __init__(self):
-        self.bytes, self.beside = 0, 0
-        self._seen: set[int] = set()
-
-    def __call__(self, value, args, nums):
-        """One call that depends on its arguments `nums`."""
-        self.bytes += CALL + getattr(value, "nbytes", 0)
-        for arg in leaves([arg for number, arg in enumerate(args) if number not in nums]):  # tuples are of indices
-            if isinstance(arg, np.ndarray) and id(arg) not in self._seen:
-                self._seen.add(id(arg))
-                self.beside += arg.nbytes
 
 
 class Steps:
@@ -108,20 +91,23 @@ class Steps:
         values, statics = self._called(state, self._given(state), self.params)
         return State(state.i + 1, self.loop.state.check(values, "the step", self.outer), statics)
 
-    def taped(self, state):
-        """The same on a tape: (Tape, the state after this one)."""
-        wanted = [self.loop.wants(state.i)] * len(state.values) + self.input_roots
-        starts = [reverse_root(self.recorder) if wants else None for wants in wanted]
-        given = boxed(self._given(state), starts, self.number)
-        try:
-            found, statics = self._called(state, given, self._traced_params)
-        finally:
-            nodes = self.recorder.taken()
-        values, ends = split_boxes(found, self.number)
-        values = self.loop.state.check(values, "the step", self.outer)
-        # What is on no tape may be an array that the step uses again.
-        values = [value if node else owned(value) for value, node in zip(values, ends, strict=True)]
-        return Tape(starts, nodes, ends), State(state.i + 1, values, statics)
+    def taped(self, state, stop):
+        """The steps from a state to state `stop`, on one tape: (Tape, the state after them)."""
+        starts = [reverse_root(self.recorder) if self.loop.wants(state.i) else None for _ in state.values]
+        nodes, steps = starts, []  # type: Any, list
+        while state.i < stop:
+            roots = [root and reverse_root(self.recorder) for root in self.input_roots]
+            given = boxed(self._given(state), [*nodes, *roots], self.number)
+            try:
+                results, statics = self._called(state, given, self._traced_params)
+            finally:
+                steps.append((state, roots, self.recorder.taken()))
+            values, nodes = split_boxes(results, self.number)
+            values = self.loop.state.check(values, "the step", self.outer)
+            # What is on no tape may be an array that the step uses again.
+            values = [value if node else owned(value) for value, node in zip(values, nodes, strict=True)]
+            state = State(state.i + 1, values, statics)
+        return Tape(starts, steps, nodes), state
 
     def _given(self, state):
         """The variables of state and inputs that a step gets: constants where the derivative is cut."""
@@ -173,10 +159,10 @@ class Steps:
         state: Any = self.last
         if state is None:
             return None
-        found, rebuild = flatten(self._parts(state, self._given(state), self.params))
+        entries, rebuild = flatten(self._parts(state, self._given(state), self.params))
         for number, name in enumerate(label for layout in self.loop.layouts for label in layout.labels):
-            if isinstance(found[number], np.ndarray):
-                copies = copied(list(map(plain, found)))
+            if isinstance(entries[number], np.ndarray):
+                copies = copied(list(map(plain, entries)))
                 copies[number].flags.writeable = False
                 try:
                     self.loop.step(*rebuild(copies))
@@ -193,6 +179,6 @@ def _refuses_writing(error):
 def _check_entries(parts, given):
     """Refuse a step that changes the dicts and lists it is given, which a tape would not see."""
     for name, part, before in zip(_REMEDY, parts, given, strict=False):
-        found = leaves(part)
-        if len(found) != len(before) or any(a is not b for a, b in zip(found, before, strict=True)):
+        after = leaves(part)
+        if len(after) != len(before) or any(a is not b for a, b in zip(after, before, strict=True)):
             raise ValueError(f"the step changes the entries of {name}; {_REMEDY[name]}")
