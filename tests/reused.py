@@ -119,6 +119,7 @@ STEPPERS = {
     "backward_euler": {},
     "crank_nicolson": {},
     "tr_bdf2": {},
+    "radau": {},
     "imex": {"linear": dp.laplacian(LINE)},
     "etdrk4": {"linear": dp.laplacian(LINE)},
 }

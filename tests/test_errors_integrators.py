@@ -22,7 +22,7 @@ TABLE = [
         lambda: dp.stepper("rk5", decay, 0.1),
         VALUE,
         "method must be one of euler, heun, ssprk3, rk4, backward_euler, crank_nicolson, tr_bdf2, imex, "
-        "etdrk4, leapfrog, got 'rk5'",
+        "radau, etdrk4, leapfrog, got 'rk5'",
     ),
     (lambda: dp.stepper("euler", L, 0.1, unstable="warn"), VALUE, "unstable must be 'raise' or 'allow', got 'warn'"),
     (

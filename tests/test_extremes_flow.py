@@ -11,7 +11,7 @@ import sparsedp as dp
 SHAPE, NONFINITE = dp.errors.ShapeError, dp.errors.NonFiniteError
 SCHEMES = ("upwind", "van_leer", "semi_lagrangian", "maccormack")
 SPLIT = ("imex", "etdrk4")
-METHODS = ("euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2", *SPLIT)
+METHODS = ("euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2", "radau", *SPLIT)
 IN_PLACE = r"the rate changes the state in place; write u = u \+ du instead of u \+= du, or work on a copy"
 LINE = dp.laplacian(dp.Grid(5, size=1.0, periodic=True))
 
@@ -122,7 +122,7 @@ def test_what_is_not_finite_is_named(method):
             timed((u, np.nan), 1.0)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [word for word in METHODS if word != "radau"])  # real states only
 def test_kinds_of_numbers_in_a_loop_of_linear_steps(method, rng):
     """The step's own pullback gives the dtypes of the tape: single precision, complex state and real coefficient."""
     step = dp.stepper(method, dp.laplacian(dp.Grid((6, 5), size=1.0), dp.dirichlet), 1e-3)

@@ -356,6 +356,18 @@ BUGS = {
         "anp.mean(g, axis=0) if anp.ndim(bias) == 1 else g",
         "tests/test_network.py",
     ),
+    "lengths of radau that are held where a jump moves": Bug(
+        "integrators",
+        "return -h / (speed * h + SLACK) / (speed or 1.0) * row",
+        "return 0.0 * row",
+        "tests/test_integrators_radau.py::test_stiff_problems_with_their_gradients",
+    ),
+    "derivatives of radau at the wrong stage": Bug(
+        "integrators",
+        "[self._rows(number, 0), self._rows(number, 1), ends(number)]",
+        "[self._rows(number, 1), self._rows(number, 0), ends(number)]",
+        "tests/test_integrators_radau.py::test_one_step_against_a_root",
+    ),
     # ---- check, report
     "a checker that takes a wrong gradient for a right one": Bug(
         "check",

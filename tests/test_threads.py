@@ -243,7 +243,7 @@ def rate(u, p):
 @pytest.mark.parametrize("tolerance", [None, 1e-4])
 @pytest.mark.parametrize(
     "method",
-    ["euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2", "imex", "etdrk4"],
+    ["euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2", "radau", "imex", "etdrk4"],
 )
 def test_steppers(method, tolerance):
     split = method in ("imex", "etdrk4")

@@ -45,7 +45,7 @@ from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain
 from sparsedp.tree import flatten, leaves, mapped
 
-__all__ = ["Adaptive"]
+__all__ = ["Adaptive", "Moving", "Taken", "flat", "relative"]
 
 SAFETY, SMALLEST, LARGEST = 0.9, 0.2, 5.0  # of one change of the length
 QUIET = 1e-2  # share of the tolerance below which an error shows no trend
@@ -85,16 +85,20 @@ class Adaptive(Scheme):
 
     Attributes
     ----------
+    compared : int
+        Order of the error that is controlled.
     taken : list of float
         Lengths of the accepted steps in the last interval, as shares of it.
     weight : float
         Of the extrapolation, 1 / (2^p - 1), or 0.
     """
 
+    window = WINDOW
+
     def __init__(self, scheme, tolerance, floor):
         super().__init__(scheme.problem, f"stepper({scheme.name})", scheme.order)
         self.scheme, self.tolerance, self.floors, self.info = scheme, tolerance, leaves(constant(floor)), scheme.info
-        self.taken, self.ratio = [], 2**self.order - 1
+        self.taken, self.ratio, self.compared, self.dyadic = [], 2**self.order - 1, self.order, scheme.dyadic
         self.weight = 0.0 if scheme.name == "crank_nicolson" else 1 / self.ratio
 
     def __call__(self, *given):
@@ -117,7 +121,7 @@ class Adaptive(Scheme):
     def _steps(self, u, params, t, h):
         """The steps over the interval, one after the other."""
         length, done, taken, mark = self._first(u, params, t, h), 0.0, [], 0.0
-        before, most, power = None, LARGEST, -1 / (self.order + 1)
+        before, most, power = None, LARGEST, -1 / (self.compared + 1)
         for trial in range(1, MOST + 1):
             left = 1.0 - done
             length = self._allowed(length, left)
@@ -135,9 +139,10 @@ class Adaptive(Scheme):
                 before = length, error
             length *= float(np.clip(change, SMALLEST, most))
             most = LARGEST if error <= 1 else 1.0  # the step after a refused one is not made longer
-            if length < LEAST or trial % WINDOW == 0 and (1.0 - done) * WINDOW > FAR * MOST * (done - mark):
+            turn = trial % self.window == 0
+            if length < LEAST or turn and (1.0 - done) * self.window > FAR * MOST * (done - mark):
                 break
-            mark = done if trial % WINDOW == 0 else mark
+            mark = done if turn else mark
         raise ConvergenceError(
             f"{self.name} found no step that meets the tolerance {self.tolerance:g} at {done:.3g} of its interval "
             f"after {len(taken)} steps; take a larger tolerance, a method for stiff problems, or an interval "
@@ -147,7 +152,7 @@ class Adaptive(Scheme):
     def _first(self, u, params, t, h):
         """A first length from the size of the rate: one that changes the state by a hundredth."""
         size, speed = (
-            float(np.max(_flat(map(np.abs, leaves(tree))), initial=0.0)) for tree in (u, self.problem(u, params, t))
+            float(np.max(flat(map(np.abs, leaves(tree))), initial=0.0)) for tree in (u, self.problem(u, params, t))
         )
         if not np.isfinite(speed):
             raise NonFiniteError(
@@ -158,7 +163,7 @@ class Adaptive(Scheme):
 
     def _allowed(self, length, left):
         """At most what is left, and not just short of it."""
-        if not self.scheme.dyadic:
+        if not self.dyadic:
             return left if length > 0.99 * left else min(length, 0.5 * left) if length > 0.5 * left else length
         return 2.0 ** float(np.floor(np.log2(min(length, left))))
 
@@ -193,16 +198,16 @@ class Adaptive(Scheme):
 
     def _error(self, u, new, whole):
         rows = zip(self.sizes(u, new), leaves(new), leaves(whole), strict=True)
-        share = _flat(np.where(one == other, 0.0, np.abs(one - other) / size) for size, one, other in rows)
+        share = flat(np.where(one == other, 0.0, np.abs(one - other) / size) for size, one, other in rows)
         return float(np.linalg.norm(share)) / (max(share.size, 1) ** 0.5 * self.tolerance * self.ratio)
 
     def _followed(self, path, given):
         """The state at the end of the path, with a derivative that is judged."""
         known = untraced(given)
-        start = Moving(given, isbox, [*self.sizes(path[0].u), *map(_size, leaves(known[1:]))])
+        start = Moving(given, isbox, [*self.sizes(path[0].u), *map(relative, leaves(known[1:]))])
         end = Moving(path[-1].new, is_variable, self.sizes(path[0].u, path[-1].new))
         slopes = self._slopes(path, *known[1:])
-        spread, judge = self._doors(len(path))
+        spread, judge = linear(f"{self.name}.variation", *self.doors(len(path)))
         entered = spread(start.off(given))
         runs = (self._again(path, slopes, less, *start.at(entered[number])) for number, less in enumerate(LESS))
         arrived = [*map(end.off, runs)]
@@ -245,9 +250,10 @@ class Adaptive(Scheme):
             back = shift / rest if row else back
         return u
 
-    def _doors(self, count):
-        """(spread, judge): where the three runs part, and where they meet."""
-        limit = UNCERTAIN * self.tolerance ** (self.order / (self.order + 1)) if self.weight else TIMES * self.tolerance
+    def doors(self, count):
+        """(spread, judge): where the three runs part, and where they meet; on plain arrays."""
+        share = self.compared / (self.compared + 1)
+        limit = UNCERTAIN * self.tolerance**share if self.weight else TIMES * self.tolerance
         unit, scale = EPSILON * self.ratio, [0.0]
 
         def spread(x):
@@ -268,7 +274,7 @@ class Adaptive(Scheme):
                 "interval in the middle of a fast change, or take fixed steps"
             )
 
-        return linear(f"{self.name}.variation", spread, judge)
+        return spread, judge
 
 
 class Moving:
@@ -307,7 +313,7 @@ class Moving:
         return self.rebuild(found)
 
 
-def _flat(parts):
+def flat(parts):
     return anp.concatenate([np.zeros(0), *map(anp.ravel, parts)])
 
 
@@ -328,7 +334,7 @@ def _bend(u, rows):
     return sum(anp.sum(anp.real(row * _off(leaf, plain(leaf)))) for leaf, row in pairs if isbox(leaf))
 
 
-def _size(leaf):
+def relative(leaf):
     """What a relative change is relative to: the entry itself, and where it is 0, the largest one."""
     size = np.abs(leaf) if is_variable(leaf) else 1.0
     return np.where(size > 0, size, np.max(size, initial=0.0))

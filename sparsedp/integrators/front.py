@@ -9,6 +9,7 @@ from sparsedp.integrators.adaptive import Adaptive
 from sparsedp.integrators.exponential import Exponential
 from sparsedp.integrators.leapfrog import Leapfrog, Staggered
 from sparsedp.integrators.problem import Problem, like, positive
+from sparsedp.integrators.radau import Radau
 from sparsedp.integrators.runge_kutta import EXPLICIT, IMPLICIT, Explicit, Linear, Nonlinear, Polynomial
 from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import check_settings
@@ -18,7 +19,7 @@ from sparsedp.tree import copied, leaves
 
 __all__ = ["METHODS", "Step", "stepper"]
 
-METHODS = (*EXPLICIT, *IMPLICIT, "etdrk4", "leapfrog")
+METHODS = (*EXPLICIT, *IMPLICIT, "radau", "etdrk4", "leapfrog")
 KEPT = {False: 2, True: 12}  # set-ups of linear steps, without and with error control
 ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
 DENSE_UP_TO = 64
@@ -53,6 +54,7 @@ def stepper(
         crank_nicolson          2     any dt, but what is stiff keeps its size and changes sign (it rings)
         tr_bdf2                 2     L-stable, two stages with one factor
         imex                    2     `linear` and source implicit (L-stable), the rate explicit
+        radau                   5     L-stable, full LU: for stiff systems of up to 500 unknowns, best with a tolerance
         etdrk4                  4     `linear` exact by transforms (separable only), the rate explicit
         leapfrog                2     waves: two fields, each moved by the other, half a step apart; reversible
         ======================= ===== ==============================================================
@@ -84,7 +86,7 @@ def stepper(
         Explicit steps of an Operator whose spectrum is known: refuse a dt beyond the stable limit, or take it.
     jacobian : callable, optional
         ``jacobian(u, params)`` (or with t): the derivative of the rate in u, for implicit steps of a
-        nonlinear rate. Default: found by colouring.
+        nonlinear rate. Default: found by colouring; by radau from one tape, for Newton's method alone.
     damping : pair, optional
         Of leapfrog: the rates at which both fields die out [1 / time], such as `sponge` makes; None for none.
     solver, rtol, maxiter, **options
@@ -120,9 +122,11 @@ def stepper(
     follows a jump whose time moves with the params. The derivative is that of these steps; what extrapolation takes
     away from it, relative to the params and to its largest entry, must stay below 6 tolerance^(p / (p + 1)), p the
     order (crank_nicolson: below 10 tolerance). Derivatives that are small because terms cancel may be refused, too.
+    radau compares with an embedded formula instead (p = 3 in that bound), and has first derivatives only.
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
-    takes about six times the steps of its value: three times as long as without the judgement.
-    Source: runge_kutta.py and exponential.py name the papers.
+    takes about six times the steps of its value: three times as long as without the judgement. radau takes three
+    Jacobians for the derivative of a step, and one rule on the tape for an interval.
+    Source: runge_kutta.py, radau.py and exponential.py name the papers.
 
     Examples
     --------
@@ -141,12 +145,16 @@ def stepper(
     settings = check_settings(solver, rtol, maxiter, "raise", known) | dict(options=given["options"])
     if (method in EXPLICIT or method in ("etdrk4", "leapfrog")) and (options or jacobian is not None):
         raise TypeError(f"{method} solves nothing; leave out {', '.join([*options] or ['jacobian'])}")
+    if method == "radau" and (options or solver not in ("auto", "direct")):
+        raise TypeError(f"radau solves full systems by LU; leave out {', '.join(options) or 'solver'}")
     if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
         raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
     if not all(map(_is_floor, leaves(floor))):
         raise ValueError(f"floor must hold numbers >= 0, in the units of u, got {floor!r}; write for example 1e-3")
     dt = dt if callable(dt) else positive(dt, "dt")
     problem = _problem(method, given)
+    if method == "radau":
+        return Step(method, problem, dt, Radau(problem, jacobian, tolerance, given["floor"], settings), np.inf, given)
     scheme, largest = _scheme(method, problem, jacobian, settings, KEPT[tolerance is not None]), np.inf
     if tolerance is not None:
         scheme = Adaptive(scheme, float(tolerance), given["floor"])

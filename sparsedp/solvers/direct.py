@@ -22,7 +22,7 @@ from sparsedp.solvers.solve import Engine, failure
 from sparsedp.solvers.system import System
 from sparsedp.structure.base import probes, rows_of
 
-__all__ = ["DENSE_UP_TO", "DenseSystem", "dense_engine", "direct_engine"]
+__all__ = ["DENSE_UP_TO", "DenseSystem", "dense_engine", "dense_lu", "direct_engine"]
 
 DENSE_UP_TO = 64
 BAND_UP_TO = 8  # half bandwidth up to which banded LU is used
@@ -68,7 +68,7 @@ def direct_engine(system):
     offsets = matrix.indices - rows_of(matrix)
     lower, upper = -int(offsets.min(initial=0)), int(offsets.max(initial=0))
     if system.size <= DENSE_UP_TO:
-        solve, words = _dense(matrix.toarray())[0], "dense LU"
+        solve, words = dense_lu(matrix.toarray())[0], "dense LU"
     elif max(lower, upper) <= BAND_UP_TO:
         solve, words = _banded(matrix, lower, upper)
     else:
@@ -136,11 +136,11 @@ class DenseSystem(System):
 def dense_engine(system):
     """DenseSystem -> Direct, or None where the matrix may be a singular one."""
     size = system.norm(False)
-    solve, condition = _dense(system.dense, size) if in_range(size) else (None, 0.0)
+    solve, condition = dense_lu(system.dense, size) if in_range(size) else (None, 0.0)
     return Direct(solve, f"dense LU, {system.size} rows") if condition > LEAST_CONDITION else None
 
 
-def _dense(matrix, size=None):
+def dense_lu(matrix, size=None):
     """2-D array -> (solve(b, transposed), 1 / (|A^-1| |A|) where its norm is given)."""
     getrf, getrs, gecon = la.lapack.get_lapack_funcs(("getrf", "getrs", "gecon"), dtype=matrix.dtype)
     factors, pivots, singular = getrf(matrix)

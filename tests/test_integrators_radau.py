@@ -1,0 +1,271 @@
+"""Radau IIA: order, published stiff problems, derivatives that are right or refused, refusals at the door."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from stiff import SCENES, of_hires, robertson
+from test_integrators_variation import KNOWN, oscillator
+
+import sparsedp as dp
+from sparsedp.derivative import pushforward, value_and_grad
+from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
+from sparsedp.integrators.radau import A, C
+
+RATES = np.array([0.04, 1e4, 3e7])
+SMALL = {"Robertson": np.array([1e-6, 1e-11, 1e-2])}
+
+
+def pendulum(u, p, t):
+    return {"a": u["s"], "s": -p["g"] * anp.sin(u["a"]) * (1 + 0.1 * anp.cos(t))}
+
+
+def pendulum_by_scipy(a, g, end, start=0.0):
+    rate = lambda t, u: [u[1], -g * np.sin(u[0]) * (1 + 0.1 * np.cos(t))]
+    return solve_ivp(rate, (start, start + end), [a, 0.0], method="DOP853", rtol=1e-13, atol=1e-14).y[0, -1]
+
+
+def angle(x, count=1, **options):
+    """Of (first angle, g, end, first time): the last angle."""
+    step = dp.stepper("radau", pendulum, lambda p: p["T"] / count, **options)
+    return dp.rollout(step, ({"a": x[0], "s": 0.0}, x[3]), {"g": x[1], "T": x[2]}, count)[0]["a"]
+
+
+X = np.array([1.0, 2.0, 1.5, 0.3])
+
+
+def test_order_five():
+    """On a smooth problem with fixed steps."""
+    exact = pendulum_by_scipy(*X)
+    errors = [abs(angle(X, count) - exact) for count in (4, 8, 16)]
+    assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx([5, 5], abs=0.25)
+
+
+@pytest.mark.parametrize("stiffness", [1e2, 1e6])
+def test_prothero_robinson(stiffness):
+    """u' = -k (u - cos t) - sin t, whose solution is cos t: at every tolerance, and better with the tolerance."""
+    rate = lambda u, k, t: -k * (u - anp.cos(t)) - anp.sin(t)
+    errors, tolerances = [], (1e-3, 1e-5, 1e-8)
+    for tolerance in tolerances:
+        step = dp.stepper("radau", rate, 5.0, tolerance=tolerance)
+        errors.append(abs(step((1.0, 0.0), stiffness)[0] - np.cos(5.0)))
+        assert len(step.taken) < 110
+    assert errors[2] < errors[0] and all(e <= 2 * tol for e, tol in zip(errors, tolerances, strict=True))
+
+
+def test_published_values():
+    """Robertson at 40 s (Hairer and Wanner) and HIRES at 321.8122 s (test set for initial value problems)."""
+    step = dp.stepper("radau", robertson, 40.0, tolerance=1e-6, floor=SMALL["Robertson"])
+    assert step(np.array([1.0, 0, 0]), RATES) == pytest.approx([0.7158, 9.185e-6, 0.2841], rel=1e-3)
+    rate, _, start, params, end, _ = SCENES["HIRES"]
+    wanted = [
+        0.7371312573325668e-3, 0.1442485726316185e-3, 0.5888729740967575e-4, 0.1175651343283149e-2,
+        0.2386356198831331e-2, 0.6238968252742796e-2, 0.2849998395185769e-2, 0.2850001604814231e-2,
+    ]  # fmt: skip
+    new = dp.stepper("radau", rate, end, tolerance=1e-9)(np.array(start), np.array(params))
+    assert np.max(np.abs(new - wanted)) <= 1e-9 * np.max(wanted)
+
+
+@pytest.mark.parametrize(
+    "name", ["van der Pol, 100", "Robertson", "HIRES", pytest.param("van der Pol, 1000", marks=pytest.mark.whole)]
+)
+def test_stiff_problems_with_their_gradients(name):
+    """Values and gradients within the tolerance that the page names; both fall with it."""
+    rate, _, start, params, end, number = SCENES[name]
+    state, slopes = map(np.array, KNOWN[name])
+    start, params, found = np.array(start), np.array(params), []
+    for tolerance in (1e-3, 1e-5, 1e-7):
+        step = dp.stepper("radau", rate, end, tolerance=tolerance, floor=SMALL.get(name))
+        new = step(start, params)
+        value, g = value_and_grad(lambda p: step(start, p)[number])(params)
+        assert value == new[number]  # a trace changes no bit
+        of_gradient = np.linalg.norm(g * params - slopes) / np.linalg.norm(slopes)
+        assert of_gradient <= 6 * tolerance**0.75
+        found.append((np.max(np.abs(new - state)) / np.max(np.abs(state)), of_gradient))
+    assert found[0][0] > found[1][0] > found[2][0] and found[0][1] > found[2][1] <= 1e-6
+
+
+def test_one_step_against_a_root():
+    """The value and gradient of a fixed step are those of the stage equations by `implicit`."""
+    p, u = np.array([2.0, 0.5]), np.array([1.0, -0.5, 0.3])
+
+    def rate(u, p, t):
+        return anp.array([u[1] * u[2], -p[0] * u[0] + anp.sin(t), p[1] * u[0] ** 2 - u[2]])
+
+    def stages(z, u, p, t, h):
+        f = anp.array([rate(u + z[i], p, t + C[i] * h) for i in range(3)])
+        return z - h * anp.dot(A, f)
+
+    root = dp.implicit(stages, rtol=1e-13)
+    weights = np.array([1.0, 2.0, -1.0])
+    step = dp.stepper("radau", rate, lambda p: p[1], rtol=1e-13)
+    ours = lambda x: anp.sum(weights * step((x["u"], x["t"]), (x["p"], x["h"]))[0])
+    step = dp.stepper("radau", lambda u, p, t: rate(u, p[0], t), lambda p: p[1], rtol=1e-13)
+    twin = lambda x: anp.sum(weights * (x["u"] + root(np.zeros((3, 3)), x["u"], x["p"], x["t"], x["h"])[2]))
+    x = {"u": u, "p": p, "t": 0.3, "h": 0.4}
+    (value, g), (wanted, slopes) = value_and_grad(ours)(x), value_and_grad(twin)(x)
+    assert value == pytest.approx(wanted, rel=1e-11)
+    for key, slope in slopes.items():
+        assert g[key] == pytest.approx(slope, rel=1e-9, abs=1e-11)
+    assert dp.check.gradient(ours, x).verdict == "agrees"
+
+
+@pytest.mark.parametrize(
+    "count, options, near", [(1, dict(tolerance=1e-7), 1e-6), (3, dict(tolerance=1e-7), 1e-6), (20, {}, 1e-6)]
+)
+def test_every_mode(count, options, near):
+    """A tree with time: gradient and tangent in state, params, time and length beside differences of SciPy's."""
+    wanted = [(pendulum_by_scipy(*(X + d)) - pendulum_by_scipy(*(X - d))) / 2e-4 for d in 1e-4 * np.eye(4)]
+    loss = lambda x: angle(x, count, **options)
+    value, g = value_and_grad(loss)(X)
+    assert value == pytest.approx(pendulum_by_scipy(*X), abs=near) and g == pytest.approx(wanted, rel=near, abs=near)
+    along = np.array([0.3, 0.5, -0.2, 0.1])
+    assert pushforward(loss, X, along)[1] == pytest.approx(g @ along, rel=1e-9)
+
+
+def test_second_derivatives_are_refused():
+    step = dp.stepper("radau", oscillator, 1.0, tolerance=1e-4)
+    with pytest.raises(
+        DerivativeError,
+        match=r"stepper\(radau\) has first derivatives only, got one inside another; take tr_bdf2 for second ones",
+    ):
+        dp.hvp(lambda u: step(u, 2.0)[0], np.array([2.0, 0.0]), np.array([1.0, 0.0]))
+    loss = lambda p: dp.rollout(step, np.array([2.0, 0.0]), p, 3)[0]
+    with pytest.raises(DerivativeError, match="first derivatives only"):
+        value_and_grad(lambda p: value_and_grad(loss)(p)[1])(2.0)
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
+def test_runs_that_meet_in_a_jump(tolerance):
+    """Terms of the derivative there cancel to a thousandth: right, or refused."""
+    slope = -0.6642059117567769 / 20
+    for cut in (16.969, 16.9692, 16.9694):
+        first, then = (dp.stepper("radau", oscillator, length, tolerance=tolerance) for length in (cut, 20.0 - cut))
+        try:
+            g = value_and_grad(lambda mu: then(first(np.array([2.0, 0.0]), mu), mu)[0])(20.0)[1]
+        except DerivativeError as error:
+            assert "give a smaller floor or tolerance" in str(error)
+        else:
+            assert abs(g / slope - 1) <= 10 * tolerance
+
+
+def test_long_oscillation():
+    """A thousand turns of a frequency: the phase of the derivative grows with time; right, or refused."""
+    rate = lambda u, p: anp.array([p * u[1], -p * u[0]])
+    for tolerance in (1e-3, 1e-5):
+        step = dp.stepper("radau", rate, 200.0, tolerance=tolerance)
+        exact = -200 * np.sin(200 * 1.01)
+        try:
+            g = value_and_grad(lambda p: step(np.array([1.0, 0.0]), p)[0])(1.01)[1]
+        except DerivativeError:
+            continue
+        assert abs(g - exact) <= 6 * tolerance**0.75 * 200
+
+
+def test_what_matters_early_only():
+    """A kick in the first thousandth, forgotten by one part and kept by the other."""
+
+    def rate(u, p, t):
+        kick = p[0] * anp.exp(-(((t - 0.05) / 0.01) ** 2))
+        return anp.array([kick - p[1] * u[0], kick])
+
+    step = dp.stepper("radau", rate, 50.0, tolerance=1e-6, floor=1e-3)
+    value, g = value_and_grad(lambda p: step((np.zeros(2), 0.0), p)[0][1])(np.array([3.0, 1.0]))
+    assert g[0] == pytest.approx(0.01 * np.sqrt(np.pi), rel=1e-5) and abs(g[1]) <= 1e-9
+
+
+@pytest.mark.parametrize("given", [lambda u, p: of_hires(u, p)[0], lambda u, p: 1.1 * of_hires(u, p)[0]])
+def test_a_jacobian_that_is_given(given):
+    """It serves Newton's method; a poor one costs steps, and never the derivative."""
+    rate, _, start, params, end, number = SCENES["HIRES"]
+    start, params = np.array(start), np.array(params)
+    step = dp.stepper("radau", rate, end, tolerance=1e-6, jacobian=given)
+    value, g = value_and_grad(lambda p: step(start, p)[number])(params)
+    assert value == pytest.approx(KNOWN["HIRES"][0][number], rel=1e-5)
+    assert np.linalg.norm(g * params - KNOWN["HIRES"][1]) <= 1e-5 * np.linalg.norm(KNOWN["HIRES"][1])
+
+
+def test_kinds_of_states():
+    """Batches, single precision, one number, whole numbers, nothing, nothing that moves; inputs stay as they are."""
+    rate, p = lambda u, p: -p * u**2, 0.5
+    step = dp.stepper("radau", rate, 2.0, tolerance=1e-6)
+    u = np.array([[1.0, 2.0], [0.5, 0.1]])
+    u.flags.writeable = False
+    exact = u / (1 + p * u * 2.0)
+    assert step(u, p) == pytest.approx(exact, rel=1e-5)
+    single = step(u.astype(np.float32), p)
+    assert single.dtype == np.float32 and single == pytest.approx(exact, rel=1e-5)
+    g = value_and_grad(lambda u: anp.sum(step(u, p)))(u.astype(np.float32))[1]
+    assert g.dtype == np.float32 and g == pytest.approx((1 + p * u * 2.0) ** -2, rel=1e-4)
+    assert isinstance(step(1.0, p), float) and step(1.0, p) == pytest.approx(0.5, rel=1e-6)
+    assert value_and_grad(lambda p: step(1.0, p))(p)[1] == pytest.approx(-0.5, rel=1e-5)
+    assert step(np.array([1, 2]), p) == pytest.approx(exact[0], rel=1e-5)
+    assert step(np.zeros(0), p).shape == (0,)
+    still = dp.stepper("radau", lambda u, p: 0.0 * u, 1.0, tolerance=1e-6)
+    assert np.array_equal(still(u, None), u) and still.taken == [1.0]
+    from_zero = dp.stepper("radau", lambda u, p: p + 0.0 * u, 2.0, tolerance=1e-6)
+    assert from_zero(np.zeros(2), 3.0) == pytest.approx([6.0, 6.0], rel=1e-12)
+
+
+@pytest.mark.parametrize("tolerance", [1e-12, 1e-14])
+def test_fine_tolerances(tolerance):
+    """Near rounding: met, or refused in words."""
+    step = dp.stepper("radau", lambda u, p: -p * u, 1.0, tolerance=tolerance)
+    try:
+        assert step(np.ones(2), 1.0) == pytest.approx(np.exp(-1.0), rel=1e-11)
+    except ConvergenceError as error:
+        assert "found no step that meets the tolerance" in str(error)
+
+
+def test_an_operator_and_a_source():
+    """u' = c L u + s + rate, dense."""
+    grid = dp.Grid(12, size=1.0)
+    L = dp.laplacian(grid, dp.dirichlet)
+    step = dp.stepper(
+        "radau", lambda u, p: -(u**3), 0.1, linear=(L, lambda p: p), source=lambda p: p * np.ones(12), tolerance=1e-7
+    )
+    u = np.sin(np.pi * grid.centres()[0])
+    fine = dp.stepper("tr_bdf2", lambda u, p: -(u**3) + p, 0.1, linear=(L, lambda p: p), tolerance=1e-7)
+    (value, g), (wanted, slope) = (value_and_grad(lambda p: anp.sum(s(u, p)))(0.7) for s in (step, fine))
+    assert value == pytest.approx(wanted, rel=1e-5) and g == pytest.approx(slope, rel=1e-4)
+
+
+ONES = np.ones(2)
+DECAY = lambda u, p: -p * u
+REFUSED = [
+    (lambda: dp.stepper("radau", DECAY, 1.0, sparsity=np.eye(2)), TypeError,
+     "radau solves full systems by LU; leave out sparsity"),
+    (lambda: dp.stepper("radau", DECAY, 1.0, solver="krylov"), TypeError,
+     "radau solves full systems by LU; leave out solver"),
+    (lambda: dp.stepper("radau", DECAY, 1.0)(np.ones(501), 1.0), ShapeError,
+     "stepper(radau) solves full systems of at most 500 unknowns, got 501; take tr_bdf2"),
+    (lambda: dp.stepper("radau", DECAY, 1.0)(ONES + 1j, 1.0), TypeError,
+     "stepper(radau) solves for real unknowns; give real and imaginary part as two fields"),
+    (lambda: dp.stepper("radau", DECAY, 1.0)(ONES, 1j), TypeError,
+     "a rate of complex numbers needs a complex state, got float64; write u.astype(complex)"),
+    (lambda: value_and_grad(lambda p: dp.stepper("radau", lambda u, p: -anp.abs(p) * u, 1.0)(ONES, p)[0])(1j),
+     DerivativeError, "stepper(radau) has derivatives in real params; give real and imaginary part as two"),
+    (lambda: dp.stepper("radau", DECAY, 1.0, tolerance=1e-8)(np.ones(2, np.float32), 1.0), ValueError,
+     "stepper(radau) cannot meet the tolerance 1e-08 with a state of float32, whose rounding is 1.2e-07; "
+     "take a larger tolerance or write u.astype(float)"),
+    (lambda: dp.stepper("radau", DECAY, 1.0, jacobian=lambda u, p: np.eye(3))(ONES, 1.0), ShapeError,
+     "the jacobian of stepper(radau) must have shape (2, 2), got (3, 3)"),
+    (lambda: dp.stepper("radau", lambda u, p: u[:1], 1.0)(ONES, 1.0), ShapeError,
+     "a rate must have the shape of the state, (2,), got (1,)"),
+    (lambda: dp.stepper("radau", DECAY, 1.0)(np.array([1.0, np.nan]), 1.0), NonFiniteError,
+     "the state of stepper(radau) must be finite, got 1 that are NaN or infinite, the first at 1"),
+    (lambda: dp.stepper("radau", lambda u, p: p * u**2, 2.0)(np.array([1.0]), 1.0), ConvergenceError,
+     "stepper(radau): Newton's method does not converge in a step of 2; "
+     "take a smaller dt, or give stepper a tolerance"),
+    (lambda: dp.stepper("radau", lambda u, p: p * u**2, 2.0, tolerance=1e-3)(np.array([1.0]), 1.0), ConvergenceError,
+     "stepper(radau) found no step that meets the tolerance 0.001 at 0.5"),
+    (lambda: dp.stepper("radau", lambda u, p: p * anp.log(u), 1.0, tolerance=1e-3)(np.array([0.0]), 1.0),
+     NonFiniteError, "the rate of stepper(radau) must be finite at the state given; take a state in its domain"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("act, kind, message", REFUSED)
+def test_refusals(act, kind, message):
+    with pytest.raises(kind) as caught, np.errstate(all="ignore"):
+        act()
+    assert str(caught.value).startswith(message)
