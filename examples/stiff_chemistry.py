@@ -25,7 +25,7 @@ start = np.array([1.0, 0.0, 0.0, 0.0])
 print(f"G = integral of C over {end:g} s, and its derivative in the logarithm of each rate\n")
 print("tolerance  steps          G  dG/dlog p1  dG/dlog p2  dG/dlog p3  error of G    of dG/dp  seconds")
 for tolerance in (1e-3, 1e-4, 1e-5):
-    step = dp.stepper("tr_bdf2", robertson, end, tolerance=tolerance)
+    step = dp.stepper("radau", robertson, end, tolerance=tolerance)
     clock = perf_counter()
     value, g = dp.value_and_grad(lambda p: step(start, p)[3])(RATES)  # the adjoint follows the steps taken
     seconds = perf_counter() - clock
@@ -35,12 +35,12 @@ for tolerance in (1e-3, 1e-4, 1e-5):
     print(f"{tolerance:9.0e} {len(step.taken):6} {value:10.6f}  {figures} {seconds:8.1f}")
 
 small = dict(tolerance=1e-4, floor=1e-6)  # B is 4e-5: its errors have to be less
-explicit, implicit = (dp.stepper(method, robertson, end / 50, **small) for method in ("rk4", "tr_bdf2"))
+explicit, implicit = (dp.stepper(method, robertson, end / 50, **small) for method in ("rk4", "radau"))
 explicit(start, RATES), implicit(start, RATES)
-print(f"\nThe first {end / 50:g} s: rk4 takes {len(explicit.taken)} steps, tr_bdf2 {len(implicit.taken)}.")
+print(f"\nThe first {end / 50:g} s: rk4 takes {len(explicit.taken)} steps, radau {len(implicit.taken)}.")
 
 times = end * np.logspace(-3, 0, 10)
-reach = dp.stepper("tr_bdf2", lambda u, p: robertson(u, p[0]), lambda p: p[1], tolerance=1e-3)
+reach = dp.stepper("radau", lambda u, p: robertson(u, p[0]), lambda p: p[1], tolerance=1e-3)
 run = lambda logs: dp.rollout(reach, start, RATES * np.exp(logs), 10, inputs=np.diff(times, prepend=0.0), keep="all")
 moves = [pushforward(run, np.zeros(3), direction) for direction in np.eye(3)]  # forward mode, once for each rate
 states, slopes = moves[0][0], [move[1:, 2] for _, move in moves]
