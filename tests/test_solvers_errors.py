@@ -134,9 +134,9 @@ SET_UP = [
         "write method='krylov'",
     ),
     Case(
-        lambda: dp.inverse(1j * OP, "krylov"),
+        lambda: dp.inverse(1j * OP, "multigrid"),
         ValueError,
-        match=f"krylov takes real operators, {1j * OP} is complex; write method='direct'",
+        match=f"multigrid takes real operators, {1j * OP} is complex; write method='direct' or 'krylov'",
     ),
 ]
 
@@ -213,8 +213,8 @@ SETTINGS = [
     Case(
         lambda: dp.inverse(OP, "krylov", preconditioner="ilu"),
         ValueError,
-        match="preconditioner must be None, 'jacobi' (for a diagonal of one sign), an Operator or a function, "
-        "got 'ilu'",
+        match="preconditioner must be None, 'jacobi' (for a diagonal of one sign), 'shifted_laplace' (for an "
+        "operator with entries), an Operator or a function, got 'ilu'",
     ),
     Case(
         lambda: dp.inverse(WIND, "krylov", diff="unrolled"),
@@ -239,7 +239,16 @@ ELLIPTIC = [
         match="k takes a number or a field on faces(3, 2) of shape (17,), got an array of "
         "shape (3, 2); write harmonic_average(grid)(k)",
     ),
-    Case(lambda: SOLVE(K * 1j, B), ValueError, match="k must hold real numbers, got dtype complex128; write k.real"),
+    Case(
+        lambda: SOLVE(np.full(17, "1"), B),
+        ValueError,
+        match="k must hold numbers, got dtype <U1; write np.asarray(k, float)",
+    ),
+    Case(
+        lambda: SOLVE(K, B, "1"),
+        ValueError,
+        match="shift must hold numbers, got dtype <U1; write np.asarray(shift, float)",
+    ),
     Case(
         lambda: SOLVE(BAD, B),
         FINITE,
@@ -247,8 +256,21 @@ ELLIPTIC = [
     ),
     Case(lambda: SOLVE(-2.0 * K, B), ValueError, match="k must be >= 0, got -2 at 0"),
     Case(lambda: value_and_grad(lambda k: anp.sum(SOLVE(k, B)))(-K), ValueError, match="k must be >= 0, got -1 at 0"),
-    Case(lambda: SOLVE(K, B, K), SHAPE, match="shift takes one number, got an array of shape (17,)"),
-    Case(lambda: SOLVE(K, B, 1j), ValueError, match="shift must be real, got 1j; write for example shift=1.0"),
+    Case(
+        lambda: SOLVE(K, B, K),
+        SHAPE,
+        match="shift takes a number or a field on cells(3, 2), got an array of shape (17,)",
+    ),
+    Case(
+        lambda: SOLVE(K, B, np.where(B > 0, np.nan, 1j)),
+        FINITE,
+        match="shift must be finite, got 6 that are NaN or infinite, the first at (0, 0)",
+    ),
+    Case(
+        lambda: SOLVE(np.full(17, complex(1, np.inf)), B),
+        FINITE,
+        match="k must be finite, got 17 that are NaN or infinite, the first at 0",
+    ),
     Case(lambda: SOLVE(K, B, np.nan), FINITE, match="shift must be finite, got nan; write a finite number"),
     Case(
         lambda: SOLVE(K, B.T), SHAPE, match="elliptic_solver takes a field on cells(3, 2), got an array of shape (2, 3)"

@@ -80,7 +80,7 @@ def test_complex_data(method, rng):
     assert inv(b + 0j).imag.any() == 0 and inv.info.forward.status == "converged"
 
 
-def test_complex_operators_go_to_the_direct_method(rng):
+def test_complex_operators_take_the_direct_method_or_gmres(rng):
     matrix = rng.standard_normal((80, 80)) + 1j * rng.standard_normal((80, 80))
     op = dp.from_matrix(matrix + 20 * np.eye(80))
     b = rng.standard_normal(80)
@@ -88,8 +88,13 @@ def test_complex_operators_go_to_the_direct_method(rng):
     assert inv.method == "direct"
     assert inv(b) == pytest.approx(np.linalg.solve(op.matrix.toarray(), b))
     assert inv.T(b * 1j) == pytest.approx(np.linalg.solve(op.matrix.toarray().T, b * 1j))
-    with pytest.raises(ValueError, match=r"krylov takes real operators, <.*> is complex; write method='direct'"):
-        dp.inverse(op, "krylov")
+    krylov = dp.inverse(op, "krylov")
+    for solve, twin in ((krylov, inv), (krylov.T, inv.T)):
+        assert solve(b) == pytest.approx(twin(b), rel=1e-8) and solve(b * 1j) == pytest.approx(twin(b * 1j), rel=1e-8)
+    bare = dp.inverse(dp.from_functions(op, op.T, 80, 80, dtype=complex))
+    assert bare.method == "krylov" and bare(b) == pytest.approx(inv(b), rel=1e-8)
+    with pytest.raises(ValueError, match=r"structured takes real operators, <.*> is complex; write method='direct' or"):
+        dp.inverse(op, "structured")
 
 
 def test_wrong_shapes():

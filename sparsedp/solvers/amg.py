@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from sparsedp.fields import is_number, is_whole
 from sparsedp.solvers.krylov import Krylov
 
-__all__ = ["Multigrid", "coarse_solver", "multigrid_engine"]
+__all__ = ["Hierarchy", "Level", "Multigrid", "coarse_solver", "multigrid_engine", "ruge_stueben"]
 
 CYCLES = {"V": 1, "W": 2}
 SWEEPS = {"forward": "backward", "backward": "forward"}  # each with its mirror image
@@ -100,7 +100,7 @@ class Multigrid(Krylov):
         unit = 2.0 ** -int(np.frexp(system.norm(False))[1])  # PyAMG prints where entries are far from 1
         self._scale = unit * system.sign * (system.weights if self.symmetric else 1.0)
         matrix = csr_array(system.matrix * np.broadcast_to(self._scale, system.size)[:, None])
-        self.forward = Hierarchy(_ruge_stueben(matrix, strength, levels), visits, *sweeps)
+        self.forward = Hierarchy(ruge_stueben(matrix, strength, levels), visits, *sweeps)
         self.hierarchy = self.forward.words
 
     def precondition(self, r, transposed):
@@ -167,7 +167,7 @@ def _turned(matrix):
     return None if matrix is None else csr_array(matrix.T.tocsr())
 
 
-def _ruge_stueben(matrix, strength, levels):
+def ruge_stueben(matrix, strength, levels):
     """The levels that PyAMG builds; this splitting draws no random numbers."""
     from pyamg import ruge_stuben_solver
 

@@ -79,12 +79,17 @@ def direct_engine(system):
 
 
 def _refuse_singular(system, matrix, solve):
-    """Solutions for row sums times random signs are of order |A^-1| |A|: huge when A is singular."""
+    """Solutions for row sums times numbers up to 1 are of order |A^-1| |A|: huge when A is singular.
+
+    The numbers are random signs, then what comes of them: next to an eigenvalue, its own vector.
+    """
     if not system.size:
         return
     sums = abs(matrix) @ np.ones(system.size)
     with np.errstate(all="ignore"):
-        growth = max(np.max(np.abs(solve((sums * probe).astype(matrix.dtype), False))) for probe in probes(system.size))
+        images = [solve((sums * probe).astype(matrix.dtype), False) for probe in probes(system.size)]
+        growth, image = max(((np.max(np.abs(image)), image) for image in images), key=lambda pair: pair[0])
+        growth = max(growth, np.max(np.abs(solve(sums * (image / growth), False))))
     if not growth < MOST_GROWTH:
         raise ConvergenceError(
             f"{system.given} is singular and its null space is neither constant nor that of the volumes, or its "

@@ -14,8 +14,8 @@ from sparsedp.operator import Operator
 from sparsedp.operators.given import check_operator
 from sparsedp.solvers.amg import multigrid_engine
 from sparsedp.solvers.direct import DenseSystem, dense_engine, direct_engine
-from sparsedp.solvers.krylov import krylov_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
+from sparsedp.solvers.preconditioners import krylov_engine
 from sparsedp.solvers.separable import separable_engine, spectrum, transforming
 from sparsedp.solvers.solve import EmptySystem, SolveLog, Solver, failure
 from sparsedp.solvers.system import System
@@ -70,8 +70,9 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
         What to do with data outside the range of a singular operator: refuse it, or take that part out.
     **options
         multigrid: cycle="V" or "W", strength=0.25, sweeps, levels=25.
-        krylov: preconditioner=None, "jacobi", an Operator or a function; diff="implicit" or "unrolled";
-        iterations=None. structured: precision="single" or "double". The others have none.
+        krylov: preconditioner=None, "jacobi", "shifted_laplace" (for waves), an Operator or a function;
+        diff="implicit" or "unrolled"; iterations=None. structured: precision="single" or "double".
+        The others have none.
 
     Returns
     -------
@@ -123,8 +124,8 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
     system = System(op, rtol, maxiter)
     word, reason, engine = (method, "as asked", None) if method != "auto" else _chosen(system, solves)
     _check_options(word, options)
-    if system.complex and word != "direct":
-        raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct'")
+    if system.complex and word not in ("direct", "krylov"):
+        raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct' or 'krylov'")
     engine = _engine(system, word, options, engine)
     name = name or f"inverse({op.name})"
     made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
@@ -201,10 +202,10 @@ def _chosen(system, solves):
     """The word of a method, why, and its engine if it is built. Depends on the operator only, so that bits repeat."""
     size, grid = system.unknowns, system.op.domain.grid
     dimension = 0 if grid is None else grid.dim
-    if system.complex:
-        return "direct", "complex entries", None
     if not system.op.structure.has_entries:
         return "krylov", "only products with the operator are known", None
+    if system.complex:
+        return "direct", "complex entries", None
     engine = _transforms(system, dimension)
     if engine is not None:
         reason = f"{size} unknowns in {dimension}-D, a sum of 1-D factors: transforms solve it exactly"

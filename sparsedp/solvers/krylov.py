@@ -13,54 +13,17 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.fields import is_whole
-from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.scaling import dot, inverted, norm
+from sparsedp.solvers.scaling import dot, norm
 from sparsedp.solvers.solve import Engine
 from sparsedp.structure.base import probes
 from sparsedp.tape import plain
 
-__all__ = ["Krylov", "krylov_engine"]
+__all__ = ["Krylov"]
 
 RESTART = 30
 DIVERGED = 1e8  # growth of the residual over the first one
-MOST_NUMBERS = 2**27  # in the basis of GMRES: 1 GB
-
-
-def krylov_engine(system, *, preconditioner=None, diff="implicit", iterations=None):
-    """System -> Krylov: conjugate gradients when the operator is symmetric and definite, else GMRES.
-
-    Parameters
-    ----------
-    system : System
-    preconditioner : None, "jacobi", Operator, or callable on fields, optional
-        Approximates the inverse of the operator; symmetric when the operator is.
-    diff : "implicit" or "unrolled"
-        How derivatives are made: by one adjoint solve, or through the iterations themselves. The
-        latter costs memory and time for each iteration; it is there to compare, and to train `start`.
-    iterations : int, optional
-        Exactly this many iterations, whatever the residual: then nothing is refined and nothing raised.
-
-    Returns
-    -------
-    Krylov
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range, or an unrolled solve is asked of an operator that is not symmetric.
-    """
-    if diff not in ("implicit", "unrolled"):
-        raise ValueError(f"diff must be 'implicit' or 'unrolled', got {diff!r}")
-    if iterations is not None and not is_whole(iterations, 1):
-        raise ValueError(f"iterations must be a whole number >= 1 or None, got {iterations!r}")
-    engine = Krylov(system, _preconditioner(system, preconditioner), iterations=iterations and int(iterations))
-    if diff == "unrolled":
-        if system.weights is None or preconditioner is not None:
-            raise ValueError("diff='unrolled' needs a symmetric operator and no preconditioner; write diff='implicit'")
-        engine.unrolled = True
-    return engine
+MOST_NUMBERS = 2**27  # in the basis of GMRES, a complex one is two: 1 GB
 
 
 class Krylov(Engine):
@@ -74,24 +37,27 @@ class Krylov(Engine):
     maxiter : int, optional
         Used when the system does not say.
     iterations : int, optional
-        See `krylov_engine`.
+        See `krylov_engine` in preconditioners.py.
+    dtype : float64 or complex128
+        In which is iterated: complex where the operator is, or what preconditions it.
     """
 
     method = "krylov"
     iterative = True
     precondition: Any = None
 
-    def __init__(self, system, precondition=None, maxiter=None, iterations=None):
-        self.system = system
+    def __init__(self, system, precondition=None, maxiter=None, iterations=None, dtype=float):
+        self.system, self.dtype = system, np.result_type(system.op.dtype, dtype)
         if precondition is not None:  # subclasses bring a method of this name
             self.precondition = precondition
-        self.sign = system.sign or _probed_sign(system)
+        self.sign = system.sign or _probed_sign(system) if self.dtype == float else 0
         self.symmetric = system.symmetric and self.sign != 0
         self.maxiter = iterations or system.maxiter or maxiter or int(np.clip(4 * system.size, 100, 20_000))
         self.iterations = iterations
         self.refines = iterations is None
         self.window = max(50, self.maxiter // (2 if self.precondition is None else 8))
-        self.restart = int(np.clip(MOST_NUMBERS // max(system.size, 1), 8, RESTART))
+        numbers = max(system.size, 1) * self.dtype.itemsize // 8
+        self.restart = int(np.clip(MOST_NUMBERS // numbers, 8, RESTART))
         self.hierarchy = (
             "conjugate gradients" if self.symmetric else f"GMRES, restarted after {self.restart} iterations"
         )
@@ -109,7 +75,8 @@ class Krylov(Engine):
 
         if self.symmetric:
             return self._conjugate_gradients(b, accepted, transposed)
-        return self._gmres(b, goal, accepted, transposed)
+        x, used, word = self._gmres(b.astype(self.dtype, copy=False), goal, accepted, transposed)
+        return (x if b.dtype == self.dtype else x.real.copy()), used, word
 
     def _conjugate_gradients(self, b, accepted, transposed):
         """Preconditioned conjugate gradients from 0, until accepted(|b - A x|, x)."""
@@ -171,14 +138,14 @@ class Krylov(Engine):
             return system.null_space.project(z, transposed)
 
         x, r, used = np.zeros_like(b), b, 0
-        residual, basis = np.sqrt(dot(r, r)), np.empty((self.restart + 1, b.size))
+        residual, basis = norm(r), np.empty((self.restart + 1, b.size), self.dtype)
         while True:
             steps = min(self.restart, self.maxiter - used)
             change, steps = _gmres_cycle(apply, r, residual, precondition, goal, basis, steps)
             used += steps
             trial = x + precondition(change)
             r = b - apply(trial)
-            before, residual = residual, np.sqrt(dot(r, r))
+            before, residual = residual, norm(r)
             if not residual < before:
                 return x, used, "stagnated" if np.isfinite(residual) else "diverged"
             x = trial
@@ -225,24 +192,6 @@ def _probed_sign(system):
     return int(signs.pop()) if len(signs) == 1 else 0
 
 
-def _preconditioner(system, given):
-    """The option -> precondition(r, transposed) on flat arrays, or None."""
-    if given is None:
-        return None
-    if isinstance(given, str) and given == "jacobi" and system.sign:
-        inverse = inverted(system.diagonal)
-        return lambda r, transposed: r * inverse
-    if isinstance(given, Operator):
-        scale = 2.0**system.exponent
-        return lambda r, transposed: scale * (given.T if transposed else given)._flat.apply(r)
-    if callable(given):
-        shape = system.op.domain.shape
-        return lambda r, transposed: np.array(given(r.reshape(shape)), dtype=float).reshape(-1)
-    raise ValueError(
-        f"preconditioner must be None, 'jacobi' (for a diagonal of one sign), an Operator or a function, got {given!r}"
-    )
-
-
 # ---------------------------------------------------------------- the iterations
 
 
@@ -260,20 +209,20 @@ def _gmres_cycle(apply, r, residual, precondition, goal, basis, steps):
     In the basis, A acts as a Hessenberg matrix with one row more than columns. With `null`, the vector that is 0 times
     that matrix and begins with 1, the smallest residual is |r| / |null|: no system need be solved to know it.
     """
-    hessenberg, null = np.zeros((steps + 1, steps)), np.zeros(steps + 1)
+    hessenberg, null = np.zeros((steps + 1, steps), basis.dtype), np.zeros(steps + 1, basis.dtype)
     null[0] = 1.0
     np.divide(r, residual, out=basis[0])
     for j in range(steps):
         w = apply(precondition(basis[j]))
         for _ in range(2):  # once is not enough: orthogonality is lost to rounding
-            overlap = basis[: j + 1] @ w
+            overlap = (basis[: j + 1] @ w.conj()).conj()
             w -= overlap @ basis[: j + 1]
             hessenberg[: j + 1, j] += overlap
-        hessenberg[j + 1, j] = length = np.sqrt(dot(w, w))
+        hessenberg[j + 1, j] = length = norm(w)
         if not length > 0:
             break
         null[j + 1] = -(null[: j + 1] @ hessenberg[: j + 1, j]) / length
-        if residual <= 0.9 * goal * np.sqrt(dot(null, null)):
+        if residual <= 0.9 * goal * norm(null):
             break
         np.divide(w, length, out=basis[j + 1])
     data = np.zeros(j + 2)

@@ -6,7 +6,9 @@ With A = shift - D diag(k) G and A x = b, a change of the data gives
 
 so with the adjoint solve A^T y = g, one for all arguments,
 
-    cotangent of b: y,    of shift: -y.x,    of k: (D^T y) * (G x).
+    cotangent of b: y,    of shift: -y * x (its sum where shift is one number),    of k: (D^T y) * (G x),
+
+in the convention of tape.py for complex numbers too: plain transposes, and the real part for what is real.
 
 The transposed solve is a rule of the same form with D, G exchanged for G^T, D^T: each is the other's
 helper, and derivatives of every order follow.
@@ -19,7 +21,6 @@ places of the pattern are ever touched.
 from functools import cached_property
 from typing import Any
 
-import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
@@ -64,14 +65,14 @@ class ParametricSolver(Remade):
         """The solve (or the transposed solve) as a rule in (k, b, shift). Not cached: it holds this solver."""
 
         def forward(k, b, shift):
-            inv = self._inverse(np.asarray(k), float(shift))
+            inv = self._inverse(k, shift)
             return (inv.T if transposed else inv if checked else inv.tangent).apply(b)
 
         def vjp(nums, ans, k, b, shift):
             def pull(g):
                 other = self._rule(not transposed)(k, g, shift)
                 x, y = (other, ans) if transposed else (ans, other)
-                slopes = {0: lambda: self.D.T(y) * self.G(x), 1: lambda: other, 2: lambda: -anp.sum(y * x)}
+                slopes = {0: lambda: self.D.T(y) * self.G(x), 1: lambda: other, 2: lambda: -y * x}
                 with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
                     return tuple(self._finite(of_argument(slopes[num](), (k, b, shift)[num])) for num in nums)
 
@@ -93,7 +94,7 @@ class ParametricSolver(Remade):
 
     def _inverse(self, k, shift):
         """The set-up for this content, from the last two or new."""
-        k = k.astype(np.result_type(k, np.float64), copy=False)
+        k, shift = (np.asarray(values, np.result_type(values, float)) for values in (k, shift))
         known = self._cache.find((k, shift))
         if known is not None:
             return known
@@ -123,18 +124,19 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     Returns
     -------
     EllipticSolver
-        Call it as ``solve(k, b, shift=0.0)``: k a number or one value for each face, finite and >= 0;
-        b a field on the cells; shift a finite number. Differentiable in all three, to every order.
-        The set-up depends on the content of (k, shift); the last two are kept.
+        Call it as ``solve(k, b, shift=0.0)``: k a number or one value for each face, real and >= 0 or
+        complex; b a field on the cells; shift a number or one for each cell, real or complex; all finite.
+        Differentiable in all three, to every order. The set-up depends on the content of (k, shift); the
+        last two are kept.
 
     Raises
     ------
     TypeError
         If D or G is not an Operator, and on use, if k or b is a masked array.
     ShapeError
-        If D and G do not fit, and on use, if k or b has another shape.
+        If D and G do not fit, and on use, if k, b or shift has another shape.
     ValueError
-        On use, if k is negative or complex.
+        On use, if k is real and negative, or k or shift holds no numbers.
     NonFiniteError
         On use, if k, b or shift holds NaN or infinity.
     ConvergenceError
@@ -144,7 +146,8 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     -----
     Cost: one solve; its derivative in any of k, b, shift one more, with the transpose of the same
     set-up. Null space: where shift is 0 and no wall holds the level (pure Neumann), as for `inverse`;
-    derivatives are projected, never refused.
+    derivatives are projected, never refused. Helmholtz: a negative shift, -(omega / c)^2; its imaginary
+    part damps, and absorbs waves where it grows towards the walls.
 
     Examples
     --------
@@ -153,8 +156,8 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     >>> solve = elliptic_solver(divergence(grid), gradient(grid, dirichlet))
     >>> solve(1.0, np.array([2.0, 2.0]))
     array([1., 1.])
-    >>> value_and_grad(lambda k: anp.sum(solve(k, np.array([2.0, 2.0]))))(1.0)
-    (2.0, -2.0)
+    >>> value_and_grad(lambda k: solve(k, np.array([2.0, 2.0]))[0])(1.0)
+    (1.0, -1.0)
     """
     for name, op in (("D", D), ("G", G)):
         if not isinstance(op, Operator):
@@ -183,41 +186,33 @@ class EllipticSolver(ParametricSolver):
 
         Parameters
         ----------
-        k : float, or array of the shape of a field on the faces
+        k : number, or array of the shape of a field on the faces
         b : array, a field on the cells; leading axes are a batch
-        shift : float
+        shift : number, or array of the shape of a field on the cells
 
         Returns
         -------
-        array of the shape and dtype of b
+        array of the shape and dtype of b; complex where k or shift is
         """
-        check_plain("elliptic_solver", k, b)
+        check_plain("elliptic_solver", k, b, shift)
         k = self._coefficient(k)
-        _check_shift(plain(shift))
+        shift = _values("shift", shift, self.D.codomain)
         return self._rule(False, True)(k, b if isbox(b) else np.asarray(b), shift)
 
     def _coefficient(self, k):
-        values, space = np.asarray(plain(k)), self.D.domain
-        if values.shape not in ((), space.shape):
-            advice = "; write harmonic_average(grid)(k)" if values.shape == self.D.codomain.shape else ""
-            raise ShapeError(
-                f"k takes a number or a field on {space.described}, got an array of shape {values.shape}{advice}"
-            )
-        if values.dtype.kind not in "biuf":
-            instead = "k.real" if values.dtype.kind == "c" else "np.asarray(k, float)"
-            raise ValueError(f"k must hold real numbers, got dtype {values.dtype}; write {instead}")
-        check_finite("k", values)
-        if np.any(values < 0):
+        k = _values("k", k, self.D.domain, "harmonic_average(grid)(k)", self.D.codomain)
+        values = np.asarray(plain(k))
+        if values.dtype.kind != "c" and np.any(values < 0):
             raise ValueError(f"k must be >= 0, got {values.min():g} at {np.argmin(values)}")
-        if values.ndim == 0:
-            return k * np.ones(space.shape)
-        return k if isbox(k) else values
+        return k * np.ones(self.D.domain.shape) if values.ndim == 0 else k
 
     def _operator(self, k, shift):
-        name = f"{shift:g} - {self.D.name} @ diag(k) @ {self.G.name}"
-        if k.size and np.all(k == k[0]) and self._product.separable and self._settings["method"] != "direct":
-            # A constant coefficient keeps the operator a sum of 1-D factors.
-            op = -k[0] * self._product + shift * identity(self.G.domain)
+        word, real = "shift" if shift.ndim else f"{shift:g}", np.result_type(k, shift).kind == "f"
+        name = f"{word} - {self.D.name} @ diag(k) @ {self.G.name}"
+        even = real and not shift.ndim and k.size and np.all(k == k[0])
+        if even and self._product.separable and self._settings["method"] != "direct":
+            # Constant coefficients keep the operator a sum of 1-D factors.
+            op = -k[0] * self._product + float(shift) * identity(self.G.domain)
             return Operator(op.structure, self.G.domain, self.D.codomain, name)
         return Operator(Elliptic(self._minus, self.G, k, shift), self.G.domain, self.D.codomain, name)
 
@@ -233,12 +228,21 @@ class EllipticSolver(ParametricSolver):
         return f"<elliptic_solver: shift - {self.D.name} @ diag(k) @ {self.G.name} on {self.G.domain}>"
 
 
-def _check_shift(shift):
-    if np.shape(shift) != ():
-        raise ShapeError(f"shift takes one number, got an array of shape {np.shape(shift)}")
-    if np.asarray(shift).dtype.kind not in "biuf":
-        raise ValueError(f"shift must be real, got {shift!r}; write for example shift=1.0")
-    check_finite("shift", shift)
+def _values(name, given, space, advice="", other=None):
+    """A parameter, traced or not, which must be one finite number or a field on `space`.
+
+    `advice`: what to write where it is a field on the space `other`.
+    """
+    values = np.asarray(plain(given))
+    if values.shape not in ((), space.shape):
+        advice = f"; write {advice}" if other is not None and values.shape == other.shape else ""
+        raise ShapeError(
+            f"{name} takes a number or a field on {space.described}, got an array of shape {values.shape}{advice}"
+        )
+    if values.dtype.kind not in "biufc":
+        raise ValueError(f"{name} must hold numbers, got dtype {values.dtype}; write np.asarray({name}, float)")
+    check_finite(name, values)
+    return given if isbox(given) else values
 
 
 class Elliptic(Sum):
@@ -249,18 +253,19 @@ class Elliptic(Sum):
     D, G : Operator
         They keep what does not depend on k: transposes, magnitudes, and matrices where entries are asked for.
     k : array, shape (faces,)
-    shift : float
+    shift : array, a number or a field on the cells
     """
 
     def __init__(self, D, G, k, shift, transposed=False):
-        self.D, self.G, self.k, self.shift = D, G, k.reshape(-1), shift
+        self.D, self.G, self.k = D, G, k.reshape(-1)
+        self.shift = Diagonal(np.broadcast_to(shift.reshape(-1), D.shape[0]))
         self.transposed = transposed
         left, right = (G.T, D.T) if transposed else (D, G)
         product = Chain([left.structure, Diagonal(self.k), right.structure])
-        super().__init__([Diagonal(np.full(D.shape[0], shift)), product])
+        super().__init__([self.shift, product])
 
     def transpose(self):
-        return Elliptic(self.D, self.G, self.k, self.shift, not self.transposed)
+        return Elliptic(self.D, self.G, self.k, self.shift.values, not self.transposed)
 
     def scaled(self, factor):
         return None  # so that the entries are the same bits, scaled
@@ -268,7 +273,7 @@ class Elliptic(Sum):
     def explicit(self):
         D, G = self.D.matrix, self.G.matrix
         slopes = sp.csr_array((G.data * self.k[rows_of(G)], G.indices, G.indptr), shape=G.shape)
-        matrix = compact(self.shift * sp.eye_array(D.shape[0], format="csr") + D @ slopes)
+        matrix = compact(self.shift.explicit() + D @ slopes)
         return matrix.T.tocsr() if self.transposed else matrix
 
 
