@@ -1,5 +1,8 @@
 """Derivatives of whole programs: any function of a tree of arrays, forward and backward."""
 
+import gc
+import threading
+from contextlib import contextmanager
 from numbers import Number
 
 import autograd.numpy as anp
@@ -16,7 +19,6 @@ from sparsedp.tape import (
     dtype_of,
     fit,
     forward_root,
-    growing,
     is_variable,
     isbox,
     new_trace,
@@ -33,6 +35,27 @@ __all__ = [
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
 NO_JVP = (DerivativeError, NotImplementedError)
+
+SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
+_lock = threading.Lock()
+_growing: list[tuple] = []  # thresholds to go back to, one for each tape that grows
+
+
+@contextmanager
+def growing():
+    """While a tape grows: it has no cycles, and every search for cyclic garbage would walk all of it."""
+    with _lock:
+        before = gc.get_threshold()
+        _growing.append(before if not _growing else _growing[0])
+        if 0 < before[0] < SELDOM:
+            gc.set_threshold(SELDOM, *before[1:])
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _growing.pop()
+            if not _growing:
+                gc.set_threshold(*before)
 
 
 def pullback(fun, x):

@@ -6,9 +6,7 @@ Only this file opens autograd. All rules go through one primitive (`_call`), all
 Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A x is A^T g.
 """
 
-import gc
 import inspect
-import threading
 from contextlib import contextmanager
 from functools import cached_property, partial, wraps
 from itertools import count as numbers_from
@@ -44,7 +42,7 @@ from sparsedp.tree import copied, leaves
 
 __all__ = [
     "Recorder", "ReverseNode", "Rule", "apply_operator", "backward", "boxed", "called", "cast", "differentiable",
-    "dtype_of", "fit", "forward_root", "growing", "innermost", "is_variable", "isbox", "linear", "new_trace",
+    "dtype_of", "fit", "forward_root", "innermost", "is_variable", "isbox", "linear", "new_trace",
     "of_argument", "plain", "reverse_root", "split_boxes", "through", "traces_of", "untraced",
 ]  # fmt: skip
 
@@ -57,8 +55,15 @@ plain = getval  # the value below all boxes
 class Recorder:
     """Takes down the calls of reverse-mode traces in order: the backward pass need not sort a graph."""
 
+    bytes: Any = None  # while it is a number: of the results, and of what stands beside traced values, is added
+
     def __init__(self):
         self.nodes: list = []
+
+    def weigh(self, value, args, nums):
+        """One call."""
+        held = leaves((value, [arg for num, arg in enumerate(args) if num not in nums]))
+        self.bytes += sum(getattr(leaf, "nbytes", 0) for leaf in held)
 
     def taken(self):
         """The calls since it was asked last: it forgets them, for they know it, and a circle is freed late."""
@@ -95,6 +100,8 @@ class ReverseNode(VJPNode):
             if getattr(plain(value), "dtype", FLOAT).kind == "c":
                 self._keep_real(args, nums)
         self.recorder.nodes.append(self)
+        if self.recorder.bytes is not None:
+            self.recorder.weigh(value, args, nums)
 
     def _keep_real(self, args, nums):
         """Beside complex values autograd hands complex cotangents on to real ones."""
@@ -144,28 +151,6 @@ def _new_trace():
 
 
 trace_stack.new_trace = _new_trace
-
-
-SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
-_lock = threading.Lock()
-_growing: list[tuple] = []  # thresholds to go back to, one for each tape that grows
-
-
-@contextmanager
-def growing():
-    """While a tape grows: it has no cycles, and every search for cyclic garbage would walk all of it."""
-    with _lock:
-        before = gc.get_threshold()
-        _growing.append(before if not _growing else _growing[0])
-        if 0 < before[0] < SELDOM:
-            gc.set_threshold(SELDOM, *before[1:])
-    try:
-        yield
-    finally:
-        with _lock:
-            before = _growing.pop()
-            if not _growing:
-                gc.set_threshold(*before)
 
 
 def traces_of(values):

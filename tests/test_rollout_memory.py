@@ -287,3 +287,18 @@ def test_constants_of_a_step_leave_its_tapes_where_they_are():
     with recording() as calls:
         dp.value_and_grad(lambda u: anp.sum(dp.rollout(lambda u, v: move(u, v, 1.0), u, v, 5) ** 2))(u)
     assert calls["transport upwind", "forward"] == 5
+
+
+@pytest.mark.parametrize("given", ["16 MB", None])
+def test_tapes_of_large_steps_keep_to_their_room(given, monkeypatch):
+    """A step that makes arrays far larger than the state, as between all pairs of bodies: few of them stay on tapes."""
+    monkeypatch.setattr("sparsedp.trajectory.front.ROOM", 2**24)
+    x, pairs = np.random.default_rng(0).random((120, 3)), 120**2 * 8
+
+    def step(x, strength):
+        apart = x[:, None] - x[None]
+        return x - strength * anp.sum(apart / (anp.sum(apart**2, 2, keepdims=True) + 1.0) ** 1.5, 1)
+
+    loss = lambda strength: anp.sum(dp.rollout(step, x, strength, 100, memory=given) ** 2)
+    one_step = 24 * pairs  # of arrays of pairs, forward and back
+    assert peak(lambda: dp.grad(loss)(1e-3)) < 2**24 + one_step

@@ -85,11 +85,12 @@ class Loop:
         for i in shown_steps(self.progress, range(self.n), "forward"):
             if i < state.i:
                 continue  # it is on the tape of an earlier one
-            # The first step tells what a tape takes, and shows traced values that the step keeps.
+            # The first two tapes tell what a step takes; the first shows traced values that the step keeps.
             taped = wanted and (i == 0 or weight <= room)
             if taped:
+                steps.recorder.bytes = 0 if i < 2 else None
                 tape, state = steps.taped(state, self.end(i, room // max(weight, 1) if i else 1))
-                weight = self.weight(tape.steps[-1])
+                weight = self.weight(tape, steps.recorder.bytes) if i < 2 else weight
                 room -= weight * len(tape.steps)
                 tapes += [tape] if i or room >= 0 else []
                 del tape
@@ -101,9 +102,10 @@ class Loop:
                 kept.append(state)
         return state, kept, tapes
 
-    def weight(self, step):
-        """Bytes of a step on a tape, beside the state that is kept: every call may hold the largest thing there is."""
-        return len(step[2]) * (CALL + max(form.nbytes for form in self.layouts[:2])) - self.state.nbytes
+    def weight(self, tape, held):
+        """Bytes of a step on a tape, beside the state that is kept: of arrays, and of the calls themselves."""
+        calls = sum(len(nodes) for _, _, nodes in tape.steps)
+        return (held + calls * CALL) // len(tape.steps) - self.state.nbytes
 
     def end(self, i, most):
         """Where a tape from state i may end: nobody looks at the states inside, and float64 is not rounded there."""
