@@ -45,6 +45,27 @@ def matrix_solver():
     return dp.matrix_solver(PLACES), [entries, lambda s: field(6, s)]
 
 
+@case("conservation_law")
+def conservation_law():
+    law = dp.conservation_law(
+        GRID,
+        lambda u, params, axis: params * u**2,
+        lambda u, params, axis: anp.max(anp.abs(2 * params * u), axis=0),
+        source=lambda u, params: -params * u,
+        equilibrium=field((2, *GRID.shape), 0),
+    )
+    return law, [lambda s: field((2, *GRID.shape), s), lambda s: field((), s)]
+
+
+@case("sponge")
+def leapfrog():
+    D, G = dp.divergence(LINE), dp.gradient(LINE)
+    rates = (lambda v, c: -c * D(v)), (lambda p, c: -G(p))
+    step = dp.stepper("leapfrog", rates, 0.01, damping=dp.sponge(LINE, 2, 1.0))
+    start = lambda s: (field(LINE.shape, s), field(LINE.faces.shape, s))
+    return lambda state, c: step(state, c)[0], [start, lambda s: field((), s)]
+
+
 @case("elliptic_solver")
 def elliptic_solver():
     solve = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))

@@ -1,0 +1,239 @@
+"""Messages of conservation laws, waves, flows with scalars, stiff steps and sparse terms, in full."""
+
+import re
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+LINE, BOX = dp.Grid(4), dp.Grid((4, 4))
+RATES = (lambda v, c: v), (lambda p, c: p)
+SHAPE, UNSTABLE, VALUE, TYPE = dp.errors.ShapeError, dp.errors.UnstableStepError, ValueError, TypeError
+
+
+def carry(u, params, axis):
+    return u
+
+
+def law(**given):
+    return dp.conservation_law(LINE, carry, carry, **given)
+
+
+def flow(dt=0.1, v=0.0, **given):
+    step = dp.flow_step(BOX, dt, **given)
+    return step(step.start(np.full(40, v)))
+
+
+def turned(u, params):
+    return anp.real(params) * u
+
+
+def stay(target, rho, x):
+    return x
+
+
+def fast(u, params):
+    return -(u**2)
+
+
+def drift():
+    grid = dp.Grid((16, 16), periodic=True)
+    step = dp.flow_step(grid, 0.75)
+    return step(step.start(grid.join(1.0, 0.0)))
+
+
+class Growing:
+    """An operator that changes its shape."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, x):
+        self.calls += 1
+        return x if self.calls < 3 else anp.concatenate([x, x])
+
+
+TABLE = [
+    (
+        lambda: law(scheme="weno"),
+        VALUE,
+        "conservation_law takes scheme from upwind, van_leer, got 'weno'; write one of them",
+    ),
+    (
+        lambda: law(boundary=dp.no_slip),
+        VALUE,
+        "conservation_law takes outflow, free_slip or inflow, got no_slip; write one of them",
+    ),
+    (
+        lambda: law(boundary=dp.inflow),
+        VALUE,
+        "conservation_law got one of two: inflow at a side needs inflow=; give both or none",
+    ),
+    (
+        lambda: law(inflow=1.0),
+        VALUE,
+        "conservation_law got one of two: inflow= needs a side with dp.inflow; give both or none",
+    ),
+    (
+        lambda: law(boundary=dp.free_slip),
+        VALUE,
+        "conservation_law at a free_slip wall needs momentum, the number of a field for each "
+        "axis, got None; write for example momentum=(1,)",
+    ),
+    (
+        lambda: law()(np.ones(5)),
+        SHAPE,
+        "conservation_law takes u of shape (fields, 4), got (5,)",
+    ),
+    (
+        lambda: law()(np.ones(4, complex)),
+        TYPE,
+        "conservation_law takes real numbers as u, got dtype complex128; write u.real",
+    ),
+    (
+        lambda: law()(np.array([1.0, np.nan, 1.0, 1.0])),
+        dp.errors.NonFiniteError,
+        "the speed of a conservation_law is NaN or infinite along x: the state has left where it "
+        "has waves (a density or a depth below 0?); take a smaller dt",
+    ),
+    (
+        lambda: law(source=lambda u, p: 1.0)(np.ones(4)),
+        SHAPE,
+        "the source of a conservation_law must have shape (4,) here, got ()",
+    ),
+    (
+        lambda: dp.conservation_law(LINE, np.ones(4), carry),
+        TYPE,
+        "flux must be a function, got ndarray; write lambda u, params, axis: ...",
+    ),
+    (
+        lambda: flow(scalars={"heat": 0.1}),
+        VALUE,
+        "scalar 'heat' of flow_step needs a dict of diffusivity, boundary, values, source, got 0.1",
+    ),
+    (
+        lambda: flow(scalars={"heat": {}}),
+        SHAPE,
+        "flow_step needs the scalars ['heat'], got {}; write step.start(v, params, s)",
+    ),
+    (
+        lambda: drift(),
+        UNSTABLE,
+        "flow_step is unstable for this velocity with dt = 0.75: waves grow by 20% a step, at a "
+        "Courant number of 0.75; dt = 0.5 is safe, or write unstable='allow'",
+    ),
+    (
+        lambda: dp.stepper("radau", fast, 0.1, solver="krylov"),
+        TYPE,
+        "radau solves full systems by LU; leave out solver",
+    ),
+    (
+        lambda: dp.stepper("leapfrog", RATES[0], 0.1),
+        TYPE,
+        "leapfrog needs a pair of rates, got function; write (lambda v, c: ..., lambda p, c: ...) for the state (p, v)",
+    ),
+    (
+        lambda: dp.stepper("leapfrog", RATES, 0.1, tolerance=0.1),
+        TYPE,
+        "leapfrog does not use tolerance; leave it out",
+    ),
+    (
+        lambda: dp.stepper("rk4", fast, 0.1, damping=(1.0, 1.0)),
+        TYPE,
+        "rk4 takes no damping; put it into the rate, or write method 'leapfrog'",
+    ),
+    (
+        lambda: dp.stepper("leapfrog", RATES, 0.1, damping=1.0),
+        TYPE,
+        "damping needs a pair, for both fields of the state, got float",
+    ),
+    (
+        lambda: dp.stepper("leapfrog", RATES, 0.1, damping=(-1.0, 0.0)),
+        VALUE,
+        "damping needs finite rates >= 0 [1 / time]; take dp.sponge(grid, cells, speed)",
+    ),
+    (
+        lambda: dp.stepper("leapfrog", RATES, 0.1, damping=(1.0, 0.0)).back((1.0, 1.0)),
+        VALUE,
+        "a leapfrog step with damping cannot be reversed: what it takes away grows on the way back",
+    ),
+    (
+        lambda: dp.stepper("rk4", fast, 0.1).back(1.0),
+        VALUE,
+        "stepper(rk4) cannot be reversed; write 'leapfrog'",
+    ),
+    (
+        lambda: dp.stepper("leapfrog", RATES, 0.1)(1.0),
+        TYPE,
+        "the state of leapfrog is a pair of fields, got float; write (p, v)",
+    ),
+    (
+        lambda: dp.stepper("leapfrog", RATES, 0.1, damping=((1.0, 2.0), None))((1.0, 1.0)),
+        SHAPE,
+        "damping has 2 parts for a field of 1; give one for each",
+    ),
+    (
+        lambda: dp.sponge(LINE, 5, 1.0),
+        VALUE,
+        "sponge on x needs 0 to 4 cells, got 5",
+    ),
+    (
+        lambda: dp.sponge(LINE, 2, 0),
+        VALUE,
+        "sponge needs a speed > 0 and an echo between 0 and 1, got 0 and 0.001",
+    ),
+    (
+        lambda: dp.total_variation(LINE, 0.0),
+        VALUE,
+        "total_variation needs eps > 0, a slope that counts as small, got 0.0",
+    ),
+    (
+        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, operator=Growing(), inner=stay),
+        SHAPE,
+        "the operator of admm gave shape (6,) after (3,); it must not change",
+    ),
+    (
+        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=0.0),
+        VALUE,
+        "admm needs weight > 0, got 0.0",
+    ),
+    (
+        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, batches=[1]),
+        TYPE,
+        "admm does not use batches; leave it out",
+    ),
+    (
+        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weights=1.0),
+        TYPE,
+        "admm has no option 'weights'; it has weight, operator, rho, inner, prox",
+    ),
+    (
+        lambda: dp.stepper("radau", fast, 0.1)(np.ones(3, complex)),
+        TYPE,
+        "stepper(radau) solves for real unknowns; give real and imaginary part as two fields",
+    ),
+    (
+        lambda: dp.stepper("radau", fast, 0.1)(np.ones(600)),
+        SHAPE,
+        "stepper(radau) solves full systems of at most 500 unknowns, got 600; take tr_bdf2",
+    ),
+    (
+        lambda: dp.stepper("radau", lambda u, p: u**2, 50.0)(np.ones(1)),
+        dp.errors.ConvergenceError,
+        "stepper(radau): Newton's method does not converge in a step of 50; take a smaller dt, "
+        "or give stepper a tolerance",
+    ),
+    (
+        lambda: dp.grad(lambda c: anp.real(dp.stepper("radau", turned, 0.1)(np.ones(1), c)[0]))(1.0 + 1.0j),
+        dp.errors.DerivativeError,
+        "stepper(radau) has derivatives in real params; give real and imaginary part as two",
+    ),
+]
+
+
+@pytest.mark.parametrize("call, kind, message", TABLE, ids=[message[:40] for _, _, message in TABLE])
+def test_message(call, kind, message):
+    with pytest.raises(kind, match=re.escape(message)):
+        call()
