@@ -245,6 +245,8 @@ REFUSED = [
      "a rate of complex numbers needs a complex state, got float64; write u.astype(complex)"),
     (lambda: value_and_grad(lambda p: dp.stepper("radau", lambda u, p: -anp.abs(p) * u, 1.0)(ONES, p)[0])(1j),
      DerivativeError, "stepper(radau) has derivatives in real params; give real and imaginary part as two"),
+    (lambda: value_and_grad(lambda k: dp.stepper("radau", lambda u, p: -k * u, 1.0)(ONES, None)[0])(1.0),
+     DerivativeError, "the rate of stepper(radau) uses a traced value that is not an argument; put it into params"),
     (lambda: dp.stepper("radau", DECAY, 1.0, tolerance=1e-8)(np.ones(2, np.float32), 1.0), ValueError,
      "stepper(radau) cannot meet the tolerance 1e-08 with a state of float32, whose rounding is 1.2e-07; "
      "take a larger tolerance or write u.astype(float)"),

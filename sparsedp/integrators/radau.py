@@ -24,6 +24,7 @@ shadows, as adaptive.py says and for its reasons. Two things differ: the first s
 u + z_3 + EPSILON e, and the sum of all d is given back at the end, where it counts with the speed there.
 """
 
+from collections import deque
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -64,7 +65,7 @@ ROUNDING = 1e-15  # relative correction that no iteration is asked to go below
 STALLED = 1e-11  # relative correction that is taken for rounding where it does not shrink
 ITERATIONS = 10  # of Newton's method in a step with error control
 CAREFUL = 1e-3  # first length where the rate takes the time: it may be at rest at the start alone
-FAST = 1e-3  # share of a correction that is left after an iteration, up to which the Jacobian serves the next step
+FAST = 0.03  # share of a correction that is left after an iteration, up to which the Jacobian serves the next step
 
 
 class Radau(Adaptive):
@@ -98,9 +99,9 @@ class Radau(Adaptive):
         rates = Rates(self, u, params, list(map(isbox, leaves(given[1]))))
         if rates.size == 0:
             return given[0]
-        path = self._path(rates, u, t, float(h))
-        new = rates.layout.rounded(path[-1].new)
         traced = [leaf for leaf in leaves(given) if isbox(leaf)]
+        path = deque(self._path(rates, u, t, float(h)), None if traced else 1)
+        new = rates.layout.rounded(path[-1].new)
         if not traced:
             return new
         if len(traces_of(traced)) > 1:  # the rule below is linear: its own derivative would miss that of the steps
@@ -113,12 +114,17 @@ class Radau(Adaptive):
 
     def _path(self, rates, u, t, h):
         v = rates.layout.flat(u)
-        self._first(v, rates, t, h)  # refuses what is not finite
         state = rates.state(v)
-        like(combine(state, (0.0, self.problem(state, rates.params, t))), state)  # refuses other shapes, and complex
+        rate = self.problem(state, rates.params, t)
+        like(combine(state, (0.0, rate)), state)  # refuses other shapes, and complex
+        if any(map(isbox, leaves(rate))):
+            raise DerivativeError(
+                f"the rate of {self.name} uses a traced value that is not an argument; put it into params"
+            )
+        self._first(v, rates, t, h)  # refuses what is not finite
         if self.tolerance is not None:
             self._check_tolerance(u)
-            return list(self._steps(v, rates, t, h))
+            return self._steps(v, rates, t, h)
         with np.errstate(all="ignore"):
             z = rates.stages(v, t, h)
         if z is None:
