@@ -96,6 +96,8 @@ class Radau(Adaptive):
     def __call__(self, *given):
         """(u, params, t, h) -> the state after the interval h."""
         u, params, t, h = untraced(given)
+        if any(map(isbox, leaves(given))):  # the caller may write into its arrays before the way back
+            u, params = constant((u, params))
         rates = Rates(self, u, params, list(map(isbox, leaves(given[1]))))
         if rates.size == 0:
             return given[0]
