@@ -27,7 +27,7 @@ _WINDOW = {
     "operators.boundary": "diagonal identity interior lift mask",
     "solvers.inverses": "inverse",
     "solvers.parametric": "elliptic_solver matrix_solver",
-    "solvers.roots": "implicit",
+    "solvers.roots": "implicit steady",
     "solvers.separable": "exponential power",
     "flow.momentum": "convection face_laplacian face_lift",
     "advection.front": "transport",

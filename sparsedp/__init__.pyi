@@ -64,6 +64,7 @@ from .solvers.inverses import inverse as inverse
 from .solvers.parametric import elliptic_solver as elliptic_solver
 from .solvers.parametric import matrix_solver as matrix_solver
 from .solvers.roots import implicit as implicit
+from .solvers.roots import steady as steady
 from .solvers.separable import exponential as exponential
 from .solvers.separable import power as power
 from .space import Space as Space

@@ -27,6 +27,7 @@ SMALL = {
     "taylor_green.py": "50",
     "cavity.py": "32",
     "convection.py": "32",
+    "steady_states.py": "24",
     "obstacle.py": "10",
     "shape.py": "12",
     "velocity_recovery.py": "64",

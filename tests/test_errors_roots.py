@@ -102,7 +102,8 @@ TABLE = [
     (
         lambda: dp.implicit(square, maxiter=1)(1.0, 1e6),
         FAILED,
-        "implicit(square) after 1 Newton steps: relative residual 9.6e-01, wanted 1e-10 (max_iterations)",
+        "implicit(square) after 1 Newton steps: relative residual 9.6e-01, wanted 1e-10 (max_iterations); start from "
+        "the solution for nearby parameters, or raise maxiter",
     ),
     (
         lambda: dp.matrix_solver(np.ones((2, 3))),

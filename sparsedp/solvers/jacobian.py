@@ -22,6 +22,7 @@ from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.inverses import Inverse, Solution, build, build_dense
 from sparsedp.solvers.solve import failure
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like
+from sparsedp.structure.base import rows_of
 from sparsedp.tape import isbox
 from sparsedp.tree import copied
 
@@ -30,6 +31,7 @@ __all__ = ["Jacobians", "Linearisation"]
 FULL_UP_TO = 16  # unknowns: a full Jacobian takes fewer products than the search for its pattern
 FULL_AT_MOST = 2000  # unknowns: a larger Jacobian that is not sparse is left as products
 SYMMETRIC = 1e-12  # of the largest entry: by how much a symmetric Jacobian may differ from its transpose
+MOST_COLOURS = 64  # products for a matrix: with more, a search at all points takes as few
 AGREES = 1e-8  # relative difference up to which two forms of one Jacobian are taken for equal
 
 
@@ -52,6 +54,10 @@ class Linearisation:
 
     def __str__(self):
         return str(Inverse(Solution(self.solver)))
+
+    def magnitude(self, x):
+        """|J| x, row by row, for x >= 0."""
+        return self.solver.system.given.structure.magnitude()(x)
 
     @property
     def singular(self):
@@ -82,7 +88,7 @@ class Linearisation:
         v = rng.uniform(0.5, 1.5, x.size) * rng.choice([-1.0, 1.0], x.size)
         with np.errstate(all="ignore"):
             wanted = equation.tangent(x, leaves)(v)
-        size = np.maximum(self.solver.system.given.structure.magnitude()(np.abs(v)), np.abs(wanted))
+        size = np.maximum(self.magnitude(np.abs(v)), np.abs(wanted))
         size += 1e-8 * np.max(size, initial=0.0)  # rounding of large rows is no difference in small ones
         share = np.abs(self.product(v) - wanted) / np.where(size > 0, size, 1.0)
         row = int(np.argmax(share)) if share.size else 0
@@ -131,22 +137,28 @@ class Jacobians:
         known = self._points.find(_key(equation, x, leaves)) or self.fresh(equation, x, leaves)
         return self.fresh(equation, x, leaves) if self.enlarged(known) else known
 
-    def _solver(self, op):
-        if op.form == "explicit":
-            return self._solver_of(op.matrix, lambda: op)
-        products = {} if op.structure.has_entries else dict(method="krylov")
-        return build(op, **self.settings | products, solves="few").solver
+    def relaxed(self, equation, x, leaves, pace):
+        """The Solver of J + D / pace, D the rates of its rows; None where its entries are not known."""
+        matrix, make, _ = self._assembled(equation, x, leaves)
+        if matrix is None:
+            return None
+        matrix = sp.csr_array(matrix + sp.diags_array(_rates(matrix, equation.layout) / pace))
+        return self._set_up(matrix, partial(from_matrix, matrix, *(make().domain,) * 2, self.settings["name"]))
 
-    def _solver_of(self, matrix, make):
-        """The Solver of an assembled Jacobian, of which ``make()`` is the Operator: found again or set up."""
-        settings, solver = self.settings, None
+    def _solver(self, matrix, make):
+        """The Solver of a Jacobian, of which ``make()`` is the Operator: found again or set up. No matrix: products."""
+        if matrix is None:
+            op = make()
+            products = {} if op.structure.has_entries else dict(method="krylov")
+            return build(op, **self.settings | products, solves="few").solver
         key = matrix.indptr, matrix.indices, matrix.data
-        known = self._matrices.find(key)
-        if known is not None:
-            return known
+        return self._matrices.find(key) or self._matrices.put(key, self._set_up(matrix, make))
+
+    def _set_up(self, matrix, make):
+        settings, solver = self.settings, None
         if len(matrix.indptr) <= DENSE_UP_TO + 1 and settings["method"] in ("auto", "direct"):
             solver = build_dense(matrix.toarray(), make, settings["rtol"], settings["nullspace"], settings["name"])
-        return self._matrices.put(key, solver or build(make(), **settings, solves="few").solver)
+        return solver or build(make(), **settings, solves="few").solver
 
     def suspected(self, known):
         """As `enlarged`, for a Newton step that did not do well. A Jacobian that was given may be a simpler one."""
@@ -191,21 +203,27 @@ class Jacobians:
 
     def _made(self, equation, x, leaves):
         """(the Solver of the Jacobian, whether it is the derivative itself for certain)."""
+        matrix, make, exact = self._assembled(equation, x, leaves)
+        return self._solver(matrix, make), exact
+
+    def _assembled(self, equation, x, leaves):
+        """(its matrix, None where it is products; what makes the Operator; whether it is exact for certain)."""
         size, name = equation.size, self.settings["name"]
         if self.given is not None:
             self.way = "given"
             given = self.given(equation.layout.split(x), *equation.params(leaves))
-            return self._solver(self._as_operator(given, size, name)), False
+            op = self._as_operator(given, size, name)
+            return op.matrix if op.form == "explicit" else None, lambda: op, False
         with self._alone:
             coloured, space = self._patterns.get(size) or self._coloured(equation, x, leaves)
         if coloured is None:
             forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
-            return self._solver(from_functions(forward, backward, size, size, name)), True
+            return None, lambda: from_functions(forward, backward, size, size, name), True
         matrix = coloured.matrix(self._product(equation, x, leaves, coloured.by_rows))
         # A field of another shape may have as many unknowns.
         suits = space is not None and equation.layout.shapes[0] == space.shape and _is_symmetric(matrix, space)
         make = partial(from_matrix, matrix, *(space if suits else size,) * 2, name)
-        return self._solver_of(matrix, make), coloured.by_rows and coloured.pattern.nnz == size**2
+        return matrix, make, coloured.by_rows and coloured.pattern.nnz == size**2
 
     def _as_operator(self, given, size, name):
         if isbox(given):
@@ -276,7 +294,9 @@ class Jacobians:
 
     def _probed(self, equation, points, leaves, by_rows):
         products = [self._product(equation, point, leaves, by_rows, "pattern") for point in points]
-        found = find_pattern(products, equation.size, equation.size)
+        found = find_pattern(products[:1], equation.size, equation.size)
+        if found is not None and not _serves(found, products[1:]):
+            found = find_pattern(products, equation.size, equation.size)
         return found.T.tocsr() if by_rows and found is not None else found
 
     def _enlarge(self, equation, x, leaves, row):
@@ -297,7 +317,19 @@ def _points(x):
     rng = np.random.default_rng(0)
     scale = np.sqrt(np.mean(x**2)) or 1.0
     far = scale * rng.standard_normal(x.size)
-    return x * (1 + 0.1 * rng.uniform(-1, 1, x.size)), far, -far  # opposite: each side of a switch is met
+    return far, -far, x * (1 + 0.1 * rng.uniform(-1, 1, x.size))  # opposite: each side of a switch is met
+
+
+def _serves(pattern, products):
+    """Whether matrices have entries on a pattern only: what the products with their colours give acts as they do."""
+    coloured, v = Coloured(pattern, by_rows=False), np.random.default_rng(1).uniform(0.5, 1.5, pattern.shape[1])
+    if products and coloured.count > MOST_COLOURS:
+        return False
+    for product in products:
+        matrix = coloured.matrix(product)
+        if np.any(np.abs(matrix @ v - product(v)) > AGREES * (abs(matrix) @ v)):
+            return False
+    return True
 
 
 def _is_valid(equation, x, leaves):
@@ -316,6 +348,20 @@ def _can(derive, *args):
     except NO_JVP:
         return False
     return True
+
+
+def _rates(matrix, layout):
+    """The rate at which each unknown relaxes, with the sign of its equation; 0 where it is no equation of rates.
+
+    Half the sum of a row over its own field: 4 nu / h^2 of a Laplacian in 2-D, |v| / h of convection. The sign is that
+    of the diagonal where it leads the row, else that of the diagonal of the whole field. 0 for a pressure in div v = 0.
+    """
+    field = np.repeat(np.arange(len(layout.shapes)), [int(np.prod(shape)) for shape in layout.shapes])
+    row, diagonal = rows_of(matrix), matrix.diagonal()
+    inside = field[row] == field[matrix.indices]
+    sums = np.bincount(row[inside], np.abs(matrix.data[inside]), diagonal.size)
+    signs = np.sign(np.bincount(field, diagonal))[field] if field.size else diagonal
+    return 0.5 * sums * np.where(2.1 * np.abs(diagonal) >= sums, np.sign(diagonal), signs)
 
 
 # ---------------------------------------------------------------- the grid of the Jacobian

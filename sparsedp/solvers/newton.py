@@ -6,7 +6,8 @@ for linear systems (see solve.py), x is accepted when
     |F| <= rtol |b|,    or    |F| <= 8 eps (|J| |x| + |b|)    (converged_at_roundoff).
 
 Of small systems |J| |x| is taken entry by entry: unknowns of different sizes (species of 1 and 1e-10 with rates of 1e7)
-would else be accepted with errors that add up over many steps.
+would else be accepted with errors that add up over many steps. Of a tree of fields each is judged by itself, for
+pressures of 1e6 would hide a temperature that is no solution; a step lowers the sum of all in these units.
 
 A Jacobian serves further steps (simplified Newton) while they leave at most a tenth of the residual and the rest
 of the way is short. Such steps gain digits at a fixed rate, where a Newton step doubles them and most often ends
@@ -15,6 +16,15 @@ far below the tolerance; they go on to rtol / 1000, so that roots found either w
 Where no step lowers the residual any more, F may be rounding of terms that cancel (the 1 in exp(x) - 1).
 It is taken for that, and x for converged_at_roundoff, when |F| <= 64 eps (|J| |x| + |b| + the largest |F|
 met + |F_p p|) and J is right about F a thousand steps further: then neither J nor a kink is to blame.
+
+Where Newton steps stall, far from a root, the solve starts again from the guess in **pseudo-time**: implicit Euler
+steps of x' = -F / sign(D), linearised once each, in units of the time in which each unknown relaxes by itself,
+
+    (J + D / tau) s = -F,        tau <- tau |F| / |F_next|      (switched evolution relaxation).
+
+It follows a flow from the guess to its steady state, where the residual may rise for a while. An equation without a
+rate of its own, as div v = 0 for a pressure, has D = 0. From the longest steps on it is Newton's method again.
+Source: Kelley and Keyes, SIAM J. Numer. Anal. 35 (1998); Coffey, Kelley and Keyes, SIAM J. Sci. Comput. 25 (2003).
 """
 
 from typing import Any
@@ -43,6 +53,10 @@ FAR = 1024.0  # Newton steps: where rounding is no longer seen
 LOOSEST = 1e-2  # relative residual of the linear solve of a first step
 KEPT, MOST_KEPT = 0.1, 8  # a Jacobian is kept while a step leaves less, and for as many steps to the end
 FURTHER = 1e-3  # of the tolerance, for steps with a Jacobian that was kept
+STALLED, STALLS = 0.9, 2  # so many Newton steps on end that leave more of the residual: pseudo-time
+SHORTEST, FIRST, LONGEST = 1e-3, 10.0, 1e4  # pseudo-time steps; of 1, 10, 100 at first, 10 takes the fewest in cavities
+GROWTH = 10.0  # of a pseudo-time step, at most
+RISE = 2.0  # times the residual at the guess: a step to more is not taken, but a quarter of it in time
 TINY = 1e-8  # an iterate that is smaller than the last one by this share may be on its way to 0
 
 
@@ -229,25 +243,29 @@ class Newton:
         self.rtol, self.maxiter, self.run = rtol, maxiter, run
         self.x: np.ndarray
         self.F: Any = None
-        self.size = 0.0  # |F|
+        self.size = 0.0  # |F|, of several fields each in units of the terms that it is the sum of
+        self.cuts = np.cumsum([np.prod(shape, dtype=int) for shape in equation.layout.shapes])[:-1]  # between fields
+        self.units: Any = 1.0  # of each number of F
         self.steps, self.keeps = steps, steps or equation.size > DENSE_UP_TO
         self.J: Any = None
         self.stale = False  # whether J is that of an earlier iterate
-        self.largest = 0.0  # residual met
+        self.largest: Any = 0.0  # residual met, of each field
+        self.stalls = 0  # Newton steps on end that left nearly all of the residual
+        self.evolves = not steps  # whether pseudo-time may be tried: once
 
-    def solve(self, guess, start=None):
-        """From a guess to a root, the first steps with the Jacobian `start` where there is one.
+    def solve(self, guess, known=None):
+        """From a guess to a root, the first steps with the Jacobian `known` where there is one.
 
         Raises ConvergenceError with the best iterate.
         """
-        self.x, self.F = guess, self._first(guess)
-        self.size = length(self.F)
+        self.x, self.F = self.start = guess, self._first(guess)
+        self.size = self._measure(self.F)
         word, forcing = "" if self.F.any() else "converged", LOOSEST
         if not word:
-            if start is None:
+            if known is None:
                 self._linearise()
             else:
-                self.J, self.stale = start, True
+                self.J, self.stale = known, True
             word = self._accepted(0.0 if self.steps else 1.0)
         while not word:
             before = self.size
@@ -260,7 +278,7 @@ class Newton:
             elif self.stale or self.jacobians.suspected(self.J):
                 self._linearise()
             else:
-                word = self._rounding(step) or self._fail("stagnated")
+                word = self._rounding(step) or self._restarted()
         self.run.status = word
         return self.x
 
@@ -272,6 +290,9 @@ class Newton:
             return word, LOOSEST
         if ratio > SLOW and fresh:
             self.jacobians.suspected(self.J)
+        self.stalls = self.stalls + 1 if ratio > STALLED and fresh else 0
+        if self.stalls >= STALLS and self._evolved():
+            return self._accepted(), LOOSEST
         self._linearise()
         return "", float(np.clip(0.9 * ratio**2, self.rtol, LOOSEST)) if fresh else LOOSEST
 
@@ -299,8 +320,28 @@ class Newton:
     def _linearise(self):
         try:
             self.J, self.stale = self.jacobians.fresh(self.equation, self.x, self.leaves), False
+            self._weigh()
         except ConvergenceError as error:
-            self._fail("setup_failed", f"its Jacobian has no inverse there: {error}; start from another guess")
+            self._fail(
+                "setup_failed",
+                f"its Jacobian has no inverse there: {error}; start from another guess, or fix a constant "
+                "that is free (of a pressure p: add pin * p, pin 1 in one cell, to its equation)",
+            )
+
+    def _weigh(self):
+        """Units for the residual of several fields: the sizes of the terms of each, at this Jacobian."""
+        if self.cuts.size:
+            sizes = np.ldexp(self._sizes()[2], -self._unit)
+            sizes[sizes == 0] = np.max(sizes) or 1.0  # a field that is 0 and solved: in the units of the others
+            self.units = 1 / np.repeat(sizes, np.diff(self.cuts, prepend=0, append=self.x.size))
+            self.size = self._measure(self.F)
+
+    def _measure(self, F):
+        return length(F * self.units)
+
+    def _norms(self, values):
+        """The norm of each field."""
+        return np.array([length(part) for part in (np.split(values, self.cuts) if self.cuts.size else [values])])
 
     def _step(self, forcing):
         try:
@@ -316,7 +357,7 @@ class Newton:
             if np.array_equal(x, self.x):
                 return False
             F = self._value(x)
-            size = np.inf if F is None else length(F)
+            size = np.inf if F is None else self._measure(F)
             if size <= (1 - DECREASE * share) * self.size:
                 self.x, self.F, self.size = self._at_zero(x, F, size)
                 return True
@@ -339,6 +380,45 @@ class Newton:
             return None
         return F if np.all(np.isfinite(F)) else None
 
+    # ------------------------------------------------------------ pseudo-time
+
+    def _restarted(self):
+        """The status word after pseudo-time where no Newton step lowers the residual; an error where that fails too."""
+        if not self._evolved():
+            self._fail("stagnated")
+        return self._accepted()
+
+    def _evolved(self):
+        """Steps in pseudo-time from the guess, once. False: they lead nowhere, and x is left as it was."""
+        if not self.evolves:
+            return False
+        before = self.x, self.F, self.size
+        (self.x, self.F), self.evolves, pace = self.start, False, FIRST
+        self.size = first = self._measure(self.F)
+        while SHORTEST <= pace <= LONGEST and self.run.iterations < self.maxiter:
+            self.run.iterations += 1
+            pace *= self._flow(pace, RISE * first)
+        if pace > LONGEST:
+            self._linearise()
+            return True
+        self.x, self.F, self.size = before
+        return False
+
+    def _flow(self, pace, most):
+        """One step in pseudo-time -> by how much the next one should be longer; 0: there can be none."""
+        try:
+            solver = self.jacobians.relaxed(self.equation, self.x, self.leaves, pace)
+            if solver is None:
+                return 0.0
+            x = self.x + solver.approximate(-self.F, LOOSEST)
+        except ConvergenceError:
+            return 0.25
+        F = self._value(x)
+        if F is None or not self._measure(F) <= most:
+            return 0.25
+        self.x, self.F, before, self.size = x, F, self.size, self._measure(F)
+        return GROWTH if before >= GROWTH * self.size else max(before / self.size, 0.5)
+
     # ------------------------------------------------------------ the verdict
 
     def _accepted(self, share=1.0):
@@ -347,36 +427,40 @@ class Newton:
             self.run.residual = self.run.backward_error = 0.0
             return "converged"
         residual, data, size = self._sizes()
-        self.run.residual, self.run.backward_error = residual / data if data else 1.0, residual / size
-        self.largest = max(self.largest, self.size)
-        if not np.isfinite(size):
+        whole = length(data)
+        self.run.residual = length(residual) / whole if whole else 1.0
+        self.run.backward_error = length(residual) / length(size)
+        self.largest = np.maximum(self.largest, np.ldexp(residual, -self._unit))
+        if not np.all(np.isfinite(size)):
             return ""
-        if residual <= share * self.rtol * data:
+        enough = residual <= share * self.rtol * data
+        if enough.all():
             return "converged"
-        return "converged_at_roundoff" if residual <= ROUNDING * size else ""
+        return "converged_at_roundoff" if np.all(enough | (residual <= ROUNDING * size)) else ""
 
     def _sizes(self):
-        """|F|, |b| and |J| |x| + |b|, in a unit in which no square leaves the range of floats."""
+        """|F|, |b| and |J| |x| + |b| of each field, in a unit in which no square leaves the range of floats."""
         with np.errstate(over="ignore", invalid="ignore"):
             F = np.ldexp(self.F, self._unit)
-            data = length(np.ldexp(self.J.product(self.x), self._unit) - F)
-            return length(F), data, float(np.ldexp(self.J.terms(self.x), self._unit)) + data
+            data = self._norms(np.ldexp(self.J.product(self.x), self._unit) - F)
+            terms = self._norms(self.J.magnitude(np.abs(self.x))) if self.cuts.size else self.J.terms(self.x)
+            return self._norms(F), data, np.ldexp(terms, self._unit) + data
 
     @property
     def _unit(self):
-        return -far_exponent(self.F, self.size)
+        return -far_exponent(self.F, length(self.F))
 
     def _rounding(self, step):
         """The status word when what is left of F is rounding, else ""."""
         residual, _, size = self._sizes()
-        size += float(np.ldexp(self.largest + length(self._terms()), self._unit))
+        size = size + np.ldexp(self.largest + self._norms(self._terms()), self._unit)
         far = self._value(self.x + FAR * step)
-        if far is None or not residual <= 8 * ROUNDING * size:
+        if far is None or not np.all(residual <= 8 * ROUNDING * size):
             return ""
         predicted = (1 - FAR) * self.F
         if length(far - predicted) > 0.05 * length(predicted):
             return ""
-        self.run.backward_error = residual / size
+        self.run.backward_error = length(residual) / length(size)
         return "converged_at_roundoff"
 
     def _terms(self):
@@ -392,6 +476,8 @@ class Newton:
         hint = self.jacobians.hint(self.J) if self.J is not None else ""
         if word == "stagnated" and self.J.singular:
             hint += "; its Jacobian is singular there, start from another guess"
+        elif not (reason or hint or self.steps):
+            hint = "; start from the solution for nearby parameters, or raise maxiter"
         raise ConvergenceError(
             f"{name} after {run.iterations} Newton steps: {reason or reached}{hint}",
             info=run.info(),

@@ -21,6 +21,7 @@ import numpy as np
 
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError
+from sparsedp.fields import check_function
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note, thread
 from sparsedp.recipe import Remade
@@ -30,7 +31,7 @@ from sparsedp.solvers.newton import Equation, Layout, Newton, vary
 from sparsedp.solvers.solve import Run, SolveLog
 from sparsedp.tape import Rule, plain
 
-__all__ = ["Root", "implicit"]
+__all__ = ["Root", "implicit", "steady"]
 
 CHANGED = 1e-4  # relative change of a root by one more Newton step, from which on the residual must be another one
 CANCELS = 1e-12  # residual in units of its terms that is rounding
@@ -116,6 +117,59 @@ def implicit(
     if maxiter is None:
         raise ValueError("maxiter must be a whole number >= 1, got None")
     return Root(residual, jacobian, sparsity, settings.pop("maxiter"), settings)
+
+
+def steady(residual, guess, *params, **options):
+    """Residual, guess, parameters -> the steady state: x of residual(x, *params) = 0, never by a loop over time.
+
+    It is ``implicit(residual, **options)(guess, *params)``. Where there are many solves, in a descent say, make the
+    root once: ``root = implicit(residual)`` keeps what it learned of the Jacobian, and its records.
+
+    Parameters
+    ----------
+    residual : callable
+        ``residual(x, *params)``: the rate of change of each field, or any equation for it, as a tree like x.
+    guess : number, array, or tree of arrays
+        The state at rest, or that for nearby parameters: ``{"v": faces, "p": cells}`` of a flow.
+    *params : trees of arrays
+    **options
+        As of `implicit`: method, rtol, maxiter, jacobian, sparsity, nullspace.
+
+    Returns
+    -------
+    x, like the guess
+        Differentiable in the parameters; the derivative in the guess is 0. Whether it is stable is not asked.
+
+    Raises
+    ------
+    TypeError, ValueError, ShapeError, DerivativeError
+        As `implicit`.
+    ConvergenceError
+        If Newton's method and pseudo-time fail, or the Jacobian is singular: at a fold, or where a constant is free.
+    NonFiniteError
+        If the guess, a parameter or the residual at the guess holds NaN or infinity.
+
+    Notes
+    -----
+    Newton's method with a line search; where it stalls, pseudo-time steps from the guess (see newton.py), then Newton
+    again. Each field of a tree meets the tolerance by itself. A field that is known up to a constant needs one value
+    in its equation: ``"p": D(v) + pin * p`` with ``pin`` 1 in one cell and 0 elsewhere, which leaves D(v) = 0 in all
+    cells. Faces in walls need an equation: ``inside(rate) + v - inside(v)``.
+    Cost: sparse LU of the Jacobian for each Newton step; for a gradient one more, kept for each further one.
+    Source: Kelley and Keyes, SIAM J. Numer. Anal. 35 (1998).
+
+    Examples
+    --------
+    >>> from sparsedp import value_and_grad
+    >>> flow = lambda x, p: {"u": x["w"] - x["u"], "w": p - x["u"] * x["w"]}
+    >>> state = steady(flow, {"u": 1.0, "w": 1.0}, 9.0)
+    >>> float(state["u"]), float(state["w"])
+    (3.0, 3.0)
+    >>> round(value_and_grad(lambda p: steady(flow, {"u": 1.0, "w": 1.0}, p)["u"])(9.0)[1], 12)
+    0.166666666667
+    """
+    check_function("steady", residual, "lambda x: ...")
+    return implicit(residual, **options)(guess, *params)
 
 
 class Root(Remade):
