@@ -70,6 +70,17 @@ def test_convection():
     )
 
 
+@example("steady_states.py")
+def test_steady_states():
+    """24^2 cells: order 2 is far from these figures, but the flows are there; 128^2 is in test_steady.py."""
+    printed = run("steady_states.py")
+    cavity = rows(printed, r"^Re +(\d+) +min u (\S+), known (\S+)$")
+    assert [row[0] for row in cavity] == [100, 400, 1000] and cavity[0][1] == pytest.approx(cavity[0][2], rel=0.05)
+    heat = rows(printed, r"^Ra +(\S+) +Nu +(\S+), known +(\S+) +d log Nu / d log Ra (\S+)$")
+    assert all(ours == pytest.approx(known, rel=0.07) and 0.28 < slope < 0.35 for _, ours, known, slope in heat)
+    assert len(heat) == 2
+
+
 @example("obstacle.py")
 def test_obstacle():
     printed = run("obstacle.py")

@@ -96,7 +96,7 @@ BUDGETS = {
     "operators": 5_800,
     "optimize": 13_350,  # admm: 500; total_variation, smoothness: 400
     "report": 17_950,
-    "solvers": 41_750,
+    "solvers": 41_800,
     "solvers/multigrid": 10_000,
     "structure": 6_450,
     "trajectory": 9_200,

@@ -36,6 +36,8 @@ from sparsedp.constants import constant
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import check_finite, check_plain
+from sparsedp.ledger import active as recordings
+from sparsedp.ledger import note
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import far_exponent, length
@@ -394,6 +396,8 @@ class Newton:
             return False
         before = self.x, self.F, self.size
         (self.x, self.F), self.evolves, pace = self.start, False, FIRST
+        if recordings:
+            note(self.equation.name, "method", "pseudo-time, as Newton steps stalled")
         self.size = first = self._measure(self.F)
         while SHORTEST <= pace <= LONGEST and self.run.iterations < self.maxiter:
             self.run.iterations += 1

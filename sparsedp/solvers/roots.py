@@ -59,7 +59,7 @@ def implicit(
     rtol : float
         Relative tolerance of the nonlinear residual, and of each adjoint solve.
     maxiter : int
-        Most Newton steps.
+        Most Newton steps, those in pseudo-time too.
     sparsity : sparse matrix or 2-D array, optional
         Where the Jacobian may have entries. Default: found by probing.
     nullspace : "raise" or "project"
@@ -94,7 +94,8 @@ def implicit(
     Notes
     -----
     Formula: J x' = -F_p p'; one adjoint solve with J^T serves all parameters. Derivatives of every order.
-    Tolerance: see newton.py; the residual may be scaled by any power of two. A trial point where the
+    Tolerance: see newton.py; the residual may be scaled by any power of two, and each field of a tree is judged by
+    itself. Where steps stall, pseudo-time steps from the guess (not in `stepper`). A trial point where the
     residual raises UnstableStepError, NonFiniteError or ConvergenceError, or is not finite, is not taken.
     Cost: per Jacobian one product per colour (3 for three points in 1-D, 5 in 2-D, 7 in 3-D) and one set-up: one
     for each Newton step, or for several while they contract (more than 64 unknowns, steps of `stepper`); one for
@@ -154,7 +155,8 @@ def steady(residual, guess, *params, **options):
     Newton's method with a line search; where it stalls, pseudo-time steps from the guess (see newton.py), then Newton
     again. Each field of a tree meets the tolerance by itself. A field that is known up to a constant needs one value
     in its equation: ``"p": D(v) + pin * p`` with ``pin`` 1 in one cell and 0 elsewhere, which leaves D(v) = 0 in all
-    cells. Faces in walls need an equation: ``inside(rate) + v - inside(v)``.
+    cells. Faces in walls need an equation: ``inside(rate) + v - inside(v)``. Differences of states from a near guess
+    (`check.gradient`) see the tolerance: write rtol=1e-13.
     Cost: sparse LU of the Jacobian for each Newton step; for a gradient one more, kept for each further one.
     Source: Kelley and Keyes, SIAM J. Numer. Anal. 35 (1998).
 
