@@ -1,14 +1,17 @@
 """Solves whose operator depends on parameters: what a gradient costs beside the solve, and Taylor orders.
 
-Sections: cost, orders. Run ``python -m benchmarks.parametric [cost|orders] [--quick]`` in the root of
+Sections: cost, orders, waves. Run ``python -m benchmarks.parametric [cost|orders|waves] [--quick]`` in the root of
 the repository. `cost`: a new coefficient each time; the set-up is what the first solve with it takes
 longer than the second; limit: value and gradient <= 2.1 forward solves and one set-up. Times are the
 smallest of a few, of the processor and on one thread, which other programs hardly disturb. `orders`:
 with t the step, the remainder of the loss without derivatives falls like t, with the gradient like t^2
-(limit 1.95), with the Hessian like t^3 (2.9).
+(limit 1.95), with the Hessian like t^3 (2.9). `waves`: Helmholtz in a medium of two speeds at 10 cells a wavelength,
+LU beside GMRES with shifted Laplace, each in a process of its own for its memory; limit: residual 1e-6 at 1024^2.
 """
 
 import argparse
+from concurrent.futures import ProcessPoolExecutor
+from resource import RUSAGE_SELF, getrusage
 from time import process_time
 
 import autograd.numpy as anp
@@ -158,7 +161,41 @@ def _order(rests, floor):
     return float(found[-3:].min()) if found.size >= 2 else float("nan")
 
 
-SECTIONS = {"cost": cost, "orders": orders}
+# ---------------------------------------------------------------- waves
+
+
+def waves(quick):
+    """Helmholtz: forward and adjoint."""
+    print("\nHelmholtz, 10 cells a wavelength, sponge of 2 wavelengths, rtol 1e-10; limit: relative residual 1e-6")
+    print(
+        f"{'cells':12}{'method':9}{'set-up s':>9}{'forward s':>10}{'adjoint s':>10}{'iterations':>12}{'residual':>10}"
+        f"{'adjoint':>9}{'GB':>6}"
+    )
+    for n in (128,) if quick else (256, 512, 1024):
+        for method in ("direct", "krylov"):
+            with ProcessPoolExecutor(1) as pool:
+                print(pool.submit(_wave_row, n, method).result(), flush=True)
+
+
+def _wave_row(n, method, cells=10):
+    dp.set_threads(1)
+    grid = dp.Grid((n, n), size=1.0)
+    x, y = grid.centres()
+    speed = 1.0 + 0.5 * ((x - 0.4) ** 2 + (y - 0.6) ** 2 < 0.04)
+    damping = np.maximum(1 - np.minimum(np.minimum(x, 1 - x), np.minimum(y, 1 - y)) * n / (2 * cells), 0) ** 2
+    options = {"preconditioner": "shifted_laplace"} if method == "krylov" else {}
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), method, **options)
+    source = n**2 * (np.hypot(x - 0.5, y - 0.3) < 1.5 / n)
+    loss = lambda c: anp.sum(anp.abs(solve(1.0, source, -((2 * np.pi * n / cells / c) ** 2) * (1 + 1j * damping))) ** 2)
+    value_and_grad(loss)(speed)
+    there, back, memory = solve.info.forward, solve.info.adjoint, getrusage(RUSAGE_SELF).ru_maxrss / 1e6
+    return (
+        f"{n:4} x {n:<5}{method:9}{solve.info.setup_seconds:9.2f}{there.seconds:10.2f}{back.seconds:10.2f}"
+        f"{there.iterations:6} +{back.iterations:4}{there.residual:10.1e}{back.residual:9.1e}{memory:6.2f}"
+    )
+
+
+SECTIONS = {"cost": cost, "orders": orders, "waves": waves}
 
 
 def main():

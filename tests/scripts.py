@@ -38,6 +38,7 @@ SMALL = {
     "full_waveform.py": "24",
     "conservation_laws.py": "100",
     "conductivity_design.py": "200",
+    "helmholtz.py": "64",
     "residual_or_physics.py": "10",
     "solver_in_the_loop.py": "48",
 }  # cells, the end time, or gradients; the others run with 16

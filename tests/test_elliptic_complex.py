@@ -8,6 +8,7 @@ from test_elliptic import dense, stretched
 import sparsedp as dp
 from sparsedp.derivative import pullback, pushforward, value_and_grad
 from sparsedp.ledger import recording
+from sparsedp.solvers.inverses import COMPLEX_UP_TO
 from sparsedp.solvers.preconditioners import shifted_laplace
 from sparsedp.solvers.system import System
 from sparsedp.tape import plain
@@ -184,11 +185,19 @@ def test_shifted_laplace_preconditions_waves_and_their_adjoint():
     close(solve(1.0, b, shift), exact(1.0, b, shift), 1e-8)
     loss = lambda solve: lambda s: anp.sum(anp.abs(solve(1.0, b, s)[20:30]) ** 2)
     close(value_and_grad(loss(solve))(shift)[1], value_and_grad(loss(exact))(shift)[1], 1e-8)
-    assert solve.info.forward.iterations <= 45 and solve.info.adjoint.iterations <= 45
+    assert solve.info.forward.iterations <= 40 and solve.info.adjoint.iterations <= 40
     assert "GMRES, restarted after 30 iterations; shifted Laplace: 3 levels, unknowns 9216 >" in str(solve)
     alone = waves(96, preconditioner=None, maxiter=500)[0]
     with pytest.raises(dp.errors.ConvergenceError, match="krylov on <shift - divergence"):
         alone(1.0, b, shift)
+
+
+def test_auto_leaves_lu_where_it_would_not_fit(monkeypatch):
+    monkeypatch.setitem(COMPLEX_UP_TO, 2, 2000)
+    for n, word in ((40, "direct: complex entries"), (50, "krylov: 2500 complex unknowns in 2-D: LU would not fit")):
+        solve, shift, b = waves(n, "auto")
+        close(solve(1.0, b, shift), waves(n, "direct")[0](1.0, b, shift))
+        assert f"method      {word}" in str(solve)
 
 
 def test_the_cycle_of_shifted_laplace_has_an_exact_transpose():
@@ -199,6 +208,29 @@ def test_the_cycle_of_shifted_laplace_has_an_exact_transpose():
     b, g = rng.standard_normal((2, grid.cells.size)) + 1j * rng.standard_normal((2, grid.cells.size))
     x, y = hierarchy.cycle(b), hierarchy.T.cycle(g)
     assert abs(np.sum(x * g) - np.sum(b * y)) <= 1e-13 * np.linalg.norm(x) * np.linalg.norm(g)
+
+
+def test_absorbing_layers_reflect_less_than_a_thousandth():
+    """A sponge by a complex shift; a perfectly matched layer by a complex coefficient too, on a line and in 2-D."""
+    cells, grid = 10, dp.Grid(200)
+    k, ends = 2 * np.pi / cells, lambda x: np.maximum(1 - np.minimum(x, 200 - x) / (2 * cells), 0) ** 3
+    (x,), (face,) = grid.centres(), grid.face_centres(0)
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
+    phase = np.arccos(1 - k**2 / 2) * np.arange(120)
+    matched = 1 / (1 - 2j * ends(face)), -(k**2) * (1 - 2j * ends(x))
+    for (coefficient, shift), limit in (((1.0, -(k**2) * (1 + 3j * ends(x))), 1e-3), (matched, 2e-6)):
+        u = solve(coefficient, np.eye(200)[40], shift)[50:170]
+        back, there = np.sort(np.abs(np.linalg.lstsq(np.exp(np.outer(phase, [1j, -1j])), u, rcond=None)[0]))
+        assert back <= limit * there
+    grid = dp.Grid((80, 60))
+    ends = [lambda x, n=n: 1 - 2j * np.maximum(1 - np.minimum(x, n - x) / (2 * cells), 0) ** 3 for n in grid.shape]
+    (fx, y), (x, fy) = grid.face_centres(0), grid.face_centres(1)
+    coefficient = grid.join(ends[1](y) / ends[0](fx), ends[0](x) / ends[1](fy))
+    shift, b = -(k**2) * np.outer(ends[0](x[:, 0]), ends[1](y[0])), np.eye(80)[:60].T
+    D, G = dp.divergence(grid), dp.gradient(grid, dp.dirichlet)
+    waves = dp.elliptic_solver(D, G, "krylov", preconditioner="shifted_laplace")
+    close(waves(coefficient, b, shift), dp.elliptic_solver(D, G)(coefficient, b, shift), 1e-8)
+    assert waves.info.forward.iterations <= 60
 
 
 def test_waves_without_damping_have_a_real_solution():
@@ -213,10 +245,10 @@ def test_waves_without_damping_have_a_real_solution():
 
 @pytest.mark.slow
 def test_a_million_unknowns_at_ten_cells_a_wavelength():
-    """Where LU does not fit: about 400 iterations to 1e-10."""
+    """Where LU takes 4 GB: about 300 iterations to 1e-10."""
     solve, shift, b = waves(1024)
     solve(1.0, b, shift)
-    assert solve.info.forward.residual <= 1e-10 and solve.info.forward.iterations <= 600
+    assert solve.info.forward.residual <= 1e-10 and solve.info.forward.iterations <= 400
 
 
 # ---------------------------------------------------------------- extremes

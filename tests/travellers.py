@@ -232,6 +232,10 @@ def travellers():
     solve = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
     k, b = np.exp(numbers(GRID.faces.size)), numbers(GRID.shape)
     yield "elliptic_solver", "", solve, lambda solve: bits(solve, k, b, 0.5)
+    K = np.eye(GRID.dim).reshape(GRID.dim, GRID.dim, *[1] * GRID.dim) + 0.1 * np.ones(GRID.shape)
+    yield "elliptic_solver", "tensors", solve, lambda solve: bits(solve, K, b, 0.5)
+    waves = dp.elliptic_solver(solve.D, solve.G, "krylov", preconditioner="shifted_laplace")
+    yield "elliptic_solver", "waves", waves, lambda solve: bits(lambda k, b: anp.real(solve(k, b, -1 - 0.5j)), k, b)
     pattern = sp.csr_array(BAND)
     yield "matrix_solver", "", dp.matrix_solver(pattern), lambda s: bits(s, pattern.data, numbers(12))
     for jacobian in (None, slope_of_cubic):

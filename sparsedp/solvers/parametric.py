@@ -29,13 +29,14 @@ from sparsedp.fields import check_finite, check_plain
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
 from sparsedp.operators.given import from_matrix
+from sparsedp.operators.tensor import check_tensor, corners
 from sparsedp.recipe import Remade
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.inverses import build, check_settings
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.sparsity import pattern_like
 from sparsedp.space import Space, fits
-from sparsedp.structure.base import compact, rows_of
+from sparsedp.structure.base import Matrix, compact, rows_of
 from sparsedp.structure.lazy import Chain, Diagonal, Sum
 from sparsedp.tape import Rule, isbox, of_argument, plain
 
@@ -125,7 +126,8 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     -------
     EllipticSolver
         Call it as ``solve(k, b, shift=0.0)``: k a number or one value for each face, real and >= 0 or
-        complex; b a field on the cells; shift a number or one for each cell, real or complex; all finite.
+        complex, or a tensor for each cell, shape (dim, dim, *grid.shape), positive definite; b a field on
+        the cells; shift a number or one for each cell, real or complex; all finite.
         Differentiable in all three, to every order. The set-up depends on the content of (k, shift); the
         last two are kept.
 
@@ -136,7 +138,7 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     ShapeError
         If D and G do not fit, and on use, if k, b or shift has another shape.
     ValueError
-        On use, if k is real and negative, or k or shift holds no numbers.
+        On use, if k is real and negative, a tensor is not positive definite, or k or shift holds no numbers.
     NonFiniteError
         On use, if k, b or shift holds NaN or infinity.
     ConvergenceError
@@ -147,7 +149,8 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     Cost: one solve; its derivative in any of k, b, shift one more, with the transpose of the same
     set-up. Null space: where shift is 0 and no wall holds the level (pure Neumann), as for `inverse`;
     derivatives are projected, never refused. Helmholtz: a negative shift, -(omega / c)^2; its imaginary
-    part damps, and absorbs waves where it grows towards the walls.
+    part damps, and absorbs waves where it grows towards the walls. Tensors: order 2; where G has no slope
+    (a closed wall, a solid) the flux is 0, not the slope; see operators/tensor.py.
 
     Examples
     --------
@@ -186,7 +189,8 @@ class EllipticSolver(ParametricSolver):
 
         Parameters
         ----------
-        k : number, or array of the shape of a field on the faces
+        k : number, or array of the shape of a field on the faces, or of shape (dim, dim, *grid.shape)
+            A tensor need not be symmetric; where it is, so is the operator.
         b : array, a field on the cells; leading axes are a batch
         shift : number, or array of the shape of a field on the cells
 
@@ -195,9 +199,25 @@ class EllipticSolver(ParametricSolver):
         array of the shape and dtype of b; complex where k or shift is
         """
         check_plain("elliptic_solver", k, b, shift)
-        k = self._coefficient(k)
+        b = b if isbox(b) else np.asarray(b)
         shift = _values("shift", shift, self.D.codomain)
-        return self._rule(False, True)(k, b if isbox(b) else np.asarray(b), shift)
+        if np.ndim(plain(k)) > 2:
+            solver, at_corners = self._tensors
+            check_tensor("k", k, self.D.codomain.grid)
+            return solver._rule(False, True)(at_corners(k), b, shift)
+        return self._rule(False, True)(self._coefficient(k), b, shift)
+
+    @cached_property
+    def _tensors(self):
+        """(The solver for the entries of tensors at corners, the function from tensors in cells to them)."""
+        grid = self.D.codomain.grid
+        if grid is None or (self.D.codomain, self.D.domain) != (grid.cells, grid.faces):
+            raise ShapeError(
+                f"a tensor needs D from the faces to the cells of a grid, got {self.D}; write k for each face"
+            )
+        closed = self.G.structure.magnitude()(np.ones(self.G.shape[1])) == 0
+        slopes, fluxes, at_corners = corners(grid, closed)
+        return TensorSolver(self.D @ fluxes, slopes @ self.G, self), at_corners
 
     def _coefficient(self, k):
         k = _values("k", k, self.D.domain, "harmonic_average(grid)(k)", self.D.codomain)
@@ -226,6 +246,20 @@ class EllipticSolver(ParametricSolver):
 
     def __repr__(self):
         return f"<elliptic_solver: shift - {self.D.name} @ diag(k) @ {self.G.name} on {self.G.domain}>"
+
+
+class TensorSolver(ParametricSolver):
+    """As the EllipticSolver `front`, with D and G that meet at the corners of cells: they are multiplied out."""
+
+    name = "elliptic_solver"
+
+    def __init__(self, D, G, front):
+        super().__init__(D, G, front._settings)
+        self.info, self._cache = front.info, front._cache
+
+    def _operator(self, k, shift):
+        structure = Matrix(Elliptic(-self.D, self.G, k, shift).explicit())
+        return Operator(structure, self.G.domain, self.D.codomain, "shift - divergence of tensor fluxes")
 
 
 def _values(name, given, space, advice="", other=None):

@@ -1,8 +1,8 @@
 """krylov: its engine, and what preconditions it.
 
-Waves: A = L - k^2 with L the discrete -div(k grad), k^2 the wave numbers, has eigenvalues of both signs, on which
-multigrid fails. Where the wave numbers are damped, A + i d with d of half their size, it works, and the damped inverse
-moves the eigenvalues of A into a disc in which GMRES converges.
+Waves: A = L - w with L the discrete -div(k grad) and w the squares of wave numbers has eigenvalues of both signs, on
+which multigrid fails. On L - (1 + i d) w, where waves are damped, it works, and the damped inverse moves the
+eigenvalues of A into a disc in which GMRES converges.
 """
 
 import numpy as np
@@ -19,7 +19,10 @@ from sparsedp.solvers.system import System
 
 __all__ = ["krylov_engine", "shifted_laplace"]
 
-DAMPED = 0.5  # imaginary part given to the wave numbers, as a share of their real part; Erlangga and others (2004)
+# The d above. Erlangga and others (2004) take 0.5, for sweeps on every level; here they end where waves are of few
+# cells, and less damping will do. Measured at 10 cells a wavelength, 512^2, to 1e-10: 206 iterations with 0.5, 134 with
+# 0.2, and hardly fewer with 0.1.
+DAMPED = 0.2
 # Largest ratio of wave numbers to links of a cell on a level that is smoothed, (kh)^2 / 4 on a 5-point stencil: sweeps
 # of Gauss and Seidel amplify waves of few cells. Measured with 10 cells a wavelength, 512^2: 0.1 and 0.2 on the first
 # two levels converge; with the third (0.8) smoothed as well nothing does.
@@ -92,8 +95,8 @@ def _preconditioner(system, given):
 def shifted_laplace(system):
     """System with entries -> (Hierarchy, unit): a cycle on unit * r nearly solves A z = r with damped wave numbers.
 
-    The wave number of a cell is minus the sum of its row, where that is positive. Prolongations are those of the
-    links alone; the first level on which waves are of few cells is solved by sparse LU. The transpose is exact.
+    The sum of a row, of negative real part, is minus the square of a wave number. Prolongations are those of the links
+    alone; the first level on which waves are of few cells is solved by sparse LU. The transpose is exact.
 
     Notes
     -----
@@ -105,10 +108,9 @@ def shifted_laplace(system):
     sums = size @ np.ones(system.size)
     unit = 2.0 ** -int(np.frexp(np.max(sums))[1])
     links = csr_array(diags_array(sums + np.maximum(rows.real, 0.0)) - size)  # the matrix as if it had no waves
-    waves = np.maximum(-rows.real, 0.0)
-    turn = 1.0 if np.sum(rows.imag) > 0 else -1.0  # damped further to the side on which it is damped
-    damping = np.where(waves > 0, turn * np.maximum(np.abs(rows.imag), DAMPED * waves), rows.imag)
-    A, levels = csr_array(unit * (A + diags_array(1j * (damping - rows.imag)))), []
+    turn = -1.0 if np.sum(rows.imag) > 0 else 1.0  # damped further to the side on which they are damped
+    waves = (rows.real < 0) | (turn * rows.imag < 0)
+    A, levels = csr_array(unit * (A + diags_array(np.where(waves, 1j * turn * DAMPED * rows, 0.0)))), []
     for level in ruge_stueben(csr_array(unit * links), 0.25, 25):
         if level.P is None or not _resolved(A):
             break
