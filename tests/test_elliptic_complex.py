@@ -179,6 +179,14 @@ def waves(n, method="krylov", cells=10, **options):
     return dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), method, **options), shift, b
 
 
+def test_waves_are_no_task_for_multigrid():
+    grid = dp.Grid((200, 160), size=1.0)
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
+    message = r"multigrid on <shift - .*>: .* wanted 1e-10 \(indefinite_operator\); write method='direct'"
+    with pytest.raises(dp.errors.ConvergenceError, match=message):
+        solve(1.0, np.ones(grid.shape), np.full(grid.shape, -4e3))
+
+
 def test_shifted_laplace_preconditions_waves_and_their_adjoint():
     solve, shift, b = waves(96)
     exact = waves(96, "direct")[0]
@@ -294,6 +302,8 @@ def test_single_precision_one_cell_and_no_cells():
     one = dp.Grid(1)
     solve = dp.elliptic_solver(dp.divergence(one), dp.gradient(one, dp.dirichlet))
     assert solve(1.0, np.array([2.0]), np.array([-2j]))[0] == pytest.approx(2 / (4 - 2j))
+    with pytest.raises(dp.errors.ConvergenceError, match="elliptic_solver is singular"):
+        solve(1.0, np.array([2.0]), np.array([-4.0 + 0j]))
     none = dp.Grid((0, 3))
     solve = dp.elliptic_solver(dp.divergence(none), dp.gradient(none, dp.dirichlet))
     assert solve(1j, np.zeros((0, 3)), np.zeros((0, 3), complex)).shape == (0, 3)

@@ -230,3 +230,46 @@ def test_what_is_no_tensor_is_refused():
         dp.errors.ShapeError, match="a tensor needs D from the faces to the cells of a grid, got <matrix"
     ):
         bare(np.ones((1, 1, 3)), np.ones(3))
+
+
+# ---------------------------------------------------------------- kinds of arrays and grids
+
+
+def test_kinds_of_arrays_and_units():
+    grid = stretched(6, 5)
+    solve, K, b = solver(grid), tensors(grid), np.random.default_rng(0).standard_normal((6, 5))
+    x = solve(K, b)
+    for given in (K.tolist(), np.asfortranarray(K), np.repeat(K, 2, axis=3)[..., ::2]):
+        assert np.array_equal(solve(given, b), x)
+    assert np.array_equal(solve(K, np.stack([b, 2 * b])), np.stack([x, 2 * x]))
+    for exponent in (-900, 900):
+        assert np.array_equal(np.ldexp(solve(np.ldexp(K, exponent), b), exponent), x)
+    single = K.astype(np.float32)
+    assert np.array_equal(solve(single, b), solve(single.astype(float), b))  # tensors are taken apart in double
+    assert value_and_grad(lambda K: anp.sum(solve(K, b)))(single)[1].dtype == np.float32
+    with pytest.raises(TypeError, match="elliptic_solver takes plain arrays, got a masked array; fill it first"):
+        solve(np.ma.masked_array(K), b)
+
+
+def test_small_and_thin_grids():
+    for shape, periodic in (((1, 1), False), ((1, 4), (True, False)), ((2, 2), True), ((5,), False), ((0, 3), False)):
+        grid = dp.Grid(shape, periodic=periodic)
+        number = 2.0 * np.eye(grid.dim).reshape(grid.dim, grid.dim, *[1] * grid.dim) * np.ones(shape)
+        b = np.sin(np.arange(grid.cells.size)).reshape(shape)
+        assert solver(grid)(number, b, 0.5) == pytest.approx(solver(grid)(2.0, b, 0.5), rel=1e-12)
+    line, k = dp.Grid(5), 1.0 + np.arange(5.0)
+    faces = np.array([1.0, 1.5, 2.5, 3.5, 4.5, 5.0])
+    assert solver(line)(k[None, None], np.ones(5)) == pytest.approx(solver(line)(faces, np.ones(5)), rel=1e-12)
+
+
+def test_solids_and_singular_systems():
+    grid, rng = dp.Grid((6, 5), size=1.0), np.random.default_rng(0)
+    solid = np.zeros(grid.shape, dtype=bool)
+    solid[2:4, 1:3] = True
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.neumann, solid), nullspace="project")
+    b = np.where(solid, 0.0, rng.standard_normal(grid.shape))
+    x = solve(tensors(grid), b)
+    assert not np.any(x[solid]) and abs(np.sum(x)) <= 1e-13 * np.sum(np.abs(x))
+    assert dp.check.gradient(lambda K: anp.sum(solve(K, b) ** 2), tensors(grid)).verdict == "agrees"
+    with pytest.raises(dp.errors.IncompatibleError, match="elliptic_solver is singular"):
+        solver(grid, dp.neumann)(tensors(grid), b + 1)

@@ -50,7 +50,8 @@ def corners(grid, closed):
     dim, volumes = grid.dim, grid.volumes.reshape(-1)
     beside = [[_face_beside(grid, axis, upper) for upper in (0, 1)] for axis in range(dim)]
     sides = list(product((0, 1), repeat=dim))
-    shares = 2.0 ** (1 - dim) / sum(face.T @ volumes for faces in beside for face in faces)  # of the volume at a face
+    at_faces = sum(face.T @ volumes for faces in beside for face in faces)
+    shares = 2.0 ** (1 - dim) / np.where(at_faces > 0, at_faces, 1.0)  # of the volume at a face
     picks = {(side, i, j): (beside[i][side[i]], beside[j][side[j]]) for side in sides for i, j in np.ndindex(dim, dim)}
     slopes = sp.vstack([other for _, other in picks.values()])
     fluxes = sp.hstack([one.T * volumes for one, _ in picks.values()])

@@ -38,7 +38,7 @@ from sparsedp.solvers.sparsity import pattern_like
 from sparsedp.space import Space, fits
 from sparsedp.structure.base import Matrix, compact, rows_of
 from sparsedp.structure.lazy import Chain, Diagonal, Sum
-from sparsedp.tape import Rule, isbox, of_argument, plain
+from sparsedp.tape import Rule, cast, dtype_of, isbox, of_argument, plain
 
 __all__ = ["Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]
 
@@ -199,12 +199,12 @@ class EllipticSolver(ParametricSolver):
         array of the shape and dtype of b; complex where k or shift is
         """
         check_plain("elliptic_solver", k, b, shift)
-        b = b if isbox(b) else np.asarray(b)
+        k, b = (given if isbox(given) else np.asarray(given) for given in (k, b))
         shift = _values("shift", shift, self.D.codomain)
-        if np.ndim(plain(k)) > 2:
+        if np.ndim(k) > 2:
             solver, at_corners = self._tensors
             check_tensor("k", k, self.D.codomain.grid)
-            return solver._rule(False, True)(at_corners(k), b, shift)
+            return solver._rule(False, True)(at_corners(cast(k, np.result_type(dtype_of(k), float))), b, shift)
         return self._rule(False, True)(self._coefficient(k), b, shift)
 
     @cached_property

@@ -50,6 +50,7 @@ __all__ = ["STATUS_WORDS", "Engine", "Run", "SolveInfo", "SolveLog", "Solver", "
 EPS = np.finfo(float).eps
 COMPATIBLE = 1e-6  # largest relative defect of primal data that is taken for rounding
 FAR_OFF = 0.1  # a residual beyond this share of the data is no solution, whatever the size of x
+ADVICE = {"indefinite_operator": "; write method='direct'"}
 ROUNDS = 8  # refinements; each must halve the residual
 
 
@@ -294,7 +295,7 @@ class Solver(Remade):
         run.measure(residual, data, system.norm(transposed) * length)
         if word or not self.engine.refines:
             return x
-        self._refuse(run, x, why=f" ({run.status})")
+        self._refuse(run, x, why=f" ({run.status}){ADVICE.get(run.status, '')}")
 
     def _refuse(self, run, x, how="", why=""):
         """Raise: x does not meet the tolerance."""
