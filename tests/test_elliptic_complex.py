@@ -194,7 +194,12 @@ def test_shifted_laplace_preconditions_waves_and_their_adjoint():
     loss = lambda solve: lambda s: anp.sum(anp.abs(solve(1.0, b, s)[20:30]) ** 2)
     close(value_and_grad(loss(solve))(shift)[1], value_and_grad(loss(exact))(shift)[1], 1e-8)
     assert solve.info.forward.iterations <= 40 and solve.info.adjoint.iterations <= 40
+    with recording() as calls:
+        waves(32)[0](1.0, b[:32, :32], shift[:32, :32])
+    assert calls["elliptic_solver", "hierarchy"] == 1
     assert "GMRES, restarted after 30 iterations; shifted Laplace: 3 levels, unknowns 9216 >" in str(solve)
+    with pytest.raises(ValueError, match="diff='unrolled' needs a symmetric operator and no preconditioner"):
+        dp.inverse(1j * dp.laplacian(dp.Grid((3, 3)), dp.dirichlet), "krylov", diff="unrolled")
     alone = waves(96, preconditioner=None, maxiter=500)[0]
     with pytest.raises(dp.errors.ConvergenceError, match="krylov on <shift - divergence"):
         alone(1.0, b, shift)

@@ -96,7 +96,7 @@ BUDGETS = {
     "operators": 6_600,
     "optimize": 13_350,  # admm: 500; total_variation, smoothness: 400
     "report": 17_950,
-    "solvers": 42_150,
+    "solvers": 42_200,
     "solvers/multigrid": 10_000,
     "structure": 6_450,
     "trajectory": 9_200,

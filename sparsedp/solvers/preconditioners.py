@@ -59,9 +59,9 @@ def krylov_engine(system, *, preconditioner=None, diff="implicit", iterations=No
         raise ValueError(f"iterations must be a whole number >= 1 or None, got {iterations!r}")
     precondition, dtype, words = _preconditioner(system, preconditioner)
     engine = Krylov(system, precondition, iterations=iterations and int(iterations), dtype=dtype)
-    engine.hierarchy += words
+    engine.hierarchy, engine.hierarchical = engine.hierarchy + words, bool(words)
     if diff == "unrolled":
-        if not engine.symmetric or preconditioner is not None:
+        if system.complex or system.weights is None or preconditioner is not None:
             raise ValueError("diff='unrolled' needs a symmetric operator and no preconditioner; write diff='implicit'")
         engine.unrolled = True
     return engine
