@@ -57,6 +57,14 @@ def conservation_law():
     return law, [lambda s: field((2, *GRID.shape), s), lambda s: field((), s)]
 
 
+@case("steady")
+def steady():
+    def residual(x, p):
+        return p["s"] - x - 0.1 * p["k"] * x**3
+
+    return lambda p: dp.steady(residual, np.ones(6), p), [lambda s: {"k": field(6, s), "s": field(6, s + 50)}]
+
+
 @case("sponge")
 def leapfrog():
     D, G = dp.divergence(LINE), dp.gradient(LINE)

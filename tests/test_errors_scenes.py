@@ -34,6 +34,15 @@ def stay(target, rho, x):
     return x
 
 
+def tensor(K, D=None):
+    G = dp.gradient(BOX)
+    return dp.elliptic_solver(D or dp.divergence(BOX), G)(K, np.ones((4, 4)), 1.0)
+
+
+def leaked(c):
+    return dp.stepper("radau", lambda u, p: c * u, 0.1)(np.ones(2))[0]
+
+
 def fast(u, params):
     return -(u**2)
 
@@ -229,6 +238,28 @@ TABLE = [
         lambda: dp.grad(lambda c: anp.real(dp.stepper("radau", turned, 0.1)(np.ones(1), c)[0]))(1.0 + 1.0j),
         dp.errors.DerivativeError,
         "stepper(radau) has derivatives in real params; give real and imaginary part as two",
+    ),
+    (
+        lambda: tensor(np.ones((2, 2, 3, 3))),
+        SHAPE,
+        "k takes a tensor for each cell, an array of shape (2, 2, 4, 4), got shape (2, 2, 3, 3)",
+    ),
+    (
+        lambda: tensor(np.zeros((2, 2, 4, 4))),
+        VALUE,
+        "k must be positive definite in every cell, but in cell (0, 0) it is [[0.0, 0.0], [0.0, "
+        "0.0]]; give it eigenvalues > 0",
+    ),
+    (
+        lambda: tensor(np.ones((2, 2, 4, 4)), dp.from_matrix(dp.divergence(BOX).matrix)),
+        SHAPE,
+        "a tensor needs D from the faces to the cells of a grid, got <matrix: space(40) -> "
+        "space(16), explicit>; write k for each face",
+    ),
+    (
+        lambda: dp.grad(leaked)(1.0),
+        dp.errors.DerivativeError,
+        "the rate of stepper(radau) uses a traced value that is not an argument; put it into params",
     ),
 ]
 
