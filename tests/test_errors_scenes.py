@@ -53,6 +53,16 @@ def drift():
     return step(step.start(grid.join(1.0, 0.0)))
 
 
+class Wrong:
+    """A step with a wrong inverse."""
+
+    def __call__(self, u, c):
+        return c * u
+
+    def back(self, u, c):
+        return u / c + 1e-3
+
+
 class Growing:
     """An operator that changes its shape."""
 
@@ -260,6 +270,18 @@ TABLE = [
         lambda: dp.grad(leaked)(1.0),
         dp.errors.DerivativeError,
         "the rate of stepper(radau) uses a traced value that is not an argument; put it into params",
+    ),
+    (
+        lambda: dp.rollout(dp.identity(LINE.cells), np.ones(4), None, 3, memory="reverse"),
+        VALUE,
+        "memory='reverse' needs a step with step.back(state, params), got <identity: cells(4) -> "
+        "cells(4), explicit>; write memory='200 MB', or make it by stepper('leapfrog', ...)",
+    ),
+    (
+        lambda: dp.grad(lambda c: dp.rollout(Wrong(), 1.0, c, 3, memory="reverse"))(1.0),
+        dp.errors.DerivativeError,
+        "reversed steps end 3.0e-03 away from the first state, beside states of size 1.0e+00: "
+        "rounding grew on the way; give rollout a memory in bytes",
     ),
 ]
 

@@ -1,5 +1,7 @@
 """leapfrog and sponge: orders, energy, the way back, damping, echoes, derivatives, refusals."""
 
+import tracemalloc
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -178,3 +180,68 @@ def test_refusals():
         dp.sponge(dp.Grid(4), 5, 1.0)
     with pytest.raises(ValueError, match="sponge needs a speed > 0 and an echo between 0 and 1, got 0 and 0.001"):
         dp.sponge(dp.Grid(4), 2, 0)
+
+
+# ---- a rollout that runs its steps backward ----
+
+
+@pytest.mark.parametrize("keep", ["last", "each"])
+def test_reversed_steps_give_the_gradient(keep):
+    """To 1e-10 of that with all states kept, in state, params and inputs; second order too."""
+    rng = np.random.default_rng(2)
+    grid = dp.Grid(24, size=1.0, periodic=True)
+    D, G = dp.divergence(grid), dp.gradient(grid)
+    rates = (lambda v, given: -(given[0] ** 2) * D(v) + given[1]), (lambda p, given: -G(p))
+    step, weights = dp.stepper("leapfrog", rates, 0.01), rng.standard_normal(24)
+
+    def loss(x, memory):
+        given = dict(inputs=x["beat"], memory=memory)
+        if keep == "each":
+            told = dp.rollout(step, x["state"], x["c"], 300, keep=lambda i, state: anp.sum(weights * state[0]), **given)
+            return sum(one**2 for one in told)
+        return anp.sum(weights * dp.rollout(step, x["state"], x["c"], 300, **given)[0] ** 2)
+
+    x = {"state": (rng.standard_normal(24), rng.standard_normal(24)), "c": 1 + rng.random(24), "beat": rng.random(300)}
+    for act in (lambda f: dp.grad(f)(x), lambda f: dp.hvp(f, x, x)):
+        kept, turned = (act(lambda x, memory=memory: loss(x, memory)) for memory in (None, "reverse"))
+        pairs = [(kept["c"], turned["c"]), (kept["beat"], turned["beat"]), *zip(kept["state"], turned["state"])]
+        for one, other in pairs:
+            np.testing.assert_allclose(one, other, rtol=0, atol=1e-10 * np.max(np.abs(one)))
+
+
+def test_reversed_steps_keep_one_state():
+    """Ten times the steps take no more memory."""
+    grid, step = strings(20_000, 2e-5)
+    state = np.sin(6 * grid.centres()[0]), np.zeros(20_000)
+    peaks = []
+    for n in (40, 400):
+        tracemalloc.start()
+        dp.grad(lambda c, n=n: anp.sum(dp.rollout(step, state, c, n, memory="reverse")[0] ** 2))(1.0)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.05 * peaks[0] + 400 * 1000
+
+
+def test_reversed_steps_refuse():
+    state = np.ones(12), np.ones(12)
+    with pytest.raises(ValueError, match="leapfrog step with damping cannot be reversed"):
+        dp.rollout(strings(12, 0.03, (1.0, 1.0))[1], state, 1.0, 3, memory="reverse")
+    with pytest.raises(ValueError, match=r"stepper\(rk4\) cannot be reversed; write 'leapfrog'"):
+        dp.rollout(dp.stepper("rk4", lambda u, c: u, 0.1), 1.0, None, 3, memory="reverse")
+    message = (
+        r"memory='reverse' needs a step with step.back\(state, params\), got .*; write memory='200 MB', or make it by "
+    )
+    with pytest.raises(ValueError, match=message):
+        dp.rollout(lambda u, c: u, 1.0, None, 3, memory="reverse")
+
+
+def test_a_way_back_that_loses_the_start_is_refused():
+    class Wrong:
+        def __call__(self, u, c):
+            return c * u
+
+        def back(self, u, c):
+            return u / c + 1e-3
+
+    with pytest.raises(dp.errors.DerivativeError, match="reversed steps end 3.0e-03 away from the first state, beside"):
+        dp.grad(lambda c: dp.rollout(Wrong(), 1.0, c, 3, memory="reverse"))(1.0)

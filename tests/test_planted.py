@@ -42,6 +42,12 @@ BUGS = {
         "                self.part(x[self.momentum], *ghosts)[...] *= 1",
         "tests/test_conservation_law.py",
     ),
+    "a step back with the wrong sign": Bug(
+        "integrators",
+        "        p = combine(p, (-h, f(q, params)))",
+        "        p = combine(p, (h, f(q, params)))",
+        "tests/test_leapfrog.py",
+    ),
     "a leapfrog that uses the old velocity": Bug(
         "integrators",
         "        q = _advanced(q, g(p, params), h, z)\n        return _advanced(p, f(q, params), h, s), q",

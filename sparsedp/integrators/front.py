@@ -280,10 +280,15 @@ class Step(Remade):
         state, params, *inputs
             As for the step itself; `state` is what it returned.
         """
-        if self.method != "leapfrog":
-            raise ValueError(f"{self.name} cannot be reversed; write 'leapfrog'")
+        self.check_reversible()
         params = (params, *inputs) if inputs else params
         return like(self.scheme.back(state, params, self.dt(params) if callable(self.dt) else self.dt), state)
+
+    def check_reversible(self):
+        """Refuse a step that `back` cannot turn round."""
+        if self.method != "leapfrog":
+            raise ValueError(f"{self.name} cannot be reversed; write 'leapfrog'")
+        self.scheme.check_reversible()
 
     def _check_stable(self, h, c):
         """Refuse a step that would grow without bound."""

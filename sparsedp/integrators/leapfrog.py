@@ -80,12 +80,15 @@ class Leapfrog(Scheme):
         q = _advanced(q, g(p, params), h, z)
         return _advanced(p, f(q, params), h, s), q
 
-    def back(self, state, params, h):
-        """The state before a step."""
+    def check_reversible(self):
+        """Refuse a step that loses something."""
         if self.problem.damping is not None:
             raise ValueError(
                 "a leapfrog step with damping cannot be reversed: what it takes away grows on the way back"
             )
+
+    def back(self, state, params, h):
+        """The state before a step."""
         p, q = _pair(state)
         f, g = self.problem.rates
         p = combine(p, (-h, f(q, params)))

@@ -40,7 +40,7 @@ class BackwardPass:
         loop, steps, tapes, n = self.loop, self.steps, self.tapes, self.loop.n
         growth = Growth(loop)
         source = loop.keep.source(n, g)
-        state = self.kept.pop()
+        state = last = self.kept.pop()
         total = source(state)
         growth.see(n, total)
         for i in shown_steps(loop.progress, range(n - 1, -1, -1), "backward"):
@@ -53,10 +53,11 @@ class BackwardPass:
                 state = tape.steps[0][0]
             else:
                 tape, end = None, state.marks()
-                state = self._state_at(i)
+                state = steps.back(state) if loop.reverse else self._state_at(i)
                 if total is not None:
                     tape, after = steps.taped(state, i + 1)
-                    loop.compare(after.marks(), end)
+                    if not loop.reverse:
+                        loop.compare(after.marks(), end)
                     del after
             if total is not None:
                 total = self._pull(tape, total)
@@ -65,6 +66,8 @@ class BackwardPass:
                 growth.see(state.i, total)
             if loop.keep.along and (i > 0 or loop.wants(0)):
                 total = _sum(total, source(state))
+        if loop.reverse and state.i == 0:
+            steps.check_start(state, last)
         if active:
             count("rollout.step", "vjp", n)
             count("rollout.step", "recomputed", self.recomputed)

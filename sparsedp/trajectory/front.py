@@ -37,11 +37,13 @@ def rollout(
         Number of steps.
     inputs : the same, optional
         What changes from step to step: step i gets entry i of the first axis of every array.
-    memory : None, number of bytes, or text such as "200 MB"
+    memory : None, number of bytes, text such as "200 MB", or "reverse"
         What the rollout may take. None keeps every state. Else as many are kept as fit beside params, inputs
         and their gradients, and the others are run again from those, as rarely as possible. Where all fit, what
         is left goes to the tapes of the steps (with None 256 MB): such a step runs once, not twice. Not counted:
         what one step needs by itself, and what `keep` hands out; with keep="all" no state is run again.
+        "reverse" keeps the last state alone, and goes back by ``step.back(state, params)``, the step turned round: for
+        leapfrog without damping. Rounding makes the gradient a little off; more than 1e-8 is refused.
     keep : "last", "all" or callable
         What is handed out: the last state; all n + 1, each array with a new first axis; or the tuple of what
         ``keep(index, state)`` returned for index = 0 ... n, any trees.
@@ -121,10 +123,12 @@ def rollout(
         args = constant_args(args, traced)
     beside = sum((1 + any(map(isbox, part))) * form.nbytes for form, part in zip(forms[1:], values[1:]))  # a gradient
     sizes = forms[0].nbytes, n, beside
-    slots = None if memory is None else slots_within(memory, *sizes)
+    if memory == "reverse":
+        _check_reversible(step)
+    slots = None if memory is None else 0 if memory == "reverse" else slots_within(memory, *sizes)
     if truncate is not None and not is_whole(truncate, 1):
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
-    room = ROOM if memory is None else room_within(memory, *sizes)
+    room = ROOM if memory is None else room_within(memory, *sizes) if slots else 0
     loop = Loop(step, forms, n, truncate, innermost(args), _kind(keep, forms[0]), slots, room, progress, record)
     _check_values(loop, args, traced)
     if loop.wanted and loop.slots:
@@ -133,6 +137,16 @@ def rollout(
         hook(step, state, params, inputs, n)
     outputs = through(rollout_rule, Run(loop), *args)
     return loop.keep.tree(parts(outputs, count_of(plain(outputs))))
+
+
+def _check_reversible(step):
+    """Refuse a step that cannot be turned round."""
+    if not callable(getattr(step, "back", None)):
+        raise ValueError(
+            f"memory='reverse' needs a step with step.back(state, params), got {step!r}; write memory='200 MB', or "
+            "make it by stepper('leapfrog', ...)"
+        )
+    getattr(step, "check_reversible", lambda: None)()
 
 
 def _number_of_steps(n):

@@ -28,6 +28,7 @@ class Last:
     """
 
     along = False  # cotangents enter at the end only
+    exact = True  # states on the way back are those of the way forward, to the last bit
     whole = False  # every state is handed out, and thereby kept
 
     def __init__(self, layout):
@@ -157,7 +158,7 @@ class Each(Last):
         marks = [(value.shape, value.dtype, fingerprint([value])) for value in values]
         if i == len(self._marks):
             self._marks.append(marks)
-        elif self._marks[i] != marks:
+        elif self.exact and self._marks[i] != marks:
             raise DerivativeError(
                 "keep returns something else when it is called again; it must depend on its arguments only"
             )

@@ -40,7 +40,7 @@ class Loop:
         The arguments that want a cotangent.
     keep : Last, All or Each
     slots : int or None
-        How many states may be kept for the way back; None: all.
+        How many states may be kept for the way back; None: all; 0: the last one, steps are reversed.
     room : int
         Bytes for tapes that are kept from the way forward.
     progress : bool or str
@@ -55,7 +55,12 @@ class Loop:
         self.keep, self.room, self.progress, self.record = keep, room, progress, record
         self.every = max(n // SAMPLES, APART)
         self.slots = None if keep.whole else slots
-        self.stops = {*checkpoints(n, self.slots), n} if wanted else {0}  # numbers of the states that are kept, and n
+        self.reverse = slots == 0  # no state is kept: steps are turned round
+        if self.reverse:
+            keep.exact = False
+        self.stops = (
+            {*(() if self.reverse else checkpoints(n, self.slots)), n} if wanted else {0}
+        )  # numbers of the states that are kept, and n
         self.kept = len(self.stops) - 1
 
     @property

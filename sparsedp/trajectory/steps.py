@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
+from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.fields import frozen
 from sparsedp.tape import Recorder, boxed, new_trace, plain, reverse_root, split_boxes, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned
@@ -13,6 +13,7 @@ from sparsedp.tree import copied, flatten, leaves
 
 __all__ = ["State", "Steps", "Tape"]
 
+DRIFT = 1e-8  # of the largest state: a gradient by reversed steps has about as many digits
 _REMEDY = {
     "state": "return another dict or list",
     "params": "make what changes a part of the state",
@@ -108,6 +109,25 @@ class Steps:
             values = [value if node else owned(value) for value, node in zip(values, nodes, strict=True)]
             state = State(state.i + 1, values, statics)
         return Tape(starts, steps, nodes), state
+
+    def back(self, state):
+        """The state before this one, by the step turned round: the same to rounding."""
+        self.last = earlier = state._replace(i=state.i - 1)
+        result = self.loop.step.back(*self._parts(earlier, self._given(earlier), self.params))
+        values, statics = self.loop.state.take(result, "the step turned round")
+        return State(earlier.i, self.loop.state.check(values, "the step turned round", self.outer), statics)
+
+    def check_start(self, state, last):
+        """Refuse a way back by reversed steps, from the last state, that did not end where the way forward began."""
+        first = [plain(value) for value in self.first.values]
+        size = max((float(np.max(np.abs(plain(x)), initial=0.0)) for x in (*first, *last.values)), default=0.0)
+        pairs = zip(map(plain, state.values), first, strict=True)
+        off = max((float(np.max(np.abs(a - b), initial=0.0)) for a, b in pairs), default=0.0)
+        if not off <= DRIFT * size:
+            raise DerivativeError(
+                f"reversed steps end {off:.1e} away from the first state, beside states of size {size:.1e}: rounding "
+                "grew on the way; give rollout a memory in bytes"
+            )
 
     def _given(self, state):
         """The variables of state and inputs that a step gets: constants where the derivative is cut."""
