@@ -243,7 +243,7 @@ class Adopted(Remade):
         def coloured(pattern):
             return Coloured(pattern if earlier is None else pattern_like(pattern + earlier), grid, by_rows=False)
 
-        guess = None if grid is None else stencil_pattern(products, grid)
+        guess = None if grid is None else stencil_pattern(products, [grid])
         if guess is not None:
             yield coloured(guess)
         sparse = find_pattern(products, rows, columns)

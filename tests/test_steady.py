@@ -3,11 +3,13 @@
 import autograd.numpy as anp
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from autograd import jacobian
 
 import sparsedp as dp
 from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
 from sparsedp.solvers.newton import Newton
+from sparsedp.solvers.sparsity import stencil_pattern
 
 
 def bratu(n, dim=1):
@@ -219,6 +221,36 @@ def test_two_fields_against_a_dense_twin(rng):
     assert value == pytest.approx(weights @ x, rel=1e-10)
     assert slope["a"] == pytest.approx(-y[:9] @ x[9:] ** 2, rel=1e-8)
     assert np.allclose(slope["b"], -y[9:], rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(20, 13), (9, 8, 10)])
+@pytest.mark.parametrize("periodic", [False, True])
+def test_the_pattern_of_fields_on_one_grid_is_guessed(shape, periodic):
+    """Velocity and pressure: every place that is not 0, from a few products for each kind of field."""
+    grid = dp.Grid(shape, periodic=(periodic,) + (False,) * (len(shape) - 1))
+    L, G, D = dp.face_laplacian(grid), dp.gradient(grid), dp.divergence(grid)
+    whole = sp.block_array([[L.matrix, G.matrix], [D.matrix, None]]).tocsr()
+    products = []
+
+    def product(v):
+        products.append(0)
+        return whole @ v
+
+    pattern = stencil_pattern([product], [*grid.faces.parts, grid.shape])
+    assert abs(whole).sign().multiply(pattern).sum() == whole.nnz and len(products) == 3 * (len(shape) + 1)
+    assert pattern.nnz < 1.6 * whole.nnz
+
+
+def test_a_mean_over_a_field_fits_no_stencil():
+    """A pressure whose mean is 0 in place of a pin: a full row is found, and the flow is the same."""
+    scene = Flow(16)
+
+    def free(x, re):
+        rates = scene.cavity(x, re)
+        return {"v": rates["v"], "p": scene.D(x["v"]) + scene.pin * anp.mean(x["p"])}
+
+    x, y = (dp.steady(residual, scene.rest, 50.0) for residual in (scene.cavity, free))
+    assert np.allclose(x["v"], y["v"], atol=1e-10) and np.allclose(x["p"] - x["p"].mean(), y["p"], atol=1e-9)
 
 
 @pytest.mark.parametrize("size", [1.0, 1e10, 1e-10])

@@ -21,7 +21,7 @@ from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.inverses import Inverse, Solution, build, build_dense
 from sparsedp.solvers.solve import failure
-from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like
+from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
 from sparsedp.structure.base import rows_of
 from sparsedp.tape import isbox
 from sparsedp.tree import copied
@@ -31,7 +31,7 @@ __all__ = ["Jacobians", "Linearisation"]
 FULL_UP_TO = 16  # unknowns: a full Jacobian takes fewer products than the search for its pattern
 FULL_AT_MOST = 2000  # unknowns: a larger Jacobian that is not sparse is left as products
 SYMMETRIC = 1e-12  # of the largest entry: by how much a symmetric Jacobian may differ from its transpose
-MOST_COLOURS = 64  # products for a matrix: with more, a search at all points takes as few
+MOST_COLOURS = 64  # products for a matrix: with more, a guess at its pattern saves nothing
 AGREES = 1e-8  # relative difference up to which two forms of one Jacobian are taken for equal
 
 
@@ -294,9 +294,11 @@ class Jacobians:
 
     def _probed(self, equation, points, leaves, by_rows):
         products = [self._product(equation, point, leaves, by_rows, "pattern") for point in points]
-        found = find_pattern(products[:1], equation.size, equation.size)
-        if found is not None and not _serves(found, products[1:]):
-            found = find_pattern(products, equation.size, equation.size)
+        parts = fields_met(equation, points[0], leaves)
+        found = None if parts is None else stencil_pattern(products, parts)
+        if found is not None and _serves(found, products):
+            return found.T.tocsr() if by_rows else found
+        found = find_pattern(products, equation.size, equation.size)
         return found.T.tocsr() if by_rows and found is not None else found
 
     def _enlarge(self, equation, x, leaves, row):
@@ -317,13 +319,13 @@ def _points(x):
     rng = np.random.default_rng(0)
     scale = np.sqrt(np.mean(x**2)) or 1.0
     far = scale * rng.standard_normal(x.size)
-    return far, -far, x * (1 + 0.1 * rng.uniform(-1, 1, x.size))  # opposite: each side of a switch is met
+    return x * (1 + 0.1 * rng.uniform(-1, 1, x.size)), far, -far  # opposite: each side of a switch is met
 
 
 def _serves(pattern, products):
     """Whether matrices have entries on a pattern only: what the products with their colours give acts as they do."""
     coloured, v = Coloured(pattern, by_rows=False), np.random.default_rng(1).uniform(0.5, 1.5, pattern.shape[1])
-    if products and coloured.count > MOST_COLOURS:
+    if coloured.count > MOST_COLOURS:
         return False
     for product in products:
         matrix = coloured.matrix(product)
@@ -356,7 +358,7 @@ def _rates(matrix, layout):
     Half the sum of a row over its own field: 4 nu / h^2 of a Laplacian in 2-D, |v| / h of convection. The sign is that
     of the diagonal where it leads the row, else that of the diagonal of the whole field. 0 for a pressure in div v = 0.
     """
-    field = np.repeat(np.arange(len(layout.shapes)), [int(np.prod(shape)) for shape in layout.shapes])
+    field = np.repeat(np.arange(len(layout.shapes)), np.diff(layout.space.offsets))
     row, diagonal = rows_of(matrix), matrix.diagonal()
     inside = field[row] == field[matrix.indices]
     sums = np.bincount(row[inside], np.abs(matrix.data[inside]), diagonal.size)
@@ -390,7 +392,24 @@ def cells_met(equation, x, leaves):
     shapes = equation.layout.shapes
     if len(shapes) != 1 or len(shapes[0]) < 2:
         return None  # on one axis banded LU needs no geometry
+    spaces = _spaces_met(equation, x, leaves)
+    return next((s for s in spaces if s.grid is not None and s.kind == "cells" and s.shape == shapes[0]), None)
+
+
+def fields_met(equation, x, leaves):
+    """The shapes of the fields, one after the other, where all are on one grid, a velocity by its components; or None.
+
+    As `cells_met`: told from the Operators in the residual.
+    """
+    met = {space.shape: space for space in _spaces_met(equation, x, leaves) if space.grid is not None}
+    spaces = [met.get(shape) for shape in equation.layout.shapes]
+    if len(spaces) < 2 or None in spaces or len({space.grid for space in spaces}) > 1:
+        return None
+    return [part for space in spaces for part in space.parts]
+
+
+def _spaces_met(equation, x, leaves):
+    """The domains of the Operators that the residual applies."""
     with recording() as calls, np.errstate(all="ignore"):
         equation(x, *leaves)
-    spaces = (op.domain for actors in calls.actors.values() for op in actors.values() if isinstance(op, Operator))
-    return next((s for s in spaces if s.grid is not None and s.kind == "cells" and s.shape == shapes[0]), None)
+    return [op.domain for actors in calls.actors.values() for op in actors.values() if isinstance(op, Operator)]

@@ -246,7 +246,7 @@ class Newton:
         self.x: np.ndarray
         self.F: Any = None
         self.size = 0.0  # |F|, of several fields each in units of the terms that it is the sum of
-        self.cuts = np.cumsum([np.prod(shape, dtype=int) for shape in equation.layout.shapes])[:-1]  # between fields
+        self.cuts = np.array(equation.layout.space.offsets[1:-1], int)  # between fields
         self.units: Any = 1.0  # of each number of F
         self.steps, self.keeps = steps, steps or equation.size > DENSE_UP_TO
         self.J: Any = None
@@ -280,7 +280,10 @@ class Newton:
             elif self.stale or self.jacobians.suspected(self.J):
                 self._linearise()
             else:
-                word = self._rounding(step) or self._restarted()
+                word = self._rounding(step)
+                if not word and not self._evolved():
+                    self._fail("stagnated")
+                word = word or self._accepted()
         self.run.status = word
         return self.x
 
@@ -383,12 +386,6 @@ class Newton:
         return F if np.all(np.isfinite(F)) else None
 
     # ------------------------------------------------------------ pseudo-time
-
-    def _restarted(self):
-        """The status word after pseudo-time where no Newton step lowers the residual; an error where that fails too."""
-        if not self._evolved():
-            self._fail("stagnated")
-        return self._accepted()
 
     def _evolved(self):
         """Steps in pseudo-time from the guess, once. False: they lead nowhere, and x is left as it was."""

@@ -119,31 +119,38 @@ def dense_pattern(rows, columns):
     return sp.csr_array(np.ones((rows, columns)))
 
 
-def stencil_pattern(products, shape):
-    """Products with one matrix at several points, on fields of a shape -> csr_array of ones, or None.
+def stencil_pattern(products, shapes):
+    """Products with one matrix at several points, on fields of these shapes -> csr_array of ones, or None.
 
     Parameters
     ----------
     products : list of callables
         ``product(v) -> A v``, flat.
-    shape : tuple of int
-        Of the fields on both sides.
+    shapes : sequence of tuples of int
+        Of the fields, one after the other, on both sides; of one dimension: cells, or faces across each axis.
 
     Returns
     -------
     csr_array or None
         None when the fields are small, or a cell touches too many.
     """
-    index, lengths = np.indices(shape).reshape(len(shape), -1), np.array(shape)[:, None]
+    own = np.array([(1, *shape) for shape in shapes])[:, :, None]
+    lengths = np.max(own, axis=0)
+    lengths[0] = len(own)  # the first axis counts fields
+    index = np.hstack([np.indices(shape[:, 0]).reshape(len(shape), -1) for shape in own])
+    index[0] = np.repeat(np.arange(len(own)), np.prod(own, axis=(1, 2)))
+    number = np.full(lengths[:, 0], -1)
+    number[tuple(index)] = np.arange(index.shape[1])
     far = lengths > SHORT  # axes that count places; the others count kinds
+    far[0] = False
     if not far.any() or not products or index.shape[1] < SMALLEST or np.prod(lengths[~far]) > SHORT:
         return None
     moves, wraps, rng = set(), np.zeros(far.shape, dtype=bool), np.random.default_rng(0)
     kinds = np.unique(np.where(far, 0, index), axis=1).T[:, :, None]
     period = np.where(far, lengths, 2 * lengths)
     for kind, product, place in combinations(kinds, products, (0 * lengths, lengths // 2, lengths - 1)):
-        cell, v = np.where(far, place, kind), np.zeros(index.shape[1])
-        v[np.ravel_multi_index(cell, shape)] = rng.uniform(0.5, 1.5) * rng.choice((-1.0, 1.0))
+        cell, v = np.where(far, np.minimum(place, own[kind[0, 0]] - 1), kind), np.zeros(index.shape[1])
+        v[number[tuple(cell)]] = rng.uniform(0.5, 1.5) * rng.choice((-1.0, 1.0))
         ways = index[:, np.flatnonzero(product(v))] - cell
         if ways.shape[1] > WIDEST:
             return None
@@ -157,7 +164,8 @@ def stencil_pattern(products, shape):
         to = index[:, column] + step
         to = np.where(wraps, to % lengths, to)  # steps over an edge count where the field goes round
         inside = np.all((to >= 0) & (to < lengths), axis=0)
-        places.append(np.stack([np.ravel_multi_index(to[:, inside], shape), column[inside]]))
+        row = number[tuple(to[:, inside])]
+        places.append(np.stack([row, column[inside]])[:, row >= 0])
     row, column = np.hstack(places)
     return pattern_of(row, column, (index.shape[1],) * 2)
 
