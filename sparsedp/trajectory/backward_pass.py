@@ -40,7 +40,8 @@ class BackwardPass:
         loop, steps, tapes, n = self.loop, self.steps, self.tapes, self.loop.n
         growth = Growth(loop)
         source = loop.keep.source(n, g)
-        state = last = self.kept.pop()
+        state = self.kept.pop()
+        last = state if loop.reverse else None
         total = source(state)
         growth.see(n, total)
         for i in shown_steps(loop.progress, range(n - 1, -1, -1), "backward"):
