@@ -31,7 +31,7 @@ _WINDOW = {
     "solvers.separable": "exponential power",
     "flow.momentum": "convection face_laplacian face_lift",
     "advection.front": "transport",
-    "advection.finite_volumes": "conservation_law",
+    "flow.finite_volumes": "conservation_law",
     "flow.pressure": "projection",
     "flow.stepping": "flow_step",
     "integrators.front": "stepper",

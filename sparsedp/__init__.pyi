@@ -2,7 +2,6 @@ from . import check as check
 from . import errors as errors
 from . import network as network
 from . import report as report
-from .advection.finite_volumes import conservation_law as conservation_law
 from .advection.front import transport as transport
 from .blackbox import adopt as adopt
 from .conditions import dirichlet as dirichlet
@@ -17,6 +16,7 @@ from .derivative import hvp as hvp
 from .derivative import jvp as jvp
 from .derivative import value_and_grad as value_and_grad
 from .derivative import vjp as vjp
+from .flow.finite_volumes import conservation_law as conservation_law
 from .flow.momentum import convection as convection
 from .flow.momentum import face_laplacian as face_laplacian
 from .flow.momentum import face_lift as face_lift

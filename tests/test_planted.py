@@ -37,7 +37,7 @@ BUGS = {
         "tests/test_operators.py::test_discrete_identities",
     ),
     "momentum that passes through a wall": Bug(
-        "advection",
+        "flow",
         "                self.part(x[self.momentum], *ghosts)[...] *= -1",
         "                self.part(x[self.momentum], *ghosts)[...] *= 1",
         "tests/test_conservation_law.py",
