@@ -184,6 +184,12 @@ def _owner(value):
 def _gradient(leaf, cotangent):
     if cotangent is None:
         return 0.0 if isinstance(leaf, float) else anp.zeros_like(plain(leaf))
+    shape, wanted = np.shape(plain(cotangent)), np.shape(plain(leaf))
+    if shape != wanted:
+        raise ShapeError(
+            f"the gradient has shape {shape} where {wanted} is needed: autograd's np.where does not add up what it "
+            "spreads; multiply by the condition instead, a * c + b * (1 - c)"
+        )
     cotangent = fit("the gradient", leaf, cotangent, cotangent)
     return float(cotangent) if isinstance(leaf, float) and not isbox(cotangent) else cotangent
 

@@ -283,6 +283,12 @@ TABLE = [
         "reversed steps end 3.0e-03 away from the first state, beside states of size 1.0e+00: "
         "rounding grew on the way; give rollout a memory in bytes",
     ),
+    (
+        lambda: dp.grad(lambda a: anp.sum(anp.where(np.arange(3) > 1, a, 0.0)))(1.0),
+        SHAPE,
+        "the gradient has shape (3,) where () is needed: autograd's np.where does not add up "
+        "what it spreads; multiply by the condition instead, a * c + b * (1 - c)",
+    ),
 ]
 
 
