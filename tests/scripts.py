@@ -36,6 +36,7 @@ SMALL = {
     "inverse_heat.py": "6",
     "control.py": "2",
     "full_waveform.py": "24",
+    "edges.py": "24",
     "conservation_laws.py": "100",
     "conductivity_design.py": "200",
     "helmholtz.py": "64",

@@ -48,6 +48,14 @@ def test_conservation_laws():
     assert abs(float(re.search(r"on the left: (\S+)", printed)[1]) - 1) < 1e-4
 
 
+@example("edges.py")
+def test_edges():
+    """Total variation finds field and jumps better."""
+    pairs = re.findall(r"^(?:smooth|edges) +\S+ +(\S+) +(\S+) +\d+$", run("edges.py"), re.MULTILINE)
+    smooth, edges = [tuple(map(float, pair)) for pair in pairs]
+    assert edges[0] < 0.95 * smooth[0] and edges[1] < 0.9 * smooth[1]
+
+
 @example("full_waveform.py")
 def test_full_waveform():
     """The body is where it is, to a cell and a half, though the misfit is what waves of 11 cells can tell."""
