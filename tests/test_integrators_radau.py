@@ -49,6 +49,9 @@ def test_prothero_robinson(stiffness):
     for tolerance in tolerances:
         step = dp.stepper("radau", rate, 5.0, tolerance=tolerance)
         errors.append(abs(step((1.0, 0.0), stiffness)[0] - np.cos(5.0)))
+        forced = dp.stepper("radau", lambda u, p, t: p * rate(u / p, stiffness, t), 5.0, tolerance=tolerance)
+        slope = value_and_grad(lambda p: forced((1.0, 0.0), p)[0])(1.0)[1]  # of p cos t
+        assert slope == pytest.approx(np.cos(5.0), rel=10 * tolerance)
         assert len(step.taken) < 110
     assert errors[2] < errors[0] and all(e <= 2 * tol for e, tol in zip(errors, tolerances, strict=True))
 
@@ -82,7 +85,9 @@ def test_stiff_problems_with_their_gradients(name):
         of_gradient = np.linalg.norm(g * params - slopes) / np.linalg.norm(slopes)
         assert of_gradient <= 6 * tolerance**0.75
         found.append((np.max(np.abs(new - state)) / np.max(np.abs(state)), of_gradient))
-    assert found[0][0] > found[1][0] > found[2][0] and found[0][1] > found[2][1] <= 1e-6
+    assert (
+        found[0][0] > found[1][0] > found[2][0] and max(found[0][1], 1e-7) > found[2][1] <= 1e-6
+    )  # the reference is good to 3e-8
 
 
 def test_one_step_against_a_root():

@@ -21,7 +21,8 @@ J_i, P_i, q_i the derivatives of f_i in the state, the params and the time,
 
 and the backward pass is the transpose of that. Lengths move with the state, dh = d, and the derivative is judged by two
 shadows, as adaptive.py says and for its reasons. Two things differ: the first shadow has the derivative of
-u + z_3 + EPSILON e, and the sum of all d is given back at the end, where it counts with the speed there.
+u + z_3 + EPSILON e, and the last step gives the sum of all d back: the rate at its end would not do, since errors of
+stiff parts are large in it.
 """
 
 from collections import deque
@@ -304,7 +305,7 @@ class Variation:
         split, first, last = rates.layout.space.split, path[0].u, path[-1]
         sizes = [*split(rates.sizes(first, first)), *map(relative, leaves(untraced(self.tree[1:])))]
         self.start, self.scales = Moving(self.tree, is_variable, sizes), np.concatenate([*map(np.ravel, sizes)])
-        self.sizes, self.speed = rates.sizes(last.u, last.new), rates(last.new, self._time(1.0))
+        self.sizes = rates.sizes(last.u, last.new)
         self.judged = scheme.tolerance is not None
         self.shadow = np.array([0.0, EPSILON, 0.0]) if self.judged else np.zeros(1)
         self.spread: Any
@@ -324,13 +325,12 @@ class Variation:
         n, y = self.n, np.insert(self.spread(x) * self.scales, self.n, 0.0, axis=1).T
         for step, shadow in self._matrices(range(len(self.path))):
             y[: n + 1] = step @ y + self.shadow * (shadow @ y)
-        return self.judge((y[:n] - np.outer(self.speed, y[n])).T / self.sizes)
+        return self.judge(y[:n].T / self.sizes)
 
     def cotangent(self, g):
         """The transpose."""
-        n, g = self.n, (self.spread(g) / self.sizes).T
-        y = np.zeros((self.scales.size + 1, self.shadow.size))
-        y[: n + 1] = np.vstack([g, -self.speed @ g])
+        n, y = self.n, np.zeros((self.scales.size + 1, self.shadow.size))
+        y[:n] = (self.spread(g) / self.sizes).T
         for step, shadow in self._matrices(range(len(self.path) - 1, -1, -1)):
             head = y[: n + 1].copy()
             y[: n + 1] = 0.0
@@ -366,9 +366,11 @@ class Variation:
             error, section = dense_lu(REAL / h * one - first[:, :n])[0](error, False), self._section(step, h)
         M = np.array([new, error])
         u, params, t, length = M[:, :, :n], M[:, :, n:-2], M[:, :, -2:-1], M[:, :, -1:]
-        M = np.dstack([u + length * section, t, params, t, step.done * t + step.length * length])
+        last = step is self.path[-1]  # it gives the shift back
+        shift = t - length if last else t
+        M = np.dstack([u + length * section * (not last), shift, params, t, step.done * t + step.length * length])
         M = np.pad(M, ((0, 0), (0, 1), (0, 0)))
-        M[0, n, : n + 1] = [*section, 1.0]
+        M[0, n, : n + 1] = 0.0 if last else [*section, 1.0]
         return M
 
     def _section(self, step, h):
