@@ -284,3 +284,13 @@ def test_solver_in_the_loop():
     assert len(table) == 6 and table["1, then 4, then 8 steps"][1] > 1.1
     assert table["4 steps"][0] < 0.85 * table["1 step"][0]
     assert all(lost < 1e-13 for _, _, lost in table.values())
+
+
+@example("helmholtz.py")
+def test_helmholtz():
+    """Absorbing layers, both solvers, and the gradient in every speed."""
+    printed = run("helmholtz.py")
+    sponge, matched = map(float, re.findall(r"reflection .*: (\S+)$", printed, re.MULTILINE))
+    assert sponge <= 1e-3 and matched <= 2e-6
+    assert int(re.search(r"GMRES .*: (\d+) iterations", printed)[1]) <= 40
+    assert "gradient in 4096 speeds: agrees" in printed
