@@ -287,12 +287,12 @@ class Elliptic(Sum):
     D, G : Operator
         They keep what does not depend on k: transposes, magnitudes, and matrices where entries are asked for.
     k : array, shape (faces,)
-    shift : array, a number or a field on the cells
+    shift : a number or a field on the cells
     """
 
     def __init__(self, D, G, k, shift, transposed=False):
         self.D, self.G, self.k = D, G, k.reshape(-1)
-        self.shift = Diagonal(np.broadcast_to(shift.reshape(-1), D.shape[0]))
+        self.shift = Diagonal(np.broadcast_to(np.ravel(shift), D.shape[0]))
         self.transposed = transposed
         left, right = (G.T, D.T) if transposed else (D, G)
         product = Chain([left.structure, Diagonal(self.k), right.structure])
