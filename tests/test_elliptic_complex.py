@@ -312,3 +312,23 @@ def test_single_precision_one_cell_and_no_cells():
     none = dp.Grid((0, 3))
     solve = dp.elliptic_solver(dp.divergence(none), dp.gradient(none, dp.dirichlet))
     assert solve(1j, np.zeros((0, 3)), np.zeros((0, 3), complex)).shape == (0, 3)
+
+
+@pytest.mark.parametrize("options", [{}, {"preconditioner": "shifted_laplace"}], ids=str)
+def test_singular_systems_and_solids_in_complex_numbers(options):
+    grid, rng = stretched(9, 8), np.random.default_rng(0)
+    D, b = dp.divergence(grid), rng.standard_normal(grid.shape)
+    k, even = rng.uniform(0.5, 1.5, grid.faces.size) * (1 - 0.4j), b - np.sum(b * grid.volumes) / np.sum(grid.volumes)
+    exact, solve = (dp.elliptic_solver(D, dp.gradient(grid), m, **o) for m, o in (("direct", {}), ("krylov", options)))
+    close(solve(k, even), exact(k, even), 1e-7)
+    assert abs(np.sum(solve(k, even) * grid.volumes)) <= 1e-11
+    losses = [lambda k, act=act: anp.sum(anp.abs(act(k, even)) ** 2) for act in (solve, exact)]
+    close(*(value_and_grad(loss)(k)[1] for loss in losses), 1e-7)
+    with pytest.raises(dp.errors.IncompatibleError, match="elliptic_solver is singular"):
+        solve(k, b + 1)
+    solid = np.zeros(grid.shape, dtype=bool)
+    solid[3:5, 2:4] = True
+    G, b, shift = dp.gradient(grid, dp.dirichlet, solid), np.where(solid, 0.0, b), -0.3 * (1 + 0.2j) * ~solid
+    x = dp.elliptic_solver(D, G, "krylov", **options)(k, b, shift)
+    assert not np.any(x[solid])
+    close(x, dp.elliptic_solver(D, G, "direct")(k, b, shift), 1e-8)
