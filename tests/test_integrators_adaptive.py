@@ -80,3 +80,12 @@ def test_a_stiff_problem_keeps_explicit_steps_small():
 def test_nothing_moves():
     step = dp.stepper("rk4", lambda u, p: 0.0 * u, 1.0, tolerance=1e-6)
     assert np.array_equal(step(np.ones(3), None), np.ones(3)) and step.taken == [1.0]
+
+
+@pytest.mark.parametrize("method", ["rk4", "tr_bdf2", "radau"])
+def test_a_rate_that_is_at_rest_at_the_start_is_not_skipped(method):
+    """A bell in time: at the start its rate is 0 to rounding, and so is the error of one step over all of it."""
+    width = 0.5 if method == "tr_bdf2" else 0.3
+    bell = lambda u, p, t: p * anp.exp(-(((t - 2.0) / width) ** 2))
+    step = dp.stepper(method, bell, 10.0, tolerance=1e-6)
+    assert step((0.0, 0.0), 1.0)[0] == pytest.approx(width * np.sqrt(np.pi), rel=1e-4)

@@ -51,6 +51,7 @@ SAFETY, SMALLEST, LARGEST = 0.9, 0.2, 5.0  # of one change of the length
 QUIET = 1e-2  # share of the tolerance below which an error shows no trend
 FLOOR = 0.1  # share of the largest entry of an array to which errors of small entries are compared
 LEAST = 1e-15  # share of the interval below which no step is tried
+CAREFUL = 1e-3  # most that is tried first where the rate takes the time: it may be at rest at the start alone
 MOST = 100_000  # trials in one interval
 WINDOW, FAR = 1000, 10  # trials at a pace that would need FAR * MOST for the rest: no use to go on
 
@@ -159,7 +160,7 @@ class Adaptive(Scheme):
                 f"the rate of {self.name} must be finite at the state given; take a state in its domain"
             )
         length = 0.01 * (size or 1.0) / (speed * float(h)) if speed > 0 else 1.0
-        return min(max(1e3 * LEAST, length), 1.0)
+        return min(max(1e3 * LEAST, length), CAREFUL if self.problem.timed else 1.0)
 
     def _allowed(self, length, left):
         """At most what is left, and not just short of it."""

@@ -65,7 +65,6 @@ NEWTON = 1e-3  # error of Newton's method in units of the tolerance: at 0.03 HIR
 ROUNDING = 1e-15  # relative correction that no iteration is asked to go below
 STALLED = 1e-11  # relative correction that is taken for rounding where it does not shrink
 ITERATIONS = 10  # of Newton's method in a step with error control
-CAREFUL = 1e-3  # first length where the rate takes the time: it may be at rest at the start alone
 FAST = 0.03  # share of a correction that is left after an iteration, up to which the Jacobian serves the next step
 
 
@@ -138,8 +137,7 @@ class Radau(Adaptive):
         return [Taken(1.0, 0.0, v, z, v + z[2])]
 
     def _first(self, v, rates, t, h):
-        length = super()._first(rates.state(v), rates.params, t, h)
-        return min(length, CAREFUL) if self.problem.timed else length
+        return super()._first(rates.state(v), rates.params, t, h)
 
     def _trial(self, v, rates, t, length, h):
         """The stages, the new state, and the error of the embedded formula in units of the tolerance."""
