@@ -97,7 +97,7 @@ BUDGETS = {
     "operators": 6_600,  # tensors: 800
     "optimize": 13_350,  # admm: 500; total_variation, smoothness: 400
     "report": 17_950,
-    "solvers": 42_450,  # steady states, tensors, complex coefficients and waves: 2 550
+    "solvers": 42_500,  # steady states, tensors, complex coefficients and waves: 2 550
     "solvers/multigrid": 10_000,
     "structure": 6_450,
     "trajectory": 9_600,  # reversed steps: 400

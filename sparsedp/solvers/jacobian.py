@@ -402,8 +402,9 @@ def fields_met(equation, x, leaves):
     As `cells_met`: told from the Operators in the residual.
     """
     met = {space.shape: space for space in _spaces_met(equation, x, leaves) if space.grid is not None}
-    spaces = [met.get(shape) for shape in equation.layout.shapes]
-    if len(spaces) < 2 or None in spaces or len({space.grid for space in spaces}) > 1:
+    shapes = equation.layout.shapes
+    spaces = [met[shape] for shape in shapes if shape in met]
+    if len(shapes) < 2 or len(spaces) < len(shapes) or len({space.grid for space in spaces}) > 1:
         return None
     return [part for space in spaces for part in space.parts]
 

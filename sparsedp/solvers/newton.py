@@ -22,8 +22,9 @@ steps of x' = -F / sign(D), linearised once each, in units of the time in which 
 
     (J + D / tau) s = -F,        tau <- tau |F| / |F_next|      (switched evolution relaxation).
 
-It follows a flow from the guess to its steady state, where the residual may rise for a while. An equation without a
-rate of its own, as div v = 0 for a pressure, has D = 0. From the longest steps on it is Newton's method again.
+It follows a flow from the guess to its steady state, on which the residual
+may rise for a while. An equation without a rate of its own, as div v = 0 for a pressure, has D = 0. From the longest
+steps on it is Newton's method again.
 Source: Kelley and Keyes, SIAM J. Numer. Anal. 35 (1998); Coffey, Kelley and Keyes, SIAM J. Sci. Comput. 25 (2003).
 """
 
@@ -57,7 +58,7 @@ KEPT, MOST_KEPT = 0.1, 8  # a Jacobian is kept while a step leaves less, and for
 FURTHER = 1e-3  # of the tolerance, for steps with a Jacobian that was kept
 STALLED, STALLS = 0.9, 2  # so many Newton steps on end that leave more of the residual: pseudo-time
 SHORTEST, FIRST, LONGEST = 1e-3, 10.0, 1e4  # pseudo-time steps; of 1, 10, 100 at first, 10 takes the fewest in cavities
-GROWTH = 10.0  # of a pseudo-time step, at most
+GROWTH = 10.0  # of a pseudo-time step, at most. A rule that grows 1.5 times faster loses the cavity at Re 1000
 RISE = 2.0  # times the residual at the guess: a step to more is not taken, but a quarter of it in time
 TINY = 1e-8  # an iterate that is smaller than the last one by this share may be on its way to 0
 
