@@ -148,6 +148,25 @@ BUILDERS = {
         lambda tolerance, floor: dp.stepper("heun", lambda u, p: -p * u**2, 0.5, tolerance=tolerance, floor=floor),
         stepped,
     ),
+    "conservation_law": (
+        (CELLS.copy(), {"y": [dp.inflow, dp.outflow]}, CELLS[:, :1].copy()),
+        lambda still, sides, given: dp.conservation_law(
+            GRID,
+            lambda u, p, axis: u**2,
+            lambda u, p, axis: anp.abs(2 * u),
+            boundary=sides,
+            inflow=given,
+            equilibrium=still,
+        ),
+        lambda law: value_and_grad(lambda u: anp.sum(law(u) ** 2))(CELLS**2),
+    ),
+    "stepper, leapfrog": (
+        ((np.ones(12), np.ones(12)),),
+        lambda damping: dp.stepper("leapfrog", (lambda q, p: -q, lambda p, c: p), 0.1, damping=damping),
+        lambda step: step((np.ones(12), np.ones(12))),
+    ),
+    "total_variation": ((SOLID.copy(),), lambda solid: dp.total_variation(GRID, 0.1, solid), lambda tv: tv(CELLS**3)),
+    "smoothness": ((SOLID.copy(),), lambda solid: dp.smoothness(GRID, solid), lambda h1: h1(CELLS**3)),
     "physical_gradient": (
         (np.array(0.5),),
         lambda rate: dp.physical_gradient(lambda x: x**3, lambda y, x: np.cbrt(y), rate),
@@ -203,7 +222,9 @@ def test_arrays_may_be_reused(name):
 
 def test_every_builder_is_here():
     """The others are built of no arrays (a LinearOperator and functions are used as they are), or build nothing."""
-    unbuilt = "identity divergence curl upwind component prolong harmonic_average from_functions from_linear_operator"
+    unbuilt = (
+        "sponge identity divergence curl upwind component prolong harmonic_average from_functions from_linear_operator"
+    )
     calls = "adopt minimize certify certified explain stress workprec rollout grad value_and_grad vjp jvp hvp"
     calls += " differentiable set_threads steady"
     shown = "animate plot convergence v_curve update_direction"

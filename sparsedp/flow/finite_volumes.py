@@ -27,6 +27,7 @@ import numpy as np
 
 from sparsedp.conditions import free_slip, outflow, resolve
 from sparsedp.conditions import inflow as inflow_side
+from sparsedp.constants import constant
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import check_plain, check_takes, is_whole
 from sparsedp.grid import AXES, check_grid
@@ -106,9 +107,9 @@ def conservation_law(
     --------
     >>> from sparsedp import Grid
     >>> grid = Grid(4, periodic=True)
-    >>> law = conservation_law(grid, lambda u, p, axis: u**2 / 2, lambda u, p, axis: u, scheme="upwind")
+    >>> law = conservation_law(grid, lambda u, p, axis: u**2 / 2, lambda u, p, axis: (u, u), scheme="upwind")
     >>> law(np.array([1.0, 1.0, 2.0, 1.0]))
-    array([ 0. , -0.5, -0.5,  1. ])
+    array([ 0. ,  0. , -1.5,  1.5])
     """
     check_grid("conservation_law", grid)
     if scheme not in SCHEMES:
@@ -149,6 +150,7 @@ class ConservationLaw(Remade):
     name = "conservation_law"
 
     def __init__(self, grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium):
+        inflow, equilibrium = constant(inflow), constant(equilibrium)
         self.given = grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium
         self.grid, self.flux, self.speed, self.source, self.equilibrium = grid, flux, speed, source, equilibrium
         self.axes = [

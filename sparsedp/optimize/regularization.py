@@ -47,7 +47,7 @@ def total_variation(grid, eps, solid=None):
     --------
     >>> from sparsedp import Grid
     >>> tv = total_variation(Grid(4, size=1.0), 1e-6)
-    >>> round(tv(np.array([0.0, 0.0, 3.0, 3.0])), 3)
+    >>> print(f"{tv(np.array([0.0, 0.0, 3.0, 3.0])):.3f}")
     4.243
     """
     if not (is_number(eps) and 0 < eps < np.inf):
@@ -80,7 +80,7 @@ def smoothness(grid, solid=None):
     Examples
     --------
     >>> from sparsedp import Grid
-    >>> smoothness(Grid(4, size=1.0))(np.array([0.0, 1.0, 2.0, 3.0]))
+    >>> print(smoothness(Grid(4, size=1.0))(np.array([0.0, 1.0, 2.0, 3.0])))
     8.0
     """
     square, volumes = _square(grid, "smoothness", solid)
