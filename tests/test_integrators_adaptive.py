@@ -85,7 +85,6 @@ def test_nothing_moves():
 @pytest.mark.parametrize("method", ["rk4", "tr_bdf2", "radau"])
 def test_a_rate_that_is_at_rest_at_the_start_is_not_skipped(method):
     """A bell in time: at the start its rate is 0 to rounding, and so is the error of one step over all of it."""
-    width = 0.5 if method == "tr_bdf2" else 0.3
-    bell = lambda u, p, t: p * anp.exp(-(((t - 2.0) / width) ** 2))
+    bell = lambda u, p, t: p * anp.exp(-(((t - 2.0) / 0.3) ** 2))  # in the end it leaves the range of floats
     step = dp.stepper(method, bell, 10.0, tolerance=1e-6)
-    assert step((0.0, 0.0), 1.0)[0] == pytest.approx(width * np.sqrt(np.pi), rel=1e-4)
+    assert step((0.0, 0.0), 1.0)[0] == pytest.approx(0.3 * np.sqrt(np.pi), rel=1e-4)

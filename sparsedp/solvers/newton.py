@@ -41,7 +41,7 @@ from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.scaling import far_exponent, length
+from sparsedp.solvers.scaling import far_exponent, in_range, length
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten, leaves
@@ -450,7 +450,11 @@ class Newton:
 
     @property
     def _unit(self):
-        return -far_exponent(self.F, length(self.F))
+        size = length(self.F)
+        if in_range(size):
+            return 0
+        terms = np.append(self.F, self.J.product(self.x))  # F alone may be the rest of large terms
+        return -far_exponent(terms, length(terms))
 
     def _rounding(self, step):
         """The status word when what is left of F is rounding, else ""."""
