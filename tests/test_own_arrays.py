@@ -225,7 +225,7 @@ def test_every_builder_is_here():
     unbuilt = (
         "sponge identity divergence curl upwind component prolong harmonic_average from_functions from_linear_operator"
     )
-    calls = "adopt minimize certify certified explain stress workprec rollout grad value_and_grad vjp jvp hvp"
+    calls = "function adopt minimize certify certified explain stress workprec rollout grad value_and_grad vjp jvp hvp"
     calls += " differentiable set_threads steady"
     shown = "animate plot convergence v_curve update_direction"
     public = {name for name in dir(dp) if callable(getattr(dp, name)) and name.islower() and name[0] != "_"}

@@ -110,3 +110,52 @@ def test_derivatives_and_dtypes():
     assert spread(u.astype(np.float32)).dtype == np.float32
     np.testing.assert_allclose(spread(u + 2j * u), spread(u) + 2j * spread(u), rtol=1e-14)
     assert dp.check.operator(spread).ok
+
+
+# ---- any function ----
+
+
+@pytest.mark.parametrize("grid", [dp.Grid((5, 4), size=(1.0, 2.0)), dp.Grid((6, 5), periodic=True), dp.Grid((2, 3, 4))])
+def test_a_polynomial_of_a_laplacian(grid):
+    L = dp.laplacian(grid, dp.dirichlet)
+    op, u = dp.function(L, lambda e: e**3 - 2 * e + 1), np.cos(np.arange(grid.cells.size)).reshape(grid.shape)
+    wanted = L(L(L(u))) - 2 * L(u) + u
+    np.testing.assert_allclose(op(u), wanted, rtol=0, atol=1e-12 * np.max(np.abs(wanted)))
+    np.testing.assert_allclose(op.matrix.toarray(), op.T.matrix.toarray().T, rtol=0, atol=1e-9)
+    both = dp.function(dp.exponential(L, 0.1), np.log)(u)
+    np.testing.assert_allclose(both, 0.1 * L(u), rtol=0, atol=1e-9 * np.max(np.abs(L(u))))
+
+
+def test_kuramoto_sivashinsky_in_a_plane():
+    """u_t = -lap u - lap^2 u - |grad u|^2 / 2: waves grow as they should, and stay bounded where they meet."""
+    grid = dp.Grid((32, 32), size=12 * np.pi, periodic=True)
+    L, G, mean = dp.laplacian(grid), dp.gradient(grid), dp.average(grid).T
+    linear = dp.function(L, lambda e: -e - e**2)
+    step = dp.stepper("etdrk4", lambda u, p: -0.5 * p * mean(G(u) ** 2), 0.1, linear=linear)
+    x, y = grid.centres()
+    wave = 1e-6 * np.cos(x / 2)
+    rate = linear(wave)[3, 4] / wave[3, 4]
+    np.testing.assert_allclose(dp.rollout(step, wave, 0.0, 20), wave * np.exp(2.0 * rate), rtol=0, atol=1e-17)
+    assert 0.1 < rate < 0.2
+    start = 0.1 * (np.cos(x / 3) + np.cos(y / 2) * np.sin(x / 6))
+    end = dp.rollout(step, start, 1.0, 300)
+    assert 1 < np.ptp(end) < 30 and np.mean(end) < np.mean(start)
+    assert dp.check.gradient(lambda p: anp.sum(dp.rollout(step, start, p, 5) ** 2), 1.0).verdict == "agrees"
+
+
+def test_functions_that_are_refused():
+    L = dp.laplacian(dp.Grid(4))
+    with pytest.raises(ValueError, match="function needs a separable operator that can be diagonalised"):
+        dp.function(dp.from_matrix(np.triu(np.ones((3, 3)))), np.exp)
+    with pytest.raises(
+        dp.errors.ShapeError, match=r"function needs f to give shape \(4,\), a number an eigenvalue, got \(\)"
+    ):
+        dp.function(L, lambda e: 1.0)
+    with pytest.raises(TypeError, match="function needs f to give real numbers, got dtype complex128"):
+        dp.function(L, lambda e: e * 1j)
+    with pytest.raises(
+        dp.errors.NonFiniteError, match=r"f\(laplacian\) holds NaN or infinity; check f at its eigenvalues"
+    ):
+        dp.function(L, lambda e: np.log(e - 1))
+    with pytest.raises(TypeError):
+        dp.function(L, 3)

@@ -213,6 +213,7 @@ def operators():
     yield "from_functions", dp.from_functions(mix, unmix, 12, 12)
     yield "from_linear_operator", dp.from_linear_operator(aslinearoperator(sp.csr_array(BAND)))
     yield "exponential", dp.exponential(dp.laplacian(GRID, dp.dirichlet), 0.1)
+    yield "function", dp.function(dp.laplacian(BOX), np.cos)
     yield "power", dp.power(-dp.laplacian(BOX, dp.dirichlet), 0.5)
     yield "projection", dp.projection(GRID, SOLID, {"x": (dp.no_slip, dp.outflow)})
     yield "projection by transforms", dp.projection(BOX)

@@ -23,8 +23,8 @@ import scipy.fft as fft
 import scipy.linalg
 
 from sparsedp import kernels
-from sparsedp.errors import NonFiniteError
-from sparsedp.fields import is_number
+from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.fields import check_function, is_number
 from sparsedp.operator import Operator
 from sparsedp.solvers.scaling import inverted
 from sparsedp.solvers.solve import Engine
@@ -36,6 +36,7 @@ __all__ = [
     "Spectrum",
     "diagonalised",
     "exponential",
+    "function",
     "power",
     "separable_engine",
     "spectrum",
@@ -482,6 +483,57 @@ def power(op, exponent):
         weights = np.where(zero, 1.0 if exponent == 0 else 0.0, np.where(zero, 1.0, values) ** float(exponent))
     refusal = f"{op.name} to the power {exponent:g} is beyond 1.8e308; rescale the operator"
     return _function(op, axes, weights, f"({op.name})^{exponent:g}", refusal)
+
+
+def function(op, f):
+    """Separable operator -> the operator f(op): f of its eigenvalues, such as a polynomial in a Laplacian.
+
+    Parameters
+    ----------
+    op : Operator
+        A Kronecker sum from a space to itself (``op.separable``); or a function of one.
+    f : callable
+        ``f(e)``: an array of eigenvalues [unit of the operator] -> as many real numbers. It is called once.
+
+    Returns
+    -------
+    Operator
+        Matrix-free: two transforms for each application. As `linear` of ``stepper("etdrk4", ...)`` it is exact in time.
+
+    Raises
+    ------
+    ValueError
+        If the operator is not separable or cannot be diagonalised.
+    ShapeError
+        If f returns another shape.
+    TypeError
+        If f is no function, or returns what are no real numbers.
+    NonFiniteError
+        If a value is NaN or infinite.
+
+    Notes
+    -----
+    With A = V diag(e) V^-1: f(A) = V diag(f(e)) V^-1. Transpose: f(A^T).
+
+    Examples
+    --------
+    >>> from sparsedp import Grid, laplacian
+    >>> L = laplacian(Grid(3))
+    >>> swift_hohenberg = function(L, lambda e: 0.1 - (1 + e) ** 2)
+    >>> u = np.array([1.0, 2.0, 4.0])
+    >>> print(np.round(swift_hohenberg(u) - (0.1 * u - u - 2 * L(u) - L(L(u))), 12) + 0.0)
+    [0. 0. 0.]
+    """
+    check_function("function", f, "lambda e: -e**2 - e")
+    axes, values = diagonalised(op, "function")
+    with np.errstate(all="ignore"):  # NaN is refused below
+        weights = np.asarray(f(values.copy()))
+    if weights.shape != values.shape:
+        raise ShapeError(f"function needs f to give shape {values.shape}, a number an eigenvalue, got {weights.shape}")
+    if weights.dtype.kind not in "fiu":
+        raise TypeError(f"function needs f to give real numbers, got dtype {weights.dtype}")
+    name = f"f({op.name})"
+    return _function(op, axes, weights.astype(float), name, f"{name} holds NaN or infinity; check f at its eigenvalues")
 
 
 def diagonalised(op, name, advice=""):
