@@ -294,8 +294,8 @@ def carry(u, params, axis):
             dict(boundary=dp.free_slip),
             "needs momentum, the number of a field for each axis, got None; write for example",
         ),
-        (dict(boundary=dp.inflow), "inflow at a side needs inflow="),
-        (dict(inflow=1.0), "inflow= needs a side with dp.inflow"),
+        (dict(boundary=dp.inflow), "side of dp.inflow without inflow="),
+        (dict(inflow=1.0), "inflow= without such a side"),
     ],
 )
 def test_refused_settings(given, message):
@@ -316,6 +316,11 @@ def test_refused_values():
     law = dp.conservation_law(LINE, carry, carry)
     with pytest.raises(dp.errors.ShapeError, match=r"conservation_law takes u of shape \(fields, 4\), got \(5,\)"):
         law(np.ones(5))
+    channel = dp.Grid((3, 4), periodic=(True, False))  # its walls would turn the sign of a row of cells
+    with pytest.raises(
+        dp.errors.ShapeError, match=r"field for each number in momentum=\(0, 0\), got u of shape \(3, 4\)"
+    ):
+        dp.conservation_law(channel, carry, carry, boundary=dp.free_slip, momentum=(0, 0))(np.ones((3, 4)))
     with pytest.raises(TypeError, match="conservation_law takes real numbers as u, got dtype complex128; write u.real"):
         law(np.ones(4, complex))
     with pytest.raises(TypeError, match="got a masked array; fill it first"):

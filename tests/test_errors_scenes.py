@@ -88,18 +88,24 @@ TABLE = [
     (
         lambda: law(boundary=dp.inflow),
         VALUE,
-        "conservation_law got one of two: inflow at a side needs inflow=; give both or none",
+        "conservation_law got a side of dp.inflow without inflow=, or inflow= without such a side; give both or none",
     ),
     (
         lambda: law(inflow=1.0),
         VALUE,
-        "conservation_law got one of two: inflow= needs a side with dp.inflow; give both or none",
+        "conservation_law got a side of dp.inflow without inflow=, or inflow= without such a side; give both or none",
     ),
     (
         lambda: law(boundary=dp.free_slip),
         VALUE,
         "conservation_law at a free_slip wall needs momentum, the number of a field for each "
         "axis, got None; write for example momentum=(1,)",
+    ),
+    (
+        lambda: law(boundary=dp.free_slip, momentum=0)(np.ones(4)),
+        SHAPE,
+        "conservation_law needs a field for each number in momentum=(0,), got u of shape (4,); write u[None] for a "
+        "single field",
     ),
     (
         lambda: law()(np.ones(5)),
@@ -135,7 +141,7 @@ TABLE = [
     (
         lambda: flow(scalars={"heat": {}}),
         SHAPE,
-        "flow_step needs the scalars ['heat'], got {}; write step.start(v, params, s)",
+        "flow_step needs the scalars ['heat'], got []; write step.start(v, params, s)",
     ),
     (
         lambda: drift(),

@@ -141,7 +141,9 @@ def test_refusals():
     ):
         dp.flow_step(grid, 1.0, scalars={"heat": {"diffusivity": 9.0}})
     step = dp.flow_step(grid, 0.1, scalars={"heat": {}})
-    with pytest.raises(dp.errors.ShapeError, match=r"flow_step needs the scalars \['heat'\], got {}; write step.start"):
+    with pytest.raises(
+        dp.errors.ShapeError, match=r"flow_step needs the scalars \['heat'\], got \[\]; write step.start"
+    ):
         step.start(np.zeros(40))
     with pytest.raises(dp.errors.ShapeError, match="flow_step takes a dict of v, p, a, s and r as its state"):
         step({"v": np.zeros(40)})

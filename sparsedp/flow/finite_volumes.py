@@ -59,12 +59,13 @@ def conservation_law(
         point, the field's axis left out (Rusanov's flux); or a pair, the slowest and the fastest with their signs
         (the flux of Harten, Lax and van Leer, which smears less).
     scheme : str
-        How values at faces are found: "van_leer" (limited slopes, second order), "upwind" (first order), or another
+        How values at faces are made: "van_leer" (limited slopes, second order), "upwind" (first order), or another
         one of `dp.transport`.
     boundary : condition, or dict of conditions
         outflow: waves leave. free_slip: a wall, needs `momentum`. inflow: what `inflow` says.
     momentum : int or tuple of int, optional
-        Which field is the momentum along each axis: it changes its sign at walls.
+        Which field is the momentum along each axis: it changes its sign at walls. In 2-D (1, 2) says that u[1] and
+        u[2] are the momenta along x and y.
     inflow : number, array, or callable, optional
         The state beyond sides of inflow, in a shape that fits the state's; or ``inflow(params, axis, side)``, side 0
         (lower) or 1 (upper).
@@ -84,7 +85,7 @@ def conservation_law(
     ValueError
         If scheme, boundary or momentum is none of the above, or something is missing.
     ShapeError
-        If the state, or what a function returns, has the wrong shape.
+        If the state, or what a function returns, has the wrong shape, or the state has no field for a momentum.
     NonFiniteError
         If a speed is NaN or infinite: often a density or a depth has become negative.
     TypeError
@@ -110,6 +111,16 @@ def conservation_law(
     >>> law = conservation_law(grid, lambda u, p, axis: u**2 / 2, lambda u, p, axis: (u, u), scheme="upwind")
     >>> law(np.array([1.0, 1.0, 2.0, 1.0]))
     array([ 0. ,  0. , -1.5,  1.5])
+
+    Shallow water between walls, with depth u[0], discharge u[1] and gravity 10: a dam starts to break in the middle.
+
+    >>> import autograd.numpy as anp
+    >>> flux = lambda u, g, axis: anp.stack([u[1], u[1] ** 2 / u[0] + 0.5 * g * u[0] ** 2])
+    >>> speed = lambda u, g, axis: anp.abs(u[1] / u[0]) + anp.sqrt(g * u[0])
+    >>> water = conservation_law(Grid(4), flux, speed, boundary=free_slip, momentum=1)
+    >>> water(np.array([[2.0, 2.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]]), 10.0).round(2)
+    array([[ 0.  , -2.24,  2.24,  0.  ],
+           [ 0.  ,  7.5 ,  7.5 ,  0.  ]])
     """
     check_grid("conservation_law", grid)
     if scheme not in SCHEMES:
@@ -123,8 +134,10 @@ def conservation_law(
     for side in conditions - {outflow, free_slip, inflow_side}:
         raise ValueError(f"conservation_law takes outflow, free_slip or inflow, got {side}; write one of them")
     if (inflow_side in conditions) != (inflow is not None):
-        words = "inflow at a side needs inflow=" if inflow is None else "inflow= needs a side with dp.inflow"
-        raise ValueError(f"conservation_law got one of two: {words}; give both or none")
+        raise ValueError(
+            "conservation_law got a side of dp.inflow without inflow=, or inflow= without such a side; "
+            "give both or none"
+        )
     momentum = _momentum(grid, momentum) if free_slip in conditions else None
     return ConservationLaw(grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium)
 
@@ -188,6 +201,12 @@ class ConservationLaw(Remade):
         u, shape = u if hasattr(u, "shape") else np.asarray(u), self.grid.shape
         if u.shape[-len(shape) :] != shape or u.ndim > len(shape) + 1:
             raise ShapeError(f"conservation_law takes u of shape (fields, {', '.join(map(str, shape))}), got {u.shape}")
+        fields, momentum = u.shape[0] if u.ndim > len(shape) else 0, self.given[5]
+        if momentum and fields <= max(momentum):  # without a field's axis a row of cells would change its sign
+            raise ShapeError(
+                f"conservation_law needs a field for each number in momentum={momentum}, got u of shape {u.shape}; "
+                "write u[None] for a single field"
+            )
         kind = dtype_of(u)
         if kind.kind not in "biuf":
             raise TypeError(f"conservation_law takes real numbers as u, got dtype {kind}; write u.real")
@@ -286,8 +305,8 @@ class Axis:
         self.cell = beyond % n  # what a place of the padded line repeats
         for upper, side in enumerate(sides):
             ghosts = slice(*GHOST_CELLS[upper])
-            mirrored = 2 * n * upper - 1 - beyond[ghosts]
-            self.cell[ghosts] = np.clip(mirrored, 0, n - 1) if side is free_slip else upper * (n - 1)
+            mirror = 2 * n * upper - 1 - beyond[ghosts]
+            self.cell[ghosts] = np.clip(mirror, 0, n - 1) if side is free_slip else upper * (n - 1)
         self.pad, _ = linear("ghost_cells", self._pad, self._unpad)
         self.widths, padded = self._along(line), line[self.cell]
         gaps = padded[1:] + padded[:-1]

@@ -188,7 +188,7 @@ class FlowStep(Remade):
         self.made, self.strict, self.implicit = (*given, scalars, unstable), unstable == "raise", implicit
         self.pressure, self.divergence = self.project.pressure, divergence(grid)
         self.slope = gradient(grid, setup.pressure_conditions, solid)
-        self.kept = mask(grid.faces, setup.open)
+        self.open = mask(grid.faces, setup.open)
         # A force is for faces that are free: an implicit viscosity would carry it from the others into the fluid.
         self.free = mask(
             grid.faces, faces_that(grid, resolve(grid, boundary, no_slip), solid, lambda side: side == outflow)
@@ -209,7 +209,8 @@ class FlowStep(Remade):
         v, s = self.project(v), {} if s is None else s
         if not isinstance(s, dict) or s.keys() != self.scalars.keys():
             raise ShapeError(
-                f"flow_step needs the scalars {sorted(self.scalars)}, got {s!r}; write step.start(v, params, s)"
+                f"flow_step needs the scalars {sorted(self.scalars)}, got "
+                f"{list(s) if isinstance(s, dict) else type(s).__name__}; write step.start(v, params, s)"
             )
         state = {"v": v, "p": np.zeros(self.grid.shape), "a": self.acceleration(v, params, s)}
         return state | ({"s": s, "r": self._rates(v, s, params)} if s else {})
@@ -227,7 +228,7 @@ class FlowStep(Remade):
         if self.viscous is not None:
             ahead = self.viscous.relaxed(ahead, v)
         q = self.pressure(ahead)
-        new = {"v": self.kept(ahead) + self.slope(q), "p": p - q / dt, "a": a}
+        new = {"v": self.open(ahead) + self.slope(q), "p": p - q / dt, "a": a}
         if s:
             new["r"] = self._rates(v, s, params)
             new["s"] = {k: one.step(s[k], new["r"][k], state["r"][k]) for k, one in self.scalars.items()}

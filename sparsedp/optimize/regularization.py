@@ -4,6 +4,7 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.constants import constant
 from sparsedp.fields import is_number
 from sparsedp.grid import check_grid
 from sparsedp.operators.boundary import interior
@@ -23,7 +24,7 @@ def total_variation(grid, eps, solid=None):
     eps : float
         Slopes well above it count by their size, those below by their square: > 0 [unit / length].
     solid : bool array, shape `grid.shape`, optional
-        Cells that are not looked at, nor the jumps to them.
+        Cells that are left out, with the jumps to them.
 
     Returns
     -------
@@ -40,7 +41,8 @@ def total_variation(grid, eps, solid=None):
     Notes
     -----
     Formula: sum over cells of volume (sqrt(g^2 + eps^2) - eps). Along each axis g^2 is the mean of the squared slopes
-    on the faces of a cell that are neither walls nor at a solid: a ramp counts the same in the corner.
+    on the faces of a cell that are neither walls nor at a solid: a ramp counts the same in the corner. A jump across
+    one face is seen by half from both of its cells, and counts sqrt(2) times its height.
     Source: L. I. Rudin, S. Osher, E. Fatemi, Physica D 60 (1992) 259-268.
 
     Examples
@@ -54,7 +56,7 @@ def total_variation(grid, eps, solid=None):
         raise ValueError(f"total_variation needs eps > 0, a slope that counts as small, got {eps!r}")
     square, volumes = _square(grid, "total_variation", solid)
     return Made(
-        lambda u: anp.sum(volumes * (anp.sqrt(square(u) + eps**2) - eps)), total_variation, grid, eps, _own(solid)
+        lambda u: anp.sum(volumes * (anp.sqrt(square(u) + eps**2) - eps)), total_variation, grid, eps, constant(solid)
     )
 
 
@@ -65,7 +67,7 @@ def smoothness(grid, solid=None):
     ----------
     grid : Grid
     solid : bool array, shape `grid.shape`, optional
-        Cells that are not looked at, nor the jumps to them.
+        Cells that are left out, with the jumps to them.
 
     Returns
     -------
@@ -84,11 +86,7 @@ def smoothness(grid, solid=None):
     8.0
     """
     square, volumes = _square(grid, "smoothness", solid)
-    return Made(lambda u: 0.5 * anp.sum(volumes * square(u)), smoothness, grid, _own(solid))
-
-
-def _own(solid):
-    return None if solid is None else np.array(solid)
+    return Made(lambda u: 0.5 * anp.sum(volumes * square(u)), smoothness, grid, constant(solid))
 
 
 def _square(grid, name, solid):
