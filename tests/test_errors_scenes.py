@@ -172,7 +172,7 @@ TABLE = [
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=1.0),
         TYPE,
-        "damping needs a pair, for both fields of the state, got float",
+        "damping needs a pair, for both fields of the state, got float; write (s, None)",
     ),
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=(-1.0, 0.0)),
@@ -182,7 +182,8 @@ TABLE = [
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=(1.0, 0.0)).back((1.0, 1.0)),
         VALUE,
-        "a leapfrog step with damping cannot be reversed: what it takes away grows on the way back",
+        "a leapfrog step with damping cannot be reversed: what it takes away grows on the way back; give rollout a "
+        "memory in bytes",
     ),
     (
         lambda: dp.stepper("rk4", fast, 0.1).back(1.0),
@@ -198,6 +199,11 @@ TABLE = [
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=((1.0, 2.0), None))((1.0, 1.0)),
         SHAPE,
         "damping has 2 parts for a field of 1; give one for each",
+    ),
+    (
+        lambda: dp.sponge(LINE, {"y": (2, 2)}, 1.0),
+        VALUE,
+        "sponge on Grid(4 cells, size 4) needs cells along ['x'], got ['y']; leave out the others",
     ),
     (
         lambda: dp.sponge(LINE, 5, 1.0),
@@ -223,6 +229,11 @@ TABLE = [
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=0.0),
         VALUE,
         "admm needs weight > 0, got 0.0",
+    ),
+    (
+        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, inner=0),
+        VALUE,
+        "admm needs inner >= 1 steps in a round, or a function, got 0; write inner=10",
     ),
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, batches=[1]),

@@ -60,7 +60,9 @@ class Staggered:
         for rate in rates:
             check_takes("leapfrog", rate, 2, "lambda field, params: ...")
         if damping is not None and not (isinstance(damping, (tuple, list)) and len(damping) == 2):
-            raise TypeError(f"damping needs a pair, for both fields of the state, got {type(damping).__name__}")
+            raise TypeError(
+                f"damping needs a pair, for both fields of the state, got {type(damping).__name__}; write (s, None)"
+            )
         for rate in map(plain, leaves(damping)):
             if rate is not None and not (np.all(np.isfinite(rate)) and np.all(rate >= 0)):
                 raise ValueError("damping needs finite rates >= 0 [1 / time]; take dp.sponge(grid, cells, speed)")
@@ -84,7 +86,8 @@ class Leapfrog(Scheme):
         """Refuse a step that loses something."""
         if self.problem.damping is not None:
             raise ValueError(
-                "a leapfrog step with damping cannot be reversed: what it takes away grows on the way back"
+                "a leapfrog step with damping cannot be reversed: what it takes away grows on the way back; give "
+                "rollout a memory in bytes"
             )
 
     def back(self, state, params, h):
@@ -123,8 +126,8 @@ def sponge(grid, cells, speed, echo=1e-3):
     ----------
     grid : Grid
     cells : int, or dict
-        How many cells deep the sponge is at every bounded end; or {"x": (lower, upper), ...}, 0 for none, axes that are
-        not named have none.
+        How many cells deep the sponge is at every bounded end; or {"x": 8, "y": (lower, upper)}, 0 for none, axes that
+        are not named have none.
     speed : float
         Of the waves there, the fastest [length / time].
     echo : float
@@ -133,12 +136,13 @@ def sponge(grid, cells, speed, echo=1e-3):
     Returns
     -------
     (array of grid.shape, array of grid.faces.shape)
-        Rates in the cells and on the faces [1 / time]: for the state (p, v) of pressures and velocities.
+        Rates in the cells and on the faces [1 / time]: for the state (p, v) of pressures and velocities, as the
+        `damping` of `stepper` takes them.
 
     Raises
     ------
     ValueError
-        If a sponge is deeper than its axis, or speed or echo are out of range.
+        If a sponge is deeper than its axis, an axis that is named has no ends, or speed or echo are out of range.
 
     Notes
     -----
@@ -160,12 +164,15 @@ def sponge(grid, cells, speed, echo=1e-3):
     check_grid("sponge", grid)
     if not (is_number(speed) and 0 < speed < np.inf and is_number(echo) and 0 < echo < 1):
         raise ValueError(f"sponge needs a speed > 0 and an echo between 0 and 1, got {speed!r} and {echo!r}")
-    deep = cells if isinstance(cells, dict) else dict.fromkeys(grid.axes, (cells, cells))
+    bounded = [name for name, periodic in zip(grid.axes, grid.periodic, strict=True) if not periodic]
+    depths = cells if isinstance(cells, dict) else dict.fromkeys(bounded, cells)
+    if set(depths) - set(bounded):
+        raise ValueError(f"sponge on {grid} needs cells along {bounded}, got {list(depths)}; leave out the others")
     rates = []
     for places in (grid.centres(), *map(grid.face_centres, range(grid.dim))):
         total = np.zeros(places[0].shape)
-        for axis, name in enumerate(AXES[: grid.dim]):
-            for upper, count in enumerate(() if grid.periodic[axis] else deep.get(name, (0, 0))):
+        for axis, name in enumerate(grid.axes):
+            for upper, count in enumerate(np.broadcast_to(depths.get(name, 0), 2)):
                 total += _rate(grid, axis, upper, count, places[axis]) * (POWER + 1) / 2 * speed * log(1 / echo)
         rates.append(total)
     return rates[0], grid.join(*rates[1:])
@@ -175,7 +182,7 @@ def _rate(grid, axis, upper, count, x):
     """(depth / width)^POWER / width at the places x along an axis."""
     widths = grid.widths[axis]
     if not (is_whole(count, 0) and count <= widths.size):
-        raise ValueError(f"sponge on {AXES[axis]} needs 0 to {widths.size} cells, got {count!r}")
+        raise ValueError(f"sponge on {AXES[axis]} needs 0 to {widths.size} cells, got {count}")
     width = np.sum(widths[-count:] if upper else widths[:count]) if count else np.inf
     wall = grid.origin[axis] + upper * np.sum(widths)
     return np.maximum(1 - np.abs(x - wall) / width, 0.0) ** POWER / width if count else 0.0

@@ -148,8 +148,8 @@ class Radau(Adaptive):
                 return None, None, np.inf
             rest, size = E @ z / h, rates.sizes(v, v + z[2])
             error = rates.real(rates.f + rest, False)
-            found = norm(error / size) / self.tolerance
-        return z, v + z[2], found if np.isfinite(found) else np.inf
+            ratio = norm(error / size) / self.tolerance
+        return z, v + z[2], ratio if np.isfinite(ratio) else np.inf
 
 
 class Rates:
@@ -209,8 +209,8 @@ class Rates:
         shapes, rows = list(map(np.shape, values)), []
         for unit in np.eye(self.size):
             backs = pull([unit[span].reshape(shape)[()] for span, shape in zip(self.spans, shapes, strict=True)])
-            found = [pair for pair, moves in zip(zip(backs, leaves(tree), strict=True), moving, strict=True) if moves]
-            parts = [np.ravel(0.0 * leaf if back is None else back) for back, leaf in found]
+            pairs = [pair for pair, moves in zip(zip(backs, leaves(tree), strict=True), moving, strict=True) if moves]
+            parts = [np.ravel(0.0 * leaf if back is None else back) for back, leaf in pairs]
             rows.append(np.concatenate([*parts, self.still]))
         return np.array(rows)
 

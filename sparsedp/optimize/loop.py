@@ -94,10 +94,11 @@ def minimize(
         physical_gradient: physics, inverse, rate=1.0. apart=True: residuals along axis 0 are samples, and the loss
         takes every leaf of x with a leading axis of copies, one for each (a few products give the whole Jacobian).
         dense: whether the Jacobian is formed; None: when it is small. truncation, rank: see `update_direction`.
-        admm: weight, operator=None (K, linear, from x to an array; x itself where None), rho=None (the penalty at
-        first), inner=10 (steps of lbfgs in a round, or ``inner(target, rho, x)`` -> the x that minimizes loss(x) +
-        rho/2 |K x - target|^2), prox=None (``prox(v, t)`` instead of the soft threshold). Its iterations are rounds,
-        and a tolerance of 1e-4 is usual.
+        admm: weight (of the sum over entries, not of an integral: few jumps on a uniform grid are asked for by
+        operator=dp.gradient(grid) and a weight times the volume of a cell), operator=None (K, linear, from x to an
+        array; None for x itself, which is one array then), rho=None (the penalty at first), inner=10 (steps of lbfgs in
+        a round, or ``inner(target, rho, x)`` -> the x that minimizes loss(x) + rho/2 |K x - target|^2), prox=None
+        (``prox(v, t)`` instead of the soft threshold). Its iterations are rounds, and a tolerance of 1e-4 is usual.
 
     Returns
     -------

@@ -19,7 +19,7 @@ import numpy as np
 
 from sparsedp.derivative import vjp
 from sparsedp.errors import ShapeError
-from sparsedp.fields import is_number
+from sparsedp.fields import is_number, is_whole
 from sparsedp.ledger import thread
 from sparsedp.optimize.result import Minimum, Record
 from sparsedp.tree import norm
@@ -37,6 +37,8 @@ def admm(
     for name, value in (("weight", weight), ("rho", 1.0 if rho is None else rho)):
         if not (is_number(value) and 0 < value < np.inf):
             raise ValueError(f"admm needs {name} > 0, got {value!r}")
+    if not (callable(inner) or is_whole(inner, 1)):
+        raise ValueError(f"admm needs inner >= 1 steps in a round, or a function, got {inner!r}; write inner=10")
     K = (lambda x: 1.0 * x) if operator is None else operator
     prox = prox or (lambda v, t: np.sign(v) * np.maximum(np.abs(v) - t, 0.0))
     x, clock, solves, count = start, time.perf_counter(), thread.solves, 0
@@ -47,13 +49,13 @@ def admm(
         rho = weight / (float(np.mean(np.abs(z))) or 1.0)
     message, converged = f"stopped after {maxiter} rounds, as maxiter asks", False
 
-    def seen(residual):
+    def record(residual):
         value = float(loss(x)) + weight * float(np.sum(np.abs(K(x))))
         now = time.perf_counter() - clock
         history.append(Record(len(history), value, residual, now, count, (), thread.solves - solves))
         return callback is not None and len(history) > 1 and callback(history[-1], x)
 
-    seen(np.inf)
+    record(np.inf)
     for number in range(int(maxiter)):
         target = z - w
         if callable(inner):
@@ -72,7 +74,7 @@ def admm(
         w = w + image - z
         primal = norm(image - z) / (max(norm(image), norm(z)) or 1.0)
         dual = norm(pull(z - before)) / (norm(pull(w)) or 1.0)
-        if seen(primal):
+        if record(primal):
             message = "stopped by the callback"
             break
         if max(primal, dual) <= tolerance:
