@@ -41,6 +41,16 @@ TABLE = [
         "floor must hold numbers >= 0, in the units of u, got 'small'; write for example 1e-3",
     ),
     (
+        lambda: dp.stepper("rk4", lambda u, p: -u, 0.1, tolerance=1e-3, floor=np.ones(2))(np.ones(3)),
+        dp.errors.ShapeError,
+        "floor must be one number or fit the state, of shapes [(3,)], got [(2,)]; give one for each array",
+    ),
+    (
+        lambda: dp.stepper("radau", lambda u, p: -u, 0.1, tolerance=1e-3, floor=(1.0, 2.0))(np.ones(3)),
+        dp.errors.ShapeError,
+        "floor must be one number or fit the state, of shapes [(3,)], got [(), ()]; give one for each array",
+    ),
+    (
         lambda: dp.stepper("imex", decay, 0.1),
         TYPE,
         "imex needs the stiff linear term: write linear=L or linear=(L, coefficient)",

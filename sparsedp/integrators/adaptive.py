@@ -38,7 +38,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import constant
-from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
+from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.space import Space
@@ -110,7 +110,16 @@ class Adaptive(Scheme):
         return self._followed(path, given) if traced else path[-1].new
 
     def _check_tolerance(self, u):
-        """Steps of a state that cannot hold the digits asked for would shrink to nothing."""
+        """Refuse a floor that does not fit the state, and digits that it cannot hold: steps would shrink to nothing."""
+        shapes = [np.shape(plain(leaf)) for leaf in leaves(u)]
+        try:
+            for floor, shape in zip(self._floors(len(shapes)), shapes, strict=True):
+                np.broadcast_to(floor, shape)
+        except ValueError:
+            raise ShapeError(
+                f"floor must be one number or fit the state, of shapes {shapes}, got {[*map(np.shape, self.floors)]}; "
+                "give one for each array"
+            ) from None
         for leaf in filter(is_variable, leaves(u)):
             rounding = np.finfo(dtype_of(leaf)).eps
             if self.tolerance < 4 * rounding:
@@ -189,12 +198,15 @@ class Adaptive(Scheme):
         """fine + weight (fine - whole)."""
         return combine(fine, (weight, fine), (-weight, whole)) if weight else fine
 
+    def _floors(self, count):
+        """A floor for each array of the state; a lone one serves all."""
+        return self.floors * count if len(self.floors) == 1 else self.floors
+
     def sizes(self, *states):
         """For each array of the state |u| + floor, to which its errors are compared."""
         columns = list(zip(*map(leaves, states), strict=True))
-        floors = self.floors * len(columns) if len(self.floors) == 1 else self.floors
         sizes = [np.max(np.abs(parts), axis=0) for parts in columns]
-        pairs = zip(sizes, floors, strict=True)
+        pairs = zip(sizes, self._floors(len(columns)), strict=True)
         return [size + (FLOOR * np.max(size, initial=0.0) if floor is None else floor) for size, floor in pairs]
 
     def _error(self, u, new, whole):
