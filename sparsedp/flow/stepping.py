@@ -5,7 +5,7 @@
 
 with a(v) = force(v) - div(v v), and + nu (L v + B) in place of the last term where viscosity is explicit:
 Adams-Bashforth for what is explicit, the trapezoidal rule for an implicit viscosity, and a pressure that is corrected,
-not found anew (incremental).
+not solved for anew (incremental).
 Source: van Kan, SIAM J. Sci. Stat. Comput. 7 (1986), second order pressure correction.
 
 Scalars, such as heat or dye, go along in the same way, with the velocity of the same time:
@@ -83,7 +83,9 @@ def flow_step(
         Of cell fields that the flow carries: ``{"heat": {"diffusivity": 0.1, "boundary": {"x": dp.dirichlet},
         "values": values, "source": lambda s, params: ...}}``, all four optional: a number >= 0 [length^2 / time], a
         condition or dict (default neumann), wall values as `lift` takes them, a rate [scalar / time] that gets the dict
-        of all scalars. The force is then ``force(v, s, params)``.
+        of all scalars. Values for x-lower, x-upper, y-lower and y-upper:
+        ``dp.lift(grid, {"x": dp.dirichlet}).domain.join(1.0, 0.0, 0.0, 0.0)``. The force is then
+        ``force(v, s, params)``.
     unstable : "raise" or "allow"
         What to do when a step is so long that waves would grow.
 
@@ -98,7 +100,7 @@ def flow_step(
     Raises
     ------
     ValueError
-        If dt or the viscosity is out of range, or a word of `boundary` is not known.
+        If dt or the viscosity is out of range, or a scalar has another entry than those four.
     ShapeError
         On use, if the state is not one that ``step.start`` makes.
     DerivativeError

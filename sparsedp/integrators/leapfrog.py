@@ -183,6 +183,7 @@ def _rate(grid, axis, upper, count, x):
     widths = grid.widths[axis]
     if not (is_whole(count, 0) and count <= widths.size):
         raise ValueError(f"sponge on {AXES[axis]} needs 0 to {widths.size} cells, got {count}")
+    count = int(count)  # 2.0 counts as a whole number
     width = np.sum(widths[-count:] if upper else widths[:count]) if count else np.inf
     wall = grid.origin[axis] + upper * np.sum(widths)
     return np.maximum(1 - np.abs(x - wall) / width, 0.0) ** POWER / width if count else 0.0

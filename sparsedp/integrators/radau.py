@@ -75,7 +75,7 @@ class Radau(Adaptive):
     ----------
     problem : Problem
     jacobian : callable or None
-        For Newton's method alone; derivatives are found from the rate.
+        For Newton's method alone; derivatives are made from the rate.
     tolerance : float or None
         As `Adaptive`; None: one step.
     floor : None, number, or tree like the state

@@ -79,6 +79,10 @@ def smoothness(grid, solid=None):
     ShapeError
         If `solid` has another shape than the grid.
 
+    Notes
+    -----
+    Formula: 1/2 sum over cells of volume g^2, g^2 as in `total_variation`.
+
     Examples
     --------
     >>> from sparsedp import Grid

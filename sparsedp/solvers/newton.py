@@ -481,7 +481,7 @@ class Newton:
         reached = f"relative residual {run.residual:.1e}, wanted {self.rtol:g} ({word})"
         hint = self.jacobians.hint(self.J) if self.J is not None else ""
         if word == "stagnated" and self.J.singular:
-            hint += "; its Jacobian is singular there, start from another guess"
+            hint += "; its Jacobian is singular there, start from another guess or fix what is free by a constant"
         elif not (reason or hint or self.steps):
             hint = "; start from the solution for nearby parameters, or raise maxiter"
         raise ConvergenceError(

@@ -126,8 +126,8 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     -------
     EllipticSolver
         Call it as ``solve(k, b, shift=0.0)``: k a number or one value for each face, real and >= 0 or
-        complex, or a tensor for each cell, shape (dim, dim, *grid.shape), positive definite; b a field on
-        the cells; shift a number or one for each cell, real or complex; all finite.
+        complex, or a tensor for each cell, shape (dim, dim, *grid.shape), its symmetric real part positive
+        definite; b a field on the cells; shift a number or one for each cell, real or complex; all finite.
         Differentiable in all three, to every order. The set-up depends on the content of (k, shift); the
         last two are kept.
 
