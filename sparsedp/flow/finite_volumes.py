@@ -59,8 +59,8 @@ def conservation_law(
         point, the field's axis left out (Rusanov's flux); or a pair, the slowest and the fastest with their signs
         (the flux of Harten, Lax and van Leer, which smears less).
     scheme : str
-        How values at faces are made: "van_leer" (limited slopes, second order), "upwind" (first order), or another
-        one of `dp.transport`.
+        How values at faces are made: "van_leer" (limited slopes, second order) or "upwind" (first order), the
+        Eulerian schemes of `dp.transport`.
     boundary : condition, or dict of conditions
         outflow: waves leave. free_slip: a wall, needs `momentum`. inflow: what `inflow` says.
     momentum : int or tuple of int, optional
