@@ -91,7 +91,7 @@ BUDGETS = {
     "advection": 14_000,
     "check": 14_850,
     "flow": 9_950,  # conservation laws: 2 850; scalars and the Courant limit of flow_step: 1 450
-    "integrators": 16_300,  # radau: 4 400; leapfrog and sponge: 1 250
+    "integrators": 16_350,  # radau: 4 400; leapfrog and sponge: 1 250
     "kernels": 14_000,
     "network": 2_650,
     "operators": 6_600,  # tensors: 800

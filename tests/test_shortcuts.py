@@ -7,6 +7,7 @@ import autograd.numpy as anp
 import numpy as np
 import pytest
 from autograd.extend import defvjp, primitive
+from autograd.tracer import getval
 
 import sparsedp as dp
 from sparsedp.derivative import pushforward
@@ -181,3 +182,17 @@ def test_a_gradient_of_small_steps_takes_a_few_of_their_values():
     value = seconds(lambda: of_rates(POINT))
     assert seconds(lambda: dp.value_and_grad(of_rates)(POINT)) < 14 * value  # measured: 8.8, by autograd's dispatch 20
     assert seconds(lambda: pushforward(of_rates, POINT, np.ones(3))) < 8 * value  # measured: 5.8, 9.5
+
+
+def test_powers_have_the_bits_of_the_plain_ones():
+    """A rollout that runs a step again, without a tape, compares bits."""
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        s, u = np.float64(rng.random() + 0.3), rng.random(7) + 0.3
+        for power in (2, 3, 1.5, -1, 0.5, np.float64(2.5)):
+            for x in (s, u):
+                plain = []
+                dp.value_and_grad(
+                    lambda x, power=power, plain=plain: anp.sum(plain.append(getval(x**power)) or x**power)
+                )(x)
+                assert np.array_equal(plain[0], x**power)
