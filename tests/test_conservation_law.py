@@ -340,3 +340,33 @@ def test_refused_values():
     given = dp.conservation_law(LINE, carry, carry, boundary=dp.inflow, inflow=np.ones((3, 2)))
     with pytest.raises(dp.errors.ShapeError, match=r"inflow of a conservation_law must have shape \(2,\)"):
         given(np.ones(4))
+
+
+def test_a_speed_below_0_is_refused():
+    """It would take the mean flux, which is unstable, for the flux of the wind."""
+    u = np.array([1.0, 2.0, 4.0, 3.0])
+    for speed in (lambda u, p, axis: -u, lambda u, p, axis: (u + 1.0, u - 1.0)):
+        law = dp.conservation_law(LINE, carry, speed)
+        for use in (law, law.time_step):
+            with pytest.raises(ValueError, match="speed of a conservation_law must be >= 0, or a pair, the slowest"):
+                use(u)
+
+
+@pytest.mark.parametrize("name", ["flux", "speed", "source", "equilibrium"])
+def test_complex_numbers_are_refused(name):
+    wave = dict(flux=carry, speed=carry)
+    given = np.ones(4, complex) if name == "equilibrium" else lambda u, *rest: u + 0j
+    with pytest.raises(TypeError, match=f"the {name} of a conservation_law must be real, got complex numbers; write"):
+        dp.conservation_law(LINE, **wave | {name: given})(np.ones(4))
+
+
+@pytest.mark.parametrize("name", ["flux", "speed", "source"])
+def test_functions_cannot_write_into_what_they_get(name):
+    def doubled(u, *rest):
+        u *= 2.0
+        return u
+
+    u = np.array([1.0, 2.0, 4.0, 3.0])
+    with pytest.raises(ValueError, match="read-only"):
+        dp.conservation_law(LINE, **dict(flux=carry, speed=carry) | {name: doubled})(u)
+    assert np.array_equal(u, [1.0, 2.0, 4.0, 3.0])

@@ -313,3 +313,23 @@ def test_a_short_step_drags_alike_with_explicit_and_implicit_viscosity(convectiv
     implicit, explicit = (step(step.start(0.0 * walls)) for step in shorts)
     assert np.linalg.norm(explicit["v"]) > 0.1 * dt * nu * np.linalg.norm(walls)
     np.testing.assert_allclose(implicit["v"], explicit["v"], rtol=0, atol=1e-4 * np.max(np.abs(explicit["v"])))
+
+
+def test_a_source_has_the_shape_of_its_field_and_changes_none():
+    def doubled(s, params):
+        s["heat"] *= 2.0
+        return s["heat"]
+
+    grid, heat = dp.Grid((4, 5)), np.ones((4, 5))
+    for source, error, message in (
+        (
+            lambda s, params: np.ones(5),
+            dp.errors.ShapeError,
+            r"a source of 'heat' of shape \(4, 5\), or a number, got an",
+        ),
+        (doubled, ValueError, "read-only"),
+    ):
+        step = dp.flow_step(grid, 0.1, scalars={"heat": {"source": source}})
+        with pytest.raises(error, match=message):
+            step.start(np.zeros(grid.faces.shape), None, {"heat": heat})
+    assert np.all(heat == 1.0)

@@ -29,7 +29,7 @@ from sparsedp.conditions import free_slip, outflow, resolve
 from sparsedp.conditions import inflow as inflow_side
 from sparsedp.constants import constant
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_plain, check_takes, is_whole
+from sparsedp.fields import check_plain, check_takes, frozen, is_whole
 from sparsedp.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.recipe import Remade
@@ -83,13 +83,14 @@ def conservation_law(
     Raises
     ------
     ValueError
-        If scheme, boundary or momentum is none of the above, or something is missing.
+        If scheme, boundary or momentum is none of the above, or something is missing; on use, if a speed is
+        negative, or a function changes its argument in place.
     ShapeError
         If the state, or what a function returns, has the wrong shape, or the state has no field for a momentum.
     NonFiniteError
         If a speed is NaN or infinite: often a density or a depth has become negative.
     TypeError
-        If a function is none, or the state holds no real numbers.
+        If a function is none, or it or the state holds no real numbers.
 
     Notes
     -----
@@ -210,7 +211,7 @@ class ConservationLaw(Remade):
         kind = dtype_of(u)
         if kind.kind not in "biuf":
             raise TypeError(f"conservation_law takes real numbers as u, got dtype {kind}; write u.real")
-        return u if kind.kind == "f" else u * 1.0
+        return frozen(u if kind.kind == "f" else u * 1.0)
 
     def _rate(self, u, e, params):
         """The rate; of an equilibrium e only the slopes take notice."""
@@ -228,7 +229,7 @@ class ConservationLaw(Remade):
 
     def _flux(self, axis, lower, upper, params):
         """The values below and above each face -> the flux of Harten, Lax and van Leer."""
-        both = anp.concatenate([lower, upper], axis.place)
+        both = frozen(anp.concatenate([lower, upper], axis.place))
         f_lower, f_upper = axis.halves(_shaped("flux", self.flux(both, params, axis.number), both))
         slow, fast = map(axis.halves, self._speeds(axis.number, both, params))
         a, b = anp.minimum(anp.minimum(*slow), 0.0), anp.maximum(anp.maximum(*fast), 0.0)
@@ -248,6 +249,11 @@ class ConservationLaw(Remade):
                     f"the speed of a conservation_law is NaN or infinite along {AXES[axis]}: the state has left where "
                     "it has waves (a density or a depth below 0?); take a smaller dt"
                 )
+        if np.any(plain(given[0]) > plain(given[1])):  # no flux would lean against the wind
+            raise ValueError(
+                "the speed of a conservation_law must be >= 0, or a pair, the slowest before the fastest; write abs(u) "
+                "for u, or (u - c, u + c)"
+            )
         return given
 
     def time_step(self, u, params=None, cfl=0.4):
@@ -279,6 +285,8 @@ def _shaped(name, value, u):
     """What a function of the user returned, of the shape of u."""
     if np.shape(value) != np.shape(u):
         raise ShapeError(f"the {name} of a conservation_law must have shape {np.shape(u)} here, got {np.shape(value)}")
+    if dtype_of(value).kind == "c":
+        raise TypeError(f"the {name} of a conservation_law must be real, got complex numbers; write its .real")
     return value
 
 

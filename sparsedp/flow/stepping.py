@@ -27,7 +27,7 @@ import numpy as np
 from sparsedp.conditions import neumann, no_slip, outflow, resolve
 from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_function, is_number, rounded_down
+from sparsedp.fields import check_function, frozen, is_number, rounded_down
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
 from sparsedp.flow.setup import faces_that
@@ -102,7 +102,7 @@ def flow_step(
     ValueError
         If dt or the viscosity is out of range, or a scalar has another entry than those four.
     ShapeError
-        On use, if the state is not one that ``step.start`` makes.
+        On use, if the state is not one that ``step.start`` makes, or a force or source does not fit its field.
     DerivativeError
         If dt or the viscosity is traced.
     NonFiniteError
@@ -248,7 +248,8 @@ class FlowStep(Remade):
 
     def _pushed(self, v, params, *scalars):
         """The force; a number is the same on all faces."""
-        force = self.force(v, *scalars, params)
+        scalars = [{name: frozen(field) for name, field in s.items()} for s in scalars]
+        force = self.force(frozen(v), *scalars, params)
         if np.shape(plain(force)) == ():
             return force * np.ones(v.shape, dtype_of(v))
         if np.shape(plain(force)) != v.shape:
@@ -366,7 +367,13 @@ class Scalar:
         u = s[self.name]
         rate = -self.flow.divergence(v * (self.mean(u) + self.held))
         if self.source is not None:
-            rate = rate + self.source(s, params)
+            source = self.source({name: frozen(field) for name, field in s.items()}, params)
+            if np.shape(plain(source)) not in ((), u.shape):
+                raise ShapeError(
+                    f"flow_step takes a source of {self.name!r} of shape {u.shape}, or a number, got an array of shape "
+                    f"{np.shape(plain(source))}; write one number for each cell"
+                )
+            rate = rate + source
         return rate if self.diffused is None else rate + self.diffused.rate(u, params)
 
     def step(self, u, rate, before):
