@@ -203,7 +203,7 @@ TABLE = [
     (
         lambda: dp.sponge(LINE, {"y": (2, 2)}, 1.0),
         VALUE,
-        "sponge on Grid(4 cells, size 4) needs cells along ['x'], got ['y']; leave out the others",
+        "sponge needs a number of cells or a pair for axes of ['x'], got {'y': (1, 1)}",
     ),
     (
         lambda: dp.sponge(LINE, 5, 1.0),

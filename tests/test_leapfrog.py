@@ -245,3 +245,27 @@ def test_a_way_back_that_loses_the_start_is_refused():
 
     with pytest.raises(dp.errors.DerivativeError, match="reversed steps end 3.0e-03 away from the first state, beside"):
         dp.grad(lambda c: dp.rollout(Wrong(), 1.0, c, 3, memory="reverse"))(1.0)
+
+
+class Lossy:
+    """Steps whose way back is wrong in a small field beside a large one."""
+
+    def __call__(self, state, c):
+        large, small = state
+        return large, small + 0.1 * c
+
+    def back(self, state, c):
+        large, small = state
+        return large, small - 0.1 * c + 0.01
+
+
+def test_a_large_field_hides_no_error_of_a_small_one():
+    loss = lambda c: dp.rollout(Lossy(), (1e9, 1.0), c, 3, memory="reverse")[1] ** 2
+    with pytest.raises(dp.errors.DerivativeError, match="end 3.0e-02 away from the first state, beside states of size"):
+        dp.grad(loss)(1.0)
+
+
+@pytest.mark.parametrize("cells", [{"z": (2, 2)}, {"x": (2,)}, {"x": (1, 1, 1)}, {0: (2, 2)}])
+def test_a_sponge_on_no_axis_is_refused(cells):
+    with pytest.raises(ValueError, match=r"sponge needs a number of cells or a pair for axes of \['x', 'y'\], got"):
+        dp.sponge(dp.Grid((5, 4)), cells, 1.0)

@@ -166,8 +166,8 @@ def sponge(grid, cells, speed, echo=1e-3):
         raise ValueError(f"sponge needs a speed > 0 and an echo between 0 and 1, got {speed!r} and {echo!r}")
     bounded = [name for name, periodic in zip(grid.axes, grid.periodic, strict=True) if not periodic]
     depths = cells if isinstance(cells, dict) else dict.fromkeys(bounded, cells)
-    if set(depths) - set(bounded):
-        raise ValueError(f"sponge on {grid} needs cells along {bounded}, got {list(depths)}; leave out the others")
+    if set(depths) - set(bounded) or any(np.shape(deep) not in ((), (2,)) for deep in depths.values()):
+        raise ValueError(f"sponge needs a number of cells or a pair for axes of {bounded}, got {cells!r}")
     rates = []
     for places in (grid.centres(), *map(grid.face_centres, range(grid.dim))):
         total = np.zeros(places[0].shape)

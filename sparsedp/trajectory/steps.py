@@ -13,7 +13,7 @@ from sparsedp.tree import copied, flatten, leaves
 
 __all__ = ["State", "Steps", "Tape"]
 
-DRIFT = 1e-8  # of the largest state: a gradient by reversed steps has about as many digits
+DRIFT = 1e-8  # of the size of each field: a gradient by reversed steps has about as many digits
 _REMEDY = {
     "state": "return another dict or list",
     "params": "make what changes a part of the state",
@@ -119,15 +119,15 @@ class Steps:
 
     def check_start(self, state, last):
         """Refuse a way back by reversed steps, from the last state, that did not end where the way forward began."""
-        first = [plain(value) for value in self.first.values]
-        size = max((float(np.max(np.abs(plain(x)), initial=0.0)) for x in (*first, *last.values)), default=0.0)
-        pairs = zip(map(plain, state.values), first, strict=True)
-        off = max((float(np.max(np.abs(a - b), initial=0.0)) for a, b in pairs), default=0.0)
-        if not off <= DRIFT * size:
-            raise DerivativeError(
-                f"reversed steps end {off:.1e} away from the first state, beside states of size {size:.1e}: rounding "
-                "grew on the way; give rollout a memory in bytes"
-            )
+        largest = lambda x: float(np.max(np.abs(x), initial=0.0))
+        for values in zip(state.values, self.first.values, last.values, strict=True):  # a large one hides no other
+            back, first, end = map(plain, values)
+            off, size = largest(back - first), max(largest(first), largest(end))
+            if not off <= DRIFT * size:
+                raise DerivativeError(
+                    f"reversed steps end {off:.1e} away from the first state, beside states of size {size:.1e}: "
+                    "rounding grew on the way; give rollout a memory in bytes"
+                )
 
     def _given(self, state):
         """The variables of state and inputs that a step gets: constants where the derivative is cut."""
