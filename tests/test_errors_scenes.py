@@ -203,7 +203,7 @@ TABLE = [
     (
         lambda: dp.sponge(LINE, {"y": (2, 2)}, 1.0),
         VALUE,
-        "sponge needs a number of cells or a pair for axes of ['x'], got {'y': (1, 1)}",
+        "sponge needs a number of cells or a pair for axes of ['x'], got {'y': (2, 2)}",
     ),
     (
         lambda: dp.sponge(LINE, 5, 1.0),

@@ -129,3 +129,32 @@ def test_admm_refuses():
         dp.minimize(loss, np.ones(2), "admm", batches=[1], weight=1.0)
     with pytest.raises(TypeError, match="weight"):
         dp.minimize(loss, np.ones(2), "admm")
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e-9, 1e-100])
+def test_total_variation_of_small_slopes_has_all_its_digits(scale):
+    """Slopes far below eps count by their square."""
+    u = np.random.default_rng(0).standard_normal(GRIDS[1].shape)
+    tv, h1 = dp.total_variation(GRIDS[1], 1.0), dp.smoothness(GRIDS[1])
+    assert tv(scale * u) == pytest.approx(h1(scale * u), rel=50 * scale**2 + 1e-13, abs=0)
+
+
+def test_refused_regularization():
+    for eps in (1e-170, 1e170):
+        with pytest.raises(ValueError, match="total_variation needs eps > 0, a slope that counts as small"):
+            dp.total_variation(GRIDS[0], eps)
+    for term in (dp.total_variation(GRIDS[0], 1.0), dp.smoothness(GRIDS[0])):
+        with pytest.raises(TypeError, match="takes real fields, got complex numbers; add that of u.real and that of"):
+            term(np.ones(7, complex))
+
+
+def test_values_of_admm_with_another_prox_are_those_of_the_loss():
+    loss = lambda x: 0.5 * anp.sum((x - 3.0) ** 2)
+    best = dp.minimize(loss, np.ones(4), "admm", weight=1.0, prox=lambda v, t: v / (1 + 2 * t))
+    assert best.x == pytest.approx(np.ones(4), rel=1e-3) and best.value == loss(best.x)
+
+
+def test_admm_refuses_bounds_that_nobody_keeps():
+    inner = lambda target, rho, x: (3.0 + rho * target) / (1 + rho)
+    with pytest.raises(TypeError, match="admm with a function as inner does not use bounds; leave them out, or keep"):
+        dp.minimize(lambda x: 0.5 * anp.sum((x - 3.0) ** 2), np.ones(4), "admm", weight=1.0, inner=inner, bounds=(0, 1))

@@ -97,8 +97,9 @@ def minimize(
         admm: weight (of the sum over entries, not of an integral: few jumps on a uniform grid are asked for by
         operator=dp.gradient(grid) and a weight times the volume of a cell), operator=None (K, linear, from x to an
         array; None for x itself, which is one array then), rho=None (the penalty at first), inner=10 (steps of lbfgs in
-        a round, or ``inner(target, rho, x)`` -> the x that minimizes loss(x) + rho/2 |K x - target|^2), prox=None
-        (``prox(v, t)`` instead of the soft threshold). Its iterations are rounds, and a tolerance of 1e-4 is usual.
+        a round, or ``inner(target, rho, x)`` -> the x that minimizes loss(x) + rho/2 |K x - target|^2; without bounds),
+        prox=None (``prox(v, t)`` instead of the soft threshold; the values are then those of the loss alone). Its
+        iterations are rounds, and a tolerance of 1e-4 is usual.
 
     Returns
     -------

@@ -11,6 +11,7 @@ from sparsedp.operators.boundary import interior
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.given import from_matrix
 from sparsedp.recipe import Made
+from sparsedp.tape import dtype_of
 
 __all__ = ["smoothness", "total_variation"]
 
@@ -34,9 +35,11 @@ def total_variation(grid, eps, solid=None):
     Raises
     ------
     ValueError
-        If eps is not a finite number > 0.
+        If eps is not a number > 0, from 1e-150 to 1e150.
     ShapeError
         If `solid` has another shape than the grid.
+    TypeError
+        On use, if u is complex.
 
     Notes
     -----
@@ -52,12 +55,15 @@ def total_variation(grid, eps, solid=None):
     >>> print(f"{tv(np.array([0.0, 0.0, 3.0, 3.0])):.3f}")
     4.243
     """
-    if not (is_number(eps) and 0 < eps < np.inf):
+    if not (is_number(eps) and 1e-150 < eps < 1e150):  # its square is a number
         raise ValueError(f"total_variation needs eps > 0, a slope that counts as small, got {eps!r}")
     square, volumes = _square(grid, "total_variation", solid)
-    return Made(
-        lambda u: anp.sum(volumes * (anp.sqrt(square(u) + eps**2) - eps)), total_variation, grid, eps, constant(solid)
-    )
+
+    def integral(u):
+        g = square(u)  # the quotient is the difference of the formula without its cancellation
+        return anp.sum(volumes * g / (anp.sqrt(g + eps**2) + eps))
+
+    return Made(integral, total_variation, grid, eps, constant(solid))
 
 
 def smoothness(grid, solid=None):
@@ -78,6 +84,8 @@ def smoothness(grid, solid=None):
     ------
     ShapeError
         If `solid` has another shape than the grid.
+    TypeError
+        On use, if u is complex.
 
     Notes
     -----
@@ -105,4 +113,10 @@ def _square(grid, name, solid):
         start = stop
     mean = from_matrix(sp.hstack(blocks, format="csr"), grid.faces, grid.cells, name="mean over faces")
     volumes = grid.volumes if solid is None else np.where(solid, 0.0, grid.volumes)
-    return lambda u: mean(inside(slope(u)) ** 2), volumes
+
+    def square(u):
+        if dtype_of(u).kind == "c":
+            raise TypeError(f"{name} takes real fields, got complex numbers; add that of u.real and that of u.imag")
+        return mean(inside(slope(u)) ** 2)
+
+    return square, volumes

@@ -39,7 +39,10 @@ def admm(
             raise ValueError(f"admm needs {name} > 0, got {value!r}")
     if not (callable(inner) or is_whole(inner, 1)):
         raise ValueError(f"admm needs inner >= 1 steps in a round, or a function, got {inner!r}; write inner=10")
+    if callable(inner) and bounds is not None:
+        raise TypeError("admm with a function as inner does not use bounds; leave them out, or keep to them in inner")
     K = (lambda x: 1.0 * x) if operator is None else operator
+    penalty = 0.0 if prox else weight  # what another prox belongs to is not said
     prox = prox or (lambda v, t: np.sign(v) * np.maximum(np.abs(v) - t, 0.0))
     x, clock, solves, count = start, time.perf_counter(), thread.solves, 0
     history: list = []
@@ -50,7 +53,7 @@ def admm(
     message, converged = f"stopped after {maxiter} rounds, as maxiter asks", False
 
     def record(residual):
-        value = float(loss(x)) + weight * float(np.sum(np.abs(K(x))))
+        value = float(loss(x)) + penalty * float(np.sum(np.abs(K(x))))
         now = time.perf_counter() - clock
         history.append(Record(len(history), value, residual, now, count, (), thread.solves - solves))
         return callback is not None and len(history) > 1 and callback(history[-1], x)
