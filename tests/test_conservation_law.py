@@ -370,3 +370,8 @@ def test_functions_cannot_write_into_what_they_get(name):
     with pytest.raises(ValueError, match="read-only"):
         dp.conservation_law(LINE, **dict(flux=carry, speed=carry) | {name: doubled})(u)
     assert np.array_equal(u, [1.0, 2.0, 4.0, 3.0])
+
+
+def test_one_field_is_the_momentum_of_one_axis():
+    with pytest.raises(ValueError, match=r"needs momentum, the number of a field for each axis, got \(1, 1\); write"):
+        dp.conservation_law(dp.Grid((3, 4)), carry, carry, boundary=dp.free_slip, momentum=(1, 1))

@@ -248,8 +248,7 @@ class FlowStep(Remade):
 
     def _pushed(self, v, params, *scalars):
         """The force; a number is the same on all faces."""
-        scalars = [{name: frozen(field) for name, field in s.items()} for s in scalars]
-        force = self.force(frozen(v), *scalars, params)
+        force = self.force(frozen(v), *({name: frozen(field) for name, field in s.items()} for s in scalars), params)
         if np.shape(plain(force)) == ():
             return force * np.ones(v.shape, dtype_of(v))
         if np.shape(plain(force)) != v.shape:
