@@ -21,9 +21,9 @@ def law(**given):
     return dp.conservation_law(LINE, carry, carry, **given)
 
 
-def flow(dt=0.1, v=0.0, **given):
+def flow(dt=0.1, v=0.0, s=None, **given):
     step = dp.flow_step(BOX, dt, **given)
-    return step(step.start(np.full(40, v)))
+    return step(step.start(np.full(40, v), None, s))
 
 
 def turned(u, params):
@@ -305,6 +305,33 @@ TABLE = [
         SHAPE,
         "the gradient has shape (3,) where () is needed: autograd's np.where does not add up "
         "what it spreads; multiply by the condition instead, a * c + b * (1 - c)",
+    ),
+    (
+        lambda: dp.conservation_law(LINE, lambda u, p, axis: 1j * u, carry)(np.ones(4)),
+        TYPE,
+        "the flux of a conservation_law must be real, got complex numbers; write its .real",
+    ),
+    (
+        lambda: law()(-np.ones(4)),
+        VALUE,
+        "the speed of a conservation_law must be >= 0, or a pair, the slowest before the "
+        "fastest; write abs(u) for u, or (u - c, u + c)",
+    ),
+    (
+        lambda: flow(scalars={"heat": {"source": lambda s, params: np.ones(4)}}, s={"heat": np.ones((4, 4))}),
+        SHAPE,
+        "flow_step takes a source of 'heat' of shape (4, 4), or a number, got an array of shape "
+        "(4,); write one number for each cell",
+    ),
+    (
+        lambda: dp.smoothness(LINE)(np.ones(4, complex)),
+        TYPE,
+        "smoothness takes real fields, got complex numbers; add that of u.real and that of u.imag",
+    ),
+    (
+        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, inner=stay, bounds=(0, 1)),
+        TYPE,
+        "admm with a function as inner does not use bounds; leave them out, or keep to them in inner",
     ),
 ]
 
