@@ -42,7 +42,7 @@ from sparsedp.tree import copied, leaves
 
 __all__ = [
     "Recorder", "ReverseNode", "Rule", "apply_operator", "backward", "boxed", "called", "cast", "differentiable",
-    "dtype_of", "fit", "forward_root", "innermost", "is_variable", "isbox", "linear", "new_trace",
+    "dtype_of", "entrywise", "fit", "forward_root", "innermost", "is_variable", "isbox", "linear", "new_trace",
     "of_argument", "plain", "reverse_root", "split_boxes", "through", "traces_of", "untraced",
 ]  # fmt: skip
 
@@ -537,6 +537,20 @@ def linear(name, forward, transpose):
         rule.vjp = lambda nums, ans, x, act=transposed: lambda g: (act(g),)
         rule.jvp = lambda nums, tangents, ans, x, act=rule: act(tangents[0])
     return there, back
+
+
+def entrywise(name, value, slopes):
+    """Name, ``value(a, b)`` entry by entry, ``slopes(a, b)``: its derivatives in both, on the tape too -> a rule."""
+
+    def vjp(nums, ans, a, b):
+        pair = slopes(a, b)
+        return lambda g: tuple(g * pair[num] for num in nums)
+
+    def jvp(nums, tangents, ans, a, b):
+        pair = slopes(a, b)
+        return sum(pair[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
+
+    return Rule(name, value, vjp, jvp)
 
 
 def _apply(op, u):

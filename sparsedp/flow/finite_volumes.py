@@ -33,7 +33,7 @@ from sparsedp.fields import check_plain, check_takes, frozen, is_whole
 from sparsedp.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.recipe import Remade
-from sparsedp.tape import Rule, cast, dtype_of, linear, plain
+from sparsedp.tape import cast, dtype_of, entrywise, linear, plain
 from sparsedp.tree import mapped
 
 __all__ = ["ConservationLaw", "conservation_law"]
@@ -387,16 +387,8 @@ class Axis:
 
     def _limiter(self, limiter, end):
         """A rule: differences to the cells below and above -> what the upper (0) or lower (1) end differs by."""
-
-        def slopes(a, b):
-            return limiter(a, b, *self.distances)[2 + 2 * end :][:2]
-
-        def vjp(nums, ans, a, b):
-            pair = slopes(a, b)
-            return lambda g: tuple(g * pair[num] for num in nums)
-
-        def jvp(nums, tangents, ans, a, b):
-            pair = slopes(a, b)
-            return sum(pair[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
-
-        return Rule("limiter", lambda a, b: limiter(a, b, *self.distances)[end], vjp, jvp)
+        return entrywise(
+            "limiter",
+            lambda a, b: limiter(a, b, *self.distances)[end],
+            lambda a, b: limiter(a, b, *self.distances)[2 + 2 * end :][:2],
+        )

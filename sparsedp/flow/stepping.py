@@ -37,6 +37,7 @@ from sparsedp.operators.transfer import average
 from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import inverse
 from sparsedp.tape import dtype_of, isbox, plain
+from sparsedp.tree import mapped
 
 __all__ = ["FlowStep", "flow_step"]
 
@@ -248,7 +249,7 @@ class FlowStep(Remade):
 
     def _pushed(self, v, params, *scalars):
         """The force; a number is the same on all faces."""
-        force = self.force(frozen(v), *({name: frozen(field) for name, field in s.items()} for s in scalars), params)
+        force = self.force(*mapped(frozen, (v, *scalars)), params)
         if np.shape(plain(force)) == ():
             return force * np.ones(v.shape, dtype_of(v))
         if np.shape(plain(force)) != v.shape:
@@ -366,7 +367,7 @@ class Scalar:
         u = s[self.name]
         rate = -self.flow.divergence(v * (self.mean(u) + self.held))
         if self.source is not None:
-            source = self.source({name: frozen(field) for name, field in s.items()}, params)
+            source = self.source(mapped(frozen, s), params)
             if np.shape(plain(source)) not in ((), u.shape):
                 raise ShapeError(
                     f"flow_step takes a source of {self.name!r} of shape {u.shape}, or a number, got an array of shape "

@@ -256,7 +256,7 @@ class Step(Remade):
                 f"{self.name} has an Operator, which acts on one array, got a {type(u).__name__} as u; "
                 "stack its parts into one array, or apply the Operator inside the rate of an implicit method"
             )
-        h = positive(self.dt(params), "dt") if callable(self.dt) else self.dt
+        h = self._length(params)
         if self.largest < np.inf:
             self._check_stable(float(plain(h)), float(plain(self.problem.coefficient(params))))
         try:
@@ -282,7 +282,10 @@ class Step(Remade):
         """
         self.check_reversible()
         params = (params, *inputs) if inputs else params
-        return like(self.scheme.back(state, params, self.dt(params) if callable(self.dt) else self.dt), state)
+        return like(self.scheme.back(state, params, self._length(params)), state)
+
+    def _length(self, params):
+        return positive(self.dt(params), "dt") if callable(self.dt) else self.dt
 
     def check_reversible(self):
         """Refuse a step that `back` cannot turn round."""

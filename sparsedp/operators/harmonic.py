@@ -18,7 +18,7 @@ from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, cell_beside
 from sparsedp.recipe import Made
 from sparsedp.structure.kronecker import Kronecker
-from sparsedp.tape import Rule, plain
+from sparsedp.tape import entrywise, plain
 
 __all__ = ["harmonic_average"]
 
@@ -99,12 +99,4 @@ def _pair_rule(share):
         from_low, from_high = ratios(low, high)
         return share * from_high**2, (1 - share) * from_low**2
 
-    def vjp(nums, ans, low, high):
-        both = slopes(low, high)
-        return lambda g: tuple(g * both[num] for num in nums)
-
-    def jvp(nums, tangents, ans, low, high):
-        both = slopes(low, high)
-        return sum(both[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
-
-    return Rule("harmonic_average", forward, vjp, jvp)
+    return entrywise("harmonic_average", forward, slopes)

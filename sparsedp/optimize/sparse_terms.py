@@ -52,13 +52,13 @@ def admm(
         rho = weight / (float(np.mean(np.abs(z))) or 1.0)
     message, converged = f"stopped after {maxiter} rounds, as maxiter asks", False
 
-    def record(residual):
-        value = float(loss(x)) + penalty * float(np.sum(np.abs(K(x))))
+    def record(image, residual):
+        value = float(loss(x)) + penalty * float(np.sum(np.abs(image)))
         now = time.perf_counter() - clock
         history.append(Record(len(history), value, residual, now, count, (), thread.solves - solves))
         return callback is not None and len(history) > 1 and callback(history[-1], x)
 
-    record(np.inf)
+    record(z, np.inf)
     for number in range(int(maxiter)):
         target = z - w
         if callable(inner):
@@ -77,7 +77,7 @@ def admm(
         w = w + image - z
         primal = norm(image - z) / (max(norm(image), norm(z)) or 1.0)
         dual = norm(pull(z - before)) / (norm(pull(w)) or 1.0)
-        if record(primal):
+        if record(image, primal):
             message = "stopped by the callback"
             break
         if max(primal, dual) <= tolerance:
