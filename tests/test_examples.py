@@ -117,8 +117,7 @@ def test_implicit_or_unrolled():
         for label in ("multigrid, implicit", "chosen by itself, implicit"):
             assert table[label, n][0] <= taped[0] / 5
         assert cut[2] > 0.1
-    # The same method, 105 iterations there and as many back: 4 to 5 times; 7 when the tape took twice as long.
-    assert table["CG, implicit", 48][0] <= table["CG, 200 iterations unrolled", 48][0] / 4
+    assert table["CG, implicit", 48][0] <= table["CG, 200 iterations unrolled", 48][0] / 5
     assert table["CG, 200 iterations unrolled", 48][2] <= 1e-10  # 200 iterations are enough here
     assert 1e-8 <= table["CG, 200 iterations unrolled", 96][2] <= 1e-4  # and not here
 

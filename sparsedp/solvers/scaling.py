@@ -25,9 +25,9 @@ SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve comput
 
 
 def _blocks(*arrays):
-    """The parts of flat arrays of the same size that belong together."""
-    for start in range(0, arrays[0].size, BLOCK):
-        yield [x[start : start + BLOCK] for x in arrays]
+    """The parts of flat arrays of the same size that belong together; small arrays are one part themselves."""
+    size = arrays[0].size
+    return (arrays,) if size <= BLOCK else ([x[i : i + BLOCK] for x in arrays] for i in range(0, size, BLOCK))
 
 
 def dot(x, y):
