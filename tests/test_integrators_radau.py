@@ -57,9 +57,12 @@ def test_prothero_robinson(stiffness):
 
 
 def test_published_values():
-    """Robertson at 40 s (Hairer and Wanner) and HIRES at 321.8122 s (test set for initial value problems)."""
+    """Robertson at 40 s (Hairer and Wanner), at 1e11 s and HIRES at 321.8122 s (test set for initial value problems)."""
     step = dp.stepper("radau", robertson, 40.0, tolerance=1e-6, floor=SMALL["Robertson"])
     assert step(np.array([1.0, 0, 0]), RATES) == pytest.approx([0.7158, 9.185e-6, 0.2841], rel=1e-3)
+    late = dp.stepper("radau", robertson, 1e11, tolerance=1e-6, floor=np.array([1e-8, 1e-13, 1.0]))
+    end = late(np.array([1.0, 0, 0]), RATES)  # the first step is 1e-16 of the interval
+    assert end == pytest.approx([0.2083340149701255e-7, 0.8333360770334713e-13, 0.9999999791665050], rel=1e-6)
     rate, _, start, params, end, _ = SCENES["HIRES"]
     wanted = [
         0.7371312573325668e-3, 0.1442485726316185e-3, 0.5888729740967575e-4, 0.1175651343283149e-2,

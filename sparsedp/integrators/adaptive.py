@@ -50,7 +50,8 @@ __all__ = ["Adaptive", "Moving", "Taken", "flat", "relative"]
 SAFETY, SMALLEST, LARGEST = 0.9, 0.2, 5.0  # of one change of the length
 QUIET = 1e-2  # share of the tolerance below which an error shows no trend
 FLOOR = 0.1  # share of the largest entry of an array to which errors of small entries are compared
-LEAST = 1e-15  # share of the interval below which no step is tried
+LEAST = 1e-15  # share of the time so far below which no step is tried: its end would be rounded to its start
+TINY = 1e-25  # share of the interval, for the first step
 CAREFUL = 1e-3  # most that is tried first where the rate takes the time: it may be at rest at the start alone
 MOST = 100_000  # trials in one interval
 WINDOW, FAR = 1000, 10  # trials at a pace that would need FAR * MOST for the rest: no use to go on
@@ -150,7 +151,7 @@ class Adaptive(Scheme):
             length *= float(np.clip(change, SMALLEST, most))
             most = LARGEST if error <= 1 else 1.0  # the step after a refused one is not made longer
             turn = trial % self.window == 0
-            if length < LEAST or turn and (1.0 - done) * self.window > FAR * MOST * (done - mark):
+            if length < max(LEAST * done, TINY) or turn and (1.0 - done) * self.window > FAR * MOST * (done - mark):
                 break
             mark = done if turn else mark
         raise ConvergenceError(
@@ -169,7 +170,7 @@ class Adaptive(Scheme):
                 f"the rate of {self.name} must be finite at the state given; take a state in its domain"
             )
         length = 0.01 * (size or 1.0) / (speed * float(h)) if speed > 0 else 1.0
-        return min(max(1e3 * LEAST, length), CAREFUL if self.problem.timed else 1.0)
+        return min(max(1e3 * TINY, length), CAREFUL if self.problem.timed else 1.0)
 
     def _allowed(self, length, left):
         """At most what is left, and not just short of it."""
@@ -188,7 +189,7 @@ class Adaptive(Scheme):
                 error = self._error(u, fine, whole)
                 new = self.joined(fine, whole, self.weight)
         except (UnstableStepError, NonFiniteError, ConvergenceError):
-            if length * SMALLEST < LEAST:
+            if length * SMALLEST < TINY:
                 raise
             return None, None, np.inf
         return middle, new, error if np.isfinite(error) else np.inf
