@@ -57,7 +57,7 @@ def test_prothero_robinson(stiffness):
 
 
 def test_published_values():
-    """Robertson at 40 s (Hairer and Wanner), at 1e11 s and HIRES at 321.8122 s (test set for initial value problems)."""
+    """Robertson at 40 s (Hairer and Wanner), at 1e11 s and HIRES at 321.8122 s (IVP test set)."""
     step = dp.stepper("radau", robertson, 40.0, tolerance=1e-6, floor=SMALL["Robertson"])
     assert step(np.array([1.0, 0, 0]), RATES) == pytest.approx([0.7158, 9.185e-6, 0.2841], rel=1e-3)
     late = dp.stepper("radau", robertson, 1e11, tolerance=1e-6, floor=np.array([1e-8, 1e-13, 1.0]))
