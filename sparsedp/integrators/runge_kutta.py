@@ -1,8 +1,5 @@
 """Runge-Kutta steps. An explicit one is a table of numbers; an implicit one a few stages, x of x = b + h f(x, t).
 
-Where the rate is c L u and nothing else, an explicit step of order p in p stages is the Taylor polynomial T_p(z L) u,
-z = h c, and one node on the tape (functions.py).
-
 Sources: Heun, Z. Math. Phys. 45 (1900); Kutta, Z. Math. Phys. 46 (1901);
 Shu and Osher, J. Comput. Phys. 77 (1988), the strong-stability-preserving step of order 3.
 
@@ -44,7 +41,6 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import ConvergenceError
-from sparsedp.integrators.functions import Taylor, TaylorPolynomials
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
@@ -122,14 +118,16 @@ def _ahead(u, h, row, rates):
 
 
 class Polynomial(Scheme):
-    """The same for u' = c L u."""
+    """The same for u' = c L u, where it is the Taylor polynomial of exp(h c L): by Horner's rule."""
 
     def __init__(self, problem, name):
         super().__init__(problem, name, EXPLICIT[name].order)
-        self.polynomials = TaylorPolynomials(problem.op, f"stepper({name})")
 
     def __call__(self, u, params, t, h):
-        return self.polynomials((Taylor(self.order),), h * self.problem.coefficient(params), u)
+        z, x = h * self.problem.coefficient(params), u
+        for k in range(self.order, 0, -1):
+            x = combine(u, (z / k, self.problem.op(x)))
+        return x
 
 
 # ---- the linear solve ------------------------------------------------------------------------------------------------
