@@ -228,7 +228,7 @@ TABLE = [
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=0.0),
         VALUE,
-        "admm needs weight > 0, got 0.0",
+        "admm needs a positive weight, got 0.0; write weight=0.1",
     ),
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, inner=0),

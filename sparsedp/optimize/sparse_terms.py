@@ -19,8 +19,9 @@ import numpy as np
 
 from sparsedp.derivative import vjp
 from sparsedp.errors import ShapeError
-from sparsedp.fields import is_number, is_whole
+from sparsedp.fields import is_whole
 from sparsedp.ledger import thread
+from sparsedp.optimize.first_order import check_positive
 from sparsedp.optimize.result import Minimum, Record
 from sparsedp.tree import norm
 
@@ -35,8 +36,7 @@ def admm(
 ):
     """The method "admm" of `minimize`, which is `search`: see there."""
     for name, value in (("weight", weight), ("rho", 1.0 if rho is None else rho)):
-        if not (is_number(value) and 0 < value < np.inf):
-            raise ValueError(f"admm needs {name} > 0, got {value!r}")
+        check_positive("admm", name, value, f"write {name}=0.1")
     if not (callable(inner) or is_whole(inner, 1)):
         raise ValueError(f"admm needs inner >= 1 steps in a round, or a function, got {inner!r}; write inner=10")
     if callable(inner) and bounds is not None:
