@@ -375,3 +375,14 @@ def test_functions_cannot_write_into_what_they_get(name):
 def test_one_field_is_the_momentum_of_one_axis():
     with pytest.raises(ValueError, match=r"needs momentum, the number of a field for each axis, got \(1, 1\); write"):
         dp.conservation_law(dp.Grid((3, 4)), carry, carry, boundary=dp.free_slip, momentum=(1, 1))
+
+
+def test_a_lone_field_may_be_the_momentum():
+    """Burgers' equation between walls: u is its own momentum, as a field of the grid and as one of a stack."""
+    half, walls = lambda u, p, axis: 0.5 * u**2, dict(boundary=dp.free_slip, momentum=0)
+    law = dp.conservation_law(LINE, half, lambda u, p, axis: (u, u), **walls)
+    stack = dp.conservation_law(LINE, half, lambda u, p, axis: (u[0], u[0]), **walls)
+    u = np.array([1.0, 2.0, 4.0, 3.0])
+    np.testing.assert_array_equal(law(u), stack(u[None])[0])
+    assert law(u)[-1] == pytest.approx(-law(-u[::-1])[0])  # mirrored, with its sign changed
+    assert dp.check.gradient(lambda u: anp.sum(anp.sin(law(u))), u + 0.1 * np.cos(u)).verdict == "agrees"

@@ -102,10 +102,10 @@ TABLE = [
         "axis, got None; write for example momentum=(1,)",
     ),
     (
-        lambda: law(boundary=dp.free_slip, momentum=0)(np.ones(4)),
+        lambda: law(boundary=dp.free_slip, momentum=1)(np.ones(4)),
         SHAPE,
-        "conservation_law needs a field for each number in momentum=(0,), got u of shape (4,); write u[None] for a "
-        "single field",
+        "conservation_law needs a field for each number in momentum=(1,), got u of shape (4,); give a state that holds "
+        "them all",
     ),
     (
         lambda: law()(np.ones(5)),

@@ -33,7 +33,7 @@ from sparsedp.fields import check_plain, check_takes, frozen, is_whole
 from sparsedp.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.recipe import Remade
-from sparsedp.tape import cast, dtype_of, entrywise, linear, plain
+from sparsedp.tape import cast, dtype_of, entrywise, plain
 from sparsedp.tree import mapped
 
 __all__ = ["ConservationLaw", "conservation_law"]
@@ -172,7 +172,7 @@ class ConservationLaw(Remade):
         self.given = grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium
         self.grid, self.flux, self.speed, self.source, self.equilibrium = grid, flux, speed, source, equilibrium
         self.axes = [
-            Axis(grid, axis, sides[axis] or (), momentum and momentum[axis], inflow, SCHEMES[scheme])
+            Axis(grid, axis, sides[axis] or (None, None), momentum and momentum[axis], inflow, SCHEMES[scheme])
             for axis in range(grid.dim if grid.cells.size else 0)
         ]
 
@@ -206,11 +206,11 @@ class ConservationLaw(Remade):
         u, shape = u if hasattr(u, "shape") else np.asarray(u), self.grid.shape
         if u.shape[-len(shape) :] != shape or u.ndim > len(shape) + 1:
             raise ShapeError(f"conservation_law takes u of shape (fields, {', '.join(map(str, shape))}), got {u.shape}")
-        fields, momentum = u.shape[0] if u.ndim > len(shape) else 0, self.given[5]
-        if momentum and fields <= max(momentum):  # without a field's axis a row of cells would change its sign
+        fields, momentum = u.shape[0] if u.ndim > len(shape) else 1, self.given[5]
+        if momentum and fields <= max(momentum):
             raise ShapeError(
                 f"conservation_law needs a field for each number in momentum={momentum}, got u of shape {u.shape}; "
-                "write u[None] for a single field"
+                "give a state that holds them all"
             )
         kind = dtype_of(u)
         if kind.kind not in "biuf":
@@ -225,7 +225,7 @@ class ConservationLaw(Remade):
             if e is None:
                 lower, upper = axis.beside_faces(padded)
             else:
-                rest = axis.pad(e)
+                rest = axis.padded(e, params, False)
                 lower, upper = (values + axis.between(rest) for values in axis.beside_faces(padded - rest))
             f = self._flux(axis, lower, upper, params)
             total = total + (axis.part(f, 0, -1) - axis.part(f, 1)) / axis.widths
@@ -302,7 +302,7 @@ class Axis:
     grid : Grid
     number : int
         Of the axis.
-    sides : pair of FlowCondition, or () where the axis is periodic
+    sides : pair of FlowCondition, or of None where the axis is periodic
     momentum : int or None
         The field that changes its sign at walls.
     inflow : as `conservation_law` takes it
@@ -315,11 +315,10 @@ class Axis:
         line, n = grid.widths[number], grid.shape[number]
         beyond = np.arange(-GHOSTS, n + GHOSTS)
         self.cell = beyond % n  # what a place of the padded line repeats
-        for upper, side in enumerate(sides):
+        for upper, side in enumerate(sides if sides[0] else ()):
             ghosts = slice(*GHOST_CELLS[upper])
             mirror = 2 * n * upper - 1 - beyond[ghosts]
             self.cell[ghosts] = np.clip(mirror, 0, n - 1) if side is free_slip else upper * (n - 1)
-        self.pad, _ = linear("ghost_cells", self._pad, self._unpad)
         self.widths, padded = self._along(line), line[self.cell]
         gaps = padded[1:] + padded[:-1]
         self.distances = [self._along(gap / padded[1:-1]) for gap in (gaps[:-1], gaps[1:])]
@@ -332,44 +331,38 @@ class Axis:
 
     def part(self, x, start, stop=None):
         """The places from start to stop along this axis."""
-        return x[(Ellipsis, slice(start, stop), *[slice(None)] * (-1 - self.place))]
+        return x[self._at(slice(start, stop))]
+
+    def _at(self, places):
+        """An index of places along this axis."""
+        return (Ellipsis, places, *[slice(None)] * (-1 - self.place))
 
     def halves(self, x):
         """What `_flux` put one after the other."""
         n = x.shape[self.place] // 2
         return self.part(x, 0, n), self.part(x, n)
 
-    def padded(self, u, params):
-        """The field with its ghost cells, and what flows in."""
-        field = self.pad(u)
-        if inflow_side not in self.sides:
-            return field
-        pieces = [self.part(field, *GHOST_CELLS[0]), u, self.part(field, *GHOST_CELLS[1])]
-        for upper, side in enumerate(self.sides):
-            if side is inflow_side:
-                value = self.inflow(params, self.number, upper) if callable(self.inflow) else self.inflow
-                if np.ndim(value) == 1 and u.ndim > self.dim:  # a number for each field
-                    value = anp.reshape(value, (-1,) + (1,) * self.dim)
-                ghosts = value + 0.0 * plain(pieces[2 * upper])
-                pieces[2 * upper] = _shaped("inflow", ghosts, pieces[2 * upper])
-        return anp.concatenate(pieces, self.place)
+    def padded(self, u, params, flows=True):
+        """The field with its ghost cells; `flows`: those beyond an inflow are what flows in, else the last cell."""
+        lower, upper = (self._ghosts(u, params, upper, flows) for upper in (0, 1))
+        return anp.concatenate([lower, u, upper], self.place)
 
-    def _turned(self, x):
-        """The momentum in the ghost cells of walls changes its sign. The array itself."""
-        for side, ghosts in zip(self.sides, GHOST_CELLS, strict=False):
-            if side is free_slip:
-                self.part(x[self.momentum], *ghosts)[...] *= -1
-        return x
+    def _ghosts(self, u, params, upper, flows):
+        """What stands beyond an end."""
+        ghosts, side = u[self._at(self.cell[slice(*GHOST_CELLS[upper])])], self.sides[upper]
+        if side is free_slip:  # the momentum changes its sign
+            signs = 1.0 - 2.0 * (np.arange(len(u)) == self.momentum)
+            return -ghosts if u.ndim == self.dim else ghosts * self._fields(signs)
+        if side is not inflow_side or not flows:
+            return ghosts
+        value = self.inflow(params, self.number, upper) if callable(self.inflow) else self.inflow
+        if np.ndim(value) == 1 and u.ndim > self.dim:
+            value = self._fields(value)
+        return _shaped("inflow", value + 0.0 * plain(ghosts), ghosts)
 
-    def _pad(self, u):
-        return self._turned(np.take(u, self.cell, self.place))
-
-    def _unpad(self, g):
-        g = self._turned(g.copy())
-        u = self.part(g, GHOSTS, -GHOSTS).copy()
-        for k in (*range(GHOSTS), *range(-GHOSTS, 0)):
-            self.part(u, self.cell[k], self.cell[k] + 1)[...] += self.part(g, k, k + 1 or None)
-        return u
+    def _fields(self, numbers):
+        """A number for each field, shaped so that they fit fields."""
+        return anp.reshape(numbers, (-1,) + (1,) * self.dim)
 
     def between(self, padded):
         """Cells with ghost cells -> the means at the faces."""
