@@ -97,7 +97,7 @@ BUDGETS = {
     "operators": 6_500,  # tensors: 800
     "optimize": 13_450,  # admm: 500; total_variation, smoothness: 400
     "report": 17_950,
-    "solvers": 42_650,  # steady states, tensors, complex coefficients and waves: 2 550
+    "solvers": 43_070,  # steady states, tensors, complex coefficients and waves: 2 550; obstacles held at 0: 400
     "solvers/multigrid": 10_000,
     "structure": 6_450,
     "trajectory": 9_600,  # reversed steps: 400

@@ -167,6 +167,35 @@ def test_an_indefinite_operator_is_named():
     assert dp.inverse(op, "direct")(np.array([1.0, -1.0])) == pytest.approx([-1.0, 1.0])
 
 
+@pytest.mark.parametrize("method", ["multigrid", *(["structured"] if compiled() else [])])
+@pytest.mark.parametrize("nu", [1e-3, 1.0, 1e3])
+def test_obstacles_that_are_held_follow_from_the_fluid(method, nu, rng):
+    """Their rows of 1 - nu L read the fluid, and no row reads them: beside the solves they are an assignment."""
+    grid = dp.Grid((12, 15), size=(1.0, 2.0))
+    solid = np.hypot(*(x - 0.4 for x in grid.centres())) < 0.25
+    L = dp.laplacian(grid, {"x": (dp.dirichlet, dp.neumann)}, solid, dp.dirichlet)
+    A = dp.identity(grid.cells) - nu * L
+    inv, dense, b = dp.inverse(A, method), A.matrix.toarray(), rng.standard_normal(grid.shape)
+    for solve, matrix in ((inv, dense), (inv.T, dense.T)):
+        for data in (b, np.where(solid, b, 0.0), np.where(solid, 0.0, 1e-300 * b)):
+            wanted = np.linalg.solve(matrix, data.ravel()).reshape(grid.shape)
+            np.testing.assert_allclose(solve(data), wanted, rtol=1e-8, atol=1e-8 * np.max(np.abs(wanted)))
+    assert inv.info.forward.iterations <= 12 and inv.info.adjoint.iterations <= 12
+    assert repr(inv) and method in str(inv)
+
+
+def test_implicit_diffusion_around_held_obstacles_converges_by_itself(rng):
+    """It stagnated under algebraic multigrid: the rows of the obstacles cannot be smoothed."""
+    grid = dp.Grid((16, 16, 16), size=1.0)
+    solid = sum((x - 0.5) ** 2 for x in grid.centres()) < 0.04
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, solid=solid, solid_boundary=dp.dirichlet))
+    b = rng.standard_normal(grid.shape)
+    x = solve(1.0, b, 1.0)
+    L = dp.laplacian(grid, solid=solid, solid_boundary=dp.dirichlet)
+    assert np.linalg.norm(x - L(x) - b) <= 1e-9 * np.linalg.norm(b)
+    assert solve.info.forward.iterations <= 12
+
+
 def test_mixed_signs_go_to_gmres(rng):
     matrix = rng.standard_normal((25, 25))
     inv = dp.inverse(dp.from_matrix(matrix + matrix.T), "krylov")

@@ -192,6 +192,10 @@ def _engine(system, word, options, suited=None):
             "give it an equation",
             info=failure("empty_row"),
         )
+    if word in ("structured", "multigrid") and system.last is not None:
+        engine = _engine(system.rest, word, options, suited)
+        engine.last = system.last
+        return engine
     try:
         engine = METHODS[word](system, **options) if suited is None or options else suited
         return engine if system.null_space is not None else None
@@ -231,6 +235,8 @@ def _chosen(system, solves):
     limit = DIRECT_UP_TO[solves][dimension]
     if size <= limit:
         return "direct", f"{where}; up to {limit}, for {solves} solves, kept LU factors are fastest", None
+    if system.last is not None:
+        return _chosen(system.rest, solves)
     where = f"{where}; {unsuited}; above {limit}, for {solves} solves, LU costs more"
     if system.sign:
         return "multigrid", f"{where}; the diagonal has one sign", None

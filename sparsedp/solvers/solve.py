@@ -29,12 +29,14 @@ need not be exact: the contract refines with further calls on the residual. Attr
     hierarchical     True: its set-up is a multigrid hierarchy
     refines          False: one call, no refinement and no error (fixed numbers of iterations)
     unrolled         True: inv(b) is engine.unroll(b, start, transposed)[0], differentiated as it runs
+    last             None, or the unknowns that it leaves to the contract: see System.last
 
 Its builder is a function (system, **options) -> engine; `system` is a System (system.py).
 """
 
 from dataclasses import dataclass, field
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -64,6 +66,7 @@ class Engine:
     hierarchical = False
     refines = True
     unrolled = False
+    last: Any = None
 
 
 class EmptySystem(Engine):
@@ -318,10 +321,22 @@ class Solver(Remade):
         exponent = far_exponent(r, residual)
         if exponent:
             r, goal = shifted(r, -exponent), float(np.ldexp(goal, -exponent))
-        step, used, trouble = self.engine.solve(r, goal, transposed)
+        solve = self.engine.solve if self.engine.last is None else self._in_order
+        step, used, trouble = solve(r, goal, transposed)
         if self.system.active is not None:
             step[~self.system.active] = 0.0
         return (shifted(step, exponent) if exponent else step), used, trouble
+
+    def _in_order(self, r, goal, transposed):
+        """One call of an engine of all unknowns but the last ones: those follow; of the transpose they come first."""
+        last, product = self.engine.last, self.system.product
+        x = last * r
+        if transposed:
+            r = r - product(x, True)
+        rest = np.where(last, 0.0, r)
+        y, used, trouble = self.engine.solve(rest, goal, transposed) if norm(rest) > goal else (rest, 0, "")
+        y = np.where(last, 0.0, y)
+        return y + (x if transposed else last * (r - product(y))), used, trouble
 
 
 def _remade(build, arguments):

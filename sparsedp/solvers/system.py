@@ -8,6 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sparsedp.errors import NonFiniteError
 from sparsedp.grid import Grid
+from sparsedp.operators.boundary import mask
 from sparsedp.solvers.nullspace import ROUNDING, find_null_space
 from sparsedp.solvers.scaling import length, remainder
 from sparsedp.structure.base import Matrix
@@ -240,6 +241,26 @@ class System:
             matrix = matrix.copy()
             matrix.eliminate_zeros()
         return matrix
+
+    @cached_property
+    def last(self):
+        """1 / diagonal on the unknowns that no row reads but their own, which has more entries, else 0; None: no such.
+
+        In an obstacle that is held at 0, 1 - z L takes values from the fluid beside it and gives none back: such
+        rows cannot be smoothed, and need not be solved.
+        """
+        if self.faces is not None or not self.op.structure.has_entries:
+            return None
+        matrix, diagonal = self.matrix, self.matrix.diagonal()
+        links = np.diff(matrix.indptr) > 1
+        last = links & (diagonal != 0) & (np.bincount(matrix.indices, minlength=self.size) == 1)
+        return np.where(last, 1 / np.where(last, diagonal, 1.0), 0.0) if last.any() else None
+
+    @cached_property
+    def rest(self):
+        """The System of all unknowns but the `last`."""
+        keep = mask(self.op.domain, (self.last == 0).reshape(self.op.domain.shape))
+        return System(self.op @ keep, self.rtol, self.maxiter)
 
     @cached_property
     def regular_matrix(self):
