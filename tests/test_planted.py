@@ -42,6 +42,12 @@ BUGS = {
         "1.0 - 0.0 * (np.arange(len(u)) == self.momentum)",
         "tests/test_conservation_law.py",
     ),
+    "obstacles that lead where they should follow": Bug(
+        "solvers",
+        "return y + (x if transposed else last * (r - product(y))), used, trouble",
+        "return y + x, used, trouble",
+        "tests/test_solvers_methods.py",
+    ),
     "a step back with the wrong sign": Bug(
         "integrators",
         "        p = combine(p, (-h, f(q, params)))",
@@ -394,8 +400,8 @@ BUGS = {
     ),
     "lengths of radau that are held where a jump moves": Bug(
         "integrators",
-        "return -h / (speed * h + SLACK) / (speed or 1.0) * row",
-        "return 0.0 * row",
+        "np.dstack([u + length * section * (not last), shift,",
+        "np.dstack([u + 0.0 * section * (not last), shift,",
         "tests/test_integrators_radau.py::test_stiff_problems_with_their_gradients",
     ),
     "derivatives of radau at the wrong stage": Bug(

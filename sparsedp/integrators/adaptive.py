@@ -227,7 +227,7 @@ class Adaptive(Scheme):
         arrived = [*map(end.off, runs)]
         return end.at(judge(anp.array(arrived)))
 
-    def _section(self, u, params, t, half):
+    def section(self, u, params, t, half):
         """The derivative of d for each array of the state, and the speed, as a share of the state's size by time."""
         rates = leaves(self.problem(u, params, t))
         sizes = [np.where(size > 0, size, np.inf) for size in self.sizes(u)]
@@ -242,8 +242,8 @@ class Adaptive(Scheme):
         rows, speeds = [], []
         for step in path:
             half, at = 0.5 * step.length * h, later(t, step.done * h)
-            first, speed = self._section(step.u, params, at, half)
-            rows.append((first, self._section(step.middle, params, later(at, half), half)[0]))
+            first, speed = self.section(step.u, params, at, half)
+            rows.append((first, self.section(step.middle, params, later(at, half), half)[0]))
             speeds.append(speed)
         rest = h * (1.0 - np.array([step.done for step in path]))
         turn = int(np.argmin(np.maximum.accumulate(speeds[::-1])[::-1] + 1 / rest))  # the fastest from each step on

@@ -36,7 +36,7 @@ import scipy.sparse as sp
 from sparsedp.constants import constant
 from sparsedp.derivative import linearised
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.integrators.adaptive import EPSILON, SLACK, WINDOW, Adaptive, Moving, Taken, flat, relative
+from sparsedp.integrators.adaptive import EPSILON, WINDOW, Adaptive, Moving, Taken, flat, relative
 from sparsedp.integrators.problem import combine, later, like, untraced
 from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.operator import Operator
@@ -373,7 +373,5 @@ class Variation:
 
     def _section(self, step, h):
         """The derivative of d in the state."""
-        rate, size = self.rates(step.u, self._time(step.done)), self.rates.sizes(step.u, step.u)
-        row = rate / size**2 / self.n
-        speed = float(np.sqrt(row @ rate))
-        return -h / (speed * h + SLACK) / (speed or 1.0) * row
+        rates = self.rates
+        return flat(self.scheme.section(rates.state(step.u), rates.params, self._time(step.done), h)[0])
