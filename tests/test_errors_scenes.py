@@ -139,6 +139,26 @@ TABLE = [
         "scalar 'heat' of flow_step needs a dict of diffusivity, boundary, values, source, got 0.1",
     ),
     (
+        lambda: flow(scalars=["heat"]),
+        TYPE,
+        'flow_step takes a dict of scalars, got list; write scalars={"heat": {...}}',
+    ),
+    (
+        lambda: flow(scalars={"heat": {}}, force=lambda v, params: v),
+        TYPE,
+        "flow_step calls a function with 3 arguments, got one that takes 2; write force=lambda v, s, params: ...",
+    ),
+    (
+        lambda: flow(force=lambda v, s, params: v),
+        TYPE,
+        "flow_step calls a function with 2 arguments, got one that takes 3; write force=lambda v, params: ...",
+    ),
+    (
+        lambda: flow(scalars={"heat": {"source": lambda s: s}}),
+        TYPE,
+        "flow_step calls a function with 2 arguments, got one that takes 1; write source=lambda s, params: ...",
+    ),
+    (
         lambda: flow(scalars={"heat": {}}),
         SHAPE,
         "flow_step needs the scalars ['heat'], got []; write step.start(v, params, s)",

@@ -27,7 +27,7 @@ import numpy as np
 from sparsedp.conditions import neumann, no_slip, outflow, resolve
 from sparsedp.constants import constant
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_function, frozen, is_number, rounded_down
+from sparsedp.fields import check_function, check_takes, frozen, is_number, rounded_down
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
 from sparsedp.flow.setup import faces_that
@@ -104,6 +104,8 @@ def flow_step(
         If dt or the viscosity is out of range, or a scalar has another entry than those four.
     ShapeError
         On use, if the state is not one that ``step.start`` makes, or a force or source does not fit its field.
+    TypeError
+        If scalars is not a dict, or a force or source is no function of as many arguments.
     DerivativeError
         If dt or the viscosity is traced.
     NonFiniteError
@@ -132,8 +134,14 @@ def flow_step(
         _check_constant("viscosity", viscosity, ">= 0")
     elif implicit:
         raise ValueError("implicit viscosity of flow_step is a number, got a function; write implicit=False")
+    if not isinstance(scalars, (dict, type(None))):
+        raise TypeError(
+            f'flow_step takes a dict of scalars, got {type(scalars).__name__}; write scalars={{"heat": {{...}}}}'
+        )
     if force is not None:
-        check_function("flow_step", force, "force=lambda v, params: ...")
+        example = f"force=lambda v, {'s, ' * bool(scalars)}params: ..."
+        check_function("flow_step", force, example)
+        check_takes("flow_step", force, 3 if scalars else 2, example)
     if walls is not None and np.shape(plain(walls)) != grid.faces.shape:
         raise ShapeError(
             f"flow_step takes walls on {grid.faces}, got an array of shape {np.shape(plain(walls))}; write "
@@ -147,6 +155,7 @@ def flow_step(
         _check_constant(f"diffusivity of {name!r}", given.get("diffusivity", 0.0), ">= 0")
         if given.get("source") is not None:
             check_function("flow_step", given["source"], "source=lambda s, params: ...")
+            check_takes("flow_step", given["source"], 2, "source=lambda s, params: ...")
     viscosity = viscosity if callable(viscosity) else float(viscosity)
     given = grid, float(dt), viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
     return FlowStep(*given, scalars or {}, unstable)
