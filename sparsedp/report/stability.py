@@ -43,12 +43,11 @@ def growth_of(loss, x, step=None):
 
     ``step(x) -> (advance, state)`` gives another loop.
     """
-    with np.errstate(all="ignore"):
-        try:
-            loop = _first_rollout(loss, x) if step is None else step(x)
-            return loop and _measured(*loop)
-        except (SparsedpError, ValueError, ArithmeticError, RuntimeError) as error:
-            return Growth(np.nan, refusal=type(error).__name__)
+    try:
+        loop = _first_rollout(loss, x) if step is None else step(x)
+        return loop and _measured(*loop)
+    except (SparsedpError, ValueError, ArithmeticError, RuntimeError) as error:
+        return Growth(np.nan, refusal=type(error).__name__)
 
 
 def _first_rollout(loss, x):

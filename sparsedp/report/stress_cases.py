@@ -4,7 +4,6 @@ GROUPS is the table: for each group a function that lists its cases, the values 
 """
 
 import re
-import warnings
 from functools import partial
 from math import inf, isfinite, ldexp, log, log2, nan
 from typing import Any, NamedTuple
@@ -84,7 +83,7 @@ class Scene:
     def sheltered(self, x):
         """The loss there, NaN whatever it raises."""
         try:
-            return quietly(self.loss, x)
+            return self.loss(x)
         except Exception:  # a scene may raise anything
             return nan
 
@@ -117,19 +116,12 @@ def run(loss, x):
     """Value and gradient of a loss at x -> Outcome; whatever it raises is part of it."""
     grown = thread.grown
     try:
-        value, gradient = quietly(value_and_grad(loss), x)
+        value, gradient = value_and_grad(loss)(x)
     except Exception as error:  # a scene may raise anything: its row shows it
         chance = isinstance(error, (np.linalg.LinAlgError, UnicodeError))
         typed = isinstance(error, (SparsedpError, ValueError, TypeError)) and not chance
         return Outcome(nan, [], (REFUSED if typed else DEGRADED, nan, error_text(error)))
     return Outcome(float(value), [np.asarray(g) for g in leaves(gradient) if g is not None], (), thread.grown > grown)
-
-
-def quietly(function, x):
-    """function(x) without warnings."""
-    with np.errstate(all="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return function(x)
 
 
 # ---------------------------------------------------------------- judges: (scene, other values) -> (word, figure, note)
@@ -234,20 +226,21 @@ def _against_differences(scene, other, out):
     trials = Trials(scene.sheltered, point, out.gradient)
     trials.base, trials.gradient = out.value, gradient
     line = Line(name, direction, trials)
-    if abs(line.slope) <= UNSEEN * abs(out.value):
-        line.sweep(DIFFERENCES)
-        if judgement(line).word == "disagrees":
-            return FAILED, inf, "the gradient is 0, the differences are not"
-        return PASSED, 0.0, "the gradient is smaller than differences can see"
-    for steps in DIFFERENCES[:1], DIFFERENCES:
-        line.sweep(steps)
-        gaps = [abs((level.difference - level.slope) / line.slope) for level in line.usable]
+    unseen, gap = abs(line.slope) <= UNSEEN * abs(out.value), inf
+    for step in DIFFERENCES:
+        line.sweep([step])
+        gaps = [abs(level.difference - level.slope) / abs(line.slope or 1.0) for level in line.usable]
         gap = min(gaps, default=inf)
-        if gap <= GOOD:
+        if gap <= GOOD and not unseen:
             return PASSED, gap, ""
+    wrong = judgement(line).word == "disagrees"
+    if unseen and wrong:
+        return FAILED, inf, "the gradient is 0, the differences are not"
+    if unseen:
+        return PASSED, 0.0, "the gradient is smaller than differences can see"
     if out.flagged:
         return DEGRADED, gap, "the gradient grows without bound on its way back"
-    if gap > BAD and judgement(line).word == "disagrees":
+    if gap > BAD and wrong:
         return FAILED, gap, "the differences settle on another gradient"
     return DEGRADED, gap, "the differences do not settle on the gradient: a kink, noise or a steep change"
 
@@ -278,8 +271,7 @@ def scalings(scene, name, x):
 def _degree(scene, name, x):
     """d, where the loss is a monomial s^d in the scale s of a parameter, else 0."""
     values = [scene.run({name: s * x}).value for s in (0.5, 1.0, 2.0)]  # NaN where it is refused
-    with np.errstate(all="ignore"):
-        low, high = np.diff(np.log2(np.abs(values)))
+    low, high = np.diff(np.log2(np.abs(values)))
     return round(low) if abs(low - high) + abs(low - np.rint(low)) < 1e-12 else 0
 
 

@@ -1,5 +1,9 @@
 """stress: a scene driven through stiff and extreme cases, one word for each."""
 
+import warnings
+
+import numpy as np
+
 from sparsedp.fields import check_function
 from sparsedp.report import plots
 from sparsedp.report.stability import stability_map
@@ -74,15 +78,17 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
         if group not in GROUPS:
             raise ValueError(f"stress has no cases {group!r}; write some of {', '.join(GROUPS)}")
     chosen = [name for name in GROUPS if only is None or name in only]
-    scene = Scene(loss, x, ranges, step, time_step, viscosity)
-    rows = [dict(zip(COLUMNS, (*names, *judge()))) for *names, judge in cases(scene, chosen)]
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the rows say what became of a case
+        scene = Scene(loss, x, ranges, step, time_step, viscosity)
+        rows = [dict(zip(COLUMNS, (*names, *judge()))) for *names, judge in cases(scene, chosen)]
+        growth = stability_map(scene) if "time step and viscosity" in chosen else None
     ran = {row["group"] for row in rows}
     skipped = [
         f"{name}: {GROUPS[name].reason if name in chosen else 'not asked for'}" for name in GROUPS if name not in ran
     ]
     if scene.growth is None:
         skipped.append("growth in one step: no rollout in the loss; give step=lambda x: (advance, state)")
-    growth = stability_map(scene) if "time step and viscosity" in chosen else None
     return Stress(rows=rows, left_out=[*skipped, *ELSEWHERE], map=growth)
 
 
