@@ -93,7 +93,7 @@ BUDGETS = {
     "flow": 10_000,  # conservation laws: 2 850; scalars and the Courant limit of flow_step: 1 450
     "integrators": 16_350,  # radau: 4 400; leapfrog and sponge: 1 250
     "kernels": 14_000,
-    "network": 2_650,
+    "network": 2_450,
     "operators": 6_500,  # tensors: 800
     "optimize": 13_450,  # admm: 500; total_variation, smoothness: 400
     "report": 17_950,

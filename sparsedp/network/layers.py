@@ -41,31 +41,8 @@ def dense(p, x):
             f"dense takes x (samples, inputs), a weight (inputs, outputs) and a bias (outputs,), "
             f"got {given}, {w} and {b}"
         )
-    return _dense(x, weight, bias)
-
-
-def _product(x, weight):
-    return x @ weight if anp.ndim(weight) == 2 else (x[:, None] @ weight)[:, 0]
-
-
-def _forward(x, weight, bias):
-    return _product(x, weight) + bias
-
-
-_dense = by_parts(
-    "dense",
-    _forward,
-    (
-        lambda g, y, x, weight, bias: _product(g, anp.swapaxes(weight, -1, -2)),
-        lambda g, y, x, weight, bias: x.T @ g if anp.ndim(weight) == 2 else x[:, :, None] * g[:, None, :],
-        lambda g, y, x, weight, bias: anp.sum(g, axis=0) if anp.ndim(bias) == 1 else g,
-    ),
-    (
-        lambda t, y, x, weight, bias: _product(t, weight),
-        lambda t, y, x, weight, bias: _product(x, t),
-        lambda t, y, x, weight, bias: t + anp.zeros(anp.shape(y)),
-    ),
-)
+    product = x @ weight if len(w) == 2 else (x[:, None] @ weight)[:, 0]
+    return product + bias
 
 
 def _activation(name, forward, slope):
