@@ -143,11 +143,9 @@ def minimize(
         raise ValueError(f"minimize needs a tolerance >= 0, got {tolerance!r}; the default is 1e-8")
     if stepper is None:
         unused = dict(progress=progress, gradient=gradient, project=project, batches=batches, checkpoint=checkpoint)
-        for name in [
-            *(name for name, value in unused.items() if value),
-            *(["tolerance"] if callable(tolerance) else []),
-        ]:
-            raise TypeError(f"admm does not use {name}; leave it out")
+        for name, given in {**unused, "tolerance": callable(tolerance)}.items():
+            if given:
+                raise TypeError(f"admm does not use {name}; leave it out")
         _check_options(method, options, list(inspect.signature(admm).parameters)[7:])
         return admm(minimize, loss, start, maxiter, tolerance, callback, bounds, **options)
     if hasattr(tolerance, "inside"):  # it takes part in the evaluations

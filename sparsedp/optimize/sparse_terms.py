@@ -58,18 +58,17 @@ def admm(
         history.append(Record(len(history), value, residual, now, count, (), thread.solves - solves))
         return callback is not None and len(history) > 1 and callback(history[-1], x)
 
+    def searched(target, rho, x):
+        """The x of a round, from that of the last one, and the evaluations it took."""
+        split = lambda x: loss(x) + 0.5 * rho * anp.sum((K(x) - target) ** 2)
+        best = search(split, x, maxiter=inner, bounds=bounds, tolerance=1e-6)
+        return best.x, best.evaluations
+
+    minimized = (lambda *state: (inner(*state), 1)) if callable(inner) else searched
     record(z, np.inf)
     for number in range(int(maxiter)):
-        target = z - w
-        if callable(inner):
-            x, count = inner(target, rho, x), count + 1
-        else:
-
-            def split(x, target=target, rho=rho):
-                return loss(x) + 0.5 * rho * anp.sum((K(x) - target) ** 2)
-
-            best = search(split, x, maxiter=inner, bounds=bounds, tolerance=1e-6)
-            x, count = best.x, count + best.evaluations
+        x, spent = minimized(z - w, rho, x)
+        count += spent
         image, pull = vjp(K, x)
         if np.shape(image) != z.shape:
             raise ShapeError(f"the operator of admm gave shape {np.shape(image)} after {z.shape}; it must not change")

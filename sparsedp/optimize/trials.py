@@ -135,8 +135,7 @@ class Trials:
 
     def linearised(self, trial):
         """The residuals at a point and their Jacobian in what the bounds leave free, on the batch that saw it."""
-        here = self._linearise(trial.vector, trial.iteration)
-        return here.among(self.box.free(trial.vector, trial.slope))
+        return self._linearise(trial.vector, trial.iteration).among(self.free(trial))
 
     def covariance(self, trial):
         """That of the unknowns of a least-squares problem at a point; None where its Jacobian is not formed."""
@@ -151,7 +150,7 @@ class Trials:
         """
         if self._gradient is not None:
             raise TypeError("newton_cg differentiates the loss twice and takes no gradient of yours; leave it out")
-        batch, packing, free = self.batches.at(trial.iteration), self._packing, self.box.free(trial.vector, trial.slope)
+        batch, packing, free = self.batches.at(trial.iteration), self._packing, self.free(trial)
         if packing.complex:
             raise DerivativeError("newton_cg takes real numbers, got complex ones; split them into two real arrays")
         slope, pull = pullback(
@@ -159,9 +158,13 @@ class Trials:
         )
         return lambda v: np.where(free, packing.pack_gradient(pull(np.asarray(v, dtype=slope.dtype))), 0.0)
 
+    def free(self, trial):
+        """Which unknowns the bounds let go downhill at a point."""
+        return self.box.free(trial.vector, trial.slope)
+
     def downhill(self, trial):
         """The gradient, 0 where the bounds hold an unknown."""
-        return np.where(self.box.free(trial.vector, trial.slope), trial.slope, 0.0)
+        return np.where(self.free(trial), trial.slope, 0.0)
 
     def pop_failures(self):
         """The refused points since the last call."""
