@@ -11,7 +11,7 @@ import numpy as np
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import check_plain
 from sparsedp.recipe import Uncached, Value
-from sparsedp.tape import dtype_of, isbox, linear
+from sparsedp.tape import dtype_of, isbox
 
 __all__ = ["Space", "fits", "whole_lengths"]
 
@@ -97,11 +97,9 @@ class Space(Value, Uncached):
         """
         if np.shape(v) != self.shape:
             raise ShapeError(f"split takes a field on {self.described}, got an array of shape {np.shape(v)}")
-        if isbox(v):
-            return tuple(rule(v) for rule in self._parted)
         check_plain("split", v)
-        flat = np.asarray(v).reshape(-1)
-        return tuple(flat[start:stop].reshape(part) for start, stop, part in self._spans)
+        flat, spans = anp.reshape(v, (-1,)), zip(self.offsets, self.offsets[1:], self.parts)
+        return tuple(flat[start:stop].reshape(part) for start, stop, part in spans)
 
     def join(self, *parts):
         """Components -> one field of shape `shape`. Differentiable; inverse of `split`.
@@ -129,16 +127,6 @@ class Space(Value, Uncached):
         ]
         numpy = anp if any(map(isbox, components)) else np  # the same, without the tape
         return numpy.reshape(numpy.concatenate([numpy.reshape(part, (-1,)) for part in components]), self.shape)
-
-    @cached_property
-    def _parted(self):
-        """The rules of `split`: one for each component."""
-        return [_part(self.kind, self.shape, *span) for span in self._spans]
-
-    @cached_property
-    def _spans(self):
-        """Start, end and shape of each component in the flat array."""
-        return list(zip(self.offsets, self.offsets[1:], self.parts))
 
     @cached_property
     def _key(self):
@@ -180,17 +168,3 @@ def _broadcast(space, part, shape):
         return part * np.ones(shape, dtype_of(part)) if isbox(part) else np.broadcast_to(part, shape)
     except ValueError:
         raise ShapeError(f"join on {space} needs components {space.parts}, got one of shape {np.shape(part)}") from None
-
-
-def _part(kind, whole, start, stop, shape):
-    """The rule that takes one component out of a traced field; its transpose puts it back."""
-
-    def take(v):
-        return v.reshape(-1)[start:stop].reshape(shape)
-
-    def put(g):
-        v = np.zeros(whole, np.result_type(g))
-        v.reshape(-1)[start:stop] = np.reshape(g, -1)
-        return v
-
-    return linear(f"part of {kind}", take, put)[0]
