@@ -207,7 +207,7 @@ def certify(loss, x, target=TARGET):
     best = RecordedSolves(left).run(loss, x)  # once more: a value tells its own error, and that of the correction
     return Certificate(
         value=value, gradient=gradient, corrected_value=best, corrected_gradient=slope, gradient_error=error,
-        causes=causes, solves=rows, advice=_advice(error, causes, rows, target),
+        causes=causes, solves=rows, rows=rows, advice=_advice(error, causes, rows, target),
     )  # fmt: skip
 
 
@@ -256,18 +256,13 @@ class Certificate(Table):
         Estimated, relative, Euclidean.
     causes : dict
         Relative error of the gradient from forward and from adjoint solves.
-    solves : list of dict
+    solves, rows : list of dict
         solver, rtol, error (its share), iterative, forward and adjoint (numbers of solves), their largest
         relative residuals.
     advice : str
     """
 
     _plain = ("value", "corrected_value", "value_error", "gradient_error", "causes", "solves", "advice")
-
-    @property
-    def rows(self):
-        """The solves: its table."""
-        return self.solves
 
     @property
     def value_error(self):

@@ -69,17 +69,10 @@ def prepare(terrain, grids):
     return Study(terrain, grids, survey(fine, hidden), remap(fine, grids[-1])(hidden))
 
 
-class Recovery(NamedTuple):
-    """What one grid gives: the log-conductivity, its row of the table, and the errors after each iteration."""
-
-    logk: np.ndarray
-    row: dict
-    curve: np.ndarray  # seconds, errors
-
-
 def recover(study, grid):
-    """Study and grid -> Recovery: the gradient checked, the ground found by L-BFGS; prints a line an iteration.
+    """Study and grid -> (log-conductivity, row of the table, (seconds, errors)); prints a line for each iteration.
 
+    The gradient is checked, then the ground is found by L-BFGS.
     Misfit: root mean square of (computed - read) / noise, 1 is a fit within the noise. Error: distance from the truth,
     relative, 1 for the flat start.
     """
@@ -108,7 +101,7 @@ def recover(study, grid):
     print(f"  {', '.join(f'{many} {name}' for name, many in counts.items())}\n")
     row = {"grid": " x ".join(map(str, grid.shape)), "unknowns": best.x.size, **rows[-1], **counts}
     row |= {"gradient": check.verdict, "gradient_error": max((line.share for line in check.lines), default=np.nan)}
-    return Recovery(best.x, row, np.array([(one["seconds"], one["error"]) for one in rows]).T)
+    return best.x, row, tuple([one[name] for one in rows] for name in ("seconds", "error"))
 
 
 # ---------------------------------------------------------------- what the reader sees
@@ -137,8 +130,7 @@ def tell(study, folder, force):
         If one has come there during the run, and `force` is not set.
     """
     print(INTRODUCTION.format(s=study, d=study.data, noise=100 * NOISE), flush=True)
-    recoveries = [recover(study, grid) for grid in study.grids]
-    rows, logk = [one.row for one in recoveries], recoveries[-1].logk
+    (*_, logk), rows, curves = zip(*(recover(study, grid) for grid in study.grids))
     print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
     print(text_table(rows, SHOWN), end="\n\n")
     claim(folder, FILES, force)  # once more: it is a while since the run began
@@ -147,7 +139,7 @@ def tell(study, folder, force):
     try:
         plots.write_picture(folder / "truth.png", partial(_map, study, "Hidden ground", study.truth))
         plots.write_picture(folder / "recovery.png", partial(_map, study, "Recovered", logk))
-        plots.write_picture(folder / "convergence.png", partial(_convergence, recoveries))
+        plots.write_picture(folder / "convergence.png", partial(_convergence, rows, curves))
     except ImportError as error:
         print(f"No pictures: {error}")
     print(f"Written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
@@ -171,7 +163,7 @@ def _map(study, title, field, ax):
     return ax
 
 
-def _convergence(recoveries, ax):
+def _convergence(rows, curves, ax):
     """Error against run time, one curve for each grid."""
-    lines = {f"{one.row['grid']} cells": one.curve for one in recoveries}
+    lines = {f"{row['grid']} cells": curve for row, curve in zip(rows, curves)}
     return plots.curves(lines, ax, "run time [s]", "relative error of log conductivity (flat start: 1)")

@@ -180,7 +180,7 @@ def read_field(path):
 def _only_map(path):
     """Path of a .npz file -> the 2-D array in it."""
     with np.load(path) as archive:
-        maps = {name: archive[name] for name in archive.files if np.ndim(archive[name]) == 2}
+        maps = {name: values for name, values in archive.items() if np.ndim(values) == 2}
         if len(maps) != 1:
             names = ", ".join(name[:24] for name in list(maps or archive.files)[:4]) or "nothing"
             raise ValueError(f"it needs exactly one 2-D array, got {len(maps)} among {len(archive.files)}: {names}")
