@@ -338,7 +338,7 @@ def finite_number(entry, name):
 def flag(entry, shape):
     """One entry of `periodic`: True or False, nothing that only counts as one of them."""
     if not isinstance(entry, (bool, np.bool_)):
-        example = "True" if len(shape) == 1 else f"({', '.join(['True', *['False'] * (len(shape) - 1)])})"
+        example = (True, False, False)[: len(shape)] if len(shape) > 1 else True
         raise TypeError(f"periodic needs True or False for each axis, got {entry!r}; write periodic={example}")
     return bool(entry)
 

@@ -1,7 +1,7 @@
 """Space: where the numbers of a field live, as a value. No numbers are stored here."""
 
 from functools import cached_property
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from math import prod
 from typing import Any
 
@@ -98,8 +98,8 @@ class Space(Value, Uncached):
         if np.shape(v) != self.shape:
             raise ShapeError(f"split takes a field on {self.described}, got an array of shape {np.shape(v)}")
         check_plain("split", v)
-        flat, spans = anp.reshape(v, (-1,)), zip(self.offsets, self.offsets[1:], self.parts)
-        return tuple(flat[start:stop].reshape(part) for start, stop, part in spans)
+        flat, spans = anp.reshape(v, (-1,)), pairwise(self.offsets)
+        return tuple(flat[start:stop].reshape(part) for (start, stop), part in zip(spans, self.parts))
 
     def join(self, *parts):
         """Components -> one field of shape `shape`. Differentiable; inverse of `split`.

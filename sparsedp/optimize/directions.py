@@ -39,8 +39,8 @@ class Direction(NamedTuple):
         s = self.spectrum
         if not len(s):
             return f"direction ({self.method}): J is 0"
-        marks = [0, len(s) // 4, len(s) // 2, 3 * len(s) // 4, len(s) - 1]
-        shown = "  ".join(f"s[{i}] {s[i]:.2e}" for i in dict.fromkeys(marks))
+        marks = dict.fromkeys(np.linspace(0, len(s) - 1, 5, dtype=int))
+        shown = "  ".join(f"s[{i}] {s[i]:.2e}" for i in marks)
         return f"direction ({self.method}): {len(s)} singular values, {self.kept} kept; {shown}"
 
 

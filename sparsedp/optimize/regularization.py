@@ -1,5 +1,7 @@
 """Regularization: total_variation and smoothness of a cell field, walls and obstacles left out."""
 
+from itertools import pairwise
+
 import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
@@ -105,12 +107,10 @@ def _square(grid, name, solid):
     """(function from a cell field to its squared slope in the cells, volumes of the cells that count)."""
     check_grid(name, grid)
     slope, inside = gradient(grid), interior(grid, solid)
-    beside, start, blocks = abs(divergence(grid).matrix) @ inside.matrix != 0, 0, []
-    for part in grid.faces.parts:
-        stop = start + int(np.prod(part))
+    beside, blocks = abs(divergence(grid).matrix) @ inside.matrix != 0, []
+    for start, stop in pairwise(grid.faces.offsets):
         faces = sp.csr_array(beside[:, start:stop], dtype=float)
         blocks.append(sp.diags_array(1 / np.maximum(faces.sum(axis=1), 1)) @ faces)
-        start = stop
     mean = from_matrix(sp.hstack(blocks, format="csr"), grid.faces, grid.cells, name="mean over faces")
     volumes = grid.volumes if solid is None else np.where(solid, 0.0, grid.volumes)
 
