@@ -18,7 +18,11 @@ INTERRUPTED = 130  # exit code of what Ctrl-C ends, the same as a shell's
 LONGEST = 200  # letters of a name that a sentence shows
 CODES = {"agrees": 0, "disagrees": 1, "inconclusive": 3}
 LOOPS = [  # where loops are defined
-    *(f"sparsedp.kernels.{name}" for name in "elimination fluxes interpolation projection stencil".split()),
+    "sparsedp.kernels.elimination",
+    "sparsedp.kernels.fluxes",
+    "sparsedp.kernels.interpolation",
+    "sparsedp.kernels.projection",
+    "sparsedp.kernels.stencil",
     "sparsedp.solvers.multigrid.loops",
 ]
 

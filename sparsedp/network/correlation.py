@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-__all__ = ["correlate", "fold", "pad", "weigh"]
+__all__ = ["MODES", "correlate", "fold", "pad", "weigh"]
 
 BLOCK = 1 << 22  # bytes of the copied matrix that are made at a time: they stay in the cache
 MODES: dict[str, Any] = {"periodic": "wrap", "zero": "constant", "replicate": "edge"}

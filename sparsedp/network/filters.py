@@ -14,12 +14,10 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.network.correlation import correlate, fold, pad, weigh
+from sparsedp.network.correlation import MODES, correlate, fold, pad, weigh
 from sparsedp.tape import Rule, plain
 
 __all__ = ["check_widths", "convolution"]
-
-PADDINGS = ("periodic", "zero", "replicate")
 
 
 def convolution(p, x, padding="periodic"):
@@ -76,7 +74,7 @@ def check_widths(widths):
 
 
 def _check(weight, bias, x, padding):
-    if padding not in PADDINGS:
+    if padding not in MODES:
         raise ValueError(f"padding must be periodic, zero or replicate, got {padding!r}")
     dim = len(x) - 2
     if dim not in (1, 2) or len(weight) not in (dim + 2, dim + 3):

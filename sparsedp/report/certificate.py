@@ -336,7 +336,7 @@ class Certified:
 
     def __init__(self, fraction, tolerance):
         self.fraction, self.tolerance = fraction, tolerance
-        self.share = min(max(fraction, SHARES[0]), SHARES[1])
+        self.share = float(np.clip(fraction, *SHARES))
         self.evaluations = self.iterations = self.passes = 0
         self._value: Any = None  # of the last step
         self._gradient: Any = None
