@@ -270,7 +270,7 @@ def scalings(scene, name, x):
 
 def _degree(scene, name, x):
     """d, where the loss is a monomial s^d in the scale s of a parameter, else 0."""
-    values = [scene.run({name: s * x}).value for s in (0.5, 1.0, 2.0)]  # NaN where it is refused
+    values = [scene.sheltered(scene.at({name: s * x})) for s in (0.5, 1.0, 2.0)]  # NaN where it is refused
     low, high = np.diff(np.log2(np.abs(values)))
     return round(low) if abs(low - high) + abs(low - np.rint(low)) < 1e-12 else 0
 

@@ -172,9 +172,8 @@ def read_field(path):
     with np.errstate(over="ignore"):
         field = field.astype(float)
     check_finite(path, field, "needs finite values")
-    return np.ldexp(
-        field, -np.frexp(np.abs(field).max())[1]
-    )  # by a power of two: nothing is rounded, nothing overflows
+    # By a power of two: nothing is rounded, nothing overflows.
+    return np.ldexp(field, -np.frexp(np.abs(field).max())[1])
 
 
 def _only_map(path):
