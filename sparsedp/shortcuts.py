@@ -14,7 +14,7 @@ import numpy as np
 
 __all__ = [
     "ACTS", "ARRAY", "BOX", "COPY", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part", "REAL",
-    "pull_of", "tangent_of",
+    "formulas_of",
 ]  # fmt: skip
 
 FLOAT = np.dtype(float)
@@ -46,105 +46,58 @@ HELD: dict[tuple, Any] = {
 
 
 class Part(tuple):
-    """(g, index, shape): a cotangent that is zero outside ``whole[index]``, and g there."""
+    """(g, index, shape): zero outside ``whole[index]``, and g there."""
 
     __slots__ = ()
 
 
-def pull_of(fun, value, args, nums):
-    """A call ``value = fun(*args)`` -> (pull, held), or None: autograd knows.
-
-    ``pull(g, *held)``: the cotangents of args `nums`.
-    """
-    formulas = FORMULAS.get(fun)  # autograd's own: a primitive that a user made of NumPy's has other derivatives
-    if formulas is None or type(value) not in NUMBERS or value.dtype is not FLOAT:
+def formulas_of(fun, value, args, nums):
+    """A call ``value = fun(*args)`` -> its two formulas in FORMULAS; None: autograd knows."""
+    line = FORMULAS.get(fun)  # autograd's own: a primitive that a user made of NumPy's has other derivatives
+    if line is None or type(value) not in NUMBERS or value.dtype is not FLOAT:
         return None
     for num in nums:
         arg = args[num]
         if type(arg) not in NUMBERS or arg.dtype is not FLOAT:
             return None
-    return formulas[0](value, nums, args)
-
-
-def tangent_of(fun, value, args, nums, tangents):
-    """A call ``value = fun(*args)`` and the tangents of args `nums` -> that of the value; None: autograd knows."""
-    formulas = FORMULAS.get(fun)
-    if formulas is None or type(value) not in NUMBERS or value.dtype != FLOAT:
-        return None
-    for tangent in tangents:
-        if type(tangent) not in REAL:
-            return None
-    tangent = formulas[1](value, nums, tangents, *args)
-    return tangent if np.shape(tangent) == value.shape else None
+    return line[1:] if line[0](value, nums, args) else None
 
 
 def _entrywise(*acts):
-    """Formulas of a function entry by entry: for each operand its derivative ``act(g, *args)``, and what that needs.
+    """A line for a function entry by entry: for each operand its derivative ``act(g, *args)``, and what that needs.
 
     A derivative is its own transpose. What is needed is a key of HELD: no array is held in vain.
     """
-    act, other = acts[0][0], acts[-1][0]
-    pulls = {
-        (0,): (lambda g, *args: (act(g, *args),), HELD[acts[0][1]]),
-        (1,): (lambda g, *args: (other(g, *args),), HELD[acts[-1][1]]),
-        (0, 1): (lambda g, *args: (act(g, *args), other(g, *args)), HELD[acts[0][1] and (0, 1)]),
-    }
+    (act, need), (other, needs) = acts[0], acts[-1]
+    pulls: dict[tuple, Any] = {(0,): (lambda g, *args: (act(g, *args),), HELD[need])}
+    if len(acts) == 2:
+        pulls[1,] = lambda g, *args: (other(g, *args),), HELD[needs]
+        pulls[0, 1] = lambda g, *args: (act(g, *args), other(g, *args)), HELD[need and (0, 1)]
 
-    def back(value, nums, args):
-        if nums[-1] >= len(acts):
-            return None
-        (pull, hold), shape = pulls[nums], value.shape
+    def fits(value, nums, args):
         for num in nums:
-            if args[num].shape != shape:
-                break
-        else:
-            return pull, hold(args)
-        many = [value.ndim - args[num].ndim for num in nums]
-        if any(shape[first:] != args[num].shape for num, first in zip(nums, many)):
-            return None
-        return (lambda g, *args: [_summed(back, first) for back, first in zip(pull(g, *args), many)]), hold(args)
+            if args[num].shape != value.shape:
+                return False
+        return nums in pulls
 
-    def forth(value, nums, tangents, *args):
-        if nums[-1] >= len(acts):
-            return None
-        parts = [acts[num][0](tangent, *args) for num, tangent in zip(nums, tangents)]
-        return parts[0] + parts[1] if len(nums) == 2 else parts[0]
+    def back(nums, args):
+        pull, hold = pulls[nums]
+        return pull, hold(args)
 
-    return back, forth
+    return fits, back, lambda g, num, args, shape: acts[num][0](g, *args)
 
 
-def _summed(g, many):
-    """A cotangent summed over its first axes."""
-    for _ in range(many):
-        g = g.sum(axis=0)
-    return g
-
-
-def _item(value, nums, args):
-    x, index = args
-    if type(index) not in BASIC and not (type(index) is tuple and all(type(one) in BASIC for one in index)):
-        return None
-    return _part, ((index, x.shape),)
+def _is_basic(value, nums, args):
+    index = args[1]
+    return type(index) in BASIC or (type(index) is tuple and all(type(one) in BASIC for one in index))
 
 
 def _part(g, place):
     return (Part((g, *place)),)
 
 
-def _array(value, nums, args):
-    return None if args[0] or args[1] else (lambda g: [g[num - 2] for num in nums], ())
-
-
-def _array_along(value, nums, tangents, positional, options, *entries):
-    if positional or options:
-        return None
-    along = np.zeros(value.shape)
-    for num, tangent in zip(nums, tangents, strict=True):
-        along[num - 2] = tangent
-    return along
-
-
-# Of a function of autograd: (pull, held) from (value, nums, args), the tangent from (value, nums, tangents, *args).
+# Of a function of autograd: whether the formulas hold, from (value, nums, args); (pull, held), from (nums, args), with
+# ``pull(g, *held)`` the cotangents of args `nums`; what a tangent of one of them gives, from (g, num, args, shape).
 FORMULAS: dict[Any, Any] = {
     anp.add: _entrywise((lambda g, *args: g, ()), (lambda g, *args: g, ())),
     anp.subtract: _entrywise((lambda g, *args: g, ()), (lambda g, *args: -g, ())),
@@ -152,6 +105,14 @@ FORMULAS: dict[Any, Any] = {
     anp.true_divide: _entrywise((lambda g, x, y: g / y, (1,)), (lambda g, x, y: -g * x / y**2, (0, 1))),
     anp.power: _entrywise((lambda g, x, y: g * y * x ** np.where(y, y - 1, 1.0), (0, 1))),
     anp.negative: _entrywise((lambda g, *args: -g, ())),
-    ITEM: (_item, lambda value, nums, tangents, x, index: tangents[0][index]),
-    ARRAY: (_array, _array_along),
+    ITEM: (
+        _is_basic,
+        lambda nums, args: (_part, ((args[1], args[0].shape),)),
+        lambda g, num, args, shape: g[args[1]],
+    ),
+    ARRAY: (
+        lambda value, nums, args: not (args[0] or args[1]),
+        lambda nums, args: (lambda g: [g[num - 2] for num in nums], ()),
+        lambda g, num, args, shape: Part((g, num - 2, shape)),
+    ),
 }

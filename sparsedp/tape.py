@@ -8,7 +8,7 @@ Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A
 
 import inspect
 from contextlib import contextmanager
-from functools import cached_property, partial, wraps
+from functools import cached_property, partial, reduce, wraps
 from itertools import count as numbers_from
 from typing import Any
 
@@ -35,9 +35,8 @@ from sparsedp.shortcuts import (
     PLAIN,
     REAL,
     Part,
-    pull_of,
-    tangent_of,
-)
+    formulas_of,
+)  # fmt: skip
 from sparsedp.tree import copied, leaves
 
 __all__ = [
@@ -88,9 +87,9 @@ class ReverseNode(VJPNode):
 
     def __init__(self, value, fun, args, options, nums, parents):
         self.parents, self.recorder = parents, parents[0].recorder
-        quick = None if options else pull_of(fun, value, args, nums)
-        if quick is not None:
-            self.vjp, held = quick
+        formulas = None if options else formulas_of(fun, value, args, nums)
+        if formulas:
+            self.vjp, held = formulas[0](nums, args)
             self.held = constant_args(held, nums) if len(nums) < len(held) else held
         else:
             if len(nums) < len(args) and fun not in sparing:
@@ -117,8 +116,11 @@ class ForwardNode(JVPNode):
     g: Any
 
     def __init__(self, value, fun, args, options, nums, parents):
-        self.g = None if options else tangent_of(fun, value, args, nums, [parent.g for parent in parents])
-        if self.g is None:
+        formulas = None if options else formulas_of(fun, value, args, nums)
+        if formulas:
+            parts = [formulas[1](parent.g, num, args, value.shape) for num, parent in zip(nums, parents, strict=True)]
+            self.g = reduce(_added, parts, None)[0]
+        else:
             super().__init__(value, fun, args, options, nums, parents)
 
 
