@@ -26,7 +26,7 @@ from sparsedp.tape import (
     reverse_root,
     split_boxes,
 )  # fmt: skip
-from sparsedp.tree import copied, flatten, keys, leaves
+from sparsedp.tree import copied, flatten, keys, mapped
 
 __all__ = [
     "NO_JVP", "described", "grad", "hvp", "jvp", "linearised", "pullback", "push", "pushforward", "traced",
@@ -46,7 +46,7 @@ def growing():
     """While a tape grows: it has no cycles, and every search for cyclic garbage would walk all of it."""
     with _lock:
         before = gc.get_threshold()
-        _growing.append(before if not _growing else _growing[0])
+        _growing.append(_growing[0] if _growing else before)
         if 0 < before[0] < SELDOM:
             gc.set_threshold(SELDOM, *before[1:])
     try:
@@ -133,8 +133,7 @@ def linearised(fun, tree, moving):
 
     def pull(cotangents):
         sums: dict = {}
-        with growing():  # rollouts make tapes on their way back
-            backward(nodes, ends, cotangents, sums)
+        backward(nodes, ends, cotangents, sums)
         return [sums.get(root, (None,))[0] for root in roots]
 
     return values, rebuild, pull
@@ -148,8 +147,7 @@ def traced(fun, tree, roots):
     entries, rebuild = flatten(tree)
     number = new_trace()
     try:
-        with growing():
-            ends, build = flatten(fun(rebuild(boxed(entries, roots, number))))
+        ends, build = flatten(fun(rebuild(boxed(entries, roots, number))))
         return *split_boxes(ends, number), build
     except (TypeError, ValueError, AttributeError) as error:
         said = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
@@ -190,8 +188,12 @@ def _gradient(leaf, cotangent):
             f"the gradient has shape {shape} where {wanted} is needed: autograd's np.where does not add up what it "
             "spreads; multiply by the condition instead, a * c + b * (1 - c)"
         )
-    cotangent = fit("the gradient", leaf, cotangent, cotangent)
-    return float(cotangent) if isinstance(leaf, float) and not isbox(cotangent) else cotangent
+    return _as_given(fit("the gradient", leaf, cotangent, cotangent), leaf)
+
+
+def _as_given(derivative, leaf):
+    """A derivative of a number of Python as such a number, where it is not traced."""
+    return float(derivative) if isinstance(leaf, float) and not isbox(derivative) else derivative
 
 
 def pushforward(fun, x, tangent):
@@ -230,17 +232,12 @@ def zero_like(value):
 
 def _directions(x, tangent):
     """Tangent of each leaf of `x`, None where it is not floating; entries of dicts are paired by name."""
-    names, given = keys(x), f"{described(x)}, got {described(tangent)}"
-    error = ShapeError(f"the tangent must have the structure of x: {given}")
-    if names is not None:
-        if keys(tangent) != names:
-            raise error
-        return [leaf for name in names for leaf in _directions(x[name], tangent[name])]
-    if not is_variable(x):
+    names = keys(x)
+    if names is None and not is_variable(x):
         return [None]
-    if not _is_array(tangent) or np.shape(tangent) != np.shape(x):
-        raise error
-    return [tangent]
+    if keys(tangent) != names or (names is None and not (_is_array(tangent) and np.shape(tangent) == np.shape(x))):
+        raise ShapeError(f"the tangent must have the structure of x: {described(x)}, got {described(tangent)}")
+    return [tangent] if names is None else [t for name in names for t in _directions(x[name], tangent[name])]
 
 
 def _is_array(value):
@@ -318,9 +315,7 @@ def hvp(loss, x, tangent):
     >>> hvp(lambda x: x[0] ** 2 * x[1], (2.0, 5.0), (1.0, 0.0))
     (10.0, 4.0)
     """
-    product = jvp(grad(loss), x, tangent)[1]
-    entries, rebuild = flatten(product)
-    return rebuild([float(p) if isinstance(u, float) and not isbox(p) else p for p, u in zip(entries, leaves(x))])
+    return mapped(_as_given, jvp(grad(loss), x, tangent)[1], x)
 
 
 def push(fun, tree, tangents):

@@ -8,7 +8,7 @@ Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A
 
 import inspect
 from contextlib import contextmanager
-from functools import cached_property, partial, reduce, wraps
+from functools import cached_property, partial, wraps
 from itertools import count as numbers_from
 from typing import Any
 
@@ -118,8 +118,11 @@ class ForwardNode(JVPNode):
     def __init__(self, value, fun, args, options, nums, parents):
         formulas = None if options else formulas_of(fun, value, args, nums)
         if formulas:
-            parts = [formulas[1](parent.g, num, args, value.shape) for num, parent in zip(nums, parents, strict=True)]
-            self.g = reduce(_added, parts, None)[0]
+            total: Any = None
+            for num, parent in zip(nums, parents, strict=True):
+                g = formulas[1](parent.g, num, args, value.shape)
+                total = (g, False) if total is None and type(g) in NUMBERS else _added(total, g)
+            self.g = total[0]
         else:
             super().__init__(value, fun, args, options, nums, parents)
 
@@ -172,9 +175,8 @@ def boxed(values, roots, number):
 
 def split_boxes(values, number):
     """Values -> those below the boxes of this trace, and the nodes of the boxes (None where there is none)."""
-    ours = [isbox(value) and value._trace == number for value in values]
-    pairs = list(zip(values, ours, strict=True))
-    return [x._value if box else x for x, box in pairs], [x._node if box else None for x, box in pairs]
+    pairs = [(x._value, x._node) if isbox(x) and x._trace == number else (x, None) for x in values]
+    return [value for value, _ in pairs], [node for _, node in pairs]
 
 
 def backward(nodes, ends, cotangents, sums):
@@ -256,16 +258,13 @@ def _of_two(function):
 
     @wraps(function)
     def call(x, y):
-        if type(x) is BOX:
-            a, trace, nums, parents = x._value, x._trace, (0,), (x._node,)  # type: Any, Any, tuple, tuple
-            if type(y) is BOX and y._trace == trace:
-                b, nums, parents = y._value, (0, 1), (x._node, y._node)
-            elif type(y) in PLAIN:
-                b = y
-            else:
-                return function(x, y)
-        elif type(x) in PLAIN:
+        left, right = type(x), type(y)
+        if left is BOX and right in PLAIN:
+            a, b, trace, nums, parents = x._value, y, x._trace, (0,), (x._node,)  # type: Any, Any, Any, tuple, tuple
+        elif left in PLAIN:  # the other one is traced
             a, b, trace, nums, parents = x, y._value, y._trace, (1,), (y._node,)
+        elif left is right is BOX and x._trace == y._trace:
+            a, b, trace, nums, parents = x._value, y._value, x._trace, (0, 1), (x._node, y._node)
         else:
             return function(x, y)
         if type(a) is BOX or type(b) is BOX:
@@ -569,7 +568,7 @@ def _operator_vjp(argnums, ans, args, kwargs):
     def pull(g, dtype=u.dtype):
         act = partial(apply_operator, op.T) if isbox(g) else op.T.apply
         back = timed(op.name, "vjp", act, g)
-        return (back if back.dtype == dtype else cast(back, dtype),)
+        return (cast(back, dtype),)
 
     return pull
 

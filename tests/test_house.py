@@ -87,7 +87,7 @@ LONGER = {
 # Nodes of the syntax tree that each room may have, docstrings left out; what a line says is free, what it does is not.
 # They may be lowered at any time, and raised only with a sentence on what that buys. "": the whole package.
 BUDGETS = {
-    "": 189_990,  # what scenes of the second edition added is said room by room
+    "": 189_890,  # what scenes of the second edition added is said room by room
     "advection": 14_000,
     "check": 14_850,
     "flow": 10_000,  # conservation laws: 2 850; scalars and the Courant limit of flow_step: 1 450
