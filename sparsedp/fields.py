@@ -17,7 +17,6 @@ __all__ = [
     "check_plain",
     "check_takes",
     "field_array",
-    "frozen",
     "is_number",
     "is_whole",
     "place",
@@ -109,15 +108,6 @@ def place(index, shape):
     """Number of an entry in C order -> its index: a number in 1-D, else a tuple."""
     indices = tuple(map(int, np.unravel_index(index, shape)))
     return indices[0] if len(indices) == 1 else indices
-
-
-def frozen(value):
-    """Array -> a view nobody can write through; numbers as they are."""
-    if type(value) is not np.ndarray:
-        return value
-    view = value.view()
-    view.flags.writeable = False
-    return view
 
 
 def check_function(name, thing, example):

@@ -18,7 +18,7 @@ from autograd.core import JVPNode, VJPNode, add_outgrads
 from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
 from autograd.tracer import box_types, getval, isbox, new_box, notrace_primitives, trace_stack
 
-from sparsedp.constants import constant, constant_args, sparing
+from sparsedp.constants import constant, constant_args, frozen, sparing
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, note, thread, timed
 from sparsedp.recipe import Remade
@@ -326,7 +326,7 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     Rule
         Call it like `forward`. `vjp` and `jvp` use `ans`, `args` and `g` only through other rules, Operators or
         autograd.numpy: then derivatives of every order follow. What the three functions return is copied: each may
-        return one array of its own again and again.
+        return one array of its own again and again. Into the arrays that they are given they cannot write.
 
     Raises
     ------
@@ -347,16 +347,14 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     """
     given = name, forward, vjp, jvp, tuple(keywords)
     made = differentiable, given
-    return Rule(name, _fresh(forward), vjp and _fresh_pull(vjp), jvp and _fresh(jvp), given[-1], made)
+    back = vjp and (lambda *args: _apart(vjp(*map(frozen, args))))
+    along = jvp and _apart(lambda nums, tangents, *args: jvp(nums, [*map(frozen, tangents)], *args))
+    return Rule(name, _apart(forward), back, along, given[-1], made)
 
 
-def _fresh(function):
-    """A function of the user, whose results are copied: it may write into the arrays that it has returned."""
-    return wraps(function)(lambda *args: copied(function(*args)))  # it has the signature of the function
-
-
-def _fresh_pull(vjp):
-    return lambda *args: _fresh(vjp(*args))
+def _apart(function):
+    """A function of the user apart from the tape: it may write into what it returned, not into what it is given."""
+    return wraps(function)(lambda *args: copied(function(*map(frozen, args))))  # it has the signature of the function
 
 
 class Rule(Remade):

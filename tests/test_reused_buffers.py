@@ -89,6 +89,26 @@ def test_rules_of_users(rng):
     assert dp.check.gradient(loss, x).verdict == "agrees"
 
 
+@pytest.mark.parametrize("part", ["forward", "pull", "vjp", "jvp"])
+def test_rules_of_users_cannot_write_into_what_they_are_given(part):
+    """The tape needs it: a cotangent goes to both terms of a sum, a tangent to all that its value is used for."""
+
+    def act(x, name):
+        if name == part:
+            x[0] = 0.0
+        return x
+
+    def vjp(nums, ans, x):
+        act(x, "vjp")
+        return lambda g: (act(g, "pull"),)
+
+    rule = dp.differentiable("change", lambda x: act(x, "forward"), vjp, lambda nums, ts, ans, x: act(ts[0], "jvp"))
+    x, t = np.arange(1.0, 4.0), np.ones(3)
+    with pytest.raises(ValueError, match="read-only"):
+        dp.jvp(rule, x, t) if part == "jvp" else dp.grad(lambda x: anp.sum(x * x + rule(x)))(x)
+    assert np.array_equal(x, [1, 2, 3]) and np.array_equal(t, [1, 1, 1])
+
+
 def test_physical_gradient(rng):
     physics, inverse = reusing(lambda x: 2 * x), reusing(lambda y, x: y / 2)
     f, x = dp.physical_gradient(physics, inverse), rng.standard_normal(N)

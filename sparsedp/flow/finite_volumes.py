@@ -27,9 +27,9 @@ import numpy as np
 
 from sparsedp.conditions import free_slip, outflow, resolve
 from sparsedp.conditions import inflow as inflow_side
-from sparsedp.constants import constant
+from sparsedp.constants import constant, frozen
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_plain, check_takes, frozen, is_whole
+from sparsedp.fields import check_plain, check_takes, is_whole
 from sparsedp.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.recipe import Remade

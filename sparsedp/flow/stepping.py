@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 
 from sparsedp.conditions import neumann, no_slip, outflow, resolve
-from sparsedp.constants import constant
+from sparsedp.constants import constant, frozen
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_function, check_takes, frozen, is_number, rounded_down
+from sparsedp.fields import check_function, check_takes, is_number, rounded_down
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
 from sparsedp.flow.setup import faces_that

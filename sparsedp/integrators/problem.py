@@ -6,8 +6,9 @@ import inspect
 
 import numpy as np
 
+from sparsedp.constants import frozen
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_takes, frozen, is_number
+from sparsedp.fields import check_takes, is_number
 from sparsedp.operator import Operator
 from sparsedp.space import fits
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp import kernels
+from sparsedp.constants import frozen
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import frozen
 from sparsedp.recipe import Remade
 from sparsedp.structure.base import Structure, compact, rows_of
 from sparsedp.structure.kronecker import Kronecker, components

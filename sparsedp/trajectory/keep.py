@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.constants import constant
+from sparsedp.constants import constant, frozen
 from sparsedp.derivative import linearised
 from sparsedp.errors import DerivativeError
-from sparsedp.fields import frozen
 from sparsedp.tape import dtype_of, is_variable, isbox, plain, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, stacked
 from sparsedp.tree import leaves, mapped

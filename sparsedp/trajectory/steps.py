@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp.constants import frozen
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
-from sparsedp.fields import frozen
 from sparsedp.tape import Recorder, boxed, new_trace, plain, reverse_root, split_boxes, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.tree import copied, flatten, leaves
