@@ -16,6 +16,7 @@ from sparsedp.tape import (
     Recorder,
     backward,
     boxed,
+    cast,
     dtype_of,
     fit,
     forward_root,
@@ -29,8 +30,8 @@ from sparsedp.tape import (
 from sparsedp.tree import copied, flatten, keys, mapped
 
 __all__ = [
-    "NO_JVP", "described", "grad", "hvp", "jvp", "linearised", "pullback", "push", "pushforward", "traced",
-    "value_and_grad", "vjp", "zero_like",
+    "NO_JVP", "described", "grad", "hvp", "jvp", "linearised", "of_argument", "pullback", "push",
+    "pushforward", "traced", "value_and_grad", "vjp", "zero_like",
 ]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
@@ -129,7 +130,7 @@ def linearised(fun, tree, moving):
     try:
         values, ends, rebuild = traced(fun, tree, roots)
     finally:
-        nodes = recorder.taken()
+        nodes, recorder.ended = recorder.taken(), True
 
     def pull(cotangents):
         sums: dict = {}
@@ -469,3 +470,10 @@ def value_and_grad(loss, argnum=0):
         return value if isbox(value) else float(value), gradient
 
     return Made(evaluate, value_and_grad, loss, argnum)
+
+
+def of_argument(cotangent, value):
+    """What a product of fields gives for an argument: summed over batches, and for a real argument the real part."""
+    while np.ndim(cotangent) > np.ndim(value):
+        cotangent = anp.sum(cotangent, axis=0)
+    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent

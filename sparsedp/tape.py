@@ -16,7 +16,7 @@ import autograd.numpy as anp
 import numpy as np
 from autograd.core import JVPNode, VJPNode, add_outgrads
 from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
-from autograd.tracer import box_types, getval, isbox, new_box, notrace_primitives, trace_stack
+from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_primitives, trace_stack
 
 from sparsedp.constants import constant, constant_args, frozen, sparing
 from sparsedp.errors import DerivativeError, ShapeError
@@ -42,7 +42,7 @@ from sparsedp.tree import copied, leaves
 __all__ = [
     "Recorder", "ReverseNode", "Rule", "apply_operator", "backward", "boxed", "called", "cast", "differentiable",
     "dtype_of", "entrywise", "fit", "forward_root", "innermost", "is_variable", "isbox", "linear", "new_trace",
-    "of_argument", "plain", "reverse_root", "split_boxes", "through", "traces_of", "untraced",
+    "plain", "reverse_root", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
@@ -55,6 +55,7 @@ class Recorder:
     """Takes down the calls of reverse-mode traces in order: the backward pass need not sort a graph."""
 
     bytes: Any = None  # while it is a number: of the results, and of what stands beside traced values, is added
+    ended = False  # whether the function has returned: nothing goes back through a later call
 
     def __init__(self):
         self.nodes: list = []
@@ -69,12 +70,16 @@ class Recorder:
         nodes, self.nodes = self.nodes, []
         return nodes
 
+    def refuse(self):
+        """Refuse a call after the end."""
+        raise DerivativeError(
+            "a traced value was stored, and is used after the function or the step that made it has ended: its "
+            "derivative would be lost; return it, from a rollout in the state or by keep"
+        )
+
 
 class ReverseNode(VJPNode):
-    """A call on a reverse-mode trace. Its pullback sees the constants of the call as they are now.
-
-    ``vjp(g, *held)``: the cotangents of the parents.
-    """
+    """A call on a reverse-mode trace. Its pullback ``vjp(g, *held)`` sees the constants of the call as they are now."""
 
     __slots__ = ("held", "recorder")
     parents: Any
@@ -87,6 +92,8 @@ class ReverseNode(VJPNode):
 
     def __init__(self, value, fun, args, options, nums, parents):
         self.parents, self.recorder = parents, parents[0].recorder
+        if self.recorder.ended:
+            self.recorder.refuse()
         formulas = None if options else formulas_of(fun, value, args, nums)
         if formulas:
             self.vjp, held = formulas[0](nums, args)
@@ -109,6 +116,22 @@ class ReverseNode(VJPNode):
             self.vjp = lambda g: [anp.real(back) if one else back for one, back in zip(real, pull(g), strict=True)]
 
 
+class UntapedNode(Node):
+    """A call of a step that will be run again on a tape: it tells that the result is traced, and holds nothing."""
+
+    __slots__ = ("recorder",)
+    recorder: Any
+
+    def initialize_root(self, recorder):
+        """Begin a trace."""
+        self.recorder = recorder
+
+    def __init__(self, value, fun, args, options, nums, parents):
+        self.recorder = parents[0].recorder
+        if self.recorder.ended:
+            self.recorder.refuse()
+
+
 class ForwardNode(JVPNode):
     """A call on a forward-mode trace."""
 
@@ -129,6 +152,8 @@ class ForwardNode(JVPNode):
 
 untraced = notrace_primitives  # by kind of node, functions that leave the tape
 untraced[ReverseNode], untraced[ForwardNode] = untraced[VJPNode], untraced[JVPNode]
+untraced[UntapedNode] = untraced[VJPNode]
+untaped_root = UntapedNode.new_root
 forward_root = ForwardNode.new_root  # a fresh start of a forward-mode trace, with its tangent
 
 
@@ -149,8 +174,7 @@ def new_trace():
 def _new_trace():
     """The same for autograd's own traces.
 
-    autograd counts up and down, for all threads together: of two nested traces the inner one could get the smaller
-    number, and its derivative be that of the other.
+    autograd counts up and down, for all threads: of two nested traces the inner one could get the smaller number.
     """
     yield new_trace()
 
@@ -175,8 +199,13 @@ def boxed(values, roots, number):
 
 def split_boxes(values, number):
     """Values -> those below the boxes of this trace, and the nodes of the boxes (None where there is none)."""
-    pairs = [(x._value, x._node) if isbox(x) and x._trace == number else (x, None) for x in values]
-    return [value for value, _ in pairs], [node for _, node in pairs]
+    below, nodes = list(values), [None] * len(values)
+    for k, value in enumerate(below):
+        if isbox(value) and value._trace == number:
+            below[k], nodes[k] = value._value, value._node
+        elif isbox(value) and getattr(value._node, "recorder", Recorder).ended:
+            value._node.recorder.refuse()
+    return below, nodes
 
 
 def backward(nodes, ends, cotangents, sums):
@@ -278,14 +307,11 @@ def _of_two(function):
 def _install():
     """Give autograd's traced values quick operators, and its maker of arrays a quick way."""
 
-    def reflected(act):
-        return lambda box, other: act(other, box)
-
     BOX.shape, BOX.__getitem__ = property(lambda box: np.shape(box._value)), _of_two(ITEM)
     for name, function in OPERATORS.items():
         act = _of_two(function)
         setattr(BOX, f"__{name}__", act)
-        setattr(BOX, f"__r{name}__", reflected(act))
+        setattr(BOX, f"__r{name}__", lambda box, other, act=act: act(other, box))
     copy = direct(COPY)
 
     @wraps(COPY)
@@ -438,7 +464,10 @@ def _call_vjp(argnums, ans, args, kwargs):
         raise DerivativeError(f"{rule.name} has no VJP; give differentiable(...) a vjp")
     values = constant_args(args[1:], nums)
     if active:
-        _note_unasked(rule, nums, values)
+        names = list(rule._signature.parameters)  # of the arguments that could have a derivative, and nobody asks for
+        for num, value in enumerate(values):
+            if num not in nums and is_variable(value):
+                note(rule.name, "not asked", names[min(num, len(names) - 1)])
     pull = rule.vjp(nums, ans, *values)
 
     def checked_pull(g):
@@ -450,14 +479,6 @@ def _call_vjp(argnums, ans, args, kwargs):
         return [fit(rule.name, values[num], back, g) for num, back in zip(nums, backs, strict=True)]
 
     return checked_pull
-
-
-def _note_unasked(rule, nums, values):
-    """The arguments that could have a derivative, and whose derivative nobody asks for."""
-    names = list(rule._signature.parameters)
-    for num, value in enumerate(values):
-        if num not in nums and is_variable(value):
-            note(rule.name, "not asked", names[min(num, len(names) - 1)])
 
 
 def _call_jvp(argnums, tangents, ans, args, kwargs):
@@ -514,22 +535,8 @@ def cast(g, dtype):
     return linear("cast", lambda x: np.asarray(x, dtype), lambda x: np.asarray(x, given))[0](g)
 
 
-def of_argument(cotangent, value):
-    """What a product of fields gives for an argument: summed over batches, and for a real argument the real part."""
-    while np.ndim(cotangent) > np.ndim(value):
-        cotangent = anp.sum(cotangent, axis=0)
-    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent
-
-
 def linear(name, forward, transpose):
-    """Name, linear ``forward(x)``, its ``transpose(g)`` on plain arrays -> two rules, each the other's derivative.
-
-    Examples
-    --------
-    >>> double, _ = linear("double", lambda x: 2 * x, lambda g: 2 * g)
-    >>> double(4.0)
-    8.0
-    """
+    """Name, linear ``forward(x)``, its ``transpose(g)`` on plain arrays -> two rules, each the other's derivative."""
     there = Rule(name, forward)
     back = Rule(f"{name}.T", transpose)
     for rule, transposed in ((there, back), (back, there)):

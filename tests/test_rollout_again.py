@@ -269,3 +269,103 @@ def test_a_step_that_keeps_what_it_made_of_params_is_refused(memory):
 
     with pytest.raises(DerivativeError, match="uses a traced value that is not one of its arguments"):
         dp.value_and_grad(lambda p: anp.sum(dp.rollout(step, U, p, N, memory=memory)))(0.3)
+
+
+def stored_in(name):
+    """A step of a state (field, number of the step), and what it stores."""
+    stored, at = {}, int(name.split()[-1])
+
+    def step(s, p):
+        u, i = s
+        if name.startswith("params") and i == at:
+            stored["k"] = anp.exp(-p)
+        if name.startswith("field") and i == at:
+            stored["k"] = 0.1 * anp.mean(u * p)
+        if name.startswith("every") and i % at == 0:
+            stored["k"] = anp.exp(-p)
+        new = smooth(u, p) * (1.0 + (0.0 if "loss" in name else stored.get("k", 0.0)))
+        if name.startswith("before"):
+            stored["k"] = anp.mean(u)
+        return new, i + 1
+
+    return step, stored
+
+
+@pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
+@pytest.mark.parametrize("keep", KEEPS)
+@pytest.mark.parametrize(
+    "name",
+    ["params 1", "params 5", "field 1", "field 4", "every 4", "before 0", "params, loss 1", "field, loss 7"],
+)
+def test_what_a_step_stores_is_refused_or_right(name, keep):
+    """Used by later steps, or by the loss: a state that is run again knows nothing of the first run's constants."""
+
+    def loop(p):
+        step, stored = stored_in(name)
+        states = [(U, 0)]
+        for _ in range(N):
+            states.append(step(states[-1], p))
+        return KEEPS[keep][2]([u for u, _ in states]) + ("loss" in name) * stored["k"]
+
+    def rolled(p, memory):
+        step, stored = stored_in(name)
+        function = lambda i, s: KEEPS["each"][0](i, s[0])
+        out = dp.rollout(step, (U, 0), p, N, memory=memory, keep=function if keep == "each" else keep)
+        return KEEPS[keep][1](out if keep == "each" else out[0]) + ("loss" in name) * stored["k"]
+
+    value, slope = autograd.value_and_grad(loop)(1.3)
+    refused = 0
+    for memory in BUDGETS:
+        assert pushforward(lambda p: rolled(p, memory), 1.3, 1.0)[1] == pytest.approx(slope, rel=1e-11)
+        try:
+            found = dp.value_and_grad(lambda p: rolled(p, memory))(1.3)
+        except DerivativeError:
+            refused += 1
+        else:
+            assert found == pytest.approx((value, slope), rel=1e-11)
+    assert refused > 2
+
+
+def stores(where):
+    """Losses that use what was stored on the way."""
+    seen = []
+
+    def step(u, p):
+        seen.append(anp.sum(u))
+        return smooth(u, p)
+
+    def loss(p, memory):
+        seen.clear()
+        if where == "keep":
+            dp.rollout(smooth, U, p, N, memory=memory, keep=lambda i, u: seen.append(anp.sum(u)))
+        else:
+            dp.rollout(step, U, p, N, memory=memory)
+        if where == "another rollout":
+            return anp.sum(dp.rollout(lambda u, q: u * q, U, seen[5], 2))
+        return seen[5] if where == "as it is" else p * seen[5]
+
+    return loss
+
+
+@pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
+@pytest.mark.parametrize("memory", BUDGETS[:3])
+@pytest.mark.parametrize("where", ["keep", "step", "another rollout", "as it is"])
+def test_a_loss_that_uses_what_was_stored_on_the_way_is_refused(where, memory):
+    loss = stores(where)
+    with pytest.raises(DerivativeError, match="^a traced value was stored"):
+        dp.value_and_grad(lambda p: loss(p, memory))(1.3)
+    assert np.isfinite(loss(1.3, memory))
+
+
+def test_a_value_stored_by_an_earlier_gradient_is_refused():
+    seen = {}
+    loss = lambda p: seen.setdefault("k", anp.exp(p)) * p
+    first = dp.value_and_grad(loss)(0.5)
+    assert first == pytest.approx((0.5 * np.exp(0.5), 1.5 * np.exp(0.5)))
+    for again in (loss, lambda p: seen["k"]):
+        with pytest.raises(
+            DerivativeError,
+            match="^a traced value was stored, and is used after the function or the step that made it has ended: its "
+            "derivative would be lost; return it, from a rollout in the state or by keep$",
+        ):
+            dp.value_and_grad(again)(0.5)

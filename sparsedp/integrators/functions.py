@@ -21,9 +21,10 @@ import autograd.numpy as anp
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
+from sparsedp.derivative import of_argument
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.solvers.separable import diagonalised
-from sparsedp.tape import Rule, isbox, of_argument
+from sparsedp.tape import Rule, isbox
 
 __all__ = ["Function", "PhiFunctions", "phi"]
 

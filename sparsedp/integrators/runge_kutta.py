@@ -40,6 +40,7 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.derivative import of_argument
 from sparsedp.errors import ConvergenceError
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
@@ -50,7 +51,7 @@ from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
 from sparsedp.structure.kronecker import Kronecker
-from sparsedp.tape import Rule, of_argument
+from sparsedp.tape import Rule
 
 __all__ = ["EXPLICIT", "IMPLICIT", "Explicit", "Linear", "Nonlinear", "Polynomial", "Resolvent", "Scheme"]
 

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.derivative import of_argument
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.operator import Operator
@@ -38,7 +39,7 @@ from sparsedp.solvers.sparsity import pattern_like
 from sparsedp.space import Space, fits
 from sparsedp.structure.base import Matrix, compact, rows_of
 from sparsedp.structure.lazy import Chain, Diagonal, Sum
-from sparsedp.tape import Rule, cast, dtype_of, isbox, of_argument, plain
+from sparsedp.tape import Rule, cast, dtype_of, isbox, plain
 
 __all__ = ["Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]
 

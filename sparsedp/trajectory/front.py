@@ -70,8 +70,9 @@ def rollout(
     NonFiniteError
         If state, params or inputs hold NaN or infinity, or a step makes some, or the way back does.
     DerivativeError
-        If the step or `keep` uses a traced value that is not an argument; if a derivative is asked of a state
-        without floating numbers; if a step or `keep` that is run again gives another result.
+        If the step or `keep` uses a traced value that is not an argument, or what one of them stored is used later; if
+        a derivative is asked of a state without floating numbers; if a step or `keep` that is run again gives another
+        result.
     ImportError
         If a progress bar is wanted and tqdm is not installed.
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.constants import constant, frozen
+from sparsedp.constants import constant
 from sparsedp.derivative import linearised
 from sparsedp.errors import DerivativeError
-from sparsedp.tape import dtype_of, is_variable, isbox, plain, traces_of
+from sparsedp.tape import dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, stacked
 from sparsedp.tree import leaves, mapped
 
@@ -34,8 +34,8 @@ class Last:
         self.layout = layout
         self._statics: Any = None
 
-    def start(self, n, outer, stored):
-        """A run of n steps begins, on values of the traces `outer`; `stored` for a way back."""
+    def start(self, steps):
+        """A run begins."""
 
     def see(self, state):
         """A state of the run -> the same, perhaps in other memory."""
@@ -61,11 +61,12 @@ class All(Last):
 
     along = whole = True
 
-    def start(self, n, outer, stored):
+    def start(self, steps):
         """One block for each variable, or a list where its states are traced."""
+        n, outer = steps.loop.n, steps.outer
         pairs = zip(self.layout.shapes, self.layout.dtypes, strict=True)
         self._blocks: list = [[None] * (n + 1) if outer else np.empty((n + 1, *shape), kind) for shape, kind in pairs]
-        self._statics, self._stored = [], stored
+        self._statics, self._stored = [], bool(steps.loop.wanted)
 
     def see(self, state):
         """A state of the run -> the same in the memory that is handed out."""
@@ -121,18 +122,17 @@ class Each(Last):
         self.function = function
         self._marks: list = []  # of what the function returned, where it will be called again
 
-    def start(self, n, outer, stored):
+    def start(self, steps):
         """A run begins."""
         self._stacks: dict = {}
         self._trees: list = []  # what the function returned, rows in place of floating results
-        self._outer, self._stored = outer, stored
+        self._steps = steps
 
     def see(self, state):
         """A state of the run -> the same."""
-        given = self.layout.build([frozen(value) for value in state.values], state.statics)
-        result = self.function(state.i, given)
+        result = self.function(state.i, self._steps.shown(state))
         self._trees.append(mapped(self._kept, result))
-        if self._stored:
+        if self._steps.loop.wanted:
             self._compare(state.i, leaves(result))
         return state
 
@@ -141,7 +141,8 @@ class Each(Last):
         refuse_mask("keep returned a masked array", plain(leaf))
         if not is_variable(leaf):
             return constant(leaf)
-        if not traces_of([leaf]) <= self._outer:
+        (leaf,), _ = split_boxes([leaf], self._steps.number)
+        if not traces_of([leaf]) <= self._steps.outer:
             raise DerivativeError(
                 "keep uses a traced value that is not part of the state, and its derivative would be lost; "
                 "return what it needs of the state, and combine the two outside of rollout"

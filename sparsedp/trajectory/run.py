@@ -169,11 +169,12 @@ class Run:
     def forward(self, args):
         """Run all steps; return the arrays to hand out."""
         loop, steps = self.loop, Steps(self.loop, args)
-        loop.keep.start(loop.n, steps.outer, bool(loop.wanted))
+        loop.keep.start(steps)
         with steps.guarded():
             state, kept, tapes = loop.advance(steps)
         if not all(map(is_finite, state.values)):
             loop.refuse(steps)
+        steps.recorder.ended = True
         if loop.wanted:
             self._end = state.marks()
             self._stored = steps, kept, tapes
@@ -194,8 +195,10 @@ class Run:
         steps, kept, tapes = self._stored
         if loop.slots is not None:  # under a budget they are freed as they are used, and made again if asked again
             self._stored = None
+        steps.recorder.ended = False
         with steps.guarded("on the way back through step"):
             cotangents = BackwardPass(loop, steps, list(kept) if self._stored else kept, list(tapes)).back(g)
+        steps.recorder.ended = True
         for number in loop.wanted:
             loop.check_gradient(number, cotangents[number], g)
         backs = ((cotangents[number], args[number]) for number in loop.wanted)

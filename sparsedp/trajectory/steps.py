@@ -7,7 +7,7 @@ import numpy as np
 
 from sparsedp.constants import frozen
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
-from sparsedp.tape import Recorder, boxed, new_trace, plain, reverse_root, split_boxes, traces_of
+from sparsedp.tape import Recorder, boxed, new_trace, plain, reverse_root, split_boxes, traces_of, untaped_root
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.tree import copied, flatten, leaves
 
@@ -76,7 +76,8 @@ class Steps:
     """
 
     def __init__(self, loop, args):
-        self.loop, self.number, self.recorder = loop, new_trace(), Recorder()
+        self.loop, self.recorder = loop, Recorder()
+        self.number = new_trace()
         self.outer, self.last = traces_of(args), None
         self._open = any(layout.open for layout in loop.layouts)
         values, self.p, self.x = loop.split(args)
@@ -84,13 +85,23 @@ class Steps:
         roots = [reverse_root(self.recorder) if number in loop.wanted else None for number in range(len(args))]
         _, self.roots, self.input_roots = loop.split(roots)
         given = list(map(frozen, self.p))
+        self._taped_params = loop.params.build(boxed(given, self.roots, self.number))
+        # Without a tape the values are traced all the same: what a step stores away is no constant.
+        self._root = untaped_root(self.recorder) if loop.wanted else None
+        self._untaped_params = loop.params.build(boxed(given, [one and self._root for one in self.roots], self.number))
         self.params = loop.params.build(given)
-        self._traced_params = loop.params.build(boxed(given, self.roots, self.number))
+
+    def shown(self, state):
+        """The tree of a state for a function that is called again on a tape."""
+        root = self._root if state.i or self.loop.wants(0) else None
+        values = [frozen(value) for value in state.values]
+        return self.loop.state.build(boxed(values, [root] * len(values), self.number), state.statics)
 
     def forward(self, state):
         """The state after this one."""
-        values, statics = self._called(state, self._given(state), self.params)
-        return State(state.i + 1, self.loop.state.check(values, "the step", self.outer), statics)
+        roots = [self._root if self.loop.wants(state.i) else None] * len(state.values)
+        roots += [one and self._root for one in self.input_roots]
+        return self._called(state, roots, self._untaped_params)[0]
 
     def taped(self, state, stop):
         """The steps from a state to state `stop`, on one tape: (Tape, the state after them)."""
@@ -98,16 +109,13 @@ class Steps:
         nodes, steps = starts, []  # type: Any, list
         while state.i < stop:
             roots = [root and reverse_root(self.recorder) for root in self.input_roots]
-            given = boxed(self._given(state), [*nodes, *roots], self.number)
             try:
-                results, statics = self._called(state, given, self._traced_params)
+                after, nodes = self._called(state, [*nodes, *roots], self._taped_params)
             finally:
                 steps.append((state, roots, self.recorder.taken()))
-            values, nodes = split_boxes(results, self.number)
-            values = self.loop.state.check(values, "the step", self.outer)
             # What is on no tape may be an array that the step uses again.
-            values = [value if node else owned(value) for value, node in zip(values, nodes, strict=True)]
-            state = State(state.i + 1, values, statics)
+            values = [value if node else owned(value) for value, node in zip(after.values, nodes, strict=True)]
+            state = after._replace(values=values)
         return Tape(starts, steps, nodes), state
 
     def back(self, state):
@@ -143,15 +151,17 @@ class Steps:
             parts.append(inputs.build(values[many:], rest))
         return parts
 
-    def _called(self, state, values, params):
-        """The step on variables that may be traced -> those of the next state, and its statics."""
+    def _called(self, state, roots, params):
+        """The step on variables with these roots -> the next state, and the nodes of its variables."""
         self.last = state
-        parts = self._parts(state, values, params)
+        parts = self._parts(state, boxed(self._given(state), roots, self.number), params)
         given = [leaves(part) for part in parts] if self._open else None
         result = self.loop.step(*parts)
         if given is not None:
             _check_entries(parts, given)
-        return self.loop.state.take(result, "the step")
+        results, statics = self.loop.state.take(result, "the step")
+        values, nodes = split_boxes(results, self.number)
+        return State(state.i + 1, self.loop.state.check(values, "the step", self.outer), statics), nodes
 
     @contextmanager
     def guarded(self, way="in step"):
