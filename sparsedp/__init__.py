@@ -28,7 +28,7 @@ _WINDOW = {
     "solvers.inverses": "inverse",
     "solvers.parametric": "elliptic_solver matrix_solver",
     "solvers.roots": "implicit steady",
-    "solvers.separable": "exponential function power",
+    "solvers.spectral": "exponential function power",
     "flow.momentum": "convection face_laplacian face_lift",
     "advection.front": "transport",
     "flow.finite_volumes": "conservation_law",

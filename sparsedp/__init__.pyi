@@ -65,9 +65,9 @@ from .solvers.parametric import elliptic_solver as elliptic_solver
 from .solvers.parametric import matrix_solver as matrix_solver
 from .solvers.roots import implicit as implicit
 from .solvers.roots import steady as steady
-from .solvers.separable import exponential as exponential
-from .solvers.separable import function as function
-from .solvers.separable import power as power
+from .solvers.spectral import exponential as exponential
+from .solvers.spectral import function as function
+from .solvers.spectral import power as power
 from .space import Space as Space
 from .tape import differentiable as differentiable
 from .trajectory.front import rollout as rollout

@@ -9,7 +9,9 @@ import scipy.linalg
 
 import sparsedp as dp
 from sparsedp.derivative import value_and_grad
-from sparsedp.solvers.separable import diagonalise, spectrum
+from sparsedp.solvers.separable import diagonalise, eigenbasis, spectrum
+from sparsedp.structure.factor import Factor
+from sparsedp.structure.kronecker import Kronecker, Term
 
 SIDES = [
     dp.neumann,
@@ -124,6 +126,51 @@ def test_a_polynomial_of_a_laplacian(grid):
     np.testing.assert_allclose(op.matrix.toarray(), op.T.matrix.toarray().T, rtol=0, atol=1e-9)
     both = dp.function(dp.exponential(L, 0.1), np.log)(u)
     np.testing.assert_allclose(both, 0.1 * L(u), rtol=0, atol=1e-9 * np.max(np.abs(L(u))))
+
+
+WIDE, LONG = np.linspace(1.0, 2.0, 33), np.linspace(2.0, 1.0, 32)
+BOXES = [dp.Grid((33, 32), size=(1.0, 2.0)), dp.Grid((33, 32), periodic=True), dp.Grid((33, 32), spacing=[WIDE, LONG])]
+
+
+@pytest.mark.parametrize("grid", BOXES, ids=["box", "periodic", "stretched"])
+@pytest.mark.parametrize("boundary", [dp.neumann, dp.dirichlet])
+def test_what_is_made_of_one_laplacian_is_inverted_by_transforms(grid, boundary):
+    """Squares multiplied out, functions, and their sums: one pair of transforms, and the eigenvalues of the whole."""
+    L, I = dp.laplacian(grid, boundary), dp.identity(grid.cells)
+    f, u = dp.function(L, lambda e: 0.3 - (1 + e) ** 2), np.cos(np.arange(grid.cells.size)).reshape(grid.shape)
+    for op in (L @ L, -2 * L @ L - L, 0.3 * I - (I + L) @ (I + L), f, -0.5 * f + f - I, f @ f, dp.power(f, 2) + f):
+        found, values = eigenbasis(op.structure)
+        wanted = op(u)
+        y = found.apply(values, u.reshape(-1)).reshape(grid.shape)
+        np.testing.assert_allclose(y, wanted, rtol=0, atol=2e-14 * np.max(np.abs(wanted)))
+        inv = dp.inverse(I + 0.7 / np.max(np.abs(values)) * op)
+        assert inv.method == "separable" and "a function of a sum of 1-D factors" in inv.reason
+        np.testing.assert_allclose(inv(u + 0.7 / np.max(np.abs(values)) * wanted), u, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(dp.exponential(L @ L, -1e-9)(u), dp.function(L, lambda e: np.exp(-1e-9 * e**2))(u))
+
+
+def test_squares_in_space():
+    grid = dp.Grid((6, 5, 7), size=1.0)
+    L = dp.laplacian(grid, {"x": dp.dirichlet})
+    found, values = eigenbasis((3 * L - L @ L).structure)
+    u = np.sin(np.arange(grid.cells.size))
+    wanted = (3 * L - L @ L) @ u
+    np.testing.assert_allclose(found.apply(values, u), wanted, rtol=0, atol=1e-13 * np.max(np.abs(wanted)))
+
+
+def test_what_is_not_made_of_one_laplacian():
+    """Near misses: another polynomial, other walls, a line that bends along one axis."""
+    grid = dp.Grid((33, 32), spacing=(1e-3, 1.0))
+    L, M = dp.laplacian(grid), dp.laplacian(grid, dp.dirichlet)
+    bent = np.diag(1e-6 * np.arange(32.0))  # far below the squares along x
+    along_y = dp.from_matrix(np.kron(np.eye(33), bent), grid.cells, grid.cells)
+    factor = Kronecker(grid.cells.parts, grid.cells.parts, {(0, 0): (Term(1.0, (None, Factor(bent))),)})
+    bend = dp.Operator(factor, grid.cells, grid.cells, "bend")
+    np.testing.assert_array_equal(bend.matrix.toarray(), along_y.matrix.toarray())
+    for op in (L @ L @ L, L @ M, L @ L + M, L @ L + bend, dp.function(L, np.exp) + M, dp.function(L, np.exp) @ bend):
+        assert eigenbasis(op.structure) is None, op
+    assert eigenbasis((L @ L + L).structure) is not None
+    assert eigenbasis(dp.diagonal(grid.cells, 1j * np.ones(grid.shape)).structure) is None
 
 
 def test_kuramoto_sivashinsky_in_a_plane():

@@ -23,7 +23,7 @@ from numpy.polynomial.polynomial import polyval
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.solvers.separable import diagonalised
+from sparsedp.solvers.spectral import diagonalised
 from sparsedp.tape import Rule, isbox
 
 __all__ = ["Function", "PhiFunctions", "phi"]

@@ -16,7 +16,7 @@ from sparsedp.solvers.amg import multigrid_engine
 from sparsedp.solvers.direct import DenseSystem, dense_engine, direct_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
 from sparsedp.solvers.preconditioners import krylov_engine
-from sparsedp.solvers.separable import separable_engine, spectrum, transforming
+from sparsedp.solvers.separable import eigenbasis, separable_engine, transforming
 from sparsedp.solvers.solve import EmptySystem, SolveLog, Solver, failure
 from sparsedp.solvers.system import System
 from sparsedp.space import fits
@@ -211,6 +211,11 @@ def _chosen(system, solves):
     """The word of a method, why, and its engine if it is built. Depends on the operator only, so that bits repeat."""
     size, grid = system.unknowns, system.op.domain.grid
     dimension = 0 if grid is None else grid.dim
+    engine = _transforms(system, dimension)
+    if engine is not None:
+        what = "" if system.op.structure.separable else "a function of "
+        reason = f"{size} unknowns in {dimension}-D, {what}a sum of 1-D factors: transforms solve it exactly"
+        return "separable", reason, engine
     if not system.op.structure.has_entries:
         return "krylov", "only products with the operator are known", None
     if system.complex:
@@ -222,10 +227,6 @@ def _chosen(system, solves):
             f"{size} complex unknowns in {dimension}-D: LU would not fit, GMRES and shifted Laplace do",
             engine,
         )
-    engine = _transforms(system, dimension)
-    if engine is not None:
-        reason = f"{size} unknowns in {dimension}-D, a sum of 1-D factors: transforms solve it exactly"
-        return "separable", reason, engine
     where = f"{size} unknowns in {dimension}-D" if dimension else f"{size} unknowns without a grid"
     limit = DIRECT_BELOW_STRUCTURED[solves].get(dimension, 0)
     engine, unsuited = (None, "") if size <= limit else structured_if_suited(system)
@@ -244,13 +245,14 @@ def _chosen(system, solves):
 
 
 def _transforms(system, dimension):
-    """The engine of a sum of 1-D factors, where transforms along them are cheap, else None."""
+    """The engine of a sum of 1-D factors or what is made of one, where transforms along them are cheap, else None."""
     structure = system.op.structure
-    if dimension < 2 or system.size < SEPARABLE_FROM or not structure.separable or system.active is not None:
+    few = dimension < 2 or system.size < SEPARABLE_FROM
+    if structure.has_entries and few or system.active is not None:
         return None
-    found = spectrum(structure)
-    dense = [] if found is None else [axis.eigenvalues.size for axis in found.axes if axis.kind == "eigenvectors"]
-    return None if found is None or max(dense, default=0) > LONGEST_EIGENVECTORS else transforming(structure, found)
+    found = eigenbasis(structure)
+    dense = [] if found is None else [axis.eigenvalues.size for axis in found[0].axes if axis.kind == "eigenvectors"]
+    return None if found is None or max(dense, default=0) > LONGEST_EIGENVECTORS else transforming(structure, *found)
 
 
 # ---- the inverse as an operator ----

@@ -23,21 +23,17 @@ import scipy.fft as fft
 import scipy.linalg
 
 from sparsedp import kernels
-from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_function, is_number
-from sparsedp.operator import Operator
 from sparsedp.solvers.scaling import inverted
 from sparsedp.solvers.solve import Engine
 from sparsedp.structure.base import Structure
+from sparsedp.structure.kronecker import Kronecker, Term
+from sparsedp.structure.lazy import Chain, Diagonal, Sum
 
 __all__ = [
     "Separable",
     "SpectralFunction",
     "Spectrum",
-    "diagonalised",
-    "exponential",
-    "function",
-    "power",
+    "eigenbasis",
     "separable_engine",
     "spectrum",
     "transforming",
@@ -246,6 +242,14 @@ class Spectrum:
             y = self.axes[a].turned(1, y, a, transposed, self.workers, True)
         return y.reshape(-1)
 
+    def same_basis(self, other):
+        """Whether the other one has the same eigenvectors, bit by bit."""
+        pairs = zip(self.axes, other.axes)
+        return self.shape == other.shape and all(
+            one.kind == two.kind and (one.kind != "eigenvectors" or np.array_equal(one.matrices[1], two.matrices[1]))
+            for one, two in pairs
+        )
+
     @property
     def words(self):
         """One line: what each axis is."""
@@ -335,9 +339,9 @@ class Separable(Engine):
     method = "separable"
     unit = "refinements"
 
-    def __init__(self, found, elimination=None):
+    def __init__(self, found, eigenvalues, elimination=None):
         self.spectrum, self.elimination = found, elimination
-        self.weights = inverted(found.eigenvalues) if elimination is None else None
+        self.weights = inverted(eigenvalues) if elimination is None else None
         self.hierarchy = found.words
         if elimination is not None:
             self.hierarchy = f"elimination({found.shape[0]}) x {found.words.split(' x ', 1)[1]}"
@@ -351,19 +355,19 @@ class Separable(Engine):
         return self.spectrum.backward(y, transposed), 0, ""
 
 
-def transforming(structure, found):
-    """Kronecker sum and its Spectrum -> Separable, without transforms along the first axis unless they are as good."""
-    first, modes = found.shape[0], found.eigenvalues[0].size
-    if 0 not in structure.lines or first < 3 or modes < (WIDE_COMPILED if kernels.compiled() else WIDE_PLAIN):
-        return Separable(found)
+def transforming(structure, found, eigenvalues):
+    """Structure and its `eigenbasis` -> Separable, without transforms along the first axis unless they are as good."""
+    first, wide = found.shape[0], WIDE_COMPILED if kernels.compiled() else WIDE_PLAIN
+    if not structure.separable or 0 not in structure.lines or first < 3 or found.eigenvalues[0].size < wide:
+        return Separable(found, eigenvalues)
     rest = Spectrum(found.shape, (Axis("identity", np.zeros(first)), *found.axes[1:]), found.shift)
     sums = rest.eigenvalues[0].reshape(-1)
     elimination = sweep(structure.lines[0], np.repeat(sums, 2) if rest.fourier else sums)  # real and imaginary parts
-    return Separable(found) if elimination is None else Separable(rest, elimination)
+    return Separable(found, eigenvalues) if elimination is None else Separable(rest, None, elimination)
 
 
 def separable_engine(system):
-    """Engine: transforms along the axes. For Kronecker sums whose factors can be diagonalised.
+    """Engine: transforms along the axes. For Kronecker sums whose factors can be diagonalised, and what is made of one.
 
     Parameters
     ----------
@@ -374,14 +378,13 @@ def separable_engine(system):
     ValueError
         If the operator is not such a sum.
     """
-    structure = system.op.structure
-    found = spectrum(structure) if structure.separable and system.active is None else None
+    found = eigenbasis(system.op.structure) if system.active is None else None
     if found is None:
         raise ValueError(f"separable needs a sum of 1-D factors that can be diagonalised, got {system.given}")
-    return transforming(structure, found)
+    return transforming(system.op.structure, *found)
 
 
-# ---------------------------------------------------------------- functions of a separable operator
+# ---------------------------------------------------------------- functions of a Kronecker sum
 
 
 class SpectralFunction(Structure):
@@ -399,164 +402,68 @@ class SpectralFunction(Structure):
     def transpose(self):
         return SpectralFunction(self.spectrum, self.weights, not self.transposed)
 
+    def scaled(self, factor):
+        real = not np.iscomplexobj(factor)
+        return SpectralFunction(self.spectrum, self.weights * factor, self.transposed) if real else None
 
-def exponential(op, time=1.0):
-    """Separable operator -> the operator exp(time * op): exact diffusion over a time, at any size of step.
 
-    Parameters
-    ----------
-    op : Operator
-        A Kronecker sum from a space to itself (``op.separable``), such as a laplacian; or a power of one.
-    time : float
-        Finite [1 / unit of the operator].
+def eigenbasis(structure):
+    """(Spectrum, eigenvalues) of a diagonal, a Kronecker sum, and what is made of one; None of others.
 
-    Returns
-    -------
-    Operator
-        Matrix-free: two transforms for each application.
-
-    Raises
-    ------
-    ValueError
-        If the operator is not separable or cannot be diagonalised.
-    TypeError
-        If `time` is not one real number.
-    NonFiniteError
-        If `time` is not finite, or the exponential leaves the range of floats.
-
-    Notes
-    -----
-    With A = V diag(e) V^-1: exp(t A) = V diag(exp(t e)) V^-1. Transpose: exp(t A^T).
-
-    Examples
-    --------
-    >>> from sparsedp import Grid, laplacian
-    >>> spread = exponential(laplacian(Grid(2)), 1e9)
-    >>> print(np.round(spread(np.array([1.0, 3.0])), 6))
-    [2. 2.]
+    Made of one are its functions, its square, and sums and products of these. Nothing is tried that takes long: where
+    members have eigenvectors of their own, they count as the same only if all their bits are.
     """
-    axes, values = diagonalised(op, "exponential")
-    _check_number("exponential", "time", time, 0.1)
-    with np.errstate(over="ignore"):
-        weights = np.exp(time * values)
-    name = f"exp({time:g} * {op.name})"
-    return _function(op, axes, weights, name, f"{name} is beyond 1.8e308; take a shorter time or the other sign")
+    if isinstance(structure, Diagonal) and structure.dtype == float:
+        size = structure.shape[0]
+        return Spectrum((size,), (Axis("identity", np.zeros(size)),), 0.0), structure.values
+    return _of_one(structure)
 
 
-def power(op, exponent):
-    """Separable operator -> the operator op^exponent, such as a square root or a smoothing power.
-
-    Parameters
-    ----------
-    op : Operator
-        A Kronecker sum from a space to itself (``op.separable``); or an exponential of one.
-    exponent : float
-        Whole, or any number when no eigenvalue is negative. On the null space a negative exponent
-        gives 0: the generalised inverse.
-
-    Returns
-    -------
-    Operator
-
-    Raises
-    ------
-    ValueError
-        If the operator is not separable, or a fractional power of a negative eigenvalue is asked for.
-    TypeError
-        If `exponent` is not one real number.
-    NonFiniteError
-        If `exponent` is not finite, or the power leaves the range of floats.
-
-    Examples
-    --------
-    >>> from sparsedp import Grid, laplacian
-    >>> root = power(-laplacian(Grid(3)), 0.5)
-    >>> print(np.round(root(root(np.array([1.0, 2.0, 4.0]))), 6))
-    [-1. -1.  2.]
-    """
-    axes, values = diagonalised(op, "power")
-    _check_number("power", "exponent", exponent, 0.5)
-    if exponent != int(exponent) and np.any(values < 0):
-        raise ValueError(f"{op.name} has eigenvalues down to {values.min():.1e}; a fractional power needs them >= 0")
-    zero = values == 0
-    with np.errstate(over="ignore"):
-        weights = np.where(zero, 1.0 if exponent == 0 else 0.0, np.where(zero, 1.0, values) ** float(exponent))
-    refusal = f"{op.name} to the power {exponent:g} is beyond 1.8e308; rescale the operator"
-    return _function(op, axes, weights, f"({op.name})^{exponent:g}", refusal)
-
-
-def function(op, f):
-    """Separable operator -> the operator f(op): f of its eigenvalues, such as a polynomial in a Laplacian.
-
-    Parameters
-    ----------
-    op : Operator
-        A Kronecker sum from a space to itself (``op.separable``); or a function of one.
-    f : callable
-        ``f(e)``: an array of eigenvalues [unit of the operator] -> as many real numbers. It is called once.
-
-    Returns
-    -------
-    Operator
-        Matrix-free: two transforms for each application. As `linear` of ``stepper("etdrk4", ...)`` it is exact in time.
-
-    Raises
-    ------
-    ValueError
-        If the operator is not separable or cannot be diagonalised.
-    ShapeError
-        If f returns another shape.
-    TypeError
-        If f is no function, or returns what are no real numbers.
-    NonFiniteError
-        If a value is NaN or infinite.
-
-    Notes
-    -----
-    With A = V diag(e) V^-1: f(A) = V diag(f(e)) V^-1. Transpose: f(A^T).
-
-    Examples
-    --------
-    >>> from sparsedp import Grid, laplacian
-    >>> L = laplacian(Grid(3))
-    >>> swift_hohenberg = function(L, lambda e: 0.1 - (1 + e) ** 2)
-    >>> u = np.array([1.0, 2.0, 4.0])
-    >>> print(np.round(swift_hohenberg(u) - (0.1 * u - u - 2 * L(u) - L(L(u))), 12) + 0.0)
-    [0. 0. 0.]
-    """
-    check_function("function", f, "lambda e: -e**2 - e")
-    axes, values = diagonalised(op, "function")
-    with np.errstate(all="ignore"):  # NaN is refused below
-        weights = np.asarray(f(values.copy()))
-    if weights.shape != values.shape:
-        raise ShapeError(f"function needs f to give shape {values.shape}, a number an eigenvalue, got {weights.shape}")
-    if weights.dtype.kind not in "fiu":
-        raise TypeError(f"function needs f to give real numbers, got dtype {weights.dtype}")
-    name = f"f({op.name})"
-    return _function(op, axes, weights.astype(float), name, f"{name} holds NaN or infinity; check f at its eigenvalues")
-
-
-def diagonalised(op, name, advice=""):
-    """(Spectrum, eigenvalues) of an operator that is separable, or a function of such a one; `name` needs them."""
-    structure = op.structure
+def _of_one(structure):
+    """The same of all but diagonals."""
     if isinstance(structure, SpectralFunction) and not structure.transposed:
         return structure.spectrum, structure.weights
-    axes = spectrum(structure) if op.separable else None
-    if axes is None:
-        raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}{advice}")
-    return axes, axes.eigenvalues
+    if isinstance(structure, (Sum, Chain)):
+        return _together(structure.members, np.add if isinstance(structure, Sum) else np.multiply)
+    if not isinstance(structure, Kronecker):
+        return None
+    if not structure.separable:
+        return _squared(structure)
+    found = spectrum(structure)
+    return None if found is None else (found, found.eigenvalues)
 
 
-def _check_number(name, what, number, example):
-    """Refuse what is not one finite number."""
-    if not is_number(number):
-        raise TypeError(f"{name} needs one real number as {what}, got {number!r}; write for example {example}")
-    if not np.isfinite(number):
-        raise NonFiniteError(f"{name} needs a finite {what}, got {number}")
+def _together(members, combined):
+    """The same of a sum or a product of structures, where one basis is that of all of them."""
+    axes, values = None, []
+    for member in members:
+        if isinstance(member, Kronecker) and member.separable and not member.lines:  # a number times the identity
+            values.append(float(member.shift))
+            continue
+        found = _of_one(member)
+        if found is None or not (axes is None or axes.same_basis(found[0])):
+            return None
+        axes = found[0]
+        values.append(found[1])
+    return None if axes is None else (axes, reduce(combined, values))
 
 
-def _function(op, axes, weights, name, refusal):
-    """The Operator with these weights in place of the eigenvalues; refused when they are beyond the range of floats."""
-    if not np.all(np.isfinite(weights)):
-        raise NonFiniteError(refusal)
-    return Operator(SpectralFunction(axes, weights), op.domain, op.codomain, name)
+def _squared(structure):
+    """The same of a L^2 + b L + c, multiplied out: products of the factors of two axes give L away."""
+    products = [term for term in structure.terms if len(term.axes) == 2]
+    parts, lines = structure.out_parts, {axis: term.factors[axis] for term in products for axis in term.axes}
+    if not products or structure.in_parts != parts or len(parts) > 1:
+        return None
+    once = [Term(1.0, tuple(line if a == axis else None for a in range(len(parts[0])))) for axis, line in lines.items()]
+    L, a, b = Kronecker(parts, parts, {(0, 0): tuple(once)}), products[0].scale / 2, 0.0
+    rest = structure.added(L.composed(L).scaled(-a))
+    axis = min(lines, key=lambda axis: lines[axis].largest)  # where rounding in the squares hides least
+    if axis in rest.lines:
+        line = lines[axis].matrix
+        b = float(line.multiply(rest.lines[axis].matrix).sum() / line.multiply(line).sum())
+    rest = rest.added(L.scaled(-b))
+    limits = {axis: ROUNDING * abs(a) * line.largest**2 for axis, line in lines.items()}
+    if not rest.separable or any(line.largest > limits.get(axis, 0.0) for axis, line in rest.lines.items()):
+        return None  # another polynomial in L, or none
+    found = spectrum(L)
+    return None if found is None else (found, (a * found.eigenvalues + b) * found.eigenvalues + rest.shift)

@@ -1,0 +1,169 @@
+"""Functions of a separable operator as operators: exponentials, powers, and any function of its eigenvalues."""
+
+import numpy as np
+
+from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.fields import check_function, is_number
+from sparsedp.operator import Operator
+from sparsedp.solvers.separable import SpectralFunction, eigenbasis
+
+__all__ = ["diagonalised", "exponential", "function", "power"]
+
+
+def exponential(op, time=1.0):
+    """Separable operator -> the operator exp(time * op): exact diffusion over a time, at any size of step.
+
+    Parameters
+    ----------
+    op : Operator
+        A Kronecker sum from a space to itself (``op.separable``), such as a laplacian; or a power of one.
+    time : float
+        Finite [1 / unit of the operator].
+
+    Returns
+    -------
+    Operator
+        Matrix-free: two transforms for each application.
+
+    Raises
+    ------
+    ValueError
+        If the operator is not separable or cannot be diagonalised.
+    TypeError
+        If `time` is not one real number.
+    NonFiniteError
+        If `time` is not finite, or the exponential leaves the range of floats.
+
+    Notes
+    -----
+    With A = V diag(e) V^-1: exp(t A) = V diag(exp(t e)) V^-1. Transpose: exp(t A^T).
+
+    Examples
+    --------
+    >>> from sparsedp import Grid, laplacian
+    >>> spread = exponential(laplacian(Grid(2)), 1e9)
+    >>> print(np.round(spread(np.array([1.0, 3.0])), 6))
+    [2. 2.]
+    """
+    axes, values = diagonalised(op, "exponential")
+    _check_number("exponential", "time", time, 0.1)
+    with np.errstate(over="ignore"):
+        weights = np.exp(time * values)
+    name = f"exp({time:g} * {op.name})"
+    return _function(op, axes, weights, name, f"{name} is beyond 1.8e308; take a shorter time or the other sign")
+
+
+def power(op, exponent):
+    """Separable operator -> the operator op^exponent, such as a square root or a smoothing power.
+
+    Parameters
+    ----------
+    op : Operator
+        A Kronecker sum from a space to itself (``op.separable``); or an exponential of one.
+    exponent : float
+        Whole, or any number when no eigenvalue is negative. On the null space a negative exponent
+        gives 0: the generalised inverse.
+
+    Returns
+    -------
+    Operator
+
+    Raises
+    ------
+    ValueError
+        If the operator is not separable, or a fractional power of a negative eigenvalue is asked for.
+    TypeError
+        If `exponent` is not one real number.
+    NonFiniteError
+        If `exponent` is not finite, or the power leaves the range of floats.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid, laplacian
+    >>> root = power(-laplacian(Grid(3)), 0.5)
+    >>> print(np.round(root(root(np.array([1.0, 2.0, 4.0]))), 6))
+    [-1. -1.  2.]
+    """
+    axes, values = diagonalised(op, "power")
+    _check_number("power", "exponent", exponent, 0.5)
+    if exponent != int(exponent) and np.any(values < 0):
+        raise ValueError(f"{op.name} has eigenvalues down to {values.min():.1e}; a fractional power needs them >= 0")
+    zero = values == 0
+    with np.errstate(over="ignore"):
+        weights = np.where(zero, 1.0 if exponent == 0 else 0.0, np.where(zero, 1.0, values) ** float(exponent))
+    refusal = f"{op.name} to the power {exponent:g} is beyond 1.8e308; rescale the operator"
+    return _function(op, axes, weights, f"({op.name})^{exponent:g}", refusal)
+
+
+def function(op, f):
+    """Separable operator -> the operator f(op): f of its eigenvalues, such as a polynomial in a Laplacian.
+
+    Parameters
+    ----------
+    op : Operator
+        A Kronecker sum from a space to itself (``op.separable``); or a function of one.
+    f : callable
+        ``f(e)``: an array of eigenvalues [unit of the operator] -> as many real numbers. It is called once.
+
+    Returns
+    -------
+    Operator
+        Matrix-free: two transforms for each application. As `linear` of ``stepper("etdrk4", ...)`` it is exact in time.
+
+    Raises
+    ------
+    ValueError
+        If the operator is not separable or cannot be diagonalised.
+    ShapeError
+        If f returns another shape.
+    TypeError
+        If f is no function, or returns what are no real numbers.
+    NonFiniteError
+        If a value is NaN or infinite.
+
+    Notes
+    -----
+    With A = V diag(e) V^-1: f(A) = V diag(f(e)) V^-1. Transpose: f(A^T).
+
+    Examples
+    --------
+    >>> from sparsedp import Grid, laplacian
+    >>> L = laplacian(Grid(3))
+    >>> swift_hohenberg = function(L, lambda e: 0.1 - (1 + e) ** 2)
+    >>> u = np.array([1.0, 2.0, 4.0])
+    >>> print(np.round(swift_hohenberg(u) - (0.1 * u - u - 2 * L(u) - L(L(u))), 12) + 0.0)
+    [0. 0. 0.]
+    """
+    check_function("function", f, "lambda e: -e**2 - e")
+    axes, values = diagonalised(op, "function")
+    with np.errstate(all="ignore"):  # NaN is refused below
+        weights = np.asarray(f(values.copy()))
+    if weights.shape != values.shape:
+        raise ShapeError(f"function needs f to give shape {values.shape}, a number an eigenvalue, got {weights.shape}")
+    if weights.dtype.kind not in "fiu":
+        raise TypeError(f"function needs f to give real numbers, got dtype {weights.dtype}")
+    name = f"f({op.name})"
+    return _function(op, axes, weights.astype(float), name, f"{name} holds NaN or infinity; check f at its eigenvalues")
+
+
+def diagonalised(op, name, advice=""):
+    """(Spectrum, eigenvalues) of an operator that is separable, or made of such ones; `name` needs them."""
+    found = eigenbasis(op.structure)
+    if found is None:
+        raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}{advice}")
+    return found
+
+
+def _check_number(name, what, number, example):
+    """Refuse what is not one finite number."""
+    if not is_number(number):
+        raise TypeError(f"{name} needs one real number as {what}, got {number!r}; write for example {example}")
+    if not np.isfinite(number):
+        raise NonFiniteError(f"{name} needs a finite {what}, got {number}")
+
+
+def _function(op, axes, weights, name, refusal):
+    """The Operator with these weights in place of the eigenvalues; refused when they are beyond the range of floats."""
+    if not np.all(np.isfinite(weights)):
+        raise NonFiniteError(refusal)
+    return Operator(SpectralFunction(axes, weights), op.domain, op.codomain, name)
