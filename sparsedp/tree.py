@@ -9,7 +9,7 @@ from math import hypot, isfinite
 import numpy as np
 import scipy.sparse as sp
 
-__all__ = ["copied", "flatten", "keys", "labels", "leaves", "mapped", "norm", "subscript"]
+__all__ = ["copied", "flatten", "keys", "labels", "leaves", "leaves_like", "mapped", "norm", "subscript"]
 
 
 def flatten(tree):
@@ -73,6 +73,20 @@ def leaves(tree):
     """
     names = keys(tree)
     return [tree] if names is None else [leaf for name in names for leaf in leaves(tree[name])]
+
+
+def leaves_like(tree, other):
+    """Tree and another one -> its leaves in the order of the other's: by name, where both have the same names.
+
+    Examples
+    --------
+    >>> leaves_like({"v": 2.0, "u": 1.0}, {"u": None, "v": None})
+    [1.0, 2.0]
+    """
+    names, wanted = keys(tree), keys(other)
+    if names is None or wanted is None or set(names) != set(wanted):
+        return leaves(tree)
+    return [leaf for name in wanted for leaf in leaves_like(tree[name], other[name])]
 
 
 def labels(tree, root):

@@ -85,8 +85,30 @@ TABLE = [
     (
         lambda: dp.stepper("imex", decay, 0.1, linear=L)({"a": U}),
         TYPE,
-        "stepper(imex) has an Operator, which acts on one array, got a dict as u; "
-        "stack its parts into one array, or apply the Operator inside the rate of an implicit method",
+        "linear must be like the state, which has a tree of ['a'] there, got one for one field; "
+        "write None for a field without a stiff part",
+    ),
+    (
+        lambda: dp.stepper("etdrk4", decay, 0.1, linear={"a": (L, 1.0)})(U),
+        TYPE,
+        "linear must be like the state, which has one field there, got one for a tree of ['a']; "
+        "write None for a field without a stiff part",
+    ),
+    (
+        lambda: dp.stepper("imex", decay, 0.1, linear={"a": (L, {"b": L, "c": None})})({"a": (U, {"b": U, "d": U})}),
+        TYPE,
+        "linear['a'][1] must be like the state, which has a tree of ['b', 'd'] there, got one for a tree of "
+        "['b', 'c']; write None for a field without a stiff part",
+    ),
+    (
+        lambda: dp.stepper("imex", decay, 0.1, linear=[L, {"b": 3.0}]),
+        TYPE,
+        "linear[1]['b'] takes an Operator or a pair (Operator, coefficient), got float",
+    ),
+    (
+        lambda: dp.stepper("imex", lambda u, p: u, 0.1, linear={"a": (L, -1.0)})({"a": U}),
+        VALUE,
+        "the coefficient of laplacian['a'] must be >= 0, got -1; put the sign into the operator",
     ),
     (
         lambda: dp.stepper("euler", None, 0.1),

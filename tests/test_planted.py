@@ -361,6 +361,24 @@ BUGS = {
         "found[k + 1] += k * weight",
         "tests/test_integrators.py tests/test_integrators_split.py",
     ),
+    "a coefficient of the field before": Bug(
+        "integrators",
+        "h * term.coefficient(params)",
+        "h * self.stiff[0].coefficient(params)",
+        "tests/test_integrators_fields.py",
+    ),
+    "rates that go to fields by their place": Bug(
+        "tree.py",
+        "names is None or wanted is None or set(names) != set(wanted)",
+        "True",
+        "tests/test_integrators_fields.py",
+    ),
+    "a squared operator without what stands beside it": Bug(
+        "solvers",
+        "(a * found.eigenvalues + b) * found.eigenvalues",
+        "(a * found.eigenvalues) * found.eigenvalues",
+        "tests/test_spectral.py",
+    ),
     "cotangents of a trajectory at the step before": Bug(
         "trajectory",
         "[block[state.i] for block in g]",

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from sparsedp.integrators.functions import Function, PhiFunctions
-from sparsedp.integrators.problem import later
+from sparsedp.integrators.problem import combine, later
 from sparsedp.integrators.runge_kutta import Scheme
 
 __all__ = ["Exponential"]
@@ -46,23 +46,33 @@ class Exponential(Scheme):
 
     def __init__(self, problem):
         super().__init__(problem, "etdrk4", 4)
-        self.functions = PhiFunctions(problem.op, "stepper(etdrk4)")
+        self.functions = problem.engines(lambda op: PhiFunctions(op, "stepper(etdrk4)"), _free)
         self.nodes = () if problem.source is None else NODES if problem.moving else NODES[:1]
         self.parts = [quadrature(self.nodes, *ends) for ends in ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0))]
 
     def __call__(self, u, params, t, h):
-        z, f = h * self.problem.coefficient(params), self.functions
-        s = [h * self.problem.given(params, later(t, node * h)) for node in self.nodes]
+        def f(functions, *trees):
+            def of_field(op, z, leaf, *rates):
+                return self.functions[op](functions, z, leaf, *(h * rate for rate in rates))
+
+            return self.problem.on_fields(of_field, h, params, *trees)
+
+        s = [self.problem.given(params, later(t, node * h)) for node in self.nodes]
         whole, first, second = self.parts
         if self.problem.rate is None:
-            return f((WHOLE, *whole), z, u, *s)
+            return f((WHOLE, *whole), u, *s)
 
         def n(v, share):
-            return h * self.problem.explicit(v, params, later(t, share * h))
+            return self.problem.explicit(v, params, later(t, share * h))
 
         n0 = n(u, 0.0)
-        a = f((HALF, MEAN, *first), z, u, n0, *s)
+        a = f((HALF, MEAN, *first), u, n0, *s)
         n1 = n(a, 0.5)
-        n2 = n(f((HALF, MEAN, *first), z, u, n1, *s), 0.5)
-        n3 = n(f((HALF, MEAN, *second), z, a, 2.0 * n2 - n0, *s), 1.0)
-        return f((WHOLE, BEGIN, MIDDLE, END, *whole), z, u, n0, n1 + n2, n3, *s)
+        n2 = n(f((HALF, MEAN, *first), u, n1, *s), 0.5)
+        n3 = n(f((HALF, MEAN, *second), a, combine(n2, (1.0, n2), (-1.0, n0)), *s), 1.0)
+        return f((WHOLE, BEGIN, MIDDLE, END, *whole), u, n0, combine(n1, (1.0, n2)), n3, *s)
+
+
+def _free(functions, z, *fields):
+    """The sum of functions where L is 0."""
+    return sum(function.at_zero(None, field) for function, field in zip(functions, fields, strict=True))

@@ -55,7 +55,7 @@ def stepper(
         tr_bdf2                 2     L-stable, two stages with one factor
         imex                    2     `linear` and source implicit (L-stable), the rate explicit
         radau                   5     L-stable, full LU: for stiff systems of up to 500 unknowns, best with a tolerance
-        etdrk4                  4     `linear` exact by transforms (separable only), the rate explicit
+        etdrk4                  4     `linear` exact by transforms (what is made of a box), the rate explicit
         leapfrog                2     waves: two fields, each moved by the other, half a step apart; reversible
         ======================= ===== ==============================================================
     rate : callable or Operator
@@ -67,8 +67,11 @@ def stepper(
         times of the steps, q half a step before, on entry and on return.
     dt : float, traced number, or function of params
         Length of a step [time], > 0. To differentiate in dt inside a loop write ``lambda params: params["dt"]``.
-    linear : Operator or (Operator, coefficient), optional
-        A term c L u beside the rate, with u one array; `coefficient` is a number >= 0 or a function of params.
+    linear : Operator or (Operator, coefficient), or a tree of these like the state, optional
+        A term c L u beside the rate; `coefficient` is a number >= 0 or a function of params. Each field of a tree has
+        its own, or None: ``{"u": (L, 0.1), "v": (L, lambda p: p["D"]), "w": None}``. A pair with a number is one term,
+        so for a state of two fields, the second without one, write ``[L, None]``. Also L may be ``-1.0 * L @ L``, a
+        `function` of an operator, or a `diagonal`. Set-ups are shared by fields with the same L and c.
     source : callable, optional
         ``source(params)`` or ``source(params, t)``: a term that does not depend on u, such as nu D(B(values)) of walls
         that move, with B a `lift`; implicit methods keep their order with it, imex and etdrk4 too. A problem of
@@ -103,7 +106,7 @@ def stepper(
     ValueError
         If the method or a setting is unknown, dt <= 0, or a coefficient is negative.
     TypeError
-        If rate, linear or source is not what it should be.
+        If rate, linear or source is not what it should be; on use, if `linear` is not like the state.
     NonFiniteError
         If dt, state or params holds NaN or infinity, or the new state would.
     UnstableStepError
@@ -154,13 +157,13 @@ def stepper(
     dt = dt if callable(dt) else positive(dt, "dt")
     problem = _problem(method, given)
     if method == "radau":
-        return Step(method, problem, dt, Radau(problem, jacobian, tolerance, given["floor"], settings), np.inf, given)
-    scheme, largest = _scheme(method, problem, jacobian, settings, KEPT[tolerance is not None]), np.inf
+        return Step(method, problem, dt, Radau(problem, jacobian, tolerance, given["floor"], settings), [], given)
+    scheme, limits = _scheme(method, problem, jacobian, settings, KEPT[tolerance is not None]), []
     if tolerance is not None:
         scheme = Adaptive(scheme, float(tolerance), given["floor"])
-    elif method in EXPLICIT and problem.op is not None and unstable == "raise":
-        largest = largest_step(problem.op, EXPLICIT[method].reach)
-    return Step(method, problem, dt, scheme, largest, given)
+    elif method in EXPLICIT and unstable == "raise":
+        limits = [(term, largest_step(term.op, EXPLICIT[method].reach)) for term in problem.stiff]
+    return Step(method, problem, dt, scheme, limits, given)
 
 
 def _problem(method, given):
@@ -189,7 +192,7 @@ def _scheme(method, problem, jacobian, settings, kept):
         return Leapfrog(problem)
     if method in EXPLICIT:
         return (Polynomial if problem.linear and problem.source is None else Explicit)(problem, method)
-    if method in ("imex", "etdrk4") and problem.op is None:
+    if method in ("imex", "etdrk4") and not problem.stiff:
         raise TypeError(f"{method} needs the stiff linear term: write linear=L or linear=(L, coefficient)")
     if method == "etdrk4":
         return Exponential(problem)
@@ -208,8 +211,8 @@ class Step(Remade):
     dt : number, traced number, or function of params
     scheme : callable
         ``scheme(u, params, t, h)``: the state after a step h.
-    largest : float
-        Stable h c of an explicit step.
+    limits : list of pairs
+        A term c L, and the largest stable h c of an explicit step.
     given : dict
         The arguments of `stepper`.
 
@@ -223,8 +226,8 @@ class Step(Remade):
         With error control: the accepted lengths of the last interval, as shares of it.
     """
 
-    def __init__(self, method, problem, dt, scheme, largest, given):
-        self.method, self.problem, self.dt, self.scheme, self.largest = method, problem, dt, scheme, largest
+    def __init__(self, method, problem, dt, scheme, limits, given):
+        self.method, self.problem, self.dt, self.scheme, self.limits = method, problem, dt, scheme, limits
         self.name, self.given, self.order, self.info = f"stepper({method})", given, scheme.order, scheme.info
 
     def recipe(self):
@@ -251,14 +254,11 @@ class Step(Remade):
         """
         params = (params, *inputs) if inputs else params
         u, t = self._parts(state)
-        if self.problem.op is not None and isinstance(u, (dict, list, tuple)):
-            raise TypeError(
-                f"{self.name} has an Operator, which acts on one array, got a {type(u).__name__} as u; "
-                "stack its parts into one array, or apply the Operator inside the rate of an implicit method"
-            )
         h = self._length(params)
-        if self.largest < np.inf:
-            self._check_stable(float(plain(h)), float(plain(self.problem.coefficient(params))))
+        if self.problem.stiff:
+            self.problem.terms(u)  # refuses another tree before anything is solved
+        for term, largest in self.limits:
+            self._check_stable(float(plain(h)), float(plain(term.coefficient(params))), term.op.name, largest)
         try:
             new = like(self.scheme(u, params, t, h), u)
         except NonFiniteError:  # a solver on the way may have met it: name the argument
@@ -293,13 +293,12 @@ class Step(Remade):
             raise ValueError(f"{self.name} cannot be reversed; write 'leapfrog'")
         self.scheme.check_reversible()
 
-    def _check_stable(self, h, c):
+    def _check_stable(self, h, c, name, largest):
         """Refuse a step that would grow without bound."""
-        if h * c > self.largest * (1 + ROUNDING):
-            name = self.problem.op.name
+        if h * c > largest * (1 + ROUNDING):
             raise UnstableStepError(
                 f"{self.method} is unstable for {name} with dt = {h:.12g}: the largest stable dt is "
-                f"{rounded_down(self.largest / c)}; take smaller steps or an implicit method, or write unstable='allow'"
+                f"{rounded_down(largest / c)}; take smaller steps or an implicit method, or write unstable='allow'"
             )
 
     def _parts(self, state):

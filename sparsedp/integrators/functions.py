@@ -138,12 +138,18 @@ class PhiFunctions:
         """[the sum for each row of functions], on plain values, or with the transpose of L."""
         op, z = (self.op.T if transposed else self.op), float(z)
         for field in fields:
-            if np.shape(field) != op.domain.shape:
+            if np.shape(field)[-len(op.domain.shape) :] != op.domain.shape:
                 raise ShapeError(
                     f"{self.name} takes a field on {op.domain.described}, got an array of shape {np.shape(field)}"
                 )
         if z == 0:  # no transform, and for phi_0 the field itself, bit for bit
             return [sum(f.at_zero(op, field) for f, field in zip(row, fields, strict=True)) for row in rows]
+        shape = np.shape(fields[0])
+        if len(shape) > len(op.domain.shape):  # a batch, field by field
+            batch = [np.reshape(field, (-1, *op.domain.shape)) for field in fields]
+            each = [self.plain(rows, z, row, transposed) for row in zip(*batch, strict=True)]
+            found = np.reshape(each, (len(batch[0]), len(rows), *op.domain.shape))
+            return [*np.moveaxis(found, 1, 0).reshape(len(rows), *shape)]
         if any(map(np.iscomplexobj, fields)):
             parts = (self.plain(rows, z, [*map(part, fields)], transposed) for part in (np.real, np.imag))
             return [real + 1j * imaginary for real, imaginary in zip(*parts, strict=True)]

@@ -20,7 +20,6 @@ J.-P. Berenger, J. Comput. Phys. 114 (1994) 185-200 (matched damping, its streng
 """
 
 from math import log
-from typing import Any
 
 import numpy as np
 
@@ -48,7 +47,7 @@ class Staggered:
         Of p and of q.
     """
 
-    op: Any = None
+    stiff = ()
     timed = False
 
     def __init__(self, rates, damping):

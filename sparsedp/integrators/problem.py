@@ -1,5 +1,5 @@
 """What is integrated: u' = c L u + rate(u, params, t) + source(params, t), the checks of its numbers, and arithmetic on
-states: an array, or any tree of arrays, plus multiples of others.
+states: an array, or any tree of arrays, plus multiples of others. Each field of a tree has a c L of its own, or none.
 """
 
 import inspect
@@ -12,7 +12,7 @@ from sparsedp.fields import check_takes, is_number
 from sparsedp.operator import Operator
 from sparsedp.space import fits
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
-from sparsedp.tree import copied, flatten, leaves, mapped
+from sparsedp.tree import copied, flatten, keys, leaves, leaves_like, mapped, subscript
 
 __all__ = ["Problem", "combine", "later", "like", "positive", "untraced"]
 
@@ -40,14 +40,19 @@ def combine(u, *pairs):
             u = u + factor * rate
         return u
     found, rebuild = flatten(u)
-    shapes = _shapes(found)
     for factor, tree in pairs:
-        rates = leaves(tree)
-        if _shapes(rates) != shapes:  # broadcasting a rate into a state would hide a mistake
-            given, wanted = (", ".join(map(str, words)) or "nothing" for words in (_shapes(rates), shapes))
-            raise ShapeError(f"a rate must have the shape of the state, {wanted}, got {given}")
+        rates = _of_fields(tree, u)
         found = [leaf if leaf is None else leaf + factor * rate for leaf, rate in zip(found, rates, strict=True)]
     return rebuild(found)
+
+
+def _of_fields(tree, u):
+    """The leaves of a rate, one for each of the state; broadcasting one into another would hide a mistake."""
+    found = leaves_like(tree, u)
+    if _shapes(found) != (shapes := _shapes(leaves(u))):
+        given, wanted = (", ".join(map(str, words)) or "nothing" for words in (_shapes(found), shapes))
+        raise ShapeError(f"a rate must have the shape of the state, {wanted}, got {given}")
+    return found
 
 
 def _shapes(found):
@@ -78,6 +83,63 @@ def untraced(tree):
     return mapped(plain, tree)
 
 
+class Stiff:
+    """c L of one field.
+
+    Parameters
+    ----------
+    op : Operator
+        L.
+    coefficient : number, or function of params
+    place : str
+        Where it was given, for messages.
+    """
+
+    def __init__(self, op, coefficient, place):
+        self.op, self._coefficient = op, coefficient
+        self.name = f"the coefficient of {op.name}{place.removeprefix('linear')}"
+        if not fits(op.domain, op.codomain):
+            raise ShapeError(
+                f"stepper needs an operator from a space to itself, {op.name} maps {op.domain} to {op.codomain}"
+            )
+
+    def coefficient(self, params):
+        """The number c >= 0, traced or not."""
+        given = self._coefficient
+        c = number(given(params) if callable(given) else given, self.name)
+        if plain(c) < 0:
+            raise ValueError(f"{self.name} must be >= 0, got {plain(c):g}; put the sign into the operator")
+        return c
+
+
+def _terms(linear, place):
+    """What `linear` holds: a Stiff, None, or a dict of the same for the branches of a tree."""
+    if linear is None or (isinstance(linear, (int, float)) and linear == 0):
+        return None
+    op, coefficient = linear if isinstance(linear, tuple) and len(linear) == 2 else (linear, 1.0)
+    if isinstance(op, Operator) and not isinstance(coefficient, (Operator, tuple, list, dict, type(None))):
+        return Stiff(op, coefficient, place)
+    names = keys(linear)
+    if names is None:
+        given = type(linear).__name__
+        raise TypeError(f"{place} takes an Operator or a pair (Operator, coefficient), got {given}")
+    return {name: _terms(linear[name], place + subscript(linear, name)) for name in names}
+
+
+def _matched(terms, u, place):
+    """The terms of the fields of a state, from left to right."""
+    names, branch = keys(u), isinstance(terms, dict)
+    if terms is None or not (branch or names is not None):
+        return [terms] * len(leaves(u))
+    if not branch or names is None or set(terms) != set(names):
+        wanted, given = ("one field" if k is None else f"a tree of {[*k]}" for k in (names, keys(terms)))
+        raise TypeError(
+            f"{place} must be like the state, which has {wanted} there, got one for {given}; "
+            "write None for a field without a stiff part"
+        )
+    return [term for name in names for term in _matched(terms[name], u[name], place + subscript(u, name))]
+
+
 class Problem:
     """The right-hand side of u' = c L u + rate + source, each part optional.
 
@@ -88,8 +150,8 @@ class Problem:
 
     Attributes
     ----------
-    op : Operator or None
-        L.
+    stiff : list of Stiff
+        Those of all fields.
     timed : bool
         Whether the state is the pair (u, t).
     driven, moving : bool
@@ -103,9 +165,8 @@ class Problem:
             if linear is not None:
                 raise TypeError("give the operator once: as rate, or as linear with the rest as rate")
             rate, linear = None, (rate, lambda params: 1.0 if params is None else params)
-        self.rate, self.source = rate, source
-        pair: tuple = linear if isinstance(linear, tuple) and len(linear) == 2 else (linear, 1.0)
-        self.op, self._coefficient = pair
+        self.rate, self.source, self._terms = rate, source, _terms(linear, "linear")
+        self.stiff = [term for term in leaves(self._terms) if term is not None]
         self._check_functions()
         self.driven, self.moving = _takes(rate, 3), _takes(source, 2)
         self.timed = self.driven or self.moving if timed is None else timed
@@ -115,34 +176,38 @@ class Problem:
             check_takes("stepper", rate, 3 if self.driven else 2, example)
 
     def _check_functions(self):
-        op = self.op
-        if op is not None and not isinstance(op, Operator):
-            raise TypeError(f"linear takes an Operator or a pair (Operator, coefficient), got {type(op).__name__}")
-        if op is not None and not fits(op.domain, op.codomain):
-            raise ShapeError(
-                f"stepper needs an operator from a space to itself, {op.name} maps {op.domain} to {op.codomain}"
-            )
         for name, fun in (("rate", self.rate), ("source", self.source)):
             if fun is not None and not callable(fun):
                 raise TypeError(
                     f"{name} must be a function{' or an Operator' * (name == 'rate')}, got {type(fun).__name__}"
                 )
-        if self.rate is None and op is None:
+        if self.rate is None and not self.stiff:
             raise TypeError("stepper needs a rate, a function rate(u, params) or an Operator, or the option linear")
 
-    def coefficient(self, params):
-        """The number c >= 0, traced or not."""
-        c, name = self._coefficient, f"the coefficient of {self.op.name}"
-        c = number(c(params) if callable(c) else c, name)
-        if plain(c) < 0:
-            raise ValueError(f"{name} must be >= 0, got {plain(c):g}; put the sign into the operator")
-        return c
+    def terms(self, u):
+        """The Stiff of each field of a state, None where there is none."""
+        return _matched(self._terms, u, "linear")
+
+    def engines(self, make, free):
+        """{L: make(L)} for every L there is, and {None: free}: what serves the fields without one."""
+        return {term.op: make(term.op) for term in self.stiff} | {None: free}
+
+    def on_fields(self, act, h, params, u, *trees):
+        """act(L, h c, leaf, ...) for each field of the state u, and of trees like it -> a tree like u.
+
+        L is None where nothing is stiff.
+        """
+        found, rebuild = flatten(u)
+        rows = zip(self.terms(u), found, *(_of_fields(tree, u) for tree in trees), strict=True)
+        return rebuild(
+            [act(*((term.op, h * term.coefficient(params)) if term else (None, h)), *row) for term, *row in rows]
+        )
 
     def explicit(self, u, params, t):
         """The rate alone, or None; a copy: it may write into the array that it returned before."""
         if self.rate is None:
             return None
-        return copied(_unchanged(self.rate, u, (params, t) if self.driven else (params,)))
+        return _ordered(copied(_unchanged(self.rate, u, (params, t) if self.driven else (params,))), u)
 
     def given(self, params, t):
         """The source alone, or None."""
@@ -150,13 +215,16 @@ class Problem:
 
     def __call__(self, u, params, t):
         """The whole right-hand side."""
-        rest, source = self.explicit(u, params, t), self.given(params, t)
-        if source is not None:
-            rest = source if rest is None else combine(rest, (1.0, source))
-        if self.op is None:
-            return rest
-        grown = self.op(u) * self.coefficient(params)
-        return grown if rest is None else grown + rest
+        rest = [self.explicit(u, params, t), _ordered(self.given(params, t), u)]
+        if self.stiff:
+            rest.insert(0, self.on_fields(lambda L, c, leaf: (L(leaf) if L else 0.0 * leaf) * c, 1.0, params, u))
+        first, *others = [part for part in rest if part is not None]
+        return combine(first, *((1.0, part) for part in others))
+
+
+def _ordered(rate, u):
+    """A rate with its parts in the order of those of the state."""
+    return rate if keys(u) is None or rate is None else leaves_like(rate, u)
 
 
 def _takes(fun, least):

@@ -32,7 +32,7 @@ What L leaves as it is (the mean, where nothing flows through the walls) is spli
 after it: 1 - z L has the eigenvalue 1 there beside those of size z |L|, and would lose it to rounding.
 """
 
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -52,6 +52,7 @@ from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.tape import Rule
+from sparsedp.tree import mapped
 
 __all__ = ["EXPLICIT", "IMPLICIT", "Explicit", "Linear", "Nonlinear", "Polynomial", "Resolvent", "Scheme"]
 
@@ -125,10 +126,18 @@ class Polynomial(Scheme):
         super().__init__(problem, name, EXPLICIT[name].order)
 
     def __call__(self, u, params, t, h):
-        z, x = h * self.problem.coefficient(params), u
-        for k in range(self.order, 0, -1):
-            x = combine(u, (z / k, self.problem.op(x)))
+        return self.problem.on_fields(self._horner, h, params, u)
+
+    def _horner(self, op, z, leaf):
+        x = leaf
+        for k in range(self.order, 0, -1) if op else ():
+            x = combine(leaf, (z / k, op(x)))
         return x
+
+
+def unchanged(z, leaf):
+    """What becomes of a field without a stiff part."""
+    return leaf
 
 
 # ---- the linear solve ------------------------------------------------------------------------------------------------
@@ -147,15 +156,17 @@ class Resolvent:
         method, rtol, maxiter, nullspace, options: as in `inverse`.
     most : int
         Number of set-ups that are kept.
+    log : SolveLog, optional
+        Where its solves are recorded.
 
     Attributes
     ----------
     info : SolveLog
     """
 
-    def __init__(self, op, name, settings, most=2):
+    def __init__(self, op, name, settings, most=2, log=None):
         self.op, self.name, self.settings = op, name, settings
-        self.info, self._inverse = SolveLog(), lru_cache(most)(self._set_up)
+        self.info, self._inverse = log or SolveLog(), lru_cache(most)(self._set_up)
         self._checked, self._rules = self._rule(False, True), [self._rule(False), self._rule(True)]
 
     def __call__(self, z, b):
@@ -274,7 +285,7 @@ class Stages(Scheme):
 
 
 class Linear(Stages):
-    """Stages of u' = c L u + source by one factor, hierarchy or transform for each h c.
+    """Stages of u' = c L u + source by one factor, hierarchy or transform for each L and h c.
 
     Parameters
     ----------
@@ -289,22 +300,27 @@ class Linear(Stages):
 
     def __init__(self, problem, name, settings, most):
         super().__init__(problem, name)
-        self.resolvent = Resolvent(problem.op, f"stepper({name})", settings, most)
-        self.info = self.resolvent.info
+        self.info, most = SolveLog(), most * len(problem.stiff)
+        self.resolvents = problem.engines(
+            lambda op: Resolvent(op, f"stepper({name})", settings, most, self.info), unchanged
+        )
+
+    def _resolved(self, h, params, b):
+        """(1 - h c L)^-1 b, field by field."""
+        return self.problem.on_fields(lambda op, z, leaf: self.resolvents[op](z, leaf), h, params, b)
 
     def solve(self, guess, b, params, t, h):
         """x of x = b + h (c L x + s(t))."""
         source = self.problem.given(params, t)
         b = b if source is None else combine(b, (h, source))
-        return self.resolvent(h * self.problem.coefficient(params), b)
+        return self._resolved(h, params, b)
 
     def trapezium(self, u, params, t, h):
         """x of x = u + h/2 (f(u, t) + f(x, t + h))."""
         b = u
         if self.problem.source is not None:
             b = combine(u, *((0.25 * h, self.problem.given(params, at)) for at in (t, later(t, h))))
-        w = self.resolvent(0.5 * h * self.problem.coefficient(params), b)
-        return 2.0 * w - u
+        return mapped(lambda w, leaf: 2.0 * w - leaf, self._resolved(0.5 * h, params, b), u)
 
 
 class Nonlinear(Stages):

@@ -252,7 +252,7 @@ def _transforms(system, dimension):
         return None
     found = eigenbasis(structure)
     dense = [] if found is None else [axis.eigenvalues.size for axis in found[0].axes if axis.kind == "eigenvectors"]
-    return None if found is None or max(dense, default=0) > LONGEST_EIGENVECTORS else transforming(structure, *found)
+    return None if found is None or max(dense, default=0) > LONGEST_EIGENVECTORS else transforming(system, *found)
 
 
 # ---- the inverse as an operator ----
