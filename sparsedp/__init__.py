@@ -20,7 +20,7 @@ _WINDOW = {
     "derivative": "grad hvp jvp value_and_grad vjp",
     "operator": "Operator",
     "operators.given": "from_functions from_linear_operator from_matrix",
-    "operators.difference": "curl divergence gradient laplacian upwind",
+    "operators.difference": "curl divergence flux gradient laplacian upwind",
     "operators.transfer": "average component prolong restrict sample",
     "operators.harmonic": "harmonic_average",
     "optimize.regularization": "smoothness total_variation",

@@ -34,6 +34,7 @@ from .operators.boundary import lift as lift
 from .operators.boundary import mask as mask
 from .operators.difference import curl as curl
 from .operators.difference import divergence as divergence
+from .operators.difference import flux as flux
 from .operators.difference import gradient as gradient
 from .operators.difference import laplacian as laplacian
 from .operators.difference import upwind as upwind

@@ -59,6 +59,7 @@ CATALOGUE = [
     Entry("gradient", lambda grid, boundary: dp.gradient(grid, boundary, solid(grid))),
     Entry("gradient", lambda grid, boundary: dp.gradient(grid, boundary, solid(grid), dp.dirichlet)),
     Entry("divergence", lambda grid, _: dp.divergence(grid), Field.outflow),
+    Entry("flux", lambda grid, _: dp.flux(grid, solid(grid))),
     Entry("laplacian", dp.laplacian, Field.laplacian),
     Entry("laplacian", lambda grid, boundary: dp.laplacian(grid, boundary, solid(grid), dp.robin(2, 1))),
     Entry("curl", lambda grid, _: dp.curl(grid), Field.curl, least_dim=2),

@@ -123,6 +123,17 @@ TABLE = [
         SHAPE,
         "solid needs one flag for each value on cells(3), got an array of shape (4,)",
     ),
+    (
+        lambda: dp.flux(BOX, np.s_[0:1]),
+        VALUE,
+        "a box on Grid(2 x 2 cells, size 2 x 2) needs one slice of cells for each axis, got slice(0, 1, None); write "
+        "np.s_[4:8, 2:6]",
+    ),
+    (
+        lambda: dp.flux(BOX, np.zeros(4, bool)),
+        SHAPE,
+        "cells needs one flag for each value on cells(2, 2), got an array of shape (4,)",
+    ),
     (lambda: dp.sample(BOX, np.ones(3)), SHAPE, "sample needs points of shape (m, 2), got an array of shape (3,)"),
     (lambda: dp.sample(dp.Grid(0), [0.0]), SHAPE, "sample needs a grid with cells, got Grid(0 cells, size 0)"),
     (

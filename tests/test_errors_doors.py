@@ -16,6 +16,7 @@ LAP = -dp.laplacian(GRID, dp.dirichlet)
 SOLVE = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
 BUILDERS = {
     "divergence": dp.divergence,
+    "flux": lambda grid: dp.flux(grid, np.s_[1:2, 1:2]),
     "laplacian": dp.laplacian,
     "curl": dp.curl,
     "upwind": dp.upwind,

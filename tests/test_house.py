@@ -87,14 +87,14 @@ LONGER = {
 # Nodes of the syntax tree that each room may have, docstrings left out; what a line says is free, what it does is not.
 # They may be lowered at any time, and raised only with a sentence on what that buys. "": the whole package.
 BUDGETS = {
-    "": 191_650,  # what scenes of the second edition added is said room by room
+    "": 191_950,  # what scenes of the second edition added is said room by room
     "advection": 14_000,
     "check": 14_850,
     "flow": 9_950,  # conservation laws: 2 850; scalars and the Courant limit of flow_step: 1 450
     "integrators": 16_900,  # radau: 4 400; leapfrog and sponge: 1 250; a term for each field, batches of etdrk4: 850
     "kernels": 14_000,
     "network": 2_450,
-    "operators": 6_500,  # tensors: 800
+    "operators": 6_850,  # tensors: 800; flux: 300
     "optimize": 13_350,  # admm: 500; total_variation, smoothness: 400
     "report": 17_900,
     "solvers": 43_950,  # steady states, tensors, complex coefficients and waves: 2 550; obstacles held at 0: 400

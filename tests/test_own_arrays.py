@@ -73,6 +73,7 @@ BUILDERS = {
     "robin": ((np.array(2.0), np.array(0.5)), dp.robin, lambda c: dp.laplacian(GRID, c)(CELLS)),
     "lift": ((walls("pressure"),), lambda b: dp.lift(GRID, b), applied),
     "average": ((walls("pressure"),), lambda b: dp.average(GRID, b), applied),
+    "flux": ((SOLID,), lambda s: dp.flux(GRID, s), applied),
     "interior": ((SOLID,), lambda s: dp.interior(GRID, s), applied),
     "mask": ((SOLID,), lambda s: dp.mask(GRID.cells, s), applied),
     "diagonal": ((CELLS,), lambda v: dp.diagonal(GRID.cells, v), applied),

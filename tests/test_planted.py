@@ -48,6 +48,12 @@ BUGS = {
         "return y + x, used, trouble",
         "tests/test_solvers_methods.py",
     ),
+    "a flux that enters through one side": Bug(
+        "operators",
+        "np.concatenate(areas) * (below.astype(float) - above)",
+        "np.concatenate(areas) * (below.astype(float) + above)",
+        "tests/test_forces.py",
+    ),
     "a step back with the wrong sign": Bug(
         "integrators",
         "        p = combine(p, (-h, f(q, params)))",

@@ -23,8 +23,8 @@ from sparsedp.tree import flatten, leaves
 # One array and no other, so that nothing beside it is kept; or nothing to differentiate; or tested where it stands.
 ALONE = """
 adopt animate average certified certify check component convergence curl diagonal dirichlet divergence errors explain
-exponential face_laplacian function face_lift free_slip from_functions from_linear_operator from_matrix grad gradient
-harmonic_average hvp identity inflow interior jvp laplacian lift mask minimize neumann no_slip Operator outflow
+exponential face_laplacian flux function face_lift free_slip from_functions from_linear_operator from_matrix grad
+gradient harmonic_average hvp identity inflow interior jvp laplacian lift mask minimize neumann no_slip Operator outflow
 physical_gradient plot power projection prolong report restrict robin sample set_threads smoothness stress
 total_variation update_direction upwind v_curve value_and_grad vjp workprec
 """.split()

@@ -32,7 +32,7 @@ What L leaves as it is (the mean, where nothing flows through the walls) is spli
 after it: 1 - z L has the eigenvalue 1 there beside those of size z |L|, and would lose it to rounding.
 """
 
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from math import sqrt
 from typing import Any, NamedTuple
 

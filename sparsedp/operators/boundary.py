@@ -210,6 +210,18 @@ def _boolean(flags, space, name):
     return flags
 
 
+def region_of(grid, cells):
+    """A box of cells as slices, one for each axis, or a boolean array -> boolean array of the shape of the grid."""
+    if not isinstance(cells, (slice, tuple)):
+        return _boolean(cells, grid.cells, "cells")
+    box = cells if isinstance(cells, tuple) else (cells,)
+    if len(box) != grid.dim or not all(isinstance(side, slice) and side.step in (None, 1) for side in box):
+        raise ValueError(f"a box on {grid} needs one slice of cells for each axis, got {cells}; write np.s_[4:8, 2:6]")
+    found = np.zeros(grid.shape, dtype=bool)
+    found[box] = True
+    return found
+
+
 def solid_faces(grid, solid):
     """Cell mask -> two flat face masks: the cell below the face is solid, the cell above is.
 

@@ -1,14 +1,21 @@
-"""Differences on the staggered grid: gradient, divergence, laplacian, curl, upwind."""
+"""Differences on the staggered grid: gradient, divergence, flux, laplacian, curl, upwind."""
+
+from functools import reduce
+
+import numpy as np
+import scipy.sparse as sp
 
 from sparsedp.conditions import check_condition, neumann, resolve
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import check_solid, solid_faces
+from sparsedp.operators.boundary import check_solid, region_of, solid_faces
 from sparsedp.operators.stencils import along, differences, one_sided, pick, slopes
+from sparsedp.space import Space
+from sparsedp.structure.base import Matrix
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Mask, compose, total
 
-__all__ = ["curl", "divergence", "gradient", "laplacian", "upwind"]
+__all__ = ["curl", "divergence", "flux", "gradient", "laplacian", "upwind"]
 
 
 def gradient(grid, boundary=neumann, solid=None, solid_boundary=neumann):
@@ -98,6 +105,49 @@ def divergence(grid):
     check_grid("divergence", grid)
     blocks = {(0, a): along(a, grid.dim, differences(grid, a)) for a in range(grid.dim)}
     return Operator(Kronecker(grid.cells.parts, grid.faces.parts, blocks), grid.faces, grid.cells, "divergence")
+
+
+def flux(grid, cells):
+    """Faces -> number: what flows out of a box through its sides, per time.
+
+    Parameters
+    ----------
+    grid : Grid
+    cells : slices or bool array
+        The cells of the box: one slice for each axis (``np.s_[4:8, 2:6]``), or any set of cells as an array of shape
+        `grid.shape`.
+
+    Returns
+    -------
+    Operator
+        in: faces [velocity]; out: shape () [velocity length^(dim - 1)]. Sum of area times velocity over the
+        sides, outwards; equals the sum of volume times divergence over the cells.
+
+    Raises
+    ------
+    ShapeError
+        If the array has another shape than the grid.
+    TypeError
+        If the array is not boolean.
+    ValueError
+        If there is not one slice of neighbouring cells for each axis.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sparsedp import Grid
+    >>> out = flux(Grid(4), np.s_[1:3])
+    >>> float(out(np.array([0.0, 1.0, 7.0, 3.0, 4.0])))
+    2.0
+    """
+    check_grid("flux", grid)
+    below, above = solid_faces(grid, region_of(grid, cells))
+    areas = []
+    for axis, shape in enumerate(grid.faces.parts):
+        lengths = [np.ones(shape[a]) if a == axis else h for a, h in enumerate(grid.widths)]
+        areas.append(reduce(np.multiply.outer, lengths).ravel())
+    row = np.concatenate(areas) * (below.astype(float) - above)
+    return Operator(Matrix(sp.csr_array(row[None])), grid.faces, Space(()), "flux")
 
 
 def laplacian(grid, boundary=neumann, solid=None, solid_boundary=neumann):
