@@ -118,6 +118,12 @@ def inverse_unrolled():
     return (lambda b, start: inv(b, start=start)), [lambda s: field(GRID.shape, s), lambda s: field(GRID.shape, s)]
 
 
+@case("forces")
+def forces():
+    on = dp.forces(GRID, cells=np.s_[1:3, :2])
+    return on, [lambda s: field(GRID.faces.shape, s), lambda s: field(GRID.shape, s), lambda s: field((), s)]
+
+
 @case("convection")
 def convection():
     return dp.convection(GRID), [lambda s: field(GRID.faces.shape, s), lambda s: field(GRID.faces.shape, s)]

@@ -134,6 +134,16 @@ TABLE = [
         SHAPE,
         "cells needs one flag for each value on cells(2, 2), got an array of shape (4,)",
     ),
+    (
+        lambda: dp.forces(BOX),
+        VALUE,
+        "forces needs an obstacle or a set of cells, got neither; write cells=np.s_[4:8, 2:6]",
+    ),
+    (
+        lambda: dp.forces(BOX, cells=np.s_[:, :], about=np.nan),
+        VALUE,
+        "about needs finite numbers, got nan; write one for each axis, or one for all",
+    ),
     (lambda: dp.sample(BOX, np.ones(3)), SHAPE, "sample needs points of shape (m, 2), got an array of shape (3,)"),
     (lambda: dp.sample(dp.Grid(0), [0.0]), SHAPE, "sample needs a grid with cells, got Grid(0 cells, size 0)"),
     (

@@ -17,6 +17,7 @@ SOLVE = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
 BUILDERS = {
     "divergence": dp.divergence,
     "flux": lambda grid: dp.flux(grid, np.s_[1:2, 1:2]),
+    "forces": lambda grid: dp.forces(grid, cells=np.s_[1:2, 1:2]),
     "laplacian": dp.laplacian,
     "curl": dp.curl,
     "upwind": dp.upwind,

@@ -106,6 +106,11 @@ BUILDERS = {
     "face_laplacian": ((SOLID, walls("flow")), lambda s, b: dp.face_laplacian(GRID, b, s), applied),
     "face_lift": ((walls("flow"),), lambda b: dp.face_lift(GRID, b), lambda op: op(np.ones(op.domain.shape))),
     "convection": ((SOLID, walls("flow")), lambda s, b: dp.convection(GRID, b, s), lambda f: f(K, K)),
+    "forces": (
+        (SOLID, walls("flow"), SOLID.copy(), [0.1, 0.2]),
+        lambda s, b, c, about: dp.forces(GRID, s, b, cells=c, about=about),
+        lambda on: on(K, CELLS, 0.1),
+    ),
     "projection": ((SOLID, walls("flow")), lambda s, b: dp.projection(GRID, s, b), lambda P: (P(K), P.T(K))),
     "projection, sent": (
         (SOLID, walls("flow")),

@@ -48,6 +48,12 @@ BUGS = {
         "return y + x, used, trouble",
         "tests/test_solvers_methods.py",
     ),
+    "a force that forgets the momentum that arrives": Bug(
+        "flow",
+        "+ self.pressure(p) - self.gain(self.carried(v) * self.carrier(v))",
+        "+ self.pressure(p) - 0 * self.gain(self.carried(v) * self.carrier(v))",
+        "tests/test_forces.py",
+    ),
     "a flux that enters through one side": Bug(
         "operators",
         "np.concatenate(areas) * (below.astype(float) - above)",

@@ -25,7 +25,7 @@ from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Mask, compose, total
 from sparsedp.tree import copied
 
-__all__ = ["convection", "face_laplacian", "face_lift"]
+__all__ = ["convection", "face_laplacian", "face_lift", "momentum_fluxes", "stresses"]
 
 
 def face_laplacian(grid, boundary=no_slip, solid=None, solid_boundary=no_slip):
@@ -65,21 +65,8 @@ def face_laplacian(grid, boundary=no_slip, solid=None, solid_boundary=no_slip):
     array([ 0.,  0., -4., -4.,  0.,  0.,  0.,  0.,  0.,  0.,  0.,  0.])
     """
     sides = resolve(grid, boundary, no_slip)
-    if solid_boundary not in (no_slip, free_slip):
-        raise TypeError(f"solid_boundary needs dp.no_slip or dp.free_slip, got {solid_boundary!r}")
-    free = Mask(_free(grid, sides, solid))
-    if solid is None:
-        blocks = {
-            (c, c): sum((along(a, grid.dim, _second(grid, c, a, sides)) for a in range(grid.dim)), ())
-            for c in range(grid.dim)
-        }
-        structure = compose(free, Kronecker(grid.faces.parts, grid.faces.parts, blocks))
-    else:
-        flags = grid.faces.split(np.logical_or(*solid_faces(grid, check_solid(grid, solid))))
-        whole = sp.block_diag(
-            [_around(grid, c, sides, flags[c], solid_boundary.along) for c in range(grid.dim)], format="csr"
-        )
-        structure = Matrix(free.explicit() @ whole)
+    free, whole = Mask(_free(grid, sides, solid)), stresses(grid, sides, solid, solid_boundary)
+    structure = compose(free, whole) if solid is None else Matrix(free.explicit() @ whole.explicit())
     return Operator(structure, grid.faces, grid.faces, "face_laplacian")
 
 
@@ -171,6 +158,38 @@ def convection(grid, boundary=no_slip, solid=None):
     array([ 2.,  0., -2.,  0.])
     """
     sides = resolve(grid, boundary, no_slip)
+    A, B, gain = momentum_fluxes(grid, sides)
+    C = Operator(compose(Mask(_free(grid, sides, solid)), gain.structure), gain.domain, grid.faces, "gain")
+
+    def convect(v, w):
+        return C(A(v) * B(w))
+
+    return Made(convect, convection, *copied((grid, boundary, solid)))
+
+
+# ------------------------------------------------------------ the same on every face, walls and obstacles too
+
+
+def stresses(grid, sides, solid, solid_boundary):
+    """The Laplacian of each component: what passes through the sides of a control volume, over its size -> structure.
+
+    With obstacles also that of the faces they close: the friction there.
+    """
+    if solid_boundary not in (no_slip, free_slip):
+        raise TypeError(f"solid_boundary needs dp.no_slip or dp.free_slip, got {solid_boundary!r}")
+    if solid is None:
+        blocks = {
+            (c, c): sum((along(a, grid.dim, _second(grid, c, a, sides)) for a in range(grid.dim)), ())
+            for c in range(grid.dim)
+        }
+        return Kronecker(grid.faces.parts, grid.faces.parts, blocks)
+    flags = grid.faces.split(np.logical_or(*solid_faces(grid, check_solid(grid, solid))))
+    lines = [_around(grid, c, sides, flags[c], solid_boundary.along) for c in range(grid.dim)]
+    return Matrix(sp.block_diag(lines, format="csr"))
+
+
+def momentum_fluxes(grid, sides):
+    """Operators A, B, C: div(w v) = C ((A v) (B w)), as in `convection`."""
     carried, carrier, gain, flux = {}, {}, {}, []
     for number, (c, a) in enumerate(product(range(grid.dim), repeat=2)):  # component c through the sides across axis a
         if a == c:
@@ -183,15 +202,9 @@ def convection(grid, boundary=no_slip, solid=None):
         gain[c, number] = along(a, grid.dim, back)
         flux.append(tuple(mean.shape[0] if b == a else n for b, n in enumerate(grid.face_shape(c))))
     faces, sites = grid.faces, Space(None, "fluxes", grid, flux)
-    free = Mask(_free(grid, sides, solid))
     A = Operator(Kronecker(flux, faces.parts, carried), faces, sites, "carried")
     B = Operator(Kronecker(flux, faces.parts, carrier), faces, sites, "carrier")
-    C = Operator(compose(free, Kronecker(faces.parts, flux, gain)), sites, faces, "gain")
-
-    def convect(v, w):
-        return C(A(v) * B(w))
-
-    return Made(convect, convection, *copied((grid, boundary, solid)))
+    return A, B, Operator(Kronecker(faces.parts, flux, gain), sites, faces, "gain")
 
 
 # ------------------------------------------------------------ the factors

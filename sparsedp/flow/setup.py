@@ -24,7 +24,7 @@ from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import build
 from sparsedp.solvers.scaling import in_range, largest, norm, shifted
 
-__all__ = ["Setup", "faces_that"]
+__all__ = ["Setup", "faces_that", "pressure_conditions"]
 
 FEW = 1024  # cells below which transforms are tried even where `inverse` would factor
 
@@ -41,9 +41,7 @@ class Setup(Remade):
         self.solid = None if solid is None else check_solid(grid, solid).copy()
         named = {axis: pair for axis, pair in zip(grid.axes, self.sides, strict=True) if pair}
         self.made = grid, self.solid, named, settings  # nothing that the caller may change
-        # Conditions of the pressure: 0 at an outflow, no slope elsewhere.
-        pairs = named.items()
-        self.pressure_conditions = {axis: tuple(condition.pressure for condition in pair) for axis, pair in pairs}
+        self.pressure_conditions = pressure_conditions(grid, self.sides)
         self.open = faces_that(grid, self.sides, self.solid, lambda condition: not condition.closed)
         self.exponent = int(np.frexp(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))[1])
         near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
@@ -172,6 +170,12 @@ def _exponent(x, source):
     """The power of two by which data beyond the middle of the range of floats are scaled; 0: by none."""
     top = max(largest(x), 0.0 if source is None else largest(source))
     return 0 if in_range(top) or not 0 < top < np.inf else int(np.frexp(top)[1])
+
+
+def pressure_conditions(grid, sides):
+    """Conditions of the pressure as `gradient` takes them: 0 at an outflow, no slope elsewhere."""
+    pairs = zip(grid.axes, sides, strict=True)
+    return {axis: tuple(condition.pressure for condition in pair) for axis, pair in pairs if pair}
 
 
 def faces_that(grid, sides, solid, open_side):
