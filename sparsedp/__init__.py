@@ -32,7 +32,7 @@ _WINDOW = {
     "flow.momentum": "convection face_laplacian face_lift",
     "advection.front": "transport",
     "flow.finite_volumes": "conservation_law",
-    "flow.obstacles": "forces",
+    "flow.obstacles": "brinkman forces",
     "flow.pressure": "projection",
     "flow.stepping": "flow_step",
     "integrators.front": "stepper",

@@ -17,10 +17,10 @@ from .derivative import jvp as jvp
 from .derivative import value_and_grad as value_and_grad
 from .derivative import vjp as vjp
 from .flow.finite_volumes import conservation_law as conservation_law
-
 from .flow.momentum import convection as convection
 from .flow.momentum import face_laplacian as face_laplacian
 from .flow.momentum import face_lift as face_lift
+from .flow.obstacles import brinkman as brinkman
 from .flow.obstacles import forces as forces
 from .flow.pressure import projection as projection
 from .flow.stepping import flow_step as flow_step

@@ -135,6 +135,21 @@ TABLE = [
         "cells needs one flag for each value on cells(2, 2), got an array of shape (4,)",
     ),
     (
+        lambda: dp.brinkman(LINE)(np.ones(3)),
+        SHAPE,
+        "brinkman takes a field on faces(3) of shape (4,), got an array of shape (3,)",
+    ),
+    (
+        lambda: dp.brinkman(LINE)(np.ones(4, complex)),
+        TYPE,
+        "brinkman takes real numbers, got dtype complex128; write level.real",
+    ),
+    (
+        lambda: dp.brinkman(LINE)([1.0, np.nan, 1.0, 1.0]),
+        FINITE,
+        "brinkman takes a finite level, got 1 that are NaN or infinite, the first at 1",
+    ),
+    (
         lambda: dp.forces(BOX),
         VALUE,
         "forces needs an obstacle or a set of cells, got neither; write cells=np.s_[4:8, 2:6]",

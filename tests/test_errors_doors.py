@@ -19,6 +19,7 @@ BUILDERS = {
     "flux": lambda grid: dp.flux(grid, np.s_[1:2, 1:2]),
     "forces": lambda grid: dp.forces(grid, cells=np.s_[1:2, 1:2]),
     "laplacian": dp.laplacian,
+    "brinkman": dp.brinkman,
     "curl": dp.curl,
     "upwind": dp.upwind,
     "interior": dp.interior,

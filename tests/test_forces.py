@@ -100,3 +100,70 @@ def test_derivatives_of_forces(rng):
     loss = lambda x: anp.sum(weights * on(x["v"], x["p"], x["nu"])) ** 2
     assert dp.check.gradient(loss, x).verdict == "agrees"
     assert np.allclose(dp.grad(lambda p: weights @ on(v, p, 0.3))(p), on.pressure.T(weights))
+
+
+# ---- brinkman: obstacles of any shape --------------------------------------------------------------------------------
+
+
+def flat_wall(grid, angle, place):
+    """Distance to a wall of this slope, at the faces."""
+    x, y = (grid.join(*(grid.face_centres(axis)[a] for axis in (0, 1))) for a in (0, 1))
+    return np.cos(angle) * (x - place) + np.sin(angle) * (y - place)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4, 2.0])
+def test_a_flat_wall_is_felt_where_it_stands(angle):
+    """The profile of the formula solves the equation on the grid, at every slope and every place."""
+    grid, h = dp.Grid((12, 12), size=3.0), 0.25
+    for place in (1.3, 1.41, 1.5):
+        s = flat_wall(grid, angle, place)
+        U = np.logaddexp(0.0, 8 * s / h) * h / 8
+        left = dp.face_laplacian(grid)(U) - dp.brinkman(grid)(7.0 * s) * U
+        inner = [part[2:-2, 2:-2] for part in grid.split(left)]
+        deep = [part[2:-2, 2:-2] < -2.8 * h for part in grid.split(s)]  # as good as 0 there
+        assert max(np.max(abs(part[~low])) for part, low in zip(inner, deep)) <= 1e-8
+
+
+def through_a_slit(n, lower=0.2137, upper=0.8011):
+    """Flow rate between two walls in a periodic box, beside (upper - lower)^3 / 12."""
+    grid = dp.Grid((1, n), size=1.0, periodic=True)
+    y = grid.face_centres(0)[1]
+    level = grid.join(0.5 * (upper - lower) - abs(y - 0.5 * (upper + lower)), 1.0)
+    rate = dp.brinkman(grid)(level) * grid.join(1.0, 0.0)  # no obstacle for the other component
+    u = dp.inverse(dp.diagonal(grid.faces, rate + grid.join(0.0, 1.0)) - dp.face_laplacian(grid))(grid.join(1.0, 0.0))
+    return np.sum(u) / n / ((upper - lower) ** 3 / 12) - 1
+
+
+def test_order_of_brinkman():
+    errors = [abs(through_a_slit(n)) for n in (20, 40, 80, 160)]
+    assert errors[0] <= 0.02 and np.log2(errors[0] / errors[-1]) >= 3 * 1.8
+
+
+@pytest.mark.parametrize(("shape", "periodic"), [((6, 5), False), ((6, 5), True), ((1, 4), False), ((3, 4, 2), False)])
+def test_derivatives_of_brinkman(shape, periodic, rng):
+    grid = dp.Grid(shape, spacing=0.3, periodic=periodic)
+    friction, weights = dp.brinkman(grid), rng.standard_normal(grid.faces.size)
+    level = 0.2 * rng.standard_normal(grid.faces.size)
+    loss = lambda level: anp.sum(weights * anp.log1p(friction(level)))
+    assert dp.check.gradient(loss, level).verdict == "agrees"
+    t = rng.standard_normal(level.size)
+    near = lambda size: dp.grad(loss)(level + size * t)
+    assert np.allclose(dp.hvp(loss, level, t), (near(1e-6) - near(-1e-6)) / 2e-6, rtol=1e-5, atol=1e-4)
+
+
+def test_levels_as_they_come(rng):
+    grid = dp.Grid((5, 4), spacing=0.5)
+    friction, s = dp.brinkman(grid), flat_wall(dp.Grid((5, 4), spacing=0.5), 0.7, 1.0)
+    want = friction(s)
+    for k in (900, -900):
+        assert np.array_equal(friction(2.0**k * s), want)
+    for given in (np.asfortranarray(s), s[::-1].copy()[::-1], np.repeat(s, 2)[::2], list(s)):
+        assert np.array_equal(friction(given), want)
+    assert np.allclose(friction(s.astype(np.float32)), want, rtol=1e-3) and np.all(want >= 0)
+    assert np.array_equal(friction(np.sign(s).astype(int)), friction(np.sign(s)))
+    nowhere, everywhere = friction(0.5 + 0 * s), friction(-0.5 + 0 * s)
+    assert not np.any(nowhere) and np.all(everywhere >= 1e4) and not np.any(friction(0 * s))
+    for h, word in ((2.0**-600, "overflow"), (2.0**600, "underflow")):
+        with pytest.raises(dp.errors.NonFiniteError, match=f"coefficients {word}: the spacing is too"):
+            dp.brinkman(dp.Grid((3, 3), spacing=h))
+    assert dp.brinkman(dp.Grid((0, 3)))(np.zeros(3)).shape == (3,)

@@ -228,7 +228,8 @@ def test_arrays_may_be_reused(name):
 
 def test_every_builder_is_here():
     """The others are built of no arrays (a LinearOperator and functions are used as they are), or build nothing."""
-    unbuilt = (
+    unbuilt = "brinkman "
+    unbuilt += (
         "sponge identity divergence curl upwind component prolong harmonic_average from_functions from_linear_operator"
     )
     calls = "function adopt minimize certify certified explain stress workprec rollout grad value_and_grad vjp jvp hvp"

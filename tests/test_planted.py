@@ -48,6 +48,12 @@ BUGS = {
         "return y + x, used, trouble",
         "tests/test_solvers_methods.py",
     ),
+    "a wall that is felt beside the place where it stands": Bug(
+        "flow",
+        "reduce(add, bends) / anp.log1p(anp.exp(s))",
+        "reduce(add, bends) / anp.log1p(anp.exp(s + 1.0))",
+        "tests/test_forces.py",
+    ),
     "a force that forgets the momentum that arrives": Bug(
         "flow",
         "+ self.pressure(p) - self.gain(self.carried(v) * self.carrier(v))",

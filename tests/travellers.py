@@ -264,6 +264,7 @@ def travellers():
     yield "convection", "", dp.convection(GRID, {"x": dp.free_slip}, SOLID), lambda c: bits(c, v, w)
     on = dp.forces(GRID, SOLID, {"x": dp.free_slip}, about=0.2)
     yield "forces", "", on, lambda on: bits(on, v, numbers(GRID.shape), 0.1)
+    yield "brinkman", "", dp.brinkman(GRID), lambda friction: bits(friction, v)
     yield "harmonic_average", "", dp.harmonic_average(GRID), lambda f: bits(f, np.exp(numbers(GRID.shape)))
     yield "value_and_grad", "", dp.value_and_grad(loss), of_pair
     yield "grad", "", dp.grad(loss), lambda f: [f(numbers(7)).tobytes()]

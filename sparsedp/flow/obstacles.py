@@ -4,24 +4,46 @@ On every face the momentum equation says dv/dt = nu L v - div(v v) - G p. On a f
 although the right-hand side does not: its sum, times the volumes of the faces, is the force on the obstacle. What one
 face gains its neighbour loses, so that these sums telescope: over all faces they are what passes through the sides of
 the domain, to rounding. Around any other set of faces they are the force on what it holds: the momentum that comes in.
+
+brinkman: a friction nu k v that makes an obstacle of any shape. Beside a wall at rest a velocity grows with the
+distance s to it. With U(s) = log(1 + exp(b s)) / b, which is s in the fluid and 0 in the obstacle, and
+
+    k = sum over axes of (U(s + d) - 2 U(s) + U(s - d)) / (h^2 U(s)),     d: how much s changes over the cell width h,
+
+U solves nu (L U - k U) = 0 on the grid itself, wherever the wall passes between two faces and whatever its slope: what
+is left is of order h^2. The second difference is log(1 + (cosh(b d) - 1) / (1 + cosh(b s))) / b; s and d are taken from
+any level set, in units of its change over a cell.
 """
 
+from functools import reduce
+from operator import add
+
+import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.conditions import no_slip, resolve
-from sparsedp.flow.momentum import momentum_fluxes, stresses
+from sparsedp.fields import check_finite
+from sparsedp.flow.momentum import face_laplacian, momentum_fluxes, stresses
 from sparsedp.flow.setup import pressure_conditions
 from sparsedp.grid import check_grid, finite_number, per_axis
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, mask, region_of, solid_faces
 from sparsedp.operators.difference import gradient
-from sparsedp.recipe import Remade
+from sparsedp.operators.stencils import along
+from sparsedp.recipe import Made, Remade
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
+from sparsedp.structure.factor import Factor
+from sparsedp.structure.kronecker import Kronecker
+from sparsedp.tape import plain
 from sparsedp.tree import copied
 
-__all__ = ["Forces", "forces"]
+__all__ = ["Forces", "brinkman", "forces"]
+
+SHARP = 8.0  # b, per cell. Drag of a cylinder of 20 cells: 0.29 % off; with 6 and 12 it is 0.43 and 0.23 %
+DEEP, FAR = -24.0, 700.0  # b s beyond which k is one number: deep in the obstacle, and where it is 0 beside rounding
+FLAT = 1e-10  # change over a cell, of the largest level, that counts as none
 
 
 def forces(grid, solid=None, boundary=no_slip, solid_boundary=no_slip, cells=None, about=0.0):
@@ -71,6 +93,88 @@ def forces(grid, solid=None, boundary=no_slip, solid_boundary=no_slip, cells=Non
     if solid is None and cells is None:
         raise ValueError("forces needs an obstacle or a set of cells, got neither; write cells=np.s_[4:8, 2:6]")
     return Forces(*copied((grid, solid, boundary, solid_boundary, cells, about)))
+
+
+def brinkman(grid):
+    """Grid -> ``friction(level)``: what stands for obstacles of any shape, of order 2, differentiable in the shape.
+
+    In place of a mask of solid cells, the momentum equation gets the term -viscosity * friction(level) * v.
+
+    Parameters
+    ----------
+    grid : Grid
+
+    Returns
+    -------
+    callable
+        in: level on faces, a level set: 0 on the surface, < 0 in the obstacle, best the distance [any unit];
+        out: faces [1 / length^2], >= 0, 0 away from the obstacle. Differentiable, to every order.
+
+    Raises
+    ------
+    ShapeError
+        On use, if the level has another shape.
+    TypeError
+        On use, if it is complex.
+    NonFiniteError
+        On use, if it is NaN or infinite.
+
+    Notes
+    -----
+    The obstacle is at rest, and cells are about uniform around it. The fluid goes on inside, hardly moving, and so does
+    its pressure: on the surface it is best taken from a cell or two outside. Obstacles thinner than a cell leak. With
+    the fraction f of a cell around each face that is solid, 0.5 - f is a level set, a coarse one.
+    The force on it is that of `forces` on a set of cells around; at a steady state also the sum of
+    ``grid.faces.volumes * viscosity * friction(level) * v``.
+    Source: Angot, Bruneau and Fabrie, Numer. Math. 81 (1999); where such a wall is felt: Hester, Vasil and Burns,
+    J. Comput. Phys. 430 (2021).
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> friction = brinkman(Grid(4))
+    >>> np.round(friction(np.array([2.0, 1.0, 0.0, -1.0, -2.0])), 1)  # the wall stands on the third face
+    array([0.00000e+00, 1.00000e-01, 9.50000e+00, 2.06460e+03, 1.19138e+04])
+    """
+    check_grid("brinkman", grid)
+    face_laplacian(grid)  # refuses cells whose squares leave the range of floats
+    steps, widths = [], []
+    for axis in range(grid.dim):
+        steps.append(tuple(_differences(grid, axis, back) for back in (0, 1)))
+        lines = [grid.spacings(axis) if c == axis else grid.widths[axis] for c in range(grid.dim)]
+        widths.append(grid.join(*(h.reshape([-1 if a == axis else 1 for a in range(grid.dim)]) for h in lines)))
+    rates = [np.divide(1, h, out=np.zeros_like(h), where=h > 0) ** 2 for h in widths]  # 0: an axis without cells
+    within = 2 * (np.cosh(SHARP) - 1) * reduce(add, rates)  # where the level may be flat
+
+    def friction(level):
+        values = np.asarray(plain(level))
+        if values.dtype.kind == "c":
+            raise TypeError(f"brinkman takes real numbers, got dtype {values.dtype}; write level.real")
+        check_finite("brinkman", values, "takes a finite level")
+        level = level / (np.max(np.abs(values), initial=0.0) or 1.0)
+        changes = [(ahead(level), behind(level)) for ahead, behind in steps]
+        squares = [0.5 * (one**2 + other**2) for one, other in changes]
+        unit = SHARP / anp.sqrt(reduce(add, squares) + FLAT**2)
+        s = anp.clip(unit * level, DEEP, FAR)
+        bends = [
+            anp.log1p((0.5 * (anp.cosh(unit * one) + anp.cosh(unit * other)) - 1) / (1 + anp.cosh(s))) * rate
+            for (one, other), rate in zip(changes, rates, strict=True)
+        ]
+        return anp.where(plain(s) <= DEEP, within, reduce(add, bends) / anp.log1p(anp.exp(s)))
+
+    return Made(friction, brinkman, grid)
+
+
+def _differences(grid, axis, back):
+    """Faces -> faces: to the value after it (back: from that before it) along an axis; at an end to the only one."""
+    blocks = {}
+    for c, part in enumerate(grid.faces.parts):
+        here, n = np.arange(part[axis]), max(part[axis], 1)
+        low = (here - back) % n if grid.periodic[axis] else np.clip(here - back, 0, max(n - 2, 0))
+        ones = np.ones(here.size)
+        factor = Factor.from_diagonals((here.size,) * 2, (here, (low + 1) % n, ones), (here, low, -ones))
+        blocks[c, c] = along(axis, grid.dim, factor)
+    return Operator(Kronecker(grid.faces.parts, grid.faces.parts, blocks), grid.faces, grid.faces, "brinkman")
 
 
 class Forces(Remade):
