@@ -4,18 +4,22 @@ import gc
 import threading
 from contextlib import contextmanager
 from numbers import Number
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import is_fixed
-from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
 from sparsedp.fields import check_function, is_whole
+from sparsedp.ledger import thread
 from sparsedp.recipe import Made
 from sparsedp.tape import (
     Recorder,
+    ReverseNode,
     backward,
     boxed,
+    called,
     cast,
     dtype_of,
     fit,
@@ -26,17 +30,19 @@ from sparsedp.tape import (
     plain,
     reverse_root,
     split_boxes,
+    untraced,
 )  # fmt: skip
-from sparsedp.tree import copied, flatten, keys, mapped
+from sparsedp.tree import copied, flatten, keys, leaves, mapped
 
 __all__ = [
-    "NO_JVP", "described", "grad", "hvp", "jvp", "linearised", "of_argument", "pullback", "push",
-    "pushforward", "traced", "value_and_grad", "vjp", "zero_like",
+    "NO_JVP", "described", "grad", "hvp", "judged", "jvp", "linearised", "name_of", "of_argument", "pullback", "push",
+    "pushforward", "traced", "value_and_grad", "vjp", "witnessed", "zero_like",
 ]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
 NO_JVP = (DerivativeError, NotImplementedError)
 
+LARGE = 1e100  # a cotangent that makes others overflow, through derivatives that do not
 SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
 _lock = threading.Lock()
 _growing: list[tuple] = []  # thresholds to go back to, one for each tape that grows
@@ -140,6 +146,64 @@ def linearised(fun, tree, moving):
     return values, rebuild, pull
 
 
+@contextmanager
+def witnessed(see):
+    """A `with` block in which ``see(node, function, value, arguments, options, numbers)`` gets each node of a tape.
+
+    Nodes of every reverse-mode trace, when they are made; `numbers`: those of the arguments that are differentiated.
+    """
+
+    class Witness(ReverseNode):
+        """A node that reports itself."""
+
+        vjp: Any
+
+        def __init__(self, value, fun, args, options, nums, parents):
+            super().__init__(value, fun, args, options, nums, parents)
+            see(self, fun, value, args, options, nums)
+
+    untraced[Witness] = untraced[ReverseNode]  # comparisons, shapes, rounding: plain values for this kind too
+    thread.witnesses.append(Witness)
+    try:
+        yield
+    finally:
+        thread.witnesses.remove(Witness)
+        del untraced[Witness]
+
+
+@contextmanager
+def judged():
+    """A `with` block in which a call is refused by name whose own derivative is NaN or infinite.
+
+    Not one whose cotangent is LARGE or NaN. For a second run, when a gradient was not finite.
+    """
+
+    def see(node, fun, value, args, options, nums):
+        pull, name = node.vjp, name_of(called(fun, args))
+
+        def checked(g, *held):
+            backs = list(pull(g, *held))
+            if all(np.all(np.abs(plain(part)) < LARGE) for part in leaves(g)):
+                for num, back in zip(nums, backs, strict=True):
+                    if is_variable(back) and not np.all(finite := np.isfinite(plain(back))):
+                        met = np.ravel(plain(args[num]))[np.argmin(finite)]
+                        raise NonFiniteError(
+                            f"the derivative of {name} is NaN or infinite where its argument is {met:.6g}; "
+                            "keep it away from there"
+                        )
+            return backs
+
+        node.vjp = checked
+
+    with witnessed(see), np.errstate(all="ignore"):
+        yield
+
+
+def name_of(subject):
+    """How the user knows a rule, an Operator or a function of autograd."""
+    return getattr(subject, "name", None) or getattr(subject, "__name__", type(subject).__name__)
+
+
 def traced(fun, tree, roots):
     """fun(tree) with a box for every root -> (leaves of the result, their nodes or None, how to build it).
 
@@ -163,9 +227,9 @@ def traced(fun, tree, roots):
 def _apart(gradients, g):
     """autograd hands one array to both terms of a sum, and g on; a caller may write into the one without the other."""
     seen = {id(_owner(g))}
-    for place, back in enumerate(gradients):
+    for number, back in enumerate(gradients):
         if isinstance(back, np.ndarray) and (id(_owner(back)) in seen or not back.flags.writeable):
-            gradients[place] = back.copy()
+            gradients[number] = back.copy()
         seen.add(id(_owner(back)))
     return gradients
 

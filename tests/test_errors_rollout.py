@@ -62,6 +62,17 @@ def blows_up(u, p):
     return u * 1e200
 
 
+def root(u, p):
+    return anp.where(u > 0, anp.sqrt(u), u) * p
+
+
+def by_length(u, p):
+    return u * p + anp.linalg.norm(u)
+
+
+law = dp.differentiable("law", lambda u: u, lambda nums, ans, u: lambda g: (g / (u < 4),))
+
+
 def roll(step=same, state=U, params=None, n=3, **options):
     return lambda: dp.rollout(step, state, params, n, **options)
 
@@ -278,6 +289,30 @@ TABLE = [
         FINITE,
         "the way back through 3 steps of rollout makes the gradient in params NaN or infinite; "
         "take fewer steps, or cut it with truncate",
+    ),
+    (
+        slope(root, 0.0 * U),
+        FINITE,
+        "on the way back through step 2 of rollout: the derivative of sqrt is NaN or infinite where its argument is "
+        "0; keep it away from there",
+    ),
+    (
+        slope(root, 0.0 * U, memory=150),
+        FINITE,
+        "on the way back through step 2 of rollout: the derivative of sqrt is NaN or infinite where its argument is "
+        "0; keep it away from there",
+    ),
+    (
+        grad(lambda p: anp.sum(dp.rollout(by_length, 0.0 * U, p * U, 3))),
+        FINITE,
+        "on the way back through step 2 of rollout: the derivative of norm is NaN or infinite where its argument is "
+        "0; keep it away from there",
+    ),
+    (
+        grad(lambda p: anp.sum(dp.rollout(lambda u, p: law(u) * p, U, p, 3))),
+        FINITE,
+        "on the way back through step 2 of rollout: the derivative of law is NaN or infinite where its argument is "
+        "4; keep it away from there",
     ),
 ]
 

@@ -35,6 +35,14 @@ def test_errors_at_the_start_are_not_hidden():
         match=rf"^the gradient of start must be finite {hint}, got 2 that are NaN or infinite, the first at 0$",
     ):
         foreign(lambda x: 1.0, lambda x: x * np.nan)
+    with (
+        np.errstate(divide="ignore"),
+        pytest.raises(
+            NonFiniteError,
+            match="^the derivative of sqrt is NaN or infinite where its argument is 0; keep it away from there$",
+        ),
+    ):
+        dp.minimize(lambda x: anp.sum(anp.sqrt(x)), np.array([4.0, 0.0]))
     where = r"^the gradient of start\['b'\] must be finite .*, the first at \(0, 1\)$"
     with pytest.raises(NonFiniteError, match=where):
         start = {"a": 1.0, "b": np.ones((2, 2))}

@@ -66,6 +66,12 @@ BUGS = {
         "np.concatenate(areas) * (below.astype(float) + above)",
         "tests/test_forces.py",
     ),
+    "a culprit that is not where the derivative is infinite": Bug(
+        "derivative.py",
+        "[np.argmin(finite)]",
+        "[np.argmax(finite)]",
+        "tests/test_minimize_refusals.py",
+    ),
     "a step back with the wrong sign": Bug(
         "integrators",
         "        p = combine(p, (-h, f(q, params)))",

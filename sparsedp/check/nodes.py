@@ -2,14 +2,13 @@
 
 from contextlib import contextmanager
 from types import CellType
-from typing import Any
 
 import numpy as np
 
-from sparsedp.ledger import thread
-from sparsedp.tape import ReverseNode, called, isbox, untraced
+from sparsedp.derivative import name_of, witnessed
+from sparsedp.tape import called, isbox
 
-__all__ = ["Node", "bytes_held", "calls_seen", "in_order", "witnessed"]
+__all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
 
 EMPTY = CellType()
 DEEPEST = 12  # levels of containers inside each other; deeper ones are not the tape's
@@ -21,6 +20,8 @@ class Node:
     Attributes
     ----------
     subject : Rule, Operator, or a function of autograd
+    name : str
+        How the user knows it.
     value
         Its result.
     values : list
@@ -35,7 +36,8 @@ class Node:
     """
 
     def __init__(self, fun, value, args, options, nums):
-        self.subject, self.value, self.inner = called(fun, args), value, []  # type: Any, Any, list[Node]
+        self.subject, self.value = called(fun, args), value
+        self.name, self.inner = name_of(self.subject), []  # type: str, list[Node]
         self.values, self.plain = [args[num] for num in nums], not any(map(isbox, args))
 
         def again(values):
@@ -43,36 +45,6 @@ class Node:
             return fun(*(given.get(num, arg) for num, arg in enumerate(args)), **options)
 
         self.again = again
-
-    @property
-    def name(self):
-        """How the user knows it."""
-        return getattr(self.subject, "name", None) or getattr(self.subject, "__name__", type(self.subject).__name__)
-
-
-@contextmanager
-def witnessed(see):
-    """A `with` block in which ``see(node, function, value, arguments, options, numbers)`` gets each node of a tape.
-
-    Nodes of every reverse-mode trace, when they are made; `numbers`: those of the arguments that are differentiated.
-    """
-
-    class Witness(ReverseNode):
-        """A node that reports itself."""
-
-        vjp: Any
-
-        def __init__(self, value, fun, args, options, nums, parents):
-            super().__init__(value, fun, args, options, nums, parents)
-            see(self, fun, value, args, options, nums)
-
-    untraced[Witness] = untraced[ReverseNode]  # comparisons, shapes, rounding: plain values for this kind too
-    thread.witnesses.append(Witness)
-    try:
-        yield
-    finally:
-        thread.witnesses.remove(Witness)
-        del untraced[Witness]
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.derivative import pullback, value_and_grad
+from sparsedp.derivative import judged, pullback, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.optimize.linearised import Linearised
 from sparsedp.optimize.result import Failure, Stuck, Trial
@@ -131,7 +131,13 @@ class Trials:
             value, gradient = self._loss(tree, *batch), self._gradient(self._packing.unpack(vector), *batch)
         if np.shape(value) != ():
             raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(value)}; sum it")
-        return float(value), self._packing.pack_gradient(gradient)
+        try:
+            return float(value), self._packing.pack_gradient(gradient)
+        except NonFiniteError:
+            if self._gradient is None:
+                with judged():  # a second run tells the call that is to blame, if one is
+                    value_and_grad(self._loss)(self._packing.unpack(vector), *batch)
+            raise
 
     def linearised(self, trial):
         """The residuals at a point and their Jacobian in what the bounds leave free, on the batch that saw it."""

@@ -4,9 +4,9 @@ import sys
 from importlib.util import find_spec
 from time import perf_counter
 
-from sparsedp.check.nodes import bytes_held, witnessed
+from sparsedp.check.nodes import bytes_held
 from sparsedp.check.sweep import solvers_of
-from sparsedp.derivative import value_and_grad
+from sparsedp.derivative import value_and_grad, witnessed
 from sparsedp.fields import check_function
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.derivative import zero_like
+from sparsedp.derivative import judged, zero_like
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.fields import place
 from sparsedp.ledger import active, count
@@ -144,14 +144,6 @@ class Loop:
                 f"the step gives another {name} when it is run again; it must depend on its arguments only"
             )
 
-    def check_gradient(self, number, slope, g):
-        """Refuse a gradient that is not finite, unless the cotangents given were not."""
-        if slope is not None and not is_finite(slope) and all(map(is_finite, g)):
-            raise NonFiniteError(
-                f"the way back through {self.n} steps of rollout makes the gradient in {self.names[number]} NaN or "
-                "infinite; take fewer steps, or cut it with truncate"
-            )
-
 
 class Run:
     """A loop from given arguments, and what it keeps for the way back; steps know the loop, it knows none of them.
@@ -187,6 +179,20 @@ class Run:
 
     def backward(self, args, g):
         """Cotangents of the outputs -> those of the arguments that want one, in that order."""
+        backs, loop = self._back(args, g), self.loop
+        broken = [loop.names[number] for number, back in zip(loop.wanted, backs, strict=True) if not is_finite(back)]
+        if broken and all(map(is_finite, g)):
+            with judged():  # a second run tells the call that is to blame, if one is
+                self.forward(args)
+                self._back(args, g)
+            raise NonFiniteError(
+                f"the way back through {loop.n} steps of rollout makes the gradient in {broken[0]} NaN or infinite; "
+                "take fewer steps, or cut it with truncate"
+            )
+        return backs
+
+    def _back(self, args, g):
+        """The same, finite or not."""
         loop = self.loop
         if self._stored is None:
             end = self._end
@@ -199,8 +205,6 @@ class Run:
         with steps.guarded("on the way back through step"):
             cotangents = BackwardPass(loop, steps, list(kept) if self._stored else kept, list(tapes)).back(g)
         steps.recorder.ended = True
-        for number in loop.wanted:
-            loop.check_gradient(number, cotangents[number], g)
         backs = ((cotangents[number], args[number]) for number in loop.wanted)
         return tuple(zero_like(value) if back is None else back for back, value in backs)
 
