@@ -192,3 +192,19 @@ def test_bits_do_not_depend_on_threads(monkeypatch, scheme, shape):
         value, pull = pullback(lambda x: move(*x), point)
         found.append([np.asarray(x).tobytes() for x in (value, *pull(np.cos(value)))])
     assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize(("share", "order"), [(0.0, 1), (0.5, 2), (1.0, 1)])
+def test_which_velocity_makes_maccormack_second_order_in_time(share, order):
+    """That of the start of a step, the mean of both ends, that of the end: v = (1 + t)^2 carries 7 / 3 far until 1."""
+
+    def error(n):
+        grid = dp.Grid(n, size=2 * np.pi, periodic=True)
+        move = dp.transport(grid, "maccormack", velocity="cells", interpolation="cubic", clamp=False)
+        (x,), dt, v = grid.centres(), 8 / n, lambda k: (1 + 8 * k / n) ** 2
+        u = np.exp(np.sin(x))
+        for k in range(n // 8):
+            u = move(u, np.full(n, (1 - share) * v(k) + share * v(k + 1)), dt)
+        return np.max(np.abs(u - np.exp(np.sin(x - 7 / 3))))
+
+    assert np.log2(error(64) / error(128)) == pytest.approx(order, abs=0.2)

@@ -57,7 +57,8 @@ def transport(
         first derivatives; the sum of the CFL numbers at most 1/2.
         semi_lagrangian: each point takes the value of the place its content comes from; any dt, linear in u,
         keeps constants, does not conserve sums. maccormack: a step there and back, and half of what that
-        misses added, second order. Both on cells of any width, first derivatives (in u alone any).
+        misses added, second order; in time too, where v is the mean of the velocities at both ends of the step, and
+        first where it is that of one end. Both on cells of any width, first derivatives (in u alone any).
     boundary : condition, or dict of conditions
         Where the velocity points inwards: dirichlet brings in `inflow`, neumann the value of the
         point at the wall. Outwards the field leaves in both cases. A closed wall is a velocity of 0 there.

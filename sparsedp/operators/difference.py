@@ -199,7 +199,8 @@ def curl(grid):
     Returns
     -------
     Operator
-        in: nodes or edges [unit]; out: faces [unit / length]. In 2-D v_x = d psi/dy, v_y = -d psi/dx.
+        in: nodes or edges [unit]; out: faces [unit / length]. In 2-D v_x = d psi/dy, v_y = -d psi/dx, with psi of
+        the shape ``grid.nodes.shape``: one node more than cells along an axis, as many along a periodic one.
 
     Raises
     ------

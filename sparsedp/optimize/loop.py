@@ -90,9 +90,10 @@ def minimize(
         lbfgs: memory=10, line_search=20. gd: rate=None (found by backtracking), momentum=0.0,
         line_search=None or "backtracking". adam: rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8. newton_cg: inner=200.
         gauss_newton: apart=False, dense=None. levenberg_marquardt: damping=1e-3, apart, dense.
-        half_inverse: rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto".
-        physical_gradient: physics, inverse, rate=1.0. apart=True: residuals along axis 0 are samples, and the loss
-        takes every leaf of x with a leading axis of copies, one for each (a few products give the whole Jacobian).
+        half_inverse: rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto" (J is formed where
+        it is small). physical_gradient: physics, inverse, rate=1.0. apart=True, the fast way for samples: residuals
+        along axis 0 are samples, and the loss takes every leaf of x with a leading axis of copies, one for each (a few
+        products give the whole Jacobian).
         dense: whether the Jacobian is formed; None: when it is small. truncation, rank: see `update_direction`.
         admm: weight (of the sum over entries, not of an integral: few jumps on a uniform grid are asked for by
         operator=dp.gradient(grid) and a weight times the volume of a cell), operator=None (K, linear, from x to an
