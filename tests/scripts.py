@@ -40,6 +40,7 @@ SMALL = {
     "conservation_laws.py": "100",
     "conductivity_design.py": "200",
     "helmholtz.py": "64",
+    "patterns.py": "32",
     "residual_or_physics.py": "10",
     "solver_in_the_loop.py": "48",
 }  # cells, the end time, or gradients; the others run with 16

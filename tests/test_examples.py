@@ -12,6 +12,7 @@ LINES = {
     "inverse_heat.py": 70,
     "steady_states.py": 70,
     "full_waveform.py": 100,
+    "patterns.py": 80,
 }  # several studies; the others stay below 60
 
 
@@ -46,6 +47,22 @@ def test_conservation_laws():
     assert tube < 0.008 and dam < 0.005
     assert float(re.search(r"water lost (\S+)", printed)[1]) < 1e-14
     assert abs(float(re.search(r"on the left: (\S+)", printed)[1]) - 1) < 1e-4
+
+
+@example("patterns.py")
+def test_patterns():
+    """32^2 cells: a drop divides, and dies with more kill; mass, energy, wavelength, growth; the feed is found."""
+    printed = run("patterns.py")
+    assert printed.count("agrees") == 4
+    spots, gone = map(int, re.search(r"(\d+) spots .* more kill (\d+)", printed).groups())
+    assert spots > 1 and gone == 0
+    drift, rise = map(float, re.search(r"mean (\S+) \(0\), largest rise of energy (\S+) ", printed).groups())
+    assert drift <= 1e-14 and rise < 0
+    length, size, single = map(float, re.search(r"wavelength (\S+) .*size (\S+) \(one wave: (\S+)\)", printed).groups())
+    assert length == pytest.approx(6.283, rel=0.04) and size == pytest.approx(single, rel=0.05)
+    growth, known = map(float, re.search(r"small wave (\S+) \((\S+)\)", printed).groups())
+    assert growth == pytest.approx(known, rel=0.03)
+    assert float(re.search(r"25 steps: (\S+)", printed)[1]) == pytest.approx(0.034, abs=1e-5)
 
 
 @example("edges.py")
