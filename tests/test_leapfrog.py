@@ -9,12 +9,12 @@ import pytest
 import sparsedp as dp
 
 
-def strings(n, dt, damping=None, periodic=True):
+def strings(n, dt, damping=None, periodic=True, **options):
     """Waves p' = -c^2 div v, v' = -grad p on a line; params: c."""
     grid = dp.Grid(n, size=1.0, periodic=periodic)
     D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
     rates = (lambda v, c: -(c**2) * D(v)), (lambda p, c: -inside(G(p)))
-    return grid, dp.stepper("leapfrog", rates, dt, damping=damping)
+    return grid, dp.stepper("leapfrog", rates, dt, damping=damping, **options)
 
 
 def standing(grid, time, dt):
@@ -44,10 +44,55 @@ def test_exact_at_the_limit():
     p, v = dp.rollout(step, start, 1.0, 20)
     np.testing.assert_allclose(p, start[0], atol=1e-13)
     np.testing.assert_allclose(v, start[1], atol=1e-13)
+    _, step = strings(20, 0.05, unstable="allow")
     with pytest.raises(
         dp.errors.NonFiniteError, match="NaN or infinity from a finite state with dt = 0.05; take smaller steps"
     ):
         dp.rollout(step, start, 1.5, 2000)
+
+
+@pytest.mark.parametrize("damping", [None, (3.0, 3.0)])
+def test_steps_beyond_the_limit_are_refused(damping):
+    """h w <= 2, w = 2 c n, with damping too: at once, for each content of the params and whatever is traced."""
+    grid, step = strings(20, 0.05, damping)
+    start = standing(grid, 0.0, 0.05)
+    with pytest.raises(
+        dp.errors.UnstableStepError,
+        match="leapfrog is unstable with dt = 0.05: waves of frequency 40.4 grow; dt = 0.0485148 is safe, or write "
+        "unstable='allow'",
+    ):
+        step(start, 1.01)
+    step(start, 1.0)
+    with pytest.raises(dp.errors.UnstableStepError, match="waves of frequency 60 grow"):
+        dp.value_and_grad(lambda c: anp.sum(dp.rollout(step, start, c, 3)[0] ** 2))(1.5)
+    _, step = strings(20, lambda c: 0.1 / c, damping)
+    with pytest.raises(dp.errors.UnstableStepError, match="dt = 0.1: waves"):
+        step(start, 1.0)
+
+
+@pytest.mark.parametrize("shape", [(2,), (9, 8), (5, 4, 6)])
+def test_the_limit_of_a_box(shape):
+    """Against the eigenvalues, where the waves have different speeds."""
+    grid = dp.Grid(shape)
+    D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
+    c = np.where(np.arange(grid.cells.size).reshape(shape) % 2, 1.0, 3.0)
+    w = np.max(np.linalg.eigvals(c.reshape(-1, 1) ** 2 * (-D @ inside @ G).matrix.toarray()).real) ** 0.5
+    state = np.zeros(shape), np.zeros(grid.faces.size)
+    rates = (lambda v, c: -(c[0] ** 2) * D(v)), (lambda p, c: -inside(G(p)))
+    step = dp.stepper("leapfrog", rates, lambda c: c[1] * 2 / w)
+    step(state, (c, 1.0))
+    with pytest.raises(dp.errors.UnstableStepError):
+        step(state, (c, 1.03))
+
+
+def test_the_estimate_is_made_once_and_inputs_do_not_count():
+    calls = []
+    g = lambda p, c: (calls.append(1), -c[0] * p)[1]
+    step = dp.stepper("leapfrog", (lambda q, c: q + c[1], g), 0.1)
+    dp.rollout(step, (np.ones(3), np.zeros(3)), 2.0, 4, inputs=np.arange(4.0))
+    most = len(calls)
+    dp.rollout(step, (np.ones(3), np.zeros(3)), 2.0, 4, inputs=np.arange(4.0))
+    assert len(calls) - most == 4 < most
 
 
 def test_nothing_is_lost_in_ten_thousand_steps():

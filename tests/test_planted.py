@@ -42,6 +42,12 @@ BUGS = {
         "1.0 - 0.0 * (np.arange(len(u)) == self.momentum)",
         "tests/test_conservation_law.py",
     ),
+    "leapfrog with a limit of Euler's method": Bug(
+        "integrators",
+        "if fastest > 4 * (1 + SLACK):",
+        "if fastest > 8 * (1 + SLACK):",
+        "tests/test_leapfrog.py",
+    ),
     "obstacles that lead where they should follow": Bug(
         "solvers",
         "return y + (x if transposed else last * (r - product(y))), used, trouble",

@@ -86,7 +86,8 @@ def stepper(
         all of its array is then followed down to nothing, in many steps: give the size below which it no longer
         matters. Where entries of very different size matter (species of 1 and 1e-5), give one for each.
     unstable : "raise" or "allow"
-        Explicit steps of an Operator whose spectrum is known: refuse a dt beyond the stable limit, or take it.
+        Explicit steps of an Operator whose spectrum is known, and leapfrog, for which it is estimated once for each
+        content of dt and params: refuse a dt beyond the stable limit, or take it.
     jacobian : callable, optional
         ``jacobian(u, params)`` (or with t): the derivative of the rate in u, for implicit steps of a
         nonlinear rate. Default: found by colouring; by radau from one tape, for Newton's method alone.
@@ -110,7 +111,7 @@ def stepper(
     NonFiniteError
         If dt, state or params holds NaN or infinity, or the new state would.
     UnstableStepError
-        On use, if an explicit step is beyond the stable limit of the operator.
+        On use, if an explicit step is beyond the stable limit of the operator, or one of leapfrog beyond its own.
     ConvergenceError
         On use, if a solve fails, or no step meets the tolerance.
     DerivativeError
@@ -252,7 +253,7 @@ class Step(Remade):
         -------
         state, like the one given
         """
-        params = (params, *inputs) if inputs else params
+        known, params = params, (params, *inputs) if inputs else params
         u, t = self._parts(state)
         h = self._length(params)
         if self.problem.stiff:
@@ -270,6 +271,8 @@ class Step(Remade):
                 f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
                 "take smaller steps or an implicit method"
             )
+        if self.method == "leapfrog" and self.given["unstable"] == "raise":
+            self.scheme.check_stable(u, params, h, known)
         return (new, t + h) if self.problem.timed else new
 
     def back(self, state, params=None, *inputs):

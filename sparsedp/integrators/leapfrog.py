@@ -4,7 +4,8 @@ q belongs to times halfway between those of p. A step h takes the state (p_n, q_
 
     q' = q + h g(p),        p' = p + h f(q'),
 
-second order, stable up to h w = 2 for the fastest frequency w, and reversible: the step back is
+second order, stable up to h w = 2 for the fastest frequency w, and reversible. w^2 is the largest eigenvalue of -f' g':
+it is estimated once for each h and params, from below, by a few steps of Arnoldi's method. The step back is
 
     p = p' - h f(q'),       q = q' - h g(p).
 
@@ -23,16 +24,22 @@ from math import log
 
 import numpy as np
 
-from sparsedp.errors import ShapeError
-from sparsedp.fields import check_takes, is_number, is_whole
+from sparsedp.derivative import push
+from sparsedp.errors import ShapeError, UnstableStepError
+from sparsedp.fields import check_takes, is_number, is_whole, rounded_down
 from sparsedp.grid import AXES, check_grid
-from sparsedp.integrators.problem import combine
+from sparsedp.integrators.adaptive import Moving
+from sparsedp.integrators.problem import combine, untraced
 from sparsedp.integrators.runge_kutta import Scheme
-from sparsedp.tape import plain
+from sparsedp.solvers.cache import Cache
+from sparsedp.tape import is_variable, plain
 from sparsedp.tree import leaves, mapped
 
 __all__ = ["Leapfrog", "Staggered", "sponge"]
 
+PRODUCTS = 20  # of Arnoldi's method: they find (h w)^2 to 0.4 % on 300^2 cells, to 2 % at worst
+SMALL = 1e-10  # of the largest entry: what is left of a product is rounding
+SLACK, SAFE = 1e-3, 0.98  # how far beyond the limit is refused, and what share of it is told
 POWER = 2  # of the depth in a sponge, that its rate grows with: of 1 to 4 the least echo, with echo=1e-3
 
 
@@ -73,6 +80,44 @@ class Leapfrog(Scheme):
 
     def __init__(self, problem):
         super().__init__(problem, "leapfrog", 2)
+        self._speeds = Cache()
+
+    def check_stable(self, state, params, h, known):
+        """Refuse a step that would grow without bound; `known`: what the frequencies depend on."""
+        state, params, h, known = untraced((state, params, h, known))
+        key = h, *leaves(known)
+        fastest = self._speeds.find(key)
+        if fastest is None:
+            fastest = self._speeds.put(key, self._fastest(state, params, h))
+        if fastest > 4 * (1 + SLACK):
+            safe = rounded_down(SAFE * 2 * h / fastest**0.5)
+            raise UnstableStepError(
+                f"leapfrog is unstable with dt = {h:.12g}: waves of frequency {fastest**0.5 / h:.4g} grow; dt = {safe} "
+                "is safe, or write unstable='allow'"
+            )
+
+    def _fastest(self, state, params, h):
+        """(h w)^2 of the fastest waves."""
+        (p, q), (f, g) = _pair(state), self.problem.rates
+        flat = Moving(p, is_variable, [1.0] * len(leaves(p)))
+        n = flat.space.size
+        basis, H = np.zeros((PRODUCTS + 1, n)), np.zeros((PRODUCTS + 1, PRODUCTS))
+        start = np.random.default_rng(0).standard_normal(n)
+        basis[0] = start / (np.linalg.norm(start) or 1.0)
+
+        def forces(x):
+            return flat.off(f(combine(q, (h, g(flat.at(x), params))), params))
+
+        for j in range(PRODUCTS):
+            w = -h * push(forces, np.zeros(n), [basis[j]])[1]
+            H[: j + 1, j] = basis[: j + 1] @ w
+            w = w - H[:, j] @ basis
+            length = np.linalg.norm(w)
+            if not SMALL * np.max(np.abs(H)) < length < np.inf:  # the basis is complete, or a rate has no finite slope
+                break
+            H[j + 1, j], basis[j + 1] = length, w / length
+        values = np.linalg.eigvals(np.nan_to_num(H[:-1]))
+        return float(np.max(values.real, initial=0.0))
 
     def __call__(self, state, params, t, h):
         p, q = _pair(state)
