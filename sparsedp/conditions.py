@@ -30,7 +30,7 @@ class Condition(Value):
     b: float
 
     def __init__(self, a, b):
-        vars(self).update(a=a, b=b)
+        super().__init__(a=a, b=b)
 
     @property
     def _key(self):

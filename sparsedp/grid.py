@@ -73,7 +73,7 @@ class Grid(Value, Uncached):
         shape = lengths(shape)
         if size is not None and spacing is not None:
             raise ValueError("a grid takes size or spacing, not both; leave one out")
-        vars(self).update(
+        super().__init__(
             shape=shape,
             dim=len(shape),
             axes=AXES[: len(shape)],

@@ -65,7 +65,7 @@ class Operator(Frozen, Remade):
         if structure.shape != (codomain.size, domain.size):
             raise ShapeError(f"{name} maps {domain} to {codomain}, but its matrix has shape {structure.shape}")
         form = form or _chosen_form(structure)
-        vars(self).update(structure=structure, domain=domain, codomain=codomain, name=name, form=form)
+        super().__init__(structure=structure, domain=domain, codomain=codomain, name=name, form=form)
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""

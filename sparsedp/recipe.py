@@ -97,7 +97,10 @@ class Uncached:
 
 
 class Frozen:
-    """An object whose attributes are set once, by ``vars(self).update(...)``."""
+    """An object whose attributes are the values it is made with."""
+
+    def __init__(self, **values):
+        vars(self).update(values)
 
     def __setattr__(self, name, value):
         raise AttributeError(f"{type(self).__name__} is frozen; make a new one instead of setting {name}")

@@ -54,7 +54,7 @@ class Space(Value, Uncached):
         entries = whole_lengths(sum(map(prod, parts)) if shape is None else shape)
         if entries is None:
             raise ShapeError(f"a space needs whole lengths >= 0, got {shape}; write Space(7) or Space((2, 3))")
-        vars(self).update(shape=entries, kind=kind, grid=grid, parts=(entries,) if parts is None else tuple(parts))
+        super().__init__(shape=entries, kind=kind, grid=grid, parts=(entries,) if parts is None else tuple(parts))
 
     @cached_property
     def size(self):

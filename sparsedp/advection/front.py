@@ -15,7 +15,7 @@ from sparsedp.grid import Grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid
-from sparsedp.recipe import Remade
+from sparsedp.recipe import Frozen, Remade
 from sparsedp.structure.base import Matrix
 from sparsedp.tape import Rule, isbox
 
@@ -152,7 +152,7 @@ def _sides(grid, boundary):
     return sides
 
 
-class Transport(Remade):
+class Transport(Frozen, Remade):
     """One time step of transport, made by `transport`. Call it: ``move(u, v, dt, inflow=0.0)``. Frozen."""
 
     setting: Setting
@@ -161,10 +161,7 @@ class Transport(Remade):
 
     def __init__(self, setting):
         law = (LAWS[setting.scheme] if setting.grid.cells.size else NoCells)(setting)
-        self.__dict__.update(setting=setting, law=law, _rule=rule_of(law))
-
-    def __setattr__(self, name, value):
-        raise AttributeError(f"Transport is frozen; make a new one instead of setting {name}")
+        super().__init__(setting=setting, law=law, _rule=rule_of(law))
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""

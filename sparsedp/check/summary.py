@@ -22,9 +22,6 @@ class Result(Frozen):
     _columns: tuple = ()  # of its table as CSV; default: those of the first row
     _plain: tuple = ()  # names of the attributes that are plain data; default: all that were given
 
-    def __init__(self, **values):
-        vars(self).update(values)
-
     def __getattr__(self, name):  # also tells type checkers that there are attributes which no class body names
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 

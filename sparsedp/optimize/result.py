@@ -96,9 +96,6 @@ class Minimum(Frozen):
     resumed: str
     covariance: Any
 
-    def __init__(self, **parts):
-        vars(self).update(parts)
-
     def __str__(self):
         last = self.history[-1]
         head = f"{self.method}: loss {self.value:.6g} after {last.iteration} iterations, {self.evaluations} evaluations"
