@@ -1,7 +1,5 @@
 """The backward pass over all steps of a loop."""
 
-import numpy as np
-
 from sparsedp.derivative import zero_like
 from sparsedp.ledger import active, count
 from sparsedp.progress import shown_steps
@@ -45,18 +43,16 @@ class BackwardPass:
         total = source(state)
         growth.see(n, total)
         for i in shown_steps(loop.progress, range(n - 1, -1, -1), "backward"):
-            if i >= state.i:
-                continue  # it was on the tape of a later one
             if total is None and not loop.keep.along:
                 break  # cut by truncation
-            if len(tapes) and tapes[-1].steps[-1][0].i == i:
+            if i < len(tapes):
                 tape = tapes.pop()  # what is on a tape is not run again
-                state = tape.steps[0][0]
+                state = tape.state
             else:
                 tape, end = None, state.marks()
                 state = steps.back(state) if loop.reverse else self._state_at(i)
                 if total is not None:
-                    tape, after = steps.taped(state, i + 1)
+                    tape, after = steps.taped(state)
                     if not loop.reverse:
                         loop.compare(after.marks(), end)
                     del after
@@ -80,22 +76,18 @@ class BackwardPass:
         return [*(total or [None] * len(loop.state.places)), *map(_fitted, params, steps.p), *inputs]
 
     def _pull(self, tape, g):
-        """Cotangents of the state after a tape -> those of the state before, None if those are not wanted."""
-        cotangents, ends = self.cotangents, tape.ends
-        for state, roots, nodes in reversed(tape.steps):
-            self.steps.last = state
-            backward(nodes, ends, g, cotangents)
-            ends = g = ()
-            for rows, root in zip(self.inputs, roots, strict=True):
-                if root in cotangents:
-                    rows[state.i] = cotangents.pop(root)[0]
-        backs = [cotangents.pop(root, NONE)[0] for root in tape.starts]
-        for root, (back, writable) in cotangents.items():
+        """Cotangents of the state after a step -> those of the state before, None if those are not wanted."""
+        cotangents, state, many = self.cotangents, tape.state, len(tape.state.values)
+        self.steps.last = state
+        backward(tape.nodes, tape.ends, g, cotangents)
+        backs = [cotangents.pop(root, NONE)[0] for root in tape.roots]
+        for rows, back in zip(self.inputs, backs[many:], strict=True):
+            if back is not None:
+                rows[state.i] = back
+        for root in cotangents:
             if root not in self.steps.roots:
                 refuse_lost("the step")  # in a call of another step
-            if not writable and type(back) is np.ndarray:
-                cotangents[root] = back.copy(), True
-        return list(map(_fitted, backs, state.values)) if any(tape.starts) else None
+        return list(map(_fitted, backs, state.values)) if self.loop.wants(state.i) else None
 
     def _state_at(self, i):
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""

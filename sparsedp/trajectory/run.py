@@ -88,15 +88,14 @@ class Loop:
         state, tapes, weight = self.keep.see(steps.first), [], 0  # type: Any, list, int
         kept = [state]
         for i in shown_steps(self.progress, range(self.n), "forward"):
-            if i < state.i:
-                continue  # it is on the tape of an earlier one
-            # The first two tapes tell what a step takes; the first shows traced values that the step keeps.
+            # The first two tapes tell what a step takes.
             taped = wanted and (i == 0 or weight <= room)
             if taped:
                 steps.recorder.bytes = 0 if i < 2 else None
-                tape, state = steps.taped(state, self.end(i, room // max(weight, 1) if i else 1))
-                weight = self.weight(tape, steps.recorder.bytes) if i < 2 else weight
-                room -= weight * len(tape.steps)
+                tape, state = steps.taped(state)
+                if i < 2:
+                    weight = steps.recorder.bytes + len(tape.nodes) * CALL - self.state.nbytes
+                room -= weight
                 tapes += [tape] if i or room >= 0 else []
                 del tape
             else:
@@ -106,18 +105,6 @@ class Loop:
                 state = state if taped or self.keep.whole else state.owned()
                 kept.append(state)
         return state, kept, tapes
-
-    def weight(self, tape, held):
-        """Bytes of a step on a tape, beside the state that is kept: of arrays, and of the calls themselves."""
-        calls = sum(len(nodes) for _, _, nodes in tape.steps)
-        return (held + calls * CALL) // len(tape.steps) - self.state.nbytes
-
-    def end(self, i, most):
-        """Where a tape from state i may end: nobody looks at the states inside, and float64 is not rounded there."""
-        if self.keep.along or any(kind.char != "d" for kind in self.state.dtypes):
-            return i + 1
-        cut = self.n - (self.n - i - 1) // self.truncate * self.truncate
-        return min(i + most, cut, i - i % self.every + self.every)
 
     def refuse(self, steps):
         """Refuse a run that is not finite at its end: NaN stays, so one look tells, and a second run finds the step."""

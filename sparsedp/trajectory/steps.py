@@ -38,20 +38,23 @@ class State(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """Some steps in order: their calls are in order too, so that the backward pass need not sort a graph.
+    """A step: its calls are in order, so that the backward pass need not sort a graph.
 
     Attributes
     ----------
-    starts : list
-        Roots of the first state; None where a constant is.
-    steps : list of (State, list, list)
-        For each step the state before it, the roots of its inputs, and all calls.
+    state : State
+        The state before it.
+    roots : list
+        Of the variables of state and inputs; None where a constant is.
+    nodes : list
+        All calls.
     ends : list
-        The nodes of the state after the last step, None where that does not depend on anything traced.
+        The nodes of the state after it, None where that does not depend on anything traced.
     """
 
-    starts: list
-    steps: list
+    state: State
+    roots: list
+    nodes: list
     ends: list
 
 
@@ -99,24 +102,22 @@ class Steps:
 
     def forward(self, state):
         """The state after this one."""
-        roots = [self._root if self.loop.wants(state.i) else None] * len(state.values)
-        roots += [one and self._root for one in self.input_roots]
+        roots = []
+        if self._root is not None:
+            roots = [self._root if self.loop.wants(state.i) else None] * len(state.values)
+            roots += [one and self._root for one in self.input_roots]
         return self._called(state, roots, self._untaped_params)[0]
 
-    def taped(self, state, stop):
-        """The steps from a state to state `stop`, on one tape: (Tape, the state after them)."""
-        starts = [reverse_root(self.recorder) if self.loop.wants(state.i) else None for _ in state.values]
-        nodes, steps = starts, []  # type: Any, list
-        while state.i < stop:
-            roots = [root and reverse_root(self.recorder) for root in self.input_roots]
-            try:
-                after, nodes = self._called(state, [*nodes, *roots], self._taped_params)
-            finally:
-                steps.append((state, roots, self.recorder.taken()))
-            # What is on no tape may be an array that the step uses again.
-            values = [value if node else owned(value) for value, node in zip(after.values, nodes, strict=True)]
-            state = after._replace(values=values)
-        return Tape(starts, steps, nodes), state
+    def taped(self, state):
+        """The step from a state: (Tape, the state after it)."""
+        roots = [self.loop.wants(state.i) or None for _ in state.values] + self.input_roots
+        roots = [one and reverse_root(self.recorder) for one in roots]
+        try:
+            after, ends = self._called(state, roots, self._taped_params)
+        finally:
+            nodes = self.recorder.taken()
+        # What is on no tape may be an array that the step uses again.
+        return Tape(state, roots, nodes, ends), after.owned() if None in ends else after
 
     def back(self, state):
         """The state before this one, by the step turned round: the same to rounding."""
@@ -154,13 +155,14 @@ class Steps:
     def _called(self, state, roots, params):
         """The step on variables with these roots -> the next state, and the nodes of its variables."""
         self.last = state
-        parts = self._parts(state, boxed(self._given(state), roots, self.number), params)
+        variables = self._given(state)
+        parts = self._parts(state, boxed(variables, roots, self.number) if roots else variables, params)
         given = [leaves(part) for part in parts] if self._open else None
         result = self.loop.step(*parts)
         if given is not None:
             _check_entries(parts, given)
         results, statics = self.loop.state.take(result, "the step")
-        values, nodes = split_boxes(results, self.number)
+        values, nodes = split_boxes(results, self.number) if roots else (results, ())
         return State(state.i + 1, self.loop.state.check(values, "the step", self.outer), statics), nodes
 
     @contextmanager
