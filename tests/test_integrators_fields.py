@@ -266,3 +266,13 @@ def test_trees_travel():
     copy = pickle.loads(pickle.dumps(step))
     for one, other in zip(step(STATE, PARAMS).values(), copy(STATE, PARAMS).values(), strict=True):
         assert np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (2, 2), (0, 3)])
+@pytest.mark.parametrize("method", ["imex", "etdrk4"])
+def test_thin_and_empty_grids(method, shape):
+    lap, u = dp.laplacian(dp.Grid(shape)), np.cos(np.arange(shape[0] * shape[1])).reshape(shape)
+    for op in (-1.0 * lap @ lap, dp.function(lap, lambda e: -(e**2))):
+        step = dp.stepper(method, lambda x, p: {"b": -p * x["b"], "a": p * x["b"]}, 0.1, linear={"a": op, "b": None})
+        end = step({"a": u, "b": u}, 0.5)
+        assert end["a"].shape == shape and np.sum(end["a"] + end["b"]) == pytest.approx(2 * np.sum(u), rel=1e-12)

@@ -212,7 +212,7 @@ class Spectrum:
         if len(axes) > 1 and not np.any(lines[0]):
             lines[0] = lines[0][:1]  # one line of sums serves all
         total = reduce(np.add.outer, lines, np.full((), float(shift)))
-        largest = sum(np.max(np.abs(axis.eigenvalues)) for axis in axes) + abs(shift)
+        largest = sum(np.max(np.abs(axis.eigenvalues), initial=0.0) for axis in axes) + abs(shift)
         # Eigenvalues that were computed, not written down, are only known to some rounding.
         uncertain = 1.0 if any(axis.kind == "eigenvectors" for axis in axes) else 0.25
         total[np.abs(total) <= ZERO * largest * uncertain] = 0.0
