@@ -27,6 +27,7 @@ SMALL = {
     "taylor_green.py": "50",
     "cavity.py": "32",
     "convection.py": "32",
+    "cylinder.py": "10",
     "steady_states.py": "24",
     "obstacle.py": "10",
     "shape.py": "12",

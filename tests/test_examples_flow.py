@@ -51,6 +51,15 @@ def test_taylor_green():
     assert np.allclose(rows(printed, r"dalpha (\S+), dJ/dnu (\S+) of"), 1, atol=0.01)
 
 
+@example("cylinder.py")
+def test_cylinder():
+    """DFG 2D-1 at 10 cells a diameter; 20 are within 0.3 % of the drag."""
+    printed = run("cylinder.py")
+    found = rows(printed, r"^ +(\d+) +(\S+) +(\S+)% +(\S+) +\S+% +(\S+) +(\S+)%")
+    assert found[1][0] == 10 and found[1][2] <= 0.9 < found[0][2] and abs(found[1][5]) <= 4.5 and "agrees" in printed
+    assert rows(printed, r"d/dr (\S+)  d/ds (\S+)")[0] == pytest.approx((130.88, -5.956), rel=1e-3)
+
+
 @example("cavity.py")
 def test_cavity():
     """Case B10 at 32^2; 64^2 within 2 % and 128^2 within 0.6 % are in test_flow_cases.py."""

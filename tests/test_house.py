@@ -82,6 +82,7 @@ LONGER = {
     "conservation_laws.py": 150,
     "inverse_heat.py": 70,
     "steady_states.py": 70,
+    "cylinder.py": 80,
     "full_waveform.py": 100,
     "patterns.py": 80,
 }  # two solvers, a network and a study; four equations
