@@ -42,7 +42,7 @@ from sparsedp.tree import copied
 __all__ = ["Forces", "brinkman", "forces"]
 
 SHARP = 8.0  # b, per cell. Drag of a cylinder of 20 cells: 0.29 % off; with 6 and 12 it is 0.43 and 0.23 %
-DEEP, FAR = -24.0, 700.0  # b s beyond which k is one number: deep in the obstacle, and where it is 0 beside rounding
+DEEP, FAR = -24.0, 100.0  # b s beyond which k is one number: deep in the obstacle, and where it is 0 beside rounding
 FLAT = 1e-10  # change over a cell, of the largest level, that counts as none
 
 
