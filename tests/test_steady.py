@@ -8,6 +8,7 @@ from autograd import jacobian
 
 import sparsedp as dp
 from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
+from sparsedp.solvers import newton, preconditioners
 from sparsedp.solvers.newton import Newton
 from sparsedp.solvers.sparsity import stencil_pattern
 
@@ -332,3 +333,19 @@ def test_refusals():
     ):
         with pytest.raises(error, match=message):
             give()
+
+
+@pytest.mark.parametrize(("most", "own"), [(20, False), (1, True)])
+def test_a_jacobian_leans_on_the_factors_of_one_before(monkeypatch, most, own):
+    """GMRES with the LU of a matrix nearby, an LU of its own where that does not do: the same root, the same bits."""
+    grid, residual = burgers(200, 0.1)
+    ends, factored, made = np.array([1.0, -1.0]), [], preconditioners.direct_engine
+    find = dp.implicit(residual)
+    loss = dp.value_and_grad(lambda ends: anp.sum(find(-grid.centres()[0], ends) ** 2))
+    exact = loss(ends)
+    monkeypatch.setattr(preconditioners, "direct_engine", lambda system: factored.append(system) or made(system))
+    monkeypatch.setattr(preconditioners, "MOST", most)
+    monkeypatch.setattr(newton, "NEAR_FROM", 100)
+    found, again = loss(ends), loss(ends)
+    assert found[0] == again[0] and np.array_equal(found[1], again[1]) and bool(factored) == own
+    assert found[0] == pytest.approx(exact[0], rel=1e-9) and found[1] == pytest.approx(exact[1], rel=1e-6)

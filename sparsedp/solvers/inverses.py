@@ -15,7 +15,7 @@ from sparsedp.operators.given import check_operator
 from sparsedp.solvers.amg import multigrid_engine
 from sparsedp.solvers.direct import DenseSystem, dense_engine, direct_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
-from sparsedp.solvers.preconditioners import krylov_engine
+from sparsedp.solvers.preconditioners import Near, krylov_engine
 from sparsedp.solvers.separable import eigenbasis, separable_engine, transforming
 from sparsedp.solvers.solve import EmptySystem, SolveLog, Solver, failure
 from sparsedp.solvers.system import System
@@ -123,14 +123,19 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     return build(op, **check_settings(method, rtol, maxiter, nullspace, options))
 
 
-def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, solves="many"):
-    """The set-up behind `inverse`, for callers that name it, keep its log, or expect "few" solves of it."""
+def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, solves="many", near=None):
+    """The set-up behind `inverse`, for callers that name it, keep its log, or expect "few" solves of it.
+
+    `near`: the engine of a matrix nearby, whose LU may do.
+    """
     clock = perf_counter()
     system = System(op, rtol, maxiter)
     word, reason, engine = (method, "as asked", None) if method != "auto" else _chosen(system, solves)
     _check_options(word, options)
     if system.complex and word not in ("direct", "krylov"):
         raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct' or 'krylov'")
+    if near is not None and word == "direct":
+        engine = Near(system, getattr(near, "lu", near))
     engine = _engine(system, word, options, engine)
     name = name or f"inverse({op.name})"
     made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)

@@ -126,39 +126,41 @@ class Jacobians:
 
     # ------------------------------------------------------------ set-ups
 
-    def fresh(self, equation, x, leaves):
-        """The Jacobian at this point, made now."""
-        solver, exact = self._made(equation, x, leaves)
-        known = Linearisation(solver, (equation, *copied((x, leaves))), exact)
-        return self._points.put(_key(equation, x, leaves), known)
+    def fresh(self, equation, x, leaves, near=None):
+        """The Jacobian at this point, made now. One that leans on the engine of another, `near`, is not kept."""
+        matrix, make, exact = self._assembled(equation, x, leaves)
+        known = Linearisation(self._solver(matrix, make, near), (equation, *copied((x, leaves))), exact)
+        return known if near else self._points.put(_key(equation, x, leaves), known)
 
     def cached(self, equation, x, leaves):
         """The Jacobian at this point for a derivative: found again or made, and checked against the residual."""
         known = self._points.find(_key(equation, x, leaves)) or self.fresh(equation, x, leaves)
         return self.fresh(equation, x, leaves) if self.enlarged(known) else known
 
-    def relaxed(self, equation, x, leaves, pace):
+    def relaxed(self, equation, x, leaves, pace, near):
         """The Solver of J + D / pace, D the rates of its rows; None where its entries are not known."""
         matrix, make, _ = self._assembled(equation, x, leaves)
         if matrix is None:
             return None
         matrix = sp.csr_array(matrix + sp.diags_array(_rates(matrix, equation.layout) / pace))
-        return self._set_up(matrix, partial(from_matrix, matrix, *(make().domain,) * 2, self.settings["name"]))
+        return self._set_up(matrix, partial(from_matrix, matrix, *(make().domain,) * 2, self.settings["name"]), near)
 
-    def _solver(self, matrix, make):
+    def _solver(self, matrix, make, near):
         """The Solver of a Jacobian, of which ``make()`` is the Operator: found again or set up. No matrix: products."""
         if matrix is None:
             op = make()
             products = {} if op.structure.has_entries else dict(method="krylov")
             return build(op, **self.settings | products, solves="few").solver
+        if near:
+            return self._set_up(matrix, make, near)
         key = matrix.indptr, matrix.indices, matrix.data
         return self._matrices.find(key) or self._matrices.put(key, self._set_up(matrix, make))
 
-    def _set_up(self, matrix, make):
+    def _set_up(self, matrix, make, near=None):
         settings, solver = self.settings, None
         if len(matrix.indptr) <= DENSE_UP_TO + 1 and settings["method"] in ("auto", "direct"):
             solver = build_dense(matrix.toarray(), make, settings["rtol"], settings["nullspace"], settings["name"])
-        return solver or build(make(), **settings, solves="few").solver
+        return solver or build(make(), **settings, solves="few", near=near).solver
 
     def suspected(self, known):
         """As `enlarged`, for a Newton step that did not do well. A Jacobian that was given may be a simpler one."""
@@ -200,11 +202,6 @@ class Jacobians:
         return True
 
     # ------------------------------------------------------------ three ways to a Jacobian
-
-    def _made(self, equation, x, leaves):
-        """(the Solver of the Jacobian, whether it is the derivative itself for certain)."""
-        matrix, make, exact = self._assembled(equation, x, leaves)
-        return self._solver(matrix, make), exact
 
     def _assembled(self, equation, x, leaves):
         """(its matrix, None where it is products; what makes the Operator; whether it is exact for certain)."""

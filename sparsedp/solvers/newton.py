@@ -60,6 +60,7 @@ STALLED, STALLS = 0.9, 2  # so many Newton steps on end that leave more of the r
 SHORTEST, FIRST, LONGEST = 1e-3, 10.0, 1e4  # pseudo-time steps; of 1, 10, 100 at first, 10 takes the fewest in cavities
 GROWTH = 10.0  # of a pseudo-time step, at most. A rule that grows 1.5 times faster loses the cavity at Re 1000
 RISE = 2.0  # times the residual at the guess: a step to more is not taken, but a quarter of it in time
+NEAR_FROM = 10_000  # unknowns: the LU factors of a smaller Jacobian are no gain for the next one
 TINY = 1e-8  # an iterate that is smaller than the last one by this share may be on its way to 0
 
 
@@ -254,6 +255,7 @@ class Newton:
         self.stale = False  # whether J is that of an earlier iterate
         self.largest: Any = 0.0  # residual met, of each field
         self.stalls = 0  # Newton steps on end that left nearly all of the residual
+        self.near: Any = None  # the engine of the last Jacobian, where its LU is worth another try
         self.evolves = not steps  # whether pseudo-time may be tried: once
 
     def solve(self, guess, known=None):
@@ -323,9 +325,15 @@ class Newton:
 
     # ------------------------------------------------------------ one step
 
+    def _lean(self, solver):
+        """Jacobians to come shall try the LU of this one."""
+        if solver.system.size >= NEAR_FROM and solver.engine.method == "direct" and not self.steps:
+            self.near = solver.engine
+
     def _linearise(self):
         try:
-            self.J, self.stale = self.jacobians.fresh(self.equation, self.x, self.leaves), False
+            self.J, self.stale = self.jacobians.fresh(self.equation, self.x, self.leaves, self.near), False
+            self._lean(self.J.solver)
             self._weigh()
         except ConvergenceError as error:
             self._fail(
@@ -409,9 +417,10 @@ class Newton:
     def _flow(self, pace, most):
         """One step in pseudo-time -> by how much the next one should be longer; 0: there can be none."""
         try:
-            solver = self.jacobians.relaxed(self.equation, self.x, self.leaves, pace)
+            solver = self.jacobians.relaxed(self.equation, self.x, self.leaves, pace, self.near)
             if solver is None:
                 return 0.0
+            self._lean(solver)
             x = self.x + solver.approximate(-self.F, LOOSEST)
         except ConvergenceError:
             return 0.25

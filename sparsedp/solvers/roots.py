@@ -157,7 +157,8 @@ def steady(residual, guess, *params, **options):
     in its equation: ``"p": D(v) + pin * p`` with ``pin`` 1 in one cell and 0 elsewhere, which leaves D(v) = 0 in all
     cells. Faces in walls need an equation: ``inside(rate) + v - inside(v)``. Differences of states from a near guess
     (`check.gradient`) see the tolerance: write rtol=1e-13.
-    Cost: sparse LU of the Jacobian for each Newton step; for a gradient one more, kept for each further one.
+    Cost: sparse LU of the Jacobian; from 10 000 unknowns on one for several steps: GMRES with the LU of a step before
+    does for the next. For a gradient one LU more, kept for each further one.
     Source: Kelley and Keyes, SIAM J. Numer. Anal. 35 (1998).
 
     Examples
