@@ -23,19 +23,7 @@ from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, note, thread, timed
 from sparsedp.recipe import Remade
 from sparsedp.shortcuts import (
-    ACTS,
-    ARRAY,
-    BOX,
-    COPY,
-    FLOAT,
-    ITEM,
-    MAKERS,
-    NUMBERS,
-    OPERATORS,
-    PLAIN,
-    REAL,
-    Part,
-    formulas_of,
+    ACTS, ARRAY, BOX, COPY, FLOAT, ITEM, MAKERS, NUMBERS, OPERATORS, PLAIN, REAL, Part, formulas_of,
 )  # fmt: skip
 from sparsedp.tree import copied, leaves
 
@@ -70,12 +58,14 @@ class Recorder:
         nodes, self.nodes = self.nodes, []
         return nodes
 
-    def refuse(self):
-        """Refuse a call after the end."""
-        raise DerivativeError(
-            "a traced value was stored, and is used after the function or the step that made it has ended: its "
-            "derivative would be lost; return it, from a rollout in the state or by keep"
-        )
+    def open(self):
+        """Itself, for one more call; refused after the end."""
+        if self.ended:
+            raise DerivativeError(
+                "a traced value was stored, and is used after the function or the step that made it has ended: its "
+                "derivative would be lost; return it, from a rollout in the state or by keep"
+            )
+        return self
 
 
 class ReverseNode(VJPNode):
@@ -91,9 +81,7 @@ class ReverseNode(VJPNode):
         self.parents, self.vjp, self.held, self.recorder = (), None, (), recorder
 
     def __init__(self, value, fun, args, options, nums, parents):
-        self.parents, self.recorder = parents, parents[0].recorder
-        if self.recorder.ended:
-            self.recorder.refuse()
+        self.parents, self.recorder = parents, parents[0].recorder.open()
         formulas = None if options else formulas_of(fun, value, args, nums)
         if formulas:
             self.vjp, held = formulas[0](nums, args)
@@ -127,9 +115,7 @@ class UntapedNode(Node):
         self.recorder = recorder
 
     def __init__(self, value, fun, args, options, nums, parents):
-        self.recorder = parents[0].recorder
-        if self.recorder.ended:
-            self.recorder.refuse()
+        self.recorder = parents[0].recorder.open()
 
 
 class ForwardNode(JVPNode):
@@ -203,8 +189,8 @@ def split_boxes(values, number):
     for k, value in enumerate(below):
         if isbox(value) and value._trace == number:
             below[k], nodes[k] = value._value, value._node
-        elif isbox(value) and getattr(value._node, "recorder", Recorder).ended:
-            value._node.recorder.refuse()
+        elif isbox(value) and hasattr(value._node, "recorder"):
+            value._node.recorder.open()
     return below, nodes
 
 

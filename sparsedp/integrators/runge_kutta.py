@@ -1,5 +1,8 @@
 """Runge-Kutta steps. An explicit one is a table of numbers; an implicit one a few stages, x of x = b + h f(x, t).
 
+Where the rate is c L u and nothing else, an explicit step of order p in p stages is the Taylor polynomial T_p(z L) u,
+z = h c, and one node on the tape (functions.py).
+
 Sources: Heun, Z. Math. Phys. 45 (1900); Kutta, Z. Math. Phys. 46 (1901);
 Shu and Osher, J. Comput. Phys. 77 (1988), the strong-stability-preserving step of order 3.
 
@@ -32,7 +35,7 @@ What L leaves as it is (the mean, where nothing flows through the walls) is spli
 after it: 1 - z L has the eigenvalue 1 there beside those of size z |L|, and would lose it to rounding.
 """
 
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -42,6 +45,7 @@ import scipy.sparse as sp
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import ConvergenceError
+from sparsedp.integrators.functions import Taylor, TaylorPolynomials
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
@@ -120,19 +124,16 @@ def _ahead(u, h, row, rates):
 
 
 class Polynomial(Scheme):
-    """The same for u' = c L u, where it is the Taylor polynomial of exp(h c L): by Horner's rule."""
+    """The same for u' = c L u."""
 
     def __init__(self, problem, name):
         super().__init__(problem, name, EXPLICIT[name].order)
+        self.polynomials = problem.engines(
+            lambda op: partial(TaylorPolynomials(op, f"stepper({name})"), (Taylor(self.order),)), unchanged
+        )
 
     def __call__(self, u, params, t, h):
-        return self.problem.on_fields(self._horner, h, params, u)
-
-    def _horner(self, op, z, leaf):
-        x = leaf
-        for k in range(self.order, 0, -1) if op else ():
-            x = combine(leaf, (z / k, op(x)))
-        return x
+        return self.problem.on_fields(lambda op, z, leaf: self.polynomials[op](z, leaf), h, params, u)
 
 
 def unchanged(z, leaf):
