@@ -30,7 +30,7 @@ DAMPED = 0.2
 # of Gauss and Seidel amplify waves of few cells. Measured with 10 cells a wavelength, 512^2: 0.1 and 0.2 on the first
 # two levels converge; with the third (0.8) smoothed as well nothing does.
 RESOLVED = 0.4
-MOST = 20  # iterations with the LU of a matrix nearby; those of a cavity of 128^2 cells take a third of the time of LU
+MOST = 12  # iterations with the LU of a matrix nearby: a third of the time of LU. With 20 a cavity at Re 1000 is slower
 
 
 class Near(Engine):
