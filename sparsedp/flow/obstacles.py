@@ -124,8 +124,8 @@ def brinkman(grid):
     The obstacle is at rest, and cells are about uniform around it. The fluid goes on inside, hardly moving, and so does
     its pressure: on the surface it is best taken from a cell or two outside. Obstacles thinner than a cell leak. With
     the fraction f of a cell around each face that is solid, 0.5 - f is a level set, a coarse one.
-    The force on it is that of `forces` on a set of cells around; at a steady state also the sum of
-    ``grid.faces.volumes * viscosity * friction(level) * v``.
+    The force on it is the sum of ``grid.faces.volumes * viscosity * friction(level) * v``; at a steady state also that
+    of `forces` on any set of cells around it, two cells wider at least.
     Source: Angot, Bruneau and Fabrie, Numer. Math. 81 (1999); where such a wall is felt: Hester, Vasil and Burns,
     J. Comput. Phys. 430 (2021).
 
