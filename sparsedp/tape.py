@@ -23,7 +23,19 @@ from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, note, thread, timed
 from sparsedp.recipe import Remade
 from sparsedp.shortcuts import (
-    ACTS, ARRAY, BOX, COPY, FLOAT, ITEM, MAKERS, NUMBERS, OPERATORS, PLAIN, REAL, Part, formulas_of,
+    ACTS,
+    ARRAY,
+    BOX,
+    COPY,
+    FLOAT,
+    ITEM,
+    MAKERS,
+    NUMBERS,
+    OPERATORS,
+    PLAIN,
+    REAL,
+    Part,
+    formulas_of,
 )  # fmt: skip
 from sparsedp.tree import copied, leaves
 
@@ -137,8 +149,8 @@ class ForwardNode(JVPNode):
 
 
 untraced = notrace_primitives  # by kind of node, functions that leave the tape
-untraced[ReverseNode], untraced[ForwardNode] = untraced[VJPNode], untraced[JVPNode]
-untraced[UntapedNode] = untraced[VJPNode]
+untraced[ReverseNode] = untraced[UntapedNode] = untraced[VJPNode]
+untraced[ForwardNode] = untraced[JVPNode]
 untaped_root = UntapedNode.new_root
 forward_root = ForwardNode.new_root  # a fresh start of a forward-mode trace, with its tangent
 
@@ -158,10 +170,7 @@ def new_trace():
 
 @contextmanager
 def _new_trace():
-    """The same for autograd's own traces.
-
-    autograd counts up and down, for all threads: of two nested traces the inner one could get the smaller number.
-    """
+    """The same for autograd's own traces: it counts up and down, and the inner of two could get the smaller number."""
     yield new_trace()
 
 
