@@ -3,7 +3,7 @@
 Run ``python -m benchmarks.physics [name ...] [--quick]`` in the root of the repository; a name is a part of a case.
 Columns: case; what is looked at; ours; published or exact; how far off, relative; seconds of the scene once, imports
 and compiling left out; the verdict of `check.gradient` on the same scene with fewer cells; lines of the scene, all
-that a user writes for it, comments and blank lines left out. ``--quick``: the few cells for both.
+that a user writes for it, without comments and the rates of benchmarks.stiff. ``--quick``: the few cells for both.
 
 A scene takes a number of cells and returns (f, p): f(p) is the number that is looked at, differentiable in p.
 """
@@ -15,40 +15,21 @@ from time import perf_counter
 import autograd.numpy as np
 
 import sparsedp as dp
+from benchmarks import stiff
 
 
 def hires(tolerance):
     """u6 at the end, in the rate that makes u8 of u6 and u7 (Hairer and Wanner, Solving ODEs II; Mazzia, Magherini)."""
 
-    def rate(u, k):
-        a, b, c, d, e, f, g, h = u
-        meet = 280.0 * f * h
-        return np.array(
-            [
-                -k * a + 0.43 * b + 8.32 * c + 0.0007,
-                k * a - 8.75 * b,
-                -10.03 * c + 0.43 * d + 0.035 * e,
-                8.32 * b + k * c - 1.12 * d,
-                -1.745 * e + 0.43 * (f + g),
-                -meet + 0.69 * (d + g) + k * e - 0.43 * f,
-                meet - 1.81 * g,
-                1.81 * g - meet,
-            ]
-        )
-
-    step = dp.stepper("radau", rate, 321.8122, tolerance=tolerance, floor=1e-3)
-    return lambda k: step(np.array([1.0, 0, 0, 0, 0, 0, 0, 0.0057]), k)[5], 1.71
+    step = dp.stepper("radau", stiff.hires, 321.8122, tolerance=tolerance, floor=1e-3)
+    return lambda k: step(np.array([1.0, 0, 0, 0, 0, 0, 0, 0.0057]), [k, *stiff.HIRES[1:]])[5], stiff.HIRES[0]
 
 
 def robertson(tolerance):
     """u1 at 1e11, in the logarithm of the slowest rate (Mazzia and Magherini, test set for IVP solvers, 2008)."""
 
-    def rate(u, k):
-        slow, back, fast = np.exp(k) * u[0], 1e4 * u[1] * u[2], 3e7 * u[1] ** 2
-        return np.array([back - slow, slow - back - fast, fast])
-
-    step = dp.stepper("radau", rate, 1e11, tolerance=tolerance, floor=np.array([1e-8, 1e-13, 1.0]))
-    return lambda k: step(np.array([1.0, 0.0, 0.0]), k)[0], np.log(0.04)
+    step = dp.stepper("radau", stiff.robertson, 1e11, tolerance=tolerance, floor=np.array([1e-8, 1e-13, 1.0]))
+    return lambda k: step(np.array([1.0, 0.0, 0.0]), [np.exp(k), 1e4, 3e7])[0], np.log(0.04)
 
 
 def swift_hohenberg(n):
@@ -58,6 +39,20 @@ def swift_hohenberg(n):
     step = dp.stepper("etdrk4", lambda u, r: r * u - u**3, 8.0, linear=L)
     start = 0.1 * np.cos(grid.centres()[0])
     return lambda r: np.sqrt(2 * np.mean(dp.rollout(step, start, r, 150) ** 2)), 0.01
+
+
+def cahn_hilliard(n):
+    """Energy of a flat interface in a 3-D box: sqrt(8) / 3 (Cahn and Hilliard, J. Chem. Phys. 28, 1958)."""
+    grid = dp.Grid((n, 4, 4), spacing=10.0 / n)
+    L, G = dp.laplacian(grid), dp.gradient(grid)
+    step = dp.stepper("imex", lambda u, p: L(u**3 - 3 * u), 0.2, linear=(2 * L - L @ L))
+    start = np.where(grid.centres()[0] < 5.0, -1.0, 1.0)
+
+    def energy(w):
+        u = dp.rollout(step, w * start, None, 200)
+        return (np.sum((u**2 - 1) ** 2) / 4 + np.sum(G(u) ** 2) / 2) * grid.volumes[0, 0, 0] / (40.0 / n) ** 2
+
+    return energy, 1.0
 
 
 def bratu(n):
@@ -253,6 +248,7 @@ CASES = {  # name: scene, number that is looked at, what is published or exact, 
     "HIRES": (hires, "u6", 0.006238968252742796, 1e-8, 1e-9),
     "Robertson, 1e11": (robertson, "u1", 2.083340149701255e-8, 1e-8, 1e-9),
     "Swift-Hohenberg, r 0.01": (swift_hohenberg, "amplitude of rolls", 2 * np.sqrt(0.01 / 3), 64, 16),
+    "Cahn-Hilliard, 3-D": (cahn_hilliard, "energy of an interface", np.sqrt(8) / 3, 64, 16),
     "Bratu, p = 1": (bratu, "largest u", 0.1405392, 257, 33),
     "cavity, Re 1000": (cavity, "min u", -0.3885698, 128, 24),
     "convection, Ra 1e5": (convection, "Nu", 4.519, 64, 16),

@@ -9,6 +9,7 @@ from benchmarks.physics import row
 
 CLOSE = {  # by how much a scene with few cells is off
     "Swift-Hohenberg, r 0.01": 0.2,
+    "Cahn-Hilliard, 3-D": 0.02,
     "Bratu, p = 1": 2e-3,
     "cavity, Re 1000": 0.3,
     "convection, Ra 1e5": 0.15,

@@ -261,7 +261,7 @@ BUGS = {
     ),
     # ---- tape, operator, structure, operators
     "the cotangent of one field for a batch of them": Bug(
-        "tape.py",
+        "derivative.py",
         "cotangent = anp.sum(cotangent, axis=0)",
         "cotangent = cotangent[0]",
         "tests/test_batch.py",
