@@ -124,6 +124,12 @@ TABLE = [
         "solid needs one flag for each value on cells(3), got an array of shape (4,)",
     ),
     (
+        lambda: dp.flux(BOX, np.s_[0.5:1, :]),
+        VALUE,
+        "a box on Grid(2 x 2 cells, size 2 x 2) needs one slice of cells for each axis, got "
+        "(slice(0.5, 1, None), slice(None, None, None)); write np.s_[4:8, 2:6]",
+    ),
+    (
         lambda: dp.flux(BOX, np.s_[0:1]),
         VALUE,
         "a box on Grid(2 x 2 cells, size 2 x 2) needs one slice of cells for each axis, got slice(0, 1, None); write "
@@ -142,12 +148,17 @@ TABLE = [
     (
         lambda: dp.brinkman(LINE)(np.ones(4, complex)),
         TYPE,
-        "brinkman takes real numbers, got dtype complex128; write level.real",
+        "brinkman takes an array of real numbers, got dtype complex128",
     ),
     (
         lambda: dp.brinkman(LINE)([1.0, np.nan, 1.0, 1.0]),
         FINITE,
         "brinkman takes a finite level, got 1 that are NaN or infinite, the first at 1",
+    ),
+    (
+        lambda: dp.forces(BOX, cells=np.s_[:, :])(np.ones((3, 24)), np.ones((3, *BOX.shape)), [0.1, 0.2, 0.3]),
+        TYPE,
+        "forces takes one real number as viscosity, got [0.1, 0.2, 0.3]",
     ),
     (
         lambda: dp.forces(BOX),

@@ -23,7 +23,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.conditions import no_slip, resolve
-from sparsedp.fields import check_finite
+from sparsedp.fields import check_finite, is_number
 from sparsedp.flow.momentum import face_laplacian, momentum_fluxes, stresses
 from sparsedp.flow.setup import pressure_conditions
 from sparsedp.grid import check_grid, finite_number, per_axis
@@ -73,7 +73,7 @@ def forces(grid, solid=None, boundary=no_slip, solid_boundary=no_slip, cells=Non
     ShapeError
         If `solid` or `cells` has another shape than the grid.
     TypeError
-        If they are not boolean, or a condition is none of a flow.
+        If they are not boolean, or a condition is none of a flow; on use, if the viscosity is no number.
     ValueError
         If neither `solid` nor `cells` is given, or `about` is not finite.
 
@@ -115,7 +115,7 @@ def brinkman(grid):
     ShapeError
         On use, if the level has another shape.
     TypeError
-        On use, if it is complex.
+        On use, if it is no array of real numbers.
     NonFiniteError
         On use, if it is NaN or infinite.
 
@@ -148,8 +148,8 @@ def brinkman(grid):
 
     def friction(level):
         values = np.asarray(plain(level))
-        if values.dtype.kind == "c":
-            raise TypeError(f"brinkman takes real numbers, got dtype {values.dtype}; write level.real")
+        if values.dtype.kind not in "biuf":
+            raise TypeError(f"brinkman takes an array of real numbers, got dtype {values.dtype}")
         check_finite("brinkman", values, "takes a finite level")
         level = level / (np.max(np.abs(values), initial=0.0) or 1.0)
         changes = [(ahead(level), behind(level)) for ahead, behind in steps]
@@ -183,7 +183,8 @@ class Forces(Remade):
     def __init__(self, grid, solid, boundary, solid_boundary, cells, about):
         self.made = grid, solid, boundary, solid_boundary, cells, about
         sides = resolve(grid, boundary, no_slip)
-        chosen = np.logical_or(*solid_faces(grid, region_of(grid, solid if cells is None else cells)))
+        held = check_solid(grid, solid) if cells is None else region_of(grid, cells)
+        chosen = np.logical_or(*solid_faces(grid, held))
         point = [finite_number(x, "about") for x in per_axis(about, grid.shape, "about")]
         self.total = _total(grid, chosen, point)
         viscous = Operator(stresses(grid, sides, solid, solid_boundary), grid.faces, grid.faces, "stresses")
@@ -197,6 +198,8 @@ class Forces(Remade):
         return Forces, self.made
 
     def __call__(self, v, p, viscosity):
+        if not is_number(plain(viscosity)):  # an array would be spread over force and torque
+            raise TypeError(f"forces takes one real number as viscosity, got {plain(viscosity)!r}")
         return viscosity * self.viscous(v) + self.pressure(p) - self.gain(self.carried(v) * self.carrier(v))
 
 

@@ -215,11 +215,17 @@ def region_of(grid, cells):
     if not isinstance(cells, (slice, tuple)):
         return _boolean(cells, grid.cells, "cells")
     box = cells if isinstance(cells, tuple) else (cells,)
-    if len(box) != grid.dim or not all(isinstance(side, slice) and side.step in (None, 1) for side in box):
+    if len(box) != grid.dim or not all(map(_is_run, box)):
         raise ValueError(f"a box on {grid} needs one slice of cells for each axis, got {cells}; write np.s_[4:8, 2:6]")
     found = np.zeros(grid.shape, dtype=bool)
     found[box] = True
     return found
+
+
+def _is_run(side):
+    """Whether it is a slice of neighbours, between whole numbers."""
+    whole = lambda end: end is None or hasattr(end, "__index__")
+    return isinstance(side, slice) and side.step in (None, 1) and whole(side.start) and whole(side.stop)
 
 
 def solid_faces(grid, solid):
