@@ -183,6 +183,16 @@ TABLE = [
         "a rate must have the shape of the state, (4,), got (1,)",
     ),
     (
+        lambda: dp.stepper("rk4", lambda x, p: {"w": x["v"], "u": x["u"]}, 0.6)({"u": U, "v": U}),
+        SHAPE,
+        "a rate must have the names of the state, ['u', 'v'], got ['w', 'u']",
+    ),
+    (
+        lambda: dp.stepper("tr_bdf2", dp.laplacian(dp.Grid(3)), 0.6)(U),
+        SHAPE,
+        "stepper(tr_bdf2) takes a field on cells(3), got an array of shape (4,)",
+    ),
+    (
         lambda: dp.stepper("rk4", decay, 0.6, tolerance=1e-9)(U.astype(np.float32), 1.0),
         VALUE,
         "stepper(rk4) cannot meet the tolerance 1e-09 with a state of float32, whose rounding is 1.2e-07; take a "

@@ -48,6 +48,8 @@ def combine(u, *pairs):
 
 def _of_fields(tree, u):
     """The leaves of a rate, one for each of the state; broadcasting one into another would hide a mistake."""
+    if isinstance(tree, dict) and isinstance(u, dict) and tree.keys() != u.keys():
+        raise ShapeError(f"a rate must have the names of the state, {[*u]}, got {[*tree]}")
     found = leaves_like(tree, u)
     if _shapes(found) != (shapes := _shapes(leaves(u))):
         given, wanted = (", ".join(map(str, words)) or "nothing" for words in (_shapes(found), shapes))
@@ -207,7 +209,7 @@ class Problem:
         """The rate alone, or None; a copy: it may write into the array that it returned before."""
         if self.rate is None:
             return None
-        return _ordered(copied(_unchanged(self.rate, u, (params, t) if self.driven else (params,))), u)
+        return copied(_unchanged(self.rate, u, (params, t) if self.driven else (params,)))
 
     def given(self, params, t):
         """The source alone, or None."""
@@ -215,16 +217,11 @@ class Problem:
 
     def __call__(self, u, params, t):
         """The whole right-hand side."""
-        rest = [self.explicit(u, params, t), _ordered(self.given(params, t), u)]
+        rest = [self.explicit(u, params, t), self.given(params, t)]
         if self.stiff:
             rest.insert(0, self.on_fields(lambda L, c, leaf: (L(leaf) if L else 0.0 * leaf) * c, 1.0, params, u))
-        first, *others = [part for part in rest if part is not None]
+        first, *others = [part if keys(u) is None else _of_fields(part, u) for part in rest if part is not None]
         return combine(first, *((1.0, part) for part in others))
-
-
-def _ordered(rate, u):
-    """A rate with its parts in the order of those of the state."""
-    return rate if keys(u) is None or rate is None else leaves_like(rate, u)
 
 
 def _takes(fun, least):

@@ -45,6 +45,7 @@ import scipy.sparse as sp
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import ConvergenceError
+from sparsedp.fields import field_array
 from sparsedp.integrators.functions import Taylor, TaylorPolynomials
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
@@ -202,16 +203,16 @@ class Resolvent:
         inv = inv.T if transposed else inv if checked else inv.tangent
         if self._null_space is None:
             return inv.apply(b)
-        b = np.asarray(b)
-        wide = b.astype(np.result_type(b, np.float64), copy=False)
+        field = field_array(inv, b, batch=True)
+        wide = field.astype(np.result_type(field, np.float64), copy=False)
         moving = self._projected(wide, transposed)
         x = self._projected(inv.apply(moving), transposed) + (wide - moving)
-        return x.astype(np.result_type(b, np.float32), copy=False)
+        return x.astype(field.dtype, copy=False)
 
     def _projected(self, b, transposed):
         """b without what L leaves as it is, field by field of a batch."""
-        fields = np.ascontiguousarray(b).reshape(-1, self.op.shape[0])
-        return np.array([self._null_space.project(field, transposed) for field in fields]).reshape(b.shape)
+        fields = [self._null_space.project(field, transposed) for field in b.reshape(-1, self.op.shape[0])]
+        return np.array(fields).reshape(b.shape)
 
     @cached_property
     def _null_space(self):

@@ -90,7 +90,7 @@ def power(op, exponent):
         raise ValueError(f"{op.name} has eigenvalues down to {values.min():.1e}; a fractional power needs them >= 0")
     zero = values == 0
     with np.errstate(over="ignore"):
-        weights = np.where(zero, 1.0 if exponent == 0 else 0.0, np.where(zero, 1.0, values) ** float(exponent))
+        weights = np.where(zero, float(exponent == 0), np.where(zero, 1.0, values) ** float(exponent))
     refusal = f"{op.name} to the power {exponent:g} is beyond 1.8e308; rescale the operator"
     return _function(op, axes, weights, f"({op.name})^{exponent:g}", refusal)
 
