@@ -133,7 +133,7 @@ TABLE = [
         lambda: dp.flux(BOX, np.s_[0:1]),
         VALUE,
         "a box on Grid(2 x 2 cells, size 2 x 2) needs one slice of cells for each axis, got slice(0, 1, None); write "
-        "np.s_[4:8, 2:6]",
+        "(slice(4, 8), slice(2, 6))",
     ),
     (
         lambda: dp.flux(BOX, np.zeros(4, bool)),
@@ -163,7 +163,7 @@ TABLE = [
     (
         lambda: dp.forces(BOX),
         VALUE,
-        "forces needs an obstacle or a set of cells, got neither; write cells=np.s_[4:8, 2:6]",
+        "forces needs an obstacle or a set of cells, got neither; write cells=(slice(4, 8), slice(2, 6))",
     ),
     (
         lambda: dp.forces(BOX, cells=np.s_[:, :], about=np.nan),

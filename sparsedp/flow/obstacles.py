@@ -91,7 +91,9 @@ def forces(grid, solid=None, boundary=no_slip, solid_boundary=no_slip, cells=Non
     """
     check_grid("forces", grid)
     if solid is None and cells is None:
-        raise ValueError("forces needs an obstacle or a set of cells, got neither; write cells=np.s_[4:8, 2:6]")
+        raise ValueError(
+            "forces needs an obstacle or a set of cells, got neither; write cells=(slice(4, 8), slice(2, 6))"
+        )
     return Forces(*copied((grid, solid, boundary, solid_boundary, cells, about)))
 
 

@@ -216,7 +216,9 @@ def region_of(grid, cells):
         return _boolean(cells, grid.cells, "cells")
     box = cells if isinstance(cells, tuple) else (cells,)
     if len(box) != grid.dim or not all(map(_is_run, box)):
-        raise ValueError(f"a box on {grid} needs one slice of cells for each axis, got {cells}; write np.s_[4:8, 2:6]")
+        raise ValueError(
+            f"a box on {grid} needs one slice of cells for each axis, got {cells}; write (slice(4, 8), slice(2, 6))"
+        )
     found = np.zeros(grid.shape, dtype=bool)
     found[box] = True
     return found

@@ -114,8 +114,8 @@ def flux(grid, cells):
     ----------
     grid : Grid
     cells : slices or bool array
-        The cells of the box: one slice for each axis (``np.s_[4:8, 2:6]``), or any set of cells as an array of shape
-        `grid.shape`.
+        The cells of the box: one slice for each axis, ``(slice(4, 8), slice(2, 6))`` (with plain NumPy
+        ``np.s_[4:8, 2:6]``), or any set of cells as an array of shape `grid.shape`.
 
     Returns
     -------
@@ -136,7 +136,7 @@ def flux(grid, cells):
     --------
     >>> import numpy as np
     >>> from sparsedp import Grid
-    >>> out = flux(Grid(4), np.s_[1:3])
+    >>> out = flux(Grid(4), slice(1, 3))
     >>> float(out(np.array([0.0, 1.0, 7.0, 3.0, 4.0])))
     2.0
     """
