@@ -146,6 +146,16 @@ TABLE = [
         "brinkman takes a field on faces(3) of shape (4,), got an array of shape (3,)",
     ),
     (
+        lambda: dp.brinkman(BOX)([np.ones((3, 2)), np.ones((2, 3))]),
+        SHAPE,
+        "brinkman takes one array on faces(2, 2) of shape (12,), got 2 parts; write grid.join(*parts)",
+    ),
+    (
+        lambda: dp.forces(BOX, cells=(slice(1), slice(1)))(np.ones((2, 2)), np.ones(12), 1.0),
+        SHAPE,
+        "forces @ stresses takes a field on faces(2, 2) of shape (12,), got an array of shape (2, 2)",
+    ),
+    (
         lambda: dp.brinkman(LINE)(np.ones(4, complex)),
         TYPE,
         "brinkman takes an array of real numbers, got dtype complex128",

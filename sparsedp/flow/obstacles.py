@@ -23,7 +23,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.conditions import no_slip, resolve
-from sparsedp.fields import check_finite, is_number
+from sparsedp.fields import check_finite, field_array, is_number
 from sparsedp.flow.momentum import face_laplacian, momentum_fluxes, stresses
 from sparsedp.flow.setup import pressure_conditions
 from sparsedp.grid import check_grid, finite_number, per_axis
@@ -149,9 +149,9 @@ def brinkman(grid):
     within = 2 * (np.cosh(SHARP) - 1) * reduce(add, rates)  # where the level may be flat
 
     def friction(level):
-        values = np.asarray(plain(level))
-        if values.dtype.kind not in "biuf":
-            raise TypeError(f"brinkman takes an array of real numbers, got dtype {values.dtype}")
+        values = field_array(steps[0][0], plain(level), batch=True)
+        if np.iscomplexobj(values):
+            raise TypeError(f"brinkman takes real numbers, got dtype {values.dtype}; write level.real")
         check_finite("brinkman", values, "takes a finite level")
         level = level / (np.max(np.abs(values), initial=0.0) or 1.0)
         changes = [(ahead(level), behind(level)) for ahead, behind in steps]
@@ -214,4 +214,4 @@ def _total(grid, chosen, point):
         forward, backward = grid.face_centres(b)[a] - point[a], grid.face_centres(a)[b] - point[b]
         rows.append({b: forward * weights[b], a: -backward * weights[a]})
     matrix = [[row.get(c, 0.0 * w).reshape(1, -1) for c, w in enumerate(weights)] for row in rows]
-    return Operator(Matrix(sp.csr_array(np.block(matrix))), grid.faces, Space(len(rows)), "total")
+    return Operator(Matrix(sp.csr_array(np.block(matrix))), grid.faces, Space(len(rows)), "forces")
