@@ -65,6 +65,7 @@ verdict = dp.check.gradient(lambda shape: coefficients(flow(shape))["C_D"], circ
 print("gradient against finite differences:", verdict)
 if "--out" in sys.argv:
     Path(sys.argv[-1]).mkdir(exist_ok=True)
-    ax = dp.plot(grid, x["v"], title="speed around a cylinder, Re 20")
+    ax, turn = dp.plot(grid, x["v"], title="flow around a cylinder, Re 20", label="speed"), np.linspace(0, 2 * np.pi)
+    ax.plot(0.2 + D / 2 * np.cos(turn), 0.2 + D / 2 * np.sin(turn), "r")
     ax.set_xlim(0, 1)
-    ax.figure.savefig(Path(sys.argv[-1]) / "cylinder.png", dpi=120)
+    ax.figure.savefig(Path(sys.argv[-1]) / "cylinder.png", dpi=120, bbox_inches="tight")

@@ -70,9 +70,10 @@ print(f"feed found from what is seen after 25 steps: {best.x:.6f} (0.034), {len(
 if "--out" in sys.argv:
     from matplotlib.figure import Figure
 
-    picture = Figure(figsize=(12, 3.4), layout="constrained")
+    picture = Figure(figsize=(13, 2.6), layout="constrained")
     fields = {"Gray-Scott, v": end["v"], "Cahn-Hilliard": films[-1], "Swift-Hohenberg": rolls}
-    for ax, (name, u) in zip(picture.subplots(1, 4), (fields | {"Kuramoto-Sivashinsky": flame}).items()):
+    fields |= {"Kuramoto-Sivashinsky, u - mean": flame - np.mean(flame)}
+    for ax, (name, u) in zip(picture.subplots(1, 4), fields.items()):
         picture.colorbar(ax.imshow(u.T, origin="lower"), ax=ax)
         ax.set(title=name, xticks=[], yticks=[])
     Path(sys.argv[-1]).mkdir(exist_ok=True)
