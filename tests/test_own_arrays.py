@@ -122,6 +122,11 @@ BUILDERS = {
         lambda w, s, b, dt, nu: dp.flow_step(GRID, dt, nu, boundary=b, solid=s, walls=w),
         flow,
     ),
+    "flow_step, friction": (
+        (np.abs(np.sin(K)),),
+        lambda f: dp.flow_step(GRID, 0.01, friction=f),
+        flow,
+    ),
     "flow_step, implicit": (
         (np.sin(K), np.array(0.02)),
         lambda w, nu: dp.flow_step(GRID, 0.01, nu, implicit=True, walls=w),

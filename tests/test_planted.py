@@ -54,6 +54,12 @@ BUGS = {
         "return y + x, used, trouble",
         "tests/test_solvers_methods.py",
     ),
+    "a friction whose share in the acceleration before has no derivative": Bug(
+        "flow",
+        "a = a + rub * v",
+        "a = a + plain(rub) * v",
+        "tests/test_flow_friction.py",
+    ),
     "a wall that is felt beside the place where it stands": Bug(
         "flow",
         "reduce(add, bends) / anp.log1p(anp.exp(s))",

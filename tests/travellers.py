@@ -257,6 +257,7 @@ def travellers():
     yield "conservation_law", "", law, lambda law: bits(law, numbers((2, *BOX.shape)), 0.3)
     yield "flow_step", "", dp.flow_step(GRID, 0.01, 0.1, push, solid=SOLID), of_flow
     yield "flow_step", "implicit", dp.flow_step(BOX, 0.01, 0.1, implicit=True, convective=False), of_flow
+    yield "flow_step", "friction", dp.flow_step(GRID, 0.01, friction=numbers(GRID.faces.size) ** 2), of_flow
     lid = dp.face_lift(GRID)
     lid = lid(lid.domain.join(0.0, 0.0, 0.0, 1.0))
     yield "flow_step", "lid", dp.flow_step(GRID, 0.01, half, walls=lid), of_flow

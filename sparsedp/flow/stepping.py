@@ -6,6 +6,16 @@
 with a(v) = force(v) - div(v v), and + nu (L v + B) in place of the last term where viscosity is explicit:
 Adams-Bashforth for what is explicit, the trapezoidal rule for an implicit viscosity, and a pressure that is corrected,
 not solved for anew (incremental).
+
+A friction f >= 0, such as that of an obstacle, is implicit, face by face: v* gets the further term
+
+    -dt f (v* - (v - v_before) / 2)
+
+of second order, as its bracket is the velocity half way. Alone it multiplies by the roots of
+(1 + m) z^2 - (1 + m / 2) z + m / 2 = 0, m = dt f: stable for every m, and |z| = 0.71 where m is large, while the
+trapezoidal rule would only change the sign there. With f v in a, which then brings in v_before, it is
+(1 + dt f) v* = v - dt f v + dt (3/2 a - 1/2 a_before - G p).
+
 Source: van Kan, SIAM J. Sci. Stat. Comput. 7 (1986), second order pressure correction.
 
 Scalars, such as heat or dye, go along in the same way, with the velocity of the same time:
@@ -27,7 +37,7 @@ import numpy as np
 from sparsedp.conditions import neumann, no_slip, outflow, resolve
 from sparsedp.constants import constant, frozen
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_function, check_takes, is_number, rounded_down
+from sparsedp.fields import check_finite, check_function, check_takes, is_number, rounded_down
 from sparsedp.flow.momentum import convection, face_laplacian
 from sparsedp.flow.pressure import projection
 from sparsedp.flow.setup import faces_that
@@ -60,6 +70,7 @@ def flow_step(
     solid_boundary=no_slip,
     scalars=None,
     unstable="raise",
+    friction=None,
 ):
     """Grid -> ``step(state, params)`` of incompressible flow, of order 2 in space and time.
 
@@ -89,27 +100,33 @@ def flow_step(
         ``force(v, s, params)``.
     unstable : "raise" or "allow"
         What to do when a step is so long that waves would grow.
+    friction : array or callable, optional
+        Faces >= 0 [1 / time], or ``friction(params)`` -> such faces: the term -friction * v, implicit, for any size of
+        it; viscosity is explicit then. An obstacle of any shape is ``lambda params: nu * dp.brinkman(grid)(level)``
+        (call brinkman once, outside). Differentiable. It does nothing on walls and inflows.
 
     Returns
     -------
     FlowStep
         ``step.start(v, params=None)`` makes the first state, a dict of the velocity "v" [velocity], the pressure "p"
         [velocity^2] and the acceleration before "a"; ``step(state, params)`` the next one. For `rollout`. The params
-        are those of the force. With scalars ``step.start(v, params, s)``, s a dict of fields: the state has them as
-        "s", and their rates before as "r".
+        are those of force, friction and viscosity. With scalars ``step.start(v, params, s)``, s a dict of fields: the
+        state has them as "s", and their rates before as "r".
 
     Raises
     ------
     ValueError
-        If dt or the viscosity is out of range, or a scalar has another entry than those four.
+        If dt or the viscosity is out of range, a scalar has another entry than those four, or a friction comes with
+        implicit viscosity; on use, if a friction is < 0 or complex.
     ShapeError
-        On use, if the state is not one that ``step.start`` makes, or a force or source does not fit its field.
+        If walls are not on the faces; on use, if the state is not one that ``step.start`` makes, or a force, friction
+        or source does not fit its field.
     TypeError
         If scalars is not a dict, or a force or source is no function of as many arguments.
     DerivativeError
         If dt or the viscosity is traced.
     NonFiniteError
-        If dt or the viscosity is NaN or infinite; on use, if the velocity is.
+        If dt or the viscosity is NaN or infinite; on use, if the velocity or a friction is.
     UnstableStepError
         If dt is beyond what explicit viscosity or diffusivity allows; on use, beyond what convection allows.
 
@@ -118,6 +135,8 @@ def flow_step(
     A step of explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth); a longer one is refused.
     Convection is explicit: with c, dt times the largest sum over the axes of |v| / h in a cell, a step is refused where
     waves would grow by more than 2 % in it. Without viscosity that is c > 0.53; viscosity allows more.
+    The force of a friction in a step is the sum of volumes * friction * (v* - (v - v_before) / 2), with v* = v_next +
+    dt G (p_next - p), as in benchmarks/cylinder.py; v_next in place of the bracket is good at a steady state only.
     Cost: one pressure solve, and one solve for implicit viscosity; the same again backward.
     Source: van Kan, SIAM J. Sci. Stat. Comput. 7 (1986).
 
@@ -142,11 +161,10 @@ def flow_step(
         example = f"force=lambda v, {'s, ' * bool(scalars)}params: ..."
         check_function("flow_step", force, example)
         check_takes("flow_step", force, 3 if scalars else 2, example)
-    if walls is not None and np.shape(plain(walls)) != grid.faces.shape:
-        raise ShapeError(
-            f"flow_step takes walls on {grid.faces}, got an array of shape {np.shape(plain(walls))}; write "
-            "face_lift(grid, boundary)(values)"
-        )
+    if walls is not None:
+        _check_faces("walls", grid, walls, "write face_lift(grid, boundary)(values)")
+    if friction is not None and implicit:
+        raise ValueError("flow_step takes no friction beside implicit viscosity; write implicit=False")
     if unstable not in ("raise", "allow"):
         raise ValueError(f"unstable must be 'raise' or 'allow', got {unstable!r}")
     for name, given in (scalars or {}).items():
@@ -158,7 +176,13 @@ def flow_step(
             check_takes("flow_step", given["source"], 2, "source=lambda s, params: ...")
     viscosity = viscosity if callable(viscosity) else float(viscosity)
     given = grid, float(dt), viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
-    return FlowStep(*given, scalars or {}, unstable)
+    return FlowStep(*given, scalars or {}, unstable, friction)
+
+
+def _check_faces(name, grid, values, write):
+    shape = np.shape(plain(values))
+    if shape != grid.faces.shape:
+        raise ShapeError(f"flow_step takes {name} on {grid.faces}, got an array of shape {shape}; {write}")
 
 
 def _check_constant(name, number, least):
@@ -190,14 +214,19 @@ class FlowStep(Remade):
         solid_boundary,
         scalars,
         unstable,
+        friction,
     ):
         self.grid, self.dt, self.force = grid, dt, force
         self.project = projection(grid, solid, boundary)
         setup = self.project.structure.setup
         _, solid, boundary, _ = setup.made  # copies, as of the walls: the caller may change them
-        walls, scalars = constant(walls), constant(scalars)
+        walls, scalars, self.friction = constant((walls, scalars, friction))
         given = grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
-        self.made, self.strict, self.implicit = (*given, scalars, unstable), unstable == "raise", implicit
+        self.made, self.strict, self.implicit = (
+            (*given, scalars, unstable, self.friction),
+            unstable == "raise",
+            implicit,
+        )
         self.pressure, self.divergence = self.project.pressure, divergence(grid)
         self.slope = gradient(grid, setup.pressure_conditions, solid)
         self.open = mask(grid.faces, setup.open)
@@ -224,7 +253,7 @@ class FlowStep(Remade):
                 f"flow_step needs the scalars {sorted(self.scalars)}, got "
                 f"{list(s) if isinstance(s, dict) else type(s).__name__}; write step.start(v, params, s)"
             )
-        state = {"v": v, "p": np.zeros(self.grid.shape), "a": self.acceleration(v, params, s)}
+        state = {"v": v, "p": np.zeros(self.grid.shape), "a": self.acceleration(v, params, s, self._rub(params))}
         return state | ({"s": s, "r": self._rates(v, s, params)} if s else {})
 
     def __call__(self, state, params=None):
@@ -235,8 +264,11 @@ class FlowStep(Remade):
         v, p, s, dt = state["v"], state["p"], state.get("s", {}), self.dt
         if self.convect is not None and self.strict:
             self._check_convection(v)
-        a = self.acceleration(v, params, s)
+        rub = self._rub(params)
+        a = self.acceleration(v, params, s, rub)
         ahead = v + dt * (1.5 * a - 0.5 * state["a"] - self.slope(p))
+        if rub is not None:
+            ahead = (ahead - dt * rub * v) / (1.0 + dt * rub)
         if self.viscous is not None:
             ahead = self.viscous.relaxed(ahead, v)
         q = self.pressure(ahead)
@@ -249,11 +281,13 @@ class FlowStep(Remade):
     def _rates(self, v, s, params):
         return {name: one.rate(v, s, params) for name, one in self.scalars.items()}
 
-    def acceleration(self, v, params, s=None):
-        """a(v): what is explicit, of those parts that the scene has."""
+    def acceleration(self, v, params, s=None, rub=None):
+        """a(v): what is explicit, of those parts that the scene has, and rub v (see the head of this file)."""
         a = 0.0 * v if self.convect is None else -self.convect(v, v)
         if self.force is not None:
             a = a + self.free(self._pushed(v, params, *([s] if self.scalars else [])))
+        if rub is not None:
+            a = a + rub * v
         return a if self.viscous is None else a + self.viscous.rate(v, params)
 
     def _pushed(self, v, params, *scalars):
@@ -261,12 +295,20 @@ class FlowStep(Remade):
         force = self.force(*mapped(frozen, (v, *scalars)), params)
         if np.shape(plain(force)) == ():
             return force * np.ones(v.shape, dtype_of(v))
-        if np.shape(plain(force)) != v.shape:
-            raise ShapeError(
-                f"flow_step takes a force on {self.grid.faces}, got an array of shape {np.shape(plain(force))}; join "
-                "its components with grid.join"
-            )
+        _check_faces("a force", self.grid, force, "join its components with grid.join")
         return force
+
+    def _rub(self, params):
+        """The friction, on faces whose velocity is not given."""
+        if self.friction is None:
+            return None
+        rub = self.friction(params) if callable(self.friction) else self.friction
+        _check_faces("a friction", self.grid, rub, "write one number for each face")
+        values = plain(rub)
+        check_finite("flow_step", values, "takes a finite friction")
+        if np.any(values != np.abs(values)):  # complex numbers too
+            raise ValueError(f"flow_step takes a friction >= 0, got {np.min(values)}; write abs(friction)")
+        return self.free(rub)
 
     def _check_convection(self, v):
         """Refuse a step in which a wave that the flow carries would grow."""
@@ -288,6 +330,7 @@ class FlowStep(Remade):
             "viscosity": self.viscous,
             "implicit": self.viscous and self.viscous.relax,
             "force": self.force,
+            "friction": self.friction,
             "moving walls": self.viscous and self.viscous.held,
             "scalars": self.scalars or None,
         }
