@@ -346,7 +346,7 @@ class Variation:
 
     def _matrices(self, numbers):
         """For each step the derivatives of (u, shift) after it, and what the first shadow adds to them."""
-        ends = lru_cache(2)(lambda number: self._rows(number, 2))
+        ends = lru_cache(3)(lambda number: self._rows(number, 2))  # in either direction the one that is met twice
         for number in numbers:
             first = ends(number - 1)
             rows = np.array([self._rows(number, 0), self._rows(number, 1), ends(number)])
