@@ -158,7 +158,7 @@ TABLE = [
     (
         lambda: dp.brinkman(LINE)(np.ones(4, complex)),
         TYPE,
-        "brinkman takes an array of real numbers, got dtype complex128",
+        "brinkman takes real numbers, got dtype complex128; write level.real",
     ),
     (
         lambda: dp.brinkman(LINE)([1.0, np.nan, 1.0, 1.0]),
