@@ -127,7 +127,7 @@ TABLE = [
         lambda: dp.flux(BOX, np.s_[0.5:1, :]),
         VALUE,
         "a box on Grid(2 x 2 cells, size 2 x 2) needs one slice of cells for each axis, got "
-        "(slice(0.5, 1, None), slice(None, None, None)); write np.s_[4:8, 2:6]",
+        "(slice(0.5, 1, None), slice(None, None, None)); write (slice(4, 8), slice(2, 6))",
     ),
     (
         lambda: dp.flux(BOX, np.s_[0:1]),
