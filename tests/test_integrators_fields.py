@@ -276,3 +276,10 @@ def test_thin_and_empty_grids(method, shape):
         step = dp.stepper(method, lambda x, p: {"b": -p * x["b"], "a": p * x["b"]}, 0.1, linear={"a": op, "b": None})
         end = step({"a": u, "b": u}, 0.5)
         assert end["a"].shape == shape and np.sum(end["a"] + end["b"]) == pytest.approx(2 * np.sum(u), rel=1e-12)
+
+
+@pytest.mark.parametrize("method", ["rk4", "crank_nicolson", "tr_bdf2", "imex", "etdrk4"])
+def test_a_field_of_none_stays(method):
+    step = lambda linear: dp.stepper(method, None, 0.01, linear=linear)
+    found = step({"u": L, "v": L, "w": None})({"u": U, "v": None, "w": None})
+    assert found["v"] is found["w"] is None and np.array_equal(found["u"], step(L)(U))

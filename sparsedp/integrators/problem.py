@@ -197,13 +197,16 @@ class Problem:
     def on_fields(self, act, h, params, u, *trees):
         """act(L, h c, leaf, ...) for each field of the state u, and of trees like it -> a tree like u.
 
-        L is None where nothing is stiff.
+        L is None where nothing is stiff. Where the state holds None it stays.
         """
         found, rebuild = flatten(u)
         rows = zip(self.terms(u), found, *(_of_fields(tree, u) for tree in trees), strict=True)
-        return rebuild(
-            [act(*((term.op, h * term.coefficient(params)) if term else (None, h)), *row) for term, *row in rows]
-        )
+
+        def on(term, leaf, *row):
+            L, z = (term.op, h * term.coefficient(params)) if term else (None, h)
+            return leaf if leaf is None else act(L, z, leaf, *row)
+
+        return rebuild([on(*row) for row in rows])
 
     def explicit(self, u, params, t):
         """The rate alone, or None; a copy: it may write into the array that it returned before."""

@@ -57,7 +57,6 @@ from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.tape import Rule
-from sparsedp.tree import mapped
 
 __all__ = ["EXPLICIT", "IMPLICIT", "Explicit", "Linear", "Nonlinear", "Polynomial", "Resolvent", "Scheme"]
 
@@ -322,7 +321,8 @@ class Linear(Stages):
         b = u
         if self.problem.source is not None:
             b = combine(u, *((0.25 * h, self.problem.given(params, at)) for at in (t, later(t, h))))
-        return mapped(lambda w, leaf: 2.0 * w - leaf, self._resolved(0.5 * h, params, b), u)
+        w = self._resolved(0.5 * h, params, b)
+        return combine(w, (1.0, w), (-1.0, u))
 
 
 class Nonlinear(Stages):
