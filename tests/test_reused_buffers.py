@@ -210,9 +210,10 @@ def test_rates_in_float32_and_of_numbers():
 def test_forces_and_viscosities(rng, convective):
     grid = dp.Grid((6, 5), size=1.0)
     force, viscosity = lambda v, p: -p * v, lambda p: 0.01 * p
-    v = rng.standard_normal(grid.faces.size)
-    for f, nu in ((force, viscosity), (reusing(force), reusing(viscosity))):
-        step = dp.flow_step(grid, 1e-3, viscosity=nu, force=f, convective=convective)
+    v, held = rng.standard_normal(grid.faces.size), np.arange(grid.faces.size)
+    friction = lambda p: p * held
+    for f, nu, rub in ((force, viscosity, friction), tuple(map(reusing, (force, viscosity, friction)))):
+        step = dp.flow_step(grid, 1e-3, viscosity=nu, force=f, convective=convective, friction=rub)
         run = lambda v, p, step=step: dp.rollout(step, step.start(v, p), p, 3)["v"]
         found = run(v, 0.5), *dp.value_and_grad(lambda p, run=run: anp.sum(run(v, p) ** 2))(0.5)
         if f is force:

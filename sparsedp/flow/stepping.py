@@ -102,8 +102,8 @@ def flow_step(
         What to do when a step is so long that waves would grow.
     friction : array or callable, optional
         Faces >= 0 [1 / time], or ``friction(params)`` -> such faces: the term -friction * v, implicit, for any size of
-        it; viscosity is explicit then. An obstacle of any shape is ``lambda params: nu * dp.brinkman(grid)(level)``
-        (call brinkman once, outside). Differentiable. It does nothing on walls and inflows.
+        it; viscosity is explicit then. With ``rub = dp.brinkman(grid)`` an obstacle of any shape is
+        ``lambda radius: viscosity * rub(distance - radius)``. Differentiable. It does nothing on walls and inflows.
 
     Returns
     -------
