@@ -14,9 +14,11 @@ from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, Sparsed
 from sparsedp.fields import check_function, is_whole
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
+from sparsedp.shortcuts import Part, held_for_many
 from sparsedp.tape import (
     Recorder,
     ReverseNode,
+    added,
     backward,
     boxed,
     called,
@@ -35,8 +37,8 @@ from sparsedp.tape import (
 from sparsedp.tree import copied, flatten, keys, leaves, mapped
 
 __all__ = [
-    "NO_JVP", "described", "grad", "hvp", "judged", "jvp", "linearised", "name_of", "of_argument", "pullback", "push",
-    "pushforward", "traced", "value_and_grad", "vjp", "witnessed", "zero_like",
+    "NO_JVP", "backward_each", "described", "grad", "hvp", "judged", "jvp", "linearised", "name_of", "of_argument",
+    "pullback", "push", "pushforward", "traced", "value_and_grad", "vjp", "witnessed", "zero_like",
 ]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
@@ -129,7 +131,8 @@ def pullback(fun, x):
 def linearised(fun, tree, moving):
     """A function at a tree, of whose leaves some move -> (leaves of its result, how to build it, pull).
 
-    ``pull(cotangents)``: of the leaves of the result -> of the leaves of the tree; None where there is none.
+    ``pull(cotangents)``: of the leaves of the result -> of the leaves of the tree; None where there is none. With
+    `backward_each` as `back` many at once, side by side along a last axis.
     """
     recorder = Recorder()
     roots = [reverse_root(recorder) if moves else None for moves in moving]
@@ -138,12 +141,40 @@ def linearised(fun, tree, moving):
     finally:
         nodes, recorder.ended = recorder.taken(), True
 
-    def pull(cotangents):
+    def pull(cotangents, back=backward):
         sums: dict = {}
-        backward(nodes, ends, cotangents, sums)
+        back(nodes, ends, cotangents, sums)
         return [sums.get(root, (None,))[0] for root in roots]
 
     return values, rebuild, pull
+
+
+def backward_each(nodes, ends, cotangents, sums):
+    """`backward` for many cotangents, side by side along a last axis: of them and of the sums; plain values alone."""
+
+    def add(parent, g):
+        if type(g) is Part:
+            part, index, shape = g
+            g = np.zeros((*shape, part.shape[-1]))
+            g[index] = part
+        sums[parent] = (sums[parent][0] + g if parent in sums else g), False
+
+    for end, g in zip(ends, cotangents, strict=True):
+        if end is not None:
+            add(end, g)
+    for node in reversed(nodes):
+        g, _ = sums.pop(node, (None, False))
+        if g is None:
+            continue
+        held = held_for_many(node.vjp, node.held)
+        if held is not None:
+            backs = node.vjp(g, *held)
+        else:
+            ones = np.ascontiguousarray(np.moveaxis(g, -1, 0))
+            columns = zip(*(node.vjp(one, *node.held) for one in ones), strict=True)
+            backs = [np.stack([added(None, back)[0] for back in column], -1) for column in columns]
+        for parent, back in zip(node.parents, backs, strict=True):
+            add(parent, back)
 
 
 @contextmanager

@@ -14,12 +14,13 @@ import numpy as np
 
 __all__ = [
     "ACTS", "ARRAY", "BOX", "COPY", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part", "REAL",
-    "formulas_of",
+    "formulas_of", "held_for_many",
 ]  # fmt: skip
 
 FLOAT = np.dtype(float)
 REAL = {np.ndarray, np.float64, float, int}
 NUMBERS = {np.ndarray, np.float64}  # that have a shape and a dtype
+SINGLE = {np.float64, float, int, type(None)}
 PLAIN = {*REAL, slice, tuple, list, bool, type(None), type(Ellipsis)}  # operands that leave all to the traced one
 BASIC = {int, slice, type(None), type(Ellipsis)}  # indices that meet no entry twice
 OPERATORS = {
@@ -43,6 +44,9 @@ HELD: dict[tuple, Any] = {
     (1,): lambda args: (None, args[1]),
     (0, 1): lambda args: args,
 }
+
+
+_by_entry: set = set()  # pullbacks that act entry by entry
 
 
 class Part(tuple):
@@ -74,6 +78,8 @@ def _entrywise(*acts):
         pulls[1,] = lambda g, *args: (other(g, *args),), HELD[needs]
         pulls[0, 1] = lambda g, *args: (act(g, *args), other(g, *args)), HELD[need and (0, 1)]
 
+    _by_entry.update(pull for pull, _ in pulls.values())
+
     def fits(value, nums, args):
         for num in nums:
             if args[num].shape != value.shape:
@@ -96,6 +102,20 @@ def _part(g, place):
     return (Part((g, *place)),)
 
 
+def _entries(g, nums):
+    return [g[num - 2] for num in nums]
+
+
+def held_for_many(pull, held):
+    """What a pullback is given beside many cotangents, side by side along a last axis; None: it takes one by one."""
+    if pull in _by_entry:
+        return [x if type(x) in SINGLE else np.expand_dims(x, -1) for x in held]
+    if pull is _part:
+        index = held[0][0]
+        return None if index is Ellipsis or type(index) is tuple and Ellipsis in index else held
+    return held if pull is _entries else None
+
+
 # Of a function of autograd: whether the formulas hold, from (value, nums, args); (pull, held), from (nums, args), with
 # ``pull(g, *held)`` the cotangents of args `nums`; what a tangent of one of them gives, from (g, num, args, shape).
 FORMULAS: dict[Any, Any] = {
@@ -112,7 +132,7 @@ FORMULAS: dict[Any, Any] = {
     ),
     ARRAY: (
         lambda value, nums, args: not (args[0] or args[1]),
-        lambda nums, args: (lambda g: [g[num - 2] for num in nums], ()),
+        lambda nums, args: (_entries, (nums,)),
         lambda g, num, args, shape: Part((g, num - 2, shape)),
     ),
 }

@@ -40,9 +40,9 @@ from sparsedp.shortcuts import (
 from sparsedp.tree import copied, leaves
 
 __all__ = [
-    "Recorder", "ReverseNode", "Rule", "apply_operator", "backward", "boxed", "called", "cast", "differentiable",
-    "dtype_of", "entrywise", "fit", "forward_root", "innermost", "is_variable", "isbox", "linear", "new_trace",
-    "plain", "reverse_root", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
+    "Recorder", "ReverseNode", "Rule", "added", "apply_operator", "backward", "boxed", "called", "cast",
+    "differentiable", "dtype_of", "entrywise", "fit", "forward_root", "innermost", "is_variable", "isbox", "linear",
+    "new_trace", "plain", "reverse_root", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
@@ -142,7 +142,7 @@ class ForwardNode(JVPNode):
             total: Any = None
             for num, parent in zip(nums, parents, strict=True):
                 g = formulas[1](parent.g, num, args, value.shape)
-                total = (g, False) if total is None and type(g) in NUMBERS else _added(total, g)
+                total = (g, False) if total is None and type(g) in NUMBERS else added(total, g)
             self.g = total[0]
         else:
             super().__init__(value, fun, args, options, nums, parents)
@@ -211,16 +211,16 @@ def backward(nodes, ends, cotangents, sums):
     """
     for end, g in zip(ends, cotangents, strict=True):
         if end is not None and g is not None:
-            sums[end] = _added(sums.get(end), g)
+            sums[end] = added(sums.get(end), g)
     for node in reversed(nodes):
         total = sums.pop(node, None)
         if total is not None:
             for parent, g in zip(node.parents, node.vjp(total[0], *node.held), strict=True):
                 total = sums.get(parent)
-                sums[parent] = (g, False) if total is None and type(g) in NUMBERS else _added(total, g)
+                sums[parent] = (g, False) if total is None and type(g) in NUMBERS else added(total, g)
 
 
-def _added(total, g):
+def added(total, g):
     """(Sum so far, whether it may be written to) or None, a cotangent -> the new pair."""
     kind = type(g)
     if kind is Part:

@@ -10,7 +10,7 @@ from test_integrators_variation import KNOWN, oscillator
 import sparsedp as dp
 from sparsedp.derivative import pushforward, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
-from sparsedp.integrators.radau import A, C
+from sparsedp.integrators.radau import A, C, Rates
 
 RATES = np.array([0.04, 1e4, 3e7])
 SMALL = {"Robertson": np.array([1e-6, 1e-11, 1e-2])}
@@ -129,6 +129,30 @@ def test_every_mode(count, options, near):
     assert value == pytest.approx(pendulum_by_scipy(*X), abs=near) and g == pytest.approx(wanted, rel=near, abs=near)
     along = np.array([0.3, 0.5, -0.2, 0.1])
     assert pushforward(loss, X, along)[1] == pytest.approx(g @ along, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [
+        lambda u, p: anp.array([p[0] * u[1] / u[0], -(u[2] ** p[1]) + u[2] - 3.0, u[0] * u[0] + u[-1]]),
+        lambda u, p: anp.array([u[..., 0] * p[0], anp.sin(u[0]) * u[1], 2.0 - u[2]]),
+        lambda u, p: anp.dot(anp.array([[1.0, p[0], 2.0], [p[1], 0.0, 1.0], [0.0, 3.0, 1.0]]), u * u) + u[1],
+        lambda u, p: u[anp.array([0, 0, 2])] * p[0] + anp.concatenate([u[1:], u[:1]]) * anp.array([u[0], p[1], 1.0]),
+        lambda u, p: anp.array([u, u * p[0], u])[1] + anp.sum(anp.array([u, p[1] * u])),
+        lambda u, p: u * [1.0, 2.0, 3.0] / anp.array([u, u * u])[1:, :][0] - (u[None] ** np.array([2.0, 1.0, 3.0]))[0],
+        lambda u, p: (np.ones((3, 3)) * anp.array([u, 2.0 * u, u * u]) * np.arange(3.0))[1, ...] + u[...],
+        lambda u, p: anp.array([1.0, 2.0, 3.0]) + 0.0 * u[0],
+        lambda u, p: u,
+        lambda u, p: anp.ones(3),
+    ],
+)
+def test_all_rows_at_once(rate):
+    """The derivatives of a rate from one pass back are those of one pass for each row, to the bit or to rounding."""
+    u, p = np.array([1.3, 0.4, 2.1]), np.array([0.7, 1.6])
+    scheme = dp.stepper("radau", rate, 1.0).scheme
+    rows = Rates(scheme, u, p, [True]).rows(u, None, [True])
+    _, pull = dp.vjp(lambda u, p: 1.0 * rate(u, p) + 0.0 * u * p[0], u, p)
+    assert rows == pytest.approx(np.array([[*np.concatenate(pull(e)), 0.0] for e in np.eye(3)]), rel=1e-15, abs=1e-15)
 
 
 def test_second_derivatives_are_refused():

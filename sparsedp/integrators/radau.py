@@ -34,7 +34,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.constants import constant
-from sparsedp.derivative import linearised
+from sparsedp.derivative import backward_each, linearised
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.integrators.adaptive import EPSILON, WINDOW, Adaptive, Moving, Taken, flat, relative
 from sparsedp.integrators.problem import combine, later, like, untraced
@@ -181,7 +181,7 @@ class Rates:
             )
         self.whole = self.layout.shapes == [(self.size,)]
         self.spans = [slice(*pair) for pair in pairwise(self.layout.space.offsets)]
-        self.still = np.zeros(0 if self.problem.timed else 1)  # the derivative in a time that nothing takes
+        self.still = np.zeros((0 if self.problem.timed else 1, self.size))  # in a time that nothing takes
         self.v = self.J = self.held = self.guess = None
         self.fresh = self.slow = False
 
@@ -206,13 +206,12 @@ class Rates:
         problem, tree = self.problem, (self.state(v), self.params, t)
         moving = [True] * len(self.spans) + moving + [problem.timed]
         values, _, pull = linearised(lambda tree: problem(*tree), tree, moving)
-        shapes, rows = list(map(np.shape, values)), []
-        for unit in np.eye(self.size):
-            backs = pull([unit[span].reshape(shape)[()] for span, shape in zip(self.spans, shapes, strict=True)])
-            pairs = [pair for pair, moves in zip(zip(backs, leaves(tree), strict=True), moving, strict=True) if moves]
-            parts = [np.ravel(0.0 * leaf if back is None else back) for back, leaf in pairs]
-            rows.append(np.concatenate([*parts, self.still]))
-        return np.array(rows)
+        n, units = self.size, np.eye(self.size)
+        pairs = zip(self.spans, values, strict=True)
+        backs = pull([units[span].reshape(*np.shape(value), n) for span, value in pairs], backward_each)
+        found = [pair for *pair, moves in zip(backs, leaves(tree), moving, strict=True) if moves]
+        parts = [np.zeros((np.size(leaf), n)) if back is None else back.reshape(-1, n) for back, leaf in found]
+        return np.concatenate([*parts, self.still]).T
 
     def jacobian(self, v, t):
         """df/du for Newton's method."""
