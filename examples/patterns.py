@@ -62,7 +62,6 @@ flame = report("Kuramoto-Sivashinsky", step, 0.1 * noise, 1.0, 1000)
 k, x = 10 * round(n / 14) / n, wide.centres()[0] - wide.centres()[0][0, 0]
 rate = np.log(1e6 * np.max(dp.rollout(step, 1e-6 * np.cos(k * x), 1.0, 50))) / 5
 print(f"growth of a small wave {rate:.4f} ({k**2 - k**4:.4f})")
-
 seen = dp.rollout(pearson, soup, feeding, 25)["v"]
 loss = lambda feed: np.mean((dp.rollout(pearson, soup, feeding | {"feed": feed}, 25)["v"] - seen) ** 2)
 best = dp.minimize(loss, np.array(0.04), maxiter=30)
