@@ -8,11 +8,12 @@ from scipy.sparse.csgraph import connected_components
 
 from sparsedp.errors import NonFiniteError
 from sparsedp.grid import Grid
-from sparsedp.operators.boundary import mask
+from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import ROUNDING, find_null_space
 from sparsedp.solvers.scaling import length, remainder
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.kronecker import Kronecker
+from sparsedp.structure.lazy import Mask
 
 __all__ = ["System"]
 
@@ -259,7 +260,7 @@ class System:
     @cached_property
     def rest(self):
         """The System of all unknowns but the `last`."""
-        keep = mask(self.op.domain, (self.last == 0).reshape(self.op.domain.shape))
+        keep = Operator(Mask(self.last == 0), self.op.domain, self.op.domain, "mask")
         return System(self.op @ keep, self.rtol, self.maxiter)
 
     @cached_property
