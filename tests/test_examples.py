@@ -5,16 +5,7 @@ import re
 import pytest
 from scripts import EXAMPLES, example, marks, run
 from sources import ROOT
-
-LINES = {
-    "solver_in_the_loop.py": 125,
-    "conservation_laws.py": 150,
-    "inverse_heat.py": 70,
-    "steady_states.py": 70,
-    "cylinder.py": 80,
-    "full_waveform.py": 100,
-    "patterns.py": 80,
-}  # several studies; the others stay below 60
+from test_house import LENGTHS, LONGER
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in EXAMPLES])
@@ -25,7 +16,7 @@ def test_it_runs(name):
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_short_and_on_both_pages(name):
     text = (ROOT / "examples" / name).read_text(encoding="utf-8")
-    assert len(text.splitlines()) < LINES.get(name, 60)
+    assert len(text.splitlines()) < LONGER.get(name, LENGTHS["examples"])
     assert text.startswith('"""') and f"python examples/{name}" in text.splitlines()[0]
     assert f"`{name}`" in (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
     assert f"`examples/{name}`" in (ROOT / "README.md").read_text(encoding="utf-8")
