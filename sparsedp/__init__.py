@@ -48,6 +48,7 @@ _WINDOW = {
     "report.work_precision": "workprec",
     "report.plan": "explain",
     "blackbox": "adopt",
+    "parallel.scenes": "ensemble",
 }
 _RENAMED = {  # names of the first edition -> what to write
     "minimise": "dp.minimize",

@@ -37,8 +37,8 @@ from sparsedp.tape import (
 from sparsedp.tree import copied, flatten, keys, leaves, mapped
 
 __all__ = [
-    "NO_JVP", "backward_each", "described", "grad", "hvp", "judged", "jvp", "linearised", "name_of", "of_argument",
-    "pullback", "push", "pushforward", "traced", "value_and_grad", "vjp", "witnessed", "zero_like",
+    "NO_JVP", "backward_each", "check_loss", "described", "grad", "hvp", "judged", "jvp", "linearised", "name_of",
+    "of_argument", "pullback", "push", "pushforward", "traced", "value_and_grad", "vjp", "witnessed", "zero_like",
 ]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
@@ -554,17 +554,20 @@ def value_and_grad(loss, argnum=0):
             raise TypeError(f"the gradient in argument {argnum} of the loss needs it, got {len(args)} arguments")
         with growing():  # until the tape is gone: a search for cyclic garbage in between would walk all of it
             value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
-            if np.shape(plain(value)) != ():
-                raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(plain(value))}; sum it")
-            if dtype_of(value).kind == "c":
-                raise DerivativeError(
-                    "the loss must be real, got a complex number; take its real part or its absolute value"
-                )
+            check_loss(value)
             gradient = pull(1.0)
             del pull
         return value if isbox(value) else float(value), gradient
 
     return Made(evaluate, value_and_grad, loss, argnum)
+
+
+def check_loss(value):
+    """Refuse what a loss returned, traced or not, if it is not one real number."""
+    if np.shape(plain(value)) != ():
+        raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(plain(value))}; sum it")
+    if dtype_of(value).kind == "c":
+        raise DerivativeError("the loss must be real, got a complex number; take its real part or its absolute value")
 
 
 def of_argument(cotangent, value):

@@ -57,6 +57,12 @@ def conservation_law():
     return law, [lambda s: field((2, *GRID.shape), s), lambda s: field((), s)]
 
 
+@case("ensemble")
+def ensemble():
+    total = dp.ensemble(lambda x, scene: anp.sum((x[0] * x[1]) ** 2 * scene), [0.5, 2.0])
+    return lambda u, v: total((u, v)), [lambda s: field(6, s), lambda s: field(6, s)]
+
+
 @case("steady")
 def steady():
     def residual(x, p):

@@ -44,6 +44,7 @@ SMALL = {
     "patterns.py": "32",
     "residual_or_physics.py": "10",
     "solver_in_the_loop.py": "48",
+    "ensemble.py": "5",
 }  # cells, the end time, or gradients; the others run with 16
 DEFAULT = {"heat_rod.py", "new_operator.py", "plan.py", "pressure_projection.py", "two_families.py"}
 

@@ -39,3 +39,12 @@ def test_residual_or_physics():
     by_equation, by_scheme, network, start = found
     assert start[3] <= 0.03 and start[4] == network[4] == 0.0
     assert min(by_equation[4], by_scheme[4]) > 0 and min(by_equation[3], by_scheme[3]) > start[3]
+
+
+@example("ensemble.py")
+def test_ensemble():
+    """Two processes give the bits of one, and a few iterations halve the misfit."""
+    printed = run("ensemble.py")
+    assert "the same bits" in printed and "5 iterations of 12 experiments" in printed
+    before, after = map(float, re.search(r"misfit (\S+) -> (\S+);", printed).groups())
+    assert after < before / 2

@@ -56,6 +56,7 @@ FLOORS = [
     ("optimize", 9),
     ("network", 9),
     ("blackbox", 9),
+    ("parallel", 10),
 ]
 FLOOR = dict(FLOORS)
 SIDE = {"check": {"check"}, "report": {"report", "check"}}  # side room: the side rooms it may import
@@ -85,11 +86,12 @@ LONGER = {
     "cylinder.py": 80,
     "full_waveform.py": 100,
     "patterns.py": 80,
+    "ensemble.py": 85,
 }  # two solvers, a network and a study; four equations
 # Nodes of the syntax tree that each room may have, docstrings left out; what a line says is free, what it does is not.
 # They may be lowered at any time, and raised only with a sentence on what that buys. "": the whole package.
 BUDGETS = {
-    "": 195_250,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
+    "": 196_850,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
     "advection": 14_000,
     "check": 14_700,
     "flow": 11_700,  # conservation laws: 2 850; forces: 780; scalars, Courant limit, friction of flow_step: 1 650
@@ -98,6 +100,7 @@ BUDGETS = {
     "network": 2_450,
     "operators": 6_850,  # tensors: 800; flux: 300
     "optimize": 13_400,  # admm: 500; total_variation, smoothness: 400
+    "parallel": 1_650,  # ensembles
     "report": 17_900,
     "solvers": 44_200,  # steady states, tensors, complex coefficients and waves: 2 550; LU that serves the next: 270
     "solvers/multigrid": 10_000,
@@ -151,7 +154,7 @@ def test_the_floors_are_those_of_the_page():
     for page in ("CONTRIBUTING.md", "README.md"):
         text = (ROOT / page).read_text(encoding="utf-8")
         none(f"{page} does not name {name}" for name in FLOOR if not re.search(rf"\b{name}\b", text))
-    rows = re.findall(r"^\| (\d) \| (.*?) \|$", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.MULTILINE)
+    rows = re.findall(r"^\| (\d+) \| (.*?) \|$", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.MULTILINE)
     told = {name: int(number) for number, names in rows for name in re.findall(r"`(\w+)/?`", names)}
     assert told == FLOOR
 
@@ -253,8 +256,8 @@ def test_nothing_unfinished():
 def test_no_setters_and_no_caches_of_a_module():
     decorators = [(m, d) for m in modules() for f in m.nodes((*FUNCTION, ast.ClassDef)) for d in f.decorator_list]
     words = [(m, d, (ast.unparse(d).split("(")[0]).split(".")[-1]) for m, d in decorators]
-    # A compiled kernel belongs to the process, like the code itself; kernels/ may keep it.
-    words = [(m, d, word) for m, d, word in words if word == "setter" or room(m.name) != "kernels"]
+    # A compiled kernel belongs to the process, like the code itself; so does what a worker of a pool has unpacked.
+    words = [(m, d, word) for m, d, word in words if word == "setter" or room(m.name) not in ("kernels", "parallel")]
     none(f"{m.place}:{d.lineno} @{word}" for m, d, word in words if word in ("setter", "cache", "lru_cache"))
 
 

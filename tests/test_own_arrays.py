@@ -46,6 +46,10 @@ def stepped(step):
     return value_and_grad(lambda u: anp.sum(dp.rollout(step, u, 0.5, 2) ** 2))(CELLS)
 
 
+def misfit_of(x, scene):
+    return anp.sum((x - scene) ** 2)
+
+
 def squares(x):
     return x**2 + 0.5 * np.roll(x, 1)
 
@@ -96,6 +100,11 @@ BUILDERS = {
         lambda solve: solve(K, CELLS),
     ),
     "implicit": ((sp.csr_array(np.eye(12)),), lambda s: dp.implicit(cubic, sparsity=s), lambda f: f(CELLS, CELLS)),
+    "ensemble": (
+        ([CELLS.copy(), 2 * CELLS], np.array([1.0, 2.0])),
+        lambda scenes, weights: dp.ensemble(misfit_of, scenes, weights=weights),
+        lambda total: value_and_grad(total)(CELLS),
+    ),
     "adopt": (
         (sp.csr_array(np.eye(12) + np.roll(np.eye(12), -1, 1)),),
         lambda s: dp.adopt(squares, s),

@@ -36,6 +36,12 @@ BUGS = {
         "    blocks = {(0, a): along(a, grid.dim, differences(grid, a), 1.0 - 2 * (a == 1)) for a in range(grid.dim)}",
         "tests/test_operators.py::test_discrete_identities",
     ),
+    "an ensemble whose gradient has no weights": Bug(
+        "parallel",
+        "[weight * part for part in parts]",
+        "[weight * parts[0], *parts[1:]]",
+        "tests/test_ensemble.py",
+    ),
     "momentum that passes through a wall": Bug(
         "flow",
         "1.0 - 2.0 * (np.arange(len(u)) == self.momentum)",

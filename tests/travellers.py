@@ -154,6 +154,14 @@ def of_certified(tolerance):
     return [best.x.tobytes()]
 
 
+def misfit_of(x, scene):
+    return anp.sum((x - scene) ** 2)
+
+
+def of_total(f):
+    return of_pair(dp.value_and_grad(f))
+
+
 def of_pair(f):
     value, slope = f(numbers(7))
     return [np.float64(value).tobytes(), slope.tobytes()]
@@ -272,6 +280,7 @@ def travellers():
     yield "differentiable", "", dp.differentiable("cube", cube, cube_vjp, cube_jvp), lambda f: bits(f, numbers(7))
     yield "physical_gradient", "", dp.physical_gradient(cube, root_of_cube), of_physical
     yield "adopt", "", dp.adopt(foreign), of_adopted
+    yield "ensemble", "", dp.ensemble(misfit_of, [1.0, 2.0], weights=[1, 3], chunk=2), of_total
     yield "certified", "", dp.certified(0.2), of_certified
     net = dp.network
     x, p = numbers((2, 2, 9)), net.residual_weights(np.random.default_rng(0), 2, 3)

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.check.summary import error_text
-from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
+from sparsedp.derivative import check_loss
+from sparsedp.errors import NonFiniteError, SparsedpError
 from sparsedp.ledger import recording, thread
 from sparsedp.packing import Packing, joined
 from sparsedp.tree import copied, mapped, norm
@@ -173,12 +174,7 @@ class Trials:
         self.tick()
         with np.errstate(all="ignore"):
             value = np.asarray(self.loss(tree))
-        if value.shape != ():
-            raise ShapeError(f"the loss must be a scalar, got an array of shape {value.shape}; sum it")
-        if value.dtype.kind == "c":
-            raise DerivativeError(
-                "the loss must be real, got a complex number; take its real part or its absolute value"
-            )
+        check_loss(value)
         if value.dtype.kind == "f":
             self.eps = max(self.eps, eps_of(value.dtype))
         return float(value)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sparsedp.derivative import judged, pullback, value_and_grad
-from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
+from sparsedp.derivative import check_loss, judged, pullback, value_and_grad
+from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.optimize.linearised import Linearised
 from sparsedp.optimize.result import Failure, Stuck, Trial
 from sparsedp.solvers.cache import Cache
@@ -129,8 +129,7 @@ class Trials:
             value, gradient = value_and_grad(self._loss)(tree, *batch)
         else:
             value, gradient = self._loss(tree, *batch), self._gradient(self._packing.unpack(vector), *batch)
-        if np.shape(value) != ():
-            raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(value)}; sum it")
+        check_loss(value)
         try:
             return float(value), self._packing.pack_gradient(gradient)
         except NonFiniteError:

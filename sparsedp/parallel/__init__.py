@@ -1,0 +1,1 @@
+"""More than one process: ensembles of scenes on any executor."""

@@ -1,0 +1,261 @@
+"""One loss over many scenes: its weighted sum and the derivatives of it, computed by the workers of any executor."""
+
+import pickle
+from functools import lru_cache
+from typing import Any
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.constants import frozen
+from sparsedp.derivative import check_loss, grad, jvp, value_and_grad, zero_like
+from sparsedp.errors import ShapeError
+from sparsedp.fields import check_finite, check_function, is_whole
+from sparsedp.progress import shown_steps
+from sparsedp.recipe import Remade
+from sparsedp.tape import Rule, isbox
+from sparsedp.tree import copied, flatten, leaves, mapped
+
+__all__ = ["Ensemble", "ensemble"]
+
+KEPT = 128  # scenes and losses that a worker keeps as they were unpacked, with all that they have set up since
+
+
+def ensemble(loss, scenes, executor=None, weights=None, chunk=None, progress=False):
+    """Loss of (x, scene), scenes -> total(x): the weighted sum of loss(x, scene) over all scenes, differentiable in x.
+
+    Parameters
+    ----------
+    loss : callable
+        ``loss(x, scene) -> real scalar``; `x` is any nesting of arrays, tuples, lists and dicts.
+    scenes : iterable
+        Whatever the loss takes: observations, initial states, grids, solvers.
+    executor : concurrent.futures.Executor, optional
+        Who computes: ``ProcessPoolExecutor``, Dask's ``client.get_executor()``, mpi4py's ``MPIPoolExecutor``.
+        Default: this process, one scene after the other. The caller starts it and shuts it down.
+    weights : array (number of scenes,), optional
+        Default: ones.
+    chunk : int, optional
+        Scenes of one task; default 1. More of them make fewer messages: a task returns one sum.
+    progress : bool or str
+        A bar over the tasks of each evaluation, with this label.
+
+    Returns
+    -------
+    Ensemble
+        ``total(x)``, or ``total(x, numbers)`` over the scenes of these numbers, in this order: a batch of `minimize`.
+
+    Raises
+    ------
+    TypeError
+        If `loss` is no function, the executor has no `submit`, or a scene cannot be pickled.
+    ValueError
+        If there is no scene, or `chunk` is no whole number from 1 on.
+    ShapeError, NonFiniteError
+        If there is not one finite weight for each scene.
+    IndexError
+        On use, if there is no scene of a number.
+
+    Notes
+    -----
+    Sums are taken in the order of the scenes, within a chunk and over chunks: the bits do not depend on the executor,
+    nor on how many workers it has. Loss and scenes are pickled once (by cloudpickle, where that is installed and
+    functions have no name); a worker keeps what it has unpacked, so each sets up a solver once. An error has the type
+    that it has here, and names its scene; tasks that have not begun are cancelled.
+
+    Derivatives of second order are right, too; of third order there are none. Only the leaves of x that are traced
+    are differentiated. `explain` counts what this process does.
+
+    A script that starts processes needs ``if __name__ == "__main__":`` around what it does. Processes that are
+    forked while compiled loops run on several threads may hang: start them afresh, by
+    ``ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn"))``.
+
+    Examples
+    --------
+    >>> total = ensemble(lambda x, scene: (x - scene) ** 2, [1.0, 2.0, 6.0], weights=[1, 1, 2])
+    >>> value_and_grad(total)(3.0)
+    (23.0, -6.0)
+    """
+    return Ensemble(loss, scenes, executor, weights, chunk, progress)
+
+
+class Ensemble(Remade):
+    """The weighted sum of a loss over scenes. Made by `ensemble`.
+
+    Attributes
+    ----------
+    count : int
+        Of scenes.
+    """
+
+    name = "ensemble"
+
+    def __init__(self, loss, scenes, executor=None, weights=None, chunk=None, progress=False):
+        check_function("ensemble", loss, "lambda x, scene: ...")
+        scenes = [*map(copied, scenes)]
+        self.count = len(scenes)
+        if not scenes:
+            raise ValueError("ensemble needs a scene, got none")
+        if executor is not None and not hasattr(executor, "submit"):
+            raise TypeError(
+                f"ensemble takes an executor, got {type(executor).__name__}; write "
+                "concurrent.futures.ProcessPoolExecutor(2)"
+            )
+        if chunk is not None and not is_whole(chunk, 1):
+            raise ValueError(f"chunk must be a number of scenes, got {chunk!r}; write 1, 2, ...")
+        self._weights = np.ones(self.count) if weights is None else np.array(weights, float)
+        if self._weights.shape != (self.count,):
+            raise ShapeError(
+                f"weights must be one number for each of {self.count} scenes, got shape {self._weights.shape}"
+            )
+        check_finite("weights", self._weights)
+        self._weights = self._weights.tolist()
+        self._given = loss, scenes, executor, self._weights, chunk, progress
+        self._chunk, self._executor, self._progress = int(chunk or 1), executor, progress
+        pack = _packed if executor is not None else lambda thing: thing
+        self._loss, self._scenes = pack(loss), [*map(pack, scenes)]
+
+    def recipe(self):
+        """The call that makes it again: see recipe.py."""
+        return ensemble, self._given
+
+    def __repr__(self):
+        return f"<ensemble of {self.count} scenes>"
+
+    def __call__(self, x, numbers=None):
+        numbers = list(range(self.count) if numbers is None else numbers)
+        for number in numbers:
+            if not is_whole(number, 0) or number >= self.count:
+                raise IndexError(f"ensemble has scenes 0 to {self.count - 1}, got {number!r}")
+        if not numbers:
+            raise ValueError("ensemble needs a scene, got none")
+        x = copied(x)  # the caller may write into what is not traced, before a second derivative is asked for
+        entries = leaves(x)
+        moving = [place for place, leaf in enumerate(entries) if isbox(leaf)]
+        slopes: Any = []
+
+        def total(task, values, tangents=None):
+            return self._sum(task, _placed(x, moving, values), moving, tangents, numbers)
+
+        def value(*values):
+            if not values:
+                return total(_value, values)[0]
+            result, *slopes[:] = total(_slopes, values)
+            return result
+
+        def slopes_at(values):
+            return gradient(*values) if any(map(isbox, values)) else slopes
+
+        def along(nums, tangents, ans, *values):
+            at = slopes_at(values)
+            return sum(anp.real(anp.sum(at[num] * tangent)) for num, tangent in zip(nums, tangents, strict=True))
+
+        def back(nums, ans, *values):
+            at = slopes_at(values)
+            return lambda g: tuple(g * at[num] for num in nums)
+
+        def curved(nums, tangents, ans, *values):
+            given = dict(zip(nums, tangents, strict=True))
+            return hessian(*values, *(given.get(num, zero_like(one)) for num, one in enumerate(values)))
+
+        def curved_back(nums, ans, *values):  # the Hessian is symmetric
+            def pull(g):
+                product = hessian(*values, *(g[num] for num in range(len(values))))
+                return tuple(product[num] for num in nums)
+
+            return pull
+
+        hessian = Rule("ensemble", lambda *both: tuple(total(_curvature, both[: len(moving)], both[len(moving) :])))
+        gradient = Rule("ensemble", lambda *values: tuple(total(_slopes, values)[1:]), curved_back, curved)
+        return Rule("ensemble", value, back, along)(*(entries[place] for place in moving))
+
+    def _sum(self, task, x, moving, tangents, numbers):
+        """What a task returns, added up over scenes in their order."""
+        chunks = [numbers[begin : begin + self._chunk] for begin in range(0, len(numbers), self._chunk)]
+        scenes = [[(number, self._weights[number], self._scenes[number]) for number in chunk] for chunk in chunks]
+        given, total = (x, moving, tangents, self.count), None
+        futures: list = []
+        try:
+            if self._executor is not None:
+                futures += [self._executor.submit(_unpacked_sum, task, self._loss, some, *given) for some in scenes]
+            for number in shown_steps(self._progress, range(len(chunks)), "scenes"):
+                part = futures[number].result() if futures else _sum(task, self._loss, scenes[number], *given)
+                total = _added(total, part)
+        finally:
+            for future in futures:
+                future.cancel()
+        return total
+
+
+# ---- in a worker -----------------------------------------------------------------------------------------------------
+
+
+def _unpacked_sum(task, loss, scenes, *rest):
+    return _sum(task, _unpacked(loss), [(number, weight, _unpacked(scene)) for number, weight, scene in scenes], *rest)
+
+
+def _sum(task, loss, scenes, x, moving, tangents, count):
+    """What a task returns over some scenes (number, weight, scene), added up in their order."""
+    total = None
+    for number, weight, scene in scenes:
+        try:
+            values = [leaves(x)[place] for place in moving]
+            parts = task(
+                lambda values, scene=scene: loss(_placed(x, moving, values), mapped(frozen, scene)), values, tangents
+            )
+        except Exception as error:
+            if error.args and not isinstance(error.args[0], str):
+                raise RuntimeError(f"scene {number} of {count} raised {type(error).__name__}: {error}") from error
+            words = error.args[0] if error.args else type(error).__name__
+            error.args = f"scene {number} of {count}: {words}", *error.args[1:]
+            raise
+        total = _added(total, [weight * part for part in parts])
+    return total
+
+
+def _value(of, values, tangents):
+    value = of(values)
+    check_loss(value)
+    return [float(value)]
+
+
+def _slopes(of, values, tangents):
+    value, slopes = value_and_grad(of)(values)
+    return [value, *slopes]
+
+
+def _curvature(of, values, tangents):
+    return jvp(grad(of), values, list(tangents))[1]
+
+
+def _placed(x, moving, values):
+    """A tree -> the same one with other values at the leaves that move."""
+    entries, rebuild = flatten(x)
+    for place, value in zip(moving, values, strict=True):
+        entries[place] = value
+    return rebuild(entries)
+
+
+def _added(total, parts):
+    return parts if total is None else [a + b for a, b in zip(total, parts, strict=True)]
+
+
+def _packed(thing):
+    """Anything -> its bytes."""
+    try:
+        return pickle.dumps(thing, 5)
+    except Exception as error:
+        try:
+            import cloudpickle
+        except ImportError:
+            raise TypeError(
+                f"ensemble cannot send {type(thing).__name__} to another process ({error}); write functions as a def "
+                "at the top level of a module, or install cloudpickle"
+            ) from error
+        return cloudpickle.dumps(thing, 5)
+
+
+@lru_cache(maxsize=KEPT)
+def _unpacked(data):
+    """The thing again; a second time the same one, with what it has set up."""
+    return pickle.loads(data)
