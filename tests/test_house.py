@@ -93,7 +93,7 @@ LONGER = {
 BUDGETS = {
     "": 196_850,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
     "advection": 14_000,
-    "check": 14_700,
+    "check": 14_650,
     "flow": 11_700,  # conservation laws: 2 850; forces: 780; scalars, Courant limit, friction of flow_step: 1 650
     "integrators": 17_800,  # radau: 4 400; leapfrog and sponge: 1 250; a term for each field, batches of etdrk4: 850
     "kernels": 14_000,
