@@ -30,7 +30,6 @@ from sparsedp.tape import (
     isbox,
     new_trace,
     plain,
-    reverse_root,
     split_boxes,
     untraced,
 )  # fmt: skip
@@ -135,7 +134,7 @@ def linearised(fun, tree, moving):
     `backward_each` as `back` many at once, side by side along a last axis.
     """
     recorder = Recorder()
-    roots = [reverse_root(recorder) if moves else None for moves in moving]
+    roots = [recorder.root() if moves else None for moves in moving]
     try:
         values, ends, rebuild = traced(fun, tree, roots)
     finally:

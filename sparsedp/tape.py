@@ -42,7 +42,7 @@ from sparsedp.tree import copied, leaves
 __all__ = [
     "Recorder", "ReverseNode", "Rule", "added", "apply_operator", "backward", "boxed", "called", "cast",
     "differentiable", "dtype_of", "entrywise", "fit", "forward_root", "innermost", "is_variable", "isbox", "linear",
-    "new_trace", "plain", "reverse_root", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
+    "new_trace", "plain", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
@@ -59,6 +59,10 @@ class Recorder:
 
     def __init__(self):
         self.nodes: list = []
+
+    def root(self):
+        """A fresh start of a reverse-mode trace, whose calls are taken down here."""
+        return (thread.witnesses[-1] if thread.witnesses else ReverseNode).new_root(self)
 
     def weigh(self, value, args, nums):
         """One call."""
@@ -153,11 +157,6 @@ untraced[ReverseNode] = untraced[UntapedNode] = untraced[VJPNode]
 untraced[ForwardNode] = untraced[JVPNode]
 untaped_root = UntapedNode.new_root
 forward_root = ForwardNode.new_root  # a fresh start of a forward-mode trace, with its tangent
-
-
-def reverse_root(recorder):
-    """A fresh start of a reverse-mode trace, whose calls the recorder takes down."""
-    return (thread.witnesses[-1] if thread.witnesses else ReverseNode).new_root(recorder)
 
 
 _numbers = numbers_from(trace_stack.top + 1)

@@ -5,7 +5,7 @@ from sparsedp.ledger import active, count
 from sparsedp.progress import shown_steps
 from sparsedp.tape import backward, fit
 from sparsedp.trajectory.layout import refuse_lost, stacked
-from sparsedp.trajectory.record import Growth
+from sparsedp.trajectory.record import growth, largest
 from sparsedp.trajectory.schedule import stride
 
 __all__ = ["BackwardPass"]
@@ -29,21 +29,21 @@ class BackwardPass:
     def __init__(self, loop, steps, kept, tapes):
         self.loop, self.steps, self.kept, self.tapes = loop, steps, kept, tapes
         self.recomputed = 0
-        self.cotangents: dict = {}  # of params: root -> (sum so far, whether it may be written to)
+        self.sums: dict = {}  # of params: root -> (sum so far, whether it may be written to)
+        self.known = set(steps.roots)
         pairs = zip(steps.x, steps.input_roots, strict=True)  # of inputs: for each row
         self.inputs = [list(zero_like(block)) if root else [] for block, root in pairs]
 
     def back(self, g):
         """Cotangents of the outputs -> those of all arguments, None where there is none."""
         loop, steps, tapes, n = self.loop, self.steps, self.tapes, self.loop.n
-        growth = Growth(loop)
-        source = loop.keep.source(n, g)
+        source, along = loop.keep.source(n, g), loop.keep.along
         state = self.kept.pop()
         last = state if loop.reverse else None
         total = source(state)
-        growth.see(n, total)
+        norms = [] if total is None else [(n, largest(total))]
         for i in shown_steps(loop.progress, range(n - 1, -1, -1), "backward"):
-            if total is None and not loop.keep.along:
+            if total is None and not along:
                 break  # cut by truncation
             if i < len(tapes):
                 tape = tapes.pop()  # what is on a tape is not run again
@@ -52,42 +52,41 @@ class BackwardPass:
                 tape, end = None, state.marks()
                 state = steps.back(state) if loop.reverse else self._state_at(i)
                 if total is not None:
-                    tape, after = steps.taped(state)
+                    after, tape = steps.after(state, True)
                     if not loop.reverse:
                         loop.compare(after.marks(), end)
                     del after
             if total is not None:
                 total = self._pull(tape, total)
             del tape
-            if state.i % loop.every == 0:
-                growth.see(state.i, total)
-            if loop.keep.along and (i > 0 or loop.wants(0)):
+            if i % loop.every == 0 and total is not None:  # before anything enters here
+                norms.append((i, largest(total)))
+            if along and loop.moves(i):
                 total = _sum(total, source(state))
         if loop.reverse and state.i == 0:
             steps.check_start(state, last)
         if active:
             count("rollout.step", "vjp", n)
             count("rollout.step", "recomputed", self.recomputed)
-        record = growth.record(loop.kept, self.recomputed)
+        record = growth(loop, norms, self.recomputed)
         if loop.record is not None:
             loop.record(record)
-        params = [self.cotangents.get(root, NONE)[0] for root in steps.roots]
+        params = [self.sums.get(root, NONE)[0] for root in steps.roots]
         inputs = [stacked(rows) if rows else None for rows in self.inputs]
-        return [*(total or [None] * len(loop.state.places)), *map(_fitted, params, steps.p), *inputs]
+        return [*(total or [None] * len(loop.state.places)), *_fitted(params, steps.p), *inputs]
 
     def _pull(self, tape, g):
         """Cotangents of the state after a step -> those of the state before, None if those are not wanted."""
-        cotangents, state, many = self.cotangents, tape.state, len(tape.state.values)
+        sums, state = self.sums, tape.state
         self.steps.last = state
-        backward(tape.nodes, tape.ends, g, cotangents)
-        backs = [cotangents.pop(root, NONE)[0] for root in tape.roots]
-        for rows, back in zip(self.inputs, backs[many:], strict=True):
+        backward(tape.nodes, tape.ends, g, sums)
+        backs = [sums.pop(root, NONE)[0] for root in tape.roots]
+        for rows, back in zip(self.inputs, backs[len(state.values) :], strict=True):
             if back is not None:
                 rows[state.i] = back
-        for root in cotangents:
-            if root not in self.steps.roots:
-                refuse_lost("the step")  # in a call of another step
-        return list(map(_fitted, backs, state.values)) if self.loop.wants(state.i) else None
+        if not sums.keys() <= self.known:
+            refuse_lost("the step")  # in a call of another step
+        return _fitted(backs, state.values) if self.loop.wants(state.i) else None
 
     def _state_at(self, i):
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""
@@ -101,14 +100,15 @@ class BackwardPass:
             stop = state.i + stride(i + 1 - state.i, free)
             self.recomputed += stop - state.i
             while state.i < stop:
-                state = self.steps.forward(state)
+                state, _ = self.steps.after(state, False)
             state = state.owned()
         return state
 
 
-def _fitted(back, value):
-    """A cotangent in the dtype of its value; None where there is none."""
-    return None if back is None else fit("the step", value, back, back)
+def _fitted(backs, values):
+    """Cotangents in the dtypes of their values; None where there is none."""
+    pairs = zip(backs, values)
+    return [None if back is None else fit("the step", value, back, back) for back, value in pairs]
 
 
 def _sum(total, entering):

@@ -10,8 +10,8 @@ from sparsedp.fields import check_function, check_takes, is_whole
 from sparsedp.ledger import thread
 from sparsedp.tape import dtype_of, innermost, is_variable, isbox, plain, through
 from sparsedp.trajectory.keep import All, Each, Last
-from sparsedp.trajectory.layout import Layout, dense
-from sparsedp.trajectory.run import Loop, Run, count_of, parts, rollout_rule
+from sparsedp.trajectory.layout import Layout
+from sparsedp.trajectory.run import Loop
 from sparsedp.trajectory.schedule import budget_within_reach, plan, room_within, slots_within
 from sparsedp.tree import leaves
 
@@ -117,7 +117,7 @@ def rollout(
     _check_inputs(inputs, n)
     example = "lambda state, params: ..." if inputs is None else "lambda state, params, input: ..."
     check_takes("rollout", step, 2 if inputs is None else 3, example)
-    values = [[dense(leaves(tree)[place]) for place in form.places] for tree, form in zip(given.values(), forms)]
+    values = [form.variables(tree) for tree, form in zip(given.values(), forms)]
     args = [value for part in values for value in part]
     traced = [k for k, arg in enumerate(args) if isbox(arg)]
     if traced:  # what is kept on the way forward must be what the way back sees
@@ -136,8 +136,7 @@ def rollout(
         _warn_of_repeats(memory, *sizes)
     for hook in thread.loop_hooks:
         hook(step, state, params, inputs, n)
-    outputs = through(rollout_rule, Run(loop), *args)
-    return loop.keep.tree(parts(outputs, count_of(plain(outputs))))
+    return loop.keep.tree(loop.parts(through(loop, *args)))
 
 
 def _check_reversible(step):

@@ -9,7 +9,7 @@ from sparsedp.constants import constant
 from sparsedp.derivative import described
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, surely_finite
-from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, traces_of
+from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.tree import flatten, keys, labels, leaves, mapped, subscript
 
 __all__ = ["Layout", "dense", "fingerprint", "is_finite", "owned", "refuse_lost", "refuse_mask", "stacked"]
@@ -77,6 +77,11 @@ class Layout:
         """Names of the variables."""
         return [self.labels[place] for place in self.places]
 
+    def variables(self, tree):
+        """The variables of the tree that it was made of, contiguous."""
+        entries = leaves(tree)
+        return [dense(entries[place]) for place in self.places]
+
     def build(self, variables, statics=None):
         """Variables and the other leaves -> the tree."""
         if self.bare:
@@ -90,14 +95,38 @@ class Layout:
     def _rebuild(self):
         return flatten(self._template)[1]
 
-    def take(self, tree, when):
-        """A tree of the same form -> its variables and its other leaves.
+    def take(self, tree, when, number, outer):
+        """A tree of the same form -> its variables below the boxes of one trace, contiguous, their nodes; other leaves.
+
+        Parameters
+        ----------
+        tree : any nesting of arrays, tuples, lists and dicts
+        when : str
+            Who made it.
+        number : int
+            Of the trace.
+        outer : set of int
+            The traces that the variables may be on beside it.
 
         Raises
         ------
         ShapeError
-            If the form differs; `when` says who made the tree.
+            If the form, a shape or a dtype differs.
         """
+        variables, others = self._parted(tree, when)
+        values, nodes = split_boxes(variables, number)
+        for k, value in enumerate(values):
+            if not (
+                type(value) is np.ndarray
+                and value.shape == self.shapes[k]
+                and value.dtype == self.dtypes[k]
+                and value.flags.c_contiguous
+            ):
+                values[k] = self._settled(k, value, when, outer)
+        return values, nodes, others
+
+    def _parted(self, tree, when):
+        """A tree of the same form -> its variables and its other leaves."""
         if self.bare and not isinstance(tree, (tuple, list, dict)):
             return [tree], self.statics
         entries: list = []
@@ -128,21 +157,6 @@ class Layout:
             return
         for name in names:
             self._collect(wanted[name], tree[name], (*path, name), when, entries)
-
-    def check(self, values, when, outer=frozenset()):
-        """Values of the variables after a step -> the same, contiguous; refuse another shape or dtype.
-
-        `outer`: the traces that they may be on.
-        """
-        for number, value in enumerate(values):
-            if not (
-                type(value) is np.ndarray
-                and value.shape == self.shapes[number]
-                and value.dtype == self.dtypes[number]
-                and value.flags.c_contiguous
-            ):
-                values[number] = self._settled(number, value, when, outer)
-        return values
 
     def _settled(self, number, value, when, outer):
         name, shape, dtype = self.names[number], self.shapes[number], self.dtypes[number]

@@ -15,7 +15,7 @@ from sparsedp.errors import GrowthWarning
 from sparsedp.ledger import thread
 from sparsedp.tape import plain
 
-__all__ = ["APART", "Growth", "Record", "SAMPLES"]
+__all__ = ["APART", "Record", "SAMPLES", "growth", "largest"]
 
 LIMIT = 1e8  # half of the digits are gone
 SAMPLES = 32  # measurements of the cotangent in a long run
@@ -61,40 +61,33 @@ class Record(NamedTuple):
         return self.amplification > LIMIT
 
 
-class Growth:
-    """Measures the cotangent of the state now and then on the way back."""
+def growth(loop, norms, recomputed):
+    """Loop, (number of a state, largest entry of its cotangent), steps run again -> the Record of the way back.
 
-    def __init__(self, loop):
-        self._n, self._truncate = loop.n, loop.truncate
-        self.norms: list = []
+    It warns when the cotangent grew too much.
+    """
+    first = next((norm for _, norm in norms if norm > 0), nan)
+    grown = max((norm / first for _, norm in norms), default=nan)
+    cut = max(loop.cuts, default=-1)  # beyond it the cotangent begins anew
+    whole = [(i, log(norm)) for i, norm in norms if 0 < norm < inf and i > cut]
+    steps = whole[0][0] - whole[-1][0] if whole else 0
+    rate = (whole[-1][1] - whole[0][1]) / steps if steps else nan
+    result = Record("backward", loop.n, loop.kept, recomputed, tuple(norms), rate, grown)
+    if result.flagged:
+        thread.grown += 1
+        warnings.warn(
+            GrowthWarning(
+                f"the cotangent grew by {grown:.0e} over {loop.n} steps of rollout, {rate:.2g} a step in the "
+                "logarithm; the gradient is exact and of little use, take fewer steps or truncate"
+            ),
+            stacklevel=2,
+        )
+    return result
 
-    def see(self, i, g):
-        """The cotangent of state i, before anything enters there; asked where i is a multiple of `loop.every`."""
-        if g is None:
-            return
-        norm = max((_largest(plain(leaf)) for leaf in g if leaf is not None), default=0.0)
-        self.norms.append((i, norm))
 
-    def record(self, kept, recomputed):
-        """The record of the way back; warns when the cotangent grew too much."""
-        n, norms = self._n, [norm for _, norm in self.norms]
-        first = next((norm for norm in norms if norm > 0), nan)
-        grown = max((norm / first for norm in norms), default=nan)
-        # Beyond a cut the cotangent begins anew.
-        whole = [(i, log(norm)) for i, norm in self.norms if 0 < norm < inf and n - i < self._truncate]
-        steps = whole[0][0] - whole[-1][0] if whole else 0
-        rate = (whole[-1][1] - whole[0][1]) / steps if steps else nan
-        result = Record("backward", n, kept, recomputed, tuple(self.norms), rate, grown)
-        if result.flagged:
-            thread.grown += 1
-            warnings.warn(
-                GrowthWarning(
-                    f"the cotangent grew by {grown:.0e} over {n} steps of rollout, {rate:.2g} a step in the "
-                    "logarithm; the gradient is exact and of little use, take fewer steps or truncate"
-                ),
-                stacklevel=2,
-            )
-        return result
+def largest(cotangents):
+    """Largest entry of some cotangents, plain or traced, of which None counts for nothing."""
+    return max((_largest(plain(g)) for g in cotangents if g is not None), default=0.0)
 
 
 def _largest(g):

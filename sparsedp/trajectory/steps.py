@@ -1,4 +1,4 @@
-"""The steps of a rollout, on plain values or on a tape, and the way back through one of them."""
+"""The steps of a rollout, on plain values or on a tape, and in which of them an error arose."""
 
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -7,7 +7,7 @@ import numpy as np
 
 from sparsedp.constants import frozen
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
-from sparsedp.tape import Recorder, boxed, new_trace, plain, reverse_root, split_boxes, traces_of, untaped_root
+from sparsedp.tape import Recorder, boxed, new_trace, plain, traces_of, untaped_root
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.tree import copied, flatten, leaves
 
@@ -30,7 +30,7 @@ class State(NamedTuple):
 
     def owned(self):
         """The same in memory of its own: a step may use the arrays again that it has returned."""
-        return self._replace(values=list(map(owned, self.values)))
+        return State(self.i, list(map(owned, self.values)), self.statics)
 
     def marks(self):
         """Fingerprints of all of it."""
@@ -79,52 +79,70 @@ class Steps:
     """
 
     def __init__(self, loop, args):
-        self.loop, self.recorder = loop, Recorder()
-        self.number = new_trace()
+        self.loop, self.recorder, self.number = loop, Recorder(), new_trace()
         self.outer, self.last = traces_of(args), None
-        self._open = any(layout.open for layout in loop.layouts)
         values, self.p, self.x = loop.split(args)
         self.first = State(0, values, loop.state.statics)
-        roots = [reverse_root(self.recorder) if number in loop.wanted else None for number in range(len(args))]
+        roots = [self.recorder.root() if number in loop.wanted else None for number in range(len(args))]
         _, self.roots, self.input_roots = loop.split(roots)
-        given = list(map(frozen, self.p))
-        self._taped_params = loop.params.build(boxed(given, self.roots, self.number))
         # Without a tape the values are traced all the same: what a step stores away is no constant.
-        self._root = untaped_root(self.recorder) if loop.wanted else None
-        self._untaped_params = loop.params.build(boxed(given, [one and self._root for one in self.roots], self.number))
-        self.params = loop.params.build(given)
+        untaped = untaped_root(self.recorder)
+        # Whether a step is taped -> what makes the roots of its variables, and its params.
+        self._forms = {
+            True: (self.recorder.root, self._params(self.roots)),
+            False: (lambda: untaped, self._params([root and untaped for root in self.roots])),
+        }
 
-    def shown(self, state):
-        """The tree of a state for a function that is called again on a tape."""
-        root = self._root if state.i or self.loop.wants(0) else None
-        values = [frozen(value) for value in state.values]
-        return self.loop.state.build(boxed(values, [root] * len(values), self.number), state.statics)
-
-    def forward(self, state):
-        """The state after this one."""
-        roots = []
-        if self._root is not None:
-            roots = [self._root if self.loop.wants(state.i) else None] * len(state.values)
-            roots += [one and self._root for one in self.input_roots]
-        return self._called(state, roots, self._untaped_params)[0]
-
-    def taped(self, state):
-        """The step from a state: (Tape, the state after it)."""
-        roots = [self.loop.wants(state.i) or None for _ in state.values] + self.input_roots
-        roots = [one and reverse_root(self.recorder) for one in roots]
-        try:
-            after, ends = self._called(state, roots, self._taped_params)
-        finally:
-            nodes = self.recorder.taken()
+    def after(self, state, taped):
+        """The step from a state -> (the state after it, its Tape or None)."""
+        loop, wants, (new, params) = self.loop, self.loop.wants(state.i), self._forms[taped]
+        self.last = state
+        roots = [new() if wants else None for _ in state.values] + [root and new() for root in self.input_roots]
+        parts = self._parts(state, boxed(self._given(state), roots, self.number), params)
+        given = [leaves(part) for part in parts] if loop.open else None
+        result = loop.step(*parts)
+        if given is not None:
+            _check_entries(parts, given)
+        values, ends, statics = loop.state.take(result, "the step", self.number, self.outer)
+        after = State(state.i + 1, values, statics)
+        if not taped:
+            return after, None
         # What is on no tape may be an array that the step uses again.
-        return Tape(state, roots, nodes, ends), after.owned() if None in ends else after
+        return after.owned() if None in ends else after, Tape(state, roots, self.recorder.taken(), ends)
 
     def back(self, state):
         """The state before this one, by the step turned round: the same to rounding."""
-        self.last = earlier = state._replace(i=state.i - 1)
-        result = self.loop.step.back(*self._parts(earlier, self._given(earlier), self.params))
-        values, statics = self.loop.state.take(result, "the step turned round")
-        return State(earlier.i, self.loop.state.check(values, "the step turned round", self.outer), statics)
+        self.last = earlier = State(state.i - 1, state.values, state.statics)
+        result = self.loop.step.back(*self._plain_parts(earlier))
+        values, _, statics = self.loop.state.take(result, "the step turned round", self.number, self.outer)
+        return State(earlier.i, values, statics)
+
+    def shown(self, state):
+        """The tree of a state for a function that is called again on a tape."""
+        root = self._forms[False][0]() if self.loop.moves(state.i) else None
+        values = boxed(map(frozen, state.values), [root] * len(state.values), self.number)
+        return self.loop.state.build(values, state.statics)
+
+    def _params(self, roots):
+        return self.loop.params.build(boxed(map(frozen, self.p), roots, self.number))
+
+    def _given(self, state):
+        """The variables of state and inputs that a step gets: constants where the derivative is cut."""
+        values = map(plain, state.values) if state.i in self.loop.cuts else state.values
+        return [frozen(value) for value in (*values, *[block[state.i] for block in self.x])]
+
+    def _parts(self, state, values, params):
+        """The arguments of a step, of the variables of state and inputs."""
+        many, inputs = len(state.values), self.loop.inputs
+        parts = [self.loop.state.build(values[:many], state.statics), params]
+        if inputs is not None:
+            rest = [leaf[state.i] if isinstance(leaf, np.ndarray) else leaf for leaf in inputs.statics]
+            parts.append(inputs.build(values[many:], rest))
+        return parts
+
+    def _plain_parts(self, state):
+        """The same from a state, on no trace of the rollout."""
+        return self._parts(state, self._given(state), self._params([None] * len(self.p)))
 
     def check_start(self, state, last):
         """Refuse a way back by reversed steps, from the last state, that did not end where the way forward began."""
@@ -137,33 +155,6 @@ class Steps:
                     f"reversed steps end {off:.1e} away from the first state, beside states of size {size:.1e}: "
                     "rounding grew on the way; give rollout a memory in bytes"
                 )
-
-    def _given(self, state):
-        """The variables of state and inputs that a step gets: constants where the derivative is cut."""
-        values = map(plain, state.values) if self.loop.is_cut(state.i) else state.values
-        return [frozen(value) for value in (*values, *(block[state.i] for block in self.x))]
-
-    def _parts(self, state, values, params):
-        """The arguments of a step, of the variables of state and inputs."""
-        many, inputs = len(state.values), self.loop.inputs
-        parts = [self.loop.state.build(values[:many], state.statics), params]
-        if inputs is not None:
-            rest = [leaf[state.i] if isinstance(leaf, np.ndarray) else leaf for leaf in inputs.statics]
-            parts.append(inputs.build(values[many:], rest))
-        return parts
-
-    def _called(self, state, roots, params):
-        """The step on variables with these roots -> the next state, and the nodes of its variables."""
-        self.last = state
-        variables = self._given(state)
-        parts = self._parts(state, boxed(variables, roots, self.number) if roots else variables, params)
-        given = [leaves(part) for part in parts] if self._open else None
-        result = self.loop.step(*parts)
-        if given is not None:
-            _check_entries(parts, given)
-        results, statics = self.loop.state.take(result, "the step")
-        values, nodes = split_boxes(results, self.number) if roots else (results, ())
-        return State(state.i + 1, self.loop.state.check(values, "the step", self.outer), statics), nodes
 
     @contextmanager
     def guarded(self, way="in step"):
@@ -182,6 +173,8 @@ class Steps:
             raise ValueError(f"{changes} in place; write u = u + du instead of u += du, or work on a copy") from (
                 error if refused else None
             )
+        finally:
+            self.recorder.taken()  # what a step that raised has left
 
     def _culprit(self):
         """Which array the step writes into, if it does: the one that stops it when all others may be written.
@@ -191,7 +184,7 @@ class Steps:
         state: Any = self.last
         if state is None:
             return None
-        entries, rebuild = flatten(self._parts(state, self._given(state), self.params))
+        entries, rebuild = flatten(self._plain_parts(state))
         for number, name in enumerate(label for layout in self.loop.layouts for label in layout.labels):
             if isinstance(entries[number], np.ndarray):
                 copies = copied(list(map(plain, entries)))
