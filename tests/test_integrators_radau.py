@@ -10,7 +10,7 @@ from test_integrators_variation import KNOWN, oscillator
 import sparsedp as dp
 from sparsedp.derivative import pushforward, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
-from sparsedp.integrators.radau import A, C, Rates
+from sparsedp.integrators.radau import A, C, Flat
 
 RATES = np.array([0.04, 1e4, 3e7])
 SMALL = {"Robertson": np.array([1e-6, 1e-11, 1e-2])}
@@ -149,8 +149,8 @@ def test_every_mode(count, options, near):
 def test_all_rows_at_once(rate):
     """The derivatives of a rate from one pass back are those of one pass for each row, to the bit or to rounding."""
     u, p = np.array([1.3, 0.4, 2.1]), np.array([0.7, 1.6])
-    scheme = dp.stepper("radau", rate, 1.0).scheme
-    rows = Rates(scheme, u, p, [True]).rows(u, None, [True])
+    problem = dp.stepper("radau", rate, 1.0).problem
+    rows = Flat(problem, u, "radau").rows(u, p, None, [True])
     _, pull = dp.vjp(lambda u, p: 1.0 * rate(u, p) + 0.0 * u * p[0], u, p)
     assert rows == pytest.approx(np.array([[*np.concatenate(pull(e)), 0.0] for e in np.eye(3)]), rel=1e-15, abs=1e-15)
 

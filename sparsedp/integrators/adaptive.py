@@ -215,17 +215,19 @@ class Adaptive(Scheme):
         share = flat(np.where(one == other, 0.0, np.abs(one - other) / size) for size, one, other in rows)
         return float(np.linalg.norm(share)) / (max(share.size, 1) ** 0.5 * self.tolerance * self.ratio)
 
-    def _followed(self, path, given):
-        """The state at the end of the path, with a derivative that is judged."""
+    def _followed(self, path, given, moves=isbox):
+        """The state at the end of the path, with a derivative that is judged; `moves`: which leaves have one."""
         known = untraced(given)
-        start = Moving(given, isbox, [*self.sizes(path[0].u), *map(relative, leaves(known[1:]))])
+        start = Moving(given, moves, [*self.sizes(path[0].u), *map(relative, leaves(known[1:]))])
         end = Moving(path[-1].new, is_variable, self.sizes(path[0].u, path[-1].new))
-        slopes = self._slopes(path, *known[1:])
         spread, judge = linear(f"{self.name}.variation", *self.doors(len(path)))
-        entered = spread(start.off(given))
-        runs = (self._again(path, slopes, less, *start.at(entered[number])) for number, less in enumerate(LESS))
-        arrived = [*map(end.off, runs)]
-        return end.at(judge(anp.array(arrived)))
+        return end.at(judge(self._runs(path, known, start, end, spread(start.off(given)))))
+
+    def _runs(self, path, known, start, end, entered):
+        """How far the ends of the three runs are off, from how far their starts are."""
+        slopes = self._slopes(path, *known[1:])
+        runs = (self._again(path, slopes, less, *start.at(x)) for less, x in zip(LESS, entered, strict=True))
+        return anp.array([*map(end.off, runs)])
 
     def section(self, u, params, t, half):
         """The derivative of d for each array of the state, and the speed, as a share of the state's size by time."""
@@ -307,6 +309,7 @@ class Moving:
         self.found, self.rebuild = flatten(tree)
         rows = enumerate(zip(self.found, sizes, strict=True))
         self.moving = [(n, plain(leaf), np.where(size > 0, size, 1.0)) for n, (leaf, size) in rows if moves(leaf)]
+        self.units = [size for *_, size in self.moving]
         shapes = [np.shape(leaf) for _, leaf, _ in self.moving for _ in range(1 + np.iscomplexobj(leaf))]
         self.space = Space(sum(map(prod, shapes)), parts=shapes)
 

@@ -51,6 +51,7 @@ from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
 from sparsedp.operator import Operator
+from sparsedp.operators.given import from_matrix
 from sparsedp.solvers.inverses import build
 from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog
@@ -374,8 +375,12 @@ def shifted(jacobian, timed):
     """df/du -> the derivative 1 - h df/du of a stage's residual."""
 
     def of_residual(x, b, h, params, t):
-        J = jacobian(x, params, t) if timed else jacobian(x, params)
-        J = J.matrix if isinstance(J, Operator) else J
-        return sp.eye_array(J.shape[0]) - h * J if sp.issparse(J) else np.eye(len(J)) - h * np.asarray(J)
+        J = as_matrix(jacobian(*(x, params, t)[: 2 + timed]))
+        return sp.eye_array(J.shape[0]) - h * J
 
     return of_residual
+
+
+def as_matrix(J):
+    """A jacobian that was given, as a sparse matrix."""
+    return (J if isinstance(J, Operator) else from_matrix(J)).matrix
