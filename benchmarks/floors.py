@@ -20,7 +20,7 @@ import pyamg
 from scipy.fft import dstn, idstn
 
 import sparsedp as dp
-from benchmarks import burgers, flow, scenes, structured
+from benchmarks import flow, scenes, small, structured
 from benchmarks.rollout import sliced_by_hand
 from benchmarks.structured import least
 from benchmarks.triad import best_times, triad
@@ -169,23 +169,25 @@ def projection(n):
     return best["projection on the tape"] / best["NumPy slices and DCT"], error
 
 
-@row("Burgers composed, rollout, ms", LESS, 3.0, 1.0, burgers.rolled)
-@row("Burgers composed, loop on the tape, ms", LESS, 3.0, 1.0, burgers.looped)
-def composed(form):
-    ours, theirs = dp.value_and_grad(form(burgers.composed())), dp.value_and_grad(burgers.looped(burgers.by_slices()))
-    error = relative(ours(burgers.START)[1], theirs(burgers.START)[1])
-    return 1e3 * best_times({"ours": lambda: ours(burgers.START)}, 200)["ours"], error
+@row("Burgers composed, rollout, ms", LESS, 3.0, 1.0, small.burgers, small.rolled)
+@row("Burgers composed, loop on the tape, ms", LESS, 3.0, 1.0, small.burgers, small.looped)
+@row("smoke 32^2 x 20 steps, rollout, ms", LESS, 18.0, 6.0, small.smoke, small.rolled)
+@row("smoke 32^2 x 20 steps, loop on the tape, ms", LESS, 18.0, 6.0, small.smoke, small.looped)
+def composed(scene, form):
+    case = scene()
+    ours, theirs = dp.value_and_grad(form(case)), dp.value_and_grad(small.written(case))
+    error = relative(ours(case.x)[1], theirs(case.x)[1])
+    return 1e3 * best_times({"ours": lambda: ours(case.x)}, 100)["ours"], error
 
 
 @row("gradient of 200 rk4 steps of two unknowns, over the value", LESS, 8.0, 4.0)
-def lotka_volterra():
-    def rate(u, p):
-        return anp.array([p[0] * u[0] - p[1] * u[0] * u[1], p[1] * u[0] * u[1] - p[2] * u[1]])
-
-    step, start, p = dp.stepper("rk4", rate, 0.05), np.array([1.0, 0.5]), np.array([1.0, 0.8, 0.9])
-    loss = lambda p: anp.sum(dp.rollout(step, start, p, 200) ** 2)
-    best = best_times({"value": lambda: loss(p), "gradient": lambda: dp.value_and_grad(loss)(p)}, 10)
-    return best["gradient"] / best["value"], None
+def predators():
+    case = small.predators()
+    loss = small.rolled(case)
+    ours, theirs = dp.value_and_grad(loss), dp.value_and_grad(small.written(case))
+    error = relative(ours(case.x)[1], theirs(case.x)[1])
+    best = best_times({"value": lambda: loss(case.x), "gradient": lambda: ours(case.x)}, 10)
+    return best["gradient"] / best["value"], error
 
 
 # ---- the package -----------------------------------------------------------------------------------------------------

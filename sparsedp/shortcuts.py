@@ -2,7 +2,7 @@
 
 autograd knows them all, and takes three to ten times as long: it is ready for all kinds of broadcasting, other dtypes
 and traces inside traces. What is here serves float64 alone, and traced operands of the shape of their result; without
-it a gradient of small steps takes twice the time (benchmarks/burgers.py, 200 steps of rk4).
+it a gradient of small steps takes twice the time (benchmarks/small.py, 200 steps of rk4).
 """
 
 import operator
