@@ -86,6 +86,11 @@ WRONG = [
     ),
     (run(method="half_inverse", rate=0), ValueError, "half_inverse needs a positive rate, got 0; the default is 1"),
     (
+        run(method="physical_gradient"), TypeError,
+        "physical_gradient needs physics and inverse; write minimize(loss_of_y, x, 'physical_gradient', physics=f, "
+        "inverse=f_inverse)",
+    ),
+    (
         run(method="gauss_newton"), DerivativeError,
         "the outputs are one number; return the residuals as an array, do not sum them",
     ),

@@ -61,7 +61,7 @@ def test_a_wrong_derivative_is_no_convergence(method):
 
 def test_methods_and_options():
     with pytest.raises(
-        ValueError, match="method must be one of lbfgs, gd, adam, newton_cg, .*, half_inverse, admm, got 'newton'"
+        ValueError, match="method must be one of lbfgs, gd, adam, newton_cg, .*, physical_gradient, admm, got 'newton'"
     ):
         dp.minimize(bowl, np.ones(2), "newton")
     with pytest.raises(TypeError, match="lbfgs has no option 'rate'; it has memory, line_search"):

@@ -209,15 +209,14 @@ def test_a_loss_that_is_another_one_away_from_the_start(tmp_path):
     refused(tmp_path, "loss at the last point", {"loss": valley}, {"loss": other}, start=START)
 
 
-def test_functions_among_the_leaves_do_not_hinder_the_next_process(tmp_path):
+def test_functions_among_the_options_do_not_hinder_the_next_process(tmp_path):
     """They have no address in the folder."""
     run = lambda maxiter, **more: dp.minimize(
-        lambda tree: anp.sum((tree["f"](tree["x"]) - 2.0) ** 2), {"x": START, "f": lambda x: 2 * x},
-        "gd", maxiter, 0, rate=0.03, **more,
+        lambda y: anp.sum((y - 2.0) ** 2), START, "physical_gradient", maxiter, 0, rate=0.3,
+        physics=lambda x: 2 * x, inverse=lambda y, x: y / 2, **more,
     )  # fmt: skip
     run(3, checkpoint=tmp_path)
-    again = run(6, checkpoint=tmp_path)
-    assert again.resumed.startswith("resumed") and np.array_equal(again.x["x"], run(6).x["x"])
+    assert same(run(6, checkpoint=tmp_path), run(6))
 
 
 def test_a_tolerance_with_a_memory_takes_no_checkpoint(tmp_path):

@@ -194,14 +194,10 @@ def test_the_two_variables_of_the_literature():
     fixed = {"maxiter": 10, "tolerance": 0}
     descent = dp.minimize(lambda x: square(y(x)), start, "gd", rate=0.01, **fixed)
     assert np.allclose(descent.x, (2.4512184, 0.96171147), rtol=1e-6)
-
-    def physical(rate, maxiter):
-        rule = dp.physical_gradient(y, lambda v, x: np.stack([v[0], np.sqrt(v[1])]), rate)
-        return dp.minimize(lambda x: square(rule(x)), start, "gd", rate=1.0, maxiter=maxiter, tolerance=0)
-
-    slow = physical(0.15, 10)
+    options = {"physics": y, "inverse": lambda v, x: np.stack([v[0], np.sqrt(v[1])])}
+    slow = dp.minimize(square, start, "physical_gradient", rate=0.15, **options, **fixed)
     assert np.allclose(slow.x, (0.08474258, 0.50421), rtol=1e-6)
-    assert np.array_equal(physical(0.5, 1).x, [0, 0])
+    assert np.array_equal(dp.minimize(square, start, "physical_gradient", rate=0.5, **options, maxiter=1).x, [0, 0])
 
 
 def test_half_inverse_equalises_the_directions():

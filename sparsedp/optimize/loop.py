@@ -11,6 +11,7 @@ from sparsedp.optimize.first_order import Adam, Descent
 from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
 from sparsedp.optimize.newton import NewtonCG
+from sparsedp.optimize.physical import PhysicalGradient
 from sparsedp.optimize.quasi_newton import Quasi
 from sparsedp.optimize.result import Minimum, Stuck
 from sparsedp.optimize.sparse_terms import admm
@@ -29,6 +30,7 @@ METHODS = {
     "gauss_newton": GaussNewton,
     "levenberg_marquardt": LevenbergMarquardt,
     "half_inverse": HalfInverse,
+    "physical_gradient": PhysicalGradient,
 }
 
 
@@ -53,12 +55,13 @@ def minimize(
     ----------
     loss : callable
         ``loss(x) -> real scalar``; with batches ``loss(x, batch)``. For gauss_newton, levenberg_marquardt and
-        half_inverse it returns residuals, an array, and half the sum of their squares is minimized.
+        half_inverse it returns residuals, an array, and half the sum of their squares is minimized. For
+        physical_gradient it is a function of the end state ``physics(x)``.
     start : array, number, or any nesting of them in tuples, lists and dicts
         Not modified. Leaves that are not floating stay as they are.
     method : str
-        "lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "levenberg_marquardt", "half_inverse"; or "admm", which
-        adds weight |K x|_1 to the loss: few entries, few jumps.
+        "lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "levenberg_marquardt", "half_inverse",
+        "physical_gradient"; or "admm", which adds weight |K x|_1 to the loss: few entries, few jumps.
     maxiter : int
         Most iterations; 0 evaluates the start and returns it.
     tolerance : float or callable
@@ -88,7 +91,7 @@ def minimize(
         line_search=None or "backtracking". adam: rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8. newton_cg: inner=200.
         gauss_newton: apart=False, dense=None. levenberg_marquardt: damping=1e-3, apart, dense.
         half_inverse: rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto" (J is formed where
-        it is small). apart=True, the fast way for samples: residuals
+        it is small). physical_gradient: physics, inverse, rate=1.0. apart=True, the fast way for samples: residuals
         along axis 0 are samples, and the loss takes every leaf of x with a leading axis of copies, one for each (a few
         products give the whole Jacobian).
         dense: whether the Jacobian is formed; None: when it is small. truncation, rank: see `update_direction`.
@@ -156,8 +159,9 @@ def minimize(
     packing, batches = Unknowns(start, "start"), Batches(batches)
     if batches.varied and stepper.searches:
         raise ValueError(f"{method} compares losses and cannot use batches; write method='adam', or give gd a rate")
-    if project is not None:
-        loss = _composed(loss, project)
+    for inner in (getattr(stepper, "rule", None), project):
+        if inner is not None:
+            loss = _composed(loss, inner)
     box = Box.of(bounds, packing, start)
     trials = Trials(loss, gradient, packing, box, batches, stepper if stepper.residuals else None)
     settings = {

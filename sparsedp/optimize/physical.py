@@ -3,10 +3,10 @@
 import autograd.numpy as anp
 
 from sparsedp.errors import ShapeError
-from sparsedp.optimize.first_order import check_positive
+from sparsedp.optimize.first_order import Descent, check_positive
 from sparsedp.tape import differentiable, plain
 
-__all__ = ["physical_gradient"]
+__all__ = ["PhysicalGradient", "physical_gradient"]
 
 
 def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
@@ -75,3 +75,23 @@ def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
     rule = differentiable(name, physics, vjp)
     rule.made = physical_gradient, (physics, inverse, rate, name)
     return rule
+
+
+class PhysicalGradient(Descent):
+    """The method of minimize: gradient descent with rate 1 on x, through the inverse simulator.
+
+    Parameters
+    ----------
+    physics, inverse : callable
+        As for dp.physical_gradient; `loss` is then a function of y = physics(x).
+    rate : float
+    """
+
+    def __init__(self, physics=None, inverse=None, rate=1.0):
+        if physics is None or inverse is None:
+            raise TypeError(
+                "physical_gradient needs physics and inverse; write minimize(loss_of_y, x, 'physical_gradient', "
+                "physics=f, inverse=f_inverse)"
+            )
+        super().__init__(rate=1.0)
+        self.rule = physical_gradient(physics, inverse, rate)
