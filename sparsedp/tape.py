@@ -92,9 +92,12 @@ class ReverseNode(VJPNode):
     vjp: Any
     held: Any
 
-    def initialize_root(self, recorder):
+    @classmethod
+    def new_root(cls, recorder):
         """Begin a trace."""
-        self.parents, self.vjp, self.held, self.recorder = (), None, (), recorder
+        root = cls.__new__(cls)
+        root.parents, root.vjp, root.held, root.recorder = (), None, (), recorder
+        return root
 
     def __init__(self, value, fun, args, options, nums, parents):
         self.parents, self.recorder = parents, parents[0].recorder.open()
@@ -210,7 +213,7 @@ def backward(nodes, ends, cotangents, sums):
     """
     for end, g in zip(ends, cotangents, strict=True):
         if end is not None and g is not None:
-            sums[end] = added(sums.get(end), g)
+            sums[end] = added(sums[end], g) if end in sums else (g, False)
     for node in reversed(nodes):
         total = sums.pop(node, None)
         if total is not None:

@@ -7,6 +7,7 @@ from sparsedp.tape import backward, fit
 from sparsedp.trajectory.layout import refuse_lost, stacked
 from sparsedp.trajectory.record import growth, largest
 from sparsedp.trajectory.schedule import stride
+from sparsedp.trajectory.steps import State
 
 __all__ = ["BackwardPass"]
 
@@ -22,12 +23,10 @@ class BackwardPass:
     steps : Steps
     kept : list of State
         The last one included.
-    tapes : list of Tape
-        Of the steps from the first one on.
     """
 
-    def __init__(self, loop, steps, kept, tapes):
-        self.loop, self.steps, self.kept, self.tapes = loop, steps, kept, tapes
+    def __init__(self, loop, steps, kept):
+        self.loop, self.steps, self.kept = loop, steps, kept
         self.recomputed = 0
         self.sums: dict = {}  # of params: root -> (sum so far, whether it may be written to)
         self.known = set(steps.roots)
@@ -36,7 +35,7 @@ class BackwardPass:
 
     def back(self, g):
         """Cotangents of the outputs -> those of all arguments, None where there is none."""
-        loop, steps, tapes, n = self.loop, self.steps, self.tapes, self.loop.n
+        loop, steps, n = self.loop, self.steps, self.loop.n
         source, along = loop.keep.source(n, g), loop.keep.along
         state = self.kept.pop()
         last = state if loop.reverse else None
@@ -45,23 +44,22 @@ class BackwardPass:
         for i in shown_steps(loop.progress, range(n - 1, -1, -1), "backward"):
             if total is None and not along:
                 break  # cut by truncation
-            if i < len(tapes):
-                tape = tapes.pop()  # what is on a tape is not run again
-                state = tape.state
-            else:
-                tape, end = None, state.marks()
-                state = steps.back(state) if loop.reverse else self._state_at(i)
-                if total is not None:
-                    after, tape = steps.after(state, True)
+            taped = self.kept and self.kept[-1].tape  # what is on a tape is not run again
+            end = None if taped else state.marks()
+            state = steps.back(state) if loop.reverse else self._state_at(i)
+            if total is not None:
+                if not taped:
+                    state = State(i, state.values, state.statics)  # the tape goes with it
+                    after = steps.after(state, True)
                     if not loop.reverse:
                         loop.compare(after.marks(), end)
                     del after
-            if total is not None:
-                total = self._pull(tape, total)
-            del tape
+                total = self._pull(state, total)
+                if not taped:
+                    state.tape = None
             if i % loop.every == 0 and total is not None:  # before anything enters here
                 norms.append((i, largest(total)))
-            if along and loop.moves(i):
+            if along and i >= loop.moving:
                 total = _sum(total, source(state))
         if loop.reverse and state.i == 0:
             steps.check_start(state, last)
@@ -75,18 +73,18 @@ class BackwardPass:
         inputs = [stacked(rows) if rows else None for rows in self.inputs]
         return [*(total or [None] * len(loop.state.places)), *_fitted(params, steps.p), *inputs]
 
-    def _pull(self, tape, g):
-        """Cotangents of the state after a step -> those of the state before, None if those are not wanted."""
-        sums, state = self.sums, tape.state
+    def _pull(self, state, g):
+        """Cotangents of the state after one -> those of the state itself, None if those are not wanted."""
+        sums, (roots, nodes, ends) = self.sums, state.tape
         self.steps.last = state
-        backward(tape.nodes, tape.ends, g, sums)
-        backs = [sums.pop(root, NONE)[0] for root in tape.roots]
+        backward(nodes, ends, g, sums)
+        backs = [sums.pop(root, NONE)[0] for root in roots]
         for rows, back in zip(self.inputs, backs[len(state.values) :], strict=True):
             if back is not None:
                 rows[state.i] = back
         if not sums.keys() <= self.known:
             refuse_lost("the step")  # in a call of another step
-        return _fitted(backs, state.values) if self.loop.wants(state.i) else None
+        return _fitted(backs, state.values) if roots[0] else None
 
     def _state_at(self, i):
         """State i, from the nearest kept state; states on the way are kept by the binomial rule."""
@@ -100,7 +98,7 @@ class BackwardPass:
             stop = state.i + stride(i + 1 - state.i, free)
             self.recomputed += stop - state.i
             while state.i < stop:
-                state, _ = self.steps.after(state, False)
+                state = self.steps.after(state, False)
             state = state.owned()
         return state
 

@@ -13,6 +13,7 @@ from sparsedp.derivative import linearised
 from sparsedp.errors import DerivativeError
 from sparsedp.tape import dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, stacked
+from sparsedp.trajectory.steps import State
 from sparsedp.tree import leaves, mapped
 
 __all__ = ["All", "Each", "Last"]
@@ -76,7 +77,7 @@ class All(Last):
             block[state.i] = values[number]
             if np.ndim(values[number]):
                 values[number] = block[state.i]
-        return state._replace(values=values)
+        return State(state.i, values, state.statics)
 
     def finish(self, last):
         """The blocks; the way back uses these very arrays."""

@@ -113,7 +113,10 @@ class Layout:
         ShapeError
             If the form, a shape or a dtype differs.
         """
-        variables, others = self._parted(tree, when)
+        if self.bare and not isinstance(tree, (tuple, list, dict)):
+            variables, others = [tree], self.statics
+        else:
+            variables, others = self._parted(tree, when)
         values, nodes = split_boxes(variables, number)
         for k, value in enumerate(values):
             if not (
@@ -127,8 +130,6 @@ class Layout:
 
     def _parted(self, tree, when):
         """A tree of the same form -> its variables and its other leaves."""
-        if self.bare and not isinstance(tree, (tuple, list, dict)):
-            return [tree], self.statics
         entries: list = []
         self._collect(self._template, tree, (), when, entries)
         variables = [entries[place] for place in self.places]

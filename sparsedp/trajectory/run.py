@@ -48,6 +48,8 @@ class Loop(Rule):
     ----------
     cuts : range
         The states that truncation makes constants for the steps after them.
+    moving : int
+        The first state that is traced.
     open : bool
         Whether a step gets dicts or lists, whose entries it could change.
     outputs : int
@@ -68,13 +70,12 @@ class Loop(Rule):
         if self.reverse:
             keep.exact = False
         self.cuts = range(n - truncate, 0, -truncate) if truncate else range(0)
-        # The first state that is traced.
-        self._moving = n + 1 if not wanted else 0 if wanted[0] < len(self.state.places) else 1
+        self.moving = n + 1 if not wanted else 0 if wanted[0] < len(self.state.places) else 1
         self._stops = (
             {*(() if self.reverse else checkpoints(n, self.slots)), n} if wanted else {0}
         )  # numbers of the states that are kept, and n
         self.kept = len(self._stops) - 1
-        self._runs: list = []  # for the way back: (steps, states with the last one, tapes from the first step on)
+        self._runs: list = []  # for the way back: (steps, states with the last one)
         self._end: list = []  # fingerprint of the last state
 
     @property
@@ -88,26 +89,18 @@ class Loop(Rule):
         second = first + len(self.params.places)
         return list(args[:first]), list(args[first:second]), list(args[second:])
 
-    def moves(self, i):
-        """Whether state i depends on what wants a cotangent."""
-        return i >= self._moving
-
-    def wants(self, i):
-        """Whether step i hands a cotangent on to its state."""
-        return i >= self._moving and i not in self.cuts
-
     def forward(self, *args):
         """Run all steps; return the array or the arrays to hand out."""
         steps = Steps(self, args)
         self.keep.start(steps)
         with steps.guarded():
-            state, kept, tapes = self._advance(steps)
+            state, kept = self._advance(steps)
         if not all(map(is_finite, state.values)):
             self._refuse(steps)
         steps.recorder.ended = True
         if self.wanted:
             self._end = state.marks()
-            self._runs = [(steps, kept, tapes)]
+            self._runs = [(steps, kept)]
         if active:
             count("rollout.step", "forward", self.n)
             count("rollout", "bytes", self.kept * self.state.nbytes)
@@ -122,31 +115,32 @@ class Loop(Rule):
         return [values] if self.outputs == 1 else [values[k] for k in range(self.outputs)]
 
     def _advance(self, steps):
-        """(last state, the states kept, the tapes kept) after all steps from the first state."""
-        see = self.keep.see
-        state, tapes, room, weight = see(steps.first), [], self.room, 0  # type: Any, list, int, int
+        """(last state, the states kept) after all steps from the first state."""
+        see, along, recorder = self.keep.see, self.keep.along, steps.recorder
+        state, room, weight = see(steps.first), self.room, 0
         kept = [state]
         for i in shown_steps(self.progress, range(self.n), "forward"):
-            # The first two tapes tell what a step takes.
-            taped = bool(self.wanted) and (i == 0 or weight <= room)
-            steps.recorder.bytes = 0 if i < 2 else None
-            state, tape = steps.after(state, taped)
+            before, taped = state, bool(self.wanted) and (i == 0 or weight <= room)
+            recorder.bytes = 0 if i < 2 else None
+            state = steps.after(before, taped)
             if taped:
-                if i < 2:
-                    weight = steps.recorder.bytes + len(tape.nodes) * CALL - self.state.nbytes
+                if i < 2:  # the first two tapes tell what a step takes
+                    weight = max(recorder.bytes + len(before.tape[1]) * CALL - self.state.nbytes, 0)
                 room -= weight
-                tapes += [tape] if i or room >= 0 else []
-            del tape
-            state = see(state)
+                if i == 0 and room < 0:
+                    before.tape = None
+            if along:
+                state = see(state)
             if i + 1 in self._stops:
-                kept.append(state if taped or self.keep.whole else state.owned())
-        return state, kept, tapes
+                state = state if taped or self.keep.whole else state.owned()
+                kept.append(state)
+        return state, kept
 
     def _refuse(self, steps):
         """Refuse a run that is not finite at its end: NaN stays, so one look tells, and a second run finds the step."""
         state, layout = steps.first, self.state
         for i in range(self.n):
-            state, _ = steps.after(state, False)
+            state = steps.after(state, False)
             for name, value in zip(layout.names, state.values, strict=True):
                 finite = np.isfinite(plain(value))
                 if not np.all(finite):
@@ -186,10 +180,10 @@ class Loop(Rule):
             self.forward(*args)
             self.compare(self._end, end)
             runs.extend(self._taken())
-        steps, kept, tapes = runs[0] if self.slots is None else runs.pop()
+        steps, kept = runs[0] if self.slots is None else runs.pop()
         steps.recorder.ended = False
         with steps.guarded("on the way back through step"):
-            cotangents = BackwardPass(self, steps, list(kept) if runs else kept, list(tapes)).back(g)
+            cotangents = BackwardPass(self, steps, list(kept) if runs else kept).back(g)
         steps.recorder.ended = True
         backs = ((cotangents[number], args[number]) for number in self.wanted)
         return tuple(zero_like(value) if back is None else back for back, value in backs)

@@ -1,7 +1,7 @@
 """The steps of a rollout, on plain values or on a tape, and in which of them an error arose."""
 
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from sparsedp.tape import Recorder, boxed, new_trace, plain, traces_of, untaped_
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.tree import copied, flatten, leaves
 
-__all__ = ["State", "Steps", "Tape"]
+__all__ = ["State", "Steps"]
 
 DRIFT = 1e-8  # of the size of each field: a gradient by reversed steps has about as many digits
 _REMEDY = {
@@ -21,12 +21,26 @@ _REMEDY = {
 }
 
 
-class State(NamedTuple):
-    """State i of a run: its variables, and its other leaves."""
+class State:
+    """State i of a run.
 
-    i: int
-    values: list
-    statics: tuple
+    Attributes
+    ----------
+    i : int
+    values : list
+        Its variables.
+    statics : tuple
+        Its other leaves.
+    tape : (roots, nodes, ends) or None
+        Of the step from it: the roots of the variables of state and inputs, None where a constant is; all calls, in
+        order, so that the backward pass need not sort a graph; the nodes of the state after it, None where that does
+        not depend on anything traced.
+    """
+
+    __slots__ = ("i", "statics", "tape", "values")
+
+    def __init__(self, i, values, statics):
+        self.i, self.values, self.statics, self.tape = i, values, statics, None  # type: int, list, tuple, Any
 
     def owned(self):
         """The same in memory of its own: a step may use the arrays again that it has returned."""
@@ -35,27 +49,6 @@ class State(NamedTuple):
     def marks(self):
         """Fingerprints of all of it."""
         return fingerprint(self.values, self.statics)
-
-
-class Tape(NamedTuple):
-    """A step: its calls are in order, so that the backward pass need not sort a graph.
-
-    Attributes
-    ----------
-    state : State
-        The state before it.
-    roots : list
-        Of the variables of state and inputs; None where a constant is.
-    nodes : list
-        All calls.
-    ends : list
-        The nodes of the state after it, None where that does not depend on anything traced.
-    """
-
-    state: State
-    roots: list
-    nodes: list
-    ends: list
 
 
 class Steps:
@@ -86,29 +79,31 @@ class Steps:
         roots = [self.recorder.root() if number in loop.wanted else None for number in range(len(args))]
         _, self.roots, self.input_roots = loop.split(roots)
         # Without a tape the values are traced all the same: what a step stores away is no constant.
-        untaped = untaped_root(self.recorder)
-        # Whether a step is taped -> what makes the roots of its variables, and its params.
-        self._forms = {
-            True: (self.recorder.root, self._params(self.roots)),
-            False: (lambda: untaped, self._params([root and untaped for root in self.roots])),
-        }
+        self._untaped = untaped_root(self.recorder)
+        self._taped_params = self._params(self.roots)
+        self._untaped_params = self._params([root and self._untaped for root in self.roots])
 
     def after(self, state, taped):
-        """The step from a state -> (the state after it, its Tape or None)."""
-        loop, wants, (new, params) = self.loop, self.loop.wants(state.i), self._forms[taped]
+        """The step from a state -> the state after it. Where it is taped, the first one gets the tape."""
+        loop, i = self.loop, state.i
         self.last = state
-        roots = [new() if wants else None for _ in state.values] + [root and new() for root in self.input_roots]
-        parts = self._parts(state, boxed(self._given(state), roots, self.number), params)
+        values, roots = self._given(state), ()  # type: list, Any
+        if loop.wanted:
+            wants, new = i >= loop.moving and i not in loop.cuts, self.recorder.root if taped else self._root
+            roots = [new() if wants else None for _ in state.values] + [root and new() for root in self.input_roots]
+            values = boxed(values, roots, self.number)
+        parts = self._parts(state, values, self._taped_params if taped else self._untaped_params)
         given = [leaves(part) for part in parts] if loop.open else None
         result = loop.step(*parts)
         if given is not None:
             _check_entries(parts, given)
         values, ends, statics = loop.state.take(result, "the step", self.number, self.outer)
-        after = State(state.i + 1, values, statics)
-        if not taped:
-            return after, None
-        # What is on no tape may be an array that the step uses again.
-        return after.owned() if None in ends else after, Tape(state, roots, self.recorder.taken(), ends)
+        after = State(i + 1, values, statics)
+        if taped:
+            state.tape = roots, self.recorder.taken(), ends
+            if None in ends:  # what is on no tape may be an array that the step uses again
+                return after.owned()
+        return after
 
     def back(self, state):
         """The state before this one, by the step turned round: the same to rounding."""
@@ -119,9 +114,12 @@ class Steps:
 
     def shown(self, state):
         """The tree of a state for a function that is called again on a tape."""
-        root = self._forms[False][0]() if self.loop.moves(state.i) else None
+        root = self._untaped if state.i >= self.loop.moving else None
         values = boxed(map(frozen, state.values), [root] * len(state.values), self.number)
         return self.loop.state.build(values, state.statics)
+
+    def _root(self):
+        return self._untaped
 
     def _params(self, roots):
         return self.loop.params.build(boxed(map(frozen, self.p), roots, self.number))
