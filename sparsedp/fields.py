@@ -13,6 +13,7 @@ __all__ = [
     "BLOCK",
     "check_finite",
     "check_function",
+    "check_number",
     "check_out",
     "check_plain",
     "check_takes",
@@ -123,6 +124,17 @@ def check_takes(name, fun, count, example):
     most = fun.__code__.co_argcount
     if not most - len(fun.__defaults__ or ()) <= count <= most:
         raise TypeError(f"{name} calls a function with {count} arguments, got one that takes {most}; write {example}")
+
+
+def check_number(name, value, sign="", advice=""):
+    """Refuse what is not one finite real number, or has not the sign that is needed, "> 0" or ">= 0"."""
+    if not is_number(value):
+        given = f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
+        raise TypeError(f"{name} must be one real number, got {given}")
+    if not np.isfinite(value):
+        raise NonFiniteError(f"{name} must be finite, got {value}")
+    if {"": False, ">= 0": value < 0, "> 0": value <= 0}[sign]:
+        raise ValueError(f"{name} must be {sign}, got {value:g}{advice}")
 
 
 def is_number(value):

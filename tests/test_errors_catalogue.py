@@ -168,7 +168,12 @@ TABLE = [
     (
         lambda: dp.forces(BOX, cells=np.s_[:, :])(np.ones((3, 24)), np.ones((3, *BOX.shape)), [0.1, 0.2, 0.3]),
         TYPE,
-        "forces takes one real number as viscosity, got [0.1, 0.2, 0.3]",
+        "the viscosity of forces must be one real number, got [0.1, 0.2, 0.3]",
+    ),
+    (
+        lambda: dp.forces(BOX, cells=np.s_[:, :])(np.ones((3, 24)), np.ones((3, *BOX.shape)), -0.1),
+        VALUE,
+        "the viscosity of forces must be >= 0, got -0.1",
     ),
     (
         lambda: dp.forces(BOX),

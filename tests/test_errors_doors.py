@@ -108,12 +108,12 @@ TABLE = [
     (
         lambda: dp.exponential(LAP, "a"),
         TYPE,
-        "exponential needs one real number as time, got 'a'; write for example 0.1",
+        "time of exponential must be one real number, got 'a'",
     ),
     (
         lambda: dp.power(LAP, [1, 2]),
         TYPE,
-        "power needs one real number as exponent, got [1, 2]; write for example 0.5",
+        "exponent of power must be one real number, got [1, 2]",
     ),
     (
         lambda: dp.rollout(None, U, None, 3),

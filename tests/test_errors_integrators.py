@@ -56,6 +56,11 @@ TABLE = [
         "imex needs the stiff linear term: write linear=L or linear=(L, coefficient)",
     ),
     (
+        lambda: dp.stepper("imex", decay, 0.1, linear=0),  # no term
+        TYPE,
+        "imex needs the stiff linear term: write linear=L or linear=(L, coefficient)",
+    ),
+    (
         lambda: dp.stepper("etdrk4", dp.from_matrix(np.triu(np.ones((2, 2))), name="A"), 0.1),
         VALUE,
         "stepper(etdrk4) needs a separable operator that can be diagonalised, got "
@@ -186,6 +191,16 @@ TABLE = [
         lambda: dp.stepper("rk4", lambda x, p: {"w": x["v"], "u": x["u"]}, 0.6)({"u": U, "v": U}),
         SHAPE,
         "a rate must have the names of the state, ['u', 'v'], got ['w', 'u']",
+    ),
+    (
+        lambda: dp.stepper("rk4", lambda x, p: (x["v"], x["u"]), 0.6)({"u": U, "v": U}),
+        SHAPE,
+        "a rate must have the names of the state, ['u', 'v'], got tuple",
+    ),
+    (
+        lambda: dp.stepper("rk4", lambda x, p: (x[0], [*x[1].values()]), 0.6)((U, {"u": U, "v": U})),
+        SHAPE,
+        "a rate must have the names of the state, ['u', 'v'], got list",
     ),
     (
         lambda: dp.stepper("tr_bdf2", dp.laplacian(dp.Grid(3)), 0.6)(U),

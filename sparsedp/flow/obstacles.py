@@ -23,7 +23,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.conditions import no_slip, resolve
-from sparsedp.fields import check_finite, field_array, is_number
+from sparsedp.fields import check_finite, check_number, field_array
 from sparsedp.flow.momentum import face_laplacian, momentum_fluxes, stresses
 from sparsedp.flow.setup import pressure_conditions
 from sparsedp.grid import check_grid, finite_number, per_axis
@@ -75,7 +75,7 @@ def forces(grid, solid=None, boundary=no_slip, solid_boundary=no_slip, cells=Non
     TypeError
         If they are not boolean, or a condition is none of a flow; on use, if the viscosity is no number.
     ValueError
-        If neither `solid` nor `cells` is given, or `about` is not finite.
+        If neither `solid` nor `cells` is given, or `about` is not finite; on use, if the viscosity is < 0.
 
     Notes
     -----
@@ -200,8 +200,7 @@ class Forces(Remade):
         return Forces, self.made
 
     def __call__(self, v, p, viscosity):
-        if not is_number(plain(viscosity)):  # an array would be spread over force and torque
-            raise TypeError(f"forces takes one real number as viscosity, got {plain(viscosity)!r}")
+        check_number("the viscosity of forces", plain(viscosity), ">= 0")  # an array would be spread over the torque
         return viscosity * self.viscous(v) + self.pressure(p) - self.gain(self.carried(v) * self.carrier(v))
 
 
@@ -213,5 +212,5 @@ def _total(grid, chosen, point):
         a, b = (c + 1) % 3, (c + 2) % 3
         forward, backward = grid.face_centres(b)[a] - point[a], grid.face_centres(a)[b] - point[b]
         rows.append({b: forward * weights[b], a: -backward * weights[a]})
-    matrix = [[row.get(c, 0.0 * w).reshape(1, -1) for c, w in enumerate(weights)] for row in rows]
-    return Operator(Matrix(sp.csr_array(np.block(matrix))), grid.faces, Space(len(rows)), "forces")
+    matrix = [grid.join(*(row.get(c, 0.0) for c in range(dim))) for row in rows]
+    return Operator(Matrix(sp.csr_array(np.array(matrix))), grid.faces, Space(len(rows)), "forces")

@@ -8,7 +8,7 @@ from sparsedp.fields import check_finite, is_number, rounded_down, surely_finite
 from sparsedp.integrators.adaptive import Adaptive
 from sparsedp.integrators.exponential import Exponential
 from sparsedp.integrators.leapfrog import Leapfrog, Staggered
-from sparsedp.integrators.problem import Problem, like, positive
+from sparsedp.integrators.problem import Problem, like, number
 from sparsedp.integrators.radau import Radau
 from sparsedp.integrators.runge_kutta import EXPLICIT, IMPLICIT, Explicit, Linear, Nonlinear, Polynomial
 from sparsedp.recipe import Remade
@@ -69,9 +69,9 @@ def stepper(
         Length of a step [time], > 0. To differentiate in dt inside a loop write ``lambda params: params["dt"]``.
     linear : Operator or (Operator, coefficient), or a tree of these like the state, optional
         A term c L u beside the rate; `coefficient` is a number >= 0 or a function of params. Each field of a tree has
-        its own, or None: ``{"u": (L, 0.1), "v": (L, lambda p: p["D"]), "w": None}``. A pair with a number is one term,
-        so for a state of two fields, the second without one, write ``[L, None]``. Also L may be ``-1.0 * L @ L``, a
-        `function` of an operator, or a `diagonal`. Set-ups are shared by fields with the same L and c.
+        its own, or None (or 0): ``{"u": (L, 0.1), "v": (L, lambda p: p["D"]), "w": None}``. A pair with a number is one
+        term, so for a state of two fields, the second without one, write ``[L, None]``. Also L may be ``-1.0 * L @ L``,
+        a `function` of an operator, or a `diagonal`. Set-ups are shared by fields with the same L and c.
     source : callable, optional
         ``source(params)`` or ``source(params, t)``: a term that does not depend on u, such as nu D(B(values)) of walls
         that move, with B a `lift`; implicit methods keep their order with it, imex and etdrk4 too. A problem of
@@ -155,7 +155,7 @@ def stepper(
         raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
     if not all(map(_is_floor, leaves(floor))):
         raise ValueError(f"floor must hold numbers >= 0, in the units of u, got {floor!r}; write for example 1e-3")
-    dt = dt if callable(dt) else positive(dt, "dt")
+    dt = dt if callable(dt) else number(dt, "dt", "> 0")
     problem = _problem(method, given)
     if method == "radau":
         return Step(method, problem, dt, Radau(problem, jacobian, tolerance, given["floor"], settings), [], given)
@@ -288,7 +288,7 @@ class Step(Remade):
         return like(self.scheme.back(state, params, self._length(params)), state)
 
     def _length(self, params):
-        return positive(self.dt(params), "dt") if callable(self.dt) else self.dt
+        return number(self.dt(params), "dt", "> 0") if callable(self.dt) else self.dt
 
     def check_reversible(self):
         """Refuse a step that `back` cannot turn round."""
@@ -316,9 +316,9 @@ class Step(Remade):
         """Refuse arguments that are not finite."""
         for what, tree in (("state", state), ("params", params)):
             found = leaves(tree)
-            for number, leaf in enumerate(found):
+            for count, leaf in enumerate(found, 1):
                 if is_variable(leaf):
-                    place = f"part {number + 1} of the {what}" if len(found) > 1 else f"the {what}"
+                    place = f"part {count} of the {what}" if len(found) > 1 else f"the {what}"
                     check_finite(f"{place} of {self.name}", np.asarray(plain(leaf)))
 
     def __repr__(self):

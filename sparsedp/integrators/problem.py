@@ -7,14 +7,14 @@ import inspect
 import numpy as np
 
 from sparsedp.constants import frozen
-from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_takes, is_number
+from sparsedp.errors import ShapeError
+from sparsedp.fields import check_number, check_takes
 from sparsedp.operator import Operator
 from sparsedp.space import fits
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tree import copied, flatten, keys, leaves, leaves_like, mapped, subscript
 
-__all__ = ["Problem", "combine", "later", "like", "positive", "untraced"]
+__all__ = ["Problem", "combine", "later", "like", "number", "untraced"]
 
 
 def combine(u, *pairs):
@@ -48,13 +48,23 @@ def combine(u, *pairs):
 
 def _of_fields(tree, u):
     """The leaves of a rate, one for each of the state; broadcasting one into another would hide a mistake."""
-    if isinstance(tree, dict) and isinstance(u, dict) and tree.keys() != u.keys():
-        raise ShapeError(f"a rate must have the names of the state, {[*u]}, got {[*tree]}")
+    _check_names(tree, u)
     found = leaves_like(tree, u)
     if _shapes(found) != (shapes := _shapes(leaves(u))):
         given, wanted = (", ".join(map(str, words)) or "nothing" for words in (_shapes(found), shapes))
         raise ShapeError(f"a rate must have the shape of the state, {wanted}, got {given}")
     return found
+
+
+def _check_names(tree, u):
+    """Refuse a rate that would meet fields with names by its order."""
+    names, wanted = keys(tree), keys(u)
+    if isinstance(tree, dict) != isinstance(u, dict) or (isinstance(u, dict) and names != wanted):
+        both = ([*x] if isinstance(x, dict) else type(x).__name__ for x in (u, tree))
+        raise ShapeError("a rate must have the names of the state, {}, got {}".format(*both))
+    for name in wanted or ():
+        if name in (names or ()):
+            _check_names(tree[name], u[name])
 
 
 def _shapes(found):
@@ -108,10 +118,8 @@ class Stiff:
     def coefficient(self, params):
         """The number c >= 0, traced or not."""
         given = self._coefficient
-        c = number(given(params) if callable(given) else given, self.name)
-        if plain(c) < 0:
-            raise ValueError(f"{self.name} must be >= 0, got {plain(c):g}; put the sign into the operator")
-        return c
+        given = given(params) if callable(given) else given
+        return number(given, self.name, ">= 0", "; put the sign into the operator")
 
 
 def _terms(linear, place):
@@ -223,7 +231,9 @@ class Problem:
         rest = [self.explicit(u, params, t), self.given(params, t)]
         if self.stiff:
             rest.insert(0, self.on_fields(lambda L, c, leaf: (L(leaf) if L else 0.0 * leaf) * c, 1.0, params, u))
-        first, *others = [part if keys(u) is None else _of_fields(part, u) for part in rest if part is not None]
+        first, *others = [part for part in rest if part is not None]
+        if keys(u) is not None:
+            first = flatten(u)[1](_of_fields(first, u))
         return combine(first, *((1.0, part) for part in others))
 
 
@@ -258,20 +268,7 @@ def _without_trace(rate, u, args):
         return error
 
 
-def number(value, name):
+def number(value, name, sign="", advice=""):
     """One finite real number, traced, or as a float, so that a float32 state stays one."""
-    known = plain(value)
-    if not is_number(known):
-        given = f"an array of shape {np.shape(known)}" if isinstance(known, np.ndarray) else repr(known)
-        raise TypeError(f"{name} must be one real number, got {given}")
-    if not np.isfinite(known):
-        raise NonFiniteError(f"{name} must be finite, got {known}")
-    return value if isbox(value) else float(known)
-
-
-def positive(value, name):
-    """A number > 0, traced or not."""
-    value = number(value, name)
-    if plain(value) <= 0:
-        raise ValueError(f"{name} must be > 0, got {plain(value):g}")
-    return value
+    check_number(name, plain(value), sign, advice)
+    return value if isbox(value) else float(value)

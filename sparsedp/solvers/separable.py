@@ -34,6 +34,7 @@ __all__ = [
     "Separable",
     "SpectralFunction",
     "Spectrum",
+    "diagonalised",
     "eigenbasis",
     "separable_engine",
     "spectrum",
@@ -466,3 +467,11 @@ def _squared(structure):
         return None  # another polynomial in L, or none
     found = spectrum(L)
     return None if found is None else (found, (a * found.eigenvalues + b) * found.eigenvalues + rest.shift)
+
+
+def diagonalised(op, name, advice=""):
+    """(Spectrum, eigenvalues) of an operator that is separable, or made of such ones; `name` needs them."""
+    found = eigenbasis(op.structure)
+    if found is None:
+        raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}{advice}")
+    return found

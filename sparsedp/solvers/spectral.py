@@ -3,11 +3,11 @@
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_function, is_number
+from sparsedp.fields import check_function, check_number
 from sparsedp.operator import Operator
-from sparsedp.solvers.separable import SpectralFunction, eigenbasis
+from sparsedp.solvers.separable import SpectralFunction, diagonalised
 
-__all__ = ["diagonalised", "exponential", "function", "power"]
+__all__ = ["exponential", "function", "power"]
 
 
 def exponential(op, time=1.0):
@@ -46,7 +46,7 @@ def exponential(op, time=1.0):
     [2. 2.]
     """
     axes, values = diagonalised(op, "exponential")
-    _check_number("exponential", "time", time, 0.1)
+    check_number("time of exponential", time)
     with np.errstate(over="ignore"):
         weights = np.exp(time * values)
     name = f"exp({time:g} * {op.name})"
@@ -85,7 +85,7 @@ def power(op, exponent):
     [-1. -1.  2.]
     """
     axes, values = diagonalised(op, "power")
-    _check_number("power", "exponent", exponent, 0.5)
+    check_number("exponent of power", exponent)
     if exponent != int(exponent) and np.any(values < 0):
         raise ValueError(f"{op.name} has eigenvalues down to {values.min():.1e}; a fractional power needs them >= 0")
     zero = values == 0
@@ -144,22 +144,6 @@ def function(op, f):
         raise TypeError(f"function needs f to give real numbers, got dtype {weights.dtype}")
     name = f"f({op.name})"
     return _function(op, axes, weights.astype(float), name, f"{name} holds NaN or infinity; check f at its eigenvalues")
-
-
-def diagonalised(op, name, advice=""):
-    """(Spectrum, eigenvalues) of an operator that is separable, or made of such ones; `name` needs them."""
-    found = eigenbasis(op.structure)
-    if found is None:
-        raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}{advice}")
-    return found
-
-
-def _check_number(name, what, number, example):
-    """Refuse what is not one finite number."""
-    if not is_number(number):
-        raise TypeError(f"{name} needs one real number as {what}, got {number!r}; write for example {example}")
-    if not np.isfinite(number):
-        raise NonFiniteError(f"{name} needs a finite {what}, got {number}")
 
 
 def _function(op, axes, weights, name, refusal):
