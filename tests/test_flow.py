@@ -256,9 +256,9 @@ def test_nothing_flows_in_a_closed_line_of_cells(shape):
 
 def test_what_is_refused():
     grid = dp.Grid((4, 4))
-    with pytest.raises(ValueError, match="flow_step needs dt > 0, got 0; write a number"):
+    with pytest.raises(ValueError, match="dt of flow_step must be > 0, got 0"):
         dp.flow_step(grid, 0)
-    with pytest.raises(ValueError, match="flow_step needs viscosity >= 0, got -1.0; write a number"):
+    with pytest.raises(ValueError, match="viscosity of flow_step must be >= 0, got -1"):
         dp.flow_step(grid, 0.1, -1.0)
     rest = np.zeros(grid.faces.size)
     with pytest.raises(
@@ -271,13 +271,13 @@ def test_what_is_refused():
         "viscosity=lambda params: ...",
     ):
         dp.value_and_grad(lambda nu: anp.sum(dp.flow_step(grid, 0.1, nu).start(rest)["v"]))(0.1)
-    with pytest.raises(ValueError, match="the viscosity in flow_step must be a finite number >= 0, got -1.0"):
+    with pytest.raises(ValueError, match="the viscosity of flow_step must be >= 0, got -1"):
         dp.flow_step(grid, 0.1, lambda nu: nu).start(rest, -1.0)
     with pytest.raises(
         dp.errors.ShapeError, match="flow_step takes a dict of v, p and a as its state; make it with step.start"
     ):
         dp.flow_step(grid, 0.1)({"v": rest})
-    with pytest.raises(FINITE, match="flow_step needs a finite dt, got nan; write a number"):
+    with pytest.raises(FINITE, match="dt of flow_step must be finite, got nan"):
         dp.flow_step(grid, np.nan)
     with pytest.raises(
         dp.errors.UnstableStepError,

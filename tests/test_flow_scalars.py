@@ -134,7 +134,7 @@ def test_refusals():
         ValueError, match="scalar 'heat' of flow_step needs a dict of diffusivity, boundary, values, source"
     ):
         dp.flow_step(grid, 0.1, scalars={"heat": 0.1})
-    with pytest.raises(ValueError, match="flow_step needs diffusivity of 'heat' >= 0, got -1.0; write a number"):
+    with pytest.raises(ValueError, match="diffusivity of 'heat' of flow_step must be >= 0, got -1"):
         dp.flow_step(grid, 0.1, scalars={"heat": {"diffusivity": -1.0}})
     with pytest.raises(
         dp.errors.UnstableStepError, match="flow_step is unstable for diffusivity of 'heat' = 9 with dt = 1:"

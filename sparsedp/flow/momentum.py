@@ -65,7 +65,7 @@ def face_laplacian(grid, boundary=no_slip, solid=None, solid_boundary=no_slip):
     array([ 0.,  0., -4., -4.,  0.,  0.,  0.,  0.,  0.,  0.,  0.,  0.])
     """
     sides = resolve(grid, boundary, no_slip)
-    free, whole = Mask(_free(grid, sides, solid)), stresses(grid, sides, solid, solid_boundary)
+    free, whole = Mask(free_faces(grid, sides, solid)), stresses(grid, sides, solid, solid_boundary)
     structure = compose(free, whole) if solid is None else Matrix(free.explicit() @ whole.explicit())
     return Operator(structure, grid.faces, grid.faces, "face_laplacian")
 
@@ -111,7 +111,7 @@ def face_lift(grid, boundary=no_slip):
                     blocks[c, len(parts)] = along(a, grid.dim, factor)
                     parts.append(tuple(1 if b == a else n for b, n in enumerate(grid.face_shape(c))))
     walls = Space(None, "moving walls", grid, parts)
-    structure = compose(Mask(_free(grid, sides, None)), Kronecker(grid.faces.parts, parts, blocks))
+    structure = compose(Mask(free_faces(grid, sides, None)), Kronecker(grid.faces.parts, parts, blocks))
     return Operator(structure, walls, grid.faces, "face_lift")
 
 
@@ -159,7 +159,7 @@ def convection(grid, boundary=no_slip, solid=None):
     """
     sides = resolve(grid, boundary, no_slip)
     A, B, gain = momentum_fluxes(grid, sides)
-    C = Operator(compose(Mask(_free(grid, sides, solid)), gain.structure), gain.domain, grid.faces, "gain")
+    C = Operator(compose(Mask(free_faces(grid, sides, solid)), gain.structure), gain.domain, grid.faces, "gain")
 
     def convect(v, w):
         return C(A(v) * B(w))
@@ -214,7 +214,7 @@ def _conditions(pair):
     return None if pair is None else tuple(condition.along for condition in pair)
 
 
-def _free(grid, sides, solid):
+def free_faces(grid, sides, solid):
     """Faces whose velocity is found: not on closed walls or inflows, and not at an obstacle."""
     return faces_that(grid, sides, solid, lambda condition: condition == outflow)
 

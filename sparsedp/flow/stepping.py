@@ -34,20 +34,19 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.conditions import neumann, no_slip, outflow, resolve
-from sparsedp.constants import constant, frozen
-from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_finite, check_function, check_takes, is_number, rounded_down
-from sparsedp.flow.momentum import convection, face_laplacian
+from sparsedp.conditions import neumann, no_slip
+from sparsedp.constants import frozen
+from sparsedp.errors import DerivativeError, ShapeError, UnstableStepError
+from sparsedp.fields import check_finite, check_function, check_number, check_takes, rounded_down
+from sparsedp.flow.momentum import convection, face_laplacian, free_faces
 from sparsedp.flow.pressure import projection
-from sparsedp.flow.setup import faces_that
 from sparsedp.operators.boundary import identity, lift, mask
 from sparsedp.operators.difference import divergence, gradient, laplacian
 from sparsedp.operators.transfer import average
 from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import inverse
 from sparsedp.tape import dtype_of, isbox, plain
-from sparsedp.tree import mapped
+from sparsedp.tree import copied, mapped
 
 __all__ = ["FlowStep", "flow_step"]
 
@@ -148,6 +147,7 @@ def flow_step(
     >>> bool(np.allclose(state["v"], 1.0))
     True
     """
+    given = copied(locals())  # the caller may change them
     _check_constant("dt", dt, "> 0")
     if not callable(viscosity):
         _check_constant("viscosity", viscosity, ">= 0")
@@ -157,26 +157,25 @@ def flow_step(
         raise TypeError(
             f'flow_step takes a dict of scalars, got {type(scalars).__name__}; write scalars={{"heat": {{...}}}}'
         )
-    if force is not None:
-        example = f"force=lambda v, {'s, ' * bool(scalars)}params: ..."
-        check_function("flow_step", force, example)
-        check_takes("flow_step", force, 3 if scalars else 2, example)
+    _check_function(force, 3 if scalars else 2, f"force=lambda v, {'s, ' * bool(scalars)}params: ...")
     if walls is not None:
         _check_faces("walls", grid, walls, "write face_lift(grid, boundary)(values)")
     if friction is not None and implicit:
         raise ValueError("flow_step takes no friction beside implicit viscosity; write implicit=False")
     if unstable not in ("raise", "allow"):
         raise ValueError(f"unstable must be 'raise' or 'allow', got {unstable!r}")
-    for name, given in (scalars or {}).items():
-        if not isinstance(given, dict) or not given.keys() <= set(SCALAR):
-            raise ValueError(f"scalar {name!r} of flow_step needs a dict of {', '.join(SCALAR)}, got {given!r}")
-        _check_constant(f"diffusivity of {name!r}", given.get("diffusivity", 0.0), ">= 0")
-        if given.get("source") is not None:
-            check_function("flow_step", given["source"], "source=lambda s, params: ...")
-            check_takes("flow_step", given["source"], 2, "source=lambda s, params: ...")
-    viscosity = viscosity if callable(viscosity) else float(viscosity)
-    given = grid, float(dt), viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
-    return FlowStep(*given, scalars or {}, unstable, friction)
+    for name, parts in (scalars or {}).items():
+        if not isinstance(parts, dict) or not parts.keys() <= set(SCALAR):
+            raise ValueError(f"scalar {name!r} of flow_step needs a dict of {', '.join(SCALAR)}, got {parts!r}")
+        _check_constant(f"diffusivity of {name!r}", parts.get("diffusivity", 0.0), ">= 0")
+        _check_function(parts.get("source"), 2, "source=lambda s, params: ...")
+    return FlowStep(given)
+
+
+def _check_function(function, count, example):
+    if function is not None:
+        check_function("flow_step", function, example)
+        check_takes("flow_step", function, count, example)
 
 
 def _check_faces(name, grid, values, write):
@@ -191,59 +190,38 @@ def _check_constant(name, number, least):
             f"flow_step needs a constant {name}, got a traced one; a derivative in the viscosity takes "
             "viscosity=lambda params: ..."
         )
-    if not is_number(number) or number < 0 or (least == "> 0" and number == 0):
-        raise ValueError(f"flow_step needs {name} {least}, got {number!r}; write a number")
-    if not np.isfinite(number):
-        raise NonFiniteError(f"flow_step needs a finite {name}, got {number}; write a number")
+    check_number(f"{name} of flow_step", number, least)
+
+
+def _remade(given):
+    return flow_step(**given)
 
 
 class FlowStep(Remade):
-    """A step of incompressible flow, made by `flow_step`. What the scene does not need is None."""
+    """A step of incompressible flow, made by `flow_step` of what is given. What the scene does not need is None."""
 
-    def __init__(
-        self,
-        grid,
-        dt,
-        viscosity,
-        force,
-        boundary,
-        solid,
-        implicit,
-        convective,
-        walls,
-        solid_boundary,
-        scalars,
-        unstable,
-        friction,
-    ):
-        self.grid, self.dt, self.force = grid, dt, force
+    def __init__(self, given):
+        self.given = given
+        grid, boundary, solid, viscosity = (given[word] for word in ("grid", "boundary", "solid", "viscosity"))
+        self.grid, self.dt, self.force, self.friction = grid, float(given["dt"]), given["force"], given["friction"]
+        self.strict, self.implicit = given["unstable"] == "raise", given["implicit"]
         self.project = projection(grid, solid, boundary)
-        setup = self.project.structure.setup
-        _, solid, boundary, _ = setup.made  # copies, as of the walls: the caller may change them
-        walls, scalars, self.friction = constant((walls, scalars, friction))
-        given = grid, dt, viscosity, force, boundary, solid, implicit, convective, walls, solid_boundary
-        self.made, self.strict, self.implicit = (
-            (*given, scalars, unstable, self.friction),
-            unstable == "raise",
-            implicit,
-        )
         self.pressure, self.divergence = self.project.pressure, divergence(grid)
+        setup = self.project.structure.setup
         self.slope = gradient(grid, setup.pressure_conditions, solid)
         self.open = mask(grid.faces, setup.open)
         # A force is for faces that are free: an implicit viscosity would carry it from the others into the fluid.
-        self.free = mask(
-            grid.faces, faces_that(grid, resolve(grid, boundary, no_slip), solid, lambda side: side == outflow)
-        )
-        self.convect: Any = convection(grid, boundary, solid) if convective else None
+        self.free = mask(grid.faces, free_faces(grid, setup.sides, solid))
+        self.convect: Any = convection(grid, boundary, solid) if given["convective"] else None
         self.viscous: Any = None
         if viscosity:
-            op = face_laplacian(grid, boundary, solid, solid_boundary)
-            self.viscous = Diffusion("viscosity", viscosity, op, walls, self)
-        self.scalars = {name: Scalar(name, solid, self, **given) for name, given in scalars.items()}
+            op = face_laplacian(grid, boundary, solid, given["solid_boundary"])
+            self.viscous = Diffusion("viscosity", viscosity, op, given["walls"], self)
+        self.scalars = {name: Scalar(name, solid, self, **parts) for name, parts in (given["scalars"] or {}).items()}
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
-        return FlowStep, self.made
+        return _remade, (self.given,)
 
     def start(self, v, params=None, s=None):
         """Velocity and scalars -> the first state: made incompressible, the pressure still unknown."""
@@ -378,8 +356,7 @@ class Diffusion:
         number = self.number
         if callable(number):
             number = number(params)
-            if not is_number(plain(number)) or not 0 <= plain(number) < np.inf:
-                raise ValueError(f"the viscosity in flow_step must be a finite number >= 0, got {plain(number)}")
+            check_number("the viscosity of flow_step", plain(number), ">= 0")
             self._check_stable(float(plain(number)))
         return number * (self.op(u) if self.held is None else self.op(u) + self.held)
 
