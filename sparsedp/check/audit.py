@@ -54,7 +54,7 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
         Random directions. Structured ones come on top: each leaf alone, constant, the gradient itself,
         its largest entry.
     rng : None, int or numpy Generator
-        Source of the directions; default a fixed seed of its own.
+        Source of the directions; default: a fixed seed.
     quick : bool
         One random direction and the gradient itself, for a loss that takes minutes. What was not looked at stands
         in the reason, also where it agrees: other random directions, single leaves and entries, complex steps, the
@@ -192,11 +192,11 @@ def _look_beside(trials, judged):
 # ------------------------------------------------------------ other ways to a derivative
 
 
-def _modes(found, tolerance):
+def _modes(modes, tolerance):
     """Gap of forward and reverse mode -> doubt, or a note."""
-    if found is None:
+    if modes is None:
         return "note", "forward mode: not available, a rule has no JVP"
-    gap, allowed = found
+    gap, allowed = modes
     if gap <= allowed:
         return "note", f"forward mode: agrees with reverse mode to {gap:.0e}"
     reason = f"forward and reverse mode differ by {gap:.1e}"
@@ -255,7 +255,7 @@ class Audit(Result):
     digits : int or None
         Digits that are proved, in the worst direction; None unless it agrees.
     culprit : str or None
-        Name of the first operator, rule or function of autograd on the tape whose own VJP or JVP is at
+        Name of the first operator, rule or function of autograd on the tape whose VJP or JVP is at
         fault, when the verdict is "disagrees"; a note says what is wrong with it. None when each is right:
         then a value bypasses the tape, or the gradient was given.
     hessian : "agrees", "disagrees", "inconclusive" or None

@@ -1,6 +1,6 @@
 """Who is at fault when a gradient is wrong: each call on the tape, examined alone at the values it met.
 
-The loss of a call f is <g, f(x)> with a fixed random g. Its gradient by the rule's own VJP is judged as that of
+The loss of a call f is <g, f(x)> with a fixed random g. Its gradient by the rule's VJP is judged as that of
 any loss. An Operator is linear: <A u, g> - <u, A^T g> and A (u + v) - A u - A v tell all, without differences.
 """
 
@@ -25,7 +25,7 @@ NOBODY = "every call on the tape is right at the values it met; a value may bypa
 
 
 def culprit_of(loss, point):
-    """Loss and point -> (name of the first call on the tape whose own derivative is at fault or None, sentence).
+    """Loss and point -> (name of the first call on the tape whose derivative is at fault or None, sentence).
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def culprit_of(loss, point):
         only when none of those is at fault.
     """
     rng = generator(None)
-    cleared: set[int] = set()  # Operators that were found right
+    cleared: set[int] = set()  # Operators that are right
     with np.errstate(all="ignore"):
         with calls_seen() as nodes:
             value_and_grad(loss)(point.fresh())
@@ -69,12 +69,12 @@ def _fault(node, cleared, rng):
         return None
     with recording() as calls:
         pullback(node.again, node.values)[1](np.ones_like(node.value))
-    actors = [actor for found in calls.actors.values() for actor in found.values() if isinstance(actor, Operator)]
+    actors = [actor for group in calls.actors.values() for actor in group.values() if isinstance(actor, Operator)]
     return next(filter(None, (_of_operator(op, cleared, rng) for op in actors)), (node.name, reason))
 
 
 def _of_operator(op, cleared, rng):
-    """A fault of an Operator that was not found right before; of an inverse, rather of the operator that it inverts."""
+    """A fault of an Operator that is not cleared yet; of an inverse, rather of the operator that it inverts."""
     if id(op) in cleared:
         return None
     cleared.add(id(op))

@@ -43,7 +43,7 @@ NEGLIGIBLE = 1e-6  # of the largest derivative: an open direction below it does 
 SMALL = 1e-3  # the same for a direction that is resolved to a digit at least
 
 MODES = 1e-10  # forward and reverse mode differ by rounding
-SOLVED = 1e-6  # by more, when there are solves inside: each mode ends at its own residual
+SOLVED = 1e-6  # by more, when there are solves inside: each mode ends at another residual
 
 # Taylor orders.
 FIRST = 0.05  # order 1 is 1 to within this
@@ -117,7 +117,7 @@ def words(e):
     )  # fmt: skip
 
 
-# What is known at the end -> verdict: the first group with a member decides, by the member that counts most.
+# The evidence at the end -> verdict: the first group with a member decides, by the member that counts most.
 VERDICTS = (
     (("unsound",), "inconclusive"),
     (("broken",), "disagrees"),
@@ -130,13 +130,13 @@ VERDICTS = (
 def verdict(judged, doubts):
     """Judgements of all directions and doubts, pairs of word and reason -> (verdict, reason in words)."""
     largest = max((one.scale for one in judged), default=0.0)
-    known = [(word, reason, inf) for word, reason in doubts]
-    known += [
+    evidence = [(word, reason, inf) for word, reason in doubts]
+    evidence += [
         (one.word, f"along {one.direction}: {one.note}", one.share if one.wrong else 0.0)
         for one in judged if not _negligible(one, largest)
     ]  # fmt: skip
     for words, outcome in VERDICTS:
-        members = [pair for word, *pair in known if word in words]
+        members = [pair for word, *pair in evidence if word in words]
         if members:
             return outcome, max(members, key=lambda pair: pair[1])[0]
     proved = {one.word for one in judged} & set(PROVED)
@@ -195,7 +195,7 @@ class Judgement(Result):
     __repr__ = object.__repr__
 
     def learn(self, **values):
-        """What is known later, by more than the levels."""
+        """Evidence that comes later, from more than the levels."""
         self.__dict__.update(values)
 
 
@@ -203,18 +203,18 @@ class Judgement(Result):
 def judgement(line):
     """Line -> what its levels prove."""
     notes = "; ".join(sorted({level.note for level in line.levels} - {""})) or "the sweep has too few steps"
-    known = {"line": line, "direction": line.name, "slope": line.slope, "used": len(line.usable), "refusals": notes}
-    known |= {"silent": max(line.silent, default=0.0), "scale": np.float64(max(abs(line.slope), line.typical))}
+    evidence = {"line": line, "direction": line.name, "slope": line.slope, "used": len(line.usable), "refusals": notes}
+    evidence |= {"silent": max(line.silent, default=0.0), "scale": np.float64(max(abs(line.slope), line.typical))}
     if len(line.usable) >= LEVELS:
-        known |= _read(line)
-        known |= _estimate(**known)
-        known |= _compared(**known)
-        known |= _taylor(**known)
-    found = Judgement(**known)
-    found.learn(difference=found.slope + found.gap, resolution=found.bar / found.scale)
-    word, note = first(words, found)
-    found.learn(word=word, note=note)
-    return found
+        evidence |= _read(line)
+        evidence |= _estimate(**evidence)
+        evidence |= _compared(**evidence)
+        evidence |= _taylor(**evidence)
+    result = Judgement(**evidence)
+    result.learn(difference=result.slope + result.gap, resolution=result.bar / result.scale)
+    word, note = first(words, result)
+    result.learn(word=word, note=note)
+    return result
 
 
 def _read(line):
@@ -240,32 +240,32 @@ def _estimate(line, t, m, kinks, noise, jitter, scale, slope, curvature, **_):
     spread, least = line.point.eps, NOISY if line.trials.solved else AGREED
     floor = 8 * spread * curvature + 4 * spread * line.typical
     agreed = max(float(np.clip(PER_NOISE * line.trials.eps * jitter, least, NOISY)), 300 * spread)
-    bends, found = _estimates(t, kinks, 1, 2 * noise), []
+    bends, estimates = _estimates(t, kinks, 1, 2 * noise), []
     for gap, bar, index in _estimates(t, m, 2, noise):
         # The jump of the one-sided derivatives around the level, and its bar; 0 if it goes to 0.
         jump, error = next((pair[:2] for pair in bends if abs(pair[2] - index) <= 1), (0.0, 0.0))
         size = max(scale, abs(slope + gap))
         split = abs(jump) * (abs(jump) > max(FAR * error, agreed * size))
-        found.append({
+        estimates.append({
             "gap": gap, "bar": bar + floor, "step": float(t[index]), "scale": size, "split": split, "uncertain": error,
             "floor": floor, "agreed": agreed, "doubtful": bool(split) or bar > RESOLVED * size,
             # A derivative is a limit, not a passing plateau: all finer levels agree with it.
             "passing": np.any((np.abs(m - gap) > bar + 6 * noise / t)[index + 1 :]),
         })  # fmt: skip
     # Away from kinks the first, with the smallest bar; of passing ones the last.
-    lasting = [one for one in found if not one["passing"]] or found[-1:]
+    lasting = [one for one in estimates if not one["passing"]] or estimates[-1:]
     return min(lasting, key=lambda one: one["doubtful"])
 
 
 def _estimates(t, values, power, noise):
     """Estimates of v0 in values(t) = v0 + c t^power, best first: (estimate, bar, index of its finest level)."""
     ratio = (t[:-1] / t[1:]) ** power
-    found: list = []
+    estimates: list = []
     for series in (values, (ratio * values[1:] - values[:-1]) / (ratio - 1)):
         jumps, start = np.abs(np.diff(series)), values.size - series.size + 1
         bars = np.maximum(jumps[:-1], jumps[1:]) + 2 * (noise / t)[start:-1]
-        found += zip(series[1:-1], bars, range(start, values.size - 1))
-    return sorted(found, key=lambda estimate: estimate[1])
+        estimates += zip(series[1:-1], bars, range(start, values.size - 1))
+    return sorted(estimates, key=lambda estimate: estimate[1])
 
 
 def _compared(line, gap, bar, scale, split, jitter, agreed, curvature, **_):
@@ -298,8 +298,8 @@ def _taylor(t, changes, rests, kinks, noise, slope, size, bar, scale, step, clos
     clear, near, even, climb = CLEAR * noise, t <= NEARBY * step, np.abs(kinks * t) / 2, abs(slope) * t
     change, rest = both(changes), both(rests)
     usable = (rest, rest >= clear + CLEAR * t * size * (close or zero)), (even, even >= clear)
-    found = [orders(t, values, some & place) for place in (near, t > 0) for values, some in usable]
-    used2, rates2 = max(found, key=lambda one: min(one[0], FEWEST))  # the first of those with enough
+    candidates = [orders(t, values, some & place) for place in (near, t > 0) for values, some in usable]
+    used2, rates2 = max(candidates, key=lambda one: min(one[0], FEWEST))  # the first of those with enough
     seen, climbs = near & (change >= clear), climb >= LINEAR * even
     used1, rates1 = orders(t, change, seen & climbs)
     still = bar + size <= VANISHED * scale and not np.any(seen | (climb >= clear))
@@ -322,11 +322,11 @@ def both(sides):
 
 def orders(t, remainder, usable, most=MOST):
     """(number, orders) of the finest usable levels; the two levels of a pair are at least a factor APART."""
-    levels, found = np.flatnonzero(usable)[-most:], []
+    levels, rates = np.flatnonzero(usable)[-most:], []
     for coarse in levels:
         for fine in levels[t[levels] * APART <= t[coarse]][:1]:
-            found.append(float(np.log(remainder[coarse] / remainder[fine]) / np.log(t[coarse] / t[fine])))
-    return len(levels), found
+            rates.append(float(np.log(remainder[coarse] / remainder[fine]) / np.log(t[coarse] / t[fine])))
+    return len(levels), rates
 
 
 # ------------------------------------------------------------ all directions
@@ -380,20 +380,20 @@ def at_kinks(judged):
     return "outside" in words or {"disagrees", "kink"} <= words or any(map(_bent, judged))
 
 
-def _bent(found):
+def _bent(result):
     """Whether the differences along two parts of a direction do not add up to those along the whole.
 
     Then there is no derivative, though every line through x is straight: x^3 / (x^2 + y^2) at 0, or a limited slope
     where neighbours are equal.
     """
-    line, part = found.line, found.line.direction.copy()
+    line, part = result.line, result.line.direction.copy()
     entries = np.flatnonzero(part)
-    if found.word != "disagrees" or entries.size < 2:
+    if result.word != "disagrees" or entries.size < 2:
         return False
     part[entries[::2]] = 0.0
     parts = [measured(Line(line.name, d, line.trials), False) for d in (part, line.direction - part)]
-    gap = found.difference - sum(one.difference for one in parts)
-    return abs(gap) > max(SEES * found.size, FAR * (found.bar + sum(one.bar for one in parts)))
+    gap = result.difference - sum(one.difference for one in parts)
+    return abs(gap) > max(SEES * result.size, FAR * (result.bar + sum(one.bar for one in parts)))
 
 
 def forward_mode(loss, judged):
@@ -430,53 +430,53 @@ def measured(line, close):
     """
     extend = line.trials.extend
     line.sweep(line.trials.steps)
-    found = judgement(line)
-    if extend and found.word in ("few", "rough") and found.step > 0:  # more levels between those there are
-        line.sweep(found.step * BETWEEN)
-        found = judgement(line)
-    if extend and found.word != "vanishes" and found.resolution > max(GOAL, 1e4 * line.point.eps):
-        line.sweep(FINER * (not found.jitter <= ROUNDING) + COARSER * (not found.jitter > ROUNDING))
-        found = min(judgement(line), found, key=lambda one: one.resolution)
-    if extend and close and found.close and found.jitter > SMOOTH:
+    result = judgement(line)
+    if extend and result.word in ("few", "rough") and result.step > 0:  # more levels between those there are
+        line.sweep(result.step * BETWEEN)
+        result = judgement(line)
+    if extend and result.word != "vanishes" and result.resolution > max(GOAL, 1e4 * line.point.eps):
+        line.sweep(FINER * (not result.jitter <= ROUNDING) + COARSER * (not result.jitter > ROUNDING))
+        result = min(judgement(line), result, key=lambda one: one.resolution)
+    if extend and close and result.close and result.jitter > SMOOTH:
         line.sweep(RIPPLED)
-        _see_ripple(found, judgement(line))
-    return found
+        _see_ripple(result, judgement(line))
+    return result
 
 
-def _see_ripple(found, finer):
+def _see_ripple(result, finer):
     """A plateau of coarse steps is no proof where fine ones, that rounding does not hide, agree on another derivative.
 
     Then the loss has a ripple: its derivative at x is one thing, the slope of the whole another.
     """
-    for start in range(np.flatnonzero(finer.t < found.step)[0], finer.t.size - RUN + 1):
+    for start in range(np.flatnonzero(finer.t < result.step)[0], finer.t.size - RUN + 1):
         run = slice(start, start + RUN)
         gap, rounding = float(np.median(finer.m[run])), np.max(4 * finer.rounding[run] / finer.t[run])
-        visible = max(NOISY * found.scale, FAR * found.bar, rounding / SEES)
+        visible = max(NOISY * result.scale, FAR * result.bar, rounding / SEES)
         if abs(gap) > visible and np.max(np.abs(finer.m[run] - gap)) <= SEES * abs(gap):
-            note = f"a ripple: steps below {found.step:.0e} are off by {abs(gap) / found.scale:.1e}, others agree"
-            found.learn(word="ripple", note=note)
+            note = f"a ripple: steps below {result.step:.0e} are off by {abs(gap) / result.scale:.1e}, others agree"
+            result.learn(word="ripple", note=note)
 
 
 @np.errstate(all="ignore")
-def explained(found):
+def explained(result):
     """Whether a ripple below the noise of the loss, that the gradient shows, may explain a gap; then -> ripple.
 
     A gradient that bends by as much as the gap, within steps over which the gap does not move the loss beyond its
     noise, belongs to a loss whose ripple no difference can see.
     """
-    line, point = found.line, found.line.point
-    reach = max(2.0, found.jitter) * line.trials.eps * abs(line.base) / found.size
+    line, point = result.line, result.line.point
+    reach = max(2.0, result.jitter) * line.trials.eps * abs(line.base) / result.size
 
     def bend(step):
         ends = [point.unpack(point.vector + side * line.direction) for side in (step, -step)]
         return abs(sum(line.trials.gradient_at(end) @ line.direction for end in ends) - 2 * line.slope)
 
-    for step in [times * reach for times in WITHIN] if found.word == "disagrees" else ():
+    for step in [times * reach for times in WITHIN] if result.word == "disagrees" else ():
         with suppress(*REFUSALS):
-            size = bend(step) if step < NEARER * found.step else 0.0
-            if size > SEES * found.size and size > 2 * bend(JUMP * step):  # at a kink it jumps, however near
-                note = f"the gradient bends by {size / found.scale:.1e} of itself within a step of {step:.0e}: "
-                found.learn(word="ripple", note=f"{note}a ripple below the noise of the loss may explain the gap")
+            size = bend(step) if step < NEARER * result.step else 0.0
+            if size > SEES * result.size and size > 2 * bend(JUMP * step):  # at a kink it jumps, however near
+                note = f"the gradient bends by {size / result.scale:.1e} of itself within a step of {step:.0e}: "
+                result.learn(word="ripple", note=f"{note}a ripple below the noise of the loss may explain the gap")
                 return
 
 
@@ -495,23 +495,23 @@ def orders_of_hessians(e):
 
 
 @np.errstate(all="ignore")
-def curvature(found, bend, extend=True):
+def curvature(result, bend, extend=True):
     """Judgement of a gradient and a Hessian product d . H d -> word and reason, by the third Taylor remainder.
 
     The order is read on the finest usable levels, those that stand out of noise, gap and the rounding of x.
     """
-    e = judgement(found.line)
+    e = judgement(result.line)
     rests = e.rests - e.t**2 / 2 * bend
-    usable = both(rests) >= CLEAR * (e.noise + e.t * (found.size + e.floor))
+    usable = both(rests) >= CLEAR * (e.noise + e.t * (result.size + e.floor))
     used, rates = orders(e.t, both(rests), usable, FEWEST)  # coarse ones are no limit t -> 0
-    if extend and found.line.trials.extend and 0 < used < FEWEST:
-        found.line.sweep(HALVES)
-        return curvature(found, bend, False)
+    if extend and result.line.trials.extend and 0 < used < FEWEST:
+        result.line.sweep(HALVES)
+        return curvature(result, bend, False)
     finest = np.max(np.flatnonzero(usable), initial=0)
     ahead, behind = rests[:, finest]
-    found.learn(
+    result.learn(
         used3=used, bend=bend, rate3=min(rates, default=inf if not used else nan),
         off=abs(ahead + behind) / e.t[finest] ** 2 / abs(bend), jumps=abs(ahead - behind) > ODD * abs(ahead + behind),
     )  # fmt: skip
-    word, text = first(orders_of_hessians, found)
-    return word, f"d.Hd = {bend:.9g} along {found.direction}, third Taylor remainder {text}"
+    word, text = first(orders_of_hessians, result)
+    return word, f"d.Hd = {bend:.9g} along {result.direction}, third Taylor remainder {text}"

@@ -50,12 +50,12 @@ class Node:
 @contextmanager
 def calls_seen():
     """A `with` block that yields the list of the calls made in it, each with those inside of it."""
-    found: list[Node] = []
+    calls: list[Node] = []
     running: list[Node] = []  # calls whose derivative is under way, the innermost last
 
     def see(tape_node, *call):
         node, pull = Node(*call), tape_node.vjp
-        (running[-1].inner if running else found).append(node)
+        (running[-1].inner if running else calls).append(node)
 
         def watched(*g):
             running.append(node)
@@ -67,7 +67,7 @@ def calls_seen():
         tape_node.vjp = watched
 
     with witnessed(see):
-        yield found
+        yield calls
 
 
 def in_order(nodes):

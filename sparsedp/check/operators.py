@@ -24,7 +24,7 @@ __all__ = ["OperatorSummary", "fault_of", "field", "layouts", "operator", "trans
 LIMIT = Summary.limit
 DTYPES = ("float64", "complex128", "float32", "complex64")
 LARGEST = 2**21  # unknowns above which no matrix is built for a check
-MOST_COLUMNS = 512  # columns that are found one application at a time
+MOST_COLUMNS = 512  # columns that are computed one application at a time
 POWERS = 8  # products of a power iteration
 DECADES = {"float32": 25, "float64": 290}  # sizes 10^+-d of operators fit into a dtype, with room for the fields
 
@@ -76,7 +76,7 @@ class Probe:
 
     @cached_property
     def turned(self):
-        """The entries of the transpose, from its own definition."""
+        """The entries that the transpose assembles by itself."""
         return self.op.structure.transpose().explicit()
 
     def domain(self, dtype=float):
@@ -227,7 +227,7 @@ def transpose(op, seeds=5, rng=None):
     seeds : int
         Pairs of random fields for each dtype.
     rng : None, int or numpy Generator
-        Source of the fields; default a fixed seed of its own.
+        Source of the fields; default: a fixed seed.
 
     Returns
     -------
@@ -266,21 +266,21 @@ def twin(op, seeds=3, rng=None):
     seeds : int
         Random fields for each dtype.
     rng : None, int or numpy Generator
-        Source of the fields; default a fixed seed of its own.
+        Source of the fields; default: a fixed seed.
 
     Returns
     -------
     Summary
         The difference of the two products, entry by entry, in units of eps |A| |u| (for products of
         operators |A| |B| |u|), each <= 10. Beside the transposed products stands that of the matrix which the
-        transpose has of its own.
+        transpose assembles by itself.
 
     Notes
     -----
     Some operators have one form only, and the first row says so. One that was given as a matrix is
     compared with the product of that matrix by SciPy. One that was given by functions is compared
-    with its columns, found one application at a time, up to 512 unknowns; above, only the functions
-    are known, nothing can be compared, and the verdict is inconclusive.
+    with its columns, computed one application at a time, up to 512 unknowns; above, only the functions
+    are there, nothing can be compared, and the verdict is inconclusive.
 
     Examples
     --------
@@ -346,7 +346,7 @@ def operator(op, seeds=3, rng=None):
     seeds : int
         Random fields for each test and dtype.
     rng : None, int or numpy Generator
-        Source of the fields; default a fixed seed of its own.
+        Source of the fields; default: a fixed seed.
 
     Returns
     -------
@@ -389,19 +389,19 @@ def _rows(probe):
 
 
 class OperatorSummary(Summary):
-    """What was found out about one operator. Prints itself.
+    """The properties of one operator, and whether it is right. Prints itself.
 
     Attributes
     ----------
     op : Operator
     size : float or None
-        sqrt(|A|_1 |A|_inf), from below when the entries are not known.
+        sqrt(|A|_1 |A|_inf), from below without entries.
     nnz : int or None
         Number of stored entries, where listing them costs no application.
     facts : dict
         What the operator is: domain, codomain, form, dtype, nnz, size; row sums, symmetry; of a square one spectral
-        radius, definiteness, null space and the largest stable step of u' = A u by explicit Euler. Found when they
-        are asked for; what cannot be found at a fair price is left out.
+        radius, definiteness, null space and the largest stable step of u' = A u by explicit Euler. Computed when they
+        are asked for; what cannot be computed at a fair price is left out.
     """
 
     def __init__(self, op, probe, rows):
@@ -422,6 +422,6 @@ class OperatorSummary(Summary):
         return super().to_dict() | self.facts
 
     def _head(self):
-        known = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in self.facts.items())
-        facts = (f"  {name}: {value}" for name, value in known if value is not None)
+        texts = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in self.facts.items())
+        facts = (f"  {name}: {value}" for name, value in texts if value is not None)
         return [*super()._head(), *facts]

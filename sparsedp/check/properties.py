@@ -12,10 +12,10 @@ from sparsedp.space import fits
 
 __all__ = ["facts_of"]
 
-DENSE_UP_TO = 256  # rows up to which all eigenvalues are found
+DENSE_UP_TO = 256  # rows up to which all eigenvalues are computed
 LARGEST_SPECTRUM = 100_000  # rows above which no eigenvalue is sought
 ZERO = 1e-10  # of the largest: a smaller eigenvalue or row sum is 0
-OUTER = 1e-4  # the same where only the ends of the spectrum are found
+OUTER = 1e-4  # the same where only the ends of the spectrum are computed
 SYMMETRIC = 1e-13
 
 
@@ -27,7 +27,7 @@ def facts_of(op, listed, right):
     ----------
     op : Operator
     listed : bool
-        Whether its entries are known.
+        Whether its entries are listed.
     right : bool
         Whether nothing is wrong with it: else its spectrum is left out.
     """

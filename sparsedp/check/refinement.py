@@ -52,15 +52,15 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
     rise = np.log([error if 0 < error < inf else nan for error in errors])
     run = -np.log(sizes)
     slopes, away = np.diff(rise) / np.diff(run), run[-3:] - np.mean(run[-3:])
-    found, verdict, reason = float(away @ rise[-3:] / (away @ away)), "inconclusive", "no order was expected"
-    if isnan(found):
+    slope, verdict, reason = float(away @ rise[-3:] / (away @ away)), "inconclusive", "no order was expected"
+    if isnan(slope):
         reason = "an error is 0 or not finite: no slope"
     elif expected is not None:
-        verdict = "agrees" if expected[0] <= found <= expected[1] else "disagrees"
+        verdict = "agrees" if expected[0] <= slope <= expected[1] else "disagrees"
         reason = f"expected {expected[0]:g} to {expected[1]:g}"
     orders = tuple(slopes.tolist())
     return Refinement(
-        sizes=sizes, errors=errors, orders=orders, order=found, expected=expected, verdict=verdict, reason=reason
+        sizes=sizes, errors=errors, orders=orders, order=slope, expected=expected, verdict=verdict, reason=reason
     )
 
 

@@ -2,7 +2,7 @@
 
 A point is one vector of real numbers, complex leaves as pairs, and so are gradients and directions: the derivative
 along a direction is a plain dot product. The noise of the loss comes from a table of differences of neighbouring
-values. The loss itself only ever sees fresh copies of its own tree.
+values. The loss itself only ever sees fresh copies of the tree.
 """
 
 import math
@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # what a loss may raise away from x
-MOST_LEAVES = 8  # with more leaves than this, none gets a direction of its own
+MOST_LEAVES = 8  # with more leaves than this, none gets a direction for itself
 SAME = "the loss does not change"
 
 
@@ -95,20 +95,20 @@ class Point(Packing):
 
         Each leaf alone, all by the same, along the gradient, its largest entry; ``wanted(name)``: whether it is.
         """
-        found = {f"random {number + 1}": self._random(rng) for number in range(count)}
+        displacements = {f"random {number + 1}": self._random(rng) for number in range(count)}
         leaf = np.concatenate([np.full(part.size, place) for place, part in enumerate(self.split(self.vector))])
         for place, name in enumerate(self.names if 1 < len(self.names) <= MOST_LEAVES else ()):
-            found[f"random in {name}"] = self._random(rng) * (leaf == place)
+            displacements[f"random in {name}"] = self._random(rng) * (leaf == place)
         slopes = self.units * np.where(np.isfinite(gradient), gradient, 0.0)
         largest = np.max(np.abs(slopes), initial=0.0)
         if self.entries > 1:
-            found["constant"] = self.units
+            displacements["constant"] = self.units
         if self.entries > 1 and largest:
             # Along the gradient, as the units measure it, no entry moves more than 4 units.
             shares = slopes / largest
-            found["gradient"] = self.units * shares / max(rms(shares), 0.25)
-            found["largest entry"] = self.units * (np.arange(slopes.size) == np.argmax(np.abs(slopes)))
-        return [(name, way) for name, way in found.items() if np.any(way) and (wanted is None or wanted(name))]
+            displacements["gradient"] = self.units * shares / max(rms(shares), 0.25)
+            displacements["largest entry"] = self.units * (np.arange(slopes.size) == np.argmax(np.abs(slopes)))
+        return [(name, way) for name, way in displacements.items() if np.any(way) and (wanted is None or wanted(name))]
 
     def _random(self, rng):
         """Random displacement, of root mean square 1 in each leaf."""
@@ -197,7 +197,7 @@ class Trials:
 
 def solvers_of(calls):
     """Recorded calls -> pairs of name and solver, of all that solved."""
-    return [(name, one) for name, found in calls.actors.items() for one in found.values() if hasattr(one, "engine")]
+    return [(name, one) for name, actors in calls.actors.items() for one in actors.values() if hasattr(one, "engine")]
 
 
 class Level(NamedTuple):
@@ -253,8 +253,8 @@ class Line:
 
     def sweep(self, steps):
         """Evaluate the loss at x + t d and x - t d for every new t of `steps`."""
-        known = {level.step: level for level in self.levels}
-        self.levels = [known.get(step) or self.level(step) for step in sorted({*known, *steps}, reverse=True)]
+        earlier = {level.step: level for level in self.levels}
+        self.levels = [earlier.get(step) or self.level(step) for step in sorted({*earlier, *steps}, reverse=True)]
 
     def level(self, step):
         """The losses at x + t d and x - t d."""
