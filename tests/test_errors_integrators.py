@@ -33,12 +33,12 @@ TABLE = [
     (
         lambda: dp.stepper("rk4", decay, 0.1, tolerance=1e-3, floor=(1e-3, -1.0)),
         VALUE,
-        "floor must hold numbers >= 0, in the units of u, got (0.001, -1.0); write for example 1e-3",
+        "floor must hold finite numbers >= 0, in the units of u, got (0.001, -1.0); write 1e-3",
     ),
     (
         lambda: dp.stepper("rk4", decay, 0.1, tolerance=1e-3, floor="small"),
         VALUE,
-        "floor must hold numbers >= 0, in the units of u, got 'small'; write for example 1e-3",
+        "floor must hold finite numbers >= 0, in the units of u, got 'small'; write 1e-3",
     ),
     (
         lambda: dp.stepper("rk4", lambda u, p: -u, 0.1, tolerance=1e-3, floor=np.ones(2))(np.ones(3)),

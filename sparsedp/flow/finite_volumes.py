@@ -29,7 +29,7 @@ from sparsedp.conditions import free_slip, outflow, resolve
 from sparsedp.conditions import inflow as inflow_side
 from sparsedp.constants import constant, frozen
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_plain, check_takes, is_whole
+from sparsedp.fields import check_finite, check_plain, check_takes, is_number, is_whole
 from sparsedp.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.recipe import Remade
@@ -88,7 +88,7 @@ def conservation_law(
     ShapeError
         If the state, or what a function returns, has the wrong shape, or the state has no field for a momentum.
     NonFiniteError
-        If a speed is NaN or infinite: often a density or a depth has become negative.
+        If a speed is NaN or infinite, often because a density or a depth has become negative, or the rate is.
     TypeError
         If a function is none, or it or the state holds no real numbers.
 
@@ -194,11 +194,14 @@ class ConservationLaw(Remade):
         array like u
         """
         u = self._state(u)
-        rate, e = self._rate, self.equilibrium
+        e = self.equilibrium
         if e is None:
-            return cast(rate(u, None, params), dtype_of(u))
-        e = _shaped("equilibrium", e(params) if callable(e) else e, u)
-        return cast(rate(u, e, params) - rate(e, e, params), dtype_of(u))
+            rate = self._rate(u, None, params)
+        else:
+            e = _shaped("equilibrium", e(params) if callable(e) else e, u)
+            rate = self._rate(u, e, params) - self._rate(e, e, params)
+        check_finite("the rate of a conservation_law", plain(rate))
+        return cast(rate, dtype_of(u))
 
     def _state(self, u):
         """The state, of floating numbers."""
@@ -276,6 +279,8 @@ class ConservationLaw(Remade):
         float [time]
             Infinite where nothing moves. Not differentiated.
         """
+        if not (is_number(cfl) and 0 < cfl < np.inf):
+            raise ValueError(f"time_step needs a finite cfl > 0, got {cfl!r}; write cfl=0.4")
         u, params = mapped(plain, (self._state(u), params))
         speeds = [np.max(np.abs(self._speeds(axis.number, u, params)), axis=0) / axis.widths for axis in self.axes]
         most = np.max(sum(speeds), initial=0.0)

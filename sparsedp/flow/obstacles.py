@@ -76,6 +76,8 @@ def forces(grid, solid=None, boundary=no_slip, solid_boundary=no_slip, cells=Non
         If they are not boolean, or a condition is none of a flow; on use, if the viscosity is no number.
     ValueError
         If neither `solid` nor `cells` is given, or `about` is not finite; on use, if the viscosity is < 0.
+    NonFiniteError
+        On use, if the viscosity is infinite, or the result: NaN or too large numbers around the obstacle.
 
     Notes
     -----
@@ -201,7 +203,9 @@ class Forces(Remade):
 
     def __call__(self, v, p, viscosity):
         check_number("the viscosity of forces", plain(viscosity), ">= 0")  # an array would be spread over the torque
-        return viscosity * self.viscous(v) + self.pressure(p) - self.gain(self.carried(v) * self.carrier(v))
+        total = viscosity * self.viscous(v) + self.pressure(p) - self.gain(self.carried(v) * self.carrier(v))
+        check_finite("what forces finds", plain(total))
+        return total
 
 
 def _total(grid, chosen, point):

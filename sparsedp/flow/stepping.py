@@ -30,6 +30,7 @@ Adams-Bashforth, by the largest root |z| of
     z^2 - z = (3/2 z - 1/2) (i c - d),      or, with implicit damping,  (z^2 - z) + d z (z + 1) / 2 = (3/2 z - 1/2) i c.
 """
 
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -231,7 +232,8 @@ class FlowStep(Remade):
                 f"flow_step needs the scalars {sorted(self.scalars)}, got "
                 f"{list(s) if isinstance(s, dict) else type(s).__name__}; write step.start(v, params, s)"
             )
-        state = {"v": v, "p": np.zeros(self.grid.shape), "a": self.acceleration(v, params, s, self._rub(params))}
+        p = np.zeros(np.shape(v)[:-1] + self.grid.shape)
+        state = {"v": v, "p": p, "a": self.acceleration(v, params, s, self._rub(params))}
         return state | ({"s": s, "r": self._rates(v, s, params)} if s else {})
 
     def __call__(self, state, params=None):
@@ -290,7 +292,8 @@ class FlowStep(Remade):
 
     def _check_convection(self, v):
         """Refuse a step in which a wave that the flow carries would grow."""
-        passing = self.divergence.structure.magnitude()(np.abs(plain(v)).astype(float))  # twice the mean |v| / h
+        rows = np.abs(plain(v)).astype(float).reshape(prod(np.shape(v)[:-1]), -1)  # of a batch
+        passing = [*map(self.divergence.structure.magnitude(), rows)]  # twice the mean |v| / h
         fastest = 0.5 * float(np.max(passing, initial=0.0))
         if SURE < self.dt * fastest < np.inf:
             terms = [self.viscous, *(one.diffused for one in self.scalars.values())]
@@ -403,7 +406,9 @@ class Scalar:
                     f"{np.shape(plain(source))}; write one number for each cell"
                 )
             rate = rate + source
-        return rate if self.diffused is None else rate + self.diffused.rate(u, params)
+        rate = rate if self.diffused is None else rate + self.diffused.rate(u, params)
+        check_finite(f"the rate of {self.name!r}", plain(rate))
+        return rate
 
     def step(self, u, rate, before):
         """The field after a step."""

@@ -234,7 +234,7 @@ class Adaptive(Scheme):
         rates = leaves(self.problem(u, params, t))
         sizes = [np.where(size > 0, size, np.inf) for size in self.sizes(u)]
         count = max(sum(size.size for size in sizes), 1)
-        rows = [np.conj(rate) / size**2 / count for rate, size in zip(rates, sizes, strict=True)]
+        rows = [np.conj(rate / size) / size / count for rate, size in zip(rates, sizes, strict=True)]
         square = float(sum(np.sum(np.real(row * rate)) for row, rate in zip(rows, rates, strict=True)))
         speed = np.sqrt(square)
         return [-half / (speed * half + SLACK) / (speed or 1.0) * row for row in rows], speed

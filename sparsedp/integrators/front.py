@@ -154,7 +154,7 @@ def stepper(
     if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
         raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
     if not all(map(_is_floor, leaves(floor))):
-        raise ValueError(f"floor must hold numbers >= 0, in the units of u, got {floor!r}; write for example 1e-3")
+        raise ValueError(f"floor must hold finite numbers >= 0, in the units of u, got {floor!r}; write 1e-3")
     dt = dt if callable(dt) else number(dt, "dt", "> 0")
     problem = _problem(method, given)
     if method == "radau":
@@ -181,7 +181,10 @@ def _problem(method, given):
 
 def _is_floor(leaf):
     """Whether a leaf of the floor is a number, or numbers, that sizes are added to; None: the default."""
-    return leaf is None or (np.asarray(leaf).dtype.kind in "fiu" and bool(np.all(np.asarray(leaf) >= 0)))
+    if leaf is None:
+        return True
+    known = np.asarray(leaf)
+    return known.dtype.kind in "fiu" and bool(np.all((known >= 0) & (known < np.inf)))
 
 
 def _remade(given):

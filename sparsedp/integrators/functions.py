@@ -26,6 +26,7 @@ from numpy.polynomial.polynomial import polyval
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.fields import check_plain
 from sparsedp.solvers.spectral import diagonalised
 from sparsedp.tape import Rule, isbox
 
@@ -189,6 +190,7 @@ class PhiFunctions(Functions):
     def plain(self, rows, z, fields, transposed=False):
         """[the sum for each row of functions], on plain values, or with the transpose of L."""
         op, z = (self.op.T if transposed else self.op), float(z)
+        check_plain(self.name, *fields)
         for field in fields:
             if np.shape(field)[-len(op.domain.shape) :] != op.domain.shape:
                 raise ShapeError(

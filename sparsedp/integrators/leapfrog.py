@@ -99,6 +99,7 @@ class Leapfrog(Scheme):
     def _fastest(self, state, params, h):
         """(h w)^2 of the fastest waves."""
         (p, q), (f, g) = _pair(state), self.problem.rates
+        p = mapped(lambda leaf: leaf if leaf is None else leaf * 1.0, p)  # whole numbers have no slope
         flat = Moving(p, is_variable, [1.0] * len(leaves(p)))
         n = flat.space.size
         basis, H = np.zeros((PRODUCTS + 1, n)), np.zeros((PRODUCTS + 1, PRODUCTS))

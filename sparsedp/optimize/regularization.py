@@ -7,13 +7,13 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.constants import constant
-from sparsedp.fields import is_number
+from sparsedp.fields import check_finite, is_number
 from sparsedp.grid import check_grid
 from sparsedp.operators.boundary import interior
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.given import from_matrix
 from sparsedp.recipe import Made
-from sparsedp.tape import dtype_of
+from sparsedp.tape import dtype_of, plain
 
 __all__ = ["smoothness", "total_variation"]
 
@@ -42,6 +42,8 @@ def total_variation(grid, eps, solid=None):
         If `solid` has another shape than the grid.
     TypeError
         On use, if u is complex.
+    NonFiniteError
+        On use, if a squared slope is NaN or beyond 1.8e308.
 
     Notes
     -----
@@ -88,6 +90,8 @@ def smoothness(grid, solid=None):
         If `solid` has another shape than the grid.
     TypeError
         On use, if u is complex.
+    NonFiniteError
+        On use, if a squared slope is NaN or beyond 1.8e308.
 
     Notes
     -----
@@ -117,6 +121,8 @@ def _square(grid, name, solid):
     def square(u):
         if dtype_of(u).kind == "c":
             raise TypeError(f"{name} takes real fields, got complex numbers; add that of u.real and that of u.imag")
-        return mean(inside(slope(u)) ** 2)
+        g = mean(inside(slope(u)) ** 2)
+        check_finite(f"the squared slope in {name}", plain(g))
+        return g
 
     return square, volumes

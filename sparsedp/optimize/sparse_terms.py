@@ -19,7 +19,7 @@ import numpy as np
 
 from sparsedp.derivative import vjp
 from sparsedp.errors import ShapeError
-from sparsedp.fields import is_whole
+from sparsedp.fields import check_function, is_whole
 from sparsedp.ledger import thread
 from sparsedp.optimize.first_order import check_positive
 from sparsedp.optimize.result import Minimum, Record
@@ -42,8 +42,10 @@ def admm(
     if callable(inner) and bounds is not None:
         raise TypeError("admm with a function as inner does not use bounds; leave them out, or keep to them in inner")
     K = (lambda x: 1.0 * x) if operator is None else operator
-    penalty = 0.0 if prox else weight  # what another prox belongs to is not said
-    prox = prox or (lambda v, t: np.sign(v) * np.maximum(np.abs(v) - t, 0.0))
+    penalty = weight if prox is None else 0.0  # what another prox belongs to is not said
+    prox = (lambda v, t: np.sign(v) * np.maximum(np.abs(v) - t, 0.0)) if prox is None else prox
+    check_function("admm, as operator,", K, "lambda x: ...")
+    check_function("admm, as prox,", prox, "lambda v, t: ...")
     x, clock, solves, count = start, time.perf_counter(), thread.solves, 0
     history: list = []
     z = np.asarray(K(x))

@@ -372,7 +372,7 @@ class Newton:
                 return False
             F = self._value(x)
             size = np.inf if F is None else self._measure(F)
-            if size <= (1 - DECREASE * share) * self.size:
+            if F is not None and size <= (1 - DECREASE * share) * self.size:
                 self.x, self.F, self.size = self._at_zero(x, F, size)
                 return True
             share /= 2

@@ -1,0 +1,329 @@
+"""The matrix of extreme cases for what physicists come with: stiff steps, steady flow, obstacles, waves, laws, TV.
+
+Each piece is a scene on any grid, with its arguments; each row is asked of all of them. What a piece alone can get
+wrong (a level set, a tensor that is not positive, a step too long) stands in the tests of the piece.
+"""
+
+from typing import Any, NamedTuple
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+from extremes import KINDS, agree, same_bits  # isort: skip
+
+NONFINITE, SHAPE, DERIVATIVE = dp.errors.NonFiniteError, dp.errors.ShapeError, dp.errors.DerivativeError
+
+
+class Piece(NamedTuple):
+    """A scene: what it makes of its arguments on a grid."""
+
+    make: Any  # grid -> run(*args)
+    args: str  # a letter each: c cells > 0, f faces of both signs, k faces > 0
+    linear: tuple = ()  # numbers of the arguments that it is linear in
+    closed: bool = True  # whether it takes a grid without walls
+
+
+def radau(tolerance):
+    def make(grid):
+        L = dp.laplacian(grid)
+        return dp.stepper("radau", lambda u, p: L(u) - p * u, 0.1, tolerance=tolerance)
+
+    return make
+
+
+def fields(method):
+    """Two fields, one with a term of fourth order."""
+
+    def make(grid):
+        L = dp.laplacian(grid)
+        linear = {"u": (L, 0.1), "v": dp.function(L, lambda e: -(e**2) - e)}
+        step = dp.stepper(method, lambda x, p: {"u": -p * x["u"], "v": p * x["u"]}, 0.1, linear=linear)
+
+        def run(u, v, p):
+            end = step({"u": u, "v": v}, p)
+            return end["u"] + 2.0 * end["v"]
+
+        return run
+
+    return make
+
+
+def steady(grid):
+    L = dp.laplacian(grid)
+    return lambda k, b: dp.steady(lambda u, k, b: k * u - 0.1 * L(u) + 0.1 * u**3 - b, np.zeros(grid.shape), k, b)
+
+
+def force(grid):
+    on = dp.forces(grid, cells=np.ones(grid.shape, bool))
+    return lambda v, p: on(v, p, 0.1)
+
+
+def obstacle(grid):
+    friction = dp.brinkman(grid)
+    return lambda level: anp.log1p(friction(level))  # it goes over many decades
+
+
+def flow(grid):
+    """Friction, and heat that drives the flow and has a source."""
+    mean = dp.average(grid)
+    heat = {"diffusivity": 0.1, "source": lambda s, p: 0.1 * s["heat"]}
+    step = dp.flow_step(
+        grid, 0.01, 0.1, force=lambda v, s, p: mean(s["heat"]), friction=lambda p: p, scalars={"heat": heat}
+    )
+
+    def run(v, u, rub):
+        end = step(step(step.start(v, rub, {"heat": u}), rub), rub)
+        return anp.concatenate([end["v"], anp.ravel(end["s"]["heat"])])
+
+    return run
+
+
+def elliptic(turn, **options):
+    """Shifted by a field, complex where `turn` is."""
+
+    def make(grid):
+        solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), **options)
+        return lambda k, b, shift: anp.real(solve(k, b, turn * shift)) + anp.imag(solve(k, b, turn * shift))
+
+    return make
+
+
+def tensor(grid):
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
+    mixed = (0.3 + 1.7 * np.eye(grid.dim)).reshape(grid.dim, grid.dim, *[1] * grid.dim)
+    return lambda k, b: solve(mixed * k, b, 0.5)
+
+
+def waves(damped=False, memory=None):
+    def make(grid):
+        D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
+        damping = dp.sponge(grid, min(grid.shape, default=0) and 1, 1.0) if damped else None
+        rates = (lambda v, c: -c * D(v)), (lambda p, c: -inside(G(p)))
+        step = dp.stepper("leapfrog", rates, 0.1, damping=damping)
+        return lambda p, v, c: dp.rollout(step, (p, v), c, 3, memory=memory)[0]
+
+    return make
+
+
+def law(scheme, speed):
+    def make(grid):
+        flux, source = (lambda u, p, axis: u**2 / 2), (lambda u, p: -p * u)
+        return dp.conservation_law(grid, flux, speed, scheme=scheme, source=source)
+
+    return make
+
+
+RUSANOV = lambda u, p, axis: anp.abs(u) + 1.0
+HLL = lambda u, p, axis: (u - 1.0, u + 1.0)
+
+PIECES = {
+    "radau": Piece(radau(None), "cc", (0,)),
+    "radau, tolerance": Piece(radau(1e-4), "cc"),
+    "imex tree": Piece(fields("imex"), "ccc"),
+    "etdrk4 function": Piece(fields("etdrk4"), "ccc"),
+    "steady": Piece(steady, "cc"),
+    "forces": Piece(force, "fc"),
+    "flux": Piece(lambda grid: dp.flux(grid, np.ones(grid.shape, bool)), "f", (0,)),
+    "brinkman": Piece(obstacle, "f"),
+    "flow": Piece(flow, "fck"),
+    "shift field": Piece(elliptic(1.0), "kcc", (1,)),
+    "complex shift": Piece(elliptic(1.0 - 0.2j), "kcc", (1,)),
+    "tensor": Piece(tensor, "cc", (1,)),
+    "helmholtz": Piece(elliptic(-0.5 - 0.1j, method="krylov", preconditioner="shifted_laplace"), "kcc"),
+    "leapfrog": Piece(waves(), "cfc", (0, 1)),
+    "sponge": Piece(waves(damped=True), "cfc", (0, 1)),
+    "reversed": Piece(waves(memory="reverse"), "cfc", (0, 1)),
+    "limited, rusanov": Piece(law("van_leer", RUSANOV), "cc"),
+    "limited, hll": Piece(law("van_leer", HLL), "cc"),
+    "upwind, hll": Piece(law("upwind", HLL), "cc"),
+    "total variation": Piece(lambda grid: dp.total_variation(grid, 0.1), "c"),
+    "smoothness": Piece(dp.smoothness, "c"),
+}
+EVERY = pytest.mark.parametrize("name", PIECES)
+SHAPES = [(0,), (0, 3), (1,), (1, 1), (1, 7), (7, 1), (2, 2), (7, 5), (1, 1, 1), (2, 1, 3)]
+
+
+def scene(name, shape=(5, 4), periodic=False):
+    """A piece on a grid, and its arguments."""
+    piece, grid, rng = PIECES[name], dp.Grid(shape, periodic=periodic), np.random.default_rng(5)
+    values = {"c": lambda: 0.2 + rng.random(shape), "f": lambda: 0.1 * rng.normal(size=grid.faces.size)}
+    values["k"] = lambda: 0.2 + rng.random(grid.faces.size)
+    return piece.make(grid), [values[letter]() for letter in piece.args]
+
+
+def alone(run, args, number):
+    """One argument -> a number."""
+    return lambda x: anp.sum(anp.sin(run(*args[:number], x, *args[number + 1 :])))
+
+
+@pytest.mark.sampled(1)
+@EVERY
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("periodic", [False, True])
+def test_every_size_has_its_gradient(name, shape, periodic):
+    """No cells, one cell, lines, primes: the gradient is the slope of the value."""
+    run, args = scene(name, shape, periodic)
+    for number, x in enumerate(args):
+        loss, t = alone(run, args, number), np.cos(np.arange(x.size)).reshape(x.shape)
+        slope = dp.grad(loss)(x)
+        assert slope.shape == x.shape and np.all(np.isfinite(slope))
+        wanted = (loss(x + 1e-5 * t) - loss(x - 1e-5 * t)) / 2e-5
+        assert np.sum(slope * t) == pytest.approx(wanted, rel=1e-4, abs=1e-6 * (1 + np.sum(np.abs(slope))))
+
+
+@pytest.mark.sampled(1)
+@EVERY
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_refused(name, bad):
+    run, args = scene(name)
+    for number, x in enumerate(args):
+        x = x.copy()
+        x.flat[0 if name in ("forces", "flux") else x.size // 2] = bad  # what stands inside a box cancels
+        loss = alone(run, args, number)
+        for act in (loss, dp.grad(loss)):
+            if name == "flux":  # an Operator lets it through
+                assert not np.all(np.isfinite(act(x)))
+                continue
+            with np.errstate(all="ignore"), pytest.raises(NONFINITE):
+                act(x)
+
+
+@pytest.mark.sampled(1)
+@EVERY
+@pytest.mark.parametrize("kind", KINDS)
+def test_kinds_of_arrays(name, kind):
+    run, args = scene(name)
+    for number, x in enumerate(args):
+        given = KINDS[kind](x)
+        if kind == "bool" and PIECES[name].args[number] == "c" and number == len(args) - 1:
+            continue  # params, of which the functions of the user take what they like
+        if name in ("leapfrog", "sponge", "reversed") and number < 2 and kind in ("int64", "bool"):
+            with pytest.raises(SHAPE, match="the step made a floating value of an array of dtype"):
+                alone(run, args, number)(given)
+            continue
+        if (name, kind) == ("reversed", "float32") and number < 2:
+            with pytest.raises(DERIVATIVE, match="rounding grew on the way; give rollout a memory in bytes"):
+                dp.grad(alone(run, args, number))(given)
+            continue
+        act = lambda x, number=number: np.asarray(run(*args[:number], x, *args[number + 1 :]))
+        if kind != "float32":
+            before = given.copy()
+            assert np.array_equal(act(given), act(np.ascontiguousarray(given, dtype=float)))
+            assert np.array_equal(given, before)
+        else:
+            agree(act(given), act(given.astype(float)), 1e-5)
+        if kind not in ("int64", "bool"):
+            single, plain = (dp.grad(alone(run, args, number))(one) for one in (given, given.astype(float)))
+            assert single.dtype == given.dtype
+            agree(single, plain, 1e-3 if kind == "float32" else 0.0)
+
+
+@EVERY
+def test_zero_everywhere(name):
+    """At rest nothing happens, and there is a gradient."""
+    run, args = scene(name)
+    args = [0.0 * x for x in args]
+    if name == "tensor":
+        with pytest.raises(ValueError, match="k must be positive definite in every cell"):
+            run(*args)
+        return
+    value = np.asarray(run(*args))
+    assert np.all(value[()] == 0.0) or name == "brinkman"
+    for number, x in enumerate(args):
+        if name != "steady":  # 0 = 0 there, refused in words
+            assert np.all(np.isfinite(dp.grad(alone(run, args, number))(x)))
+
+
+@pytest.mark.parametrize("name", [name for name, piece in PIECES.items() if piece.linear])
+@pytest.mark.parametrize("exponent", [-900, 900])
+def test_units_change_no_bit(name, exponent):
+    run, args = scene(name)
+    far = [np.ldexp(x, exponent) if number in PIECES[name].linear else x for number, x in enumerate(args)]
+    same_bits(np.asarray(run(*far)), np.ldexp(np.asarray(run(*args)), exponent))
+
+
+@EVERY
+@pytest.mark.parametrize("factor", [1e-200, 1e200])
+def test_far_from_one(name, factor):
+    """A finite value with a finite gradient, or an error of ours."""
+    run, args = scene(name)
+    for number, x in enumerate(args):
+        loss = lambda x, number=number: anp.sum(run(*args[:number], x, *args[number + 1 :]))
+        for act in (loss, dp.grad(loss)):
+            try:
+                with np.errstate(all="ignore"):
+                    found = act(factor * x)
+            except dp.errors.SparsedpError:
+                continue
+            assert np.all(np.isfinite(found))
+
+
+@EVERY
+def test_wrong_shapes_and_masks(name):
+    run, args = scene(name)
+    for number, letter in enumerate(PIECES[name].args):
+        if letter == "c" and number == len(args) - 1 and number:
+            continue  # params or the last of the fields: broadcast by the functions of the user, or checked alike
+        for wrong in (args[number][:-1], np.ma.array(args[number])):
+            with pytest.raises((SHAPE, TypeError, ValueError)):
+                run(*args[:number], wrong, *args[number + 1 :])
+
+
+# ---- numbers that settle a piece -----------------------------------------------------------------------------------
+
+GRID = dp.Grid((3, 4))
+U, V = np.ones((3, 4)), np.zeros(GRID.faces.size)
+TRANSPORT = dp.conservation_law(GRID, lambda u, p, axis: u, lambda u, p, axis: abs(u), inflow=1e300, boundary=dp.inflow)
+ON = dp.forces(GRID, cells=np.ones((3, 4), bool))
+SPLIT = lambda **options: dp.minimize(lambda x: anp.sum(x**2), U, method="admm", weight=0.1, maxiter=1, **options)
+HEAT = dp.flow_step(GRID, 0.1, scalars={"heat": {"source": lambda s, p: p}})
+REFUSED = [
+    (lambda: ON(V + 1e200, U, 1.0), NONFINITE, "what forces finds must be finite, got "),
+    (lambda: HEAT(HEAT.start(V, 1.0, {"heat": U}), np.inf), NONFINITE, "the rate of 'heat' must be finite, got 12"),
+    (lambda: SPLIT(prox=0), TypeError, "admm, as prox, takes a function, got int; write lambda v, t: ..."),
+    (lambda: SPLIT(operator=np.eye(3)), TypeError, "admm, as operator, takes a function, got ndarray; write lambda x"),
+    (lambda: dp.stepper("radau", lambda u, p: -u, 0.1, tolerance=1e-3, floor=np.inf), ValueError,
+     "floor must hold finite numbers >= 0, in the units of u, got inf; write 1e-3"),
+    (lambda: dp.total_variation(GRID, 0.1)(1e200 * np.arange(12.0).reshape(3, 4)), NONFINITE,
+     "the squared slope in total_variation must be finite, got 12 that are NaN or infinite, the first at (0, 0)"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("act, kind, message", REFUSED)
+def test_refused(act, kind, message):
+    with np.errstate(all="ignore"), pytest.raises(kind) as caught:
+        act()
+    assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize("wrong", [-1.0, np.nan, np.inf])
+def test_numbers_out_of_range(wrong):
+    with pytest.raises(ValueError, match="the viscosity of forces must be"):
+        ON(V, U, wrong)
+    with pytest.raises(ValueError, match="time_step needs a finite cfl > 0, got .*; write cfl=0.4"):
+        TRANSPORT.time_step(U, None, wrong)
+
+
+def test_a_rate_beyond_the_range_of_floats():
+    burgers = dp.conservation_law(GRID, lambda u, p, axis: u**2, lambda u, p, axis: abs(u))
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(NONFINITE, match="the rate of a conservation_law must be finite"),
+    ):
+        burgers(1e200 * np.arange(12.0).reshape(3, 4))
+
+
+def test_a_batch_of_flows_is_a_flow_each():
+    """The Courant number of each counts; the first state has the form of the next."""
+    grid = dp.Grid((4, 3), size=1.0)
+    step, v = dp.flow_step(grid, 0.02, 0.01), 0.3 * np.random.default_rng(3).normal(size=(2, grid.faces.size))
+    ends = dp.rollout(step, step.start(v), None, 3)
+    for number, one in enumerate(v):
+        wanted = dp.rollout(step, step.start(one), None, 3)
+        for part in "vpa":
+            agree(ends[part][number], wanted[part], 1e-9)
+    with pytest.raises(dp.errors.UnstableStepError, match="flow_step is unstable for this velocity with dt = 0.02"):
+        step(step.start(v * [[0.1], [300.0]]))
