@@ -269,7 +269,7 @@ TABLE = [
     (
         roll(blows_up),
         FINITE,
-        "step 1 of rollout made 3 values of state NaN or infinite, the first at 0; take a smaller time step",
+        "state of step 1 of rollout needs a smaller time step, got 3 that are NaN or infinite, the first at 0",
     ),
     (
         grad(captured),

@@ -188,7 +188,7 @@ def _kind(keep, layout):
 
 def _check_values(loop, args, traced):
     for layout, values in zip(loop.layouts, loop.split(args), strict=False):
-        layout.check_finite(list(map(plain, values)), "rollout")
+        layout.check_finite(values, "rollout")
     for k in traced:
         if dtype_of(args[k]).kind not in "fc":
             raise DerivativeError(

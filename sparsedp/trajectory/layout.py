@@ -178,11 +178,11 @@ class Layout:
             raise ShapeError(_changed(name, f"dtype {dtype}", f"dtype {dtype_of(value)}", when))
         return dense(value)
 
-    def check_finite(self, values, owner):
-        """Refuse NaN and infinity in plain variables: leaf, first index, count."""
+    def check_finite(self, values, owner, needs="must be finite"):
+        """Refuse NaN and infinity in variables, plain or traced: leaf, first index, count."""
         for number, value in enumerate(values):
-            if not surely_finite(value):
-                check_finite(f"{self.names[number]} of {owner}", value)
+            if not is_finite(value):
+                check_finite(f"{self.names[number]} of {owner}", plain(value), needs)
 
 
 def _static(leaf):

@@ -5,15 +5,12 @@ goes through the steps themselves, forward and back: a derivative forward is the
 higher order are those of the calls that the run makes.
 """
 
-import numpy as np
-
 from sparsedp.derivative import judged, zero_like
 from sparsedp.errors import DerivativeError, NonFiniteError
-from sparsedp.fields import place
 from sparsedp.ledger import active, count
 from sparsedp.progress import shown_steps
-from sparsedp.tape import Rule, plain
-from sparsedp.trajectory.backward_pass import BackwardPass
+from sparsedp.tape import Rule
+from sparsedp.trajectory.backward_pass import go_back
 from sparsedp.trajectory.layout import is_finite
 from sparsedp.trajectory.record import APART, SAMPLES, Record
 from sparsedp.trajectory.schedule import checkpoints
@@ -138,18 +135,10 @@ class Loop(Rule):
 
     def _refuse(self, steps):
         """Refuse a run that is not finite at its end: NaN stays, so one look tells, and a second run finds the step."""
-        state, layout = steps.first, self.state
+        state = steps.first
         for i in range(self.n):
             state = steps.after(state, False)
-            for name, value in zip(layout.names, state.values, strict=True):
-                finite = np.isfinite(plain(value))
-                if not np.all(finite):
-                    many = finite.size - np.count_nonzero(finite)
-                    where = place(int(np.argmin(finite)), finite.shape) if finite.ndim else 0
-                    raise NonFiniteError(
-                        f"step {i} of rollout made {many} values of {name} NaN or infinite, the first at {where}; "
-                        "take a smaller time step"
-                    )
+            self.state.check_finite(state.values, f"step {i} of rollout", "needs a smaller time step")
 
     def vjp(self, nums, ans, *args):
         """From the cotangents of what was handed out to those of the arguments that want one, in that order."""
@@ -183,7 +172,7 @@ class Loop(Rule):
         steps, kept = runs[0] if self.slots is None else runs.pop()
         steps.recorder.ended = False
         with steps.guarded("on the way back through step"):
-            cotangents = BackwardPass(self, steps, list(kept) if runs else kept).back(g)
+            cotangents = go_back(self, steps, list(kept) if runs else kept, g)
         steps.recorder.ended = True
         backs = ((cotangents[number], args[number]) for number in self.wanted)
         return tuple(zero_like(value) if back is None else back for back, value in backs)

@@ -78,6 +78,7 @@ class Steps:
         self.first = State(0, values, loop.state.statics)
         roots = [self.recorder.root() if number in loop.wanted else None for number in range(len(args))]
         _, self.roots, self.input_roots = loop.split(roots)
+        self.known = set(self.roots)
         # Without a tape the values are traced all the same: what a step stores away is no constant.
         self._untaped = untaped_root(self.recorder)
         self._taped_params = self._params(self.roots)
