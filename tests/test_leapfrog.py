@@ -219,7 +219,9 @@ def test_refusals():
     with pytest.raises(dp.errors.ShapeError, match="damping has 2 parts for a field of 1; give one for each"):
         step((np.ones(3), np.ones(3)))
     step = dp.stepper("leapfrog", (rates[0], lambda p, c: (p, p)), 0.1, damping=(None, 1.0))
-    with pytest.raises(dp.errors.ShapeError, match="a rate has 2 parts for a field of 1; give one for each"):
+    with pytest.raises(
+        dp.errors.ShapeError, match=r"a rate must have the shape of the state, \(3,\), got \(3,\), \(3,\)"
+    ):
         step((np.ones(3), np.ones(3)))
     with pytest.raises(ValueError, match="sponge on x needs 0 to 4 cells, got 5"):
         dp.sponge(dp.Grid(4), 5, 1.0)
@@ -314,3 +316,15 @@ def test_a_large_field_hides_no_error_of_a_small_one():
 def test_a_sponge_on_no_axis_is_refused(cells):
     with pytest.raises(ValueError, match=r"sponge needs a number of cells or a pair for axes of \['x', 'y'\], got"):
         dp.sponge(dp.Grid((5, 4)), cells, 1.0)
+
+
+def test_damped_rates_go_to_the_fields_of_their_names():
+    """In another order they went to the wrong fields where there is damping."""
+    x = {"a": np.array([1.0]), "b": np.array([2.0])}, np.array([1.0])
+    rates = [lambda q, c: {"a": 3.0 * q, "b": 5.0 * q}, lambda q, c: {"b": 5.0 * q, "a": 3.0 * q}]
+    damping = ({"b": 0.5, "a": 0.25}, None)
+    steps = [dp.stepper("leapfrog", (f, lambda p, c: 0.0 * p["a"]), 0.1, damping=damping) for f in rates]
+    for step in steps:
+        (p, _), s = step(x), {"a": 0.0125, "b": 0.025}
+        wanted = {"a": ((1 - s["a"]) + 0.3) / (1 + s["a"]), "b": (2 * (1 - s["b"]) + 0.5) / (1 + s["b"])}
+        assert all(p[name] == pytest.approx(wanted[name], rel=1e-14) for name in "ab")

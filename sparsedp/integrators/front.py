@@ -5,12 +5,17 @@ from scipy.sparse.linalg import ArpackError, eigsh
 
 from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.fields import check_finite, is_number, rounded_down, surely_finite
-from sparsedp.integrators.adaptive import Adaptive
-from sparsedp.integrators.exponential import Exponential
-from sparsedp.integrators.leapfrog import Leapfrog, Staggered
 from sparsedp.integrators.problem import Problem, like, number
-from sparsedp.integrators.radau import Radau
-from sparsedp.integrators.runge_kutta import EXPLICIT, IMPLICIT, Explicit, Linear, Nonlinear, Polynomial
+from sparsedp.integrators.runge_kutta import (
+    EXPLICIT,
+    IMPLICIT,
+    Explicit,
+    Exponential,
+    Linear,
+    Nonlinear,
+    Polynomial,
+    Scheme,
+)
 from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import check_settings
 from sparsedp.solvers.separable import spectrum
@@ -130,7 +135,7 @@ def stepper(
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
     takes about six times the steps of its value: three times as long as without the judgement. radau takes three
     Jacobians for the derivative of a step, and one rule on the tape for an interval.
-    Source: runge_kutta.py, radau.py and exponential.py name the papers.
+    Source: runge_kutta.py and radau.py name the papers.
 
     Examples
     --------
@@ -156,27 +161,10 @@ def stepper(
     if not all(map(_is_floor, leaves(floor))):
         raise ValueError(f"floor must hold finite numbers >= 0, in the units of u, got {floor!r}; write 1e-3")
     dt = dt if callable(dt) else number(dt, "dt", "> 0")
-    problem = _problem(method, given)
-    if method == "radau":
-        return Step(method, problem, dt, Radau(problem, jacobian, tolerance, given["floor"], settings), [], given)
-    scheme, limits = _scheme(method, problem, jacobian, settings, KEPT[tolerance is not None]), []
-    if tolerance is not None:
-        scheme = Adaptive(scheme, float(tolerance), given["floor"])
-    elif method in EXPLICIT and unstable == "raise":
-        limits = [(term, largest_step(term.op, EXPLICIT[method].reach)) for term in problem.stiff]
-    return Step(method, problem, dt, scheme, limits, given)
-
-
-def _problem(method, given):
-    """What is integrated."""
-    if method != "leapfrog":
-        if given["damping"] is not None:
-            raise TypeError(f"{method} takes no damping; put it into the rate, or write method 'leapfrog'")
-        return Problem(given["rate"], given["linear"], given["source"], given["timed"])
-    unused = [word for word in ("linear", "source", "timed", "tolerance", "jacobian") if given[word] is not None]
-    if unused:
-        raise TypeError(f"leapfrog does not use {', '.join(unused)}; leave it out")
-    return Staggered(given["rate"], given["damping"])
+    scheme, limits = _scheme(method, given, settings), []
+    if method in EXPLICIT and tolerance is None and unstable == "raise":
+        limits = [(term, largest_step(term.op, EXPLICIT[method].reach)) for term in scheme.problem.stiff]
+    return Step(method, dt, scheme, limits, given)
 
 
 def _is_floor(leaf):
@@ -191,18 +179,39 @@ def _remade(given):
     return stepper(**{word: value for word, value in given.items() if word != "options"}, **given["options"])
 
 
-def _scheme(method, problem, jacobian, settings, kept):
+def _scheme(method, given, settings):
+    """What makes the steps; what few of them need is imported by those."""
     if method == "leapfrog":
-        return Leapfrog(problem)
-    if method in EXPLICIT:
-        return (Polynomial if problem.linear and problem.source is None else Explicit)(problem, method)
+        unused = [word for word in ("linear", "source", "timed", "tolerance", "jacobian") if given[word] is not None]
+        if unused:
+            raise TypeError(f"leapfrog does not use {', '.join(unused)}; leave it out")
+        from sparsedp.integrators.leapfrog import Leapfrog
+
+        return Leapfrog(given["rate"], given["damping"])
+    if given["damping"] is not None:
+        raise TypeError(f"{method} takes no damping; put it into the rate, or write method 'leapfrog'")
+    problem = Problem(given["rate"], given["linear"], given["source"], given["timed"])
+    jacobian, tolerance, floor = given["jacobian"], given["tolerance"], given["floor"]
+    if method == "radau":
+        from sparsedp.integrators.radau import Radau
+
+        return Radau(problem, jacobian, tolerance, floor, settings)
     if method in ("imex", "etdrk4") and not problem.stiff:
         raise TypeError(f"{method} needs the stiff linear term: write linear=L or linear=(L, coefficient)")
-    if method == "etdrk4":
-        return Exponential(problem)
-    if method == "imex" or problem.linear:
-        return Linear(problem, method, settings, kept)
-    return Nonlinear(problem, method, jacobian, settings)
+    scheme: Scheme
+    if method in EXPLICIT:
+        scheme = (Polynomial if problem.linear and problem.source is None else Explicit)(problem, method)
+    elif method == "etdrk4":
+        scheme = Exponential(problem)
+    elif method == "imex" or problem.linear:
+        scheme = Linear(problem, method, settings, KEPT[tolerance is not None])
+    else:
+        scheme = Nonlinear(problem, method, jacobian, settings)
+    if tolerance is None:
+        return scheme
+    from sparsedp.integrators.adaptive import Adaptive
+
+    return Adaptive(scheme, float(tolerance), floor)
 
 
 class Step(Remade):
@@ -211,9 +220,8 @@ class Step(Remade):
     Parameters
     ----------
     method : str
-    problem : Problem
     dt : number, traced number, or function of params
-    scheme : callable
+    scheme : Scheme
         ``scheme(u, params, t, h)``: the state after a step h.
     limits : list of pairs
         A term c L, and the largest stable h c of an explicit step.
@@ -230,8 +238,8 @@ class Step(Remade):
         With error control: the accepted lengths of the last interval, as shares of it.
     """
 
-    def __init__(self, method, problem, dt, scheme, limits, given):
-        self.method, self.problem, self.dt, self.scheme, self.limits = method, problem, dt, scheme, limits
+    def __init__(self, method, dt, scheme, limits, given):
+        self.method, self.problem, self.dt, self.scheme, self.limits = method, scheme.problem, dt, scheme, limits
         self.name, self.given, self.order, self.info = f"stepper({method})", given, scheme.order, scheme.info
 
     def recipe(self):

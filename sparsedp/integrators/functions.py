@@ -25,9 +25,9 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from sparsedp.derivative import of_argument
-from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_plain
-from sparsedp.solvers.spectral import diagonalised
+from sparsedp.errors import NonFiniteError
+from sparsedp.fields import field_array
+from sparsedp.solvers.separable import diagonalised
 from sparsedp.tape import Rule, isbox
 
 __all__ = ["Function", "PhiFunctions", "Taylor", "TaylorPolynomials", "phi"]
@@ -52,7 +52,7 @@ class Functions:
     plain: Any
 
     def __init__(self, op, name):
-        self.op, self.name = op, name
+        self.op, self.name, self.domain = op, name, op.domain
         self._rule = lru_cache(None)(self._made)  # rules made once, for every z, step and adjoint
 
     def __call__(self, functions, z, *fields):
@@ -190,26 +190,22 @@ class PhiFunctions(Functions):
     def plain(self, rows, z, fields, transposed=False):
         """[the sum for each row of functions], on plain values, or with the transpose of L."""
         op, z = (self.op.T if transposed else self.op), float(z)
-        check_plain(self.name, *fields)
-        for field in fields:
-            if np.shape(field)[-len(op.domain.shape) :] != op.domain.shape:
-                raise ShapeError(
-                    f"{self.name} takes a field on {op.domain.described}, got an array of shape {np.shape(field)}"
-                )
+        fields = [field_array(self, field, batch=True) for field in fields]
         if z == 0:  # no transform, and for phi_0 the field itself, bit for bit
             return [sum(f.at_zero(op, field) for f, field in zip(row, fields, strict=True)) for row in rows]
-        shape = np.shape(fields[0])
-        if len(shape) > len(op.domain.shape):  # a batch, field by field
-            batch = [np.reshape(field, (-1, *op.domain.shape)) for field in fields]
-            each = [self.plain(rows, z, row, transposed) for row in zip(*batch, strict=True)]
-            found = np.reshape(each, (len(batch[0]), len(rows), *op.domain.shape))
-            return [*np.moveaxis(found, 1, 0).reshape(len(rows), *shape)]
         if any(map(np.iscomplexobj, fields)):
             parts = (self.plain(rows, z, [*map(part, fields)], transposed) for part in (np.real, np.imag))
             return [real + 1j * imaginary for real, imaginary in zip(*parts, strict=True)]
-        moved = [self.found.forward(np.asarray(field, float), transposed) for field in fields]
+        batches = [field.reshape(-1, *op.domain.shape) for field in fields]
+        each = [self._sums(rows, z, row, transposed) for row in zip(*batches, strict=True)]
+        each = np.reshape(each, (len(batches[0]), len(rows), op.domain.size))
+        return [total.reshape(fields[0].shape) for total in np.moveaxis(each, 1, 0)]
+
+    def _sums(self, rows, z, fields, transposed):
+        """The sum for each row of functions, on one field each."""
+        moved = [self.found.forward(field.astype(float), transposed) for field in fields]
         sums = (sum(c * self._table(f, z) for f, c in zip(row, moved, strict=True)) for row in rows)
-        return [self.found.backward(total, transposed).reshape(op.domain.shape) for total in sums]
+        return [self.found.backward(total, transposed) for total in sums]
 
     def _values(self, function, z):
         """The values of a function on the eigenvalues of z L."""

@@ -11,7 +11,7 @@ it is estimated once for each h and params, from below, by a few steps of Arnold
 
 Damping with the rates s >= 0 [1 / time], one for each field, is split evenly over old and new values, stable for any s:
 
-    x' = ((1 - s h / 2) x + h r) / (1 + s h / 2),       r = f or g.
+    x' = ((1 - s h / 2) x + h r) / (1 + s h / 2) = x + h (r - s x) / (1 + s h / 2),       r = f or g.
 
 Where p and q are damped at the same rate the impedance stays what it is: a wave enters a sponge without an echo but for
 what its slope and the angle make.
@@ -29,13 +29,13 @@ from sparsedp.errors import ShapeError, UnstableStepError
 from sparsedp.fields import check_takes, is_number, is_whole, rounded_down
 from sparsedp.grid import AXES, check_grid
 from sparsedp.integrators.adaptive import Moving
-from sparsedp.integrators.problem import combine, untraced
+from sparsedp.integrators.problem import combine, of_fields, untraced
 from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.solvers.cache import Cache
 from sparsedp.tape import is_variable, plain
-from sparsedp.tree import leaves, mapped
+from sparsedp.tree import flatten, leaves, leaves_like
 
-__all__ = ["Leapfrog", "Staggered", "sponge"]
+__all__ = ["Leapfrog", "sponge"]
 
 PRODUCTS = 20  # of Arnoldi's method: they find (h w)^2 to 0.4 % on 300^2 cells, to 2 % at worst
 SMALL = 1e-10  # of the largest entry: what is left of a product is rounding
@@ -43,8 +43,8 @@ SLACK, SAFE = 1e-3, 0.98  # how far beyond the limit is refused, and what share 
 POWER = 2  # of the depth in a sponge, that its rate grows with: of 1 to 4 the least echo, with echo=1e-3
 
 
-class Staggered:
-    """The right-hand sides of p' = f(q, params), q' = g(p, params).
+class Leapfrog(Scheme):
+    """Steps of p' = f(q, params), q' = g(p, params): see the head of this file.
 
     Parameters
     ----------
@@ -58,6 +58,7 @@ class Staggered:
     timed = False
 
     def __init__(self, rates, damping):
+        super().__init__(self, "leapfrog", 2)
         if not (isinstance(rates, (tuple, list)) and len(rates) == 2 and all(map(callable, rates))):
             raise TypeError(
                 f"leapfrog needs a pair of rates, got {type(rates).__name__}; write "
@@ -72,15 +73,7 @@ class Staggered:
         for rate in map(plain, leaves(damping)):
             if rate is not None and not (np.all(np.isfinite(rate)) and np.all(rate >= 0)):
                 raise ValueError("damping needs finite rates >= 0 [1 / time]; take dp.sponge(grid, cells, speed)")
-        self.rates, self.damping = rates, damping
-
-
-class Leapfrog(Scheme):
-    """A step of a staggered problem: see the head of this file."""
-
-    def __init__(self, problem):
-        super().__init__(problem, "leapfrog", 2)
-        self._speeds = Cache()
+        self.rates, self.damping, self._speeds = rates, damping, Cache()
 
     def check_stable(self, state, params, h, known):
         """Refuse a step that would grow without bound; `known`: what the frequencies depend on."""
@@ -98,7 +91,7 @@ class Leapfrog(Scheme):
 
     def _fastest(self, state, params, h):
         """(h w)^2 of the fastest waves."""
-        (p, q), (f, g) = _pair(state), self.problem.rates
+        (p, q), (f, g) = _pair(state), self.rates
         p = mapped(lambda leaf: leaf if leaf is None else leaf * 1.0, p)  # whole numbers have no slope
         flat = Moving(p, is_variable, [1.0] * len(leaves(p)))
         n = flat.space.size
@@ -121,15 +114,14 @@ class Leapfrog(Scheme):
         return float(np.max(values.real, initial=0.0))
 
     def __call__(self, state, params, t, h):
-        p, q = _pair(state)
-        f, g = self.problem.rates
-        s, z = self.problem.damping or (None, None)
+        (p, q), (f, g) = _pair(state), self.rates
+        s, z = self.damping or (None, None)
         q = _advanced(q, g(p, params), h, z)
         return _advanced(p, f(q, params), h, s), q
 
     def check_reversible(self):
         """Refuse a step that loses something."""
-        if self.problem.damping is not None:
+        if self.damping is not None:
             raise ValueError(
                 "a leapfrog step with damping cannot be reversed: what it takes away grows on the way back; give "
                 "rollout a memory in bytes"
@@ -137,8 +129,7 @@ class Leapfrog(Scheme):
 
     def back(self, state, params, h):
         """The state before a step."""
-        p, q = _pair(state)
-        f, g = self.problem.rates
+        (p, q), (f, g) = _pair(state), self.rates
         p = combine(p, (-h, f(q, params)))
         return p, combine(q, (-h, g(p, params)))
 
@@ -153,15 +144,12 @@ def _advanced(x, rate, h, damping):
     """x after h, with its rate."""
     if damping is None:
         return combine(x, (h, rate))
-    for name, tree in (("a rate", rate), ("damping", damping)):
-        if len(leaves(tree)) != len(leaves(x)):
-            raise ShapeError(f"{name} has {len(leaves(tree))} parts for a field of {len(leaves(x))}; give one for each")
-
-    def damped(leaf, r, s):
-        half = 0.5 * h * s
-        return combine((1 - half) / (1 + half) * leaf, (h / (1 + half), r))
-
-    return mapped(damped, x, rate, damping)
+    found, rebuild = flatten(x)
+    rates, damped = of_fields(rate, x), leaves_like(damping, x)
+    if len(damped) != len(found):
+        raise ShapeError(f"damping has {len(damped)} parts for a field of {len(found)}; give one for each")
+    rows = zip(found, rates, damped, strict=True)
+    return rebuild([leaf + h * (r - s * leaf) / (1 + 0.5 * h * s) for leaf, r, s in rows])
 
 
 def sponge(grid, cells, speed, echo=1e-3):

@@ -14,7 +14,7 @@ from sparsedp.space import fits
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tree import copied, flatten, keys, leaves, leaves_like, mapped, subscript
 
-__all__ = ["Problem", "combine", "later", "like", "number", "untraced"]
+__all__ = ["Problem", "combine", "later", "like", "number", "of_fields", "untraced"]
 
 
 def combine(u, *pairs):
@@ -41,12 +41,12 @@ def combine(u, *pairs):
         return u
     found, rebuild = flatten(u)
     for factor, tree in pairs:
-        rates = _of_fields(tree, u)
+        rates = of_fields(tree, u)
         found = [leaf if leaf is None else leaf + factor * rate for leaf, rate in zip(found, rates, strict=True)]
     return rebuild(found)
 
 
-def _of_fields(tree, u):
+def of_fields(tree, u):
     """The leaves of a rate, one for each of the state; broadcasting one into another would hide a mistake."""
     _check_names(tree, u)
     found = leaves_like(tree, u)
@@ -208,7 +208,7 @@ class Problem:
         L is None where nothing is stiff. Where the state holds None it stays.
         """
         found, rebuild = flatten(u)
-        rows = zip(self.terms(u), found, *(_of_fields(tree, u) for tree in trees), strict=True)
+        rows = zip(self.terms(u), found, *(of_fields(tree, u) for tree in trees), strict=True)
 
         def on(term, leaf, *row):
             L, z = (term.op, h * term.coefficient(params)) if term else (None, h)
@@ -233,7 +233,7 @@ class Problem:
             rest.insert(0, self.on_fields(lambda L, c, leaf: (L(leaf) if L else 0.0 * leaf) * c, 1.0, params, u))
         first, *others = [part for part in rest if part is not None]
         if keys(u) is not None:
-            first = flatten(u)[1](_of_fields(first, u))
+            first = flatten(u)[1](of_fields(first, u))
         return combine(first, *((1.0, part) for part in others))
 
 
