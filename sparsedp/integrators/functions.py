@@ -197,8 +197,8 @@ class PhiFunctions(Functions):
             parts = (self.plain(rows, z, [*map(part, fields)], transposed) for part in (np.real, np.imag))
             return [real + 1j * imaginary for real, imaginary in zip(*parts, strict=True)]
         batches = [field.reshape(-1, *op.domain.shape) for field in fields]
-        each = [self._sums(rows, z, row, transposed) for row in zip(*batches, strict=True)]
-        each = np.reshape(each, (len(batches[0]), len(rows), op.domain.size))
+        sums = [self._sums(rows, z, row, transposed) for row in zip(*batches, strict=True)]
+        each = np.reshape(sums, (len(batches[0]), len(rows), op.domain.size))
         return [total.reshape(fields[0].shape) for total in np.moveaxis(each, 1, 0)]
 
     def _sums(self, rows, z, fields, transposed):
