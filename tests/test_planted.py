@@ -527,19 +527,21 @@ def planted(folder, bug):
     return path, text.replace(bug.right, bug.wrong)
 
 
-@pytest.fixture
-def copied(tmp_path):
-    """A copy of the package and its tests."""
+@pytest.fixture(scope="session")
+def copied(tmp_path_factory):
+    """A copy of the package and its tests; what is compiled of it serves all bugs."""
+    folder = tmp_path_factory.mktemp("copy")
     for name in ("sparsedp", "tests"):
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("setup.cfg", "pyproject.toml"):
-        shutil.copy(ROOT / name, tmp_path / name)
-    return tmp_path
+        shutil.copy(ROOT / name, folder / name)
+    return folder
 
 
 def failures(folder, tests, compiled=False):
     """Run tests in a copy -> (exit code, what was printed). With the plain kernels nothing is compiled again."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "SPARSEDP_NUMBA": str(int(compiled))}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     command = [sys.executable, "-m", "pytest", "-n0", "-x", "-p", "no:cacheprovider", "--tb=line", *tests.split()]
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1800, check=False
@@ -556,16 +558,21 @@ def test_every_bug_fits_its_line():
 
 
 @pytest.mark.slow
+def test_without_a_bug_nothing_fails(copied):
+    """The longest one, so the first."""
+    code, printed = failures(copied, " ".join(sorted({test for bug in BUGS.values() for test in bug.tests.split()})))
+    assert code == 0, printed[-2000:]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BUGS)
 def test_it_is_caught(copied, name):
     bug = BUGS[name]
     path, text = planted(copied, bug)
+    right = path.read_text(encoding="utf-8")
     path.write_text(text, encoding="utf-8")
-    code, printed = failures(copied, bug.tests, bug.compiled)
+    try:
+        code, printed = failures(copied, bug.tests, bug.compiled)
+    finally:
+        path.write_text(right, encoding="utf-8")
     assert code == 1 and " failed" in printed, f"not caught:\n{printed[-2000:]}"
-
-
-@pytest.mark.slow
-def test_without_a_bug_nothing_fails(copied):
-    code, printed = failures(copied, " ".join(sorted({test for bug in BUGS.values() for test in bug.tests.split()})))
-    assert code == 0, printed[-2000:]
