@@ -327,3 +327,52 @@ def test_a_batch_of_flows_is_a_flow_each():
             agree(ends[part][number], wanted[part], 1e-9)
     with pytest.raises(dp.errors.UnstableStepError, match="flow_step is unstable for this velocity with dt = 0.02"):
         step(step.start(v * [[0.1], [300.0]]))
+
+
+# ---- solids and jumps ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("shape", [(5, 4), (1, 4), (3, 3, 2)], ids=str)
+@pytest.mark.parametrize("periodic", [False, True])
+@pytest.mark.parametrize("left", [0, 1, None])
+def test_solids_everywhere(shape, periodic, left):
+    """So many cells are left open: values and gradients stay finite, and where nothing is open nothing happens."""
+    grid, rng = dp.Grid(shape, periodic=periodic), np.random.default_rng(2)
+    solid = np.arange(np.prod(shape)).reshape(shape) >= (np.prod(shape) if left is None else left)
+    u, v = 1.0 + rng.random(shape), 0.1 * rng.normal(size=grid.faces.size)
+    D, L = dp.divergence(grid), dp.laplacian(grid, solid=solid)
+    solve = dp.elliptic_solver(D, dp.gradient(grid, solid=solid))
+    on, tv, box = dp.forces(grid, solid), dp.total_variation(grid, 0.1, solid), dp.flux(grid, solid)
+    step = dp.flow_step(grid, 0.01, 0.1, solid=solid, friction=lambda p: p, scalars={"heat": {"diffusivity": 0.1}})
+
+    def flow(v, u):
+        return step(step.start(v, v**2, {"heat": u}), v**2)["v"]
+
+    runs = {
+        "forces": (lambda v, u: on(v, u, 0.1), v, u),
+        "flux": (box, v),
+        "total variation": (tv, u),
+        "flow": (flow, v, u),
+        "shift": (lambda k, b, s: solve(k, b, s), 1.0 + np.abs(v), u, u),
+        "complex shift": (lambda k, b, s: anp.imag(solve(k, b, 1j * s)), 1.0 + np.abs(v), u, u),
+        "steady": (lambda b: dp.steady(lambda u, b: u - L(u) + u**3 - b, 0.0 * u, b), u),
+    }
+    for name, (run, *args) in runs.items():
+        value, slopes = dp.value_and_grad(lambda args, run=run: anp.sum(run(*args) ** 2))(tuple(args))
+        assert np.isfinite(value) and all(np.all(np.isfinite(slope)) for slope in slopes), name
+        if left == 0 and name in ("total variation", "flow"):
+            assert value == 0.0 and not any(np.any(slope) for slope in slopes), name
+
+
+@pytest.mark.parametrize("turn", [1.0, 1j, -1.0, -1.0 - 0.1j])
+def test_coefficients_over_eight_decades(turn):
+    """A field as shift, real, complex, and of waves: backward error of LU."""
+    grid, rng = dp.Grid((8, 7)), np.random.default_rng(4)
+    D, G = dp.divergence(grid), dp.gradient(grid, dp.dirichlet)
+    k, shift = (10.0 ** rng.uniform(-4, 4, shape) for shape in (grid.faces.size, grid.shape))
+    b = rng.normal(size=grid.shape)
+    x = dp.elliptic_solver(D, G)(k, b, turn * shift).ravel()
+    A = np.diag((turn * shift).ravel()) - (D.matrix * k) @ G.matrix.toarray()
+    left = np.linalg.norm(A @ x - b.ravel())
+    assert left <= 1e-12 * np.linalg.norm(np.abs(A) @ np.abs(x) + np.abs(b.ravel()))
