@@ -49,6 +49,7 @@ _WINDOW = {
     "report.plan": "explain",
     "blackbox": "adopt",
     "parallel.scenes": "ensemble",
+    "parallel.front": "distribute gather",
 }
 _RENAMED = {  # names of the first edition -> what to write
     "minimise": "dp.minimize",

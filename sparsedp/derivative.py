@@ -14,7 +14,7 @@ from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, Sparsed
 from sparsedp.fields import check_function, is_whole
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
-from sparsedp.shortcuts import Part, held_for_many
+from sparsedp.shortcuts import ELSEWHERE, Part, held_for_many
 from sparsedp.tape import (
     Recorder,
     ReverseNode,
@@ -337,7 +337,7 @@ def _directions(x, tangent):
 
 def _is_array(value):
     """Whether a value is one array or number, traced or not."""
-    return isbox(value) or isinstance(value, (np.ndarray, Number))
+    return isbox(value) or isinstance(value, (np.ndarray, Number)) or type(value) in ELSEWHERE
 
 
 def described(tree):

@@ -68,6 +68,7 @@ class Grid(Value, Uncached):
     periodic: tuple[bool, ...]
     origin: tuple[float, ...]
     widths: tuple[np.ndarray, ...]
+    layout = None  # of a grid whose fields lie on ranks: see parallel/layout.py
 
     def __init__(self, shape, *, size=None, spacing=None, origin=0.0, periodic=False):
         shape = lengths(shape)
@@ -145,11 +146,14 @@ class Grid(Value, Uncached):
 
     def control_volumes(self, kind, axis):
         """Volumes that belong to one component of a space; they sum to the volume of the box."""
+        return reduce(np.multiply.outer, self.control_lengths(kind, axis))
+
+    def control_lengths(self, kind, axis):
+        """The lengths along each axis whose products are the control volumes of a component."""
         on_nodes = node_axes(kind, axis, self.dim)
         if on_nodes is None:
             raise ShapeError(f"values on {kind} have no volumes; take those of grid.cells, faces, nodes or edges")
-        lengths = [self.spacings(a) if a in on_nodes else self.widths[a] for a in range(self.dim)]
-        return reduce(np.multiply.outer, lengths)
+        return [self.spacings(a) if a in on_nodes else self.widths[a] for a in range(self.dim)]
 
     def split(self, v):
         """Face field (or 3-D edge field; in 2-D write ``grid.edges.split``) -> tuple of components. Differentiable.
@@ -255,6 +259,8 @@ class Grid(Value, Uncached):
 
     def _mesh(self, places):
         lines = [self.coordinates(axis, at) for axis, at in enumerate(places)]
+        if self.layout is not None:
+            return self.layout.mesh(Space(tuple(line.size for line in lines), "places", self), lines)
         return tuple(np.array(full) for full in np.meshgrid(*lines, indexing="ij"))
 
     def axis(self, axis):
@@ -268,7 +274,7 @@ class Grid(Value, Uncached):
 
     @cached_property
     def _key(self):
-        return self.shape, self.periodic, self.origin, tuple(widths.tobytes() for widths in self.widths)
+        return self.shape, self.periodic, self.origin, tuple(widths.tobytes() for widths in self.widths), self.layout
 
     def __repr__(self):
         words = [" x ".join(map(str, self.shape)) + " cells", "size " + " x ".join(f"{size:.6g}" for size in self.size)]
@@ -277,6 +283,8 @@ class Grid(Value, Uncached):
         for word, flags in (("periodic", self.periodic), ("stretched", [not uniform for uniform in self.uniform])):
             if any(flags):
                 words.append(f"{word} in {', '.join(compress(AXES, flags))}")
+        if self.layout is not None:
+            words.append(str(self.layout))
         return f"Grid({', '.join(words)})"
 
 
@@ -284,6 +292,8 @@ def check_grid(name, grid):
     """Refuse what is no Grid."""
     if not isinstance(grid, Grid):
         raise TypeError(f"{name} takes a Grid, got {type(grid).__name__}; write dp.Grid((64, 64), size=1.0)")
+    if grid.layout is not None:
+        grid.layout.check(name)
 
 
 # ---- from what the user gave to one entry for each axis ----

@@ -4,6 +4,7 @@ import weakref
 from functools import cached_property
 from math import prod
 from numbers import Number
+from typing import Any
 
 import numpy as np
 
@@ -58,14 +59,15 @@ class Operator(Frozen, Remade):
     codomain: Space
     name: str
     form: str
+    layout: Any  # where its fields lie, when that is on ranks; else None
     _transposed = None
     _origin = staticmethod(lambda: None)  # what it was turned from, while that is there
 
     def __init__(self, structure, domain, codomain, name, form=None):
         if structure.shape != (codomain.size, domain.size):
             raise ShapeError(f"{name} maps {domain} to {codomain}, but its matrix has shape {structure.shape}")
-        form = form or _chosen_form(structure)
-        super().__init__(structure=structure, domain=domain, codomain=codomain, name=name, form=form)
+        form, layout = form or _chosen_form(structure), codomain.layout if domain.layout is None else domain.layout
+        super().__init__(structure=structure, domain=domain, codomain=codomain, name=name, form=form, layout=layout)
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
@@ -106,6 +108,8 @@ class Operator(Frozen, Remade):
         ValueError
             If `out` overlaps `u` or is not contiguous.
         """
+        if self.layout is not None:
+            return self.layout.applied(self, u, out)
         u, shape = field_array(self, u, batch=True), self.codomain.shape
         dtype = result_dtype(self.structure, u.dtype)
         lead = u.shape[: -len(self.domain.shape)]

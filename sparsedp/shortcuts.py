@@ -13,8 +13,8 @@ import autograd.numpy as anp
 import numpy as np
 
 __all__ = [
-    "ACTS", "ARRAY", "BOX", "COPY", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part", "REAL",
-    "formulas_of", "held_for_many",
+    "ACTS", "ARRAY", "BOX", "COPY", "ELSEWHERE", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part",
+    "REAL", "alike", "formulas_of", "held_for_many", "in_dtype",
 ]  # fmt: skip
 
 FLOAT = np.dtype(float)
@@ -59,12 +59,34 @@ def formulas_of(fun, value, args, nums):
     """A call ``value = fun(*args)`` -> its two formulas in FORMULAS; None: autograd knows."""
     line = FORMULAS.get(fun)  # autograd's own: a primitive that a user made of NumPy's has other derivatives
     if line is None or type(value) not in NUMBERS or value.dtype is not FLOAT:
-        return None
+        return ELSEWHERE and _elsewhere(fun, value, args, nums)
     for num in nums:
         arg = args[num]
         if type(arg) not in NUMBERS or arg.dtype is not FLOAT:
-            return None
+            return ELSEWHERE and _elsewhere(fun, value, args, nums)
     return line[1:] if line[0](value, nums, args) else None
+
+
+def _kind(value):
+    while type(value) is BOX:
+        value = value._value
+    return type(value)
+
+
+def _elsewhere(fun, value, args, nums):
+    kind = next((kind for kind in map(_kind, args) if kind in ELSEWHERE), None)
+    return kind and ELSEWHERE[kind][0](fun, value, args, nums)
+
+
+def alike(derivative, value):
+    """A derivative as the kind of array that its value is, traced or not: see ELSEWHERE."""
+    pair = ELSEWHERE and (ELSEWHERE.get(_kind(derivative)) or ELSEWHERE.get(_kind(value)))
+    return pair[1](derivative, value) if pair else derivative
+
+
+def in_dtype(value, dtype):
+    """Plain value -> the same numbers in a dtype."""
+    return value.astype(dtype) if type(value) in ELSEWHERE else np.asarray(value, dtype)
 
 
 def _entrywise(*acts):
@@ -115,6 +137,10 @@ def held_for_many(pull, held):
         return None if index is Ellipsis or type(index) is tuple and Ellipsis in index else held
     return held if pull is _entries else None
 
+
+# A kind of arrays that do not lie in the memory of one process -> what stands for `formulas_of` where one takes part,
+# and ``alike(derivative, value)``, which gives a derivative the kind of the value it belongs to.
+ELSEWHERE: dict[type, Any] = {}
 
 # Of a function of autograd: whether the formulas hold, from (value, nums, args); (pull, held), from (nums, args), with
 # ``pull(g, *held)`` the cotangents of args `nums`; what a tangent of one of them gives, from (g, num, args, shape).

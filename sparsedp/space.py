@@ -67,10 +67,17 @@ class Space(Value, Uncached):
         return (0, *accumulate(map(prod, self.parts)))
 
     @cached_property
+    def layout(self):
+        """Where its fields lie, when that is on ranks; else None."""
+        return self.grid and self.grid.layout
+
+    @cached_property
     def volumes(self):
         """Control volume of each value [length^dim]; ones in a space without a grid."""
         if self.grid is None:
             return np.ones(self.shape)
+        if self.layout is not None:
+            return self.layout.volumes(self)
         with np.errstate(over="ignore"):  # what overflows is refused
             flat = [self.grid.control_volumes(self.kind, axis).ravel() for axis in range(len(self.parts))]
         volumes = np.concatenate(flat).reshape(self.shape)
@@ -97,6 +104,8 @@ class Space(Value, Uncached):
         """
         if np.shape(v) != self.shape:
             raise ShapeError(f"split takes a field on {self.described}, got an array of shape {np.shape(v)}")
+        if self.layout is not None and self.layout.holds(v):
+            return self.layout.split(self, v)
         check_plain("split", v)
         flat, spans = anp.reshape(v, (-1,)), pairwise(self.offsets)
         return tuple(flat[start:stop].reshape(part) for (start, stop), part in zip(spans, self.parts))
@@ -121,6 +130,8 @@ class Space(Value, Uncached):
         if len(parts) != len(self.parts):
             raise ShapeError(f"join on {self} takes {len(self.parts)} components, got {len(parts)}")
         check_plain("join", *parts)
+        if self.layout is not None and self.layout.holds(*parts):
+            return self.layout.join(self, parts)
         components = [
             part if np.shape(part) == shape else _broadcast(self, part, shape)
             for part, shape in zip(parts, self.parts, strict=True)

@@ -14,8 +14,8 @@ from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
-from autograd.core import JVPNode, VJPNode, add_outgrads
-from autograd.extend import defjvp_argnums, defvjp_argnums, primitive
+from autograd.core import JVPNode, VJPNode, add_outgrads, primitive_jvps, primitive_vjps
+from autograd.extend import VSpace, defjvp_argnums, defvjp_argnums, primitive
 from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_primitives, trace_stack
 
 from sparsedp.constants import constant, constant_args, frozen, sparing
@@ -35,17 +35,20 @@ from sparsedp.shortcuts import (
     PLAIN,
     REAL,
     Part,
+    alike,
     formulas_of,
+    in_dtype,
 )  # fmt: skip
 from sparsedp.tree import copied, leaves
 
 __all__ = [
-    "Recorder", "ReverseNode", "Rule", "added", "apply_operator", "backward", "boxed", "called", "cast",
-    "differentiable", "dtype_of", "entrywise", "fit", "forward_root", "innermost", "is_variable", "isbox", "linear",
-    "new_trace", "plain", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
+    "Recorder", "ReverseNode", "Rule", "VSpace", "added", "apply_operator", "autograd_rules", "backward", "boxed",
+    "called", "cast", "differentiable", "dtype_of", "entrywise", "fit", "forward_root", "innermost", "is_variable",
+    "isbox", "linear", "new_trace", "plain", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
+autograd_rules = primitive_vjps, primitive_jvps  # by function of autograd
 
 
 # ---- traces ----------------------------------------------------------------------------------------------------------
@@ -303,7 +306,6 @@ def _of_two(function):
 
 def _install():
     """Give autograd's traced values quick operators, and its maker of arrays a quick way."""
-
     BOX.shape, BOX.__getitem__ = property(lambda box: np.shape(box._value)), _of_two(ITEM)
     for name, function in OPERATORS.items():
         act = _of_two(function)
@@ -501,7 +503,7 @@ def fit(name, value, cotangent, g):
     if type(cotangent) is type(value) and type(value) in NUMBERS:
         if cotangent.shape == value.shape and cotangent.dtype == value.dtype:
             return cotangent
-    cotangent = np.asarray(cotangent) if isinstance(cotangent, list) else cotangent
+    cotangent = alike(np.asarray(cotangent) if isinstance(cotangent, list) else cotangent, value)
     shape, wanted = np.shape(plain(cotangent)), np.shape(plain(value))
     if shape != wanted:
         raise ShapeError(f"{name} returned a derivative of shape {shape} where {wanted} is needed")
@@ -518,8 +520,7 @@ def fit(name, value, cotangent, g):
 
 
 def dtype_of(value):
-    value = plain(value)
-    return value.dtype if isinstance(value, (np.ndarray, np.generic)) else np.asarray(value).dtype
+    return np.asarray(plain(value)).dtype if not hasattr(plain(value), "dtype") else plain(value).dtype
 
 
 def cast(g, dtype):
@@ -528,8 +529,8 @@ def cast(g, dtype):
         g = anp.real(g)
     given = dtype_of(g)
     if given == dtype or not isbox(g):
-        return g if given == dtype else np.asarray(g, dtype)
-    return linear("cast", lambda x: np.asarray(x, dtype), lambda x: np.asarray(x, given))[0](g)
+        return g if given == dtype else in_dtype(g, dtype)
+    return linear("cast", lambda x: in_dtype(x, dtype), lambda x: in_dtype(x, given))[0](g)
 
 
 def linear(name, forward, transpose):
@@ -570,7 +571,7 @@ def _operator_vjp(argnums, ans, args, kwargs):
     def pull(g, dtype=u.dtype):
         act = partial(apply_operator, op.T) if isbox(g) else op.T.apply
         back = timed(op.name, "vjp", act, g)
-        return (cast(back, dtype),)
+        return (cast(back if op.layout is None else alike(back, u), dtype),)
 
     return pull
 

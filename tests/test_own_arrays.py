@@ -247,7 +247,7 @@ def test_every_builder_is_here():
         "sponge identity divergence curl upwind component prolong harmonic_average from_functions from_linear_operator"
     )
     calls = "function adopt minimize certify certified explain stress workprec rollout grad value_and_grad vjp jvp hvp"
-    calls += " differentiable set_threads steady"
+    calls += " differentiable set_threads steady distribute gather"
     shown = "animate plot convergence v_curve update_direction"
     public = {name for name in dir(dp) if callable(getattr(dp, name)) and name.islower() and name[0] != "_"}
     here = {name.split(",")[0].split(" ")[0] for name in BUILDERS}

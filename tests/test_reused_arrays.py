@@ -26,7 +26,7 @@ adopt animate average certified certify check component convergence curl diagona
 exponential face_laplacian flux function face_lift free_slip from_functions from_linear_operator from_matrix grad
 gradient harmonic_average hvp identity inflow interior jvp laplacian lift mask minimize neumann no_slip Operator outflow
 physical_gradient plot power projection prolong report restrict robin sample set_threads smoothness stress
-brinkman total_variation update_direction upwind v_curve value_and_grad vjp workprec
+brinkman distribute gather total_variation update_direction upwind v_curve value_and_grad vjp workprec
 """.split()
 
 

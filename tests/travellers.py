@@ -294,5 +294,5 @@ NOTHING_TO_CALL = {
     "Grid", "Space", "Operator", "dirichlet", "neumann", "robin", "no_slip", "free_slip", "inflow", "outflow",
     "rollout", "minimize", "update_direction",
     "set_threads", "convergence", "v_curve", "animate", "plot", "certify", "stress", "workprec", "explain", "check",
-    "errors", "report", "vjp", "jvp", "hvp", "sponge", "steady",
+    "errors", "report", "vjp", "jvp", "hvp", "sponge", "steady", "distribute", "gather",
 }  # fmt: skip

@@ -33,7 +33,7 @@ from sparsedp.integrators.problem import combine, of_fields, untraced
 from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.solvers.cache import Cache
 from sparsedp.tape import is_variable, plain
-from sparsedp.tree import flatten, leaves, leaves_like
+from sparsedp.tree import flatten, leaves, leaves_like, mapped
 
 __all__ = ["Leapfrog", "sponge"]
 

@@ -187,7 +187,8 @@ def _coarse(grid, factor):
         raise ShapeError(f"a factor must be a whole number >= 1 that divides {grid.shape}, got {factor}")
     spacing = [h.reshape(-1, f).sum(axis=1) for h, f in zip(grid.widths, factors, strict=True)]
     shape = tuple(n // f for n, f in zip(grid.shape, factors, strict=True))
-    return Grid(shape, spacing=spacing, origin=grid.origin, periodic=grid.periodic), factors
+    coarse = Grid(shape, spacing=spacing, origin=grid.origin, periodic=grid.periodic)
+    return coarse if grid.layout is None else grid.layout.laid(coarse), factors
 
 
 def component(grid, axis):

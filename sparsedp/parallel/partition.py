@@ -1,0 +1,142 @@
+"""Which rank holds which block of a field, and the numbers that all ranks agree on.
+
+Along an axis, the ranks at place c hold the cells cuts[c] to cuts[c + 1] and their lower faces; those at the last place
+hold the upper wall too. So every number has one owner, and sums over blocks are sums. Blocks may be empty: any grid
+lies on any number of ranks. A box is one (start, stop) for each axis of a component; on a periodic axis it may reach
+beyond 0 and n.
+"""
+
+from functools import cached_property
+from math import prod
+
+import numpy as np
+from mpi4py import MPI
+
+__all__ = ["Partition"]
+
+
+class Partition:
+    """The cuts of a grid for the ranks of a communicator. Equal by value.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Cells along each axis.
+    periodic : tuple of bool
+    comm : mpi4py.MPI.Comm
+    """
+
+    def __init__(self, shape, periodic, comm):
+        self.shape, self.periodic, self.comm = tuple(shape), tuple(periodic), comm
+        self.ranks = _arrangement(self.shape, comm.size)
+        self.cuts = [n * np.arange(p + 1) // p for n, p in zip(self.shape, self.ranks)]
+
+    @property
+    def _key(self):
+        return self.shape, self.periodic, self.comm.py2f()
+
+    def __eq__(self, other):
+        return isinstance(other, Partition) and self._key == other._key
+
+    def __hash__(self):
+        return hash(self._key)
+
+    def __reduce__(self):
+        raise TypeError("a grid on ranks cannot be pickled; pickle the grid that was given to dp.distribute")
+
+    # ------------------------------------------------------------ blocks
+
+    def lines(self, axis, length):
+        """Cuts along one axis of a component with so many entries: cells, nodes, or any other count."""
+        cuts, n, more = self.cuts[axis], self.shape[axis], length - self.shape[axis]
+        inner = cuts[1:-1] + more // 2 if more in (0, 1, 2) else cuts[1:-1] * length // max(n, 1)
+        return np.concatenate([[0], inner, [length]])
+
+    @cached_property
+    def places(self):
+        """Along each axis, the place of every rank."""
+        return [np.unravel_index(rank, self.ranks) for rank in range(self.comm.size)]
+
+    def box(self, part, rank=None):
+        """The box of one component that a rank (default: this one) holds."""
+        place = self.places[self.comm.rank if rank is None else rank]
+        lines = [self.lines(axis, length) for axis, length in enumerate(part)]
+        return tuple((int(line[p]), int(line[p + 1])) for line, p in zip(lines, place))
+
+    def shapes(self, parts, rank=None):
+        """Shapes of the blocks of a rank, one for each component."""
+        return [lengths(self.box(part, rank)) for part in parts]
+
+    def size(self, parts, rank=None):
+        """Count of numbers in the blocks of a rank."""
+        return sum(map(prod, self.shapes(parts, rank)))
+
+    def take(self, values, parts):
+        """A whole flat field -> the flat block of this rank, a copy."""
+        found, start = [values[:0]], 0  # where nothing is bounded there are no walls
+        for part in parts:
+            found.append(values[start : start + prod(part)].reshape(part)[slices(self.box(part))].reshape(-1))
+            start += prod(part)
+        return np.concatenate(found)
+
+    def gather(self, flat, parts):
+        """The flat block of this rank -> the whole flat field, on every rank."""
+        whole = [np.empty(part, flat.dtype) for part in parts]
+        for rank, block in enumerate(self.comm.allgather(flat)):
+            start = 0
+            for target, part, shape in zip(whole, parts, self.shapes(parts, rank)):
+                target[slices(self.box(part, rank))] = block[start : start + prod(shape)].reshape(shape)
+                start += prod(shape)
+        return np.concatenate([flat[:0], *(target.reshape(-1) for target in whole)])
+
+    def owners(self, parts, number, index):
+        """Indices on one component, an array for each axis -> the rank that holds each, and where in its flat block."""
+        starts = np.array([self.size(parts[:number], rank) for rank in range(self.comm.size)])
+        ranks = places = np.zeros((), np.int64)
+        for axis, (i, length) in enumerate(zip(index, parts[number])):
+            cuts, i = self.lines(axis, length), i % max(length, 1)
+            owner = np.searchsorted(cuts, i, side="right") - 1
+            ranks = ranks * self.ranks[axis] + owner
+            places = places * np.diff(cuts)[owner] + (i - cuts[owner])
+        return ranks, places + starts[ranks]
+
+    # ------------------------------------------------------------ numbers that all ranks agree on
+
+    def sum(self, number):
+        """Sum over the ranks, in their order: the same bits on each, whatever the MPI library does."""
+        return self._reduced(number, np.add)
+
+    def max(self, number):
+        """The largest of all ranks; NaN when one is NaN."""
+        return self._reduced(number, np.maximum)
+
+    def min(self, number):
+        """The least of all ranks; NaN when one is NaN."""
+        return self._reduced(number, np.minimum)
+
+    def _reduced(self, number, act):
+        number = np.asarray(number)
+        found = np.empty((self.comm.size, *number.shape), number.dtype)
+        self.comm.Allgather([number.tobytes(), MPI.BYTE], [found, MPI.BYTE])
+        return act.reduce(found, axis=0)[()]
+
+
+def lengths(box):
+    """Shape of a box."""
+    return tuple(stop - start for start, stop in box)
+
+
+def slices(box, origin=None):
+    """A box -> one slice for each axis, counted from the starts of another box."""
+    starts = [0] * len(box) if origin is None else [start for start, _ in origin]
+    return tuple(slice(a - start, b - start) for (a, b), start in zip(box, starts))
+
+
+def _arrangement(shape, count):
+    """So many ranks -> how many along each axis: that which cuts through the fewest cells, the first axes first."""
+    found: list[tuple] = [()]
+    for _ in shape[1:]:
+        found = [(*some, p) for some in found for p in range(1, count + 1) if count % prod((*some, p)) == 0]
+    found = [(*some, count // prod(some)) for some in found]
+    area = lambda ranks: sum((p - 1) * prod(shape) / max(n, 1) for p, n in zip(ranks, shape))
+    return min(sorted(found, reverse=True), key=area)

@@ -1,0 +1,81 @@
+"""Every line of the catalogue on ranks: beside one process, its transpose, the hash of what it gives.
+
+    mpirun -n 4 python -m mpi4py tests/ranks/catalogue_scan.py
+
+Rank 0 prints one line for each operator: its label, the largest error and dot test, the hash; or what refused it.
+"""
+
+from hashlib import sha256
+
+import numpy as np
+from catalogue import CATALOGUE, LABELS
+from mpi4py import MPI
+
+import sparsedp as dp
+
+RNG = np.random.default_rng(3)
+GRIDS = [
+    dp.Grid(13, spacing=0.3),
+    dp.Grid((12, 9), size=(2.0, 1.0), periodic=(True, False)),
+    dp.Grid((12, 9), spacing=[RNG.uniform(0.5, 2.0, n) for n in (12, 9)]),
+    dp.Grid((3, 20), spacing=[RNG.uniform(0.5, 2.0, n) for n in (3, 20)], periodic=True),
+    dp.Grid((6, 4, 8), size=1.0, periodic=(False, True, False)),
+    dp.Grid((4, 6, 5), spacing=[RNG.uniform(0.5, 2.0, n) for n in (4, 6, 5)], periodic=(True, False, True)),
+]
+
+
+def boundary(grid):
+    """The conditions of the README's kinds, mixed."""
+    sides = [(dp.dirichlet, dp.robin(1, 2)), (dp.neumann, dp.dirichlet), (dp.robin(2, 0.5), dp.neumann)]
+    return {name: sides[a] for a, name in enumerate(grid.axes) if not grid.periodic[a]}
+
+
+def whole(u):
+    """A result as one array, on ranks or not."""
+    return np.asarray(dp.gather(u))
+
+
+def looked_at(entry, plain, grid):
+    """(largest error, dot test, digest) of one operator on one grid; or the refusal."""
+    one = entry.make(plain, boundary(plain))
+    try:
+        op = entry.make(grid, boundary(grid))
+        digest, worst = sha256(), 0.0
+        u, g = (np.random.default_rng(5).standard_normal(space.shape) for space in (one.domain, one.codomain))
+        found = []
+        for act, wanted, x in ((op, one, u), (op.T, one.T, g)):
+            y, right = whole(act(x)), wanted(x)
+            assert y.shape == right.shape
+            scale = max(np.max(wanted_magnitude(wanted, x), initial=0.0), 1e-300)
+            worst = max(worst, float(np.max(np.abs(y - right), initial=0.0) / scale))
+            digest.update(y.tobytes())
+            found.append(act(x))
+        terms = np.vdot(g, found[0]), np.vdot(u, found[1])
+        dot = abs(terms[0] - terms[1]) / (np.vdot(np.abs(g), wanted_magnitude(one, u)) or 1.0)
+        return worst, float(dot), digest.hexdigest()[:16]
+    except TypeError as error:
+        return str(error)
+
+
+def wanted_magnitude(op, x):
+    """|A| |x|, the scale of rounding errors."""
+    return np.abs(op.matrix) @ np.abs(x).reshape(-1)
+
+
+def main():
+    """Print the table; end with an error where the ranks do not agree."""
+    comm = MPI.COMM_WORLD
+    for number, plain in enumerate(GRIDS):
+        grid = dp.distribute(plain, comm)
+        for label, entry in zip(LABELS, CATALOGUE):
+            if plain.dim < entry.least_dim:
+                continue
+            found = looked_at(entry, plain, grid)
+            assert len(set(comm.allgather(repr(found)))) == 1, (label, plain, comm.allgather(repr(found)))
+            if comm.rank == 0:
+                told = f"refused {found}" if isinstance(found, str) else "{:.2e} {:.2e} {}".format(*found)
+                print(f"{number} {label} {told}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""What is refused on ranks, and what one process is told: every message of parallel/."""
+
+import pickle
+import sys
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from launch import on_ranks
+
+import sparsedp as dp
+from sparsedp.errors import ShapeError
+
+
+class Scene:
+    """A grid on one rank, as on many, and what lies on it."""
+
+    def __init__(self):
+        from mpi4py import MPI
+
+        self.grid = dp.distribute(dp.Grid((5, 4)), MPI.COMM_SELF)
+        self.u, self.G = 1.0 * self.grid.volumes, dp.gradient(self.grid)
+        self.other = dp.distribute(dp.Grid((3, 2)), MPI.COMM_SELF).volumes
+
+    def double(self):
+        """An operator of two functions."""
+        return dp.from_functions(lambda u: 2 * u, lambda g: 2 * g, self.grid.cells, self.grid.cells, name="double")
+
+
+REFUSED = [
+    (
+        TypeError,
+        "u[...] does not work on a field that lies on ranks; write dp.gather(u) for the whole array",
+        lambda s: s.u[0],
+    ),
+    (ShapeError, "a field on cells(5, 4) is needed, got one on cells(3, 2)", lambda s: s.u + s.other),
+    (
+        ShapeError,
+        "a field on cells(5, 4) is needed, got an array of shape (3,); give the whole array",
+        lambda s: s.u + np.ones(3),
+    ),
+    (
+        TypeError,
+        "the derivative of vdot of a field on ranks is not known; write sums of products",
+        lambda s: dp.grad(lambda u: anp.vdot(u, u))(s.u),
+    ),
+    (
+        TypeError,
+        "a grid on ranks cannot be pickled; pickle the grid that was given to dp.distribute",
+        lambda s: pickle.dumps(s.grid),
+    ),
+    (
+        TypeError,
+        "gradient takes no out on ranks; leave it away",
+        lambda s: s.G.apply(s.u, out=np.ones(s.grid.faces.size)),
+    ),
+    (ShapeError, "gradient takes a field on cells(5, 4), got one on cells(3, 2)", lambda s: s.G(s.other)),
+    (
+        TypeError,
+        "an operator of two functions cannot be cut for ranks, for no rank knows its rows; make it of operators of the "
+        "grid or of a matrix",
+        lambda s: s.double()(s.u),
+    ),
+    (
+        TypeError,
+        "projection does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.projection(s.grid),
+    ),
+    (
+        TypeError,
+        "distribute takes a communicator, got int; write mpi4py.MPI.COMM_WORLD",
+        lambda s: dp.distribute(dp.Grid(3), 2),
+    ),
+]
+
+
+@on_ranks
+@pytest.mark.parametrize("case", range(len(REFUSED)))
+def test_refusals(case):
+    error, told, act = REFUSED[case]
+    with pytest.raises(error) as caught:
+        act(Scene())
+    assert str(caught.value) == told
+
+
+@on_ranks
+def test_another_mpi(monkeypatch):
+    monkeypatch.setenv("PMI_SIZE", "4")
+    told = "4 processes were started, and mpi4py sees one: it belongs to another MPI; install it for this one"
+    with pytest.raises(RuntimeError) as caught:
+        dp.distribute(dp.Grid(3))
+    assert str(caught.value) == told
+
+
+@on_ranks
+def test_names():
+    scene = Scene()
+    assert repr(scene.u) == "<field on cells(5, 4), on rank 0 of 1>" and repr(scene.grid).endswith("on 1 ranks)")
+
+
+def test_several_processes_without_mpi4py(monkeypatch):
+    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "2")
+    monkeypatch.setitem(sys.modules, "mpi4py", None)
+    told = "distribute on several processes needs mpi4py and petsc4py (*); install them, or start one process"
+    with pytest.raises(ImportError) as caught:
+        dp.distribute(dp.Grid(3))
+    start, end = told.split("*")
+    assert str(caught.value).startswith(start) and str(caught.value).endswith(end)
+
+
+def test_what_gather_does_not_take():
+    with pytest.raises(ShapeError, match="gather takes one field, got list; gather them one by one"):
+        dp.gather([np.ones(3), np.ones(2)])
