@@ -67,12 +67,8 @@ class Packing:
         return list(compress(labels(self._rebuild(self._leaves), self.root), self._floating))
 
     def pack(self, tree):
-        """Tree of the same structure -> flat vector of doubles."""
-        return self.pack_leaves(leaves(tree))
-
-    def pack_leaves(self, entries):
-        """Leaves of a tree of the same structure -> flat vector of doubles."""
-        return joined(compress(entries, self._floating))
+        """Tree of as many leaves -> flat vector of doubles."""
+        return joined(compress(leaves(tree), self._floating))
 
     def slopes(self, gradient):
         """Gradient of the same structure -> its floating leaves, dL/dRe + i dL/dIm of complex ones.

@@ -64,7 +64,7 @@ def _side(side, packing, start, without):
             f"a bound must be a number or have the structure of start, got {len(given)} leaves where start has "
             f"{len(wanted)}; write one number, or a tree like start"
         )
-    return packing.pack_leaves([_full(x, without if b is None else b) for x, b in zip(wanted, given)])
+    return packing.pack([_full(x, without if b is None else b) for x, b in zip(wanted, given)])
 
 
 def _full(x, bound):
