@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from math import inf, isfinite, nan
 from pathlib import Path
 from time import perf_counter
+from timeit import repeat, timeit
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from sparsedp.report.plan import total
 from sparsedp.report.table import Table, write_table
 from sparsedp.tree import leaves
 
-__all__ = ["COLUMNS", "Rows", "timed", "words_of", "workprec"]
+__all__ = ["COLUMNS", "Rows", "words_of", "workprec"]
 
 COLUMNS = (
     "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
@@ -164,10 +165,12 @@ def _prepared(problem, settings):
 def _measured(problem, settings, repeats):
     """Settings of one run -> (figures, answer, gradient). What fails keeps a row with its status."""
     try:
-        seconds, (runs, facts, answers) = timed(partial(_prepared, problem, settings))
+        clock = perf_counter()
+        runs, facts, answers = _prepared(problem, settings)
+        seconds = perf_counter() - clock
         status, first, last = _warm(runs[-1])
-        times, result = _times(runs, repeats)
-        peak = _peak(runs[-1])
+        times = _times(runs, int(repeats))
+        peak, result = _peak(runs[-1])
         answer, gradient = answers(result)
     except FAILURES as error:
         return {"status": _failure(error)}, None, None
@@ -178,19 +181,12 @@ def _measured(problem, settings, repeats):
     return row, answer, gradient
 
 
-def timed(run):
-    """A function without arguments -> (seconds, what it gives)."""
-    clock = perf_counter()
-    result = run()
-    return perf_counter() - clock, result
-
-
 def _warm(run):
     """Run until the time has settled: compiled code, caches -> (status, calls of the first run, of the last)."""
     before, first = inf, None
     for _ in range(MOST_WARM_UPS):
         with recording() as calls:
-            now, _ = timed(run)
+            now = timeit(run, number=1)
         first = first or calls
         if before <= SETTLED * now + SHORT:  # it does not fall any more
             return "ok", first, calls
@@ -199,29 +195,29 @@ def _warm(run):
 
 
 def _times(runs, repeats):
-    """Runs of the value, and of value and gradient -> (columns of their times, what the last one gave).
+    """Runs of the value, and of value and gradient -> columns of their times.
 
     The time of the gradient is that of both less the least of the value.
     """
     row: dict = {}
-    least, result = 0.0, None
+    least = 0.0
     for name, run in zip(("seconds_forward", "seconds_backward"), runs):
-        seconds, results = zip(*(timed(run) for _ in range(repeats)))
-        times = np.quantile(np.maximum(np.subtract(seconds, least), 0.0), (0.0, 0.5, 1.0)).tolist()
+        seconds = np.subtract(repeat(run, number=1, repeat=repeats), least)
+        times = np.quantile(np.maximum(seconds, 0.0), (0.0, 0.5, 1.0)).tolist()
         row |= dict(zip((name, f"{name}_median", f"{name}_max"), times))
-        least, result = times[0], results[-1]
-    return row, result
+        least = times[0]
+    return row
 
 
 def _peak(run):
-    """Bytes that a run holds at most, beyond what there was before, as Python's allocator sees it."""
+    """(Bytes that a run holds at most, beyond what there was before, as Python's allocator sees it; what it gives)."""
     running = tracemalloc.is_tracing()
     tracemalloc.start()  # nothing where it runs
     try:
         tracemalloc.reset_peak()
         before = tracemalloc.get_traced_memory()[0]
-        run()
-        return tracemalloc.get_traced_memory()[1] - before
+        result = run()
+        return tracemalloc.get_traced_memory()[1] - before, result
     finally:
         if not running:
             tracemalloc.stop()
