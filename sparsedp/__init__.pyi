@@ -54,9 +54,9 @@ from .optimize.loop import minimize as minimize
 from .optimize.physical import physical_gradient as physical_gradient
 from .optimize.regularization import smoothness as smoothness
 from .optimize.regularization import total_variation as total_variation
-from .parallel.scenes import ensemble as ensemble
 from .parallel.front import distribute as distribute
 from .parallel.front import gather as gather
+from .parallel.scenes import ensemble as ensemble
 from .report.certificate import certified as certified
 from .report.certificate import certify as certify
 from .report.plan import explain as explain

@@ -101,9 +101,8 @@ BUDGETS = {
     "kernels": 14_000,
     "network": 2_450,
     "operators": 6_900,  # tensors: 800; flux: 300; coarse grids on ranks: 15
-    "parallel": 10_350,
     "optimize": 13_400,  # admm: 500; total_variation, smoothness: 400
-    "parallel": 10_350,  # ensembles
+    "parallel": 10_350,  # of 13 000: layouts, blocks and cut operators; ensembles: 1 650
     "report": 17_400,
     "solvers": 44_150,  # steady states, tensors, complex coefficients and waves: 2 550; LU that serves the next: 270
     "solvers/multigrid": 10_000,
