@@ -23,7 +23,21 @@ from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, note, thread, timed
 from sparsedp.recipe import Remade
 from sparsedp.shortcuts import (
-    ACTS, ARRAY, BOX, COPY, FLOAT, ITEM, MAKERS, NUMBERS, OPERATORS, PLAIN, REAL, Part, alike, formulas_of, in_dtype
+    ACTS,
+    ARRAY,
+    BOX,
+    COPY,
+    FLOAT,
+    ITEM,
+    MAKERS,
+    NUMBERS,
+    OPERATORS,
+    PLAIN,
+    REAL,
+    Part,
+    alike,
+    formulas_of,
+    in_dtype,
 )  # fmt: skip
 from sparsedp.tree import copied, leaves
 
