@@ -8,6 +8,7 @@ from types import FunctionType
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.tree import leaves_like
 
 __all__ = [
     "BLOCK",
@@ -20,6 +21,7 @@ __all__ = [
     "field_array",
     "is_number",
     "is_whole",
+    "leaves_by_name",
     "place",
     "rounded_down",
     "surely_finite",
@@ -135,6 +137,16 @@ def check_number(name, value, sign="", advice=""):
         raise NonFiniteError(f"{name} must be finite, got {value}")
     if {"": False, ">= 0": value < 0, "> 0": value <= 0}[sign]:
         raise ValueError(f"{name} must be {sign}, got {value:g}{advice}")
+
+
+def leaves_by_name(what, tree, wanted, other):
+    """Leaves of a tree in the order of another one's: by name where both are dicts, and other names are refused.
+
+    `what`, `wanted`: what the trees are called in messages.
+    """
+    if isinstance(tree, dict) and isinstance(other, dict) and tree.keys() != other.keys():
+        raise ShapeError(f"{what} must have the names of {wanted}, {[*other]}, got {[*tree]}")
+    return leaves_like(tree, other)
 
 
 def is_number(value):
