@@ -222,14 +222,14 @@ class Adopted(Remade):
     def _patterns(self, x, y):
         """Patterns to be tried at x, coloured, the cheapest first; each has the entries known from earlier points."""
         rows, columns, earlier = y.size, x.size, self._sparsity
-        grid = self._shapes[0] if self._shapes[0] == self._shapes[1] else None
+        shapes = [self._shapes[0]] if self._shapes[0] == self._shapes[1] else None
         if self._coloured is not None:
             yield self._coloured
             earlier = self._coloured.pattern
         elif earlier is not None:
             if earlier.shape != (rows, columns):
                 raise ShapeError(f"the sparsity of {self.name} must have shape {(rows, columns)}, got {earlier.shape}")
-            yield Coloured(earlier, grid, by_rows=False)
+            yield Coloured(earlier, shapes, by_rows=False)
         elif not np.array_equal(self._flat(x), y):
             raise DerivativeError(f"{self.name} gives two results for one argument; fix its random state first")
         if self._sparsity is not None:
@@ -241,9 +241,9 @@ class Adopted(Remade):
         ]
 
         def coloured(pattern):
-            return Coloured(pattern if earlier is None else pattern_like(pattern + earlier), grid, by_rows=False)
+            return Coloured(pattern if earlier is None else pattern_like(pattern + earlier), shapes, by_rows=False)
 
-        guess = None if grid is None else stencil_pattern(products, [grid])
+        guess = None if shapes is None else stencil_pattern(products, shapes)
         if guess is not None:
             yield coloured(guess)
         sparse = find_pattern(products, rows, columns)

@@ -31,7 +31,6 @@ __all__ = ["Jacobians", "Linearisation"]
 FULL_UP_TO = 16  # unknowns: a full Jacobian takes fewer products than the search for its pattern
 FULL_AT_MOST = 2000  # unknowns: a larger Jacobian that is not sparse is left as products
 SYMMETRIC = 1e-12  # of the largest entry: by how much a symmetric Jacobian may differ from its transpose
-MOST_COLOURS = 64  # products for a matrix: with more, a guess at its pattern saves nothing
 AGREES = 1e-8  # relative difference up to which two forms of one Jacobian are taken for equal
 
 
@@ -250,85 +249,81 @@ class Jacobians:
 
     def _coloured(self, equation, x, leaves):
         """The coloured pattern for this many unknowns (None: only products will do), and the cells that they lie on."""
-        size, method, pattern, space = equation.size, self.settings["method"], self.sparsity, None
+        size, pattern = equation.size, self.sparsity
         if self.by_rows is None:
             self.by_rows = not _can(pushforward, lambda y: equation(y, *leaves), x, np.ones_like(x))
         if pattern is not None:
             self.way = "assembled on the pattern given"
             if pattern.shape != (size, size):
                 raise ShapeError(f"the sparsity of {self.name} must have shape {(size, size)}, got {pattern.shape}")
-        elif method == "krylov":
+        elif self.settings["method"] == "krylov":
             self.way = "products only, as asked"
         elif size <= FULL_UP_TO:
             pattern, self.way = dense_pattern(size, size), "assembled, all entries"
         else:
-            pattern, self.way = self._search(equation, x, leaves), "assembled on a pattern found by probing"
-            space = cells_met(equation, x, leaves)
-            if pattern is None and method == "auto" and size > FULL_AT_MOST:
+            points, self.way = _points(equation, x, leaves), "assembled on a pattern found by probing"
+            if self._guessed(equation, points, leaves):
+                return self._patterns[size]
+            pattern = self._probed(equation, points, leaves)
+            if pattern is None and self.settings["method"] == "auto" and size > FULL_AT_MOST:
                 self.way = f"products only: {size} unknowns and a Jacobian that is not sparse"
             elif pattern is None:
                 pattern, self.way = dense_pattern(size, size), "assembled, all entries: it is not sparse"
-        return self._colour(pattern, space, equation, x, leaves)
-
-    def _colour(self, pattern, space, equation, x, leaves):
-        coloured, shapes = None, equation.layout.shapes
         if pattern is not None:
-            # One tape serves all products with J^T; each with J takes a run of its own.
-            symmetric = (pattern - pattern.T).nnz == 0 and _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
-            by_rows = True if self.by_rows or symmetric else None
-            coloured = Coloured(pattern, shapes[0] if len(shapes) == 1 else None, by_rows)
-            space = space if symmetric else None
-        self._patterns[equation.size] = coloured, space
-        return coloured, space
+            return self._colour(pattern, equation, x, leaves)
+        return self._patterns.setdefault(size, (None, None))
 
-    def _search(self, equation, x, leaves):
-        """The pattern of J near x and at two opposite random points, by columns or by rows."""
-        points = [point for point in _points(x) if _is_valid(equation, point, leaves)] or [x]
-        found = None
+    def _colour(self, pattern, equation, x, leaves):
+        # One tape serves all products with J^T; each with J takes a run of its own.
+        symmetric = (pattern - pattern.T).nnz == 0 and _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
+        cells, shapes = fields_met(equation, x, leaves)
+        coloured = Coloured(pattern, shapes, True if self.by_rows or symmetric else None)
+        self._patterns[equation.size] = known = coloured, cells if symmetric else None
+        return known
+
+    def _guessed(self, equation, points, leaves):
+        """Whether J has entries on a stencil only: what its products with colours give acts as it does. It is kept."""
+        shapes = fields_met(equation, points[0], leaves)[1]
+        guess = stencil_pattern(self._products(equation, points, leaves, self.by_rows), shapes)
+        if guess is None:
+            return False
+        coloured = self._colour(guess.T.tocsr() if self.by_rows else guess, equation, points[0], leaves)[0]
+        (product,) = self._products(equation, points[-1:], leaves, coloured.by_rows)
+        matrix, v = coloured.matrix(product), np.random.default_rng(1).uniform(0.5, 1.5, equation.size)
+        matrix = matrix.T if coloured.by_rows else matrix
+        return not np.any(np.abs(matrix @ v - product(v)) > AGREES * (abs(matrix) @ v))
+
+    def _probed(self, equation, points, leaves):
+        """The union of the patterns of J at the points, by columns or by rows; None where it is not sparse."""
         for by_rows in (True,) if self.by_rows else (False, True):
-            found = self._probed(equation, points, leaves, by_rows) if found is None else found
-        return found
+            found = find_pattern(self._products(equation, points, leaves, by_rows), *(equation.size,) * 2)
+            if found is not None:
+                return found.T.tocsr() if by_rows else found
+        return None
 
-    def _probed(self, equation, points, leaves, by_rows):
-        products = [self._product(equation, point, leaves, by_rows, "pattern") for point in points]
-        parts = fields_met(equation, points[0], leaves)
-        found = None if parts is None else stencil_pattern(products, parts)
-        if found is not None and _serves(found, products):
-            return found.T.tocsr() if by_rows else found
-        found = find_pattern(products, equation.size, equation.size)
-        return found.T.tocsr() if by_rows and found is not None else found
+    def _products(self, equation, points, leaves, by_rows):
+        return [self._product(equation, point, leaves, by_rows, "pattern") for point in points]
 
     def _enlarge(self, equation, x, leaves, row):
         """Add the entries that J has at x. When there are none, its products are not linear."""
-        coloured, space = self._patterns[equation.size]
-        found = self._probed(equation, [x], leaves, self.by_rows)
+        coloured, found = self._patterns[equation.size][0], self._probed(equation, [x], leaves)
         total = pattern_like(coloured.pattern + (dense_pattern(x.size, x.size) if found is None else found))
         if total.nnz == coloured.pattern.nnz:
             raise DerivativeError(f"the derivative of {self.name} is not linear in its direction in row {row}")
-        self._colour(total, space, equation, x, leaves)
+        self._colour(total, equation, x, leaves)
 
 
 def _key(equation, x, leaves):
     return (x, *leaves, *equation.statics, *equation.layout.shapes)
 
 
-def _points(x):
+def _points(equation, x, leaves):
+    """Points to probe at: near x and at two opposite random ones."""
     rng = np.random.default_rng(0)
     scale = np.sqrt(np.mean(x**2)) or 1.0
     far = scale * rng.standard_normal(x.size)
-    return x * (1 + 0.1 * rng.uniform(-1, 1, x.size)), far, -far  # opposite: each side of a switch is met
-
-
-def _serves(pattern, products):
-    """Whether matrices have entries on a pattern only: what the products with their colours give acts as they do."""
-    coloured, v = Coloured(pattern, by_rows=False), np.random.default_rng(1).uniform(0.5, 1.5, pattern.shape[1])
-    if coloured.count > MOST_COLOURS:
-        return False
-    for product in products:
-        matrix = coloured.matrix(product)
-        if np.any(np.abs(matrix @ v - product(v)) > AGREES * (abs(matrix) @ v)):
-            return False
-    return True
+    points = x * (1 + 0.1 * rng.uniform(-1, 1, x.size)), far, -far  # opposite: each side of a switch is met
+    return [point for point in points if _is_valid(equation, point, leaves)] or [x]
 
 
 def _is_valid(equation, x, leaves):
@@ -373,8 +368,8 @@ def _is_symmetric(matrix, space):
     return bool(gap <= SYMMETRIC * abs(weighed).max())
 
 
-def cells_met(equation, x, leaves):
-    """The cells of the first grid that an Operator in the residual acts on, if x is one field on them; else None.
+def fields_met(equation, x, leaves):
+    """Where the unknowns lie: told from the Operators in the residual.
 
     Parameters
     ----------
@@ -384,30 +379,17 @@ def cells_met(equation, x, leaves):
 
     Returns
     -------
-    Space or None
+    cells : Space or None
+        The cells of a grid, if x is one field on them. On one axis banded LU needs no geometry.
+    shapes : list of tuples of int
+        Of the fields, one after the other, a velocity by its components where all are on one grid; of one dimension.
     """
-    shapes = equation.layout.shapes
-    if len(shapes) != 1 or len(shapes[0]) < 2:
-        return None  # on one axis banded LU needs no geometry
-    spaces = _spaces_met(equation, x, leaves)
-    return next((s for s in spaces if s.grid is not None and s.kind == "cells" and s.shape == shapes[0]), None)
-
-
-def fields_met(equation, x, leaves):
-    """The shapes of the fields, one after the other, where all are on one grid, a velocity by its components; or None.
-
-    As `cells_met`: told from the Operators in the residual.
-    """
-    met = {space.shape: space for space in _spaces_met(equation, x, leaves) if space.grid is not None}
-    shapes = equation.layout.shapes
-    spaces = [met[shape] for shape in shapes if shape in met]
-    if len(shapes) < 2 or len(spaces) < len(shapes) or len({space.grid for space in spaces}) > 1:
-        return None
-    return [part for space in spaces for part in space.parts]
-
-
-def _spaces_met(equation, x, leaves):
-    """The domains of the Operators that the residual applies."""
     with recording() as calls, np.errstate(all="ignore"):
         equation(x, *leaves)
-    return [op.domain for actors in calls.actors.values() for op in actors.values() if isinstance(op, Operator)]
+    actors = [op.domain for actors in calls.actors.values() for op in actors.values() if isinstance(op, Operator)]
+    met, shapes = {space.shape: space for space in actors[::-1] if space.grid is not None}, equation.layout.shapes
+    spaces = [met[shape] for shape in shapes if shape in met]
+    if len(spaces) == len(shapes) and len({space.grid for space in spaces}) == 1:
+        one = len(spaces) == 1 and spaces[0].kind == "cells" and len(shapes[0]) > 1
+        return spaces[0] if one else None, [part for space in spaces for part in space.parts]
+    return None, shapes if len(set(map(len, shapes))) == 1 else [(equation.size,)]

@@ -16,15 +16,17 @@ A guess at the pattern on a grid takes fewer: what a few cells touch, moved over
 
 **Colouring**: columns that share no row get one colour, and one product with A serves all columns of a colour.
 
-Two ways, and the better one is taken. On a grid the colour (a . i) mod c of the column with index i, for
-a lattice vector a, is valid when no difference of two columns in a row is a multiple of c; stencils reach
-the least count this way (3 for three points, 5 for five, 7 for seven). Any other pattern is coloured column by column.
+Two ways, and the better one is taken. On a grid the colour (a . i) mod c of the column with index i, the number of its
+field first, for a lattice vector a, is valid when no a . d is a multiple of c, d the differences of two columns in a
+row; stencils reach the least count this way (3 for three points, 5 for five, 7 for seven), velocity and pressure
+nearly: 13 where a row has 11 entries. Any other pattern is coloured column by column.
 
 Source: Curtis, Powell and Reid, On the estimation of sparse Jacobian matrices, 1974.
 """
 
 from itertools import islice
 from itertools import product as combinations
+from math import prod
 
 import numpy as np
 import scipy.sparse as sp
@@ -134,11 +136,9 @@ def stencil_pattern(products, shapes):
     csr_array or None
         None when the fields are small, or a cell touches too many.
     """
-    own = np.array([(1, *shape) for shape in shapes])[:, :, None]
+    own, index = np.array([(1, *shape) for shape in shapes])[:, :, None], _places(shapes)
     lengths = np.max(own, axis=0)
     lengths[0] = len(own)  # the first axis counts fields
-    index = np.hstack([np.indices(shape[:, 0]).reshape(len(shape), -1) for shape in own])
-    index[0] = np.repeat(np.arange(len(own)), np.prod(own, axis=(1, 2)))
     number = np.full(lengths[:, 0], -1)
     number[tuple(index)] = np.arange(index.shape[1])
     far = lengths > SHORT  # axes that count places; the others count kinds
@@ -179,8 +179,8 @@ class Coloured:
     Parameters
     ----------
     pattern : csr_array
-    shape : tuple of int, optional
-        Shape of the fields that rows and columns belong to, when it is a grid.
+    shapes : sequence of tuples of int, optional
+        Of the fields that rows and columns belong to, one after the other, of one dimension. Default: one line.
 
     Attributes
     ----------
@@ -198,13 +198,12 @@ class Coloured:
     True
     """
 
-    def __init__(self, pattern, shape=None, by_rows=None):
-        self.pattern, self.shape = pattern, shape
-        self.by_rows = bool(by_rows)
-        self.colours = colour(pattern.T.tocsr() if by_rows else pattern, shape)
+    def __init__(self, pattern, shapes=None, by_rows=None):
+        self.pattern, self.by_rows = pattern, bool(by_rows)
+        self.colours = colour(pattern.T.tocsr() if by_rows else pattern, shapes)
         highest = np.bincount(pattern.indices, minlength=1).max(initial=0)
         if by_rows is None and self.count > 2 * highest:  # no colouring of rows needs less than the highest column
-            turned = colour(pattern.T.tocsr(), shape)
+            turned = colour(pattern.T.tocsr(), shapes)
             if turned.max(initial=-1) + 1 < self.count:
                 self.by_rows, self.colours = True, turned
         # Where each entry stands in the table of products: (colour of the column, row), or mirrored.
@@ -225,14 +224,14 @@ class Coloured:
         return sp.csr_array((table[self._place], self.pattern.indices, self.pattern.indptr), shape=self.pattern.shape)
 
 
-def colour(pattern, shape=None):
+def colour(pattern, shapes=None):
     """Pattern -> a colour for each column; columns that share a row get different ones.
 
     Parameters
     ----------
     pattern : csr_array
-    shape : tuple of int, optional
-        The grid that the columns belong to, in C order.
+    shapes : sequence of tuples of int, optional
+        Of the fields that the columns belong to: see Coloured.
 
     Returns
     -------
@@ -244,33 +243,42 @@ def colour(pattern, shape=None):
         return np.arange(size)
     links = sp.csr_array(pattern.astype(np.int32))
     links = sp.csr_array(links.T @ links + sp.eye_array(size, dtype=np.int32))  # every column is linked to itself
-    found = _lattice(links, shape or (size,), least)
+    found = _lattice(links, _places(shapes or [(size,)]), least)
     if found.max() >= (least if size <= SMALL else 2 * least):
         found = min(found, _one_by_one(links), key=np.max)
     return found
 
 
-def _lattice(links, shape, least):
-    """(a . i) mod c with the smallest c that works, or a colour for each column."""
-    size, differences = links.shape[0], _differences(links, shape)
+def _places(shapes):
+    """Fields of these shapes, one after the other -> the number of its field and its index there, of each unknown."""
+    sizes = [prod(shape) for shape in shapes]
+    inside = [np.indices(shape).reshape(len(shape), size) for shape, size in zip(shapes, sizes, strict=True)]
+    return np.vstack([np.repeat(np.arange(len(sizes)), sizes), np.hstack(inside)])
+
+
+def _lattice(links, index, least):
+    """(a . i) mod c with the smallest c that works, or a colour for each column; `index`: one row for each axis."""
+    index = index[np.any(index, axis=1)]  # without axes of one place
+    differences = _differences(links, index)
     for count in range(least, 3 * least + 8) if differences is not None else ():
-        many = min(count ** (len(shape) - 1), MOST_TRIALS // max(differences.shape[1], 1))
-        tried = islice(combinations(range(count), repeat=len(shape) - 1), many)
+        many = min(count ** (len(index) - 1), MOST_TRIALS // max(differences.shape[1], 1))
+        tried = islice(combinations(range(count), repeat=len(index) - 1), many)
         vectors = np.array([(*a[::-1], 1) for a in tried])
         valid = np.all((vectors @ differences) % count != 0, axis=1)
         if valid.any():
-            return (vectors[np.argmax(valid)] @ np.stack(np.unravel_index(np.arange(size), shape))) % count
-    return np.arange(size)
+            return (vectors[np.argmax(valid)] @ index) % count
+    return np.arange(links.shape[0])
 
 
-def _differences(links, shape):
-    """Differences of the indices of linked columns, shape (dim, many), one of each pair; None when there are many."""
-    row, lengths = rows_of(links), np.array(shape)[:, None]
+def _differences(links, index):
+    """Differences of the indices of linked columns, shape (axes, many), one of each pair; None when there are many."""
+    row, reach = rows_of(links), np.max(index, axis=1, keepdims=True) + 1
     upper = links.indices > row
-    index = np.indices(shape).reshape(len(shape), -1)
-    steps = index[:, links.indices[upper]] - index[:, row[upper]]
-    first = np.unique(np.ravel_multi_index(steps + lengths, tuple(2 * lengths[:, 0])), return_index=True)[1]
-    return steps[:, first] if first.size <= MOST_DIFFERENCES else None
+    number = np.ravel_multi_index(tuple(index), box := tuple(2 * reach[:, 0]))
+    found = np.zeros(prod(box), dtype=bool)  # by their numbers in a box of twice the size, 0 in its middle
+    found[number[links.indices[upper]] - number[row[upper]] + np.ravel_multi_index(tuple(reach[:, 0]), box)] = True
+    found = np.flatnonzero(found)
+    return np.array(np.unravel_index(found, box)) - reach if found.size <= MOST_DIFFERENCES else None
 
 
 def _one_by_one(links):
