@@ -48,8 +48,8 @@ def test_planted_mistakes_are_seen(rng, monkeypatch):
     loss = lambda p: anp.sum(solve(*p) ** 2)
     assert dp.check.gradient(loss, (data, b)).verdict == "agrees"
     with monkeypatch.context() as patch:
-        rule = solve._rule
-        patch.setattr(solve, "_rule", lambda transposed, checked=False: rule(False, checked))
+        solved = solve._solve
+        patch.setattr(solve, "_solve", lambda b, params, transposed, checked: solved(b, params, False, checked))
         assert dp.check.gradient(loss, (data, b)).verdict == "disagrees"
     wrong = matrix_solver(dense(solve, data))
     wrong.rows, wrong.columns = solve.columns, solve.rows
@@ -197,7 +197,7 @@ def test_what_is_refused(rng):
     place = f"row {solve.rows[3]}, column {solve.columns[3]}"
     for arguments, error, message in (
         ((data[1:], b), ShapeError, f"data takes one value for each of {data.size} entries, got shape"),
-        ((data, b[1:]), ShapeError, r"b takes a field on space\(8\), got an array of shape \(7,\)"),
+        ((data, b[1:]), ShapeError, r"matrix_solver takes a field on space\(8\), got an array of shape \(7,\)"),
         ((wrong, b), NonFiniteError, f"data must be finite, got 1 that are NaN or infinite, the first at {place}"),
         ((data, b * np.inf), NonFiniteError, "takes finite numbers"),
         ((data.astype(str), b), TypeError, "data must hold numbers"),

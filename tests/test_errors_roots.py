@@ -118,7 +118,7 @@ TABLE = [
         FINITE,
         "data must be finite, got 1 that are NaN or infinite, the first at row 1, column 1",
     ),
-    (lambda: SOLVE(np.ones(3), TWO), SHAPE, "b takes a field on space(3), got an array of shape (2,)"),
+    (lambda: SOLVE(np.ones(3), TWO), SHAPE, "matrix_solver takes a field on space(3), got an array of shape (2,)"),
 ]
 
 

@@ -46,7 +46,7 @@ from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten, leaves
 
-__all__ = ["Equation", "Layout", "Newton", "vary"]
+__all__ = ["Equation", "Layout", "Newton"]
 
 KINDS = "biuf"  # of numbers that unknowns and residuals may hold
 HALVINGS = 30
@@ -207,18 +207,6 @@ class Equation:
     def transposed(self, x, values):
         """The function g -> J^T g."""
         return pullback(lambda y: self(y, *values), x)[1]
-
-
-def vary(fun, args, places):
-    """fun(*args) -> (function of the list of the arguments at `places`, that list)."""
-
-    def varied(chosen):
-        values = list(args)
-        for place, value in zip(places, chosen, strict=True):
-            values[place] = value
-        return fun(*values)
-
-    return varied, [args[place] for place in places]
 
 
 # ---- the method ------------------------------------------------------------------------------------------------------

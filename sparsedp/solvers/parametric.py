@@ -1,17 +1,8 @@
 """Solves whose operator depends on parameters: x of (shift - D diag(k) G) x = b, differentiable in k, b and shift.
 
-With A = shift - D diag(k) G and A x = b, a change of the data gives
+With A = shift - D diag(k) G and A x = b, one adjoint solve A^T y = g serves all arguments (see adjoint.py):
 
-    A dx = db - x dshift + D (dk * G x),
-
-so with the adjoint solve A^T y = g, one for all arguments,
-
-    cotangent of b: y,    of shift: -y * x (its sum where shift is one number),    of k: (D^T y) * (G x),
-
-in the convention of tape.py for complex numbers too: plain transposes, and the real part for what is real.
-
-The transposed solve is a rule of the same form with D, G exchanged for G^T, D^T: each is the other's
-helper, and derivatives of every order follow.
+    cotangent of b: y,    of shift: -y * x (its sum where shift is one number),    of k: (D^T y) * (G x).
 
 A matrix with the entries k at the places (i, j) of a fixed pattern is of that form too: D = -R^T and G = C, where R
 and C pick the value at the row and at the column of each entry. The cotangent of an entry is -y_i x_j, and only the
@@ -25,13 +16,14 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.derivative import of_argument
-from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.errors import ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.tensor import check_tensor, corners
 from sparsedp.recipe import Remade
+from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.inverses import build, check_settings
 from sparsedp.solvers.solve import SolveLog
@@ -39,7 +31,7 @@ from sparsedp.solvers.sparsity import pattern_like
 from sparsedp.space import Space, fits
 from sparsedp.structure.base import Matrix, compact, rows_of
 from sparsedp.structure.lazy import Chain, Diagonal, Sum
-from sparsedp.tape import Rule, cast, dtype_of, isbox, plain
+from sparsedp.tape import cast, dtype_of, isbox, plain
 
 __all__ = ["Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]
 
@@ -63,36 +55,21 @@ class ParametricSolver(Remade):
         self.info = SolveLog()
         self._settings, self._cache = settings, Cache()
 
-    def _rule(self, transposed, checked=False):
-        """The solve (or the transposed solve) as a rule in (k, b, shift). Not cached: it holds this solver."""
+    def _solution(self, k, b, shift):
+        return solve_rule(self.name, self._solve, self._back, self._along, checked=True)(b, k, shift)
 
-        def forward(k, b, shift):
-            inv = self._inverse(k, shift)
-            return (inv.T if transposed else inv if checked else inv.tangent).apply(b)
+    def _solve(self, b, params, transposed, checked):
+        inv = self._inverse(*params)
+        return (inv.T if transposed else inv if checked else inv.tangent).apply(b)
 
-        def vjp(nums, ans, k, b, shift):
-            def pull(g):
-                other = self._rule(not transposed)(k, g, shift)
-                x, y = (other, ans) if transposed else (ans, other)
-                slopes = {0: lambda: self.D.T(y) * self.G(x), 1: lambda: other, 2: lambda: -y * x}
-                with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
-                    return tuple(self._finite(of_argument(slopes[num](), (k, b, shift)[num])) for num in nums)
+    def _back(self, params, places, y, x):
+        slopes = [lambda: self.D.T(y) * self.G(x), lambda: -y * x]
+        return [of_argument(slopes[place](), params[place]) for place in places]
 
-            return pull
-
-        def jvp(nums, tangents, ans, k, b, shift):
-            first, second = (self.D.T, self.G.T) if transposed else (self.G, self.D)
-            change = {0: lambda t: second(t * first(ans)), 1: lambda t: t, 2: lambda t: -t * ans}
-            total = sum(change[num](t) for num, t in zip(nums, tangents, strict=True))
-            return self._rule(transposed)(k, total, shift)
-
-        return Rule(f"{self.name}.T" if transposed else self.name, forward, vjp, jvp)
-
-    def _finite(self, cotangent):
-        """Refuse products of two solutions that overflow."""
-        if not np.all(np.isfinite(plain(cotangent))):
-            raise NonFiniteError(f"a gradient of {self.name} is beyond 1.8e308; scale the loss or the right-hand side")
-        return cotangent
+    def _along(self, params, places, tangents, x, transposed):
+        first, last = (self.D.T, self.G.T) if transposed else (self.G, self.D)
+        changes = [lambda t: -last(t * first(x)), lambda t: t * x]
+        return sum(changes[place](t) for place, t in zip(places, tangents, strict=True))
 
     def _inverse(self, k, shift):
         """The set-up for this content, from the last two or new."""
@@ -205,8 +182,8 @@ class EllipticSolver(ParametricSolver):
         if np.ndim(k) > 2:
             solver, at_corners = self._tensors
             check_tensor("k", k, self.D.codomain.grid)
-            return solver._rule(False, True)(at_corners(cast(k, np.result_type(dtype_of(k), float))), b, shift)
-        return self._rule(False, True)(self._coefficient(k), b, shift)
+            return solver._solution(at_corners(cast(k, np.result_type(dtype_of(k), float))), b, shift)
+        return self._solution(self._coefficient(k), b, shift)
 
     @cached_property
     def _tensors(self):
@@ -421,9 +398,7 @@ class MatrixSolver(ParametricSolver):
         if values.dtype.kind not in "biufc":
             raise TypeError(f"data must hold numbers, got dtype {values.dtype}")
         check_finite("data", values, where=lambda entry: f"row {self.rows[entry]}, column {self.columns[entry]}")
-        if np.shape(plain(b))[-len(self.domain.shape) :] != self.domain.shape:
-            raise ShapeError(f"b takes a field on {self.domain}, got an array of shape {np.shape(plain(b))}")
-        return self._rule(False, True)(data if isbox(data) else values, b if isbox(b) else np.asarray(b), 0.0)
+        return self._solution(data if isbox(data) else values, b if isbox(b) else np.asarray(b), 0.0)
 
     def _operator(self, data, shift):
         matrix = sp.csr_array((data, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)

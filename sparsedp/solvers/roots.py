@@ -4,13 +4,7 @@ x(p) with F(x, p) = 0 has, with J = dF/dx,
 
     J x' = -F_p p',                 so for a cotangent g of x, with J^T y = g,   p_bar = -F_p^T y.
 
-Both linear solves are rules of (x, b, p) of their own. From A s = b, where A = J(x, p) or J(x, p)^T,
-
-    A s' = b' - A' s                A' s is the derivative of J s (or of J^T s, the pullback of F) along (x', p'),
-    b_bar = o  with  A^T o = g      (x, p)_bar = -grad <o, A s>, with o and s held fixed.
-
-The gradient of <o, J s> = <s, J^T o> is the pullback of (x, p) -> J^T o for the cotangent s. So each
-derivative of any order takes one linear solve with J or J^T, and derivatives of F.
+Both linear solves are rules of their own, of b, x and p: see adjoint.py.
 """
 
 from contextlib import contextmanager
@@ -25,9 +19,10 @@ from sparsedp.fields import check_function
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note, thread
 from sparsedp.recipe import Remade
+from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.inverses import check_settings
 from sparsedp.solvers.jacobian import Jacobians
-from sparsedp.solvers.newton import Equation, Layout, Newton, vary
+from sparsedp.solvers.newton import Equation, Layout, Newton
 from sparsedp.solvers.solve import Run, SolveLog
 from sparsedp.tape import Rule, plain
 
@@ -191,10 +186,6 @@ class Root(Remade):
         self._series: dict = {}  # by thread, inside `series`: size -> Jacobian of the last solve
         self._jacobians = Jacobians(self.name, jacobian, sparsity, dict(settings, maxiter=None))
         self._solution = Rule(self.name, self._newton, self._vjp, self._jvp)
-        self._linear = [
-            Rule(f"{self.name}{suffix}", *self._linear_rule(transposed))
-            for suffix, transposed in ((".tangent", False), (".T", True))
-        ]
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
@@ -265,7 +256,7 @@ class Root(Remade):
         varied, chosen = vary(lambda *values: equation(ans, *values), leaves, places)
 
         def pull(g):
-            y = self._linear[True](equation, ans, g, *leaves)
+            y = self._linear(True)(g, equation, ans, *leaves)
             F, back = pullback(varied, chosen)
             self._check_root(equation, plain(ans), plain(g), plain(y), plain(F), [plain(leaf) for leaf in leaves])
             return tuple(back(-y))
@@ -284,7 +275,7 @@ class Root(Remade):
         terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1] if leaves else 0.0
         if np.linalg.norm(F) <= CANCELS * np.linalg.norm(terms):  # a root near 0, where what it is made of cancels
             return
-        step = self._linear[False].forward(equation, x, F, *leaves)
+        step = self._solve(F, (equation, x, *leaves), False)
         if np.linalg.norm(step) > changed * np.linalg.norm(x):
             raise DerivativeError(
                 f"{self.name} is not solved any more by what it was: its residual uses something that has changed "
@@ -293,44 +284,22 @@ class Root(Remade):
 
     def _jvp(self, nums, tangents, ans, equation, guess, *leaves):
         varied, chosen = vary(lambda *values: equation(ans, *values), leaves, [num - 2 for num in nums])
-        return self._linear[False](equation, ans, -push(varied, chosen, tangents)[1], *leaves)
+        return self._linear(False)(-push(varied, chosen, tangents)[1], equation, ans, *leaves)
 
     # ------------------------------------------------------------ solves with J and J^T, as rules of x, b and p
 
-    def _linear_rule(self, transposed):
-        """(forward, vjp, jvp) of s with A s = b, A = J or J^T."""
+    def _linear(self, transposed):
+        """The Rule of (b, equation, x, *leaves): s of J s = b or J^T s = b."""
+        return solve_rule(self.name, self._solve, _back, _along, transposed)
 
-        def forward(equation, x, b, *leaves):
-            known = self._jacobians.cached(equation, x, leaves)
-            self._note_setup(known)
-            s, info = known.solve(b, transposed)
-            if transposed:
-                self.info.note(info, True)
-            return s
-
-        def vjp(nums, ans, equation, x, b, *leaves):
-            places = [max(num - 2, 0) for num in nums if num != 2]
-
-            def pull(g):
-                other = self._linear[not transposed](equation, x, g, *leaves)
-                y, s = (ans, other) if transposed else (other, ans)
-                varied, chosen = vary(lambda x, *leaves: equation.transposed(x, leaves)(y), (x, *leaves), places)
-                slopes = iter(pullback(varied, chosen)[1](-s) if places else ())
-                return tuple(other if num == 2 else next(slopes) for num in nums)
-
-            return pull
-
-        def jvp(nums, tangents, ans, equation, x, b, *leaves):
-            places = [max(num - 2, 0) for num in nums if num != 2]
-            moves = [t for num, t in zip(nums, tangents, strict=True) if num != 2]
-            total = sum(t for num, t in zip(nums, tangents, strict=True) if num == 2)
-            if places:
-                act = equation.transposed if transposed else equation.tangent
-                varied, chosen = vary(lambda x, *leaves: act(x, leaves)(ans), (x, *leaves), places)
-                total = total - push(varied, chosen, moves)[1]
-            return self._linear[transposed](equation, x, total, *leaves)
-
-        return forward, vjp, jvp
+    def _solve(self, b, point, transposed, checked=False):
+        equation, x, *leaves = point
+        known = self._jacobians.cached(equation, x, leaves)
+        self._note_setup(known)
+        s, info = known.solve(b, transposed)
+        if transposed:
+            self.info.note(info, True)
+        return s
 
     # ------------------------------------------------------------ words
 
@@ -339,3 +308,27 @@ class Root(Remade):
 
     def __str__(self):
         return f"{self!r}\n{self._jacobians}"
+
+
+def _back(point, places, y, s):
+    """-grad <y, J s> = -grad <s, J^T y>: the pullback of (x, p) -> J^T y."""
+    varied, chosen = vary(lambda equation, x, *leaves: equation.transposed(x, leaves)(y), point, places)
+    return pullback(varied, chosen)[1](-s)
+
+
+def _along(point, places, tangents, s, transposed):
+    product = lambda equation, x, *leaves: (equation.transposed if transposed else equation.tangent)(x, leaves)(s)
+    varied, chosen = vary(product, point, places)
+    return push(varied, chosen, tangents)[1]
+
+
+def vary(fun, args, places):
+    """fun(*args) -> (function of the list of the arguments at `places`, that list)."""
+
+    def varied(chosen):
+        values = list(args)
+        for place, value in zip(places, chosen, strict=True):
+            values[place] = value
+        return fun(*values)
+
+    return varied, [args[place] for place in places]
