@@ -61,6 +61,11 @@ TABLE = [
         "the residual of implicit(<lambda>) must hold 2 numbers, as many as x, got 1",
     ),
     (
+        lambda: dp.steady(lambda x: {"v": x["u"] - x["w"], "w": x["w"]}, {"u": 1.0, "w": 2.0}),
+        SHAPE,
+        "the residual of implicit(<lambda>) must have the names of x, ['u', 'w'], got ['v', 'w']",
+    ),
+    (
         lambda: dp.implicit(lambda x: 1j * x)(TWO),
         TYPE,
         "the residual of implicit(<lambda>) must be real; give real and imaginary part as two fields",

@@ -242,6 +242,16 @@ def test_the_pattern_of_fields_on_one_grid_is_guessed(shape, periodic):
     assert pattern.nnz < 1.6 * whole.nnz
 
 
+def test_fields_are_paired_by_name():
+    """Whatever the order in which a residual names them: the same bits, and each in its own units."""
+    scene, states = Flow(8), []
+    for turned in (False, True):
+        residual = lambda x, re, turned=turned: dict(list(scene.cavity(x, re).items())[:: -1 if turned else 1])
+        loss = dp.value_and_grad(lambda re, residual=residual: anp.sum(dp.steady(residual, scene.rest, re)["v"] ** 3))
+        states.append(loss(20.0))
+    assert states[0] == states[1] and states[0][1] != 0
+
+
 def test_a_mean_over_a_field_fits_no_stencil():
     """A pressure whose mean is 0 in place of a pin: a full row is found, and the flow is the same."""
     scene = Flow(16)

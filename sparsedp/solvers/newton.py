@@ -36,7 +36,7 @@ import numpy as np
 from sparsedp.constants import constant
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_finite, check_plain
+from sparsedp.fields import check_finite, check_plain, leaves_by_name
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
 from sparsedp.solvers.direct import DENSE_UP_TO
@@ -84,7 +84,8 @@ class Layout:
         for leaf in found:
             _check_unknown(leaf, name)
         # Rebuilt without values: a kept layout must not hold a trace or a large array.
-        _, self.rebuild = flatten(rebuild([None] * len(found)))
+        self.tree = rebuild([None] * len(found))
+        _, self.rebuild = flatten(self.tree)
         self.shapes = [np.shape(leaf) for leaf in found]
         kinds = [np.asarray(leaf).dtype for leaf in found]
         self.dtypes = [kind if kind.kind == "f" else np.dtype(float) for kind in kinds]
@@ -188,7 +189,7 @@ class Equation:
         return result
 
     def _flat(self, result):
-        parts = leaves(result)
+        parts = leaves_by_name(f"the residual of {self.name}", result, "x", self.layout.tree)
         size = sum(int(np.size(plain(part))) for part in parts)
         if size != self.size:
             raise ShapeError(f"the residual of {self.name} must hold {self.size} numbers, as many as x, got {size}")

@@ -124,7 +124,8 @@ def steady(residual, guess, *params, **options):
     Parameters
     ----------
     residual : callable
-        ``residual(x, *params)``: the rate of change of each field, or any equation for it, as a tree like x.
+        ``residual(x, *params)``: the rate of change of each field, or any equation for it, as a tree like x; entries of
+        dicts are paired by name.
     guess : number, array, or tree of arrays
         The state at rest, or that for nearby parameters: ``{"v": faces, "p": cells}`` of a flow.
     *params : trees of arrays
