@@ -11,7 +11,7 @@ from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.advection.values import check_step, flat_numbers
 from sparsedp.conditions import dirichlet, neumann, resolve
 from sparsedp.errors import DerivativeError
-from sparsedp.grid import Grid
+from sparsedp.grid import check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid
@@ -118,12 +118,12 @@ def transport(
 
     Examples
     --------
+    >>> from sparsedp import Grid
     >>> move = transport(Grid(4, periodic=True))
     >>> move(np.array([0.0, 1.0, 0.0, 0.0]), np.ones(4), 0.25)
     array([0.  , 0.75, 0.25, 0.  ])
     """
-    if not isinstance(grid, Grid):
-        raise TypeError(f"transport takes a Grid, got {type(grid).__name__}; write dp.Grid((64, 64), size=1.0)")
+    check_grid("transport", grid)
     _check_word("scheme", scheme, tuple(LAWS))
     words = dict(velocity=velocity, of=of, interpolation=interpolation, form=form, backtrace=backtrace, clamp=clamp)
     words["unstable"] = unstable
@@ -204,6 +204,7 @@ class Transport(Frozen, Remade):
 
         Examples
         --------
+        >>> from sparsedp import Grid
         >>> move = transport(Grid(3, periodic=True))
         >>> move.operator(np.ones(3), 0.5).matrix.toarray()
         array([[0.5, 0. , 0.5],
