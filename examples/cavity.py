@@ -10,6 +10,9 @@ import sparsedp as dp
 
 finest = int(sys.argv[1]) if sys.argv[1:2] and sys.argv[1] != "--out" else 64
 KNOWN = np.array([-0.2140417, 0.1795728, -0.2538030])  # Botella and Peyret, Computers and Fluids 27 (1998)
+# u on x = 1/2 at these y: Ghia, Ghia and Shin, J. Comput. Phys. 48 (1982)
+Y = [0.9766, 0.9531, 0.8516, 0.7344, 0.6172, 0.5, 0.4531, 0.2813, 0.1719, 0.1016, 0.0625]
+GHIA = [0.84123, 0.68717, 0.23151, 0.00332, -0.13641, -0.20581, -0.2109, -0.15662, -0.1015, -0.06434, -0.04192]
 
 
 def cavity(n):
@@ -55,4 +58,6 @@ for n in (finest // 2, finest):
 print(" known  " + "  ".join(f"{value:8.5f}" for value in KNOWN))
 if "--out" in sys.argv:
     Path(sys.argv[-1]).mkdir(exist_ok=True)
-    dp.plot(grid, v, title="speed").figure.savefig(Path(sys.argv[-1]) / "cavity.png", dpi=120)
+    ax = dp.plot(grid, v, title="speed, Re 100; u on x = 1/2 and Ghia's points")
+    ax.plot(0.5 + 0.4 * grid.split(v)[0][finest // 2], grid.centres()[1][0], "w-", 0.5 + 0.4 * np.array(GHIA), Y, "wo")
+    ax.figure.savefig(Path(sys.argv[-1]) / "cavity.png", dpi=120)

@@ -70,8 +70,9 @@ if "--out" in sys.argv:
     from matplotlib.figure import Figure
 
     picture = Figure(figsize=(13, 2.6), layout="constrained")
-    fields = {"Gray-Scott, v": end["v"], "Cahn-Hilliard": films[-1], "Swift-Hohenberg": rolls}
-    fields |= {"Kuramoto-Sivashinsky, u - mean": flame - np.mean(flame)}
+    fields = {f"Gray-Scott, v: {spots(end)} spots": end["v"], f"Cahn-Hilliard, mean off by {drift:.0e}": films[-1]}
+    fields[f"Swift-Hohenberg: wavelength {length:.2f} ({2 * np.pi:.2f})"] = rolls
+    fields[f"Kuramoto-Sivashinsky: growth {rate:.3f} ({k**2 - k**4:.3f})"] = flame - np.mean(flame)
     for ax, (name, u) in zip(picture.subplots(1, 4), fields.items()):
         picture.colorbar(ax.imshow(u.T, origin="lower"), ax=ax)
         ax.set(title=name, xticks=[], yticks=[])

@@ -303,4 +303,5 @@ def test_helmholtz():
     sponge, matched = map(float, re.findall(r"reflection .*: (\S+)$", printed, re.MULTILINE))
     assert sponge <= 1e-3 and matched <= 2e-6
     assert int(re.search(r"GMRES .*: (\d+) iterations", printed)[1]) <= 40
+    assert float(re.search(r"off Hankel's function: (\S+)%", printed)[1]) <= 5
     assert "gradient in 4096 speeds: agrees" in printed

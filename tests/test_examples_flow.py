@@ -49,6 +49,7 @@ def test_taylor_green():
     assert rows(printed, r"^central, Heun +25\^2  (\S+)")[0][0] == pytest.approx(1.06e-2, rel=0.1)
     assert 1.9 <= rows(printed, r"^order (\S+)")[0][0] <= 2.1
     assert np.allclose(rows(printed, r"dalpha (\S+), dJ/dnu (\S+) of"), 1, atol=0.01)
+    assert 1.9 <= rows(printed, r"^three axes, 12\^3: error \S+, order (\S+),")[0][0] <= 2.1
 
 
 @example("cylinder.py")

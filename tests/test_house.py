@@ -86,6 +86,9 @@ LONGER = {
     "inverse_heat.py": 70,
     "steady_states.py": 70,
     "cylinder.py": 80,
+    "taylor_green.py": 90,
+    "helmholtz.py": 80,
+    "cavity.py": 65,
     "full_waveform.py": 100,
     "patterns.py": 80,
     "ensemble.py": 85,
@@ -93,7 +96,7 @@ LONGER = {
 # Nodes of the syntax tree that each room may have, docstrings left out; what a line says is free, what it does is not.
 # They may be lowered at any time, and raised only with a sentence on what that buys. "": the whole package.
 BUDGETS = {
-    "": 204_900,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
+    "": 204_850,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
     "advection": 14_000,
     "check": 14_650,
     "flow": 11_650,  # conservation laws: 2 850; forces: 780; scalars, Courant limit, friction of flow_step: 1 650;
