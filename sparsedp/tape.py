@@ -339,8 +339,7 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     forward : callable
         ``forward(*args) -> ans`` on plain values; `ans` is an array, a float, or a tuple of arrays.
     vjp : callable, optional
-        ``vjp(nums, ans, *args) -> pull`` with ``pull(g) -> tuple``, one cotangent for each argument
-        position in `nums`, in that order. Called once for all requested arguments.
+        ``vjp(nums, ans, *args) -> pull``, called once; ``pull(g)`` is a tuple of a cotangent for each place in `nums`.
     jvp : callable, optional
         ``jvp(nums, tangents, ans, *args) -> tangent of ans``.
     keywords : tuple of str
