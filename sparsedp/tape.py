@@ -201,10 +201,11 @@ def split_boxes(values, number):
     """Values -> those below the boxes of this trace, and the nodes of the boxes (None where there is none)."""
     below, nodes = list(values), [None] * len(values)
     for k, value in enumerate(below):
-        if isbox(value) and value._trace == number:
-            below[k], nodes[k] = value._value, value._node
-        elif isbox(value) and hasattr(value._node, "recorder"):
-            value._node.recorder.open()
+        if isbox(value):
+            if value._trace == number:
+                below[k], nodes[k] = value._value, value._node
+            elif hasattr(value._node, "recorder"):
+                value._node.recorder.open()
     return below, nodes
 
 
@@ -434,12 +435,11 @@ _primitive = primitive(_run)
 _call = direct(_primitive)
 
 
-def through(rule, *args):
+def through(rule, nums, *args):
     """A call of a rule whose forward and VJP take values of outer traces, and hand their cotangents on.
 
-    Only the innermost trace, if it is a reverse-mode one, gets a node; all others go through those functions.
+    Only the innermost trace, of the arguments `nums`, gets a node; all others go through those functions.
     """
-    nums = innermost(args)
     if not nums:
         return _run(rule, *args)
     values = [arg._value if num in nums else arg for num, arg in enumerate(args)]

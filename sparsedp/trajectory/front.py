@@ -136,7 +136,7 @@ def rollout(
         _warn_of_repeats(memory, *sizes)
     for hook in thread.loop_hooks:
         hook(step, state, params, inputs, n)
-    return loop.keep.tree(loop.parts(through(loop, *args)))
+    return loop.keep.tree(loop.parts(through(loop, loop.wanted, *args)))
 
 
 def _check_reversible(step):

@@ -10,7 +10,7 @@ from sparsedp.derivative import described
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, surely_finite
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
-from sparsedp.tree import flatten, keys, labels, leaves, mapped, subscript
+from sparsedp.tree import flatten, keys, labels, leaves, subscript
 
 __all__ = ["Layout", "dense", "fingerprint", "is_finite", "owned", "refuse_lost", "refuse_mask", "stacked"]
 
@@ -51,12 +51,12 @@ class Layout:
     rounds = False
 
     def __init__(self, tree, root):
-        self.root, self.bare = root, is_variable(tree) and not isinstance(tree, np.ma.MaskedArray)
-        entries = leaves(tree)
+        self.root, self.bare = root, is_variable(tree)
+        entries, rebuild = flatten(tree)
         self.places = [place for place, leaf in enumerate(entries) if is_variable(leaf)]
         # Without the variables: what is kept must not hold a trace or a large array.
-        self._template = mapped(_static, tree)
-        self.statics = tuple(leaves(self._template))
+        self.statics = tuple(None if is_variable(leaf) else constant(leaf) for leaf in entries)
+        self._template = rebuild(self.statics)
         for number, leaf in enumerate(entries):
             if isinstance(leaf, np.ma.MaskedArray):
                 refuse_mask(f"rollout takes plain arrays, got a masked array as {self.labels[number]}", leaf)
@@ -83,11 +83,11 @@ class Layout:
         return [dense(entries[place]) for place in self.places]
 
     def build(self, variables, statics=None):
-        """Variables and the other leaves -> the tree."""
+        """Variables, of which there may be more, and the other leaves -> the tree."""
         if self.bare:
             return variables[0]
         entries = list(self.statics if statics is None else statics)
-        for place, value in zip(self.places, variables, strict=True):
+        for place, value in zip(self.places, variables):
             entries[place] = value
         return self._rebuild(entries)
 
@@ -183,11 +183,6 @@ class Layout:
         for number, value in enumerate(values):
             if not is_finite(value):
                 check_finite(f"{self.names[number]} of {owner}", plain(value), needs)
-
-
-def _static(leaf):
-    """A leaf as a constant, None in place of a variable."""
-    return None if is_variable(leaf) else constant(leaf)
 
 
 def is_finite(value):

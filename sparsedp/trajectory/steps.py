@@ -128,16 +128,17 @@ class Steps:
     def _given(self, state):
         """The variables of state and inputs that a step gets: constants where the derivative is cut."""
         values = map(plain, state.values) if state.i in self.loop.cuts else state.values
-        return [frozen(value) for value in (*values, *[block[state.i] for block in self.x])]
+        given = list(map(frozen, values))
+        return given + [frozen(block[state.i]) for block in self.x] if self.x else given
 
     def _parts(self, state, values, params):
         """The arguments of a step, of the variables of state and inputs."""
-        many, inputs = len(state.values), self.loop.inputs
-        parts = [self.loop.state.build(values[:many], state.statics), params]
-        if inputs is not None:
-            rest = [leaf[state.i] if isinstance(leaf, np.ndarray) else leaf for leaf in inputs.statics]
-            parts.append(inputs.build(values[many:], rest))
-        return parts
+        layout, inputs = self.loop.state, self.loop.inputs
+        first = layout.build(values, state.statics)
+        if inputs is None:
+            return first, params
+        rest = [leaf[state.i] if isinstance(leaf, np.ndarray) else leaf for leaf in inputs.statics]
+        return first, params, inputs.build(values[len(state.values) :], rest)
 
     def _plain_parts(self, state):
         """The same from a state, on no trace of the rollout."""
