@@ -151,7 +151,8 @@ def leaves_by_name(what, tree, wanted, other):
 
 def is_number(value):
     """Whether a value is one real number, NaN and infinity included; a flag is none."""
-    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
+    array = np.asarray(value)
+    return array.ndim == 0 and array.dtype.kind in "iuf"
 
 
 def is_whole(value, least):

@@ -62,10 +62,11 @@ class Recorder:
 
     def __init__(self):
         self.nodes: list = []
+        self._kind = thread.witnesses[-1] if thread.witnesses else ReverseNode
 
     def root(self):
         """A fresh start of a reverse-mode trace, whose calls are taken down here."""
-        return (thread.witnesses[-1] if thread.witnesses else ReverseNode).new_root(self)
+        return self._kind.new_root(self)
 
     def weigh(self, value, args, nums):
         """One call."""

@@ -210,7 +210,7 @@ def owned(value):
     """Array or number -> a contiguous copy of its own; traced values as they are: nobody writes into those."""
     if isbox(value):
         return value
-    return np.array(value, order="C", subok=False) if np.ndim(value) else np.asarray(value)[()]
+    return dense(np.array(value, order="C"))
 
 
 def stacked(parts):

@@ -9,6 +9,7 @@ from sparsedp.constants import frozen
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.tape import Recorder, boxed, new_trace, plain, traces_of, untaped_root
 from sparsedp.trajectory.layout import fingerprint, owned
+from sparsedp.trajectory.record import largest
 from sparsedp.tree import copied, flatten, leaves
 
 __all__ = ["State", "Steps"]
@@ -146,10 +147,9 @@ class Steps:
 
     def check_start(self, state, last):
         """Refuse a way back by reversed steps, from the last state, that did not end where the way forward began."""
-        largest = lambda x: float(np.max(np.abs(x), initial=0.0))
         for values in zip(state.values, self.first.values, last.values, strict=True):  # a large one hides no other
             back, first, end = map(plain, values)
-            off, size = largest(back - first), max(largest(first), largest(end))
+            off, size = largest([back - first]), largest([first, end])
             if not off <= DRIFT * size:
                 raise DerivativeError(
                     f"reversed steps end {off:.1e} away from the first state, beside states of size {size:.1e}: "
