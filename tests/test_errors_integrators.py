@@ -170,12 +170,12 @@ TABLE = [
     (
         lambda: dp.stepper("euler", decay, 0.6)(np.array([1, np.nan, 1]), 1.0),
         FINITE,
-        "the state of stepper(euler) must be finite, got 1 that are NaN or infinite, the first at 1",
+        "state of stepper(euler) must be finite, got 1 that are NaN or infinite, the first at 1",
     ),
     (
         lambda: dp.stepper("euler", lambda u, p: p[0] * u, 0.6)(U, (np.inf, 1.0)),
         FINITE,
-        "part 1 of the params of stepper(euler) must be finite, got inf; write a finite number",
+        "params[0] of stepper(euler) must be finite, got inf; write a finite number",
     ),
     (
         lambda: dp.stepper("euler", lambda u, p: p * u, 1.0)(U * 1e300, 1e300),
@@ -221,7 +221,7 @@ TABLE = [
     (
         lambda: dp.stepper("rk4", decay, 0.6, tolerance=1e-3)(U, np.nan),
         FINITE,
-        "the params of stepper(rk4) must be finite, got nan; write a finite number",
+        "params of stepper(rk4) must be finite, got nan; write a finite number",
     ),
 ]
 

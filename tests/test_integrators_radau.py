@@ -287,7 +287,7 @@ REFUSED = [
     (lambda: dp.stepper("radau", lambda u, p: u[:1], 1.0)(ONES, 1.0), ShapeError,
      "a rate must have the shape of the state, (2,), got (1,)"),
     (lambda: dp.stepper("radau", DECAY, 1.0)(np.array([1.0, np.nan]), 1.0), NonFiniteError,
-     "the state of stepper(radau) must be finite, got 1 that are NaN or infinite, the first at 1"),
+     "state of stepper(radau) must be finite, got 1 that are NaN or infinite, the first at 1"),
     (lambda: dp.stepper("radau", lambda u, p: p * u**2, 2.0)(np.array([1.0]), 1.0), ConvergenceError,
      "stepper(radau): Newton's method does not converge in a step of 2; "
      "take a smaller dt, or give stepper a tolerance"),

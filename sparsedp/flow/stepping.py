@@ -309,10 +309,8 @@ class FlowStep(Remade):
         parts = {
             "convection": self.convect,
             "viscosity": self.viscous,
-            "implicit": self.viscous and self.viscous.relax,
             "force": self.force,
             "friction": self.friction,
-            "moving walls": self.viscous and self.viscous.held,
             "scalars": self.scalars or None,
         }
         words = [word for word, part in parts.items() if part is not None]

@@ -20,7 +20,7 @@ from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import check_settings
 from sparsedp.solvers.separable import spectrum
 from sparsedp.tape import is_variable, plain
-from sparsedp.tree import copied, leaves
+from sparsedp.tree import copied, labels, leaves
 
 __all__ = ["METHODS", "Step", "stepper"]
 
@@ -326,10 +326,8 @@ class Step(Remade):
     def _blame(self, state, params):
         """Refuse arguments that are not finite."""
         for what, tree in (("state", state), ("params", params)):
-            found = leaves(tree)
-            for count, leaf in enumerate(found, 1):
+            for place, leaf in zip(labels(tree, what), leaves(tree), strict=True):
                 if is_variable(leaf):
-                    place = f"part {count} of the {what}" if len(found) > 1 else f"the {what}"
                     check_finite(f"{place} of {self.name}", np.asarray(plain(leaf)))
 
     def __repr__(self):

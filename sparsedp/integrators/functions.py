@@ -10,19 +10,20 @@ Function: sums of phi_k, by transforms, where L is separable:
 
     phi_0(x) = exp(x),    phi_{k+1}(x) = (phi_k(x) - 1/k!) / x,    phi_k'(x) = phi_k(x) - k phi_{k+1}(x)
 
-Near 0 the formula in the middle loses all digits: there the Taylor series of the highest one is summed and
-the others follow downwards, phi_k = x phi_{k+1} + 1/k!. Sources: Cox and Matthews, J. Comput. Phys. 176
-(2002); Kassam and Trefethen, SIAM J. Sci. Comput. 26 (2005), who name the trouble.
+Near 0 the formula in the middle loses all digits: from x = -3 on they are taken as Kummer's functions,
+phi_k(x) = 1F1(1; k + 1; x) / k!, of which SciPy knows all.
+Sources: Cox and Matthews, J. Comput. Phys. 176 (2002); Kassam and Trefethen, SIAM J. Sci. Comput. 26 (2005), who name
+the trouble.
 """
 
 from functools import lru_cache, partial, reduce
-from math import factorial
+from math import factorial, prod
 from operator import add
 from typing import Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
-from numpy.polynomial.polynomial import polyval
+from scipy.special import hyp1f1
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import NonFiniteError
@@ -32,7 +33,7 @@ from sparsedp.tape import Rule, isbox
 
 __all__ = ["Function", "PhiFunctions", "Taylor", "TaylorPolynomials", "phi"]
 
-NEAR, TERMS = 3.0, 36  # the series is summed up to |x| = 3, where its terms after the 36th are below rounding
+NEAR, LARGEST = 3.0, 1e3  # of x; beyond the second even the exponential is infinite
 KEPT = 64  # tables of weights, for a few z
 
 
@@ -129,15 +130,13 @@ def phi(k, x):
     >>> [round(float(value), 6) for value in phi(2, np.array(-1e-9))]
     [1.0, 1.0, 0.5]
     """
-    near = np.abs(x) <= NEAR
-    small, large = np.where(near, x, 0.0), np.where(near, NEAR, x)
-    series = [polyval(small, [1 / factorial(n + k) for n in range(TERMS)])]
-    with np.errstate(over="ignore"):
-        upward = [np.exp(large)]
-    for j in range(k):
-        series.insert(0, small * series[0] + 1 / factorial(k - 1 - j))
-        upward.append((upward[j] - 1 / factorial(j)) / large)
-    return [np.where(near, low, high) for low, high in zip(series, upward, strict=True)]
+    far, near = x < -NEAR, np.clip(x, -NEAR, LARGEST)
+    with np.errstate(all="ignore"):
+        found = [np.exp(x)]
+        for j in range(k):
+            kummer = hyp1f1(1, j + 2, near) / factorial(j + 1)
+            found.append(np.where(far, (found[j] - 1 / factorial(j)) / x, kummer))
+    return found
 
 
 class Function(NamedTuple):
@@ -196,10 +195,12 @@ class PhiFunctions(Functions):
         if any(map(np.iscomplexobj, fields)):
             parts = (self.plain(rows, z, [*map(part, fields)], transposed) for part in (np.real, np.imag))
             return [real + 1j * imaginary for real, imaginary in zip(*parts, strict=True)]
-        batches = [field.reshape(-1, *op.domain.shape) for field in fields]
+        shape, lone = fields[0].shape, op.domain.shape
+        count = prod(shape[: len(shape) - len(lone)])  # of a batch
+        batches = [field.reshape(count, *lone) for field in fields]
         sums = [self._sums(rows, z, row, transposed) for row in zip(*batches, strict=True)]
-        each = np.reshape(sums, (len(batches[0]), len(rows), op.domain.size))
-        return [total.reshape(fields[0].shape) for total in np.moveaxis(each, 1, 0)]
+        each = np.reshape(sums, (count, len(rows), op.domain.size))
+        return [total.reshape(shape) for total in np.moveaxis(each, 1, 0)]
 
     def _sums(self, rows, z, fields, transposed):
         """The sum for each row of functions, on one field each."""
