@@ -35,7 +35,7 @@ from sparsedp.constants import constant
 from sparsedp.derivative import backward_each, linearised
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Taken, flat
-from sparsedp.integrators.problem import combine, later, like, untraced
+from sparsedp.integrators.problem import combine, like, untraced
 from sparsedp.integrators.runge_kutta import Scheme, as_matrix
 from sparsedp.solvers.direct import dense_lu
 from sparsedp.solvers.newton import Layout
@@ -268,7 +268,7 @@ class Interval(Adaptive):
             z = np.vander(C * h / before + (start is not v), 4, increasing=True) @ cubic - v
         w = BACK @ z
         for iteration in range(1, self.scheme.most + 1):
-            rates = [self.problem(v + part, self.params, later(t, c * h)) for part, c in zip(z, C, strict=True)]
+            rates = [self.problem(v + part, self.params, t + c * h) for part, c in zip(z, C, strict=True)]
             f = BACK @ np.array(rates)
             one = self.real(f[0] - REAL / h * w[0], False)
             pair = self.complex(f[1] + 1j * f[2] - COMPLEX / h * (w[1] + 1j * w[2]), False)
@@ -324,8 +324,7 @@ class Interval(Adaptive):
         places = [*((step.u, step.done) for step in path), (path[-1].new, 1.0)]
 
         def rows(v, share):
-            time = t + share * h if self.problem.timed else None
-            return self.problem.rows(v, self.params, time, self.moving)
+            return self.problem.rows(v, self.params, t + share * h, self.moving)
 
         at = lru_cache(3)(lambda number: rows(*places[number]))  # in either direction the one that is met twice
         for number in numbers:
@@ -333,8 +332,7 @@ class Interval(Adaptive):
             inner = [rows(step.u + step.middle[i], step.done + C[i] * step.length) for i in (0, 1)]
             section = np.zeros(self.problem.size)
             if step is not path[-1]:
-                time = t + step.done * h if self.problem.timed else None
-                (section,), _ = self.section(step.u, self.params, time, step.length * h)
+                (section,), _ = self.section(step.u, self.params, t + step.done * h, step.length * h)
             yield self._linearised(step, h, first, np.array([*inner, at(number + 1)]), section, step is path[-1])
 
     def _linearised(self, step, h, first, rows, section, last):
