@@ -427,10 +427,10 @@ BUGS = {
         "True",
         "tests/test_integrators_fields.py",
     ),
-    "a squared operator without what stands beside it": Bug(
+    "eigenvalues of a factor without its scale": Bug(
         "solvers",
-        "(a * found.eigenvalues + b) * found.eigenvalues",
-        "(a * found.eigenvalues) * found.eigenvalues",
+        "term.scale * axis.eigenvalues",
+        "axis.eigenvalues",
         "tests/test_spectral.py",
     ),
     "cotangents of a trajectory at the step before": Bug(

@@ -135,10 +135,19 @@ BOXES = [dp.Grid((33, 32), size=(1.0, 2.0)), dp.Grid((33, 32), periodic=True), d
 @pytest.mark.parametrize("grid", BOXES, ids=["box", "periodic", "stretched"])
 @pytest.mark.parametrize("boundary", [dp.neumann, dp.dirichlet])
 def test_what_is_made_of_one_laplacian_is_inverted_by_transforms(grid, boundary):
-    """Squares multiplied out, functions, and their sums: one pair of transforms, and the eigenvalues of the whole."""
+    """Powers, functions, and their sums: one pair of transforms, and the eigenvalues of the whole."""
     L, I = dp.laplacian(grid, boundary), dp.identity(grid.cells)
     f, u = dp.function(L, lambda e: 0.3 - (1 + e) ** 2), np.cos(np.arange(grid.cells.size)).reshape(grid.shape)
-    for op in (L @ L, -2 * L @ L - L, 0.3 * I - (I + L) @ (I + L), f, -0.5 * f + f - I, f @ f, dp.power(f, 2) + f):
+    for op in (
+        L @ L,
+        -2 * L @ L - L,
+        L @ (L @ L - L),
+        0.3 * I - (I + L) @ (I + L),
+        f,
+        -0.5 * f + f - I,
+        f @ f,
+        dp.power(f, 2) + f,
+    ):
         found, values = eigenbasis(op.structure)
         wanted = op(u)
         y = found.apply(values, u.reshape(-1)).reshape(grid.shape)
@@ -159,7 +168,7 @@ def test_squares_in_space():
 
 
 def test_what_is_not_made_of_one_laplacian():
-    """Near misses: another polynomial, other walls, a line that bends along one axis."""
+    """Near misses: other walls, other widths, a line that bends along one axis."""
     grid = dp.Grid((33, 32), spacing=(1e-3, 1.0))
     L, M = dp.laplacian(grid), dp.laplacian(grid, dp.dirichlet)
     bent = np.diag(1e-6 * np.arange(32.0))  # far below the squares along x
@@ -167,9 +176,20 @@ def test_what_is_not_made_of_one_laplacian():
     factor = Kronecker(grid.cells.parts, grid.cells.parts, {(0, 0): (Term(1.0, (None, Factor(bent))),)})
     bend = dp.Operator(factor, grid.cells, grid.cells, "bend")
     np.testing.assert_array_equal(bend.matrix.toarray(), along_y.matrix.toarray())
-    for op in (L @ L @ L, L @ M, L @ L + M, L @ L + bend, dp.function(L, np.exp) + M, dp.function(L, np.exp) @ bend):
+    N, W = (dp.laplacian(dp.Grid((33, 32), spacing=[WIDE, width])) for width in (LONG, LONG[::-1] ** 2))
+    N = dp.Operator(N.structure, grid.cells, grid.cells, "other widths")
+    W = dp.Operator(W.structure, grid.cells, grid.cells, "others")
+    for op in (
+        N @ W,
+        N @ N + W,
+        L @ M,
+        L @ L + M,
+        L @ L + bend,
+        dp.function(L, np.exp) + M,
+        dp.function(L, np.exp) @ bend,
+    ):
         assert eigenbasis(op.structure) is None, op
-    assert eigenbasis((L @ L + L).structure) is not None
+    assert eigenbasis((L @ L + L).structure) is not None and eigenbasis((N @ N + N).structure) is not None
     assert eigenbasis(dp.diagonal(grid.cells, 1j * np.ones(grid.shape)).structure) is None
 
 

@@ -27,7 +27,7 @@ from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import inverted
 from sparsedp.solvers.solve import Engine
 from sparsedp.structure.base import Structure
-from sparsedp.structure.kronecker import Kronecker, Term
+from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Chain, Diagonal, Sum
 
 __all__ = [
@@ -245,8 +245,11 @@ class Spectrum:
         return y.reshape(-1)
 
     def same_basis(self, other):
-        """Whether the other one surely has the same eigenvectors: those that are written down are not compared."""
-        return self is other or (self.words == other.words and "eigenvectors" not in self.words)
+        """Whether the other one has the same eigenvectors."""
+        pairs = [
+            (a.matrices, b.matrices) for a, b in zip(self.axes, other.axes, strict=False) if a.matrices is not None
+        ]
+        return self is other or (self.words == other.words and all(map(np.array_equal, *zip(*pairs))))
 
     @property
     def words(self):
@@ -267,9 +270,14 @@ def spectrum(structure):
     Spectrum or None
     """
     shape = structure.out_parts[0]
-    lines = structure.lines
-    axes = [diagonalise(lines[a]) if a in lines else Axis("identity", np.zeros(n)) for a, n in enumerate(shape)]
-    return None if None in axes else Spectrum(shape, axes, structure.shift)
+    axes = [Axis("identity", np.zeros(n)) for n in shape]
+    for term in structure.terms:
+        for a in term.axes:  # without its scale: multiples have the same eigenvectors, to the same bits
+            axes[a] = axis = diagonalise(term.factors[a])
+            if axis is None:
+                return None
+            axis.eigenvalues = term.scale * axis.eigenvalues
+    return Spectrum(shape, axes, structure.shift)
 
 
 # ---------------------------------------------------------------- elimination along the first axis
@@ -410,63 +418,32 @@ class SpectralFunction(Structure):
 def eigenbasis(structure):
     """(Spectrum, eigenvalues) of a diagonal, a Kronecker sum, and what is made of one; None of others.
 
-    Made of one are its functions, its square, and sums and products of these; on stretched axes, of those of one
-    function.
+    Made of one are its functions, and sums and products of these.
     """
     if isinstance(structure, Diagonal) and structure.dtype == float:
         size = structure.shape[0]
         return Spectrum((size,), (Axis("identity", np.zeros(size)),), 0.0), structure.values
-    return _of_one(structure)
-
-
-def _of_one(structure):
-    """The same of all but diagonals."""
     if isinstance(structure, SpectralFunction) and not structure.transposed:
         return structure.spectrum, structure.weights
     if isinstance(structure, (Sum, Chain)):
         return _together(structure.members, np.add if isinstance(structure, Sum) else np.multiply)
-    if not isinstance(structure, Kronecker):
-        return None
-    if not structure.separable:
-        return _squared(structure)
-    found = spectrum(structure)
+    found = spectrum(structure) if isinstance(structure, Kronecker) and structure.separable else None
     return None if found is None else (found, found.eigenvalues)
 
 
 def _together(members, combined):
     """The same of a sum or a product of structures, where one basis is that of all of them."""
-    axes, values = None, []
+    basis, values = None, []
     for member in members:
         if isinstance(member, Kronecker) and member.separable and not member.lines:  # a number times the identity
             values.append(float(member.shift))
             continue
-        found = _of_one(member)
-        if found is None or not (axes is None or axes.same_basis(found[0])):
+        found = eigenbasis(member)
+        if found is None or not (basis is None or basis.same_basis(found[0])):
             return None
-        axes = found[0]
+        basis = found[0]
         values.append(found[1])
-    return None if axes is None else (axes, reduce(combined, values))
-
-
-def _squared(structure):
-    """The same of a L^2 + b L + c, multiplied out: products of the factors of two axes give L away."""
-    products = [term for term in structure.terms if len(term.axes) == 2]
-    parts, lines = structure.out_parts, {axis: term.factors[axis] for term in products for axis in term.axes}
-    if not products or structure.in_parts != parts or len(parts) > 1:
-        return None
-    once = [Term(1.0, tuple(line if a == axis else None for a in range(len(parts[0])))) for axis, line in lines.items()]
-    L, a, b = Kronecker(parts, parts, {(0, 0): tuple(once)}), products[0].scale / 2, 0.0
-    rest = structure.added(L.composed(L).scaled(-a))
-    axis = min(lines, key=lambda axis: lines[axis].largest)  # where rounding in the squares hides least
-    if axis in rest.lines:
-        line = lines[axis].matrix
-        b = float(line.multiply(rest.lines[axis].matrix).sum() / line.multiply(line).sum())
-    rest = rest.added(L.scaled(-b))
-    limits = {axis: ROUNDING * abs(a) * line.largest**2 for axis, line in lines.items()}
-    if not rest.separable or any(line.largest > limits.get(axis, 0.0) for axis, line in rest.lines.items()):
-        return None  # another polynomial in L, or none
-    found = spectrum(L)
-    return None if found is None else (found, (a * found.eigenvalues + b) * found.eigenvalues + rest.shift)
+    return None if basis is None else (basis, reduce(combined, values))
 
 
 def diagonalised(op, name, advice=""):

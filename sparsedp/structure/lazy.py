@@ -175,8 +175,8 @@ class Functions(Remade, Structure):
 def compose(a, b):
     """Structure of a @ b.
 
-    Identities vanish, factor-defined maps stay factor-defined, diagonals meet in one diagonal;
-    the rest becomes a chain.
+    Identities vanish, factor-defined maps stay factor-defined, diagonals meet in one diagonal; the rest becomes a
+    chain, and so do Kronecker sums of two axes and more, whose product is none.
     """
     members = _members(a, Chain)
     for member in _members(b, Chain):
@@ -198,7 +198,10 @@ def _joined(a, b):
     if a.is_identity:
         return b
     if isinstance(a, Kronecker) and isinstance(b, Kronecker) and a.in_parts == b.out_parts:
-        return a.composed(b)
+        product = a.composed(b)
+        return (
+            None if a.separable and b.separable and not product.separable else product
+        )  # L @ L keeps its eigenvectors
     if isinstance(a, Diagonal) and isinstance(b, Diagonal):
         kept = [member.keep for member in (a, b) if isinstance(member, Mask)]
         return Mask(np.all(kept, axis=0), a.values * b.values) if kept else Diagonal(a.values * b.values)
