@@ -16,7 +16,7 @@ __all__ = ["constant", "constant_args", "frozen", "is_fixed", "sparing"]
 
 SMALL = 2**16  # bytes up to which a copy of its own takes less time than a comparison with an older one
 CHUNK = 2**15  # entries that are compared at once: two pieces of them stay in the cache of a core
-BITS = {1: np.int8, 2: np.int16, 4: np.int32, 8: np.int64}  # by size of an entry: what its bits are compared as
+LONGEST = 8  # bytes of the longest integer, as which bits are compared
 FIXED = {float, int, bool, str, slice, type(None), type(Ellipsis), np.float64}
 
 # Functions whose pullbacks need no numbers of their constants, and those that call `constant_args`.
@@ -83,7 +83,7 @@ def frozen(value):
 
 
 def _copied(value):
-    if value.nbytes <= SMALL or value.dtype.kind not in "biufc" or value.real.itemsize not in BITS:
+    if value.nbytes <= SMALL or value.dtype.kind not in "biufc" or value.real.itemsize > LONGEST:
         return _frozen_copy(value)
     owner = value if value.base is None else value.base
     view = id(owner), value.shape, value.strides
@@ -105,6 +105,7 @@ def _same_bits(earlier, value):
         return False
     if value.dtype.kind == "c":
         return _same_bits(earlier.real, value.real) and _same_bits(earlier.imag, value.imag)
-    earlier, value = earlier.view(BITS[value.itemsize]), value.view(BITS[value.itemsize])
+    bits = f"i{value.itemsize}"
+    earlier, value = earlier.view(bits), value.view(bits)
     rows = max(1, CHUNK * len(value) // value.size)
     return all((earlier[k : k + rows] == value[k : k + rows]).all() for k in range(0, len(value), rows))

@@ -57,8 +57,7 @@ class Scene:
 
     def __init__(self, loss, x, ranges, step, time_step, viscosity):
         self.loss, self.step, self.point = loss, step, Point(x)
-        paths = [name.removeprefix("x") or "x" for name in self.point.names]
-        names = [re.sub(r"^\['?([^\[\]']*)'?\]$", r"\1", path) for path in paths]
+        names = [re.sub(r"^x\['?([^\[\]']*)'?\]$", r"\1", name) for name in self.point.names]  # x['dt'] is called dt
         self.leaves = dict(zip(names, self.point.values))
         self.ranges = ranges if isinstance(ranges, dict) else {"x": ranges} if ranges else {}
         for name in (*self.ranges, time_step, viscosity):
