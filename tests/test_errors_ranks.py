@@ -68,6 +68,26 @@ REFUSED = [
     ),
     (
         TypeError,
+        "inverse takes no method and no options on ranks, got 'direct'; leave them away",
+        lambda s: dp.inverse(dp.laplacian(s.grid), method="direct"),
+    ),
+    (
+        TypeError,
+        "inverse takes real operators on ranks, 0+1j * laplacian is complex; solve it on one process",
+        lambda s: dp.inverse(1j * dp.laplacian(s.grid)),
+    ),
+    (
+        TypeError,
+        "inverse of sample does not work on ranks; both sides must lie there in the same way",
+        lambda s: dp.inverse(dp.from_matrix(np.eye(20), s.grid.cells, 20, name="sample")),
+    ),
+    (
+        TypeError,
+        "Solution has no matrix on ranks; invert a sum or product of operators",
+        lambda s: dp.inverse(dp.identity(s.grid.cells) + dp.inverse(dp.laplacian(s.grid, dp.dirichlet))),
+    ),
+    (
+        TypeError,
         "distribute takes a communicator, got int; write mpi4py.MPI.COMM_WORLD",
         lambda s: dp.distribute(dp.Grid(3), 2),
     ),
@@ -81,6 +101,16 @@ def test_refusals(case):
     with pytest.raises(error) as caught:
         act(Scene())
     assert str(caught.value) == told
+
+
+@on_ranks
+def test_a_null_vector_that_nobody_tries():
+    from mpi4py import MPI
+
+    grid = dp.distribute(dp.Grid(8, spacing=[np.linspace(1, 2, 8)], periodic=True), MPI.COMM_SELF)
+    with pytest.raises(dp.errors.ConvergenceError) as caught:
+        dp.inverse(dp.upwind(grid))
+    assert "the null vector of one side is not known on ranks" in str(caught.value)
 
 
 @on_ranks

@@ -29,6 +29,12 @@ def test_fields(count):
 
 
 @on_ranks
+@pytest.mark.parametrize("count", COUNTS)
+def test_solves(count):
+    assert printed("solves_on_ranks.py", count).endswith("all agree\n")
+
+
+@on_ranks
 @pytest.mark.whole
 def test_every_operator_of_the_catalogue():
     """Within 4e-16 of one process, dot tests within 1e-15, and the same bits on 1, 2, 3 and 4 ranks."""

@@ -16,12 +16,13 @@ import scipy.sparse as sp
 
 from sparsedp.parallel.exchange import of_boxes, of_entries
 from sparsedp.parallel.partition import lengths, slices
+from sparsedp.solvers.inverses import Solution
 from sparsedp.structure.base import Matrix, Structure, rows_of
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker, Term, components
 from sparsedp.structure.lazy import Chain, Diagonal, Mask, Sum
 
-__all__ = ["localized"]
+__all__ = ["Entries", "Rows", "between", "localized"]
 
 
 def localized(structure, given, made):
@@ -45,10 +46,12 @@ def localized(structure, given, made):
         values = take(structure.values)
         return Mask(take(structure.keep), values) if isinstance(structure, Mask) else Diagonal(values)
     if isinstance(structure, Chain):
-        sides = _between(structure.members, given, made)
+        sides = between(structure.members, given, made)
         return Chain([localized(m, b, a) for m, a, b in zip(structure.members, sides, sides[1:])])
     if isinstance(structure, Sum):
         return Sum([localized(member, given, made) for member in structure.members])
+    if isinstance(structure, Solution):
+        return Solved(structure)
     if isinstance(structure, (Kronecker, Matrix)):
         return Entries(structure.explicit(), given, made)
     if isinstance(structure, Diagonal):
@@ -64,7 +67,7 @@ def _fits(structure, given, made):
     return structure.in_parts == tuple(given) and structure.out_parts == tuple(made)
 
 
-def _between(members, given, made):
+def between(members, given, made):
     """The sides of the members of a product from left to right: where neither knows, every rank has all of it."""
     layout = (given or made)[0]
     sides = [made, *[None] * (len(members) - 1), given]
@@ -75,6 +78,8 @@ def _between(members, given, made):
             sides[place] = sides[place + 1]
         elif isinstance(right, Kronecker):
             sides[place] = known(right.out_parts)
+        elif isinstance(right, Solution):
+            sides[place] = right.solver.system.side
         elif isinstance(left, Kronecker):
             sides[place] = known(left.in_parts)
     for place, member in enumerate(members[:-1]):
@@ -97,6 +102,12 @@ class Rows(Structure):
         self.exchange, self.cut = of_boxes(given, structure.in_parts, reach), _Cut(structure, given, out, reach)
         self.shape = sum(map(prod, map(lengths, own))), self.exchange.roots
         self.windows = [slices(inner, wide) for inner, wide in zip(own, out)]
+
+    def entries(self):
+        """The rows as a csr_array; its columns are what the exchange brings."""
+        numbers = components(np.arange(self.cut.shape[0]), self.cut.out_parts)
+        blocks = [part[window].reshape(-1) for part, window in zip(numbers, self.windows)]
+        return self.cut.explicit()[np.concatenate(blocks)]
 
     def act(self, x, out):
         wide = components(self.cut.product(self.exchange.forward(x)), self.cut.out_parts)
@@ -198,7 +209,17 @@ def _cut_factor(factor, rows, columns, wraps, along):
     return found
 
 
-# ---- matrices ----
+# ---- solves and matrices ----
+
+
+class Solved(Structure):
+    """A solve on ranks: it acts on blocks as it is."""
+
+    def __init__(self, solution):
+        self.solution, self.shape = solution, (solution.solver.system.here,) * 2
+
+    def apply(self, x, out):
+        self.solution.apply(x, out)
 
 
 class Entries(Structure):

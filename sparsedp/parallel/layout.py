@@ -12,6 +12,7 @@ from sparsedp.fields import field_array
 from sparsedp.parallel.cut import localized
 from sparsedp.parallel.fields import DistributedField, block, everywhere
 from sparsedp.parallel.partition import Partition
+from sparsedp.parallel.solve import RanksSystem
 from sparsedp.space import Space
 from sparsedp.structure.base import result_dtype
 from sparsedp.tape import Rule, linear, plain
@@ -65,6 +66,16 @@ class Layout(Partition):
             return u.flat if u.dtype.kind in "fc" else u.flat.astype(float)
         u = field_array(op, u)
         return block(u, op.domain).flat if op.domain.layout else u.reshape(-1)
+
+    def system(self, op, rtol, maxiter, method, options):
+        """The system of an operator on ranks, for `inverse`."""
+        if _side(op.domain) != _side(op.codomain):
+            raise TypeError(f"inverse of {op.name} does not work on ranks; both sides must lie there in the same way")
+        if method != "auto" or options:
+            raise TypeError(f"inverse takes no method and no options on ranks, got {method!r}; leave them away")
+        if op.dtype.kind == "c":
+            raise TypeError(f"inverse takes real operators on ranks, {op.name} is complex; solve it on one process")
+        return RanksSystem(op, rtol, maxiter)
 
     # ------------------------------------------------------------ fields
 

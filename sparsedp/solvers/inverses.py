@@ -129,9 +129,13 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
     `near`: the engine of a matrix nearby, whose LU may do.
     """
     clock = perf_counter()
-    system = System(op, rtol, maxiter)
-    word, reason, engine = (method, "as asked", None) if method != "auto" else _chosen(system, solves)
-    _check_options(word, options)
+    if op.layout is not None:
+        system = op.layout.system(op, rtol, maxiter, method, options)
+        word, reason, engine = "petsc", str(op.layout), None
+    else:
+        system = System(op, rtol, maxiter)
+        word, reason, engine = (method, "as asked", None) if method != "auto" else _chosen(system, solves)
+        _check_options(word, options)
     if system.complex and word not in ("direct", "krylov"):
         raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct' or 'krylov'")
     if near is not None and word == "direct":
@@ -202,7 +206,7 @@ def _engine(system, word, options, suited=None):
         engine.last = system.last
         return engine
     try:
-        engine = METHODS[word](system, **options) if suited is None or options else suited
+        engine = (system.make or METHODS[word])(system, **options) if suited is None or options else suited
         return engine if system.null_space is not None else None
     except ArithmeticError as error:
         message = f"{system.given} is singular and cannot be projected: {error}; add a shift"
@@ -289,7 +293,7 @@ class Solution(Structure):
             return x
         with np.errstate(over="ignore"):
             rounded = x.astype(dtype)
-        if not np.all(np.isfinite(rounded)):
+        if not np.isfinite(self.solver.system.largest(rounded)):
             raise NonFiniteError(f"the solution of {self.solver.name} is beyond {dtype}; give it double precision")
         return rounded
 
@@ -364,7 +368,8 @@ class Inverse(Operator):
 
     def apply(self, u, out=None):
         """Solve for a plain array, without the tape; see `Operator.apply`."""
-        if out is not None or (np.ndim(u) > len(self.domain.shape) and self.structure.start is None):
+        batch = np.ndim(u) > len(self.domain.shape) and self.structure.start is None
+        if out is not None or batch or self.layout is not None:
             return super().apply(u, out)
         return self.structure.solved(field_array(self, u).reshape(-1)).reshape(self.codomain.shape)
 

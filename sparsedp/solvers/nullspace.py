@@ -137,7 +137,7 @@ def find_null_space(system):
     singular = has_right | has_left
     many = int(np.count_nonzero(singular))
     labels = np.append(np.where(singular, np.cumsum(singular) - 1, -1), -1)[labels]
-    space = NullSpace(None if not many or np.all(labels == 0) else labels, right, left, many)
+    space = system.kernel(labels, right, left, many)
     if many and np.any(np.abs(space._products) <= 1e-10 * space._lengths[0] * space._lengths[1]):
         raise ArithmeticError("the right and the left null vector are orthogonal")
     return space
@@ -145,12 +145,12 @@ def find_null_space(system):
 
 def _candidates(system, labels, count, transposed):
     """The first of the candidates that the operator maps to 0, component by component."""
-    found, known = np.zeros(system.size, system.op.dtype), np.zeros(count, dtype=bool)
-    candidates = [np.ones(system.size), system.volumes][: 1 if system.uniform else 2]
-    members = np.bincount(labels, minlength=count + 1)[:count] > 0
+    found, known = np.zeros(labels.size, system.op.dtype), np.zeros(count, dtype=bool)
+    candidates = [np.ones(labels.size), system.volumes][: 1 if system.uniform else 2]
+    members = system.counts(labels, None, count + 1)[:count] > 0
     for candidate in map(system.masked, reversed(candidates) if transposed else candidates):
         wrong = np.abs(system.product(candidate, transposed)) > ROUNDING * system.magnitude(candidate, transposed)
-        fresh = members & ~known & (np.bincount(labels, wrong, count + 1)[:count] == 0)
+        fresh = members & ~known & (system.counts(labels, wrong, count + 1)[:count] == 0)
         chosen = np.append(fresh, False)[labels]
         found[chosen] = candidate[chosen]
         known |= fresh

@@ -44,7 +44,7 @@ from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
 from sparsedp.fields import check_finite, place
 from sparsedp.ledger import count, thread, timed
 from sparsedp.recipe import Remade
-from sparsedp.solvers.scaling import far_exponent, in_range, largest, norm, shifted
+from sparsedp.solvers.scaling import in_range, norm, shifted
 from sparsedp.tape import plain
 
 __all__ = ["STATUS_WORDS", "Engine", "Run", "SolveInfo", "SolveLog", "Solver", "failure"]
@@ -188,19 +188,19 @@ class Solver(Remade):
 
     def _scaled(self, b, run, start):
         """The solve with data and solution in the middle of the range of floats."""
-        size, exponent = norm(b), 0
+        size, exponent = self.system.size_of(b), 0
         if not in_range(size):
-            top = largest(b)
+            top = self.system.largest(b)
             if not np.isfinite(top):
                 run.status = "nonfinite_input"
                 space = self.system.op.domain if run.transposed else self.system.op.codomain
-                check_finite(self.name, b.reshape(space.shape), "takes finite numbers")
+                check_finite(self.name, self.system.shaped(b, space), "takes finite numbers")
             if top == 0:
                 run.status = "exact_zero_rhs"
                 return np.zeros_like(b)
             exponent = int(np.frexp(top)[1])
             b = shifted(b, -exponent)
-            size = norm(b)
+            size = self.system.size_of(b)
         exponent -= self.system.exponent
         if start is not None:
             start = shifted(start, -exponent).astype(b.dtype)
@@ -208,7 +208,7 @@ class Solver(Remade):
         if not exponent:
             return x
         x = shifted(x, exponent)
-        if not np.isfinite(largest(x)):
+        if not np.isfinite(self.system.largest(x)):
             run.status = "not_representable"
             raise NonFiniteError(f"the solution of {self.name} is beyond 1.8e308; scale the right-hand side down")
         return x
@@ -220,7 +220,7 @@ class Solver(Remade):
         space, size, refuses = self.system.null_space, raw, run.checked and self.nullspace == "raise"
         if self.system.active is not None:
             b = self._on_unknowns(b, raw, run, refuses)
-            size = norm(b)
+            size = self.system.size_of(b)
         if space.count:
             sums = space.sums(b, run.transposed)
             defect, worst = space.defect(b, sums, size, run.rtol * raw, run.transposed)
@@ -237,12 +237,12 @@ class Solver(Remade):
 
     def _on_unknowns(self, b, raw, run, refuses):
         outside = np.where(self.system.active, 0.0, b)
-        run.defect = norm(outside) / raw if raw else 0.0
+        run.defect = self.system.size_of(outside) / raw if raw else 0.0
         if refuses and run.defect > 8 * EPS:
             self._incompatible(
                 run,
                 ": the right-hand side must be 0 where there is no unknown (solid or isolated cells, "
-                f"coefficient 0), but is not in cell {self._cell(np.argmax(np.abs(outside)))}; set it to 0",
+                f"coefficient 0), but is not in cell {self._cell(self.system.number_of_largest(outside))}; set it to 0",
             )
         return np.where(self.system.active, b, 0.0)
 
@@ -307,7 +307,7 @@ class Solver(Remade):
             f"{how}{self.engine.method} on {op}: relative residual {run.residual:.1e} after {run.iterations} "
             f"{self.engine.unit}, wanted {run.rtol:g}{why}",
             info=run.info(),
-            best=x.reshape(op.domain.shape),
+            best=self.system.shaped(x, op.domain),
         )
 
     def _word(self, run, residual, goal, length, data):
@@ -318,7 +318,7 @@ class Solver(Remade):
 
     def _correction(self, r, residual, goal, transposed):
         """One call of the engine, on a residual in the middle of the range of floats."""
-        exponent = far_exponent(r, residual)
+        exponent = 0 if in_range(residual) else int(np.frexp(self.system.largest(r))[1])
         if exponent:
             r, goal = shifted(r, -exponent), float(np.ldexp(goal, -exponent))
         solve = self.engine.solve if self.engine.last is None else self._in_order

@@ -1,6 +1,7 @@
 """System: what an engine may know about the operator it inverts. Every fact is found on first use."""
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -9,8 +10,8 @@ from scipy.sparse.csgraph import connected_components
 from sparsedp.errors import NonFiniteError
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
-from sparsedp.solvers.nullspace import ROUNDING, find_null_space
-from sparsedp.solvers.scaling import length, remainder
+from sparsedp.solvers.nullspace import ROUNDING, NullSpace, find_null_space
+from sparsedp.solvers.scaling import largest, length, norm, remainder
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Mask
@@ -37,6 +38,9 @@ class System:
         times 2^-exponent, exactly; the contract scales the solution back.
     exponent : int
     """
+
+    make: Any = None  # its own builder of an engine, where there is only one
+    size_of, largest = staticmethod(norm), staticmethod(largest)
 
     def __init__(self, op, rtol=1e-10, maxiter=None):
         self.given = self.op = op
@@ -97,6 +101,18 @@ class System:
         return self.op.dtype.kind == "c"
 
     # ------------------------------------------------------------ sizes
+
+    def shaped(self, x, space):
+        """The field of a flat array."""
+        return x.reshape(space.shape)
+
+    def number_of_largest(self, x):
+        """Flat number of the entry of largest magnitude."""
+        return int(np.argmax(np.abs(x)))
+
+    def counts(self, labels, weights, count):
+        """Sums of weights over each label; None: how often it is there."""
+        return np.bincount(labels, weights, count)
 
     @cached_property
     def _magnitudes(self):
@@ -168,6 +184,10 @@ class System:
     def null_space(self):
         """The null vectors of the singular components. An engine builder may set it."""
         return find_null_space(self)
+
+    def kernel(self, labels, right, left, count):
+        """The NullSpace of these vectors."""
+        return NullSpace(None if not count or np.all(labels == 0) else labels, right, left, count)
 
     # ------------------------------------------------------------ symmetry
 
