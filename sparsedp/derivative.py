@@ -14,7 +14,7 @@ from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, Sparsed
 from sparsedp.fields import check_function, is_whole
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
-from sparsedp.shortcuts import ELSEWHERE, Part, held_for_many
+from sparsedp.shortcuts import ELSEWHERE, Part, alike, held_for_many
 from sparsedp.tape import (
     Recorder,
     ReverseNode,
@@ -571,6 +571,7 @@ def check_loss(value):
 
 def of_argument(cotangent, value):
     """What a product of fields gives for an argument: summed over batches, and for a real argument the real part."""
+    cotangent = alike(cotangent, value)
     while np.ndim(cotangent) > np.ndim(value):
         cotangent = anp.sum(cotangent, axis=0)
     return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent

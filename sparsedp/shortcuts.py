@@ -14,7 +14,7 @@ import numpy as np
 
 __all__ = [
     "ACTS", "ARRAY", "BOX", "COPY", "ELSEWHERE", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part",
-    "REAL", "alike", "formulas_of", "held_for_many", "in_dtype",
+    "REAL", "alike", "array", "formulas_of", "held_for_many", "in_dtype", "whole",
 ]  # fmt: skip
 
 FLOAT = np.dtype(float)
@@ -82,6 +82,16 @@ def alike(derivative, value):
     """A derivative as the kind of array that its value is, traced or not: see ELSEWHERE."""
     pair = ELSEWHERE and (ELSEWHERE.get(_kind(derivative)) or ELSEWHERE.get(_kind(value)))
     return pair[1](derivative, value) if pair else derivative
+
+
+def array(value):
+    """Plain value -> an array: itself where it lies elsewhere."""
+    return value if type(value) in ELSEWHERE else np.asarray(value)
+
+
+def whole(value):
+    """Plain value -> itself, or all of it where it lies elsewhere."""
+    return value.gather() if type(value) in ELSEWHERE else value
 
 
 def in_dtype(value, dtype):

@@ -83,6 +83,11 @@ REFUSED = [
     ),
     (
         TypeError,
+        "a tensor does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.elliptic_solver(dp.divergence(s.grid), s.G)(np.ones((2, 2, 5, 4)), np.ones((5, 4))),
+    ),
+    (
+        TypeError,
         "Solution has no matrix on ranks; invert a sum or product of operators",
         lambda s: dp.inverse(dp.identity(s.grid.cells) + dp.inverse(dp.laplacian(s.grid, dp.dirichlet))),
     ),

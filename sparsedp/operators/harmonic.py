@@ -17,6 +17,7 @@ from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, cell_beside
 from sparsedp.recipe import Made
+from sparsedp.shortcuts import array
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.tape import entrywise, plain
 
@@ -59,7 +60,7 @@ def harmonic_average(grid):
     pair = _pair_rule(widths / (widths + others))
 
     def average(k):
-        values = np.asarray(plain(k))
+        values = array(plain(k))
         if values.shape != grid.shape:
             raise ShapeError(f"harmonic_average takes a field on {grid.cells}, got an array of shape {values.shape}")
         if values.dtype.kind not in "biuf":

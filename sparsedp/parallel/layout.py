@@ -21,8 +21,8 @@ __all__ = ["Layout"]
 
 # Builders that ask by `check_grid`, and are known to be right on ranks; all others are refused by name.
 RIGHT = {
-    "component", "curl", "distribute", "divergence", "flux", "interior", "laplacian", "prolong", "restrict", "sample",
-    "upwind",
+    "component", "curl", "distribute", "divergence", "flux", "harmonic_average", "interior", "laplacian", "prolong",
+    "restrict", "sample", "upwind",
 }  # fmt: skip
 
 

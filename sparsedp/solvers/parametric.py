@@ -23,6 +23,7 @@ from sparsedp.operators.boundary import identity
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.tensor import check_tensor, corners
 from sparsedp.recipe import Remade
+from sparsedp.shortcuts import array, in_dtype, whole
 from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.inverses import build, check_settings
@@ -73,7 +74,7 @@ class ParametricSolver(Remade):
 
     def _inverse(self, k, shift):
         """The set-up for this content, from the last two or new."""
-        k, shift = (np.asarray(values, np.result_type(values, float)) for values in (k, shift))
+        k, shift = (in_dtype(whole(values), np.result_type(values, float)) for values in (k, shift))
         known = self._cache.find((k, shift))
         if known is not None:
             return known
@@ -177,9 +178,11 @@ class EllipticSolver(ParametricSolver):
         array of the shape and dtype of b; complex where k or shift is
         """
         check_plain("elliptic_solver", k, b, shift)
-        k, b = (given if isbox(given) else np.asarray(given) for given in (k, b))
+        k, b = (given if isbox(given) else array(given) for given in (k, b))
         shift = _values("shift", shift, self.D.codomain)
         if np.ndim(k) > 2:
+            if self.D.layout is not None:
+                self.D.layout.check("a tensor")
             solver, at_corners = self._tensors
             check_tensor("k", k, self.D.codomain.grid)
             return solver._solution(at_corners(cast(k, np.result_type(dtype_of(k), float))), b, shift)
@@ -199,9 +202,9 @@ class EllipticSolver(ParametricSolver):
 
     def _coefficient(self, k):
         k = _values("k", k, self.D.domain, "harmonic_average(grid)(k)", self.D.codomain)
-        values = np.asarray(plain(k))
+        values = array(plain(k))
         if values.dtype.kind != "c" and np.any(values < 0):
-            raise ValueError(f"k must be >= 0, got {values.min():g} at {np.argmin(values)}")
+            raise ValueError(f"k must be >= 0, got {np.min(values):g} at {np.argmin(values)}")
         return k * np.ones(self.D.domain.shape) if values.ndim == 0 else k
 
     def _operator(self, k, shift):
@@ -245,7 +248,7 @@ def _values(name, given, space, advice="", other=None):
 
     `advice`: what to write where it is a field on the space `other`.
     """
-    values = np.asarray(plain(given))
+    values = array(plain(given))
     if values.shape not in ((), space.shape):
         advice = f"; write {advice}" if other is not None and values.shape == other.shape else ""
         raise ShapeError(

@@ -63,6 +63,26 @@ def inverses_are_those_of_one_process():
     assert dp.inverse(-dp.laplacian(grid, solid=WALL), nullspace="project").solver.system.null_space.count == 3
 
 
+def elliptic_misfits():
+    """Value, gradient, tangent and Hessian product in a coefficient on cells, data and shift, whole or on ranks."""
+    for plain in (GRIDS[2], GRIDS[3]):
+        rng = np.random.default_rng(4)
+        k, b, t = rng.uniform(0.5, 2.0, plain.shape), *rng.standard_normal((2, *plain.shape))
+        for boundary in (dp.dirichlet, dp.neumann):
+            results = []
+            for grid, lay in ((plain, False), (dp.distribute(plain, COMM), False), (dp.distribute(plain, COMM), True)):
+                D, G, mean = dp.divergence(grid), dp.gradient(grid, boundary), dp.harmonic_average(grid)
+                solve = dp.elliptic_solver(D, G, rtol=1e-13, nullspace="project")
+                field = dp.identity(grid.cells) if lay else lambda u: u
+                x, along = (field(np.log(k)), field(b), 0.2), (field(t), field(b[::-1].copy()), 0.3)
+                loss = lambda x, solve=solve, mean=mean: anp.sum(anp.sin(solve(mean(anp.exp(x[0])), x[1], x[2])) ** 2)
+                value, slopes = dp.value_and_grad(loss)(x)
+                results.append((value, *slopes, dp.jvp(loss, x, along)[1], *dp.hvp(loss, x, along)))
+            for found in results[1:]:
+                for number, pair in enumerate(zip(found, results[0])):
+                    close(*pair, 1e-10, f"elliptic_solver on {plain}, number {number}")
+
+
 def products_with_inverses():
     """A projection written out: v + G A^-1 D v as one operator, and its transpose."""
     results = []
@@ -110,6 +130,7 @@ def errors_are_the_same_on_all_ranks():
 
 if __name__ == "__main__":
     inverses_are_those_of_one_process()
+    elliptic_misfits()
     products_with_inverses()
     errors_are_the_same_on_all_ranks()
     if COMM.rank == 0:
