@@ -336,8 +336,7 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
 
     Parameters
     ----------
-    name : str
-        In errors and in the counts.
+    name : str, for errors and counts
     forward : callable
         ``forward(*args) -> ans`` on plain values; `ans` is an array, a float, or a tuple of arrays.
     vjp : callable, optional
