@@ -351,7 +351,7 @@ LONG = "a" * 5000
             r".*b+\.\.\. cannot be written: File name too long; make room, or write ",
         ),
         (["demo", "--out", LONG], r"a+\.\.\. cannot be made a folder: File name too long; name another with --out"),
-        (["demo", "--input", f"{LONG}.npy"], r"a+\.\.\. is not there or is no plain file; give the path of a .npy or"),
+        (["demo", "--input", f"{LONG}.npy"], r"a+\.\.\. is not there or is no plain file; give the path of a .npy, "),
         (["demo", "--size", LONG], r"argument --size: invalid int value: 'a+\.\.\. see python -m sparsedp demo --help"),
         ([LONG], r"argument command: invalid choice: 'a+\.\.\. \(choose from .*; see python -m sparsedp --help"),
     ],
