@@ -128,7 +128,7 @@ def run_demo(options):
 
 ARGUMENTS: dict[str, Any] = {
     "scene": {"help": "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"},
-    "--input": {"type": Path, "metavar": "FILE", "help": "a 2-D field as .npy or .png (default: terrain)"},
+    "--input": {"type": Path, "metavar": "FILE", "help": "a 2-D field as .npy, .npz or .png (default: terrain)"},
     "--size": {"type": int, "default": 64, "metavar": "N", "help": "cells along the longest side (default: 64)"},
     "--out": {"type": Path, "metavar": "DIR", "help": "where the results go (default: %(default)s)"},
     "--force": {"action": "store_true", "help": "overwrite results of an earlier run"},

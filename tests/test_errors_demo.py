@@ -6,6 +6,7 @@ import pickle
 import re
 import struct
 import sys
+import zipfile
 import zlib
 from pathlib import Path
 
@@ -41,6 +42,21 @@ def raw(content):
     return write
 
 
+def zipped(**arrays):
+    def write(path):
+        np.savez(path, **arrays)
+
+    return write
+
+
+def member(name, content):
+    def write(path):
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(name, content)
+
+    return write
+
+
 def sparse_file(path):
     """101 million values that take no room on the disk."""
     promise = header((101, 10**6), "|b1")
@@ -72,10 +88,9 @@ def case(name, write, match):
 
 
 BAD = [
-    case("a.npy", None, match=r"a\.npy is not there or is no plain file; give the path of a .npy or .png file"),
+    case("a.npy", None, match=r"a\.npy is not there or is no plain file; give the path of a .npy, .npz or .png file"),
     case("a.npy", Path.mkdir, match=r"a\.npy is not there or is no plain file; give the path of a .npy"),
-    case("a.npz", raw(b"PK"), match=r"a\.npz is not a .npy or .png file; save the field with numpy.save"),
-    case("a.tif", raw(b"II"), match=r"a\.tif is not a .npy or .png file; save the field with numpy.save"),
+    case("a.tif", raw(b"II"), match=r"a\.tif is not a .npy, .npz or .png file; save the field with numpy.save"),
     case(
         "a.npy",
         saved(np.arange(30.0)),
@@ -138,6 +153,17 @@ BAD = [
         match=r"a\.npy needs a 2-D array, 4 values or more along each axis, got shape \(3, 3\)",
     ),
     case("a.npy", saved(np.indices((192, 192)).sum(axis=0) % 2), match=r"is constant once averaged over Grid"),
+    case(
+        "a.npz",
+        zipped(one=relief(), two=relief(), three=np.zeros(3)),
+        match=r"a\.npz cannot be read \(it needs exactly one 2-D array, got 2 among 3: one, two\)",
+    ),
+    case("a.npz", zipped(line=np.zeros(9)), match=r"it needs exactly one 2-D array, got 0 among 1: line\)"),
+    case("a.npz", member("notes.txt", b"none"), match=r"exactly one 2-D array, got 0 among 1: notes.txt\)"),
+    case("a.npz", raw(b"PK\x03\x04 cut"), match=r"a\.npz cannot be read \(.*\); save the field with numpy.save"),
+    case("a.npz", member("u.npy", header((9, 9), "|O")), match=r"a\.npz cannot be read \(Object arrays"),
+    case("a.npz", member("u.npy", header((10**5, 10**5)) + bytes(999)), match=r"a\.npz cannot be read"),
+    case("a.npz", member("u.npy", b"\x80\x04K\x01."), match=r"a\.npz (cannot be read|needs exactly one)"),
     case("a.png", raw(b"GIF89a" + bytes(40)), match=r"a\.png cannot be read"),
     case("a.png", raw(png(10**5, 10**5)), match=r"a\.png cannot be read \(Image size .* exceeds limit"),
 ]
@@ -221,6 +247,17 @@ def test_file_that_cannot_be_opened(tmp_path, monkeypatch):
     monkeypatch.setattr(np, "load", refuse)
     with pytest.raises(ValueError, match=r"a\.npy cannot be read \(Permission denied\)"):
         terrain.read_field(tmp_path / "a.npy")
+
+
+def test_archive_that_lies_about_its_length(tmp_path, capsys):
+    path = tmp_path / "a.npz"
+    member("u.npy", header((40, 40)) + bytes(12800))(path)
+    content = bytearray(path.read_bytes())
+    where = content.rfind(b"PK\x01\x02")  # the entry of the directory, which NumPy believes
+    content[where + 24 : where + 28] = struct.pack("<I", 2**31)
+    path.write_bytes(content)
+    assert main(["demo", "--input", str(path), "--size", "12", "--out", str(tmp_path / "out")]) == 2
+    assert "a.npz" in capsys.readouterr().err
 
 
 # ---- pictures ------------------------------------------------------------------------------------------------------

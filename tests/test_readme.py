@@ -160,7 +160,9 @@ def terrain(path):
     """A field to stand for the reader's own file."""
     x, y = np.meshgrid(np.linspace(0, 3, 28), np.linspace(0, 2, 24), indexing="ij")
     field = np.sin(x) * np.cos(2 * y) + 0.3 * x
-    if path.suffix == ".npy":
+    if path.suffix == ".npz":
+        np.savez(path, field=field)
+    elif path.suffix == ".npy":
         np.save(path, field)
     else:
         pytest.importorskip("matplotlib.image").imsave(path, field)

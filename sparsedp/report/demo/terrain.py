@@ -119,7 +119,7 @@ def hidden_ground(grid, terrain):
 
 
 def read_field(path):
-    """Path of a .npy or .png file -> field, shape (nx, ny), finite.
+    """Path of a .npy, .npz or .png file -> field, shape (nx, ny), finite.
 
     An array is taken as a field: axis 0 is x. A picture has its rows from the top, and is turned.
 
@@ -148,13 +148,14 @@ def read_field(path):
     """
     readers: dict[str, Any] = {
         ".npy": partial(np.load, mmap_mode="r"),  # mapped into memory: its header may promise more than it holds
+        ".npz": _only_map,
         ".png": lambda path: plots.read_picture(path)[::-1].T,  # its rows run from the top
     }
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise ValueError(f"{path} is not a .npy or .png file; save the field with numpy.save")
+        raise ValueError(f"{path} is not a .npy, .npz or .png file; save the field with numpy.save")
     if not os.path.isfile(path):  # Path.is_file raises for a name that is too long
-        raise ValueError(f"{path} is not there or is no plain file; give the path of a .npy or .png file")
+        raise ValueError(f"{path} is not there or is no plain file; give the path of a .npy, .npz or .png file")
     try:
         field = reader(path)
     except ImportError:
@@ -173,3 +174,13 @@ def read_field(path):
     check_finite(path, field, "needs finite values")
     # By a power of two: nothing is rounded, nothing overflows.
     return np.ldexp(field, -np.frexp(np.abs(field).max())[1])
+
+
+def _only_map(path):
+    """Path of a .npz file -> the 2-D array in it."""
+    with np.load(path) as archive:
+        maps = {name: values for name, values in archive.items() if np.ndim(values) == 2}
+        if len(maps) != 1:
+            names = ", ".join(name[:24] for name in list(maps or archive.files)[:4]) or "nothing"
+            raise ValueError(f"it needs exactly one 2-D array, got {len(maps)} among {len(archive.files)}: {names}")
+    return maps.popitem()[1]
