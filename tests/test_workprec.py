@@ -1,5 +1,7 @@
 """Error against run time: rows, references, failures, warm caches, files that are continued, pictures."""
 
+import csv
+import io
 import math
 import re
 
@@ -33,11 +35,12 @@ def table(**options):
 
 def test_names_that_tables_and_files_cannot_hold(tmp_path):
     methods = {"a|b": METHODS["direct"], 3: METHODS["krylov"]}
-    options = {"reference": EXACT, "repeats": 1, "scene": "walls/x"}
+    options = {"reference": EXACT, "repeats": 1, "scene": "walls/x", "file": tmp_path / "rows.csv"}
     found = dp.workprec(poisson, methods, {"cells": [8]}, **options)
     assert "| a\\|b |" in found.markdown() and "| 3 |" in found.markdown()
     assert [path.name for path in found.save(tmp_path)[:2]] == ["walls-x.md", "walls-x.csv"]
-    assert [row["method"] for row in found.rows] == ["a|b", "3"]
+    again = dp.workprec(poisson, methods, {"cells": [8]}, **options)
+    assert [row["method"] for row in again.rows] == ["a|b", "3"] and again.markdown() == found.markdown()
 
 
 def test_rows():
@@ -169,6 +172,35 @@ def test_a_run_without_gradient_and_an_output():
     scene = lambda: (lambda x: anp.sum(x**2), np.ones(3), {"output": lambda x: 2 * x})
     found = dp.workprec(scene, {"it": {}}, reference=(2 * np.ones(3), 2 * np.ones(3)), repeats=1)
     assert found.rows[0]["forward_error"] == found.rows[0]["gradient_error"] == 0.0
+
+
+def test_a_file_is_continued(tmp_path):
+    """Finished rows are kept when a run is cut off, also in the middle of a line."""
+    file, built = tmp_path / "runs.csv", []
+
+    def counted(cells, method, rtol=1e-10):
+        built.append((cells, method))
+        if len(built) == 3:
+            raise KeyboardInterrupt
+        return poisson(cells, method, rtol)
+
+    options = dict(over={"cells": [8, 16]}, reference=EXACT, repeats=1, file=file, scene="poisson")
+    with pytest.raises(KeyboardInterrupt):
+        dp.workprec(counted, METHODS, **options)
+    file.write_text(file.read_text()[:-30])  # the second row is torn
+    found = dp.workprec(counted, METHODS, **options)
+    assert built[3:] == [(16, "direct"), (8, "krylov"), (16, "krylov")]
+    again = dp.workprec(counted, METHODS, **options)
+    assert len(built) == 6 and again.csv() == found.csv() and not again.left_out
+    rows = list(csv.DictReader(io.StringIO(again.csv())))
+    assert len(rows) == 4 and [row["method"] for row in rows] == ["direct", "direct", "krylov", "krylov"]
+
+    file.write_text(file.read_text().replace("numpy ", "numpy 0."))
+    old = dp.workprec(counted, METHODS, **options)
+    assert len(built) == 10 and "4 rows of runs.csv from other versions: run again" in old.left_out
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ValueError, match="other.csv is no table of workprec; give another file name"):
+        table(file=tmp_path / "other.csv")
 
 
 def test_words_pictures_and_refusals(tmp_path):

@@ -1,5 +1,6 @@
 """workprec: error against run time, of values and of gradients, one row for each run."""
 
+import csv
 import itertools
 import json
 import platform
@@ -17,11 +18,12 @@ from sparsedp.check.summary import text_of
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.fields import check_function, is_whole
+from sparsedp.files import write_file
 from sparsedp.ledger import recording
 from sparsedp.report import plots
 from sparsedp.report.certificate import distance
 from sparsedp.report.plan import total
-from sparsedp.report.table import Table, write_table
+from sparsedp.report.table import Table, csv_text, write_table
 from sparsedp.tree import leaves
 
 __all__ = ["COLUMNS", "Rows", "words_of", "workprec"]
@@ -32,6 +34,8 @@ COLUMNS = (
     "seed", "versions", "settings", "reference_error", "seconds_forward_median", "seconds_forward_max",
     "seconds_backward_median", "seconds_backward_max",
 )  # fmt: skip
+TEXTS = ("scene", "method", "status", "seed", "versions", "settings")
+KEY = ("scene", "method", "settings", "seed", "versions")  # what a row of an earlier run is found by
 SHOWN = COLUMNS[1:15]
 COUNTS = {"solves_forward": "solve", "solves_adjoint": "adjoint", "iterations": "iterations"}  # in the ledger
 SETTLED = 2.0  # a run that is not faster than the last one by more is warm
@@ -40,7 +44,9 @@ SHORT = 2e-3  # [s]: below, times differ for other reasons
 FAILURES = (SparsedpError, ArithmeticError, ValueError, MemoryError, np.linalg.LinAlgError)
 
 
-def workprec(problem, methods, over=None, reference=None, compare=None, repeats=3, scene=None, skip=None, seed=0):
+def workprec(
+    problem, methods, over=None, reference=None, compare=None, repeats=3, file=None, scene=None, skip=None, seed=0
+):
     """Problem and methods -> error against run time: a table, one row for each method and setting.
 
     Parameters
@@ -61,6 +67,8 @@ def workprec(problem, methods, over=None, reference=None, compare=None, repeats=
         ``compare(result, exact)`` -> error of a gradient or an answer. Default: Euclidean, relative.
     repeats : int
         Timed runs after the warm ones; the least counts.
+    file : path, optional
+        CSV file: rows are added as they finish, and those in it are not run again.
     scene : str, optional
         Default: the name of `problem`.
     skip : callable, optional
@@ -77,7 +85,7 @@ def workprec(problem, methods, over=None, reference=None, compare=None, repeats=
     Raises
     ------
     ValueError
-        If `repeats` is not a whole number >= 1, or there is no method.
+        If `repeats` is not a whole number >= 1, there is no method, or the file is not such a table.
     TypeError
         If the problem does not give (loss, x).
 
@@ -103,19 +111,26 @@ def workprec(problem, methods, over=None, reference=None, compare=None, repeats=
         raise ValueError(f"workprec needs repeats >= 1, a whole number, got {repeats!r}; the default is 3")
     if not methods or not isinstance(methods, dict):
         raise ValueError("workprec needs at least one method; write {'name': {settings}}")
-    scene, over, rows, skipped = scene or getattr(problem, "__name__", "scene"), over or {}, [], []
-    shared, compare = {"scene": scene, "seed": str(seed), "versions": _versions()}, compare or distance
+    scene, over, now, rows = scene or getattr(problem, "__name__", "scene"), over or {}, _versions(), []
+    compare = compare or distance
     exact = _exact(problem, reference, compare)
+    finished = {tuple(map(row.get, KEY)): row for row in _stored(file)}
+    other = sum(row["versions"] != now for row in finished.values())
+    skipped = [f"{other} rows of {Path(file).name} from other versions: run again"] if other else []
     for (method, choice), *values in itertools.product(methods.items(), *over.values()):
         settings = dict(zip(over, values)) | choice
         reason = skip and skip(str(method), settings)
         if reason:
             skipped.append(f"{method} with {words_of(settings)}: {reason}")
             continue
-        figures, *result = _measured(problem, settings, repeats)
-        figures |= _errors(exact, compare, {name: settings[name] for name in over}, *result)
-        figures |= {**shared, "method": str(method), "settings": _text_of(settings)}
-        rows.append({name: figures.get(name, nan) for name in COLUMNS})
+        key = scene, str(method), _text_of(settings), str(seed), now
+        if key not in finished:
+            figures, *result = _measured(problem, settings, repeats)
+            figures |= _errors(exact, compare, {name: settings[name] for name in over}, *result)
+            finished[key] = {name: figures.get(name, nan) for name in COLUMNS} | dict(zip(KEY, key))
+            if file:
+                write_file(file, csv_text([*_stored(file), finished[key]], COLUMNS))
+        rows.append(finished[key])
     return Rows(scene=scene, over=tuple(over), rows=rows, left_out=skipped)
 
 
@@ -357,3 +372,23 @@ class Rows(Table):
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         return write_table(folder, self.stem, self.markdown(), self.csv(), self.plot)
+
+
+# ---------------------------------------------------------------- a file that can be continued
+
+
+def _stored(file):
+    """CSV file -> its rows, without one that was cut off; none without a file."""
+    path = file and Path(file)
+    if not path or not path.exists() or not path.stat().st_size:
+        return []
+    with path.open(encoding="utf-8", newline="") as stream:
+        reader = csv.DictReader(stream)
+        if tuple(reader.fieldnames or ()) != COLUMNS:
+            raise ValueError(f"{path.name} is no table of workprec; give another file name")
+        whole = [row for row in reader if row[COLUMNS[-1]] is not None]
+    return [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in whole]
+
+
+def _number(text):
+    return int(text) if text.isdigit() else float(text or "nan")
