@@ -30,8 +30,7 @@ def tensors(grid, seed=0, skew=0.0):
 
 def dense(solve, K, shift=0.0):
     """The matrix, column by column, from the solver's own operator."""
-    inner, at_corners = solve._tensors
-    return inner._operator(at_corners(K), np.asarray(shift)).matrix.toarray()
+    return solve.operator(K, shift).matrix.toarray()
 
 
 # ---------------------------------------------------------------- values
@@ -273,3 +272,68 @@ def test_solids_and_singular_systems():
     assert dp.check.gradient(lambda K: anp.sum(solve(K, b) ** 2), tensors(grid)).verdict == "agrees"
     with pytest.raises(dp.errors.IncompatibleError, match="elliptic_solver is singular"):
         solver(grid, dp.neumann)(tensors(grid), b + 1)
+
+
+# ---- the same term in steps, and with values at walls ----------------------------------------------------------------
+
+WALLS = {"x": dp.dirichlet, "y": (dp.neumann, dp.dirichlet)}
+
+
+def turned(grid, angle=0.5):
+    """A tensor that varies."""
+    c, s, big = np.cos(angle), np.sin(angle), 3.0 + np.sin(np.arange(grid.cells.size)).reshape(grid.shape)
+    return np.array([[c * c + big * s * s, (1 - big) * s * c], [(1 - big) * s * c, s * s + big * c * c]])
+
+
+@pytest.mark.parametrize("kind", ["number", "faces", "tensor"])
+def test_flux_operator_and_solve_are_one_term(kind, rng):
+    grid = dp.Grid((6, 5), size=1.0)
+    D, G = dp.divergence(grid), dp.gradient(grid, WALLS)
+    solve, u = dp.elliptic_solver(D, G), rng.normal(size=grid.shape)
+    k = {"number": 0.7, "faces": 0.5 + rng.random(grid.faces.size), "tensor": turned(grid)}[kind]
+    b = 2.0 * u - D(solve.flux(k, G(u)))
+    np.testing.assert_allclose(solve.operator(k, 2.0)(u), b, rtol=1e-12, atol=1e-10)
+    np.testing.assert_allclose(solve(k, b, 2.0), u, rtol=1e-8, atol=1e-9)
+    weights = rng.normal(size=grid.faces.size)
+    loss = lambda x: anp.sum(weights * solve.flux(x["k"], x["g"]) ** 2)
+    assert dp.check.gradient(loss, {"k": np.asarray(k), "g": G(u)}).verdict == "agrees"
+
+
+def test_values_at_walls_beside_a_tensor():
+    """A ramp is a steady state of a constant tensor: of second differences nothing is left, at walls too."""
+    grid, k = dp.Grid((7, 6), size=1.0), np.array([[2.0, 0.5], [0.5, 1.0]])[:, :, None, None] * np.ones((7, 6))
+    D, G, lift = dp.divergence(grid), dp.gradient(grid, dp.dirichlet), dp.lift(grid, dp.dirichlet)
+    ramp = lambda x, y: 1.0 + 2.0 * x - 3.0 * y
+    walls = []
+    for axis in (0, 1):
+        x, y = grid.face_centres(axis)
+        walls += [np.take(ramp(x, y), side, axis) for side in (0, -1)]
+    solve, values = dp.elliptic_solver(D, G), lift(lift.domain.join(*walls))
+    np.testing.assert_allclose(solve(k, D(solve.flux(k, values))), ramp(*grid.centres()), rtol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["imex", "backward_euler", "crank_nicolson", "tr_bdf2"])
+def test_steps_with_a_tensor(method, rng):
+    """As the stiff part they are those of the matrix; as a rate they have a derivative in every entry."""
+    grid = dp.Grid((5, 4), size=1.0)
+    D, G = dp.divergence(grid), dp.gradient(grid, WALLS)
+    solve, u, k, dt = dp.elliptic_solver(D, G), rng.normal(size=grid.shape), turned(grid), 0.01
+    L = -1.0 * solve.operator(k)
+    stiff, matrix = (
+        dp.stepper(method, None, dt, linear=op) for op in (L, dp.from_matrix(L.matrix, grid.cells, grid.cells))
+    )
+    np.testing.assert_allclose(stiff(u), matrix(u), rtol=1e-8, atol=1e-9)
+    if method == "imex":
+        return
+    step = dp.stepper(method, lambda u, k: D(solve.flux(k, G(u))), dt)
+    np.testing.assert_allclose(step(u, k), stiff(u), rtol=1e-7, atol=1e-8)
+    assert dp.check.gradient(lambda k: anp.sum(step(u, k) ** 2), k).verdict == "agrees"
+
+
+def test_a_traced_tensor_makes_no_operator():
+    grid = dp.Grid((3, 2))
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid))
+    with pytest.raises(
+        dp.errors.DerivativeError, match="operator takes plain k and shift, got a traced one; write solve"
+    ):
+        dp.grad(lambda k: anp.sum(solve.operator(k, 1.0)(np.ones((3, 2)))))(turned(grid))

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.derivative import of_argument
-from sparsedp.errors import ShapeError
+from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity
@@ -178,19 +178,66 @@ class EllipticSolver(ParametricSolver):
         array of the shape and dtype of b; complex where k or shift is
         """
         check_plain("elliptic_solver", k, b, shift)
-        k, b = (given if isbox(given) else array(given) for given in (k, b))
-        shift = _values("shift", shift, self.D.codomain)
-        if np.ndim(k) > 2:
-            if self.D.layout is not None:
-                self.D.layout.check("a tensor")
-            solver, at_corners = self._tensors
-            check_tensor("k", k, self.D.codomain.grid)
-            return solver._solution(at_corners(cast(k, np.result_type(dtype_of(k), float))), b, shift)
-        return self._solution(self._coefficient(k), b, shift)
+        b, shift = b if isbox(b) else array(b), _values("shift", shift, self.D.codomain)
+        k, solver = self._settled(k)
+        return solver._solution(k, b, shift)
+
+    def flux(self, k, slopes):
+        """Coefficient and slopes on the faces -> the flux k g, of a tensor K g, as the solve takes it.
+
+        Parameters
+        ----------
+        k : as for the call
+        slopes : array, a field on the faces
+            ``G(u)``, or with values at walls ``G(u) + dp.lift(grid, boundary)(values)``.
+
+        Returns
+        -------
+        array like slopes
+            ``D(solve.flux(k, G(u)))`` is what the solve inverts: a rate of `stepper`, and where walls hold values
+            ``D(solve.flux(k, lift(values)))`` belongs to b. Differentiable in both.
+        """
+        check_plain("elliptic_solver.flux", k, slopes)
+        k, solver = self._settled(k)
+        if solver is self:
+            return k * slopes
+        to_corners, from_corners = self._corners[:2]
+        return from_corners(k * to_corners(slopes))
+
+    def operator(self, k, shift=0.0):
+        """Plain k and shift -> the Operator shift - D diag(k) G that is solved with.
+
+        Parameters
+        ----------
+        k, shift : as for the call
+
+        Returns
+        -------
+        Operator
+            The stiff part of a step is ``linear=-1.0 * solve.operator(k)``. It has no derivative in k: take `flux`.
+        """
+        if isbox(k) or isbox(shift):
+            raise DerivativeError(
+                "elliptic_solver.operator takes plain k and shift, got a traced one; write solve.flux"
+            )
+        check_plain("elliptic_solver.operator", k, shift)
+        (k, solver), shift = self._settled(k), _values("shift", shift, self.D.codomain)
+        return solver._operator(np.array(k, np.result_type(k, float)), np.array(shift, np.result_type(shift, float)))
+
+    def _settled(self, k):
+        """(k for each face, or tensors at the corners; the solver for them)."""
+        k = k if isbox(k) else array(k)
+        if np.ndim(k) <= 2:
+            return self._coefficient(k), self
+        if self.D.layout is not None:
+            self.D.layout.check("a tensor")
+        _, _, at_corners, solver = self._corners
+        check_tensor("k", k, self.D.codomain.grid)
+        return at_corners(cast(k, np.result_type(dtype_of(k), float))), solver
 
     @cached_property
-    def _tensors(self):
-        """(The solver for the entries of tensors at corners, the function from tensors in cells to them)."""
+    def _corners(self):
+        """Operators to corners and back, the function from tensors in cells to those at corners, its solver."""
         grid = self.D.codomain.grid
         if grid is None or (self.D.codomain, self.D.domain) != (grid.cells, grid.faces):
             raise ShapeError(
@@ -198,7 +245,7 @@ class EllipticSolver(ParametricSolver):
             )
         closed = self.G.structure.magnitude()(np.ones(self.G.shape[1])) == 0
         slopes, fluxes, at_corners = corners(grid, closed)
-        return TensorSolver(self.D @ fluxes, slopes @ self.G, self), at_corners
+        return slopes, fluxes, at_corners, TensorSolver(self.D @ fluxes, slopes @ self.G, self)
 
     def _coefficient(self, k):
         k = _values("k", k, self.D.domain, "harmonic_average(grid)(k)", self.D.codomain)
