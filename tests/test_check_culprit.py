@@ -30,13 +30,16 @@ def named(seeds, error, **options):
     return found
 
 
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("seeds", [(0, 1), (2, 3)])
 @pytest.mark.parametrize("error", [1e-3, 1e-4])
-def test_the_culprit_of_random_scenes(error):
-    assert named(range(4), error) == {("disagrees", True): 4}
+def test_the_culprit_of_random_scenes(error, seeds):
+    assert named(seeds, error) == {("disagrees", True): 2}
 
 
-def test_right_scenes_have_none():
-    assert named(range(8, 13), 0.0) == {("agrees", True): 5}
+@pytest.mark.parametrize("seeds", [(8, 9, 10), pytest.param((11, 12, 13), marks=pytest.mark.whole)])
+def test_right_scenes_have_none(seeds):
+    assert named(seeds, 0.0) == {("agrees", True): 3}
 
 
 @pytest.mark.slow

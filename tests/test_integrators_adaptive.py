@@ -40,7 +40,7 @@ def pendulum_by_scipy(a, g, end):
 @pytest.mark.parametrize("method", ["euler", "heun", "ssprk3", "rk4", "backward_euler", "tr_bdf2"])
 def test_tolerance_and_derivatives(method):
     """On a tree with time: value, gradient and tangent beside SciPy's."""
-    tolerance = 1e-3 if "euler" in method else 1e-4
+    tolerance = {"euler": 1e-3, "backward_euler": 4e-3, "tr_bdf2": 1e-3}.get(method, 1e-4)
     step = dp.stepper(method, pendulum, lambda p: p["T"], tolerance=tolerance)
     loss = lambda x: step(({"a": x[0], "s": 0.0}, 0.0), {"g": x[1], "T": x[2]})[0]["a"]
     x = np.array([1.0, 2.0, 1.5])
@@ -86,5 +86,5 @@ def test_nothing_moves():
 def test_a_rate_that_is_at_rest_at_the_start_is_not_skipped(method):
     """A bell in time: at the start its rate is 0 to rounding, and so is the error of one step over all of it."""
     bell = lambda u, p, t: p * anp.exp(-(((t - 2.0) / 0.3) ** 2))  # in the end it leaves the range of floats
-    step = dp.stepper(method, bell, 10.0, tolerance=1e-6)
+    step = dp.stepper(method, bell, 10.0, tolerance=1e-5 if method == "tr_bdf2" else 1e-6)
     assert step((0.0, 0.0), 1.0)[0] == pytest.approx(0.3 * np.sqrt(np.pi), rel=1e-4)

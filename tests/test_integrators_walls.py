@@ -50,7 +50,7 @@ def errors(method, reaction, n):
 @pytest.mark.parametrize("reaction", [0.0, 1.0])
 def test_moving_walls(method, reaction):
     """The errors of value and gradient fall with the order of the method."""
-    found = np.array([errors(method, reaction, n) for n in (16, 32, 64, 128)])
+    found = np.array([errors(method, reaction, n) for n in (16, 128)])
     order, slopes = ORDERS[method], np.log2(found[0] / found[-1]) / 3
     assert np.all(slopes >= order - 0.2) and np.all(slopes <= order + 0.6), found
     assert np.all(found[-1] <= {1: 2e-2, 2: 3e-4, 4: 1e-7}[order]), found
@@ -63,7 +63,7 @@ def test_prothero_robinson(method):
     op = dp.laplacian(one, dp.dirichlet) * 0.25  # the number -1
     g, slope = lambda t: anp.sin(3 * t) + anp.cos(t), lambda t: 3 * anp.cos(3 * t) - anp.sin(t)
     worst = []
-    for n in (32, 64, 128):
+    for n in (32, 128):
         found = []
         for a in 10.0 ** np.arange(0, 9):
             step = dp.stepper(method, op, 2.0 / n, source=lambda a, t: np.array([a * g(t) + slope(t)]), rtol=1e-13)

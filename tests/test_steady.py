@@ -165,7 +165,7 @@ def test_cavity_at_32():
 @pytest.mark.parametrize("kind", ["cavity", "convection"])
 def test_gradients_of_flows(kind):
     """Min u in Re, Nu in Ra: both orders, forward and backward."""
-    scene = Flow(8)
+    scene = Flow(6)
     guess, figure, p = {"cavity": (scene.rest, scene.lowest, 60.0), "convection": (scene.warm, scene.nusselt, 5e3)}[
         kind
     ]
@@ -254,7 +254,7 @@ def test_fields_are_paired_by_name():
 
 def test_a_mean_over_a_field_fits_no_stencil():
     """A pressure whose mean is 0 in place of a pin: a full row is found, and the flow is the same."""
-    scene = Flow(16)
+    scene = Flow(10)
 
     def free(x, re):
         rates = scene.cavity(x, re)

@@ -235,7 +235,7 @@ def travellers():
     yield from (("inverse", label, inv, of_inverse) for label, inv in inverses())
     yield from ((label.split()[0], label, op, of_operator) for label, op in operators())
     yield from (("stepper", method, *stepped(method)) for method in STEPS)
-    yield from (("stepper", f"{method}, tolerance", *stepped(method, 1e-3)) for method in STEPS if method != "ssprk3")
+    yield from (("stepper", f"{method}, tolerance", *stepped(method, 1e-2)) for method in STEPS if method != "ssprk3")
     leapfrog = dp.stepper("leapfrog", (push, push), 0.1, damping=(1.0, numbers(12) ** 2))
     yield "stepper", "leapfrog", leapfrog, partial(of_step, state=(numbers(12), numbers(12, 1)), params=0.4)
     solve = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
