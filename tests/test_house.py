@@ -109,7 +109,7 @@ BUDGETS = {
     "report": 17_800,
     "solvers": 44_200,  # steady states, tensors, complex coefficients, waves: 2 550; LU for the next: 270; ranks: 210
     "solvers/multigrid": 10_000,
-    "structure": 6_500,
+    "structure": 6_500,  # products of Kronecker sums: 15, for 360 of solvers
     "trajectory": 9_150,  # reversed steps: 400; what a step stores is refused: 150
 }
 COMPILED = 29  # functions that numba compiles, never more than 30: each is compile time at the first use
