@@ -274,11 +274,10 @@ class Jacobians:
         return self._patterns.setdefault(size, (None, None))
 
     def _colour(self, pattern, equation, x, leaves):
-        # One tape serves all products with J^T; each with J takes a run of its own.
-        symmetric = (pattern - pattern.T).nnz == 0 and _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
+        has_vjp = _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
         cells, shapes = fields_met(equation, x, leaves)
-        coloured = Coloured(pattern, shapes, True if self.by_rows or symmetric else None)
-        self._patterns[equation.size] = known = coloured, cells if symmetric else None
+        coloured = Coloured(pattern, shapes, self.by_rows or (None if has_vjp else False))
+        known = self._patterns[equation.size] = coloured, cells if (pattern - pattern.T).nnz == 0 else None
         return known
 
     def _guessed(self, equation, points, leaves):

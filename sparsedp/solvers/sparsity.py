@@ -181,11 +181,13 @@ class Coloured:
     pattern : csr_array
     shapes : sequence of tuples of int, optional
         Of the fields that rows and columns belong to, one after the other, of one dimension. Default: one line.
+    by_rows : bool or None
+        Whether rows are coloured and the products are A^T v. None: unless that takes more than twice as many (a column
+        is full, say), for one tape serves all products with A^T, and each with A takes a run of its own.
 
     Attributes
     ----------
     by_rows : bool
-        Rows are coloured and the products are A^T v, because that takes fewer (one row is full, say).
     count : int
 
     Examples
@@ -198,14 +200,11 @@ class Coloured:
     True
     """
 
-    def __init__(self, pattern, shapes=None, by_rows=None):
+    def __init__(self, pattern, shapes=None, by_rows=False):
+        if by_rows is None:  # there are as many colours as entries in the fullest row, or, by rows, column
+            by_rows = np.bincount(pattern.indices).max(initial=0) <= 2 * np.diff(pattern.indptr).max(initial=0)
         self.pattern, self.by_rows = pattern, bool(by_rows)
         self.colours = colour(pattern.T.tocsr() if by_rows else pattern, shapes)
-        highest = np.bincount(pattern.indices, minlength=1).max(initial=0)
-        if by_rows is None and self.count > 2 * highest:  # no colouring of rows needs less than the highest column
-            turned = colour(pattern.T.tocsr(), shapes)
-            if turned.max(initial=-1) + 1 < self.count:
-                self.by_rows, self.colours = True, turned
         # Where each entry stands in the table of products: (colour of the column, row), or mirrored.
         row = rows_of(pattern)
         one, other = (row, pattern.indices) if self.by_rows else (pattern.indices, row)
