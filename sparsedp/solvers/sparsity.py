@@ -16,10 +16,10 @@ A guess at the pattern on a grid takes fewer: what a few cells touch, moved over
 
 **Colouring**: columns that share no row get one colour, and one product with A serves all columns of a colour.
 
-Two ways, and the better one is taken. On a grid the colour (a . i) mod c of the column with index i, the number of its
+Two ways. On a grid the colour (a . i) mod c of the column with index i, the number of its
 field first, for a lattice vector a, is valid when no a . d is a multiple of c, d the differences of two columns in a
 row; stencils reach the least count this way (3 for three points, 5 for five, 7 for seven), velocity and pressure
-nearly: 13 where a row has 11 entries. Any other pattern is coloured column by column.
+nearly: 13 where a row has 11 entries. Where it takes twice as many, columns are coloured one by one.
 
 Source: Curtis, Powell and Reid, On the estimation of sparse Jacobian matrices, 1974.
 """
@@ -42,7 +42,6 @@ SHORT = 8  # an axis that is not longer counts kinds of values, u and v of a rea
 SMALLEST = 256  # unknowns below which a guess saves nothing
 WIDEST = 64  # cells touched by one; more is no stencil
 MOST_DIFFERENCES = 4096  # a pattern with more is not a stencil
-SMALL = 20_000  # up to this many columns they are coloured one by one even if a lattice is near the best
 MOST_TRIALS = 2_000_000  # products of a lattice vector and a difference, for each count
 
 
@@ -243,9 +242,7 @@ def colour(pattern, shapes=None):
     links = sp.csr_array(pattern.astype(np.int32))
     links = sp.csr_array(links.T @ links + sp.eye_array(size, dtype=np.int32))  # every column is linked to itself
     found = _lattice(links, _places(shapes or [(size,)]), least)
-    if found.max() >= (least if size <= SMALL else 2 * least):
-        found = min(found, _one_by_one(links), key=np.max)
-    return found
+    return found if found.max() < 2 * least else min(found, _one_by_one(links), key=np.max)
 
 
 def _places(shapes):
