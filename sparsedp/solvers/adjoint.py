@@ -26,7 +26,7 @@ def solve_rule(name, solve, back, along, transposed=False, checked=False):
     ----------
     name : str
     solve : callable
-        ``solve(b, params, transposed, checked)``, of plain values. `checked`: b are primal data, not a derivative.
+        ``solve(transposed, checked, b, *params)``, of plain values. `checked`: b are primal data, not a derivative.
     back : callable
         ``back(params, places, y, s)``: -grad <y, A s> in the params at these places, one after the other.
     along : callable
@@ -34,9 +34,6 @@ def solve_rule(name, solve, back, along, transposed=False, checked=False):
         the params at these places.
     """
     helper = partial(solve_rule, name, solve, back, along)
-
-    def forward(b, *params):
-        return solve(b, params, transposed, checked)
 
     def vjp(nums, ans, b, *params):
         places = [num - 1 for num in nums if num]
@@ -57,6 +54,7 @@ def solve_rule(name, solve, back, along, transposed=False, checked=False):
             total = total - along(params, places, tangents[-len(places) :], ans, transposed)
         return helper(transposed)(total, *params)
 
+    forward = partial(solve, transposed, checked)  # the rule has the names of its arguments
     return Rule(f"{name}.T" if transposed else name, forward, vjp, jvp)
 
 

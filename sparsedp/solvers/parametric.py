@@ -59,8 +59,8 @@ class ParametricSolver(Remade):
     def _solution(self, k, b, shift):
         return solve_rule(self.name, self._solve, self._back, self._along, checked=True)(b, k, shift)
 
-    def _solve(self, b, params, transposed, checked):
-        inv = self._inverse(*params)
+    def _solve(self, transposed, checked, b, k, shift):
+        inv = self._inverse(k, shift)
         return (inv.T if transposed else inv if checked else inv.tangent).apply(b)
 
     def _back(self, params, places, y, x):

@@ -276,7 +276,7 @@ class Root(Remade):
         terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1] if leaves else 0.0
         if np.linalg.norm(F) <= CANCELS * np.linalg.norm(terms):  # a root near 0, where what it is made of cancels
             return
-        step = self._solve(F, (equation, x, *leaves), False)
+        step = self._solve(False, False, F, equation, x, *leaves)
         if np.linalg.norm(step) > changed * np.linalg.norm(x):
             raise DerivativeError(
                 f"{self.name} is not solved any more by what it was: its residual uses something that has changed "
@@ -293,8 +293,7 @@ class Root(Remade):
         """The Rule of (b, equation, x, *leaves): s of J s = b or J^T s = b."""
         return solve_rule(self.name, self._solve, _back, _along, transposed)
 
-    def _solve(self, b, point, transposed, checked=False):
-        equation, x, *leaves = point
+    def _solve(self, transposed, checked, b, equation, x, *leaves):
         known = self._jacobians.cached(equation, x, leaves)
         self._note_setup(known)
         s, info = known.solve(b, transposed)
