@@ -328,3 +328,24 @@ def test_damped_rates_go_to_the_fields_of_their_names():
         (p, _), s = step(x), {"a": 0.0125, "b": 0.025}
         wanted = {"a": ((1 - s["a"]) + 0.3) / (1 + s["a"]), "b": (2 * (1 - s["b"]) + 0.5) / (1 + s["b"])}
         assert all(p[name] == pytest.approx(wanted[name], rel=1e-14) for name in "ab")
+
+
+@pytest.mark.parametrize("n", [0, 1, 20, 40])
+def test_frequencies_of_every_kind(n):
+    """None at all, one alone, many, growth without a wave, and no finite slope at the state."""
+    c, ones = np.linspace(1.0, 30.0, n), (np.ones(n), np.ones(n))
+    rates = [
+        (lambda q, p: 0.0 * q, lambda p, c: 0.0 * p),
+        (lambda q, p: -30.0 * q, lambda p, c: 30.0 * p),
+        (lambda q, p: -c * q, lambda p, _: c * p),
+        (lambda q, p: c * q, lambda p, _: c * p),
+        (lambda q, p: -anp.sqrt(anp.abs(q - 1.0)), lambda p, c: 0.0 * p),
+    ]
+    for number, pair in enumerate(rates):
+        step = dp.stepper("leapfrog", pair, 0.1)
+        if number in (1, 2) and n > 1 or (number, n) == (1, 1):
+            with pytest.raises(dp.errors.UnstableStepError, match="leapfrog is unstable with dt = 0.1: waves of freq"):
+                step(ones, 1.0)
+        else:
+            with np.errstate(all="ignore"):
+                step(ones, 1.0)
