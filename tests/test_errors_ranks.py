@@ -83,6 +83,11 @@ REFUSED = [
     ),
     (
         TypeError,
+        "check.operator does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.check.operator(s.G),
+    ),
+    (
+        TypeError,
         "a tensor does not work on ranks yet; give it the grid from before dp.distribute",
         lambda s: dp.elliptic_solver(dp.divergence(s.grid), s.G)(np.ones((2, 2, 5, 4)), np.ones((5, 4))),
     ),

@@ -19,6 +19,8 @@ def check_operator(name, op):
     """Refuse what is no Operator."""
     if not isinstance(op, Operator):
         raise TypeError(f"{name} takes an Operator, got {type(op).__name__}; write dp.from_matrix(...) first")
+    if op.layout is not None:
+        op.layout.check(name)
 
 
 def from_matrix(matrix, domain=None, codomain=None, name="matrix"):

@@ -53,6 +53,10 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         """The whole field on every rank, a plain array."""
         return self.layout.gather(self.flat, self.space.parts).reshape(self.shape)
 
+    def fingerprint(self):
+        """A whole number for its bits, the same on every rank."""
+        return int(self.layout.sum(np.int64(hash(self.flat.tobytes()) >> 16)))
+
     def refuse(self, what, *args, **options):
         """The answer to all that needs more than the block."""
         name = getattr(what, "__name__", what)
@@ -92,6 +96,8 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc, method, *inputs, **options):
         if any(map(isbox, inputs)):
             return NotImplemented  # autograd's turn
+        if method == "reduce" and options == {"axis": None} and ufunc in OVER_ALL:
+            return OVER_ALL[ufunc](self)
         if method != "__call__" or ufunc.nout != 1 or ufunc.signature or not options.keys() <= {"dtype", "casting"}:
             self.refuse(f"{ufunc.__name__} with {method if method != '__call__' else 'out= or where='}")
         act = pow if ufunc is np.power and not options else ufunc  # the operator of arrays is quick for whole powers
@@ -269,6 +275,9 @@ FUNCTIONS = {
     np.full_like: lambda x, number: x.like(np.full(x.flat.shape, number, x.dtype)),
 }  # in new versions of NumPy amax is max, in old ones a function of its own
 FUNCTIONS.update({np.amax: FUNCTIONS[np.max], np.amin: FUNCTIONS[np.min]})
+
+
+OVER_ALL = {np.add: _sum, np.maximum: _max, np.minimum: _min}  # as ``np.add.reduce(u, axis=None)``
 
 
 # ---- derivatives ----

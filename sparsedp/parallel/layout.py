@@ -19,10 +19,10 @@ from sparsedp.tape import Rule, linear, plain
 
 __all__ = ["Layout"]
 
-# Builders that ask by `check_grid`, and are known to be right on ranks; all others are refused by name.
+# What asks by `check_grid` or `check_operator`, and is known to be right on ranks; all others are refused by name.
 RIGHT = {
-    "component", "curl", "distribute", "divergence", "flux", "harmonic_average", "interior", "laplacian", "prolong",
-    "restrict", "sample", "upwind",
+    "component", "curl", "distribute", "divergence", "flux", "harmonic_average", "interior", "inverse", "laplacian",
+    "prolong", "restrict", "sample", "upwind",
 }  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from sparsedp.constants import constant
 from sparsedp.derivative import described
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, surely_finite
+from sparsedp.shortcuts import ELSEWHERE, array
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.tree import flatten, keys, labels, leaves, subscript
 
@@ -65,7 +66,7 @@ class Layout:
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
         self.shapes = [np.shape(leaf) for leaf in variables]
         self.dtypes = [dtype_of(leaf) for leaf in variables]
-        self.nbytes = sum(np.asarray(leaf).nbytes for leaf in variables)
+        self.nbytes = sum(array(leaf).nbytes for leaf in variables)
 
     @cached_property
     def labels(self):
@@ -164,7 +165,7 @@ class Layout:
         if not traces_of([value]) <= outer:
             refuse_lost(when)
         refuse_mask(f"{when} made a masked array of {name}", plain(value))
-        if not isinstance(plain(value), (np.ndarray, np.generic, float, complex)):
+        if not isinstance(plain(value), (np.ndarray, np.generic, float, complex, *ELSEWHERE)):
             raise ShapeError(_changed(name, "one array", described(value), when))
         if np.shape(value) != shape:
             raise ShapeError(_changed(name, f"shape {shape}", f"shape {np.shape(value)}", when))
@@ -201,14 +202,14 @@ def _brief(value):
 
 def dense(value):
     """Array or number -> contiguous array, or a NumPy scalar when it has no axes; traced values as they are."""
-    if isbox(value):
+    if isbox(value) or type(value) in ELSEWHERE:
         return value
     return np.ascontiguousarray(value) if np.ndim(value) else np.asarray(value)[()]
 
 
 def owned(value):
     """Array or number -> a contiguous copy of its own; traced values as they are: nobody writes into those."""
-    if isbox(value):
+    if isbox(value) or type(value) in ELSEWHERE:
         return value
     return dense(np.array(value, order="C"))
 
@@ -245,6 +246,8 @@ def fingerprint(values, statics=()):
 
 def _bits(value):
     """All bits are read once: a large array is cut into lines, which are added up as whole numbers."""
+    if type(value) in ELSEWHERE:
+        return value.fingerprint()
     if value.nbytes < 8192:
         return hash(value.tobytes())
     fold = 521 if any(size % FOLD == 0 for size in value.shape) else FOLD
