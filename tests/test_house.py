@@ -100,7 +100,7 @@ BUDGETS = {
     "advection": 14_000,
     "check": 14_650,
     "flow": 11_600,  # conservation laws: 2 850; forces: 780; scalars, Courant limit, friction of flow_step: 1 650;
-    "integrators": 17_150,  # radau: 4 400; leapfrog and sponge: 1 250; a term for each field, batches of etdrk4: 850
+    "integrators": 17_200,  # radau: 4 400; leapfrog and sponge: 1 250; a term for each field, batches of etdrk4: 850
     "kernels": 14_000,
     "network": 2_450,
     "operators": 6_900,  # tensors: 800; flux: 300; coarse grids on ranks: 15

@@ -196,6 +196,8 @@ class PhiFunctions(Functions):
             parts = (self.plain(rows, z, [*map(part, fields)], transposed) for part in (np.real, np.imag))
             return [real + 1j * imaginary for real, imaginary in zip(*parts, strict=True)]
         shape, lone = fields[0].shape, op.domain.shape
+        if shape == lone:
+            return [total.reshape(shape) for total in self._sums(rows, z, fields, transposed)]
         count = prod(shape[: len(shape) - len(lone)])  # of a batch
         batches = [field.reshape(count, *lone) for field in fields]
         sums = [self._sums(rows, z, row, transposed) for row in zip(*batches, strict=True)]
@@ -204,7 +206,7 @@ class PhiFunctions(Functions):
 
     def _sums(self, rows, z, fields, transposed):
         """The sum for each row of functions, on one field each."""
-        moved = [self.found.forward(field.astype(float), transposed) for field in fields]
+        moved = [self.found.forward(field.astype(float, copy=False), transposed) for field in fields]
         sums = (sum(c * self._table(f, z) for f, c in zip(row, moved, strict=True)) for row in rows)
         return [self.found.backward(total, transposed) for total in sums]
 
