@@ -567,10 +567,10 @@ apply_operator = direct(_operator)  # a field through an Operator: half a rule's
 def _operator_vjp(argnums, ans, args, kwargs):
     op, u = args
 
-    def pull(g, dtype=u.dtype):
+    def pull(g, dtype=u.dtype, on_ranks=u if op.layout else None):  # the tape does not keep u
         act = partial(apply_operator, op.T) if isbox(g) else op.T.apply
         back = timed(op.name, "vjp", act, g)
-        return (cast(back if op.layout is None else alike(back, u), dtype),)
+        return (cast(back if op.layout is None else alike(back, on_ranks), dtype),)
 
     return pull
 

@@ -157,8 +157,9 @@ def _end(extra, side, link):
 
 def _by_eigenvectors(factor):
     """The eigenvectors of a factor that is symmetric, after scaling its rows where it has three points a row."""
-    dense = factor.matrix.toarray()
-    scaling = np.ones(len(dense)) if factor.tridiagonal is None else _scaling(factor.matrix)
+    exponent = np.frexp(factor.largest)[1]  # products of entries stay within floats, whatever the unit of length
+    dense = np.ldexp(factor.matrix.toarray(), -exponent)
+    scaling = np.ones(len(dense)) if factor.tridiagonal is None else _scaling(dense)
     if scaling is None:
         return None
     dense = dense * scaling[:, None] / scaling
@@ -172,12 +173,12 @@ def _by_eigenvectors(factor):
     rows, sizes = factor.matrix.sum(axis=1), abs(factor.matrix).sum(axis=1)
     if np.all(np.abs(rows) <= 8 * EPS * sizes):  # constants have the eigenvalue 0, where round-off gives 1e-10
         values[np.argmin(np.abs(values))] = 0.0
-    return Axis("eigenvectors", values, (vectors.T * scaling, (1 / scaling)[:, None] * vectors))
+    return Axis("eigenvectors", np.ldexp(values, exponent), (vectors.T * scaling, (1 / scaling)[:, None] * vectors))
 
 
-def _scaling(matrix):
+def _scaling(dense):
     """Square roots of the weights w with w[i] F[i, i+1] = w[i+1] F[i+1, i], or None."""
-    up, down = matrix.diagonal(1), matrix.diagonal(-1)
+    up, down = dense.diagonal(1), dense.diagonal(-1)
     linked = up != 0
     if np.any(linked != (down != 0)) or np.any(up * down < 0):
         return None
