@@ -158,6 +158,16 @@ def test_what_is_made_of_one_laplacian_is_inverted_by_transforms(grid, boundary)
     np.testing.assert_allclose(dp.exponential(L @ L, -1e-9)(u), dp.function(L, lambda e: np.exp(-1e-9 * e**2))(u))
 
 
+def test_squares_where_no_transform_is_written_out():
+    grid = dp.Grid((66, 65), size=1.0)
+    L, u = dp.laplacian(grid, dp.dirichlet), np.cos(np.arange(grid.cells.size)).reshape(grid.shape)
+    inv = dp.inverse(L @ L)
+    assert inv.method == "separable"
+    np.testing.assert_allclose(inv(L(L(u))), u, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(dp.exponential(L @ L, -1e-9)(u), dp.function(L, lambda e: np.exp(-1e-9 * e**2))(u))
+    assert eigenbasis((L @ L + dp.laplacian(grid)).structure) is None
+
+
 def test_squares_in_space():
     grid = dp.Grid((6, 5, 7), size=1.0)
     L = dp.laplacian(grid, {"x": dp.dirichlet})

@@ -247,10 +247,10 @@ class Spectrum:
 
     def same_basis(self, other):
         """Whether the other one has the same eigenvectors."""
-        pairs = [
-            (a.matrices, b.matrices) for a, b in zip(self.axes, other.axes, strict=False) if a.matrices is not None
-        ]
-        return self is other or (self.words == other.words and all(map(np.array_equal, *zip(*pairs))))
+        if self is other or self.words != other.words:
+            return self is other
+        pairs = zip(self.axes, other.axes, strict=True)
+        return all(np.array_equal(a.matrices, b.matrices) for a, b in pairs if a.matrices is not None)
 
     @property
     def words(self):
