@@ -554,7 +554,7 @@ def value_and_grad(loss, argnum=0):
         with growing():  # until the tape is gone: a search for cyclic garbage in between would walk all of it
             value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
             check_loss(value)
-            gradient = pull(1.0)
+            gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
             del pull
         return value if isbox(value) else float(value), gradient
 

@@ -121,8 +121,8 @@ class ReverseNode(VJPNode):
             self.recorder.weigh(value, args, nums)
 
     def _keep_real(self, args, nums):
-        """Beside complex values autograd hands complex cotangents on to real ones."""
-        pull, real = self.vjp, [dtype_of(args[num]).kind != "c" for num in nums]
+        """Beside complex values autograd hands complex cotangents on to real ones; a tuple, or entries, are neither."""
+        pull, real = self.vjp, [is_variable(x := plain(args[num])) and dtype_of(x).kind != "c" for num in nums]
         if any(real):
             self.vjp = lambda g: [anp.real(back) if one else back for one, back in zip(real, pull(g), strict=True)]
 

@@ -257,6 +257,34 @@ def bend_twice(u, p):
     return u + p * u * u * u.dtype.type(0.25)
 
 
+def test_complex_and_real_fields_of_different_shapes(rng):
+    """Values, gradients and second derivatives in both nestings; z: complex (3,), r: a number."""
+
+    def step(s, p):
+        z, r = s
+        return z * anp.exp(1j * p * r), r + 0.1 * anp.sum(anp.real(z * z)) * p
+
+    def by_loop(z, r, p, n):
+        states = [(z, r)]
+        for _ in range(n):
+            states.append(step(states[-1], p))
+        return anp.stack([z for z, _ in states]), anp.stack([r for _, r in states])
+
+    size = lambda z, r: anp.sum(anp.imag(z[-1]) ** 3) + anp.sum(anp.real(z[0]) ** 2 * r[-1])
+    x, along = (U + 0.2j, 0.7, 1.3), (U[::-1] - 1j * U, -0.3, 0.4)
+    for n in (0, 1, 3):
+        ours = lambda x, n=n: size(*dp.rollout(step, x[:2], x[2], n, keep="all"))
+        wanted = lambda x, n=n: size(*by_loop(*x, n))
+        close(dp.value_and_grad(ours)(x), dp.value_and_grad(wanted)(x))
+        exact = dp.hvp(wanted, x, along)
+        close(dp.hvp(ours, x, along), exact)
+        for loss in (ours, wanted):
+            product = lambda x, loss=loss: sum(
+                anp.sum(anp.real(a * b)) for a, b in zip(dp.grad(loss)(x), along, strict=True)
+            )
+            close(dp.grad(product)(x), exact)
+
+
 def test_layouts_of_memory_do_not_change_a_bit():
     field = np.arange(12.0).reshape(3, 4) / 10
     step = lambda u, p: u + 0.1 * anp.sum(u) * anp.cos(u)
@@ -275,6 +303,15 @@ def test_numbers_as_state_and_inputs():
     loss = lambda x: dp.rollout(step, (x[0], 0.5, 0), x[1], 4, inputs={"push": x[2], "more": np.arange(4)})
     assert isinstance(loss((1.0, 2.0, push))[0], float) and loss((1.0, 2.0, push))[2] == 6
     assert dp.check.gradient(lambda x: loss(x)[0] ** 2 + loss(x)[1], (1.0, 2.0, push))
+
+
+@pytest.mark.parametrize("memory", [None, 200])
+def test_numbers_of_python_without_a_step(memory):
+    for keep in ("last", "all"):
+        loss = lambda x, keep=keep: anp.sum(dp.rollout(lambda u, p: u * p, *x, 0, memory=memory, keep=keep) ** 2)
+        assert dp.value_and_grad(loss)((0.5, 2.0)) == (0.25, (1.0, 0.0))
+        assert dp.hvp(loss, (0.5, 2.0), (1.0, 1.0)) == (2.0, 0.0)
+        assert dp.grad(lambda x, loss=loss: sum(dp.grad(loss)(x)))((0.5, 2.0)) == (2.0, 0.0)
 
 
 def test_jvp_needs_no_kept_state():

@@ -235,7 +235,7 @@ def refuse_lost(what):
 
 def fingerprint(values, statics=()):
     """Variables and other leaves of a state -> 64 bits for each variable, and for each whole number and word."""
-    marks = [_bits(plain(value)) for value in values]
+    marks = [_bits(dense(plain(value))) for value in values]  # of a number of Python, too
     for leaf in statics:
         if isinstance(leaf, (int, str)):
             marks.append(hash(leaf))
