@@ -314,6 +314,12 @@ def test_numbers_of_python_without_a_step(memory):
         assert dp.grad(lambda x, loss=loss: sum(dp.grad(loss)(x)))((0.5, 2.0)) == (2.0, 0.0)
 
 
+@pytest.mark.parametrize("memory", [1500, 3000])
+def test_an_empty_state_under_a_budget_has_a_gradient(memory):
+    loss = lambda p: p**2 + anp.sum(dp.rollout(lambda u, p: u * p, np.zeros(0), p, 2000, memory=memory))
+    assert dp.value_and_grad(loss)(1.5) == (2.25, 3.0)
+
+
 def test_jvp_needs_no_kept_state():
     runs = []
     _, tangent = pushforward(lambda p: dp.rollout(bend, U, p, 6, record=runs.append), 1.3, 1.0)

@@ -123,7 +123,7 @@ def rollout(
     if traced:  # what is kept on the way forward must be what the way back sees
         args = constant_args(args, traced)
     beside = sum((1 + any(map(isbox, part))) * form.nbytes for form, part in zip(forms[1:], values[1:]))  # a gradient
-    sizes = forms[0].nbytes, n, beside
+    sizes = max(forms[0].nbytes, 1), n, beside  # an empty state takes a place among those kept, too
     if memory == "reverse":
         _check_reversible(step)
     slots = None if memory is None else 0 if memory == "reverse" else slots_within(memory, *sizes)
