@@ -164,7 +164,7 @@ FORMULAS: dict[Any, Any] = {
     ITEM: (
         _is_basic,
         lambda nums, args: (_part, ((args[1], args[0].shape),)),
-        lambda g, num, args, shape: (np.float64(g) if type(g) is float else g)[args[1]],
+        lambda g, num, args, shape: (np.asarray(g) if type(g) is float else g)[args[1]],
     ),
     ARRAY: (
         lambda value, nums, args: not (args[0] or args[1]),
