@@ -107,7 +107,7 @@ BUDGETS = {
     "optimize": 13_400,  # admm: 500; total_variation, smoothness: 400
     "parallel": 14_050,  # of 13 000: layouts, blocks and cut operators; ensembles: 1 650
     "report": 17_800,
-    "solvers": 44_100,  # steady states, tensors, complex coefficients, waves: 2 550; LU for the next: 270; ranks: 210
+    "solvers": 44_150,  # steady states, tensors, complex coefficients, waves: 2 550; LU for the next: 270; ranks: 210
     "solvers/multigrid": 10_000,
     "structure": 6_500,  # products of Kronecker sums: 15, for 360 of solvers
     "trajectory": 9_200,  # states on ranks: 30; reversed steps: 400; what a step stores is refused: 150
