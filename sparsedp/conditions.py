@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparsedp.grid import AXES, check_grid, real_numbers
+from sparsedp.grid import AXES, Grid, real_numbers
 from sparsedp.recipe import Value
 
 __all__ = [
@@ -135,7 +135,8 @@ def resolve(grid, boundary, default=neumann):
     >>> resolve(Grid((2, 2), periodic=(True, False)), {"y": (dirichlet, neumann)})
     (None, (dirichlet, neumann))
     """
-    check_grid("an operator", grid)
+    if not isinstance(grid, Grid):
+        raise TypeError(f"an operator needs a grid first, got {grid!r}; write dp.Grid((8, 6), size=1.0)")
     if isinstance(boundary, dict):
         _check_names(grid, boundary)
     else:
