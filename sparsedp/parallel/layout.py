@@ -105,9 +105,7 @@ class Layout(Partition):
             return (v,)
         ends = [0, *accumulate(map(prod, self.shapes(space.parts)))]
 
-        def component(axis):
-            own = Space(space.parts[axis], f"{space.grid.axes[axis]}-{space.kind}", space.grid)
-
+        def component(axis, own):
             def put(g):
                 flat = np.zeros(ends[-1], g.dtype)
                 flat[ends[axis] : ends[axis + 1]] = g.flat
@@ -119,13 +117,11 @@ class Layout(Partition):
                 put,
             )[0]
 
-        return tuple(component(axis)(v) for axis in range(len(space.parts)))
+        return tuple(component(axis, own)(v) for axis, own in enumerate(_components(space)))
 
     def join(self, space, parts):
         """Components, on ranks or known to all -> one field; differentiable."""
-        own = [
-            Space(part, f"{space.grid.axes[axis]}-{space.kind}", space.grid) for axis, part in enumerate(space.parts)
-        ]
+        own = _components(space)
         parts = [everywhere(part, one) for part, one in zip(parts, own)]
 
         def joined(*parts):
@@ -147,6 +143,12 @@ def laid(grid, layout):
     made = object.__new__(type(grid))
     vars(made).update(grid.__getstate__(), layout=layout)
     return made
+
+
+def _components(space):
+    """The space of each component of a field."""
+    grid, kind = space.grid, space.kind
+    return [Space(part, f"{name}-{kind}", grid) for name, part in zip(grid.axes, space.parts)]
 
 
 def _side(space):
