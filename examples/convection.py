@@ -52,6 +52,6 @@ print(" known  {:7.4f}  {:6.3f}  {:6.3f}".format(*KNOWN))
 if "--out" in sys.argv:
     Path(sys.argv[-1]).mkdir(exist_ok=True)
     words = f"isotherms, Ra 1e4: Nu {heat_flow:.3f}, published {KNOWN[0]}"
-    ax = dp.plot(grid, state["s"]["heat"], title=words, cmap="inferno")
+    ax = dp.plot(grid, state["s"]["heat"], title=words, cmap="inferno", label="temperature")
     ax.contour(*grid.centres(), state["s"]["heat"], np.linspace(0.1, 0.9, 9), colors="white")
     ax.figure.savefig(Path(sys.argv[-1]) / "convection.png", dpi=120)

@@ -51,8 +51,8 @@ for name, (term, weight) in terms.items():
 if "--out" in sys.argv:
     from matplotlib.figure import Figure
 
-    picture = Figure(figsize=(9, 3), layout="constrained")
+    picture = Figure(figsize=(10.5, 3), layout="constrained")
     for axes, (name, field) in zip(picture.subplots(1, 3), fields.items()):
-        dp.plot(grid, field, ax=axes, title=name, limits=(-1.6, 1.6))
+        dp.plot(grid, field, ax=axes, title=name, limits=(-1.6, 1.6), label="log k")
     Path(sys.argv[-1]).mkdir(exist_ok=True)
-    picture.savefig(Path(sys.argv[-1]) / "edges.png", dpi=120)
+    picture.savefig(Path(sys.argv[-1]) / "edges.png", dpi=120, bbox_inches="tight")

@@ -74,13 +74,16 @@ if "--out" in sys.argv:
     from matplotlib.figure import Figure
 
     picture = Figure(figsize=(6, 9), layout="constrained")
-    for axes, field, name in zip(
-        picture.subplots(3, 1),
-        (crust * (1 + body), crust * (1 + answer), answer),
-        ("the crust", "what the waves told", "relative to ak135"),
-    ):
-        drawn = axes.pcolormesh(x, depth, field, cmap="viridis", shading="nearest")
-        axes.set(title=name, ylabel="depth [km]", xlim=(0, 64), ylim=(32, 0), aspect="equal")
-        picture.colorbar(drawn, ax=axes)
+    panels = {
+        "the crust": (crust * (1 + body), "viridis", 5.2, 6.6, "speed [km/s]"),
+        f"what the waves told, error {error:.0%}": (crust * (1 + answer), "viridis", 5.2, 6.6, "speed [km/s]"),
+        "relative to ak135": (100 * answer, "RdBu", -10, 10, "change of speed [%]"),
+    }
+    for axes, (name, (field, colors, low, high, unit)) in zip(picture.subplots(3, 1), panels.items()):
+        drawn = axes.pcolormesh(x, depth, field, cmap=colors, vmin=low, vmax=high, shading="nearest")
+        axes.contour(x, depth, body, [-0.05], colors="black", linestyles="dashed")  # where the body is
+        axes.plot(shots, np.ones(shots.size), "r*", clip_on=False)
+        axes.set(title=name, xlabel="x [km]", ylabel="depth [km]", xlim=(0, 64), ylim=(32, 0), aspect="equal")
+        picture.colorbar(drawn, ax=axes, label=unit)
     Path(sys.argv[-1]).mkdir(exist_ok=True)
     picture.savefig(Path(sys.argv[-1]) / "full_waveform.png", dpi=120)

@@ -69,12 +69,12 @@ print(f"feed found from what is seen after 25 steps: {best.x:.6f} (0.034), {len(
 if "--out" in sys.argv:
     from matplotlib.figure import Figure
 
-    picture = Figure(figsize=(13, 2.6), layout="constrained")
-    fields = {f"Gray-Scott, v: {spots(end)} spots": end["v"], f"Cahn-Hilliard, mean off by {drift:.0e}": films[-1]}
-    fields[f"Swift-Hohenberg: wavelength {length:.2f} ({2 * np.pi:.2f})"] = rolls
-    fields[f"Kuramoto-Sivashinsky: growth {rate:.3f} ({k**2 - k**4:.3f})"] = flame - np.mean(flame)
+    picture = Figure(figsize=(13, 3.2), layout="constrained")
+    fields = {f"Gray-Scott, v\n{spots(end)} spots": end["v"], f"Cahn-Hilliard\nmean off by {drift:.0e}": films[-1]}
+    fields[f"Swift-Hohenberg\nwavelength {length:.2f}, known {2 * np.pi:.2f}"] = rolls
+    fields[f"Kuramoto-Sivashinsky\ngrowth {rate:.3f}, known {k**2 - k**4:.3f}"] = flame - np.mean(flame)
     for ax, (name, u) in zip(picture.subplots(1, 4), fields.items()):
-        picture.colorbar(ax.imshow(u.T, origin="lower"), ax=ax)
+        picture.colorbar(ax.imshow(u.T, origin="lower"), ax=ax, shrink=0.8)
         ax.set(title=name, xticks=[], yticks=[])
     Path(sys.argv[-1]).mkdir(exist_ok=True)
     picture.savefig(Path(sys.argv[-1]) / "patterns.png", dpi=120)

@@ -18,6 +18,7 @@ _WINDOW = {
     "conditions": "dirichlet free_slip inflow neumann no_slip outflow robin",
     "tape": "differentiable",
     "derivative": "grad hvp jvp value_and_grad vjp",
+    "packing": "flatten",
     "operator": "Operator",
     "operators.given": "from_functions from_linear_operator from_matrix",
     "operators.difference": "curl divergence flux gradient laplacian upwind",
@@ -51,12 +52,20 @@ _WINDOW = {
     "parallel.scenes": "ensemble",
     "parallel.front": "distribute gather",
 }
-_RENAMED = {  # names of the first edition -> what to write
+_MEANT = {  # what people write, coming from the first edition or from elsewhere -> what to write here
     "minimise": "dp.minimize",
     "part": "dp.component(grid, axis)",
     "embed": "dp.component(grid, axis).T",
+    "solve": "dp.inverse(op)(b)",
+    "poisson": "dp.inverse(-dp.laplacian(grid, dp.dirichlet))",
+    "advect": "dp.transport(grid)",
+    "odeint": "dp.rollout(dp.stepper('rk4', rate, dt), u, params, n)",
+    "jacobian": "dp.jvp(f, x, t) and dp.vjp(f, x), the products with it",
+    "hessian": "dp.hvp(loss, x, t), the product with it",
+    "tensor": "a NumPy array: fields are plain arrays",
+    "vmap": "op(u) with a batch in the leading axes of u",
 }
-_ROOMS = ("check", "errors", "network", "report")
+_ROOMS = ("check", "errors", "interop", "network", "report")
 _HOME = {name: module for module, names in _WINDOW.items() for name in names.split()}
 
 __all__ = sorted([*_HOME, *_ROOMS])
@@ -74,7 +83,7 @@ def __getattr__(name):
         except metadata.PackageNotFoundError:
             value = "0+unknown"  # run from a tree that was never installed
     else:
-        hint = f"; write {_RENAMED[name]}" if name in _RENAMED else ""
+        hint = f"; write {_MEANT[name]}" if name in _MEANT else ""
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
     globals()[name] = value  # the next look-up does not come here
     return value

@@ -1,5 +1,6 @@
 from . import check as check
 from . import errors as errors
+from . import interop as interop
 from . import network as network
 from . import report as report
 from .advection.front import transport as transport
@@ -54,6 +55,7 @@ from .optimize.loop import minimize as minimize
 from .optimize.physical import physical_gradient as physical_gradient
 from .optimize.regularization import smoothness as smoothness
 from .optimize.regularization import total_variation as total_variation
+from .packing import flatten as flatten
 from .parallel.front import distribute as distribute
 from .parallel.front import gather as gather
 from .parallel.scenes import ensemble as ensemble

@@ -1,4 +1,5 @@
-"""The command line: ``python -m sparsedp demo``, ``check FILE.py:loss``, ``report FILE.py --out DIR`` and ``compile``.
+"""The command line: ``python -m sparsedp demo``, ``check FILE.py:loss``, ``report FILE.py --out DIR``, ``compile`` and
+``ranks``.
 
 Exit codes of check and report: 0 agrees, 1 disagrees, 3 inconclusive, 2 the input was refused or a file cannot be
 written, 130 interrupted.
@@ -114,6 +115,16 @@ def run_compile(_):
     return 0 if works else 1
 
 
+def run_ranks(_):
+    """The command `ranks` -> exit code: 1 where fields cannot lie on several processes."""
+    from sparsedp.parallel.selftest import report
+
+    line = ""
+    for line in report():
+        print(line or "ranks do not work here", flush=True)
+    return 0 if line else 1
+
+
 def run_demo(options):
     """Options of the command `demo` -> exit code."""
     # Here and not at the top: --help and a wrong command line load nothing.
@@ -143,6 +154,7 @@ COMMANDS = {  # what it runs, what it says of itself, its arguments
                "folder; the file may hold dicts of arguments, workprec_options and stress_options. Exit code as check",
                "scene --out --force"),
     "compile": (run_compile, "compile all loops for this machine now, not at their first use", ""),
+    "ranks": (run_ranks, "what of MPI and PETSc is here, and a test by two processes. Exit code: 0 works, 1 not", ""),
 }  # fmt: skip
 
 

@@ -23,7 +23,19 @@ __all__ = [
 
 
 class Condition(Value):
-    """a u + b du/dn = value on a wall. Frozen, equal by value. Use dirichlet, neumann or robin."""
+    """What holds at a wall: a u + b du/dn = value, n pointing outwards. Frozen, equal by value.
+
+    dirichlet: u = value. neumann: du/dn = value. robin(a, b): the rest. Write one condition for all walls, or a dict
+    with the axes: for each a condition, or a pair (lower, upper). Axes that are not named are neumann, periodic ones
+    have no walls. The value is 0 in an operator; `lift` brings in others.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> grid = dp.Grid((4, 3), size=1.0)
+    >>> L = dp.laplacian(grid, dp.dirichlet)
+    >>> L = dp.laplacian(grid, {"x": (dp.dirichlet, dp.neumann), "y": dp.robin(1.0, 0.5)})
+    """
 
     choices = "dirichlet, neumann, robin(a, b)"
     a: float
@@ -78,7 +90,9 @@ def robin(a, b):
 
 @dataclass(frozen=True)
 class FlowCondition:
-    """What a fluid does at a wall: one of no_slip, free_slip, inflow, outflow.
+    """What a fluid does at a wall: no_slip (sticks), free_slip (glides), inflow (given), outflow (open).
+
+    Write one for all walls, or a dict with the axes, as for other conditions: axes that are not named are no_slip.
 
     Parameters
     ----------
@@ -88,6 +102,12 @@ class FlowCondition:
     along : Condition
         Of the velocity along the wall.
     pressure : Condition
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> grid = dp.Grid((4, 3), size=1.0)
+    >>> P = dp.projection(grid, boundary={"x": (dp.inflow, dp.outflow)})
     """
 
     name: str

@@ -11,10 +11,10 @@ import numpy as np
 
 from sparsedp.constants import is_fixed
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
-from sparsedp.fields import check_function, is_whole
+from sparsedp.fields import check_function, check_native, is_whole
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
-from sparsedp.shortcuts import ELSEWHERE, Part, alike, held_for_many
+from sparsedp.shortcuts import ELSEWHERE, Part, alike, held_for_many, together
 from sparsedp.tape import (
     Recorder,
     ReverseNode,
@@ -36,8 +36,9 @@ from sparsedp.tape import (
 from sparsedp.tree import copied, flatten, keys, leaves, mapped
 
 __all__ = [
-    "NO_JVP", "backward_each", "check_loss", "described", "grad", "hvp", "judged", "jvp", "linearised", "name_of",
-    "of_argument", "pullback", "push", "pushforward", "traced", "value_and_grad", "vjp", "witnessed", "zero_like",
+    "NO_JVP", "backward_each", "check_loss", "described", "grad", "gradient_of", "growing", "hvp", "judged", "jvp",
+    "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "traced", "value_and_grad", "vjp",
+    "witnessed", "zero_like",
 ]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
@@ -101,6 +102,7 @@ def pullback(fun, x):
     """
     entries, rebuild = flatten(x)
     moving = list(map(is_variable, entries))
+    check_native("a gradient", *entries)
     if not any(moving):
         kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in entries})
         raise DerivativeError(
@@ -122,7 +124,7 @@ def pullback(fun, x):
         if np.shape(g) != np.shape(value):
             raise ShapeError(f"the cotangent must have the shape {np.shape(value)} of the value, got {np.shape(g)}")
         slopes = zip(entries, moving, back([g]), strict=True)
-        return rebuild(_apart([_gradient(leaf, slope) if moves else None for leaf, moves, slope in slopes], g))
+        return rebuild(_apart([gradient_of(leaf, slope) if moves else None for leaf, moves, slope in slopes], g))
 
     return _apart_from_caller(value), pull
 
@@ -274,7 +276,8 @@ def _owner(value):
     return _owner(value.base) if isinstance(value, np.ndarray) and value.base is not None else value
 
 
-def _gradient(leaf, cotangent):
+def gradient_of(leaf, cotangent):
+    """The gradient in a leaf: of its shape and dtype, zero where no cotangent arrived."""
     if cotangent is None:
         return 0.0 if isinstance(leaf, float) else anp.zeros_like(plain(leaf))
     shape, wanted = np.shape(plain(cotangent)), np.shape(plain(leaf))
@@ -382,7 +385,9 @@ def jvp(fun, x, tangent):
     (10.0, 5.0)
     """
     check_function("jvp", fun, "lambda u: ...")
-    return copied(push(fun, x, _directions(x, tangent)))  # the caller may write into x, the tangent and the results
+    check_native("jvp", *leaves((x, tangent)))
+    results = together("jvp", (x, tangent), push, fun, x, _directions(x, tangent))
+    return copied(results)  # the caller may write into x, the tangent and the results
 
 
 def hvp(loss, x, tangent):
@@ -472,8 +477,13 @@ def vjp(fun, *x):
     (5.0, 2.0)
     """
     check_function("vjp", fun, "lambda u: ...")
-    value, pull = pullback(lambda parts: fun(*parts), x)
-    return value, (lambda g: pull(g)[0]) if len(x) == 1 else pull
+    value, pull = together("vjp", x, pullback, lambda parts: fun(*parts), x)
+
+    def back(g):
+        slopes = together("the function of vjp", (g,), pull, g)
+        return slopes[0] if len(x) == 1 else slopes
+
+    return value, back
 
 
 def grad(loss, argnum=0):
@@ -552,10 +562,12 @@ def value_and_grad(loss, argnum=0):
         if len(args) <= argnum:
             raise TypeError(f"the gradient in argument {argnum} of the loss needs it, got {len(args)} arguments")
         with growing():  # until the tape is gone: a search for cyclic garbage in between would walk all of it
-            value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
-            check_loss(value)
-            gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
-            del pull
+            return together("the loss", args, both, *args)
+
+    def both(*args):
+        value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
+        check_loss(value)
+        gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
         return value if isbox(value) else float(value), gradient
 
     return Made(evaluate, value_and_grad, loss, argnum)

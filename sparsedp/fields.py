@@ -14,6 +14,7 @@ __all__ = [
     "BLOCK",
     "check_finite",
     "check_function",
+    "check_native",
     "check_number",
     "check_out",
     "check_plain",
@@ -28,6 +29,7 @@ __all__ = [
 ]
 
 FLOAT = np.dtype(float)
+LIBRARIES = {"torch": "torch", "jax": "jax", "jaxlib": "jax"}  # by the package that the type of an array comes from
 BLOCK = 8192  # numbers of which one product of BLAS is taken: it uses one thread up to 10000, and wakes no others
 
 
@@ -62,9 +64,21 @@ def _array(op, u):
 
 
 def check_plain(name, *values):
-    """Refuse masked arrays: NumPy would drop the mask without a word."""
+    """Refuse masked arrays: NumPy would drop the mask without a word; and those of torch and jax."""
     if any(isinstance(value, np.ma.MaskedArray) for value in values):
         raise TypeError(f"{name} takes plain arrays, got a masked array; fill it first")
+    check_native(name, *values)
+
+
+def check_native(name, *values):
+    """Refuse tensors of torch and arrays of jax: NumPy would drop their gradients, or they ours."""
+    for value in values:
+        library = type(value) is not np.ndarray and LIBRARIES.get(type(value).__module__.partition(".")[0])
+        if library:
+            raise TypeError(
+                f"{name} needs arrays of NumPy, got a {type(value).__name__} of {library}; wrap what is computed in "
+                f"dp.interop.to_{library}(f), which keeps gradients"
+            )
 
 
 def check_out(op, out, u, dtype, shape):

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparsedp import kernels, results
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_out, field_array
+from sparsedp.fields import check_native, check_out, field_array
 from sparsedp.ledger import active
 from sparsedp.recipe import Frozen, Remade
 from sparsedp.space import Space, fits
@@ -179,6 +179,7 @@ class Operator(Frozen, Remade):
                     f"{self.name} @ x takes a flat x of shape ({self.domain.size},); for a field write op(u)"
                 )
             return self._flat(other)
+        check_native(self.name, other)
         return NotImplemented
 
     def _compose(self, other):

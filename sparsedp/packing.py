@@ -3,13 +3,83 @@
 from functools import cached_property
 from itertools import accumulate, compress
 
+import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import DerivativeError
-from sparsedp.tape import is_variable
-from sparsedp.tree import flatten, labels, leaves
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.fields import check_native
+from sparsedp.recipe import Made
+from sparsedp.tape import cast, is_variable, isbox
+from sparsedp.tree import copied, labels, leaves
+from sparsedp.tree import flatten as taken_apart
 
-__all__ = ["Packing", "joined"]
+__all__ = ["Packing", "flatten", "joined"]
+
+
+def flatten(tree):
+    """Tree of arrays -> its numbers as one vector of doubles, and the function from such a vector to a tree.
+
+    For libraries that know flat vectors alone, such as SciPy's minimize with ``jac=True``.
+
+    Parameters
+    ----------
+    tree : any nesting of tuple, list and dict
+        Of arrays and numbers, floating or complex (a complex number takes two). What is not floating (int, bool, None,
+        str) is left out of the vector.
+
+    Returns
+    -------
+    vector : array, shape (n,)
+    unflatten : callable
+        ``unflatten(vector)``: a tree of the same structure, shapes and dtypes, and with the same leaves that are not
+        floating. Differentiable, to every order.
+
+    Raises
+    ------
+    DerivativeError
+        If the tree holds no floating leaf.
+    ShapeError
+        On use, if a vector has another length.
+
+    Examples
+    --------
+    >>> vector, unflatten = flatten({"u": np.array([1.0, 2.0]), "k": 3.0})
+    >>> vector
+    array([1., 2., 3.])
+    >>> unflatten(vector)
+    {'u': array([1., 2.]), 'k': 3.0}
+
+    >>> from scipy.optimize import minimize
+    >>> from sparsedp import value_and_grad
+    >>> loss = lambda p: (p["u"][0] - p["k"]) ** 2 + (p["u"][1] - 5.0) ** 2
+    >>> best = minimize(value_and_grad(lambda x: loss(unflatten(x))), vector, jac=True)
+    >>> unflatten(best.x)["u"]
+    array([2., 5.])
+    """
+    tree = copied(tree)
+    packing = Packing(tree, "tree")
+
+    def unflatten(vector):
+        if np.shape(vector) != (packing.size,):
+            raise ShapeError(
+                f"this tree has {packing.size} numbers, got a vector of shape {np.shape(vector)}; write one that came "
+                "from dp.flatten of a tree like it"
+            )
+        if not isbox(vector):
+            return packing.unpack(np.asarray(vector, dtype=float))
+        return packing.tree(map(_traced, packing.split(vector), packing.values))
+
+    return packing.pack(tree), Made(unflatten, _unflatten, tree)
+
+
+def _unflatten(tree):
+    return flatten(tree)[1]
+
+
+def _traced(part, value):
+    """Part of a traced vector -> a leaf of the shape and dtype of a value."""
+    numbers = part[::2] + 1j * part[1::2] if np.iscomplexobj(value) else part
+    return cast(anp.reshape(numbers, value.shape), value.dtype)
 
 
 class Packing:
@@ -51,7 +121,8 @@ class Packing:
 
     def __init__(self, tree, root="x"):
         self.root = root
-        self._leaves, self._rebuild = flatten(tree)
+        self._leaves, self._rebuild = taken_apart(tree)
+        check_native(root, *self._leaves)
         self._floating = list(map(is_variable, self._leaves))
         self.values = [np.asarray(leaf) for leaf in compress(self._leaves, self._floating)]
         if not self.values:
@@ -114,6 +185,6 @@ def joined(arrays):
 
 
 def _like(leaf, value):
-    if isinstance(leaf, np.ndarray):
+    if isinstance(leaf, np.ndarray) or isbox(value):
         return value
     return np.asarray(value)[()] if isinstance(leaf, np.generic) else type(leaf)(value)

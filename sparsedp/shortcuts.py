@@ -14,7 +14,9 @@ import numpy as np
 
 __all__ = [
     "ACTS", "ARRAY", "BOX", "COPY", "ELSEWHERE", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part",
-    "REAL", "alike", "array", "formulas_of", "held_for_many", "in_dtype", "whole",
+    "REAL", "alike", "array", "formulas_of", "held_for_many", "in_dtype", "on_every_rank", "ranks",
+    "refuse_elsewhere",
+    "together", "whole",
 ]  # fmt: skip
 
 FLOAT = np.dtype(float)
@@ -84,6 +86,18 @@ def alike(derivative, value):
     return pair[1](derivative, value) if pair else derivative
 
 
+def together(what, given, act, *args):
+    """act(*args). On ranks all raise what one raises, and `given`, arguments, must be the same: see ELSEWHERE."""
+    for entry in ELSEWHERE.values():
+        return entry[2](what, given, act, *args)
+    return act(*args)
+
+
+def ranks():
+    """How many processes share the fields of this one."""
+    return next((entry[3]() for entry in ELSEWHERE.values()), 1)
+
+
 def array(value):
     """Plain value -> an array: itself where it lies elsewhere."""
     return value if type(value) in ELSEWHERE else np.asarray(value)
@@ -92,6 +106,19 @@ def array(value):
 def whole(value):
     """Plain value -> itself, or all of it where it lies elsewhere."""
     return value.gather() if type(value) in ELSEWHERE else value
+
+
+def on_every_rank(value):
+    """Value, traced or not -> itself, or all of it on every rank where it lies elsewhere; differentiable."""
+    pair = ELSEWHERE.get(_kind(value))
+    return pair[1](value, np.broadcast_to(0.0, value.shape)) if pair else value
+
+
+def refuse_elsewhere(name, values):
+    """Refuse plain values that lie elsewhere."""
+    for value in values:
+        if type(value) in ELSEWHERE:
+            value.refuse(name)
 
 
 def in_dtype(value, dtype):
@@ -149,7 +176,7 @@ def held_for_many(pull, held):
 
 
 # A kind of arrays that do not lie in the memory of one process -> what stands for `formulas_of` where one takes part,
-# and ``alike(derivative, value)``, which gives a derivative the kind of the value it belongs to.
+# ``alike(derivative, value)``, which gives a derivative the kind of the value it belongs to, `together` and `ranks`.
 ELSEWHERE: dict[type, Any] = {}
 
 # Of a function of autograd: whether the formulas hold, from (value, nums, args); (pull, held), from (nums, args), with

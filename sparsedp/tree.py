@@ -127,7 +127,7 @@ def norm(tree):
     >>> norm([3e200, None, np.array([0.0, 4e200])])
     5.00e+200
     """
-    arrays = [np.asarray(leaf) for leaf in leaves(tree) if leaf is not None]
+    arrays = [leaf if hasattr(leaf, "shape") else np.asarray(leaf) for leaf in leaves(tree) if leaf is not None]
     largest = max((float(np.max(np.abs(a), initial=0.0)) for a in arrays), default=0.0)
     if largest == 0 or not isfinite(largest):
         return largest

@@ -1,10 +1,19 @@
 """What every test shares: no window opens, no run differs from the last."""
 
+import gc
 import os
 import random
+import sys
 import zlib
+from pathlib import Path
 
 os.environ["MPLBACKEND"] = "Agg"  # before anything can import matplotlib
+
+if sys.dont_write_bytecode:  # then not beside the sources; but a third of a run's start is compiling, each time again
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = str(Path(__file__).resolve().parent.parent / ".pytest_cache" / "bytecode")
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix  # of the processes that tests start
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import hypothesis
 import numpy as np
@@ -19,6 +28,15 @@ hypothesis.settings.register_profile(
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
 hypothesis.settings.load_profile("house")
+
+
+gc.disable()  # until all tests are collected: hundreds of thousands of objects that stay
+
+
+def pytest_collection_finish():
+    """No collection of garbage looks at the tests again: that took a seventh of a run."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)

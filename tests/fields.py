@@ -1,5 +1,7 @@
 """Smooth exact fields for tests of accuracy: products of 1-D functions that are no eigenfunctions."""
 
+from functools import reduce
+
 import numpy as np
 
 import sparsedp as dp
@@ -34,8 +36,11 @@ class Field:
         return [t + 0.5 * x + 1, 3 * (1 - t**2) + 0.5, -18 * t * (1 - t**2)][order]
 
     def __call__(self, xs, orders=None):
-        orders = orders or (0,) * len(xs)
-        return np.prod([self.line(x, order) for x, order in zip(xs, orders)], axis=0)
+        """At points, or on the full arrays of a grid: there each coordinate changes along its own axis only."""
+        orders, dim = orders or (0,) * len(xs), len(xs)
+        if all(x.ndim == dim for x in xs):
+            xs = [x[tuple(slice(None if a == b else 1) for b in range(dim))] for a, x in enumerate(xs)]
+        return reduce(np.multiply, [self.line(x, order) for x, order in zip(xs, orders)])
 
     def along(self, xs, axis, order):
         """Derivative of some order along one axis."""

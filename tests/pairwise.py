@@ -11,9 +11,12 @@ from itertools import combinations
 SEED = 14
 
 
-def chosen(rows, ways=2):
-    """Numbers of the rows of a sample: tuples of so many values each, found greedily in a shuffled order."""
-    order = random.Random(SEED).sample(range(len(rows)), len(rows))
+def chosen(rows, ways=2, name=""):
+    """Numbers of the rows of a sample: tuples of so many values each, found greedily in a shuffled order.
+
+    The order is that of the name: tests of the same product run on other rows of it.
+    """
+    order = random.Random(f"{SEED} {name}").sample(range(len(rows)), len(rows))
     columns = [list(enumerate(row)) for row in rows]
     pairs = [set(combinations(values, min(ways, len(values)))) for values in columns]
     missing, found = set().union(*pairs), []
@@ -35,12 +38,15 @@ def sample(rows, ways=2):
 
 
 def left_out(items):
-    """Collected tests whose function has the mark `sampled` and whose parameters are not in the sample."""
+    """Collected tests whose function has the mark `sampled` and whose parameters are not in the sample.
+
+    What has the marker `whole` already, for one of its parameters, is no part of the product.
+    """
     functions = {}
     for item in items:
-        if mark := item.get_closest_marker("sampled"):
+        if (mark := item.get_closest_marker("sampled")) and not item.get_closest_marker("whole"):
             functions.setdefault(item.nodeid.split("[")[0], (mark, []))[1].append(item)
-    for mark, members in functions.values():
+    for function, (mark, members) in functions.items():
         rows = zip(*(numbered(item.callspec.params[name] for item in members) for name in members[0].callspec.params))
-        inside = chosen(list(rows), *mark.args)
+        inside = chosen(list(rows), *mark.args, name=function.split("::")[-1])
         yield from (item for number, item in enumerate(members) if number not in inside)

@@ -47,7 +47,8 @@ def call(kind, name, grid, rng, error, jvp):
     if kind == "inverse":
         return dp.inverse(op, "krylov", rtol=1e-12), f"inverse({name})"
     if kind == "elliptic":
-        solve = dp.elliptic_solver(scaled(f"{name} D", dp.divergence(grid), error), dp.gradient(grid, dp.dirichlet))
+        D, G = scaled(f"{name} D", dp.divergence(grid), error), dp.gradient(grid, dp.dirichlet)
+        solve = dp.elliptic_solver(D, G, "direct")
         faces = 1.0 + 0.2 * np.cos(np.arange(grid.faces.size))
         to_faces = dp.average(grid)
         return lambda u: solve(anp.exp(0.1 * to_faces(u)) * faces, 1.0 + 0.1 * U(grid), 1.0), f"{name} D"

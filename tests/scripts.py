@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from functools import cache
+from importlib.util import find_spec
 
 import pytest
 from sources import ROOT
@@ -46,12 +47,15 @@ SMALL = {
     "solver_in_the_loop.py": "48",
     "ensemble.py": "5",
 }  # cells, the end time, or gradients; the others run with 16
+NEEDS = {"torch_training.py": "torch", "jax_optimiser.py": "optax"}  # extras that `all` leaves out
 DEFAULT = {"heat_rod.py", "new_operator.py", "plan.py", "pressure_projection.py", "two_families.py"}
 
 
 def marks(name):
     """Of whatever looks at an example: one worker runs it, once, and most of them only with the marker `whole`."""
-    return [pytest.mark.xdist_group(name), *([] if name in DEFAULT else [pytest.mark.whole])]
+    needs = NEEDS.get(name, "sparsedp")
+    missing = pytest.mark.skipif(find_spec(needs) is None, reason=f"{needs} is not installed")
+    return [pytest.mark.xdist_group(name), missing, *([] if name in DEFAULT else [pytest.mark.whole])]
 
 
 def example(name):

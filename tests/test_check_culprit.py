@@ -1,6 +1,7 @@
 """Who is at fault: the audit names the call whose own derivative is wrong; and what it knows about ripples."""
 
 import json
+import os
 import subprocess
 import sys
 from collections import Counter
@@ -25,21 +26,21 @@ def named(seeds, error, **options):
     found = Counter()
     for seed in seeds:
         loss, x, planted = scene(seed, error, **options)
-        result = AUDIT(loss, x)
+        result = AUDIT(loss, x, directions=1)
         found[result.verdict, result.culprit == (planted if error else None)] += 1
     return found
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("seeds", [(0, 1), (2, 3)])
+@pytest.mark.parametrize("seeds", [(1, 3), (5, 7), pytest.param((0, 2), marks=pytest.mark.whole)])
 @pytest.mark.parametrize("error", [1e-3, 1e-4])
 def test_the_culprit_of_random_scenes(error, seeds):
     assert named(seeds, error) == {("disagrees", True): 2}
 
 
-@pytest.mark.parametrize("seeds", [(8, 9, 10), pytest.param((11, 12, 13), marks=pytest.mark.whole)])
+@pytest.mark.parametrize("seeds", [(8, 9), pytest.param((10, 11, 12, 13), marks=pytest.mark.whole)])
 def test_right_scenes_have_none(seeds):
-    assert named(seeds, 0.0) == {("agrees", True): 3}
+    assert named(seeds, 0.0) == {("agrees", True): len(seeds)}
 
 
 @pytest.mark.slow
@@ -57,7 +58,7 @@ def test_200_right_scenes():
 @pytest.mark.parametrize("kind", ["rule", "operator", "inverse", "elliptic", "matrix", "function", "operator given"])
 def test_every_kind_of_call(kind, rng):
     act, name = call(kind, "guilty", GRID, rng, 1e-3, False)
-    result = AUDIT(lambda u: anp.sum(anp.sin(act(u)) ** 2 * X), X)
+    result = AUDIT(lambda u: anp.sum(anp.sin(act(u)) ** 2 * X), X, directions=1)
     assert result.verdict == "disagrees" and result.culprit == name
     assert f"culprit: {name}, its" in str(result) and result.to_dict()["culprit"] == name
 
@@ -78,7 +79,7 @@ def test_a_fault_inside_a_root_or_a_loop(rng):
     """A rule that runs other rules is named only when none of those is at fault."""
     cube = dp.differentiable("cube", lambda u: u**3, lambda nums, ans, u: lambda g: (3.003 * u**2 * g,))
     root = dp.implicit(lambda u, p: u + cube(u) - p)
-    found = AUDIT(lambda p: anp.sum(root(p, p) ** 2), X[0])
+    found = AUDIT(lambda p: anp.sum(root(p, p) ** 2), X[0], directions=1)
     assert found.verdict == "disagrees" and found.culprit == "cube"
 
     def steps(u):
@@ -194,6 +195,7 @@ def test_in_pytest(tmp_path):
     )
     run = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(test)],
+        env={**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},  # they take longer than the test
         capture_output=True,
         text=True,
         check=False,
@@ -216,16 +218,16 @@ def test_to_dict_and_picture():
 
 
 def test_loose_solves_are_inconclusive():
-    solve = dp.inverse(-dp.laplacian(dp.Grid((16, 16)), dp.dirichlet), "krylov", rtol=1e-3)
-    b = np.sin(np.arange(256.0)).reshape(16, 16)
-    found = AUDIT(lambda u: anp.sum(solve(u) ** 3), b)
+    solve = dp.inverse(-dp.laplacian(dp.Grid((12, 12)), dp.dirichlet), "krylov", rtol=1e-3)
+    b = np.sin(np.arange(144.0)).reshape(12, 12)
+    found = AUDIT(lambda u: anp.sum(solve(u) ** 3), b, directions=1)
     assert found.verdict == "inconclusive" and "tighten" in found.reason
     assert (
         AUDIT(lambda u: anp.sum(solve(-u) * u) * 0.0 + anp.sum(u**2), b, gradient=lambda u: 3 * u).verdict
         == "disagrees"
     )
     law = rule_of("law", lambda u: u**3, lambda u: 4 * u**2)
-    assert AUDIT(lambda u: anp.sum(law(solve(u))), b).culprit == "law"
+    assert AUDIT(lambda u: anp.sum(law(solve(u))), b, directions=1).culprit == "law"
 
 
 def test_a_fault_inside_rollout_transport_and_steps():

@@ -248,12 +248,13 @@ def test_a_check_draws_from_its_own_generator():
 
 
 @pytest.mark.parametrize("method", ["auto", "direct", "separable", "krylov", "multigrid"])
-def test_an_inverse_is_an_operator_too(method):
+def test_an_inverse_is_an_operator_too(method, drawn):
     """Judged by its rtol: what an iteration leaves is not a mistake, 0.1 % in the transpose is."""
-    stretched = dp.Grid((7, 5), spacing=[np.linspace(1.0, 2.0, 7), 0.3])
-    for grid in (dp.Grid((8, 6)), stretched):
+    stretched = dp.Grid((5, 4), spacing=[np.linspace(1.0, 2.0, 5), 0.3])
+    for number, grid in enumerate((dp.Grid((6, 5)), stretched)):
         implicit = dp.identity(grid.cells) - 0.1 * dp.laplacian(grid)
-        for op in (implicit, -dp.laplacian(grid), -dp.laplacian(grid, dp.dirichlet)):
+        ops = [implicit, -dp.laplacian(grid), -dp.laplacian(grid, dp.dirichlet)]
+        for op in ops if drawn is list else ops[number::2]:
             inv = dp.inverse(op, method, nullspace="project")
             assert dp.check.operator(inv).ok, dp.check.operator(inv)
         assert dp.check.operator(dp.divergence(grid) @ dp.gradient(grid) @ inv).ok

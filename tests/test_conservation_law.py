@@ -132,7 +132,7 @@ def test_lake_at_rest(dim):
 def test_wave_of_euler_in_a_plane():
     """A wave of density is carried along the diagonal of a periodic box: order 2, and everything is conserved."""
     errors = []
-    for n in (32, 64):
+    for n in (24, 48):
         grid = dp.Grid((n, n), size=1.0, periodic=True)
         x, y = grid.centres()
 
@@ -229,8 +229,8 @@ def test_gradient_in_params_inflow_source_and_equilibrium():
     )
     start = {"speed": 0.7, "in": 1.1, "drag": -0.2, "still": 0.4}
     u = 1.5 + 0.3 * np.sin(3 * x + 2) * np.cos(2 * y)
-    assert dp.check.gradient(lambda p: anp.sum(law(u, p) ** 2), start).verdict == "agrees"
-    assert dp.check.gradient(lambda u: anp.sum(law(u, start) ** 2), u).verdict == "agrees"
+    assert dp.check.gradient(lambda p: anp.sum(law(u, p) ** 2), start, quick=True).verdict == "agrees"
+    assert dp.check.gradient(lambda u: anp.sum(law(u, start) ** 2), u, quick=True).verdict == "agrees"
 
 
 def test_audit_of_a_kink():
@@ -385,4 +385,4 @@ def test_a_lone_field_may_be_the_momentum():
     u = np.array([1.0, 2.0, 4.0, 3.0])
     np.testing.assert_array_equal(law(u), stack(u[None])[0])
     assert law(u)[-1] == pytest.approx(-law(-u[::-1])[0])  # mirrored, with its sign changed
-    assert dp.check.gradient(lambda u: anp.sum(anp.sin(law(u))), u + 0.1 * np.cos(u)).verdict == "agrees"
+    assert dp.check.gradient(lambda u: anp.sum(anp.sin(law(u))), u + 0.1 * np.cos(u), quick=True).verdict == "agrees"

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,21 +26,27 @@ def relief(shape=(28, 24)):
     return np.sin(x) * np.cos(2 * y) + 0.3 * x
 
 
-def demo(folder, *arguments, **options):
+def demo(folder, *arguments, way=("-m", "sparsedp")):
     """The command in a process of its own, as a reader types it."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", **options}
-    command = [sys.executable, "-m", "sparsedp", "demo", *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
+    command = [sys.executable, *way, "demo", *map(str, arguments)]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
 # ---- a run ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """One small run with the default terrain, shared by the tests that look at it."""
+FEWER = (
+    "import sys; from sparsedp.report.demo import story; story.ITERATIONS = 15; from sparsedp.__main__ import main; "
+)
+
+
+@pytest.fixture(scope="module", params=["short", pytest.param("whole", marks=pytest.mark.whole)])
+def finished(request, tmp_path_factory):
+    """One small run with the default terrain, shared by the tests that look at it; by default with few iterations."""
     folder = tmp_path_factory.mktemp("demo")
-    return folder / "sparsedp-demo", demo(folder, "--size", "16")
+    way = ["-c", FEWER + "sys.exit(main(sys.argv[1:]))"] if request.param == "short" else ["-m", "sparsedp"]
+    return folder / "sparsedp-demo", demo(folder, "--size", "16", way=way)
 
 
 def test_it_ends_well(finished):
@@ -100,10 +107,16 @@ def test_own_field_and_force(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "out" / "recovered.npy").read_bytes() == first  # the same in every run
 
 
+def audit(verdict):
+    """In place of `dp.check.gradient`: a verdict without a sweep."""
+    return lambda loss, x, directions: SimpleNamespace(verdict=verdict, lines=())
+
+
 def test_without_matplotlib_and_tqdm(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(dp.check, "gradient", audit("agrees"))
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setitem(sys.modules, "tqdm", None)
-    monkeypatch.setattr(story, "ITERATIONS", 3)
+    monkeypatch.setattr(story, "ITERATIONS", 1)
     assert main(["demo", "--size", "12", "--out", str(tmp_path)]) == 0
     assert sorted(os.listdir(tmp_path)) == sorted(story.ARRAYS)
     printed = capsys.readouterr().out
@@ -112,10 +125,8 @@ def test_without_matplotlib_and_tqdm(tmp_path, monkeypatch, capsys):
 
 
 def test_a_wrong_gradient_is_not_a_success(tmp_path, monkeypatch, capsys):
-    class Doubt:
-        verdict, lines = "disagrees", ()
-
-    monkeypatch.setattr(dp.check, "gradient", lambda loss, x, directions: Doubt())
+    monkeypatch.setattr(dp.check, "gradient", audit("disagrees"))
+    monkeypatch.setitem(sys.modules, "matplotlib", None)  # pictures take longest
     monkeypatch.setattr(story, "ITERATIONS", 1)
     assert main(["demo", "--size", "12", "--out", str(tmp_path)]) == 1
 

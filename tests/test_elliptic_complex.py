@@ -180,7 +180,7 @@ def waves(n, method="krylov", cells=10, **options):
 
 
 def test_waves_are_no_task_for_multigrid():
-    grid = dp.Grid((200, 160), size=1.0)
+    grid = dp.Grid((140, 120), size=1.0)
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
     message = r"multigrid on <shift - .*>: .* wanted 1e-10 \(indefinite_operator\); write method='direct'"
     with pytest.raises(dp.errors.ConvergenceError, match=message):

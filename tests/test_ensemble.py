@@ -10,6 +10,7 @@ import numpy as onp
 import pytest
 
 import sparsedp as dp
+from sparsedp.parallel import scenes
 from sparsedp.tree import leaves
 
 GRID = dp.Grid((6, 5), size=1.0)
@@ -44,12 +45,13 @@ def bits(total, x=X):
 class Reversed:
     """An executor that does its tasks when they are asked for, the last one first; what it unpacks is its own."""
 
-    def __init__(self):
-        self.tasks, self.cancelled = [], 0
+    def __init__(self, forgets=False):
+        self.tasks, self.sizes, self.forgets = [], [], forgets
 
     def submit(self, *task):
         future = Future()
         self.tasks.append((future, pickle.dumps(task)))
+        self.sizes.append(len(self.tasks[-1][1]))
         future.result = lambda: self.all_done() or Future.result(future)
         return future
 
@@ -57,6 +59,8 @@ class Reversed:
         while self.tasks:
             future, task = self.tasks.pop()
             act, *args = pickle.loads(task)
+            if self.forgets:
+                scenes._kept.cache_clear()
             try:
                 future.set_result(act(*args))
             except Exception as error:
@@ -92,7 +96,7 @@ def test_complex_unknowns(rng):
 
 
 def test_the_check_agrees():
-    assert dp.check.gradient(dp.ensemble(loss, SCENES[:2]), {**X, "few": 0}).verdict == "agrees"
+    assert dp.check.gradient(dp.ensemble(loss, SCENES[:2]), {**X, "few": 0}, quick=True).verdict == "agrees"
 
 
 @pytest.mark.parametrize("chunk", [None, 2, 9])
@@ -139,6 +143,32 @@ def test_a_worker_keeps_what_it_has_unpacked():
     assert [total(2.0), *dp.value_and_grad(total)(3.0)] == [12.0, 18.0, 6.0] and len(SET_UP) == 1
 
 
+def large(x, scene):
+    return np.sum(x * scene)
+
+
+def test_what_a_worker_knows_is_not_sent_again():
+    """The unknown goes with the first task; the last one is done first here, and asks for everything."""
+    total, x = dp.ensemble(large, onp.ones((3, 1000)), Reversed()), onp.ones(1000)
+    assert [total(k * x) for k in range(4)] == [0.0, 3000.0, 6000.0, 9000.0]
+    sizes = onp.array(total._executor.sizes) // 8000
+    assert sizes.tolist() == [2, 2, 2, *[1, 0, 0, 2, 2], *[1, 0, 0, 2, 2], *[1, 0, 0, 2, 2]]
+
+
+def test_a_worker_that_forgets_asks_again():
+    wanted, forgetful = dp.ensemble(loss, SCENES, weights=WEIGHTS, chunk=2), Reversed(forgets=True)
+    total = dp.ensemble(loss, SCENES, forgetful, WEIGHTS, 2)
+    assert [bits(total) for _ in range(2)] == [bits(wanted)] * 2
+    assert len(forgetful.sizes) > 3 * 2 * 3  # tasks of two evaluations, were nothing forgotten
+
+
+def test_an_error_beside_a_worker_that_asks():
+    total = dp.ensemble(Raising("typed"), range(4), Reversed(forgets=True))
+    for _ in range(3):
+        with pytest.raises(dp.errors.NonFiniteError, match="^scene 2 of 4: planted$"):
+            total(1.0)
+
+
 def test_batches_of_scenes():
     total = dp.ensemble(lambda x, scene: (x - scene) ** 2, [1.0, 2.0, 6.0, 7.0], weights=[1, 1, 2, 1], chunk=2)
     assert dp.value_and_grad(total)(3.0, [2, 0, 0]) == (26.0, -4.0)
@@ -148,15 +178,16 @@ def test_batches_of_scenes():
 
 
 @pytest.mark.parametrize("executor", [None, Reversed()], ids=["here", "elsewhere"])
-def test_a_loss_cannot_write_into_its_scene(executor):
-    """The next evaluation would see another scene."""
-    with pytest.raises(ValueError, match="scene 0 of 1: .*read-only"):
-        dp.ensemble(writing, [{"start": np.ones(3)}], executor)(1.0)
+def test_a_loss_cannot_write_into_what_it_is_given(executor):
+    """The next evaluation would see another scene, and the next scene another unknown."""
+    for x, scene in ((onp.zeros(3), onp.ones(3)), ({"start": onp.ones(3)}, 0.0)):
+        with pytest.raises(ValueError, match="scene 0 of 1: .*read-only"):
+            dp.ensemble(writing, [scene], executor)(x)
 
 
 def writing(x, scene):
-    scene["start"] *= 2
-    return x
+    (x["start"] if isinstance(x, dict) else scene)[...] *= 2
+    return 1.0
 
 
 def test_minimize_steps_back_where_a_scene_breaks():

@@ -6,7 +6,7 @@ import sys
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from launch import on_ranks
+from launch import launched, on_ranks, printed
 
 import sparsedp as dp
 from sparsedp.errors import ShapeError
@@ -63,8 +63,13 @@ REFUSED = [
     ),
     (
         TypeError,
-        "projection does not work on ranks yet; give it the grid from before dp.distribute",
-        lambda s: dp.projection(s.grid),
+        "brinkman does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.brinkman(s.grid),
+    ),
+    (
+        TypeError,
+        "transport.operator does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.transport(s.grid).operator(np.ones(s.grid.faces.size), 0.1),
     ),
     (
         TypeError,
@@ -95,6 +100,12 @@ REFUSED = [
         TypeError,
         "Solution has no matrix on ranks; invert a sum or product of operators",
         lambda s: dp.inverse(dp.identity(s.grid.cells) + dp.inverse(dp.laplacian(s.grid, dp.dirichlet))),
+    ),
+    (
+        TypeError,
+        "minimize of fields on ranks takes lbfgs, bounds of numbers and a callback, got adam, rate; leave the rest "
+        "out, or start from dp.gather(u)",
+        lambda s: dp.minimize(lambda u: anp.sum(u * u), s.u, "adam", rate=0.1),
     ),
     (
         TypeError,
@@ -151,3 +162,40 @@ def test_several_processes_without_mpi4py(monkeypatch):
 def test_what_gather_does_not_take():
     with pytest.raises(ShapeError, match="gather takes one field, got list; gather them one by one"):
         dp.gather([np.ones(3), np.ones(2)])
+
+
+# ------------------------------------------------------------ what one of several ranks raises
+
+PLANTED = {
+    "clock: TypeError": "workprec repeats runs by the clock, which no two ranks share; run it on one process",
+    "kernel in a gradient: MemoryError": "no room (on rank 1, whose block begins at cell (6, 0))",
+    "argument: ValueError": (
+        "argument 0['k'] of the loss is not the same on rank 1 as on rank 0; give all ranks the same numbers, random "
+        "ones by the same seed"
+    ),
+    "another way: ValueError": (
+        "rank 1 came to maximum of shape () where rank 0 came to add of shape (); let nothing depend on the number of "
+        "the rank, on a clock or on numbers of one rank"
+    ),
+}
+
+
+@on_ranks
+@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.whole)])
+def test_an_error_of_one_rank_is_that_of_all(count):
+    """Type and words: 30 kinds, planted on the last rank or met by it alone."""
+    lines = printed("faults.py", count).splitlines()
+    assert lines[-1] == "all agree" and len(lines) >= 30
+    assert count != 2 or {f"{fault}: {told}" for fault, told in PLANTED.items()} <= set(lines)
+
+
+@on_ranks
+@pytest.mark.whole
+@pytest.mark.parametrize(
+    "how, told",
+    [("kill", "signal 9"), ("file", "No such file or directory: '/nowhere/rank.npy'"), ("waits", "of one rank")],
+)
+def test_a_rank_that_ends_ends_all(how, told):
+    done = launched("faults.py", 2, how, seconds=30)
+    assert done.returncode != 0 and told in done.stderr + done.stdout
+    assert how == "kill" or "rank 1 of 2: Traceback" in done.stderr

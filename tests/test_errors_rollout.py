@@ -139,7 +139,15 @@ TABLE = [
         "rollout cannot work within memory=119: 5 states of 24 bytes and 0 bytes for params and inputs "
         "are needed; write memory=120",
     ),
-    (roll(keep="most"), VALUE, 'keep must be "last", "all" or a function of (index, state), got \'most\''),
+    (
+        roll(keep="most"),
+        VALUE,
+        'keep must be "last", "all", a list of states or a function of (index, state), got \'most\'',
+    ),
+    (roll(keep=[]), VALUE, "keep needs at least one state, numbers from 0 on, got []"),
+    (roll(keep=[-1, 2]), VALUE, "keep needs at least one state, numbers from 0 on, got [-1, 2]"),
+    (roll(keep=[1, 4]), VALUE, "keep needs rising numbers of states from 0 to n = 3, got [1, 4]"),
+    (roll(keep=[2, 1]), VALUE, "keep needs rising numbers of states from 0 to n = 3, got [2, 1]"),
     (roll(truncate=0), VALUE, "rollout needs truncate >= 1, a whole number of steps, or None, got 0"),
     (
         roll(state={"a": U, "b": np.array([[1.0, np.nan], [np.inf, 2.0]])}),

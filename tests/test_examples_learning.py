@@ -48,3 +48,19 @@ def test_ensemble():
     assert "the same bits" in printed and "5 iterations of 12 experiments" in printed
     before, after = map(float, re.search(r"misfit (\S+) -> (\S+);", printed).groups())
     assert after < before / 2
+
+
+@example("torch_training.py")
+def test_torch_training():
+    """The network has the law, though it has seen temperatures alone."""
+    found = rows(run("torch_training.py"), r"^ +(-?0\.\d) +(\d\.\d+) +(\d\.\d+)$")
+    assert len(found) == 5 and all(abs(mine / true - 1) < 0.03 for _, true, mine in found)
+
+
+@example("jax_optimiser.py")
+def test_jax_optimiser():
+    """Where the drop fell, to a hundredth, and how fast it spreads."""
+    printed = run("jax_optimiser.py")
+    x, y = map(float, re.search(r"fell at \((\S+), (\S+)\), true", printed).groups())
+    assert abs(x - 0.35) < 0.01 and abs(y - 0.6) < 0.01
+    assert abs(float(re.search(r"diffusivity (\S+),", printed)[1]) - 0.01) < 5e-4

@@ -55,6 +55,7 @@ def refuse_to_solve(*arguments):
     raise AssertionError("the engine was called")
 
 
+@pytest.mark.sampled(1)
 @EVERY
 @IN_SCENES
 @pytest.mark.parametrize("zero", [0.0, -0.0])
@@ -93,6 +94,7 @@ def test_parameters_that_are_not_finite_or_negative(method, bad):
 # ---- singular ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @EVERY
 @pytest.mark.parametrize("defect", [1e-14, 1e-7, 1.0])
 def test_neumann_defect(method, defect, rng):
@@ -130,6 +132,7 @@ def test_cotangents_of_singular_solves_are_projected(method, rng):
     assert inv.info.adjoint.status == "converged" and inv.info.forward.defect <= 1e-9
 
 
+@pytest.mark.sampled(1)
 @EVERY
 @pytest.mark.parametrize("count", [1, 2, 50])
 def test_isolated_regions_and_islands(method, count, rng):
@@ -165,6 +168,7 @@ def test_all_cells_solid(method, boundary):
         inv(ones)
 
 
+@pytest.mark.sampled(1)
 @EVERY
 @pytest.mark.parametrize("shape", NONE)
 @pytest.mark.parametrize("boundary", [dp.neumann, dp.dirichlet], ids=str)
@@ -180,7 +184,7 @@ def test_no_cells(method, shape, boundary):
 # ---- coefficients ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(1)
 @STRONG
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann], ids=str)
 @pytest.mark.parametrize("name", COEFFICIENTS)
@@ -209,7 +213,7 @@ def check_backward_error(op, inv, projection, b, g):
         assert np.linalg.norm(data - A @ x) <= 1e-12 * size
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(1)
 @STRONG
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann], ids=str)
 @pytest.mark.parametrize("name", ANISOTROPIC)
@@ -263,7 +267,7 @@ def test_scale_of_the_operator(scene, method, exponent, rng):
         assert (far.info.forward if solve is far else far.info.adjoint).status == "not_representable"
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(1)
 @EVERY
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann], ids=str)
 @pytest.mark.parametrize("shape, exponent", [((14, 13), -450), ((14, 13), -300), ((14, 13), 300), ((14, 13), 450),

@@ -45,6 +45,7 @@ def test_against_dense_algebra(column, method, rng):
     agree(slope.ravel(), 2 * matrix.T @ (matrix @ x.ravel()))
 
 
+@pytest.mark.sampled(1)
 @EVERY
 @IN_COLUMNS
 def test_field_zero(column, method, rng):
@@ -61,7 +62,7 @@ def test_field_zero(column, method, rng):
     assert np.any(slopes[0])
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(1)
 @EVERY
 @IN_COLUMNS
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])
@@ -82,7 +83,7 @@ def test_field_not_finite(column, method, bad, rng):
             pull(run, np.ones(shape), g)
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(1)
 @EVERY
 @IN_COLUMNS
 @pytest.mark.parametrize("exponent", [-963, -301, 900, 963])
@@ -99,7 +100,7 @@ def test_scale_of_the_data(column, method, exponent, rng):
     assert value == np.ldexp(np.sum(g * run(x)), exponent)
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(1)
 @EVERY
 @IN_COLUMNS
 @pytest.mark.parametrize("kind", KINDS)
@@ -114,6 +115,7 @@ def test_kinds_of_arrays(column, method, kind, rng):
     assert np.array_equal(g, before)
 
 
+@pytest.mark.sampled(1)
 @EVERY
 @IN_COLUMNS
 def test_wrong_shapes_and_complex_numbers(column, method, rng):
@@ -130,6 +132,7 @@ def test_wrong_shapes_and_complex_numbers(column, method, rng):
         dp.value_and_grad(lambda x: anp.sum(run(x)))(x + 1j * y)
 
 
+@pytest.mark.sampled(1)
 @EVERY
 @pytest.mark.parametrize("where", GEOMETRIES)
 def test_projection_everywhere(method, where, rng):
@@ -164,6 +167,7 @@ def test_projection_of_a_flow_through_the_walls(method, defect, rng):
     agree(pull(run, v, g), matrix.T @ g)
 
 
+@pytest.mark.sampled(1)
 @STRONG
 @IN_HARD
 def test_projection_with_jumps_and_flat_cells(method, name, rng):
@@ -204,6 +208,7 @@ def check_rollout(grid, method, k, shift, rng, boundary=dp.neumann, solid=None, 
     return slopes, solve
 
 
+@pytest.mark.sampled
 @EVERY
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann], ids=str)
 @pytest.mark.parametrize("number", [1e-8, 1.0, 1e8])
@@ -223,6 +228,7 @@ def test_rollout_with_jumps_and_flat_cells(method, name, rng):
         assert record.iterations <= (5000 if method == "krylov" or name in COEFFICIENTS else 30)
 
 
+@pytest.mark.sampled(1)
 @EVERY
 @pytest.mark.parametrize("where", GEOMETRIES)
 def test_rollout_everywhere(method, where, rng):
@@ -255,6 +261,7 @@ def test_rollout_at_velocity_zero(method, rng):
     assert np.linalg.norm(slope) > 0.01
 
 
+@pytest.mark.sampled(1)
 @EVERY
 @pytest.mark.parametrize("exponent", [-960, -900, 900, 960])
 def test_scale_of_gradients_in_coefficients(method, exponent, rng):

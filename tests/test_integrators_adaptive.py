@@ -37,7 +37,9 @@ def pendulum_by_scipy(a, g, end):
     return solve_ivp(rate, (0.0, end), [a, 0.0], method="DOP853", rtol=1e-13, atol=1e-14).y[0, -1]
 
 
-@pytest.mark.parametrize("method", ["euler", "heun", "ssprk3", "rk4", "backward_euler", "tr_bdf2"])
+@pytest.mark.parametrize(
+    "method", ["euler", "heun", "ssprk3", "rk4", pytest.param("backward_euler", marks=pytest.mark.whole), "tr_bdf2"]
+)
 def test_tolerance_and_derivatives(method):
     """On a tree with time: value, gradient and tangent beside SciPy's."""
     tolerance = {"euler": 1e-3, "backward_euler": 4e-3, "tr_bdf2": 1e-3}.get(method, 1e-4)
@@ -82,7 +84,7 @@ def test_nothing_moves():
     assert np.array_equal(step(np.ones(3), None), np.ones(3)) and step.taken == [1.0]
 
 
-@pytest.mark.parametrize("method", ["rk4", "tr_bdf2", "radau"])
+@pytest.mark.parametrize("method", ["rk4", pytest.param("tr_bdf2", marks=pytest.mark.whole), "radau"])
 def test_a_rate_that_is_at_rest_at_the_start_is_not_skipped(method):
     """A bell in time: at the start its rate is 0 to rounding, and so is the error of one step over all of it."""
     bell = lambda u, p, t: p * anp.exp(-(((t - 2.0) / 0.3) ** 2))  # in the end it leaves the range of floats

@@ -183,14 +183,15 @@ def test_functions_of_an_operator(op):
     )
     found = dp.stepper("backward_euler", op, h)(U, nu)
     assert found.ravel() == pytest.approx(np.linalg.solve(np.eye(12) - h * nu * A, U.ravel()), rel=1e-9)
-    fine = dp.stepper("rk4", lambda u, p: p * u**2 + p * op(u), h / 50)
-    exact = value_and_grad(lambda p: anp.sum((1 + V) * dp.rollout(fine, p * U, p, 100) ** 2))
+    fine, exact = dp.stepper("rk4", lambda u, p: p * u**2 + p * op(u), h / 20), None
+    if op.name.startswith("diagonal"):  # the others are too stiff for these figures
+        exact = value_and_grad(lambda p: anp.sum((1 + V) * dp.rollout(fine, p * U, p, 40) ** 2))(nu)
     for method in ("imex", "etdrk4"):
         step = dp.stepper(method, lambda u, p: p * u**2, h, linear=(op, lambda p: p), rtol=1e-13)
         loss = lambda p, step=step: anp.sum((1 + V) * step(step(p * U, p), p) ** 2)
-        if op.name.startswith("diagonal"):  # the others are too stiff for these figures
-            assert value_and_grad(loss)(nu) == pytest.approx(exact(nu), rel=3e-2 if method == "imex" else 1e-4)
-        assert dp.check.gradient(loss, nu).verdict == "agrees"
+        if exact is not None:
+            assert value_and_grad(loss)(nu) == pytest.approx(exact, rel=3e-2 if method == "imex" else 1e-4)
+        assert dp.check.gradient(loss, nu, quick=True).verdict == "agrees"
 
 
 @pytest.mark.parametrize("op", [-1.0 * L @ L, dp.function(L, lambda e: -(e**2) - e)], ids=["product", "function"])

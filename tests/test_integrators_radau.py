@@ -73,7 +73,12 @@ def test_published_values():
 
 
 @pytest.mark.parametrize(
-    "name", ["van der Pol, 100", "Robertson", "HIRES", pytest.param("van der Pol, 1000", marks=pytest.mark.whole)]
+    "name",
+    [
+        "van der Pol, 100",
+        "Robertson",
+        *(pytest.param(n, marks=pytest.mark.whole) for n in ("HIRES", "van der Pol, 1000")),
+    ],
 )
 def test_stiff_problems_with_their_gradients(name):
     """Values and gradients within the tolerance that the page names; both fall with it."""
@@ -115,7 +120,7 @@ def test_one_step_against_a_root():
     assert value == pytest.approx(wanted, rel=1e-11)
     for key, slope in slopes.items():
         assert g[key] == pytest.approx(slope, rel=1e-9, abs=1e-11)
-    assert dp.check.gradient(ours, x).verdict == "agrees"
+    assert dp.check.gradient(ours, x, directions=1).verdict == "agrees"
 
 
 @pytest.mark.parametrize(
@@ -167,7 +172,7 @@ def test_second_derivatives_are_refused():
         value_and_grad(lambda p: value_and_grad(loss)(p)[1])(2.0)
 
 
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-4, pytest.param(1e-6, marks=pytest.mark.whole)])
 def test_runs_that_meet_in_a_jump(tolerance):
     """Terms of the derivative there cancel to a thousandth: right, or refused."""
     slope = -0.6642059117567769 / 20
@@ -182,16 +187,16 @@ def test_runs_that_meet_in_a_jump(tolerance):
 
 
 def test_long_oscillation():
-    """A thousand turns of a frequency: the phase of the derivative grows with time; right, or refused."""
-    rate = lambda u, p: anp.array([p * u[1], -p * u[0]])
+    """The phase of the derivative in a frequency grows with time; right, or refused."""
+    rate, end = lambda u, p: anp.array([p * u[1], -p * u[0]]), 80.0
     for tolerance in (1e-3, 1e-5):
-        step = dp.stepper("radau", rate, 200.0, tolerance=tolerance)
-        exact = -200 * np.sin(200 * 1.01)
+        step = dp.stepper("radau", rate, end, tolerance=tolerance)
+        exact = -end * np.sin(end * 1.01)
         try:
             g = value_and_grad(lambda p: step(np.array([1.0, 0.0]), p)[0])(1.01)[1]
         except DerivativeError:
             continue
-        assert abs(g - exact) <= 6 * tolerance**0.75 * 200
+        assert abs(g - exact) <= 6 * tolerance**0.75 * end
 
 
 def test_what_matters_early_only():

@@ -103,8 +103,8 @@ def test_derivatives_of_functions():
         slope = lambda x: anp.sum(anp.sin(value_and_grad(loss)(x)[1][1]) * X) + value_and_grad(loss)(x)[1][0] ** 2
         x = (z, np.cos(X), np.sin(X))
         if z:
-            assert dp.check.gradient(loss, x).verdict == "agrees"
-            assert dp.check.gradient(slope, x).verdict == "agrees"
+            assert dp.check.gradient(loss, x, quick=True).verdict == "agrees"
+            assert dp.check.gradient(slope, x, quick=True).verdict == "agrees"
         h = 1e-5
         central = (loss((z + h, *x[1:])) - loss((z - h, *x[1:]))) / (2 * h)
         assert value_and_grad(loss)(x)[1][0] == pytest.approx(central, rel=1e-3)

@@ -96,10 +96,10 @@ def test_dense(rng):
     known, expected = value_and_grad(loss(lambda p, x: anp.dot(x, p["weight"]) + p["bias"]))((p, x))
     assert value == pytest.approx(known, rel=1e-14)
     assert all(np.allclose(a, b, rtol=1e-12) for a, b in zip(dp.tree.leaves(slopes), dp.tree.leaves(expected)))
-    assert dp.check.gradient(loss(nn.dense), (p, x))
+    assert dp.check.gradient(loss(nn.dense), (p, x), quick=True)
     copies = {name: np.stack([value] * 5) for name, value in p.items()}
     assert np.allclose(nn.dense(copies, x), nn.dense(p, x), rtol=1e-13)
-    assert dp.check.gradient(loss(nn.dense), (copies, x))
+    assert dp.check.gradient(loss(nn.dense), (copies, x), quick=True)
 
 
 @pytest.mark.parametrize("activation", [nn.tanh, nn.softplus])
@@ -123,7 +123,7 @@ def test_a_residual_network_and_its_updates(rng):
         hidden = nn.residual_block(q[1], nn.convolution(q[0], x))
         return nn.convolution(q[2], hidden) - anp.roll(x, 1, axis=-1) ** 2
 
-    assert dp.check.gradient(lambda q: anp.sum(net(q) ** 2), p).verdict == "agrees"
+    assert dp.check.gradient(lambda q: anp.sum(net(q) ** 2), p, quick=True).verdict == "agrees"
     best = dp.minimize(net, p, "levenberg_marquardt", maxiter=15, apart=True)
     assert best.value < 0.2 * best.history[0].value
 

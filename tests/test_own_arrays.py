@@ -165,7 +165,7 @@ BUILDERS = {
     ),
     "stepper, error control": (
         (np.array(1e-3), 0.1 * CELLS),
-        lambda tolerance, floor: dp.stepper("heun", lambda u, p: -p * u**2, 0.5, tolerance=tolerance, floor=floor),
+        lambda tolerance, floor: dp.stepper("heun", lambda u, p: -p * u**2, 0.1, tolerance=tolerance, floor=floor),
         stepped,
     ),
     "conservation_law": (
@@ -186,6 +186,7 @@ BUILDERS = {
         lambda step: step((np.ones(12), np.ones(12))),
     ),
     "total_variation": ((SOLID.copy(),), lambda solid: dp.total_variation(GRID, 0.1, solid), lambda tv: tv(CELLS**3)),
+    "flatten": (({"u": CELLS.copy(), "n": [3]},), lambda tree: dp.flatten(tree)[1], lambda back: back(K[:12] ** 2)),
     "smoothness": ((SOLID.copy(),), lambda solid: dp.smoothness(GRID, solid), lambda h1: h1(CELLS**3)),
     "physical_gradient": (
         (np.array(0.5),),

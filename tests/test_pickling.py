@@ -17,6 +17,8 @@ import sparsedp as dp
 
 ALL = list(travellers.travellers())
 LABELS = [f"{builder} {label}".strip() for builder, label, *_ in ALL]
+SLOW = {f"stepper {method}, tolerance" for method in travellers.STEPS.keys() - {"rk4", "backward_euler"}}
+MARKED = [pytest.param(one, marks=[pytest.mark.whole] * (label in SLOW)) for one, label in zip(ALL, LABELS)]
 
 
 def test_everything_public_that_is_called_is_here():
@@ -24,7 +26,7 @@ def test_everything_public_that_is_called_is_here():
     assert not missing, f"give them a line in tests/travellers.py: {sorted(missing)}"
 
 
-@pytest.mark.parametrize("one", ALL, ids=LABELS)
+@pytest.mark.parametrize("one", MARKED, ids=LABELS)
 def test_same_bits_here(one):
     """Pickled fresh; what has been used, in a fresh process below."""
     _, _, thing, use = one

@@ -8,6 +8,7 @@ from launch import COUNTS, on_ranks, printed
 
 import sparsedp as dp
 
+PARTS = 6  # of the table of transport
 pytestmark = pytest.mark.xdist_group("ranks")  # several processes at a time are enough
 FUNCTIONS = "cannot be cut for ranks, for no rank knows its rows; make it of operators of the grid or of a matrix"
 
@@ -24,14 +25,28 @@ def test_one_process_keeps_its_grid_and_imports_nothing(monkeypatch):
 
 @on_ranks
 @pytest.mark.parametrize("count", COUNTS)
-def test_fields(count):
-    assert printed("fields_on_ranks.py", count).endswith("all agree\n")
+@pytest.mark.parametrize("what", ["fields", "solves", "flow", "steps", "transport", "explain", "ensemble"])
+def test_as_on_one_process(what, count):
+    assert printed(f"{what}_on_ranks.py", count).endswith("all agree\n")
+
+
+@on_ranks
+@pytest.mark.whole
+@pytest.mark.parametrize("part", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in range(2, PARTS))])
+def test_every_transport(part):
+    assert printed("transport_on_ranks.py", 2 + part % 3, str(part), str(PARTS)).endswith("all agree\n")
 
 
 @on_ranks
 @pytest.mark.parametrize("count", COUNTS)
-def test_solves(count):
-    assert printed("solves_on_ranks.py", count).endswith("all agree\n")
+def test_minimize(count):
+    assert printed("minimize_on_ranks.py", count).endswith("all agree\n")
+
+
+@on_ranks
+@pytest.mark.whole
+def test_the_blocks_of_the_readme():
+    assert printed("readme_blocks.py", 2).endswith("all agree\n")
 
 
 @on_ranks
@@ -48,3 +63,29 @@ def test_every_operator_of_the_catalogue():
         figures = [line[2].split() for line in lines]
         assert all(float(error) <= 4e-16 and float(dot) <= 1e-15 for error, dot, _ in figures), lines
         assert len({digest for _, _, digest in figures}) == 1, lines
+
+
+@on_ranks
+@pytest.mark.whole
+def test_set_ups_leave_no_memory_behind():
+    assert printed("memory.py", 2).endswith("all agree\n")
+
+
+OTHERS = [pytest.param(*pair, marks=pytest.mark.whole) for pair in ((1, 2), (2, 4), (4, 2), (2, 2))]
+
+
+@on_ranks
+@pytest.mark.parametrize("first, then", [(2, 1), *OTHERS])
+def test_a_run_goes_on_where_another_number_of_ranks_left_it(tmp_path, first, then):
+    """minimize by its folder, to rounding; steps of a rollout by a file of NumPy, on ranks to the same bits."""
+    kept, whole = tmp_path / "kept", tmp_path / "whole"
+    for folder in (kept, whole):
+        folder.mkdir()
+    runs = [(first, kept, 3), (then, kept, 6), (then, whole, 6), (then, whole, 6)]
+    _, resumed, once, again = [[line.split(None, 3) for line in printed("resumes.py", n, str(f), str(k)).splitlines()]
+                               for n, f, k in runs]  # fmt: skip
+    for there, here in zip(resumed, [*once[:2], again[2]], strict=True):
+        assert float(there[1]) == pytest.approx(float(here[1]), rel=1e-6)
+        assert there[2] == here[2] or first != then and (there[0] != "steps" or 1 in (first, then))
+    assert [line[3] for line in resumed[:2]] == ["resumed from iteration 3"] * 2
+    assert once[2] != again[2]

@@ -1,26 +1,19 @@
 """Every command and code block of README.md runs, and prints what the page says.
 
-- A python block is executed, after the ones before it. The text block that follows (at once, or after one line that
-  ends in a colon) is its real output: words are compared with white space normalised, numbers with a relative
-  tolerance, ``...`` stands for anything. A line ``<!-- rtol=1e-3 atol=1e-12 -->`` before the text block sets the
-  tolerances.
+- Python blocks are run in order, and compared with the output that stands below them (pages.py).
 - Each command of a shell block is recognised: the demo runs small, an example runs, installs and tests are checked
   against pyproject.toml and .ci/run.
 """
 
-import contextlib
-import importlib.util
-import io
-import math
 import os
 import re
 import shlex
 import subprocess
 import sys
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from pages import SHELL, blocks, check_install, commands, run_blocks, same
 from sources import ROOT
 
 if sys.version_info >= (3, 11):
@@ -29,36 +22,7 @@ else:
     import tomli as tomllib
 
 README = ROOT / "README.md"
-SHELL = ("sh", "bash", "shell", "console")
-NUMBER = r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w])"
 COMMANDS = "<!-- commands -->"
-MESHES = importlib.util.find_spec("skfem") is not None  # in the extra `test`; a block that needs it is left out without
-
-
-@dataclass(frozen=True)
-class Block:
-    """A fenced block: its language, text, line number, and the text between it and the block before it."""
-
-    language: str
-    text: str
-    line: int
-    before: str
-
-
-def blocks(page):
-    found, before, inside = [], [], None
-    for number, line in enumerate(page.splitlines(), 1):
-        fence = re.match(r"\s*```\s*(\w*)", line)
-        if inside is not None and fence:
-            found.append(Block(inside[0], "\n".join(inside[2]), inside[1], "\n".join(before)))
-            inside, before = None, []
-        elif inside is not None:
-            inside[2].append(line)
-        elif fence:
-            inside = (fence[1].lower(), number, [])
-        else:
-            before.append(line)
-    return found
 
 
 def page():
@@ -69,42 +33,9 @@ def page():
 # ---- python blocks and their output --------------------------------------------------------------------------------
 
 
-def tolerances(text):
-    found = dict(re.findall(r"\b(rtol|atol)=([-+.\deE]+)", text))
-    return {"rel_tol": float(found.get("rtol", 1e-6)), "abs_tol": float(found.get("atol", 0.0))}
-
-
-def same(wanted, got, **tolerance):
-    """Whether a printed text is the wanted one, numbers within the tolerance and ``...`` for anything."""
-    wanted, got = " ".join(wanted.split()), " ".join(got.split())
-    numbers, rule = [], ""
-    for part in re.split(rf"({NUMBER}|\.\.\.)", wanted):
-        if part == "...":
-            rule += ".*?"
-        elif re.fullmatch(NUMBER, part):
-            numbers.append(float(part))
-            rule += r"\s*(" + NUMBER + ")"  # columns may shift by a sign
-        else:
-            rule += re.escape(part)
-    found = re.fullmatch(rule, got)
-    return found is not None and all(math.isclose(a, float(b), **tolerance) for a, b in zip(numbers, found.groups()))
-
-
 def test_python_blocks(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    all_blocks, space = blocks(page()), {"__name__": "__readme__"}
-    assert any(block.language == "python" for block in all_blocks), "README.md has no python block"
-    for block, following in zip(all_blocks, [*all_blocks[1:], Block("", "", 0, "")]):
-        if block.language != "python" or ("import skfem" in block.text and not MESHES):
-            continue
-        printed = io.StringIO()
-        with contextlib.redirect_stdout(printed):
-            exec(compile(block.text, f"README.md block at line {block.line}", "exec"), space)
-        prose = re.sub(r"<!--.*?-->", "", following.before, flags=re.DOTALL).strip()
-        wanted = following.text if following.language == "text" and re.fullmatch(r"([^\n]*:)?", prose) else ""
-        assert same(wanted, printed.getvalue(), **tolerances(following.before)), (
-            f"README.md line {block.line}: the block prints\n{printed.getvalue()}\nthe page says\n{wanted}"
-        )
+    run_blocks(README)
 
 
 def test_first_scene_is_short():
@@ -128,18 +59,6 @@ def test_comparison_of_printed_text():
 
 
 # ---- shell blocks --------------------------------------------------------------------------------------------------
-
-
-def commands(text):
-    """Single commands of a shell block: continued lines joined, prompts and comments dropped, split at &&."""
-    lines = text.replace("\\\n", " ").splitlines()
-    words = [shlex.split(line.removeprefix("$ "), comments=True) for line in lines]
-    for line in words:
-        while "&&" in line:
-            yield line[: line.index("&&")]
-            line = line[line.index("&&") + 1 :]
-        if line:
-            yield line
 
 
 def run_python(arguments, folder):
@@ -182,16 +101,6 @@ def run_demo(arguments, folder):
     assert any((folder / "out").iterdir()), "the demo wrote nothing"
 
 
-def check_install(arguments):
-    extras = set(
-        tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    )
-    targets = [word for word in arguments if word.startswith((".", "sparsedp"))]
-    asked = {extra for word in targets for extra in re.findall(r"[\w-]+", "".join(re.findall(r"\[(.*?)\]", word)))}
-    assert targets, f"pip {shlex.join(arguments)} does not install this package"
-    assert asked <= extras, f"pyproject.toml has no extras {sorted(asked - extras)}"
-
-
 def obey(words, folder, run):
     """Check one command of the page; what takes long is given to `run`."""
     if words[:3] == ["python", "-m", "pip"]:
@@ -207,6 +116,8 @@ def obey(words, folder, run):
         run(run_python, [str(ROOT / words[1]), *words[2:]], folder)
     elif words[0] == "python" and words[1].startswith("benchmarks/"):
         compile((ROOT / words[1]).read_text(encoding="utf-8"), words[1], "exec")  # takes minutes: not run here
+    elif words[:3] == ["python", "-m", "sphinx"]:
+        assert (ROOT / words[-2] / "conf.py").exists()  # tests/test_pages.py builds them
     elif words[0] == ".ci/run":
         assert os.access(ROOT / ".ci" / "run", os.X_OK)
     else:
@@ -264,4 +175,5 @@ def test_the_oldest_versions_are_those_of_the_requirements():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     named = [*project["dependencies"], *(one for group in project["optional-dependencies"].values() for one in group)]
     assert ci("oldest") == [one.replace(">=", "==") for one in named if ">=" in one]
-    assert len(ci("oldest")) == len(named) - 1  # all but the extra that is made of extras
+    extras = [one for one in named if one.startswith("sparsedp[")]  # in extras that are made of extras
+    assert len(ci("oldest")) == len(named) - len(extras)

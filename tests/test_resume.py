@@ -101,7 +101,7 @@ def test_a_single_changed_byte_is_seen(tmp_path):
     [state] = tmp_path.glob("state-*3.npz")
     [path.unlink() for path in tmp_path.glob("state-*") if path != state]
     content = state.read_bytes()
-    for place in range(0, len(content), 23):
+    for place in range(0, len(content), 61):
         state.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
         best = dp.minimize(valley, START, maxiter=3, tolerance=0, checkpoint=tmp_path)
         assert same(best, whole)

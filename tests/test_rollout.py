@@ -58,7 +58,7 @@ def test_value_and_gradient(inputs):
     wanted, found = dp.value_and_grad(by_loop)(x), dp.value_and_grad(by_rollout)(x)
     assert wanted[0] == found[0]
     assert gap(wanted[1], found[1]) < 1e-14
-    assert dp.check.gradient(by_rollout, x)
+    assert dp.check.gradient(by_rollout, x, quick=True)
 
 
 @pytest.mark.parametrize("memory", MEMORY)
@@ -75,6 +75,56 @@ def test_all_states():
     for name in ("u", "v", "turn"):
         assert np.array_equal(states[name], np.stack([state[name] for state in wanted]))
     assert states["name"] == "a"
+
+
+@pytest.mark.parametrize("keep", [[N], range(0, N + 1, 2), np.array([1, N - 1])])
+def test_some_states(keep):
+    some, states = (dp.rollout(step, START, PARAMS, N, keep=which) for which in (keep, "all"))
+    for name in ("u", "v", "turn"):
+        assert np.array_equal(some[name], states[name][list(keep)])
+    assert some["name"] == "a" and some["u"].flags.writeable
+
+
+def test_a_step_may_hand_out_one_array_again_and_again():
+    """In every mode: where nothing is traced, forward, back, and both."""
+    work = np.zeros(2)
+
+    def count(state, _):
+        work[:] = state["n"] + 1.0
+        return {"a": 2.0 * state["a"], "n": state["n"] + 1, "w": work}
+
+    def run(a, keep):
+        states = dp.rollout(count, {"a": a, "n": 0, "w": np.zeros(2)}, None, 4, keep=keep)
+        return states["a"] * states["w"][:, 0]
+
+    for keep in ("all", [1, 3, 4]):
+        powers = np.array([0.0, 2.0, 8.0, 24.0, 64.0])[slice(None) if keep == "all" else keep]
+        value, slope = dp.jvp(lambda a, keep=keep: run(a, keep), 1.0, 1.0)
+        again, pull = dp.vjp(lambda a, keep=keep: run(a, keep), 1.0)
+        assert np.array_equal(run(1.0, keep), powers)
+        assert np.array_equal(value, powers) and np.array_equal(slope, powers) and np.array_equal(again, powers)
+        assert pull(np.ones(powers.size)) == powers.sum()
+        assert dp.hvp(lambda a, keep=keep: anp.sum(run(a, keep) * a), 1.0, 1.0) == 2 * powers.sum()
+
+
+@pytest.mark.parametrize("keep", ["last", "all", lambda i, state: state])
+def test_a_step_that_writes_where_its_state_lies(keep):
+    """It reads state[1] after it has written into the array that it returned as such."""
+    work = np.zeros(2)
+
+    def mixed(state, p):
+        u, w = state
+        work[:] = 0.5 * w + 1.0
+        return u * p + 0.1 * w, work
+
+    def run(step, p):
+        states = dp.rollout(step, (np.ones(2), np.array([2.0, 3.0])), p, 4, keep=keep)
+        return anp.sum((states[-1] if callable(keep) else states)[0] ** 2)
+
+    fresh = lambda state, p: (state[0] * p + 0.1 * state[1], 0.5 * state[1] + 1.0)
+    wanted, slope = dp.value_and_grad(lambda p: run(fresh, p))(0.9)
+    assert run(mixed, 0.9) == wanted
+    assert dp.jvp(lambda p: run(mixed, p), 0.9, 1.0) == (wanted, pytest.approx(slope, rel=1e-13))
 
 
 def hessian_product(loss, x, along, reverse):

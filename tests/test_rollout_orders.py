@@ -76,29 +76,33 @@ ORDERS = {
 }
 
 
+KEPT = [
+    {"keep": "last"},
+    {"keep": "last", "memory": 900, "truncate": 3},
+    {"keep": "all"},
+    {"keep": "each", "memory": 1200},
+]
+
+
+@pytest.mark.sampled
+@pytest.mark.parametrize("options", KEPT, ids=["last", "last, truncated", "all", "each"])
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("name", STEPS)
-def test_every_order_is_that_of_the_loop(name, order, rng):
+def test_every_order_is_that_of_the_loop(name, order, options, rng):
     step, x = STEPS[name]
     found, rebuild = flatten(x)
     numbers = [isinstance(leaf, (float, complex, np.ndarray, np.generic)) for leaf in found]
     random = [rng.normal(size=np.shape(leaf)) for leaf in found]
     along = rebuild(np.asarray(t, np.asarray(u).dtype)[()] if n else None for t, u, n in zip(random, found, numbers))
-    for options in (
-        {"keep": "last"},
-        {"keep": "last", "memory": 900, "truncate": 3},
-        {"keep": "all"},
-        {"keep": "each", "memory": 1200},
-    ):
-        ours, wanted = (
-            [np.asarray(leaf) for leaf in leaves(ORDERS[order](lambda x: f(step, x, **options), x, along))]
-            for f in (by_rollout, by_loop)
-        )
-        for one, other in zip(ours, wanted, strict=True):
-            assert one.dtype == other.dtype
-            if one.dtype != object:
-                bound = 1e-3 if name == "single" else 1e-11
-                assert np.max(np.abs(one - other)) <= bound * (1 + np.max(np.abs(other)))
+    ours, wanted = (
+        [np.asarray(leaf) for leaf in leaves(ORDERS[order](lambda x: f(step, x, **options), x, along))]
+        for f in (by_rollout, by_loop)
+    )
+    for one, other in zip(ours, wanted, strict=True):
+        assert one.dtype == other.dtype
+        if one.dtype != object:
+            bound = 1e-3 if name == "single" else 1e-11
+            assert np.max(np.abs(one - other)) <= bound * (1 + np.max(np.abs(other)))
 
 
 def test_a_derivative_forward_runs_each_step_once_and_keeps_one_state():

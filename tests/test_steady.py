@@ -111,10 +111,11 @@ def test_burgers_in_one_dimension():
         u = dp.steady(residual, -grid.centres()[0], ends)
         errors.append(np.max(np.abs(u + np.tanh(grid.centres()[0] / (2 * nu)))))
     assert 1.9 < np.log2(errors[0] / errors[1]) < 2.1 and errors[1] < 3e-3
-    weights = np.cos(np.arange(50.0))
-    grid, residual = burgers(50, nu)
+    weights = np.cos(np.arange(20.0))
+    grid, residual = burgers(20, nu)
     find = dp.implicit(residual, rtol=1e-13)
-    result = dp.check.gradient(lambda ends: anp.sum(weights * find(-grid.centres()[0], ends)), 0.9 * ends)
+    loss = lambda ends: anp.sum(weights * find(-grid.centres()[0], ends))
+    result = dp.check.gradient(loss, 0.9 * ends, directions=1)
     assert result.verdict == "agrees"
 
 
@@ -165,7 +166,7 @@ def test_cavity_at_32():
 @pytest.mark.parametrize("kind", ["cavity", "convection"])
 def test_gradients_of_flows(kind):
     """Min u in Re, Nu in Ra: both orders, forward and backward."""
-    scene = Flow(6)
+    scene = Flow(4)
     guess, figure, p = {"cavity": (scene.rest, scene.lowest, 60.0), "convection": (scene.warm, scene.nusselt, 5e3)}[
         kind
     ]
@@ -245,7 +246,7 @@ def test_the_pattern_of_fields_on_one_grid_is_guessed(shape, periodic):
 
 def test_fields_are_paired_by_name():
     """Whatever the order in which a residual names them: the same bits, and each in its own units."""
-    scene, states = Flow(8), []
+    scene, states = Flow(5), []
     for turned in (False, True):
         residual = lambda x, re, turned=turned: dict(list(scene.cavity(x, re).items())[:: -1 if turned else 1])
         loss = dp.value_and_grad(lambda re, residual=residual: anp.sum(dp.steady(residual, scene.rest, re)["v"] ** 3))
@@ -255,7 +256,7 @@ def test_fields_are_paired_by_name():
 
 def test_a_mean_over_a_field_fits_no_stencil():
     """A pressure whose mean is 0 in place of a pin: a full row is found, and the flow is the same."""
-    scene = Flow(10)
+    scene = Flow(6)
 
     def free(x, re):
         rates = scene.cavity(x, re)
@@ -287,7 +288,7 @@ def test_kinds_of_guesses():
 
 def test_guesses_as_they_come_are_left_as_they_are(rng):
     """Fortran order, strides, read-only and broadcast arrays give the same bits."""
-    scene, plain = Flow(6), rng.standard_normal((6, 6))
+    scene, plain = Flow(4), rng.standard_normal((4, 4))
     want = dp.steady(scene.cavity, scene.rest | {"p": plain.copy()}, 20.0)
     wide = np.repeat(plain, 2, axis=1)[:, ::2]
     still = np.broadcast_to(0.0, scene.rest["v"].shape)
@@ -298,7 +299,8 @@ def test_guesses_as_they_come_are_left_as_they_are(rng):
 
 
 def test_powers_of_two_on_the_residual_change_no_bit():
-    scene = Flow(6)
+    """At a Rayleigh number that takes pseudo-time."""
+    scene = Flow(4)
     want = dp.steady(scene.convection, scene.warm, 2e4)
     for k in (300, -300):
         x = dp.steady(lambda x, ra, k=k: {a: 2.0**k * b for a, b in scene.convection(x, ra).items()}, scene.warm, 2e4)

@@ -61,11 +61,12 @@ def agree(op, b):
 @pytest.mark.parametrize("stretched", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_every_grid_against_lu(shape, stretched, drawn, rng):
-    for periodic in drawn(list(product((False, True), repeat=len(shape)))):
+    for number, periodic in enumerate(drawn(list(product((False, True), repeat=len(shape))))):
         spacing = [rng.uniform(0.5, 2, n) for n in shape] if stretched else 0.3
         grid = dp.Grid(shape, spacing=spacing, periodic=periodic)
         boundary = CONDITIONS[rng.integers(3)]
-        for op in operators(grid, boundary, rng).values():
+        ops = list(operators(grid, boundary, rng).values())
+        for op in ops if drawn is list else ops[number % 2 :: 2]:  # one half on a grid, the other one on the next
             agree(op, rng.standard_normal(shape))
 
 
@@ -90,7 +91,7 @@ def test_at_most_12_iterations_for_smooth_coefficients(shape, boundary, rng):
     assert inv.info.forward.status == "converged"
 
 
-@pytest.mark.parametrize("shape", [(128, 128), (40, 40, 40)])
+@pytest.mark.parametrize("shape", [(96, 96), (28, 28, 28)])
 def test_inclusions_with_jumps_of_a_million(shape, rng):
     grid = dp.Grid(shape, size=1.0)
     k = np.ones(shape)

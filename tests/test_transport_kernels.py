@@ -1,5 +1,6 @@
 """The loops of Eulerian transport against sparse matrices, and bits that do not depend on the number of threads."""
 
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -107,14 +108,19 @@ def parabola(a, b, c, e):
     return (a + 2 * b) / 6, (2 * a + b) / 6, one / 6, one / 3, one / 3, one / 6
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("limiter", [minmod, parabola])
+@cache
+def loop_of(limiter):
+    """Compiled once for all tests."""
+    return fluxes.slopes_of("other", limiter, cache=False)
+
+
+@pytest.mark.parametrize("limiter", [minmod, pytest.param(parabola, marks=pytest.mark.whole)])
 @pytest.mark.parametrize("velocity, form", FORMS)
 def test_other_limiters(limiter, velocity, form, monkeypatch):
     """A scheme is a function and a line: its loops, its tangent and its cotangents are there."""
     scheme = fluxes.Scheme(limiter, (0.0, 0.75, 1 / 3), 1.0, limiter is minmod)
     monkeypatch.setitem(fluxes.SCHEMES, "van_leer", scheme)
-    monkeypatch.setitem(fluxes.slopes, "van_leer", fluxes.slopes_of("other", limiter, cache=False))
+    monkeypatch.setitem(fluxes.slopes, "van_leer", loop_of(limiter))
     rng = np.random.default_rng(5)
     solid = np.zeros((7, 6), bool)
     solid[3, 3] = True

@@ -52,7 +52,7 @@ def scene(scheme, grid, velocity, form, of="cells", **options):
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
 def test_taylor(scheme, velocity, form, name):
     _, args, loss = scene(scheme, GRIDS[name], velocity, form)
-    result = dp.check.gradient(loss, args)
+    result = dp.check.gradient(loss, args, directions=1)
     assert result.verdict == "agrees", str(result)
 
 
@@ -60,7 +60,7 @@ def test_taylor(scheme, velocity, form, name):
 @pytest.mark.parametrize("number", ["u", "v", "dt", "inflow"])
 def test_taylor_in_each_argument(scheme, number):
     _, args, loss = scene(scheme, GRIDS["2-D"], "faces", "flux", of="faces")
-    result = dp.check.gradient(lambda x: loss({**args, number: x}), args[number])
+    result = dp.check.gradient(lambda x: loss({**args, number: x}), args[number], directions=1)
     assert result.verdict == "agrees", str(result)
 
 

@@ -74,7 +74,7 @@ def test_rest_is_the_identity_and_its_slope_the_mean_of_both_sides(scheme, form,
 def test_gradient_is_that_of_the_value(scheme, form, interpolation):
     move, (u, v, dt, _) = scene((7, 5), (False, True), scheme, form, interpolation, boundary=dp.dirichlet)
     inflow = np.cos(3.0 * np.arange(move.walls.size))
-    result = dp.check.gradient(lambda x: (move(*x) ** 3).sum(), (u, v, dt, inflow))
+    result = dp.check.gradient(lambda x: (move(*x) ** 3).sum(), (u, v, dt, inflow), directions=1)
     assert result.verdict == "agrees", str(result)
 
 

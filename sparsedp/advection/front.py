@@ -160,8 +160,9 @@ class Transport(Frozen, Remade):
     _rule: Rule
 
     def __init__(self, setting):
-        law = (LAWS[setting.scheme] if setting.grid.cells.size else NoCells)(setting)
-        super().__init__(setting=setting, law=law, _rule=rule_of(law))
+        layout, kind = setting.grid.layout, LAWS[setting.scheme] if setting.grid.cells.size else NoCells
+        law = (Law if layout else kind)(setting)
+        super().__init__(setting=setting, law=law, _rule=layout.transport(setting) if layout else rule_of(law))
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
@@ -212,6 +213,8 @@ class Transport(Frozen, Remade):
                [0. , 0.5, 0.5]])
         """
         name = self.law.name
+        if self.setting.grid.layout:
+            self.setting.grid.layout.check("transport.operator")
         if not self.law.linear:
             raise ValueError(
                 f"{name} is not linear in u and has no matrix; write scheme='upwind', or call move(u, v, dt)"

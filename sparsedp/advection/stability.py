@@ -14,7 +14,7 @@ ROUNDING = 8 * np.finfo(float).eps  # CFL exactly 1 leaves a weight of about -1e
 def check_numbers(setting, u, v, inflow):
     """Refuse NaN and infinity: name the argument, the first index and the count."""
     name = f"transport {setting.scheme}"
-    check_finite(name, u.reshape(setting.space.shape), "needs a finite field")
+    check_finite(name, np.reshape(u, setting.space.shape), "needs a finite field")
     check_finite(name, v, "needs a finite velocity", setting.velocity_place)
     check_finite(name, inflow, "needs finite inflow values")
 
@@ -24,7 +24,7 @@ def check_weights(setting, dt, rate, share):
     bad = ~(share - dt * rate >= -ROUNDING)
     if setting.unstable == "raise" and np.any(bad):
         worst = int(np.argmax(rate))
-        largest = rounded_down(share / rate[worst])
+        largest = rounded_down(share / np.max(rate))
         raise UnstableStepError(
             f"transport {setting.scheme}: dt = {dt:.12g} is too large at {np.count_nonzero(bad)} of {rate.size} "
             f"points, most at {place_words(setting, worst)}; the largest stable dt is {largest}, "

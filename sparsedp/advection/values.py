@@ -5,10 +5,10 @@ import numpy as np
 
 from sparsedp.advection.law import INFLOW, STEP
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_finite, is_number
+from sparsedp.fields import check_finite, check_native, is_number
 from sparsedp.tape import cast, dtype_of, isbox, plain
 
-__all__ = ["LETTERS", "check_step", "flat_numbers", "prepare", "raised", "result_like", "unflatten"]
+__all__ = ["LETTERS", "check_given", "check_step", "flat_numbers", "prepare", "raised", "result_like", "unflatten"]
 
 FLOAT = np.dtype(float)
 LETTERS = "u", "v", "dt", "inflow"
@@ -37,24 +37,28 @@ def flat_numbers(name, letter, value, shapes):
     """Array of one of the shapes -> flat contiguous float64; a traced one stays traced."""
     if type(value) is np.ndarray and value.shape in shapes and value.dtype == FLOAT and value.flags.c_contiguous:
         return value.reshape(-1)
+    check_given(name, letter, value, shapes)
+    if isbox(value):
+        return anp.reshape(cast(value, FLOAT), (-1,))
+    return np.ascontiguousarray(value, dtype=float).reshape(-1)
+
+
+def check_given(name, letter, value, shapes):
+    """Refuse what is no array of real numbers of one of the shapes."""
     shape = _shape(name, letter, value)
     if shape not in shapes:
         parts = len(shapes[0]) == 1 < len(shape)
         hint = "; write grid.join(...) for the components on faces" if parts else ""
         hint += ", or velocity='cells'" if parts and letter == "v" else ""
         raise ShapeError(f"{name} takes {letter} of shape {shapes[0]}, got an array of shape {shape}{hint}")
-    if type(plain(value)) is not np.ndarray:
-        if isinstance(value, np.ma.MaskedArray):
-            raise TypeError(f"{name} takes plain arrays, got a masked array as {letter}; fill it first")
-        value = value if isbox(value) else np.asarray(value)
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError(f"{name} takes plain arrays, got a masked array as {letter}; fill it first")
+    check_native(name, value)
     kind = dtype_of(value)
     if kind.kind not in "biu" and kind.char not in "df":
         raise TypeError(
             f"{name} takes real numbers as {letter}, got dtype {kind}; write {letter}.real or {letter}.astype(float)"
         )
-    if isbox(value):
-        return anp.reshape(cast(value, FLOAT), (-1,))
-    return np.ascontiguousarray(value, dtype=float).reshape(-1)
 
 
 def _shape(name, letter, value):

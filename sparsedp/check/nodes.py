@@ -6,6 +6,7 @@ from types import CellType
 import numpy as np
 
 from sparsedp.derivative import name_of, witnessed
+from sparsedp.shortcuts import ELSEWHERE
 from sparsedp.tape import called, isbox
 
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
@@ -87,9 +88,9 @@ def bytes_held(nodes):
     waiting: list = [(part, 0) for node in nodes for part in (node.vjp, node.held)]
     while waiting:
         thing, depth = waiting.pop()
-        if isinstance(thing, np.ndarray):
-            while isinstance(thing.base, np.ndarray):
-                thing = thing.base
+        if isinstance(thing, (np.ndarray, *ELSEWHERE)):
+            while isinstance(base := getattr(thing, "base", None), np.ndarray):  # a field on ranks has none
+                thing = base
             buffers[id(thing)] = thing.nbytes
         elif depth <= DEEPEST and id(thing) not in seen:
             seen.add(id(thing))

@@ -15,6 +15,7 @@ from sparsedp.derivative import check_loss
 from sparsedp.errors import NonFiniteError, SparsedpError
 from sparsedp.ledger import recording, thread
 from sparsedp.packing import Packing, joined
+from sparsedp.shortcuts import whole
 from sparsedp.tree import copied, mapped, norm
 
 __all__ = [
@@ -64,8 +65,9 @@ class Point(Packing):
     """
 
     def __init__(self, x):
-        # Numbers of NumPy in place of Python's: those divide by 0, and take complex steps.
-        super().__init__(mapped(lambda leaf: np.asarray(leaf)[()] if isinstance(leaf, (float, complex)) else leaf, x))
+        # Numbers of NumPy in place of Python's: those divide by 0, and take complex steps. Of fields on ranks all.
+        number = lambda leaf: np.asarray(leaf)[()] if isinstance(leaf, (float, complex)) else whole(leaf)
+        super().__init__(mapped(number, x))
         for name, values in zip(self.names, self.values):
             if not np.all(np.isfinite(values)):
                 raise NonFiniteError(f"a gradient is checked at finite values, and {name} holds NaN or infinity")

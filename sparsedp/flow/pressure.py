@@ -117,31 +117,34 @@ class Potential(Projected):
 class Projection(Operator):
     """The Operator that `projection` makes, with its pressure and its records."""
 
-    structure: Projected
+    setup: Setup
 
     def __init__(self, setup):
         faces = setup.grid.faces
-        super().__init__(Projected(setup), faces, faces, "projection", "matrix-free")
+        structure = Projected(setup) if faces.layout is None else setup.operators()[0].structure
+        super().__init__(structure, faces, faces, "projection", "matrix-free")
+        vars(self)["setup"] = setup
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
-        return Projection, (self.structure.setup,)
+        return Projection, (self.setup,)
 
     @property
     def info(self):
         """SolveLog of the pressure solves: .forward, .adjoint, .setup_seconds."""
-        return self.structure.setup.info
+        return self.setup.info
 
     @property
     def method(self):
         """The word of the pressure solver in use."""
-        return self.structure.setup.inverse.method
+        return self.setup.inverse.method
 
     @cached_property
     def pressure(self):
         """Operator faces -> cells: the p with P(v) = v + G(p) on the faces where the flow is free [velocity length]."""
-        setup = self.structure.setup
-        return Operator(Potential(setup), setup.grid.faces, setup.grid.cells, "pressure")
+        grid = self.setup.grid
+        structure = Potential(self.setup) if grid.layout is None else self.setup.operators()[1].structure
+        return Operator(structure, grid.faces, grid.cells, "pressure")
 
     def __str__(self):
-        return str(self.structure.setup.inverse)
+        return str(self.setup.inverse)

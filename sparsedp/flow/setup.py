@@ -18,7 +18,7 @@ from sparsedp.errors import NonFiniteError
 from sparsedp.fields import check_finite, place
 from sparsedp.flow.passes import Products, compiled
 from sparsedp.grid import Grid
-from sparsedp.operators.boundary import check_solid, solid_faces
+from sparsedp.operators.boundary import check_solid, diagonal, solid_faces
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import build
@@ -45,9 +45,12 @@ class Setup(Remade):
         self.open = faces_that(grid, self.sides, self.solid, lambda condition: not condition.closed)
         self.exponent = int(np.frexp(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))[1])
         near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
-        D, G = divergence(near), gradient(near, self.pressure_conditions, self.solid)
+        near = near if grid.layout is None else grid.layout.laid(near)
+        self._maps = D, G = divergence(near), gradient(near, self.pressure_conditions, self.solid)
         self.inverse = _inverse(-D @ G, settings)
         self._refuse_lost_inflow()
+        if grid.layout is not None:
+            return
         maps = (D.structure, G.structure), (G.T.structure, D.T.structure)
         self._reach = [largest(first.magnitude()(np.ones(grid.faces.size))) for first, _ in maps]
         # Of the forward solve, and of the adjoint one.
@@ -64,6 +67,14 @@ class Setup(Remade):
     def recipe(self):
         """The call that makes it again: see recipe.py."""
         return Setup, self.made
+
+    def operators(self):
+        """(P, its pressure) as products: so they act on ranks, where no pass sees the whole field."""
+        D, G = self._maps
+        K = diagonal(G.codomain, self.open)  # 0 times NaN is NaN: the solve refuses it
+        p = self.inverse @ D @ K
+        P = K + G @ p
+        return 0.0 * P if self.still else P, 2.0**self.exponent * p
 
     @property
     def _exact(self):
@@ -148,7 +159,7 @@ class Setup(Remade):
         closed = system.null_space.right != 0
         if system.active is not None:  # a cell with no free face at all
             closed = closed | ~system.active
-        closed = closed.reshape(self.grid.shape) & (True if self.solid is None else ~self.solid)
+        closed = system.whole(closed).reshape(self.grid.shape) & (True if self.solid is None else ~self.solid)
         for axis, pair in enumerate(self.sides):
             for side, condition in zip((0, -1), pair or (), strict=False):
                 if condition == inflow and np.take(closed, side, axis).any():
@@ -158,7 +169,7 @@ class Setup(Remade):
 
 def _inverse(op, settings):
     """The inverse for the pressure. Transforms are preferred on small grids too: the passes go with them."""
-    if settings["method"] == "auto" and op.domain.size < FEW and op.separable:
+    if settings["method"] == "auto" and op.domain.size < FEW and op.separable and op.layout is None:
         try:
             return _inverse(op, settings | {"method": "separable"})
         except ValueError:  # an axis that cannot be diagonalised with all its digits

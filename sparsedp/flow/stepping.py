@@ -41,6 +41,7 @@ from sparsedp.errors import DerivativeError, ShapeError, UnstableStepError
 from sparsedp.fields import check_finite, check_function, check_number, check_takes, rounded_down
 from sparsedp.flow.momentum import convection, face_laplacian, free_faces
 from sparsedp.flow.pressure import projection
+from sparsedp.grid import check_grid
 from sparsedp.operators.boundary import identity, lift, mask
 from sparsedp.operators.difference import divergence, gradient, laplacian
 from sparsedp.operators.transfer import average
@@ -149,6 +150,7 @@ def flow_step(
     True
     """
     given = copied(locals())  # the caller may change them
+    check_grid("flow_step", grid)
     _check_constant("dt", dt, "> 0")
     if not callable(viscosity):
         _check_constant("viscosity", viscosity, ">= 0")
@@ -208,7 +210,7 @@ class FlowStep(Remade):
         self.strict, self.implicit = given["unstable"] == "raise", given["implicit"]
         self.project = projection(grid, solid, boundary)
         self.pressure, self.divergence = self.project.pressure, divergence(grid)
-        setup = self.project.structure.setup
+        setup = self.project.setup
         self.slope = gradient(grid, setup.pressure_conditions, solid)
         self.open = mask(grid.faces, setup.open)
         # A force is for faces that are free: an implicit viscosity would carry it from the others into the fluid.

@@ -31,6 +31,7 @@ derivative.
 """
 
 from collections import deque
+from functools import reduce
 from math import prod
 from typing import Any, NamedTuple
 
@@ -41,11 +42,12 @@ from sparsedp.constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.integrators.runge_kutta import Scheme
+from sparsedp.shortcuts import on_every_rank
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain
 from sparsedp.tree import flatten, leaves, mapped
 
-__all__ = ["Adaptive", "Moving", "Taken", "flat", "relative"]
+__all__ = ["Adaptive", "Moving", "Taken", "relative"]
 
 SAFETY, SMALLEST, LARGEST = 0.9, 0.2, 5.0  # of one change of the length
 QUIET = 1e-2  # share of the tolerance below which an error shows no trend
@@ -163,7 +165,8 @@ class Adaptive(Scheme):
     def _first(self, u, params, t, h):
         """A first length from the size of the rate: one that changes the state by a hundredth."""
         size, speed = (
-            float(np.max(flat(map(np.abs, leaves(tree))), initial=0.0)) for tree in (u, self.problem(u, params, t))
+            float(np.max([np.max(np.abs(leaf), initial=0.0) for leaf in leaves(tree)], initial=0.0))
+            for tree in (u, self.problem(u, params, t))
         )
         if not np.isfinite(speed):
             raise NonFiniteError(
@@ -206,14 +209,17 @@ class Adaptive(Scheme):
     def sizes(self, *states):
         """For each array of the state |u| + floor, to which its errors are compared."""
         columns = list(zip(*map(leaves, states), strict=True))
-        sizes = [np.max(np.abs(parts), axis=0) for parts in columns]
+        sizes = [reduce(np.maximum, map(np.abs, parts)) for parts in columns]
         pairs = zip(sizes, self._floors(len(columns)), strict=True)
         return [size + (FLOOR * np.max(size, initial=0.0) if floor is None else floor) for size, floor in pairs]
 
     def _error(self, u, new, whole):
         rows = zip(self.sizes(u, new), leaves(new), leaves(whole), strict=True)
-        share = flat(np.where(one == other, 0.0, np.abs(one - other) / size) for size, one, other in rows)
-        return float(np.linalg.norm(share)) / (max(share.size, 1) ** 0.5 * self.tolerance * self.ratio)
+        shares = [np.where(one == other, 0.0, np.abs(one - other) / size) for size, one, other in rows]
+        count = sum(share.size for share in shares)
+        return float(np.linalg.norm([*map(np.linalg.norm, shares)])) / (
+            max(count, 1) ** 0.5 * self.tolerance * self.ratio
+        )
 
     def _followed(self, path, given, moves=isbox):
         """The state at the end of the path, with a derivative that is judged; `moves`: which leaves have one."""
@@ -317,7 +323,7 @@ class Moving:
         """Tree -> flat."""
         found, parts = leaves(tree), []
         for place, leaf, size in self.moving:
-            part = _off(found[place], leaf) / size
+            part = on_every_rank(_off(found[place], leaf) / size)
             parts += [anp.real(part), anp.imag(part)] if np.iscomplexobj(leaf) else [part]
         return self.space.join(*parts)
 
@@ -328,10 +334,6 @@ class Moving:
             part = next(parts) + 1j * next(parts) if np.iscomplexobj(leaf) else next(parts)
             found[place] = leaf + cast(size * part, dtype_of(leaf))
         return self.rebuild(found)
-
-
-def flat(parts):
-    return anp.concatenate([np.zeros(0), *map(anp.ravel, parts)])
 
 
 def _off(leaf, known):

@@ -54,7 +54,7 @@ def stepper(
     ----------
     method : str
         ======================= ===== ==============================================================
-        euler heun ssprk3 rk4   1 to 4 explicit: cheap where nothing is stiff
+        euler heun ssprk3 rk4   1-4   explicit: cheap where nothing is stiff
         backward_euler          1     L-stable: any dt, what is stiff dies out
         crank_nicolson          2     any dt, but what is stiff keeps its size and changes sign (it rings)
         tr_bdf2                 2     L-stable, two stages with one factor
@@ -200,7 +200,8 @@ def _scheme(method, given, settings):
         raise TypeError(f"{method} needs the stiff linear term: write linear=L or linear=(L, coefficient)")
     scheme: Scheme
     if method in EXPLICIT:
-        scheme = (Polynomial if problem.linear and problem.source is None else Explicit)(problem, method)
+        plain = problem.linear and problem.source is None and all(term.op.layout is None for term in problem.stiff)
+        scheme = (Polynomial if plain else Explicit)(problem, method)
     elif method == "etdrk4":
         scheme = Exponential(problem)
     elif method == "imex" or problem.linear:

@@ -28,6 +28,7 @@ from scipy.special import hyp1f1
 from sparsedp.derivative import of_argument
 from sparsedp.errors import NonFiniteError
 from sparsedp.fields import field_array
+from sparsedp.shortcuts import refuse_elsewhere
 from sparsedp.solvers.separable import diagonalised
 from sparsedp.tape import Rule, isbox
 
@@ -189,6 +190,7 @@ class PhiFunctions(Functions):
     def plain(self, rows, z, fields, transposed=False):
         """[the sum for each row of functions], on plain values, or with the transpose of L."""
         op, z = (self.op.T if transposed else self.op), float(z)
+        refuse_elsewhere(self.name, fields)
         fields = [field_array(self, field, batch=True) for field in fields]
         if z == 0:  # no transform, and for phi_0 the field itself, bit for bit
             return [sum(f.at_zero(op, field) for f, field in zip(row, fields, strict=True)) for row in rows]

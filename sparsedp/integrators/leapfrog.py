@@ -32,6 +32,7 @@ from sparsedp.grid import AXES, check_grid
 from sparsedp.integrators.adaptive import Moving
 from sparsedp.integrators.problem import combine, of_fields, untraced
 from sparsedp.integrators.runge_kutta import Scheme
+from sparsedp.shortcuts import on_every_rank
 from sparsedp.solvers.cache import Cache
 from sparsedp.tape import is_variable, plain
 from sparsedp.tree import flatten, leaves, leaves_like, mapped
@@ -77,7 +78,7 @@ class Leapfrog(Scheme):
 
     def check_stable(self, state, params, h, known):
         """Refuse a step that would grow without bound; `known`: what the frequencies depend on."""
-        state, params, h, known = untraced((state, params, h, known))
+        state, params, h, known = mapped(on_every_rank, untraced((state, params, h, known)))
         key = h, *leaves(known)
         fastest = self._speeds.find(key)
         if fastest is None:
@@ -207,7 +208,8 @@ def sponge(grid, cells, speed, echo=1e-3):
         total = np.zeros(places[0].shape)
         for axis, name in enumerate(grid.axes):
             for upper, count in enumerate(np.broadcast_to(depths.get(name, 0), 2)):
-                total += _rate(grid, axis, upper, count, places[axis]) * (POWER + 1) / 2 * speed * log(1 / echo)
+                rate = _rate(grid, axis, upper, count, places[axis]) * (POWER + 1) / 2 * speed * log(1 / echo)
+                total = total + rate
         rates.append(total)
     return rates[0], grid.join(*rates[1:])
 

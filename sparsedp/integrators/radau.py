@@ -29,14 +29,16 @@ from collections import deque
 from functools import lru_cache
 from itertools import pairwise
 
+import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import constant
 from sparsedp.derivative import backward_each, linearised
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Taken, flat
+from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Taken
 from sparsedp.integrators.problem import combine, like, untraced
 from sparsedp.integrators.runge_kutta import Scheme, as_matrix
+from sparsedp.shortcuts import refuse_elsewhere
 from sparsedp.solvers.direct import dense_lu
 from sparsedp.solvers.newton import Layout
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, traces_of
@@ -97,6 +99,11 @@ class Radau(Scheme):
         new = interval(v, [leaf for leaf in leaves(params) if isbox(leaf)], 0.0 if t is None else t + 0.0, h)
         self.taken = interval.taken
         return interval.problem.layout.rounded(new)
+
+
+def flat(parts):
+    """Arrays -> one flat array."""
+    return anp.concatenate([np.zeros(0), *map(anp.ravel, parts)])
 
 
 class Flat:
@@ -173,6 +180,7 @@ class Interval(Adaptive):
         """Refuse a state, a rate, or derivatives that it cannot serve."""
         u, _, t, h = untraced(given)
         rate = self.problem.problem(u, self.params, t)
+        refuse_elsewhere(self.name, leaves(rate))
         like(combine(u, (0.0, rate)), u)  # refuses other shapes, and complex
         if any(map(isbox, leaves(rate))):
             raise DerivativeError(

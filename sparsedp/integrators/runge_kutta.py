@@ -52,14 +52,15 @@ from numpy.polynomial import Polynomial as Line
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import ConvergenceError
-from sparsedp.fields import field_array
 from sparsedp.integrators.functions import Function, PhiFunctions, Taylor, TaylorPolynomials
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_matrix
+from sparsedp.shortcuts import FLOAT
 from sparsedp.solvers.inverses import build
+from sparsedp.solvers.nullspace import Projector
 from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
@@ -186,6 +187,7 @@ class Resolvent:
 
     def __init__(self, op, name, settings, most=2, log=None):
         self.op, self.name, self.settings = op, name, settings
+        self._one = Operator(Kronecker.identity(op.domain.parts), op.domain, op.domain, "identity")
         self.info, self._inverse = log or SolveLog(), lru_cache(most)(self._set_up)
         self._checked, self._rules = self._rule(False, True), [self._rule(False), self._rule(True)]
 
@@ -216,33 +218,32 @@ class Resolvent:
         if z == 0:
             if recordings:
                 note(self._checked.name, "skipped", "dt or coefficient 0, no solve and no set-up")
-            return np.array(b, dtype=np.result_type(b, np.float32))  # whole numbers become floating ones
+            return self._one.apply(b)  # whole numbers become floating ones
         inv = self._inverse(float(z))
         inv = inv.T if transposed else inv if checked else inv.tangent
-        if self._null_space is None:
+        if self._moving is None:
             return inv.apply(b)
-        field = field_array(inv, b, batch=True)
+        part = self._moving[transposed]
+        field = b if type(b) is np.ndarray and b.dtype is FLOAT else self._one.apply(b)
         wide = field.astype(np.result_type(field, np.float64), copy=False)
-        moving = self._projected(wide, transposed)
-        x = self._projected(inv.apply(moving), transposed) + (wide - moving)
+        moving = part.apply(wide)
+        x = part.apply(inv.apply(moving)) + (wide - moving)
         return x.astype(field.dtype, copy=False)
 
-    def _projected(self, b, transposed):
-        """b without what L leaves as it is, field by field of a batch."""
-        fields = [self._null_space.project(field, transposed) for field in b.reshape(-1, self.op.shape[0])]
-        return np.array(fields).reshape(b.shape)
-
     @cached_property
-    def _null_space(self):
-        """That of L where L is symmetric up to weights, None where there is none."""
-        system = System(self.op, self.settings["rtol"], None)
-        known = self.op.structure.has_entries and not system.complex and system.weights is not None
-        return system.null_space if known and system.null_space.count else None
+    def _moving(self):
+        """Projections, for L and L^T, of what they do not leave as it is; None where that is all, or L unsymmetric."""
+        make, space = System if self.op.layout is None else self.op.layout.system, self.op.domain
+        system = make(self.op, self.settings["rtol"], None)
+        if not self.op.structure.has_entries or system.complex or system.weights is None:
+            return None
+        null = system.null_space
+        both = (Projector(null, space.size, transposed) for transposed in (False, True))
+        return [Operator(projector, space, space, self.name) for projector in both] if null.count else None
 
     def _set_up(self, z):
         """The inverse of 1 - z L."""
-        one = Operator(Kronecker.identity(self.op.domain.parts), self.op.domain, self.op.domain, "identity")
-        return build(one - z * self.op, name=self.name, log=self.info, **self.settings)
+        return build(self._one - z * self.op, name=self.name, log=self.info, **self.settings)
 
 
 # ---- implicit: steps made of stages ----------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_finite
+from sparsedp.fields import check_finite, check_native
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, cell_beside
@@ -60,6 +60,7 @@ def harmonic_average(grid):
     pair = _pair_rule(widths / (widths + others))
 
     def average(k):
+        check_native("harmonic_average", k)
         values = array(plain(k))
         if values.shape != grid.shape:
             raise ShapeError(f"harmonic_average takes a field on {grid.cells}, got an array of shape {values.shape}")

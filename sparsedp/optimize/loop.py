@@ -18,6 +18,7 @@ from sparsedp.optimize.sparse_terms import admm
 from sparsedp.optimize.trials import Trials
 from sparsedp.optimize.watch import Watch
 from sparsedp.progress import shown_steps
+from sparsedp.shortcuts import ELSEWHERE, together
 from sparsedp.tree import leaves
 
 __all__ = ["minimize"]
@@ -58,7 +59,8 @@ def minimize(
         half_inverse it returns residuals, an array, and half the sum of their squares is minimized. For
         physical_gradient it is a function of the end state ``physics(x)``.
     start : array, number, or any nesting of them in tuples, lists and dicts
-        Not modified. Leaves that are not floating stay as they are.
+        Not modified. Leaves that are not floating stay as they are. Where one is a field on ranks, PETSc's TAO does
+        the search, by lbfgs, with bounds that are numbers, and without the other options.
     method : str
         "lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "levenberg_marquardt", "half_inverse",
         "physical_gradient"; or "admm", which adds weight |K x|_1 to the loss: few entries, few jumps.
@@ -142,8 +144,11 @@ def minimize(
         raise ValueError(f"minimize needs maxiter >= 0, a whole number, got {maxiter!r}; the default is 100")
     if not callable(tolerance) and not (is_number(tolerance) and tolerance >= 0):
         raise ValueError(f"minimize needs a tolerance >= 0, got {tolerance!r}; the default is 1e-8")
+    unused = dict(progress=progress, gradient=gradient, project=project, batches=batches, checkpoint=checkpoint)
+    for leaf in leaves(start):
+        if type(leaf) in ELSEWHERE:
+            return leaf.layout.minimize(loss, start, method, maxiter, tolerance, callback, bounds, options | unused)
     if stepper is None:
-        unused = dict(progress=progress, gradient=gradient, project=project, batches=batches, checkpoint=checkpoint)
         for name, given in {**unused, "tolerance": callable(tolerance)}.items():
             if given:
                 raise TypeError(f"admm does not use {name}; leave it out")
@@ -168,12 +173,12 @@ def minimize(
         "method": method, "set of options": sorted(options.items()), "pair of bounds": (box.lower, box.upper),
         "start": start,
     }  # fmt: skip
-    kept = Checkpoint(checkpoint, settings)
-    covariance = None
+    kept, covariance = Checkpoint(checkpoint, settings), None
     watch = Watch(trials, packing, tolerance, callback)
     steps = shown_steps(progress, range(int(maxiter)), "minimize")
     try:
-        _run(stepper, trials, watch, kept, box.inside(packing.pack(start)), steps)
+        begin = box.inside(packing.pack(start))
+        together("minimize", (start,), _run, stepper, trials, watch, kept, begin, steps)
         covariance = trials.covariance(trials.best)
     except KeyboardInterrupt:
         if not watch.history:

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.constants import constant
-from sparsedp.fields import check_finite, is_number
+from sparsedp.fields import check_finite, check_native, is_number
 from sparsedp.grid import check_grid
 from sparsedp.operators.boundary import interior
 from sparsedp.operators.difference import divergence, gradient
@@ -119,6 +119,7 @@ def _square(grid, name, solid):
     volumes = grid.volumes if solid is None else np.where(solid, 0.0, grid.volumes)
 
     def square(u):
+        check_native(name, u)
         if dtype_of(u).kind == "c":
             raise TypeError(f"{name} takes real fields, got complex numbers; add that of u.real and that of u.imag")
         g = mean(inside(slope(u)) ** 2)

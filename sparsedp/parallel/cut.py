@@ -17,12 +17,13 @@ import scipy.sparse as sp
 from sparsedp.parallel.exchange import of_boxes, of_entries
 from sparsedp.parallel.partition import lengths, slices
 from sparsedp.solvers.inverses import Solution
+from sparsedp.solvers.nullspace import Projector
 from sparsedp.structure.base import Matrix, Structure, rows_of
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker, Term, components
 from sparsedp.structure.lazy import Chain, Diagonal, Mask, Sum
 
-__all__ = ["Entries", "Rows", "between", "localized"]
+__all__ = ["Entries", "Rows", "OnBlocks", "between", "localized"]
 
 
 def localized(structure, given, made):
@@ -43,6 +44,7 @@ def localized(structure, given, made):
         return Rows(structure, given[0], made[0])
     if isinstance(structure, Diagonal) and given:
         take = partial(given[0].take, parts=given[1])
+        given[0].tell(structure.values)
         values = take(structure.values)
         return Mask(take(structure.keep), values) if isinstance(structure, Mask) else Diagonal(values)
     if isinstance(structure, Chain):
@@ -50,8 +52,8 @@ def localized(structure, given, made):
         return Chain([localized(m, b, a) for m, a, b in zip(structure.members, sides, sides[1:])])
     if isinstance(structure, Sum):
         return Sum([localized(member, given, made) for member in structure.members])
-    if isinstance(structure, Solution):
-        return Solved(structure)
+    if isinstance(structure, (Solution, Projector)):
+        return OnBlocks(structure, given[0].size(given[1]))
     if isinstance(structure, (Kronecker, Matrix)):
         return Entries(structure.explicit(), given, made)
     if isinstance(structure, Diagonal):
@@ -212,14 +214,11 @@ def _cut_factor(factor, rows, columns, wraps, along):
 # ---- solves and matrices ----
 
 
-class Solved(Structure):
-    """A solve on ranks: it acts on blocks as it is."""
+class OnBlocks(Structure):
+    """What acts on blocks as it is: a solve on ranks, a projection of its data."""
 
-    def __init__(self, solution):
-        self.solution, self.shape = solution, (solution.solver.system.here,) * 2
-
-    def apply(self, x, out):
-        self.solution.apply(x, out)
+    def __init__(self, whole, size):
+        self.apply, self.shape = whole.apply, (size, size)  # type: ignore[method-assign]
 
 
 class Entries(Structure):
@@ -227,6 +226,7 @@ class Entries(Structure):
 
     def __init__(self, matrix, given, made):
         self.dtype = matrix.dtype
+        (given or made)[0].tell(matrix.data)
         rows = np.arange(matrix.shape[0])
         matrix = matrix[made[0].take(rows, made[1])] if made else matrix
         self.read, columns = (lambda x: x), matrix.shape[1]

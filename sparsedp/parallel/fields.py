@@ -6,15 +6,16 @@ silently local, no program branches differently on two ranks, and every rank rec
 whole shape is a field that every rank knows: beside a field on ranks, each takes its own block.
 """
 
-from functools import partial
+from functools import partial, partialmethod
 
 import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.parallel.partition import slices
+from sparsedp.parallel.agreement import course
 from sparsedp.shortcuts import BOX, ELSEWHERE
 from sparsedp.tape import VSpace, autograd_rules, isbox, linear, plain
+from sparsedp.tree import leaves
 
 __all__ = ["DistributedField", "alike", "block", "everywhere", "total"]
 
@@ -45,7 +46,7 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         """Itself: nobody can write into it."""
         return self
 
-    def astype(self, dtype):
+    def astype(self, dtype, copy=True):
         """The same field in another dtype."""
         return self.like(self.flat.astype(dtype))
 
@@ -62,36 +63,15 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         name = getattr(what, "__name__", what)
         raise TypeError(f"{name} does not work on a field that lies on ranks; write dp.gather(u) for the whole array")
 
-    def __getitem__(self, index):
-        self.refuse("u[...]")
-
-    def __setitem__(self, index, value):
-        self.refuse("u[...] = value")
-
-    def __array__(self, *args, **options):
-        self.refuse("conversion to an array")
-
-    def __reduce__(self):
-        self.refuse("pickling")
-
-    def __bool__(self):
-        self.refuse("a truth value")
-
-    def __float__(self):
-        self.refuse("conversion to a number")
-
-    def __iter__(self):
-        self.refuse("iteration")
-
-    __complex__ = __int__ = __index__ = __float__
-    __len__ = __iter__
-
     def __repr__(self):
         return f"<field on {self.space}, on rank {self.layout.comm.rank} of {self.layout.comm.size}>"
 
     def block_of(self, value):
         """Another operand -> its flat block; numbers as they are."""
-        return value if np.ndim(value) == 0 else block(value, self.space).flat
+        if np.ndim(value):
+            return block(value, self.space).flat
+        self.layout.tell(value)
+        return value
 
     def __array_ufunc__(self, ufunc, method, *inputs, **options):
         if any(map(isbox, inputs)):
@@ -109,6 +89,14 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         return FUNCTIONS.get(function, partial(self.refuse, function))(*args, **options)
 
 
+for name, what in {
+    "__getitem__": "u[...]", "__setitem__": "u[...] = value", "__array__": "conversion to an array",
+    "__reduce__": "pickling", "__bool__": "a truth value", "__iter__": "iteration", "__len__": "iteration",
+    **dict.fromkeys(["__float__", "__complex__", "__int__", "__index__"], "conversion to a number"),
+}.items():  # fmt: skip
+    setattr(DistributedField, name, partialmethod(DistributedField.refuse, what))
+
+
 def block(value, space):
     """A field in any form -> one on ranks: such a field, a number, or what every rank has whole (or broadcasts)."""
     if isinstance(value, DistributedField):
@@ -116,6 +104,7 @@ def block(value, space):
             raise ShapeError(f"a field on {space.described} is needed, got one on {value.space.described}")
         return value
     value, layout = np.asarray(value), space.grid.layout
+    layout.tell(value)
     if np.ndim(value) == 0:
         return DistributedField(np.full(layout.size(space.parts), value), space)
     try:
@@ -124,9 +113,7 @@ def block(value, space):
         raise ShapeError(
             f"a field on {space.described} is needed, got an array of shape {value.shape}; give the whole array"
         ) from None
-    if len(space.parts) > 1:
-        return DistributedField(layout.take(whole, space.parts), space)
-    return DistributedField(whole[slices(layout.box(space.shape))].reshape(-1).copy(), space)
+    return DistributedField(layout.take(whole.reshape(-1), space.parts), space)
 
 
 # ---- what NumPy's functions do with them ----
@@ -136,14 +123,14 @@ def _first(*values):
     return next(value for value in values if isinstance(value, DistributedField))
 
 
-def _over_all(act):
+def _over_all(act, name):
     """A function of a field and no further choice -> the same, which refuses an axis."""
 
     def function(x, axis=None, dtype=None, out=None, keepdims=False, **options):
         if keepdims and axis is not None and not dtype and out is None and x.shape[axis] == 1:
             return x  # along an axis of one entry
         if axis is not None or keepdims or dtype is not None or out is not None or options:
-            x.refuse(f"{act.__name__[1:]} with a choice such as an axis")
+            x.refuse(f"{name} with a choice such as an axis")
         return act(x)
 
     return function
@@ -159,14 +146,17 @@ def _mean(x):
     return np.divide(_sum(x), x.size, dtype=np.result_type(x.dtype, float if x.dtype.kind in "biu" else x.dtype))
 
 
-def _max(x):
-    """The largest entry; NaN when one is NaN."""
-    return x.layout.max(np.max(x.flat, initial=_ends(x)[0]))
+def _extreme(act, end, x):
+    """The least or the largest entry; NaN when one is NaN."""
+    return x.layout.agreement.reduced(act.reduce(x.flat, initial=_ends(x)[end]), act)
 
 
-def _min(x):
-    """The least entry; NaN when one is NaN."""
-    return x.layout.min(np.min(x.flat, initial=_ends(x)[1]))
+_max, _min = partial(_extreme, np.maximum, 0), partial(_extreme, np.minimum, 1)
+
+
+def _max_from(x, *axis, initial=None, **options):
+    top = _over_all(_max, "max")(x, *axis, **options)
+    return top if initial is None else np.maximum(top, initial)
 
 
 def _ends(x):
@@ -176,60 +166,38 @@ def _ends(x):
     return {"f": (-np.inf, np.inf), "b": (False, True)}.get(x.dtype.kind) or x.refuse("an order of complex numbers")
 
 
-def _any(x):
-    """Whether an entry is not 0."""
-    return bool(x.layout.max(int(np.any(x.flat))))
-
-
-def _all(x):
-    """Whether no entry is 0."""
-    return bool(x.layout.min(int(np.all(x.flat))))
-
-
 def _vdot(x, y):
     first = _first(x, y)
     here = np.vdot(*(block(value, first.space).flat for value in (x, y)))
     return here.dtype.type(first.layout.sum(here))
 
 
-def _norm(x, ord=None, axis=None, keepdims=False):
-    if ord is not None or axis is not None or keepdims:
-        x.refuse("norm with a choice such as an axis")
-    x = x if x.dtype.kind in "fc" else x.astype(float)
+def _norm(x):
+    """Root of the sum of the squares."""
+    x = 1.0 * x  # of whole numbers, too
     return np.sqrt(_vdot(x, x).real)
 
 
-def _where(condition, x, y):
-    first = _first(condition, x, y)
-    return first.like(np.where(*map(first.block_of, (condition, x, y))))
+def _by_entry(act, *values):
+    first = _first(*values)
+    return first.like(act(*map(first.block_of, values)))
 
 
-def _clip(x, low=None, high=None):
-    first = _first(x, low, high)
-    return first.like(np.clip(*map(first.block_of, (x, low, high))))
+def _equal(x, y, **options):
+    if options:
+        _first(x, y).refuse("array_equal with a choice")
+    return np.shape(x) == np.shape(y) and bool(np.all(x == y))
 
 
-def _equal(x, y, equal_nan=False):
-    if np.shape(x) != np.shape(y):
-        return False
-    first = _first(x, y)
-    return bool(first.layout.min(int(np.array_equal(first.block_of(x), first.block_of(y), equal_nan))))
-
-
-def _argmin(x, sign=1):
-    """Flat number in the whole field of the first least entry; NaN is less than all."""
-    layout, flat = x.layout, x.flat if x.dtype.kind == "b" else sign * x.flat
-    flat = flat.astype(float) * (sign if x.dtype.kind == "b" else 1)
-    mine = layout.take(np.arange(x.size), x.space.parts)
-    least = layout.min(np.min(flat, initial=np.inf))
-    at = mine[np.isnan(flat) if np.isnan(least) else flat == least]
-    return int(layout.min(np.min(at, initial=x.size)))
+def _place(extreme, x):
+    """Flat number in the whole field of the first entry that is the least or the largest, or NaN."""
+    here = (x.flat == extreme(x)) | np.isnan(x.flat)
+    at = x.layout.take(np.arange(x.size), x.space.parts)[here]
+    return int(x.layout.min(np.min(at, initial=x.size)))
 
 
 def _shaped(x, shape, **options):
-    if (shape if np.ndim(shape) else (shape,)) not in (x.shape, list(x.shape), (-1,) if x.ndim == 1 else x.shape):
-        x.refuse("reshape")
-    return x
+    return x if np.broadcast_to(0, x.shape).reshape(shape).shape == x.shape else x.refuse("reshape")
 
 
 def _filled(number):
@@ -253,20 +221,20 @@ FUNCTIONS = {
     np.result_type: _result_type,
     np.real: lambda x: x.real,
     np.imag: lambda x: x.imag,
-    np.sum: _over_all(_sum),
-    np.mean: _over_all(_mean),
-    np.max: _over_all(_max),
-    np.min: _over_all(_min),
-    np.any: _over_all(_any),
-    np.all: _over_all(_all),
+    np.sum: _over_all(_sum, "sum"),
+    np.mean: _over_all(_mean, "mean"),
+    np.max: _max_from,
+    np.min: _over_all(_min, "min"),
+    np.any: _over_all(lambda x: bool(_max(x.astype(bool))), "any"),
+    np.all: _over_all(lambda x: bool(_min(x.astype(bool))), "all"),
     np.count_nonzero: lambda x: int(x.layout.sum(np.count_nonzero(x.flat))),
-    np.argmin: _argmin,
-    np.argmax: partial(_argmin, sign=-1),
+    np.argmin: partial(_place, _min),
+    np.argmax: partial(_place, _max),
     np.vdot: _vdot,
-    np.linalg.norm: _norm,
+    np.linalg.norm: _over_all(_norm, "norm"),
     np.array_equal: _equal,
-    np.where: _where,
-    np.clip: _clip,
+    np.where: lambda condition, x, y: _by_entry(np.where, condition, x, y),
+    np.clip: lambda x, low=None, high=None: _by_entry(np.clip, x, low, high),
     np.reshape: _shaped,
     np.repeat: _repeat,
     np.copy: lambda x: x,
@@ -277,7 +245,7 @@ FUNCTIONS = {
 FUNCTIONS.update({np.amax: FUNCTIONS[np.max], np.amin: FUNCTIONS[np.min]})
 
 
-OVER_ALL = {np.add: _sum, np.maximum: _max, np.minimum: _min}  # as ``np.add.reduce(u, axis=None)``
+OVER_ALL: dict = {np.add: _sum, np.maximum: _max, np.minimum: _min}  # as ``np.add.reduce(u, axis=None)``
 
 
 # ---- derivatives ----
@@ -372,6 +340,42 @@ class Sums(VSpace):
         return x + y
 
 
+# ---- calls that all ranks make alike ----
+
+
+def together(what, given, act, *args):
+    """act(*args): what one rank raises, all raise; the arguments `given` and the result must be the same on all.
+
+    Where no field on ranks was met, nothing is asked.
+    """
+    outermost, untold = course.begun is None, (what, given)
+    if outermost:
+        course.begun = course.met
+    course.untold.append(untold)
+    try:
+        try:
+            result = act(*args)
+        except Exception as error:
+            if agreement := _agreement(given):
+                agreement.fail(error)
+            raise
+        if agreement := _agreement(given):
+            agreement.tell_all("the result", what, result)
+            agreement.meet(what)
+        return result
+    finally:
+        course.untold[:] = [other for other in course.untold if other is not untold]
+        if outermost:
+            course.begun = None
+
+
+def _agreement(given):
+    """That of the fields among some values, or of the last message since the outermost call began; else None."""
+    layouts = [getattr(plain(leaf), "layout", None) for leaf in leaves(given)]
+    found = next((layout.agreement for layout in layouts if layout is not None), None)
+    return found or (course.last if course.met > course.begun else None)
+
+
 BOX.register(DistributedField)
 VSpace.register(DistributedField, Sums)
-ELSEWHERE[DistributedField] = formulas, alike
+ELSEWHERE[DistributedField] = formulas, alike, together, lambda: course.last.comm.size if course.last else 1

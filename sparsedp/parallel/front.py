@@ -2,7 +2,6 @@
 
 import os
 import sys
-import traceback
 
 import numpy as np
 
@@ -55,6 +54,7 @@ def distribute(grid, comm=None):
 
         if comm is None and told == MPI.COMM_WORLD.size == 1:
             return grid
+        from sparsedp.parallel.agreement import end_all
         from sparsedp.parallel.layout import Layout, laid
     except ImportError as error:
         raise ImportError(
@@ -67,7 +67,7 @@ def distribute(grid, comm=None):
             f"{told} processes were started, and mpi4py sees one: it belongs to another MPI; install it for this one"
         )
     if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
-        sys.excepthook = _end_all
+        sys.excepthook = end_all
     return laid(grid, Layout(grid.shape, grid.periodic, MPI.COMM_WORLD if comm is None else comm))
 
 
@@ -99,14 +99,3 @@ def gather(u):
         return np.asarray(u)
     except ValueError:
         raise ShapeError(f"gather takes one field, got {type(u).__name__}; gather them one by one") from None
-
-
-def _end_all(kind, error, trace):
-    """An error that ends one rank ends all: nobody waits for a message that never comes."""
-    from mpi4py import MPI
-
-    comm = MPI.COMM_WORLD
-    told = "".join(traceback.format_exception(kind, error, trace))
-    sys.stderr.write(f"rank {comm.rank} of {comm.size}: {told}")
-    sys.stderr.flush()
-    comm.Abort(1)

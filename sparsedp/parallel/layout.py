@@ -9,10 +9,11 @@ import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import field_array
-from sparsedp.parallel.cut import localized
+from sparsedp.parallel.cut import OnBlocks, localized
 from sparsedp.parallel.fields import DistributedField, block, everywhere
 from sparsedp.parallel.partition import Partition
 from sparsedp.parallel.solve import RanksSystem
+from sparsedp.parallel.transport import Carry
 from sparsedp.space import Space
 from sparsedp.structure.base import result_dtype
 from sparsedp.tape import Rule, linear, plain
@@ -22,8 +23,11 @@ __all__ = ["Layout"]
 # What asks by `check_grid` or `check_operator`, and is known to be right on ranks; all others are refused by name.
 RIGHT = {
     "component", "curl", "distribute", "divergence", "flux", "harmonic_average", "interior", "inverse", "laplacian",
-    "prolong", "restrict", "sample", "upwind",
+    "projection", "prolong", "restrict", "sample", "sponge", "transport", "upwind",
 }  # fmt: skip
+
+
+ENTRIES = 1000  # of an array that meets a field, so many are compared between ranks: it takes 5 us
 
 
 class Layout(Partition):
@@ -51,10 +55,13 @@ class Layout(Partition):
         """Operator, field on ranks or known to all -> the result, on ranks where its space is."""
         if out is not None:
             raise TypeError(f"{op.name} takes no out on ranks; leave it away")
+        return self.agreement.agreed(op.name, self._applied, op, u)
+
+    def _applied(self, op, u):
         x, side = self._given(op, u), _side(op.codomain)
-        if op.structure not in self._cuts:
-            self._cuts[op.structure] = localized(op.structure, _side(op.domain), side)
-        act = self._cuts[op.structure]
+        act = self._cuts.get(op.structure) or localized(op.structure, _side(op.domain), side)
+        if not isinstance(act, OnBlocks):  # which holds what it is made of, and would keep it for ever
+            self._cuts[op.structure] = act
         y = np.empty(act.shape[0], result_dtype(op.structure, x.dtype))
         act.apply(x, y)
         return DistributedField(y, op.codomain) if side else y.reshape(op.codomain.shape)
@@ -67,7 +74,7 @@ class Layout(Partition):
         u = field_array(op, u)
         return block(u, op.domain).flat if op.domain.layout else u.reshape(-1)
 
-    def system(self, op, rtol, maxiter, method, options):
+    def system(self, op, rtol, maxiter, method="auto", options=None):
         """The system of an operator on ranks, for `inverse`."""
         if _side(op.domain) != _side(op.codomain):
             raise TypeError(f"inverse of {op.name} does not work on ranks; both sides must lie there in the same way")
@@ -77,7 +84,25 @@ class Layout(Partition):
             raise TypeError(f"inverse takes real operators on ranks, {op.name} is complex; solve it on one process")
         return RanksSystem(op, rtol, maxiter)
 
+    def transport(self, setting):
+        """The setting of a transport -> its step, called with (u, v, dt, inflow)."""
+        return Carry(setting)
+
+    def minimize(self, *given):
+        """`minimize` of unknowns on ranks."""
+        from sparsedp.parallel.search import minimized
+
+        return minimized(self.comm, *given)
+
     # ------------------------------------------------------------ fields
+
+    def tell(self, value):
+        """Note a number or an array, or a part of its entries, that meets a field: it must be the same on all ranks."""
+        value, what = np.asarray(value), "a number"
+        if value.ndim:
+            most, what = round(ENTRIES ** (1 / value.ndim)), f"an array of shape {value.shape}"
+            value = value[tuple(slice(None, None, n // most + 1) for n in value.shape)]
+        self.agreement.tell(f"{what} beside a field on ranks", value.tobytes())
 
     def holds(self, *values):
         """Whether one of some values, traced or not, lies on ranks."""

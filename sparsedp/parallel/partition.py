@@ -10,7 +10,8 @@ from functools import cached_property
 from math import prod
 
 import numpy as np
-from mpi4py import MPI
+
+from sparsedp.parallel.agreement import Agreement
 
 __all__ = ["Partition"]
 
@@ -30,6 +31,8 @@ class Partition:
         self.shape, self.periodic, self.comm = tuple(shape), tuple(periodic), comm
         self.ranks = _arrangement(self.shape, comm.size)
         self.cuts = [n * np.arange(p + 1) // p for n, p in zip(self.shape, self.ranks)]
+        start = tuple(a for a, _ in self.box(self.shape))
+        self.agreement = Agreement(comm, f", whose block begins at cell {start}")
 
     @property
     def _key(self):
@@ -82,7 +85,7 @@ class Partition:
     def gather(self, flat, parts):
         """The flat block of this rank -> the whole flat field, on every rank."""
         whole = [np.empty(part, flat.dtype) for part in parts]
-        for rank, block in enumerate(self.comm.allgather(flat)):
+        for rank, block in enumerate(self.agreement.gathered(flat)):
             start = 0
             for target, part, shape in zip(whole, parts, self.shapes(parts, rank)):
                 target[slices(self.box(part, rank))] = block[start : start + prod(shape)].reshape(shape)
@@ -103,22 +106,16 @@ class Partition:
     # ------------------------------------------------------------ numbers that all ranks agree on
 
     def sum(self, number):
-        """Sum over the ranks, in their order: the same bits on each, whatever the MPI library does."""
-        return self._reduced(number, np.add)
+        """Sum over the ranks, in their order."""
+        return self.agreement.reduced(number, np.add)
 
     def max(self, number):
         """The largest of all ranks; NaN when one is NaN."""
-        return self._reduced(number, np.maximum)
+        return self.agreement.reduced(number, np.maximum)
 
     def min(self, number):
         """The least of all ranks; NaN when one is NaN."""
-        return self._reduced(number, np.minimum)
-
-    def _reduced(self, number, act):
-        number = np.asarray(number)
-        found = np.empty((self.comm.size, *number.shape), number.dtype)
-        self.comm.Allgather([number.tobytes(), MPI.BYTE], [found, MPI.BYTE])
-        return act.reduce(found, axis=0)[()]
+        return self.agreement.reduced(number, np.minimum)
 
 
 def lengths(box):

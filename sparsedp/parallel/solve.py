@@ -6,6 +6,7 @@ turn, and raise together. The true residual is that of the operator itself, not 
 """
 
 from functools import cached_property, reduce
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,7 +18,7 @@ from sparsedp.parallel.exchange import Exchange
 from sparsedp.parallel.fields import DistributedField
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.solve import Engine
-from sparsedp.solvers.system import SYMMETRIC, System
+from sparsedp.solvers.system import System
 from sparsedp.structure.lazy import Chain, Diagonal, Sum
 
 __all__ = ["PetscEngine", "RanksSystem"]
@@ -86,13 +87,14 @@ class RanksSystem(System):
     """What the contract and the engine ask of the operator, for fields on ranks. Arrays are flat blocks."""
 
     faces = last = None
+    here: Any = 0
 
     def __init__(self, op, rtol=1e-10, maxiter=None):
         self.layout, self.parts = op.domain.layout, op.domain.parts
         self.side = self.layout, self.parts
-        super().__init__(op, rtol, maxiter)
-        vars(self).pop("assembled", None)  # what was looked at before it was scaled
+        self.seed = [7, self.layout.comm.rank]
         self.here = self.layout.size(self.parts)
+        super().__init__(op, rtol, maxiter)
 
     # sizes, over all ranks
 
@@ -105,6 +107,15 @@ class RanksSystem(System):
         """Largest magnitude; NaN when there is one."""
         return float(self.layout.max(np.max(np.abs(x), initial=0.0)))
 
+    def total(self, numbers):
+        """Sums over all ranks."""
+        return self.layout.sum(numbers)
+
+    def extremes(self, x):
+        """The least and the largest entry."""
+        low, high = super().extremes(x)
+        return self.layout.min(low), self.layout.max(high)
+
     def counts(self, labels, weights, count):
         """Sums of weights over each label."""
         return self.layout.sum(np.bincount(labels, weights, count).astype(float))
@@ -112,6 +123,10 @@ class RanksSystem(System):
     def shaped(self, x, space):
         """The field of a flat block."""
         return DistributedField(x.copy(), space)
+
+    def whole(self, x):
+        """The flat array of all entries, on every rank."""
+        return self.layout.gather(x, self.parts)
 
     def number_of_largest(self, x):
         """Flat number, in the whole field, of the entry of largest magnitude."""
@@ -157,40 +172,6 @@ class RanksSystem(System):
         return PETSc.Vec().createWithArray(x, size=(x.size, self.size), comm=self.layout.comm)
 
     @cached_property
-    def sums(self):
-        """Sums of the magnitudes of each row and of each column."""
-        ones = np.ones(self.layout.size(self.parts))
-        return self.magnitude(ones), self.magnitude(ones, True)
-
-    @cached_property
-    def norms(self):
-        """|A|_inf and |A^T|_inf."""
-        return tuple(map(self.largest, self.sums))
-
-    def rounding(self, x, data, transposed=False):
-        """The residual that rounding leaves."""
-        return np.finfo(float).eps * (self.size_of(self.magnitude(np.abs(x), transposed)) + data)
-
-    # unknowns
-
-    @cached_property
-    def active(self):
-        """Which entries are unknowns; None when all are, on all ranks."""
-        read = self.sums[True] > 0
-        return None if self.layout.min(int(read.all())) else read
-
-    @cached_property
-    def unknowns(self):
-        """Number of unknowns."""
-        return int(self.layout.sum(self.here if self.active is None else np.count_nonzero(self.active)))
-
-    @cached_property
-    def empty_row(self):
-        """The first unknown whose row has no entries, or None."""
-        empty = self.masked((self.sums[False] == 0).astype(float))
-        return self.number_of_largest(empty) if self.largest(empty) else None
-
-    @cached_property
     def components(self):
         """(labels, count) of the connected components of the unknowns: those of the blocks, joined across ranks."""
         indptr, indices, data = self.matrix.getValuesCSR()
@@ -201,12 +182,12 @@ class RanksSystem(System):
         links = mine & (data != 0)
         graph = sp.coo_array((np.ones(links.sum()), (row[links], indices[links] - first)), shape=(here, here))
         many, labels = connected_components(graph, directed=False)
-        counts = self.layout.comm.allgather(many)
+        counts = self.layout.agreement.gathered(many)
         labels = labels + sum(counts[: self.layout.comm.rank])
         away, place = np.unique(indices[~mine & (data != 0)], return_inverse=True)
         whole = self._at_numbers(labels.astype(float), away)[place.reshape(-1)].astype(np.int64)
         pairs = np.unique(np.stack([labels[row[~mine & (data != 0)]], whole]), axis=1)
-        pairs = np.concatenate(self.layout.comm.allgather(pairs), axis=1)
+        pairs = np.concatenate(self.layout.agreement.gathered(pairs), axis=1)
         graph = sp.coo_array((np.ones(pairs.shape[1]), tuple(pairs)), shape=(sum(counts),) * 2)
         count, joined = connected_components(graph, directed=False)
         return joined[labels], count
@@ -236,36 +217,9 @@ class RanksSystem(System):
         return flat / 2.0 ** np.frexp(self.largest(flat))[1]
 
     @cached_property
-    def uniform(self):
-        """Whether all volumes are equal."""
-        least = self.layout.min(np.min(self.volumes, initial=np.inf))
-        return bool(self.largest(self.volumes) == least)
-
-    @cached_property
-    def weights(self):
-        """As in `System`."""
-        generator = np.random.default_rng([7, self.layout.comm.rank])
-        x, y = map(self.masked, generator.standard_normal((2, self.here)))
-        ax, ay, size = self.product(x), self.product(y), self.magnitude(np.abs(x))
-        for weights in [1.0] if self.uniform else [1.0, self.volumes, 1.0 / self.volumes]:
-            terms = np.array([y @ (weights * ax), x @ (weights * ay), np.abs(y) @ (weights * size)])
-            one, other, scale = self.layout.sum(terms)
-            if abs(one - other) <= SYMMETRIC * scale:
-                return weights
-        return None
-
-    @cached_property
     def diagonal(self):
         """The diagonal on the unknowns."""
         return self.masked(self.assembled.getDiagonal().getArray().copy())
-
-    @cached_property
-    def sign(self):
-        """1 or -1: the sign of the diagonal; 0 when it is mixed."""
-        values = self.diagonal if self.active is None else self.diagonal[self.active]
-        if self.layout.min(np.min(values, initial=np.inf)) > 0:
-            return 1
-        return -1 if self.layout.max(np.max(values, initial=-np.inf)) < 0 else 0
 
     @cached_property
     def matrix(self):
@@ -303,7 +257,7 @@ class RanksNullSpace(NullSpace):
         """Numbers, in the whole field, of the unknowns of one component."""
         layout, parts = self.side
         mine = layout.take(np.arange(sum(map(np.prod, parts))), parts)[self.labels == number]
-        return np.sort(np.concatenate(layout.comm.allgather(mine)))
+        return np.sort(np.concatenate(layout.agreement.gathered(mine)))
 
 
 # ---- the engine ----
@@ -358,6 +312,7 @@ class PetscEngine(Engine):
         self.ksp.setTolerances(rtol=rtol, atol=0.0, divtol=1e8, max_it=system.maxiter or MOST)
         weighed = self.sign * (b if self.rows is None or transposed else self.rows * b)
         x, turned = np.zeros(b.size), transposed and system.weights is None
+        system.layout.agreement.meet("solve by PETSc")
         (self.ksp.solveTranspose if turned else self.ksp.solve)(system.vector(weighed), system.vector(x))
         if self.rows is not None and transposed:
             x *= self.rows

@@ -28,6 +28,9 @@ TOTALS = {
     "matrices assembled": ("assembled",),
     "solves skipped": ("skipped",),
     "steps recomputed": ("recomputed",),
+    "exchanges between ranks": ("exchange",),
+    "bytes in them": ("sent",),
+    "reductions": ("reduction",),
 }
 
 
@@ -64,6 +67,8 @@ def explain(loss, x, gradient=True):
     loss ran is not counted: it is reused. Seconds are without those of the calls inside. What other threads do
     meanwhile is not counted either, those that the loss starts included.
     Bytes on the tape: all arrays that its nodes keep between the forward and the backward pass, each once.
+    On ranks: exchanges are those of fields and between neighbours, their bytes those of all ranks together, reductions
+    the numbers that all ranks agree on; what PETSc sends inside a solve is not counted. Every rank has the same counts.
 
     Examples
     --------

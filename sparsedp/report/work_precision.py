@@ -24,6 +24,7 @@ from sparsedp.report import plots
 from sparsedp.report.certificate import distance
 from sparsedp.report.plan import total
 from sparsedp.report.table import Table, csv_text, write_table
+from sparsedp.shortcuts import ranks
 from sparsedp.tree import leaves
 
 __all__ = ["COLUMNS", "Rows", "words_of", "workprec"]
@@ -87,7 +88,7 @@ def workprec(
     ValueError
         If `repeats` is not a whole number >= 1, there is no method, or the file is not such a table.
     TypeError
-        If the problem does not give (loss, x).
+        If the problem does not give (loss, x); on several ranks.
 
     Notes
     -----
@@ -107,6 +108,8 @@ def workprec(
     ['0.0313', '0.0078', '0.0020']
     """
     check_function("workprec", problem, "lambda cells: (loss, x)")
+    if ranks() > 1:
+        raise TypeError("workprec repeats runs by the clock, which no two ranks share; run it on one process")
     if not is_whole(repeats, 1):
         raise ValueError(f"workprec needs repeats >= 1, a whole number, got {repeats!r}; the default is 3")
     if not methods or not isinstance(methods, dict):

@@ -7,11 +7,12 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
-from sparsedp.fields import field_array, is_number, is_whole
+from sparsedp.fields import check_native, field_array, is_number, is_whole
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, spent
 from sparsedp.operator import Operator
 from sparsedp.operators.given import check_operator
+from sparsedp.shortcuts import together
 from sparsedp.solvers.amg import multigrid_engine
 from sparsedp.solvers.direct import DenseSystem, dense_engine, direct_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
@@ -120,7 +121,8 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     check_operator("inverse", op)
     if not fits(op.domain, op.codomain):
         raise ShapeError(f"inverse takes a square operator, got one from {op.domain} to {op.codomain}; write op.T @ op")
-    return build(op, **check_settings(method, rtol, maxiter, nullspace, options))
+    settings = check_settings(method, rtol, maxiter, nullspace, options)
+    return together("inverse", (op,), lambda: build(op, **settings))
 
 
 def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, solves="many", near=None):
@@ -361,6 +363,7 @@ class Inverse(Operator):
             return self.solver.unroll(b, start, self.structure.transposed)
         if start is None:
             return super().__call__(b)
+        check_native(self.name, start)
         if np.shape(start) != self.codomain.shape:
             raise ShapeError(f"{self.name} takes a start on {self.codomain}, got an array of shape {np.shape(start)}")
         structure, start = self.structure, np.asarray(plain(start)).reshape(-1)

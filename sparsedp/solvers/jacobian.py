@@ -226,6 +226,8 @@ class Jacobians:
             raise DerivativeError(f"the jacobian of {self.name} uses a traced value that is not an argument")
         if not isinstance(given, Operator):
             given = from_matrix(given if sp.issparse(given) or np.ndim(given) else [[given]], name=name)
+        if given.layout is not None:  # every rank solves for all unknowns
+            given = from_matrix(given.matrix, name=given.name)
         if given.shape != (size, size):
             raise ShapeError(f"the jacobian of {self.name} must have shape {(size, size)}, got {given.shape}")
         if given.dtype.kind == "c":
@@ -390,5 +392,7 @@ def fields_met(equation, x, leaves):
     spaces = [met[shape] for shape in shapes if shape in met]
     if len(spaces) == len(shapes) and len({space.grid for space in spaces}) == 1:
         one = len(spaces) == 1 and spaces[0].kind == "cells" and len(shapes[0]) > 1
-        return spaces[0] if one else None, [part for space in spaces for part in space.parts]
+        return spaces[0] if one and spaces[0].layout is None else None, [
+            part for space in spaces for part in space.parts
+        ]
     return None, shapes if len(set(map(len, shapes))) == 1 else [(equation.size,)]

@@ -39,6 +39,7 @@ from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, S
 from sparsedp.fields import check_finite, check_plain, leaves_by_name
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
+from sparsedp.shortcuts import on_every_rank, refuse_elsewhere
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import far_exponent, in_range, length
@@ -81,6 +82,7 @@ class Layout:
     def __init__(self, guess, name):
         found, rebuild = flatten(guess)
         found = [plain(leaf) for leaf in found]
+        refuse_elsewhere(name, found)
         for leaf in found:
             _check_unknown(leaf, name)
         # Rebuilt without values: a kept layout must not hold a trace or a large array.
@@ -195,7 +197,7 @@ class Equation:
             raise ShapeError(f"the residual of {self.name} must hold {self.size} numbers, as many as x, got {size}")
         if any(dtype_of(part).kind not in KINDS for part in parts):
             raise TypeError(f"the residual of {self.name} must be real; give real and imaginary part as two fields")
-        lines = [anp.reshape(part, (-1,)) for part in parts]
+        lines = [anp.reshape(on_every_rank(part), (-1,)) for part in parts]
         flat = lines[0] if len(lines) == 1 else anp.concatenate(lines) if lines else np.zeros(0)
         return flat if dtype_of(flat) == np.float64 else flat + np.zeros(self.size)
 

@@ -12,8 +12,9 @@ from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 
 from sparsedp.solvers.scaling import norm, subtracted
+from sparsedp.structure.base import Structure
 
-__all__ = ["NullSpace", "find_null_space"]
+__all__ = ["NullSpace", "Projector", "find_null_space"]
 
 EPS = np.finfo(float).eps
 ROUNDING = 8 * EPS  # a row whose entries sum to less than this share of their magnitudes sums to 0
@@ -106,6 +107,18 @@ class NullSpace:
         order = np.lexsort((-weight, labels))
         found = order[np.unique(labels[order], return_index=True)[1]]
         return found[labels[found] >= 0]
+
+
+class Projector(Structure):
+    """x without its part along a null space, as a linear map."""
+
+    has_entries = takes_complex = False
+
+    def __init__(self, space, size, transposed=False):
+        self.space, self.transposed, self.shape = space, transposed, (size, size)
+
+    def act(self, x, out):
+        self.space.project(x, self.transposed, into=out)
 
 
 def _number(side):

@@ -19,12 +19,14 @@ from sparsedp.fields import check_function
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note, thread
 from sparsedp.recipe import Remade
+from sparsedp.shortcuts import on_every_rank, together
 from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.inverses import check_settings
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation, Layout, Newton
 from sparsedp.solvers.solve import Run, SolveLog
 from sparsedp.tape import Rule, plain
+from sparsedp.tree import mapped
 
 __all__ = ["Root", "implicit", "steady"]
 
@@ -214,9 +216,10 @@ class Root(Remade):
         -------
         x, like the guess
         """
-        layout = Layout(guess, self.name)
+        layout, params = Layout(guess, self.name), mapped(on_every_rank, params)
         equation = Equation(self.residual, layout, params, self.name)
-        return layout.rounded(self._solution(equation, layout.flat(guess), *equation.variables(params)))
+        given = layout.flat(guess), *equation.variables(params)
+        return layout.rounded(together(self.name, (guess, *params), self._solution, equation, *given))
 
     # ------------------------------------------------------------ the root as a rule of the parameters
 

@@ -41,6 +41,8 @@ class System:
 
     make: Any = None  # its own builder of an engine, where there is only one
     size_of, largest = staticmethod(norm), staticmethod(largest)
+    here = property(lambda self: self.size)
+    seed: Any = 0
 
     def __init__(self, op, rtol=1e-10, maxiter=None):
         self.given = self.op = op
@@ -53,7 +55,7 @@ class System:
             self.exponent = int(np.clip(exponent, -1000, 1000))
             self.op = op * 2.0**-self.exponent
             _check_underflow(op, self.op)
-            for name in ("_magnitudes", "sums", "norms", "faces"):
+            for name in ("_magnitudes", "sums", "norms", "faces", "assembled", "absolute"):
                 self.__dict__.pop(name, None)
 
     # ------------------------------------------------------------ products
@@ -102,9 +104,21 @@ class System:
 
     # ------------------------------------------------------------ sizes
 
+    def total(self, numbers):
+        """Sums over all ranks that hold unknowns."""
+        return numbers
+
+    def extremes(self, x):
+        """The least and the largest entry."""
+        return np.min(x, initial=np.inf), np.max(x, initial=-np.inf)
+
     def shaped(self, x, space):
         """The field of a flat array."""
         return x.reshape(space.shape)
+
+    def whole(self, x):
+        """The flat array of all entries."""
+        return x
 
     def number_of_largest(self, x):
         """Flat number of the entry of largest magnitude."""
@@ -122,8 +136,7 @@ class System:
     @cached_property
     def sums(self):
         """Sums of the magnitudes of each row and of each column, or upper bounds of them."""
-        ones = np.ones(self.size)
-        return tuple(magnitude(ones) for magnitude in self._magnitudes)
+        return tuple(self.magnitude(np.ones(self.here), transposed) for transposed in (False, True))
 
     def magnitude(self, x, transposed=False):
         """An upper bound of |A| x for x >= 0."""
@@ -136,7 +149,7 @@ class System:
     @cached_property
     def norms(self):
         """|A|_inf and |A^T|_inf. An engine builder may set them."""
-        return tuple(float(np.max(sums, initial=0.0)) for sums in self.sums)
+        return tuple(map(self.largest, self.sums))
 
     # ------------------------------------------------------------ unknowns
 
@@ -150,20 +163,20 @@ class System:
         if self.faces is not None and self.faces.connected:
             return None
         read = self.sums[True] > 0
-        return None if read.all() else read
+        return read if self.largest(~read) else None
 
     @cached_property
     def unknowns(self):
         """Number of unknowns."""
-        return self.size if self.active is None else int(np.count_nonzero(self.active))
+        return self.size if self.active is None else int(self.total(np.count_nonzero(self.active)))
 
     @cached_property
     def empty_row(self):
         """The first unknown whose row has no entries, or None."""
         if self.faces is not None and self.faces.connected:
             return None
-        empty = np.flatnonzero(self.masked(self.sums[False] == 0))
-        return int(empty[0]) if empty.size else None
+        empty = self.masked(self.sums[False] == 0)
+        return self.number_of_largest(empty) if self.largest(empty) else None
 
     @cached_property
     def components(self):
@@ -201,7 +214,8 @@ class System:
     @cached_property
     def uniform(self):
         """Whether all volumes are equal."""
-        return not np.any(self.volumes != self.volumes[:1])
+        low, high = self.extremes(self.volumes)
+        return bool(low >= high)
 
     @cached_property
     def weights(self):
@@ -209,10 +223,12 @@ class System:
 
         Tried are ones, the cell volumes and their inverses, on two random vectors.
         """
-        x, y = map(self.masked, np.random.default_rng(0).standard_normal((2, self.size)))
+        x, y = map(self.masked, np.random.default_rng(self.seed).standard_normal((2, self.here)))
         ax, ay, size = self.product(x), self.product(y), self.magnitude(np.abs(x))
         for weights in [1.0] if self.uniform else [1.0, self.volumes, 1.0 / self.volumes]:
-            if abs(y @ (weights * ax) - x @ (weights * ay)) <= SYMMETRIC * (np.abs(y) @ (weights * size)):
+            terms = y @ (weights * ax), x @ (weights * ay), np.abs(y) @ (weights * size)
+            one, other, scale = self.total(np.array(terms))
+            if abs(one - other) <= SYMMETRIC * abs(scale):
                 return weights
         return None
 
@@ -245,8 +261,8 @@ class System:
         """1 or -1: the sign of the diagonal; 0 when it is mixed or not known."""
         if self.diagonal is None or self.complex:
             return 0
-        values = self.diagonal if self.active is None else self.diagonal[self.active]
-        return 1 if np.all(values > 0) else -1 if np.all(values < 0) else 0
+        low, high = self.extremes(self.diagonal if self.active is None else self.diagonal[self.active])
+        return 1 if low > 0 else -1 if high < 0 else 0
 
     @cached_property
     def matrix(self):
@@ -306,8 +322,7 @@ class System:
 
     def rounding(self, x, data, transposed=False):
         """The residual that rounding leaves, row by row: well below the bound with |A|_inf on stretched grids."""
-        rows = self.magnitude(np.abs(x), transposed)
-        return np.finfo(float).eps * (float(np.sqrt(rows @ rows)) + data)
+        return np.finfo(float).eps * (self.size_of(self.magnitude(np.abs(x), transposed)) + data)
 
 
 def _check_underflow(op, scaled):

@@ -1,6 +1,7 @@
 """rollout(): a time loop whose gradient costs one node on the tape."""
 
 import warnings
+from itertools import pairwise
 
 import numpy as np
 
@@ -8,8 +9,9 @@ from sparsedp.constants import constant_args
 from sparsedp.errors import BudgetWarning, DerivativeError, ShapeError
 from sparsedp.fields import check_function, check_takes, is_whole
 from sparsedp.ledger import thread
+from sparsedp.shortcuts import together
 from sparsedp.tape import dtype_of, innermost, is_variable, isbox, plain, through
-from sparsedp.trajectory.keep import All, Each, Last
+from sparsedp.trajectory.keep import All, Each, Last, Some
 from sparsedp.trajectory.layout import Layout
 from sparsedp.trajectory.run import Loop
 from sparsedp.trajectory.schedule import budget_within_reach, plan, room_within, slots_within
@@ -44,9 +46,10 @@ def rollout(
         what one step needs by itself, and what `keep` hands out; with keep="all" no state is run again.
         "reverse" keeps the last state alone, and goes back by ``step.back(state, params)``, the step turned round: for
         leapfrog without damping. Rounding makes the gradient a little off; more than 1e-8 is refused.
-    keep : "last", "all" or callable
-        What is handed out: the last state; all n + 1, each array with a new first axis; or the tuple of what
-        ``keep(index, state)`` returned for index = 0 ... n, any trees.
+    keep : "last", "all", list of int or callable
+        What is handed out: the last state; all n + 1, or those after so many steps (rising, 0 is the first state),
+        each array with a new first axis, of a field on ranks a tuple; or the tuple of what ``keep(index, state)``
+        returned for index = 0 ... n, any trees.
     truncate : int, optional
         Truncated back-propagation: state i counts as a constant for the steps after it wherever n - i is a
         multiple of `truncate`, 0 < i < n. The value is the same, derivatives of all orders are cut there.
@@ -109,6 +112,8 @@ def rollout(
     (2.0, -6.0)
     >>> rollout(decay, 16.0, 1.0, 3, keep="all")
     array([16.,  8.,  4.,  2.])
+    >>> rollout(decay, 16.0, 1.0, 3, keep=[1, 3])
+    array([8., 2.])
     """
     check_function("rollout", step, "lambda state, params: ...")
     n = _number_of_steps(n)
@@ -130,13 +135,14 @@ def rollout(
     if truncate is not None and not is_whole(truncate, 1):
         raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
     room = ROOM if memory is None else room_within(memory, *sizes) if slots else 0
-    loop = Loop(step, forms, n, truncate, innermost(args), _kind(keep, forms[0]), slots, room, progress, record)
+    loop = Loop(step, forms, n, truncate, innermost(args), _kind(keep, forms[0], n), slots, room, progress, record)
     _check_values(loop, args, traced)
     if loop.wanted and loop.slots:
         _warn_of_repeats(memory, *sizes)
     for hook in thread.loop_hooks:
         hook(step, state, params, inputs, n)
-    return loop.keep.tree(loop.parts(through(loop, loop.wanted, *args)))
+    result = together("rollout", tuple(given.values()), through, loop, loop.wanted, *args)
+    return loop.keep.tree(loop.parts(result))
 
 
 def _check_reversible(step):
@@ -178,12 +184,19 @@ def _warn_of_repeats(memory, size, n, beside):
         )
 
 
-def _kind(keep, layout):
+def _kind(keep, layout, n):
     if callable(keep):
         return Each(layout, keep)
-    if keep not in ("last", "all"):
-        raise ValueError(f'keep must be "last", "all" or a function of (index, state), got {keep!r}')
-    return All(layout) if keep == "all" else Last(layout)
+    if isinstance(keep, (list, tuple, range, np.ndarray)):
+        numbers = list(keep)
+        if not numbers or not all(is_whole(number, 0) for number in numbers):
+            raise ValueError(f"keep needs at least one state, numbers from 0 on, got {keep!r}")
+        if numbers[-1] > n or any(later <= number for number, later in pairwise(numbers)):
+            raise ValueError(f"keep needs rising numbers of states from 0 to n = {n}, got {keep!r}")
+        return Some(layout, numbers)
+    if not isinstance(keep, str) or keep not in ("last", "all"):
+        raise ValueError(f'keep must be "last", "all", a list of states or a function of (index, state), got {keep!r}')
+    return All(layout, range(n + 1)) if keep == "all" else Last(layout)
 
 
 def _check_values(loop, args, traced):

@@ -11,12 +11,13 @@ import numpy as np
 from sparsedp.constants import constant
 from sparsedp.derivative import linearised
 from sparsedp.errors import DerivativeError
+from sparsedp.shortcuts import ELSEWHERE, array
 from sparsedp.tape import dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, stacked
 from sparsedp.trajectory.steps import State
 from sparsedp.tree import leaves, mapped
 
-__all__ = ["All", "Each", "Last"]
+__all__ = ["All", "Each", "Last", "Some"]
 
 
 class Last:
@@ -57,44 +58,78 @@ class Last:
         return lambda state: g if state.i == n else None
 
 
-class All(Last):
-    """All n + 1 states, stacked along a new first axis."""
+class Some(Last):
+    """The states of these numbers, stacked along a new first axis; on ranks a tuple of them.
 
-    along = whole = True
+    Parameters
+    ----------
+    layout : Layout
+    numbers : sequence of int
+        Rising.
+    """
+
+    along = True
+
+    def __init__(self, layout, numbers):
+        super().__init__(layout)
+        self._rows = {number: row for row, number in enumerate(numbers)}
+        self._places: list = []  # of the variables: of their states among the outputs, or of their stack
 
     def start(self, steps):
-        """One block for each variable, or a list where its states are traced."""
-        n, outer = steps.loop.n, steps.outer
-        pairs = zip(self.layout.shapes, self.layout.dtypes, strict=True)
-        self._blocks: list = [[None] * (n + 1) if outer else np.empty((n + 1, *shape), kind) for shape, kind in pairs]
+        """One block for each variable, or a list where its states are traced, or lie elsewhere."""
+        n, lines = len(self._rows), zip(self.layout.shapes, self.layout.dtypes, steps.first.values, strict=True)
+        self._blocks: list = [
+            [None] * n if steps.outer or type(value) in ELSEWHERE else np.empty((n, *shape), kind)
+            for shape, kind, value in lines
+        ]
         self._statics, self._stored = [], bool(steps.loop.wanted)
 
     def see(self, state):
-        """A state of the run -> the same in the memory that is handed out."""
+        """A state of the run -> the same; where all are handed out, in that memory."""
+        row = self._rows.get(state.i)
+        if row is None:
+            return state
         self._statics.append(state.statics)
         values = list(state.values)
         for number, block in enumerate(self._blocks):
-            block[state.i] = values[number]
-            if np.ndim(values[number]):
-                values[number] = block[state.i]
+            if type(values[number]) in ELSEWHERE and not isinstance(block, list):  # the first state was known to all
+                block = self._blocks[number] = [*block]
+            block[row] = owned(values[number]) if isinstance(block, list) else values[number]
+            if np.ndim(values[number]) and self.whole:
+                values[number] = block[row]
         return State(state.i, values, state.statics)
 
     def finish(self, last):
-        """The blocks; the way back uses these very arrays."""
-        blocks, self._blocks = self._blocks, []
-        blocks = [stacked(block) if isinstance(block, list) else block for block in blocks]
+        """The blocks; where all are handed out, the way back uses these very arrays."""
+        blocks, self._blocks, self._places = self._blocks, [], []
+        found: list = []
         for block in blocks:
-            if not isbox(block):
-                block.flags.writeable = not self._stored
-        return tuple(blocks)
+            apart = isinstance(block, list) and type(plain(block[-1])) in ELSEWHERE
+            found += block if apart else [stacked(block) if isinstance(block, list) else block]
+            self._places.append(slice(len(found) - len(block), len(found)) if apart else len(found) - 1)
+        for block in found:
+            if type(block) is np.ndarray:
+                block.flags.writeable = not (self.whole and self._stored)
+        return tuple(found)
+
+    def _grouped(self, outputs):
+        """Outputs -> for each variable its stack, or the tuple of its states."""
+        return [outputs[place] if isinstance(place, int) else tuple(outputs[place]) for place in self._places]
 
     def tree(self, outputs):
         """Outputs of the rule -> what the user gets."""
-        return self.layout.build(outputs, [_stacked(line) for line in zip(*self._statics, strict=True)])
+        return self.layout.build(self._grouped(outputs), [_stacked(line) for line in zip(*self._statics, strict=True)])
 
     def source(self, n, g):
-        """Cotangents of the outputs -> function from a state to cotangents of a state."""
-        return lambda state: [block[state.i] for block in g]
+        """Cotangents of the outputs -> function from a state to cotangents of a state, or None."""
+        rows = self._grouped(g)
+        return lambda state: [block[self._rows[state.i]] for block in rows] if state.i in self._rows else None
+
+
+class All(Some):
+    """All n + 1 states."""
+
+    whole = True
 
 
 def _stacked(line):
@@ -103,14 +138,14 @@ def _stacked(line):
 
 
 class Row:
-    """Stands for a floating result: the number of its stack, and its row there."""
+    """Stands for a floating result: the number of its stack, and its row there; None where it is alone."""
 
     def __init__(self, stack, row):
         self.stack, self.row = stack, row
 
     def of(self, stacks):
         """The result itself, or its cotangent."""
-        return stacks[self.stack][self.row]
+        return stacks[self.stack] if self.row is None else stacks[self.stack][self.row]
 
 
 class Each(Last):
@@ -148,14 +183,15 @@ class Each(Last):
                 "keep uses a traced value that is not part of the state, and its derivative would be lost; "
                 "return what it needs of the state, and combine the two outside of rollout"
             )
-        key = np.shape(leaf), dtype_of(leaf).char
+        apart = type(plain(leaf)) in ELSEWHERE  # a field on ranks is kept by itself
+        key = len(self._stacks) if apart else (np.shape(leaf), dtype_of(leaf).char)
         stack = self._stacks.setdefault(key, [])
         stack.append(owned(leaf))
-        return Row(list(self._stacks).index(key), len(stack) - 1)
+        return Row(list(self._stacks).index(key), None if apart else len(stack) - 1)
 
     def _compare(self, i, results):
         """Refuse a function that returns something else for a state than it did before."""
-        values = [np.asarray(plain(leaf)) for leaf in results if is_variable(leaf)]
+        values = [array(plain(leaf)) for leaf in results if is_variable(leaf)]
         marks = [(value.shape, value.dtype, fingerprint([value])) for value in values]
         if i == len(self._marks):
             self._marks.append(marks)
@@ -167,7 +203,7 @@ class Each(Last):
     def finish(self, last):
         """One array for each shape and dtype."""
         stacks, self._stacks = self._stacks, {}
-        return tuple(map(stacked, stacks.values()))
+        return tuple(stack[0] if isinstance(key, int) else stacked(stack) for key, stack in stacks.items())
 
     def tree(self, outputs):
         """Outputs of the rule -> the tuple of what the function returned."""

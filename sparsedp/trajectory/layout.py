@@ -8,12 +8,14 @@ import numpy as np
 from sparsedp.constants import constant
 from sparsedp.derivative import described
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, surely_finite
+from sparsedp.fields import check_finite, check_native, surely_finite
 from sparsedp.shortcuts import ELSEWHERE, array
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.tree import flatten, keys, labels, leaves, subscript
 
-__all__ = ["Layout", "dense", "fingerprint", "is_finite", "owned", "refuse_lost", "refuse_mask", "stacked"]
+__all__ = [
+    "Layout", "dense", "fingerprint", "folded", "is_finite", "owned", "refuse_lost", "refuse_mask", "stacked",
+]  # fmt: skip
 
 
 FOLD = 509  # words to a line of a fingerprint: a prime, so that a field that was shifted has another one
@@ -61,6 +63,7 @@ class Layout:
         for number, leaf in enumerate(entries):
             if isinstance(leaf, np.ma.MaskedArray):
                 refuse_mask(f"rollout takes plain arrays, got a masked array as {self.labels[number]}", leaf)
+        check_native("rollout", *entries)
         self.open = _is_open(tree)
         variables = [plain(entries[place]) for place in self.places]
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
@@ -245,15 +248,17 @@ def fingerprint(values, statics=()):
 
 
 def _bits(value):
-    """All bits are read once: a large array is cut into lines, which are added up as whole numbers."""
-    if type(value) in ELSEWHERE:
-        return value.fingerprint()
+    return value.fingerprint() if type(value) in ELSEWHERE else hash(folded(value))
+
+
+def folded(value):
+    """Bytes made of all bits of an array, read once: a large one is cut into lines, added up as whole numbers."""
     if value.nbytes < 8192:
-        return hash(value.tobytes())
+        return value.tobytes()
     fold = 521 if any(size % FOLD == 0 for size in value.shape) else FOLD
     flat = value.reshape(-1).view(np.uint8)
     end = flat.size - flat.size % (8 * fold)
-    return hash((flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes(), flat[end:].tobytes()))
+    return flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes() + flat[end:].tobytes()
 
 
 def _at(tree, root, path):

@@ -5,6 +5,10 @@ goes through the steps themselves, forward and back: a derivative forward is the
 higher order are those of the calls that the run makes.
 """
 
+from operator import is_
+
+import numpy as np
+
 from sparsedp.derivative import judged, zero_like
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.ledger import active, count
@@ -120,6 +124,10 @@ class Loop(Rule):
             before, taped = state, bool(self.wanted) and (i == 0 or weight <= room)
             recorder.bytes = 0 if i < 2 else None
             state = steps.after(before, taped)
+            if True in map(is_, state.values, before.values) and not steps.copies and _shared(state, before):
+                steps.copies = True  # once more from the start: this step may have read what it wrote
+                self.keep.start(steps)
+                return self._advance(steps)
             if taped:
                 if i < 2:  # the first two tapes tell what a step takes
                     weight = max(recorder.bytes + len(before.tape[1]) * CALL - self.state.nbytes, 0)
@@ -186,3 +194,8 @@ class Loop(Rule):
             raise DerivativeError(
                 f"the step gives another {name} when it is run again; it must depend on its arguments only"
             )
+
+
+def _shared(state, before):
+    """Whether an array of a state is one of the state before."""
+    return any(a is b and isinstance(a, np.ndarray) for a, b in zip(state.values, before.values, strict=True))

@@ -70,7 +70,11 @@ class Steps:
         The traces of the arguments.
     last : State or None
         That which the step under way begins with.
+    copies : bool
+        Whether states get memory of their own: the step writes into arrays that it has handed out.
     """
+
+    copies = False
 
     def __init__(self, loop, args):
         self.loop, self.recorder, self.number = loop, Recorder(), new_trace()
@@ -103,8 +107,8 @@ class Steps:
         after = State(i + 1, values, statics)
         if taped:
             state.tape = roots, self.recorder.taken(), ends
-            if None in ends:  # what is on no tape may be an array that the step uses again
-                return after.owned()
+        if self.copies or (taped and None in ends):  # what is on no tape may be an array that the step uses again
+            return after.owned()
         return after
 
     def back(self, state):

@@ -122,6 +122,7 @@ def losses(grid):
         lambda u, a: anp.sum(points.T(a * points(u)) * anp.tanh(u)) + anp.sum(a * x),
         lambda u, a: sum(anp.sum(v * v * (k + a)) for k, v in enumerate(grid.split(G(u * a)))),
         lambda u, a: anp.sum(G(u) * grid.join(*[a * v**2 for v in grid.split(G(u))])),
+        lambda u, a: anp.sum(grid.join(u * u, a * anp.ones((7, 10))) * G(u)),
         lambda u, a: anp.sum(anp.abs(L(u * (1.0 + 1j * a))) ** 2),
         lambda u, a: anp.sum(anp.real((a + 1j) * u) * anp.imag(u * (u + 1j * a * x))),
         lambda u, a: anp.sum(grid.volumes * (u - a) ** 2 / (1.0 + u**2)),

@@ -31,6 +31,7 @@ def operators(grid):
     k = dp.diagonal(grid.faces, 1.0 + np.arange(grid.faces.size) % 7)
     yield "coefficients", -D @ k @ G
     yield "wind", dp.identity(grid.cells) + 2.0 * dp.upwind(grid, 0, 1, dp.neumann) - 0.1 * dp.laplacian(grid)
+    yield "far from 1", 2.0**300 * dp.laplacian(grid, dp.dirichlet)
     if grid.shape == WALL.shape:
         yield "islands", -dp.laplacian(grid, solid=WALL)
         yield "held", -dp.laplacian(grid, dp.dirichlet, WALL, dp.dirichlet)

@@ -1,0 +1,88 @@
+"""How the pages are made; building.md says what to type. Sphinx reads this file."""
+
+import sys
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
+
+import docstrings
+import gallery_scripts
+
+import sparsedp
+
+project, author, copyright = "sparsedp", "sparsedp contributors", "sparsedp contributors, MIT licence"
+release = version = sparsedp.__version__
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+    "formulas",
+]
+exclude_patterns = ["_build", "**/GALLERY_HEADER.rst"]
+templates_path = ["_templates"]
+
+# Pages are Markdown; code blocks in them are run by tests/test_pages.py.
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+html_math_renderer = "mathml"  # formulas.py: no script, no fonts to fetch
+
+# The API, from docstrings.
+default_role = "code"
+autodoc_mock_imports = ["jax", "torch"]  # the bridges have pages without them
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+napoleon_custom_sections = ["Source"]
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+add_module_names = False
+
+sphinx_gallery_conf = {
+    "examples_dirs": [str(gallery_scripts.STAGE)],
+    "gallery_dirs": ["gallery"],
+    # All are run whose libraries are here; -D sphinx_gallery_conf.filename_pattern=heat_rod runs one.
+    "filename_pattern": gallery_scripts.runnable(),
+    "within_subsection_order": "gallery_scripts.order",
+    "reset_argv": "gallery_scripts.arguments",
+    "image_scrapers": ("gallery_scripts.pictures", "matplotlib"),
+    "abort_on_example_error": True,
+    "backreferences_dir": "gallery/uses",
+    "doc_module": ("sparsedp",),
+    "inspect_global_variables": False,
+    "show_signature": False,
+    "write_computation_times": False,
+    "download_all_examples": False,
+    "thumbnail_size": (400, 280),
+}
+
+html_context = {"default_mode": "auto"}
+html_title = "sparsedp"
+html_theme = "pydata_sphinx_theme"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_sphinx = False
+html_copy_source = False
+html_show_sourcelink = False
+html_show_search_summary = False  # a page that is opened from disk may not fetch others
+html_sidebars = {"index": [], "start": [], "ideas": [], "numbers": [], "compare": [], "building": []}
+html_theme_options = {
+    "navbar_align": "left",
+    "show_prev_next": False,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+    "header_links_before_dropdown": 7,
+    "pygments_light_style": "a11y-high-contrast-light",
+}
+
+
+def setup(app):
+    gallery_scripts.stage()
+    gallery_scripts.let_processes_in()
+    app.connect("autodoc-process-docstring", docstrings.rewrite, priority=400)  # before napoleon
+    app.connect("builder-inited", gallery_scripts.thumbnails, priority=900)  # after sphinx-gallery has run the examples
+    app.connect("builder-inited", gallery_scripts.measured, priority=910)

@@ -1,0 +1,165 @@
+"""The gallery: every example is run when the pages are made, and shown with what it printed and drew.
+
+Sphinx-Gallery does the work. Here stands what it has to know of the examples: the title of each, the order, the
+size that each is run with, and where its pictures are.
+"""
+
+import ast
+import json
+import re
+import shutil
+import sys
+import textwrap
+from importlib.util import find_spec
+from multiprocessing import spawn
+from pathlib import Path
+
+import autograd.numpy as np
+import docstrings
+from matplotlib import pyplot
+from matplotlib.figure import Figure
+from sphinx_gallery.scrapers import figure_rst
+
+import sparsedp as dp
+
+ROOT = Path(__file__).parent.parent
+STAGE = Path(__file__).parent / "_build" / "examples"  # the scripts with a title; Sphinx-Gallery runs these
+DRAWN = Path(__file__).parent / "_build" / "drawn"  # what they write with --out
+HEADER = """Gallery
+=======
+
+Each example is one script, run when these pages were made. What it printed and drew stands below its code.
+Times are those of that run. Sizes are smaller than the defaults of some scripts, so that all run in about ten minutes.
+"""
+
+
+def size(name):
+    """The size that the tests run an example with."""
+    tree = ast.parse((ROOT / "tests" / "scripts.py").read_text(encoding="utf-8"))
+    [small] = [ast.literal_eval(n.value) for n in tree.body if isinstance(n, ast.Assign) and n.targets[0].id == "SMALL"]
+    return small.get(name, "16")
+
+
+def table():
+    """Name of each example -> what it shows, in the order of examples/README.md."""
+    rows = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
+    return dict(re.findall(r"^\| \d+ \| `(\w+\.py)` \| \d+ \| (.*) \|$", rows, re.MULTILINE))
+
+
+def titled(text, shows):
+    """A script whose docstring begins with a title as Sphinx-Gallery wants it; one that has it stays as it is."""
+    doc = ast.get_docstring(ast.parse(text))
+    if re.search(r"^=+$", doc, re.MULTILINE):
+        return text
+    first, _, rest = doc.partition("\n")
+    title, _, command = first.partition(" Run: ")
+    rest = docstrings.plain(re.sub(r"(?<!`)`([^`]+)`(?!`)", r"``\1``", rest.strip()))
+    title = title.rstrip(".")
+    paragraphs = [title + "\n" + "=" * len(title), shows[0].upper() + shows[1:] + ".", rest, f"Run: ``{command}``"]
+    body = text[text.index('"""', 3) + 3 :]
+    return 'r"""' + "\n\n".join(filter(None, paragraphs)) + '\n"""' + body
+
+
+def stage():
+    """Write the scripts that Sphinx-Gallery runs, where they changed."""
+    for folder in (STAGE, DRAWN):
+        folder.mkdir(parents=True, exist_ok=True)
+    shows = table()
+    for old in STAGE.glob("*.py"):
+        if old.name not in shows:
+            old.unlink()
+    texts = {name: titled((ROOT / "examples" / name).read_text(encoding="utf-8"), shows[name]) for name in shows}
+    for name, text in {**texts, "GALLERY_HEADER.rst": HEADER}.items():
+        (STAGE / name).write_text(text, encoding="utf-8")
+
+
+def runnable():
+    """A pattern of the scripts that need no library which is not here."""
+    missing = [name for name in ("jax", "optax", "torch") if find_spec(name) is None]
+    needs = re.compile(rf"^import ({'|'.join(missing)})$", re.MULTILINE)
+    scripts = [path for path in (ROOT / "examples").glob("*.py") if missing and needs.search(path.read_text())]
+    return r"/(?!({})\.py$)[^/]*$".format("|".join(path.stem for path in scripts)) if scripts else ".*"
+
+
+def order(name):
+    """Sort key: the place of an example in the table."""
+    return list(table()).index(Path(name).name)
+
+
+def arguments(gallery_conf, script_vars):
+    """What an example is called with."""
+    script = Path(script_vars["src_file"])
+    name, folder = script.stem, DRAWN / script.stem
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    target = folder / "picture.png" if name == "velocity_recovery" else folder
+    draws = "--out" in script.read_text(encoding="utf-8")
+    return [size(script.name), *(["--out", str(target)] if draws else [])]
+
+
+def let_processes_in():
+    """Processes that an example starts read it from its file; the __main__ of Sphinx-Gallery seems to have none."""
+    prepare = spawn.get_preparation_data
+
+    def from_file(name):
+        main = sys.modules["__main__"]
+        if main.__spec__ is not None and main.__spec__.loader is None:
+            main.__spec__, main.__file__ = None, str(STAGE / Path(sys.argv[0]).name)
+        return prepare(name)
+
+    spawn.get_preparation_data = from_file
+
+
+def pictures(block, block_vars, gallery_conf):
+    """The pictures and films that a script wrote with --out, for its page."""
+    paths = block_vars["image_path_iterator"]
+    found = sorted((DRAWN / Path(block_vars["src_file"]).stem).glob("*.[pg][ni][gf]"))
+    names = []
+    for path in found:
+        names.append(str(Path(next(paths)).with_suffix(path.suffix)))
+        shutil.move(path, names[-1])
+    if names:
+        pyplot.close("all")  # what was saved is not shown twice
+    return figure_rst(names, gallery_conf["src_dir"])
+
+
+def thumbnails(app):
+    """For an example without a picture: what it printed, small."""
+    folder = Path(app.srcdir) / "gallery"
+    for page in (folder / f"{Path(name).stem}.rst" for name in table()):
+        text = page.read_text(encoding="utf-8")
+        if ".. image-sg::" in text:
+            continue
+        printed = re.search(r"rst-class:: sphx-glr-script-out\s+\.\. code-block:: none\n\n(.*?)\n\n\n", text, re.DOTALL)
+        lines = textwrap.dedent(printed[1] if printed else page.stem).splitlines()[:12]
+        figure = Figure(figsize=(4, 2.8), facecolor="#f3f4f5")
+        figure.text(0.04, 0.94, "\n".join(line[:38] for line in lines), va="top", family="monospace", size=9)
+        figure.savefig(folder / "images" / "thumb" / f"sphx_glr_{page.stem}_thumb.png", dpi=100)
+
+
+def membrane(method, cells):
+    """A point of a membrane under an even load, and its slope in the load; the exact value is known."""
+    grid = dp.Grid((cells, cells), size=1.0)
+    solve, middle = dp.inverse(-dp.laplacian(grid, dp.dirichlet), method), dp.sample(grid, [[0.5, 0.5]])
+    return lambda load: middle(solve(load * np.ones(grid.shape)))[0], 1.0
+
+
+def measured(app):
+    """Picture and table of numbers.md: error against run time of every solver, on this machine."""
+    folder = Path(app.srcdir)
+    if (folder / "_build" / "error_against_time.md").exists():
+        return
+    methods = {name: {"method": name} for name in ("direct", "separable", "structured", "multigrid", "krylov")}
+    exact = 0.07367135328151
+    for method in methods:
+        membrane(method, 16)[0](1.0)  # compiling is no part of a set-up
+    table = dp.workprec(membrane, methods, over={"cells": [32, 64, 128, 256]}, reference=(exact, exact))
+    lines = ["| method | cells | error of the gradient | set-up | forward | adjoint | iterations |", "|" + "---|" * 7]
+    for row in table.rows:
+        times = (f"{1e3 * row[f'seconds_{part}']:.3g} ms" for part in ("setup", "forward", "backward"))
+        ends = f"{row['gradient_error']:.1e}", *times, f"{row['iterations']}"
+        lines.append(f"| {row['method']} | {json.loads(row['settings'])['cells']}^2 | " + " | ".join(ends) + " |")
+    (folder / "_build" / "error_against_time.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    table.plot(figure.subplots())
+    figure.savefig(folder / "gallery" / "images" / "error_against_time.png", dpi=120)

@@ -1,0 +1,21 @@
+"""Bridges to PyTorch and JAX: functions of this library there, theirs here, with derivatives of every order both ways.
+
+to_torch, from_torch   torch_bridge.py, the extra `torch`
+to_jax, from_jax       jax_bridge.py, the extra `jax`
+
+Either library is imported when one of its two names is first used.
+"""
+
+from importlib import import_module
+
+__all__ = ["from_jax", "from_torch", "to_jax", "to_torch"]
+
+
+def __getattr__(name):
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+    library = name.partition("_")[2]
+    try:
+        return getattr(import_module(f"{__name__}.{library}_bridge"), name)
+    except ImportError as error:
+        raise ImportError(f"dp.interop.{name} needs {library}; install sparsedp[{library}]") from error

@@ -1,0 +1,262 @@
+"""JAX: a function of arrays as one of JAX, and the other way. The only file that imports jax (extra `jax`)."""
+
+from contextlib import nullcontext
+from functools import partial
+from itertools import compress
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+
+from sparsedp.fields import check_function
+from sparsedp.interop.recording import owned, parts, placed, recorded
+from sparsedp.recipe import Made
+from sparsedp.tape import Rule, dtype_of, plain
+
+__all__ = ["from_jax", "to_jax"]
+
+
+# ---- functions of this library for JAX -------------------------------------------------------------------------------
+
+
+def to_jax(f, like=None):
+    """Function of arrays -> the same function of JAX arrays, for jit, grad and vmap.
+
+    Parameters
+    ----------
+    f : callable
+        ``f(*args)``, made of this library and autograd.numpy: an Operator, an inverse, a solver, a rollout, a loss.
+        Arguments and result are arrays, or pytrees of arrays.
+    like : pytree of arrays, optional
+        Of the structure, shapes and dtypes of the result of f. Default: f is run once with ones, for each set of
+        shapes that jit or vmap bring.
+
+    Returns
+    -------
+    callable
+        Takes and gives JAX arrays. Dtypes follow JAX: float32, unless ``jax_enable_x64`` is set.
+
+    Raises
+    ------
+    TypeError
+        If f is no function; on use, if f does not take ones and `like` is not given.
+
+    Notes
+    -----
+    JAX calls back: f runs in Python, on the CPU, and must give the same for the same arguments. What it raises is
+    raised as it is, and by jit inside an error of JAX. vmap runs f for one entry of a batch after the other. Only what
+    JAX asks for is differentiated, in reverse mode to every order; JAX refuses forward mode. JAX cannot keep what f
+    recorded, so the way back runs f once more.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> slope = to_jax(dp.gradient(dp.Grid(4, periodic=True)))
+    >>> jax.jit(jax.grad(lambda u: jnp.sum(slope(u) ** 2)))(jnp.array([1.0, 2.0, 4.0, 8.0]))
+    Array([-16.,  -2.,  -4.,  22.], dtype=float32)
+    """
+    check_function("to_jax", f, "dp.interop.to_jax(dp.laplacian(grid))")
+    nodes: dict = {}  # by structure of the arguments
+
+    def call(*args):
+        entries, structure = jax.tree.flatten(args)
+        if structure not in nodes:
+            nodes[structure] = _called(f, structure, like)
+        node, built = nodes[structure]
+        results = node.call(*map(jnp.asarray, entries))
+        return jax.tree.unflatten(built[0], results)
+
+    return Made(call, to_jax, f, like)
+
+
+def _called(f, structure, like):
+    """f, called with trees of one structure -> its node, and a list that will hold the structure of its result."""
+    built, known = [jax.tree.structure(like)], {}  # type: list, dict
+
+    def fun(arrays):
+        results, found = jax.tree.flatten(f(*jax.tree.unflatten(structure, arrays)))
+        built[0] = found if like is None else built[0]
+        return results
+
+    def forms(values):
+        key = tuple((value.shape, value.dtype) for value in values)
+        if like is None and key not in known:
+            try:
+                known[key] = [*map(np.zeros_like, fun([np.ones(*form)[()] for form in key]))]
+            except Exception as error:
+                raise TypeError(
+                    "to_jax learns the shape of a result by one run with ones, which this function does not take "
+                    f"({error}); give like, arrays of the shapes of the result"
+                ) from error
+        return known.get(key) or jax.tree.leaves(like)
+
+    return _Node(fun, forms), built
+
+
+class _Node:
+    """A function of a list of arrays as one of JAX arrays, with derivatives of every order.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(list of arrays) -> list of arrays``.
+    forms : callable
+        JAX arrays -> things of the shapes and dtypes of the results.
+    """
+
+    def __init__(self, fun, forms):
+        self.fun, self.forms, self._pulls = fun, forms, {}  # type: Any, Any, dict
+        self.call = jax.custom_vjp(self._run)
+        self.call.defvjp(self._forward, self._backward, symbolic_zeros=True)
+
+    def _run(self, *values):
+        """At once, or by a call back when JAX runs what it traces."""
+        if not any(isinstance(value, jax.core.Tracer) for value in values):
+            return [*map(jnp.array, self.fun([np.asarray(value)[()] for value in values]))]
+        forms = jax.eval_shape(lambda *results: [*results], *self.forms(values))  # in the dtypes that JAX allows now
+        host = _Host(self.fun, tuple(form.dtype for form in forms))
+        return jax.pure_callback(host, forms, *values, vmap_method="sequential")
+
+    def _forward(self, *primals):
+        values, marks = [primal.value for primal in primals], [() if primal.perturbed else None for primal in primals]
+        return [*self.call(*values)], (values, marks)
+
+    def _backward(self, kept, cotangents):
+        values, marks = kept
+        given = [not (isinstance(g, SymbolicZero) or g.dtype == jax.dtypes.float0) for g in cotangents]
+        key = tuple(mark is not None for mark in marks), tuple(given)
+        if key not in self._pulls:
+            self._pulls[key] = self._pull(*key)
+        slopes = iter(self._pulls[key].call(*values, *compress(cotangents, given)))
+        return tuple(next(slopes) if moves else None for moves in key[0])
+
+    def _pull(self, moving, given):
+        """The node of (arguments, cotangents of some results) -> gradients of the arguments that move."""
+        count, places = len(moving), [*compress(range(len(given)), given)]
+
+        def slopes(arrays):
+            gradients = recorded(self.fun, arrays[:count], moving)[2]
+            return gradients(placed([None] * len(given), places, arrays[count:]))
+
+        return _Node(slopes, lambda values: compress(values, moving))
+
+
+class _Host(NamedTuple):
+    """What JAX calls back: equal ones are compiled once."""
+
+    fun: Any
+    dtypes: tuple
+
+    def __call__(self, *arrays):
+        results = self.fun([np.asarray(array)[()] for array in arrays])
+        return [np.asarray(y, dtype) for y, dtype in zip(results, self.dtypes, strict=True)]
+
+
+# ---- functions of JAX on our tape ------------------------------------------------------------------------------------
+
+
+def from_jax(function):
+    """Function of JAX arrays -> the same function of NumPy arrays, differentiable by this library.
+
+    Parameters
+    ----------
+    function : callable
+        ``function(*args)``, one that ``jax.jit`` takes; arguments and result are arrays, or pytrees of arrays.
+
+    Returns
+    -------
+    callable
+        Takes and gives NumPy arrays. Arguments of float64 are computed in float64, whatever ``jax_enable_x64`` says.
+
+    Raises
+    ------
+    TypeError
+        If it is no function.
+
+    Notes
+    -----
+    Compiled by JAX at the first call with each set of shapes. VJP by ``jax.vjp``, which runs the function again, JVP
+    by ``jax.jvp``, to every order; only what is traced is differentiated.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> cube = from_jax(lambda x: x**3)
+    >>> dp.value_and_grad(lambda x: np.sum(cube(x)))(np.array([1.0, 2.0]))
+    (9.0, array([ 3., 12.]))
+    """
+    check_function("from_jax", function, "dp.interop.from_jax(jax.numpy.sin)")
+    rules: dict = {}  # by structure of the arguments
+
+    def call(*args):
+        entries, structure = jax.tree.flatten(args)
+        if structure not in rules:
+            built: list = []  # the structure of the result
+
+            def of_entries(*entries):
+                results, *built[:] = jax.tree.flatten(function(*jax.tree.unflatten(structure, entries)))
+                return results
+
+            rules[structure] = _Traced(of_entries), built
+        traced, built = rules[structure]
+        results = traced.rule(*entries)
+        return jax.tree.unflatten(built[0], parts(results, built[0].num_leaves))
+
+    return Made(call, from_jax, function)
+
+
+class _Traced:
+    """A JAX function ``f(*entries) -> list`` as a rule of our tape. Its derivatives are JAX functions, too."""
+
+    def __init__(self, function):
+        self.function, self._compiled, self._derivatives = function, jax.jit(function), {}  # type: Any, Any, dict
+        self.rule = Rule("jax function", self._run, self._vjp, self._jvp)
+
+    def _run(self, *entries):
+        wide = any(np.asarray(entry).dtype in (np.float64, np.complex128) for entry in entries)
+        with jax.enable_x64(True) if wide else nullcontext():
+            return tuple(map(owned, self._compiled(*entries)))
+
+    def _vjp(self, nums, ans, *entries):
+        def pull(g):
+            rule, used = self._derivative(_pulled, nums, ans, entries)
+            return parts(rule(*entries, *(g[k] for k in used)), len(nums))
+
+        return pull
+
+    def _jvp(self, nums, tangents, ans, *entries):
+        return self._derivative(_pushed, nums, ans, entries)[0](*entries, *tangents)
+
+    def _derivative(self, make, nums, ans, entries):
+        """The rule of a derivative, and the places of the results that have one."""
+        used = tuple(k for k, y in enumerate(plain(ans)) if dtype_of(y).kind in "fc")
+        key = make, nums, used, len(entries)
+        if key not in self._derivatives:
+            self._derivatives[key] = _Traced(partial(make, self.function, *key[1:]))
+        return self._derivatives[key].rule, used
+
+
+def _pulled(function, nums, used, count, *values):
+    """Function, (its arguments, cotangents of the results `used`) -> gradients of the arguments `nums`."""
+
+    def some(*moving):
+        results = function(*placed(values[:count], nums, moving))
+        return [results[k] for k in used]
+
+    results, pull = jax.vjp(some, *(values[num] for num in nums))
+    return [*pull(_alike(values[count:], results))]
+
+
+def _pushed(function, nums, used, count, *values):
+    """Function, (its arguments, tangents of the arguments `nums`) -> tangents of the results; 0 of those not `used`."""
+    moving = [values[num] for num in nums]
+    tangents = _alike(values[count:], moving)
+    results, slopes = jax.jvp(lambda *xs: function(*placed(values[:count], nums, xs)), moving, tangents)
+    return placed(map(jnp.zeros_like, results), used, [slopes[k] for k in used])
+
+
+def _alike(slopes, values):
+    """Derivatives of the dtypes of values, as JAX wants them."""
+    return [jnp.asarray(slope, jnp.result_type(x)) for slope, x in zip(slopes, values, strict=True)]

@@ -1,0 +1,41 @@
+"""What both bridges need of our tape: one run of a function, and the gradients that belong to it."""
+
+import numpy as np
+
+from sparsedp.derivative import gradient_of, growing, linearised
+
+__all__ = ["owned", "parts", "placed", "recorded"]
+
+
+def recorded(fun, arrays, moving):
+    """Function of a list of arrays, some of which move -> (leaves of its result, how to build it, gradients).
+
+    ``gradients(cotangents)``: of all leaves of the result, None where there is none -> those of the arrays that move.
+    """
+    with growing():
+        values, rebuild, pull = linearised(fun, arrays, moving)
+
+    def gradients(cotangents):
+        slopes = zip(arrays, pull(cotangents), moving, strict=True)
+        return [gradient_of(array, slope) for array, slope, moves in slopes if moves]
+
+    return values, rebuild, gradients
+
+
+def placed(entries, places, values):
+    """A list with other values at some places."""
+    entries = list(entries)
+    for place, value in zip(places, values, strict=True):
+        entries[place] = value
+    return entries
+
+
+def owned(array):
+    """Array of another library -> one of our own, or a number; whole numbers stay arrays, as the tape takes them."""
+    array = np.array(array)
+    return array[()] if array.dtype.kind in "fc" else array
+
+
+def parts(values, count):
+    """A tuple, traced or not, as one of values that are traced or not."""
+    return tuple(values[k] for k in range(count))

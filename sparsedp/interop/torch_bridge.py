@@ -1,0 +1,267 @@
+"""PyTorch: a function of arrays as one of tensors, and the other way. The only file that imports torch (extra `torch`).
+
+Torch's gradient in a complex number is dL/dRe + i dL/dIm, the cotangent of our tape dL/dRe - i dL/dIm: each is turned
+into the other where it crosses.
+"""
+
+import autograd.numpy as anp
+import numpy as np
+import torch
+
+from sparsedp.constants import constant, frozen
+from sparsedp.fields import check_function
+from sparsedp.interop.recording import owned, parts, placed, recorded
+from sparsedp.recipe import Made
+from sparsedp.tape import Rule, dtype_of, is_variable, isbox
+from sparsedp.tree import flatten, leaves
+
+__all__ = ["from_torch", "to_torch"]
+
+
+# ---- functions of this library for torch -----------------------------------------------------------------------------
+
+
+def to_torch(f):
+    """Function of arrays -> the same function of torch tensors, differentiable by torch.
+
+    Parameters
+    ----------
+    f : callable
+        ``f(*args, **options)``, made of this library and autograd.numpy: an Operator, an inverse, a solver, a rollout,
+        a loss. Arguments and result are arrays, or trees (tuples, lists, dicts) of arrays.
+
+    Returns
+    -------
+    callable
+        Takes tensors in the place of arrays, in the same trees, and hands on as it is what is no tensor. Results have
+        the dtypes that f gives them: float32 for float32. Only arguments that require a gradient are differentiated;
+        where none does nothing is recorded.
+
+    Raises
+    ------
+    TypeError
+        If f is no function; on use, if a tensor is not on the CPU, or has half precision.
+    RuntimeError
+        By torch, on the way back, if a tensor has been changed in place since the call.
+
+    Notes
+    -----
+    Tensors and arrays share their memory; a result is copied where f may know its memory. f runs once for a value and
+    its gradient, and once more for a gradient of the gradient (``create_graph=True``), which is right to every order:
+    f must give the same for the same arguments. ``torch.func`` and forward mode do not look through it, torch says so.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> slope = to_torch(dp.gradient(dp.Grid(4, periodic=True)))
+    >>> u = torch.tensor([1.0, 2.0, 4.0, 8.0], requires_grad=True)
+    >>> torch.sum(slope(u) ** 2).backward()
+    >>> u.grad
+    tensor([-16.,  -2.,  -4.,  22.])
+    """
+    check_function("to_torch", f, "dp.interop.to_torch(dp.laplacian(grid))")
+    return Made(lambda *args, **options: _bridged(lambda tree: f(*tree[0], **tree[1]), (args, options)), to_torch, f)
+
+
+def _bridged(fun, tree):
+    """Function of a tree of arrays, at a tree in which some are tensors -> its result as a tree of tensors."""
+    given, rebuild = flatten(tree)
+    places = [place for place, leaf in enumerate(given) if isinstance(leaf, torch.Tensor)]
+    tensors = [given[place] for place in places]
+    beside = [*map(constant, placed(given, places, [None] * len(places)))]  # no tensor: it would keep its graph alive
+    if not torch.is_grad_enabled():
+        tensors = [tensor.detach() for tensor in tensors]
+    result: list = []
+    tensors = _Call.apply(lambda arrays: fun(rebuild(placed(beside, places, arrays))), result, *tensors)
+    entries, filled, build = result
+    return build(placed(entries, filled, tensors))
+
+
+class _Call(torch.autograd.Function):
+    """A function of arrays as a node of torch's graph."""
+
+    @staticmethod
+    def forward(ctx, fun, result, *tensors):
+        arrays, moving = [*map(_array, tensors)], ctx.needs_input_grad[2:]
+        made: list = []
+
+        def watched(arrays):
+            tree = fun(arrays)
+            made.extend(map(isbox, leaves(tree)))  # what is traced comes from this call; all else may be f's own
+            return tree
+
+        values, rebuild, gradients = recorded(watched, arrays, moving)
+        places = [place for place, value in enumerate(values) if is_variable(value) or isinstance(value, np.ndarray)]
+        outputs = _tensors([values[k] if made[k] else np.array(values[k]) for k in places], arrays)
+        result += values, places, rebuild
+        ctx.kept = fun, moving, gradients, places, len(values)
+        ctx.save_for_backward(*tensors, *outputs)  # torch refuses what has been changed in place since
+        ctx.set_materialize_grads(False)
+        return tuple(outputs)
+
+    @staticmethod
+    def backward(ctx, *cotangents):
+        fun, moving, gradients, places, many = ctx.kept
+        count = len(moving)
+        tensors = ctx.saved_tensors[:count]
+        places = [place for place, g in zip(places, cotangents, strict=True) if g is not None]
+        given = [g for g in cotangents if g is not None]
+
+        def slopes(arrays, gradients=None):
+            gradients = gradients or recorded(fun, arrays[:count], moving)[2]
+            return [*map(_turned, gradients(placed([None] * many, places, map(_turned, arrays[count:]))))]
+
+        if torch.is_grad_enabled():  # a gradient of this gradient is wanted
+            found = iter(_bridged(slopes, [*tensors, *given]))
+        else:
+            arrays = [*map(_array, given)]
+            found = iter(_tensors(slopes([*tensors, *arrays], gradients), arrays))
+        return None, None, *(next(found) if moves else None for moves in moving)
+
+
+def _array(tensor):
+    """Tensor -> its memory as an array that nobody writes into, or a number."""
+    if tensor.device.type != "cpu":
+        raise TypeError(f"to_torch computes on the CPU, got a tensor on {tensor.device}; write tensor.cpu()")
+    if tensor.is_floating_point() and tensor.dtype.itemsize < 4:
+        raise TypeError(f"to_torch takes float32 or float64, got {tensor.dtype}; write tensor.float()")
+    return frozen(tensor.numpy(force=True))[()]
+
+
+def _tensors(values, others):
+    """Arrays -> tensors of the same memory, copied where it is read-only, or that of other arrays or of each other."""
+    found, seen = [], [*others]
+    for value in map(np.asarray, values):
+        if not value.flags.writeable or min(value.strides, default=0) < 0:
+            value = value.copy()
+        if any(np.may_share_memory(value, other) for other in seen):
+            value = value.copy()
+        seen.append(value)
+        found.append(torch.from_numpy(value))
+    return found
+
+
+def _turned(g):
+    """A gradient of torch -> a cotangent of the tape, and back."""
+    return anp.conj(g) if dtype_of(g).kind == "c" else g
+
+
+# ---- functions of torch on our tape ----------------------------------------------------------------------------------
+
+
+def from_torch(function):
+    """Function of torch tensors, or a module -> the same function of arrays, differentiable by this library.
+
+    Parameters
+    ----------
+    function : callable or torch.nn.Module
+        ``function(*args)``; arguments and result are tensors, or trees (tuples, lists, dicts) of tensors.
+
+    Returns
+    -------
+    callable
+        Takes and gives arrays in the place of tensors. That of a module takes its parameters first, as a dict of
+        arrays: ``net(net.parameters, x)``, with copies of those of the module in ``net.parameters``. Parameters that
+        a dict leaves out are those of the module, as constants.
+
+    Raises
+    ------
+    TypeError
+        If it is no function.
+
+    Notes
+    -----
+    The module is not changed, and its parameters get no ``.grad``: gradients come from `value_and_grad` like all
+    others, and ``module.load_state_dict({name: torch.tensor(p) for name, p in best.x.items()}, strict=False)`` puts
+    what was found back. torch computes in the dtypes that it is given: for float64 fields write ``module.double()``.
+
+    The function runs once for its value and for derivatives of every order, those with random numbers (dropout) too;
+    only what is traced is differentiated. Derivatives are reverse: `jvp` takes two passes.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> cube = from_torch(lambda x: x**3)
+    >>> dp.value_and_grad(lambda x: np.sum(cube(x)))(np.array([1.0, 2.0]))
+    (9.0, array([ 3., 12.]))
+    """
+    check_function("from_torch", function, "dp.interop.from_torch(module)")
+    run, parameters = function, {}
+    if isinstance(function, torch.nn.Module):
+        run = lambda parameters, *args: torch.func.functional_call(function, parameters, args)
+        parameters = {name: _owned(tensor) for name, tensor in function.named_parameters()}
+
+    def call(*args):
+        entries, rebuild = flatten(args)
+        moving = [*map(isbox, entries)]
+        built: list = []
+        # Copies: torch may write into its arguments, and the caller into his before the way back. Traced ones are safe.
+        entries = [np.array(one) if isinstance(one, np.ndarray) else one for one in entries]
+
+        def act(tensors):
+            results, *built[:] = flatten(run(*rebuild(tensors)))
+            return results
+
+        graph = _Graph(act, moving)
+        results = _rule(graph, *entries)
+        return built[0](parts(results, len(graph.outputs)))
+
+    vars(call)["parameters"] = parameters
+    return Made(call, from_torch, function)
+
+
+class _Graph:
+    """One run of a torch function: the tensors that go in, and those that come out.
+
+    Parameters
+    ----------
+    act : callable
+        ``act(tensors) -> list of tensors``.
+    moving : list of bool
+        Which arguments may be differentiated.
+    inputs : list of tensors
+        The first of them, where another run has made them.
+    """
+
+    outputs: list
+
+    def __init__(self, act, moving, inputs=()):
+        self._act, self._moving, self.inputs = act, moving, [*inputs]
+
+    def run(self, *entries):
+        """Arguments as arrays -> results as a tuple of arrays."""
+        for entry, moves in [*zip(entries, self._moving, strict=True)][len(self.inputs) :]:
+            tensor = _tensors([entry], ())[0].requires_grad_(moves) if moves or isinstance(entry, np.ndarray) else entry
+            self.inputs.append(tensor)
+        with torch.set_grad_enabled(any(self._moving)):
+            self.outputs = self._act(self.inputs)
+        return tuple(map(_owned, self.outputs))
+
+    def pulled(self, places, moving):
+        """The graph of the gradients of some arguments; its arguments are those here, and then the cotangents."""
+
+        def act(tensors):
+            ends = [y for y in self.outputs if y.requires_grad]
+            cotangents = [g.to(y.dtype) for y, g in zip(ends, tensors[len(self.inputs) :], strict=True)]
+            options = dict(create_graph=any(moving), retain_graph=True, allow_unused=True, materialize_grads=True)
+            wanted = [self.inputs[place] for place in places]
+            return torch.autograd.grad(ends, wanted, cotangents, **options)
+
+        return _Graph(act, moving, self.inputs)
+
+
+def _pull(nums, ans, graph, *entries):
+    def pull(g):
+        cotangents = [_turned(g[k]) for k, y in enumerate(graph.outputs) if y.requires_grad]
+        pulled = graph.pulled([num - 1 for num in nums], [*map(isbox, (*entries, *cotangents))])
+        return tuple(map(_turned, parts(_rule(pulled, *entries, *cotangents), len(nums))))
+
+    return pull
+
+
+_rule = Rule("torch function", _Graph.run, _pull)
+
+
+def _owned(tensor):
+    """Tensor -> array or number apart from it: it may be a parameter, or what the way back needs."""
+    return owned(tensor.numpy(force=True))

@@ -1,0 +1,202 @@
+"""What all ranks do and know alike, and what one of them raises.
+
+Whatever goes between ranks begins with one message of 32 bytes from each to all. It holds the mark of the rank, made of
+all that ranks must do and be told alike (calls, numbers, arrays that every rank has), or the word that it has failed,
+and up to 24 bytes that are reduced. So
+
+- a rank that fails says so in the next message, and all raise its error in its words;
+- unseeded random numbers, and a branch that only one rank takes, are errors where ranks meet next, not a drift;
+- a reduction takes one message, as it would without all this.
+"""
+
+import pickle
+import sys
+import traceback
+from collections import deque
+from itertools import zip_longest
+from numbers import Number
+from threading import Timer
+from types import SimpleNamespace
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+from mpi4py import MPI
+
+from sparsedp.ledger import active, count
+from sparsedp.tape import plain
+from sparsedp.trajectory.layout import folded
+from sparsedp.tree import labels, leaves
+
+__all__ = ["Agreement", "course", "end_all"]
+
+ROOM = 24  # bytes beside the mark
+FAILED = (-1).to_bytes(8, "little", signed=True)
+PATIENCE = 15.0  # seconds that a rank which has failed waits for the others: they may be inside PETSc, and never come
+
+# Of this process: how many messages there were; the agreement that was made or asked last; how many messages there were
+# before the outermost call that is under way; and (name, arguments) of calls whose arguments were not compared yet.
+course: Any = SimpleNamespace(met=0, last=None, begun=None, untold=[])
+
+
+class Agreement:
+    """What the ranks of a communicator agree on: numbers, errors, and that they do the same.
+
+    Parameters
+    ----------
+    comm : mpi4py.MPI.Comm
+    where : str
+        What an error says of this rank.
+    """
+
+    def __init__(self, comm, where):
+        self.comm, self.where, course.last = comm, where, self
+        self._mark = 0
+        self._log: deque = deque(maxlen=100)  # what was told since the last message: (label, mark)
+        self._mine = np.zeros(8 + ROOM, np.uint8)
+        self._all = np.zeros((comm.size, 8 + ROOM), np.uint8)
+
+    # ------------------------------------------------------------ what must be the same
+
+    def tell(self, label, content):
+        """Note what this rank does, or was given, in words and as bytes: it is compared with the next message."""
+        while course.untold:
+            what, given = course.untold.pop(0)
+            for number, tree in enumerate(given):
+                self.tell_all(f"argument {number}", what, tree)
+        self._mark = crc32(content, self._mark)
+        self._log.append((label, self._mark))
+
+    def tell_all(self, root, what, tree):
+        """The same for the leaves of a tree, on the tape or not; those on ranks are agreed on already."""
+        for name, leaf in zip(labels(tree, root), leaves(tree)):
+            value = plain(leaf)
+            if isinstance(value, (Number, np.ndarray, np.generic, str)):
+                self.tell(f"{name} of {what}", folded(np.asarray(value)))
+
+    def meet(self, label, content=b""):
+        """One message from each rank to all -> the bytes `content` of each, one after the other.
+
+        Raises
+        ------
+        Exception
+            That of the first rank that failed, on all of them.
+        ValueError
+            If ranks were told different things.
+        """
+        self.tell(label, label.encode())
+        mark = self._mark.to_bytes(8, "little")
+        found = self._sent(mark, content)
+        if found == mark * self.comm.size:
+            self._log.clear()
+        elif FAILED in (found[k : k + 8] for k in range(0, len(found), 8)):
+            self._raise_together(None)
+        else:
+            self._refuse()
+        return self._all[:, 8 : 8 + len(content)].tobytes()
+
+    def _sent(self, head, content):
+        course.met, course.last = course.met + 1, self
+        self._mine[: 8 + len(content)] = np.frombuffer(head + content, np.uint8)
+        self.comm.Allgather(self._mine, self._all)
+        return self._all[:, :8].tobytes()
+
+    def _refuse(self):
+        """Say what the ranks were told that is not the same."""
+        logs = zip_longest(*self.comm.allgather(list(self._log)), fillvalue=("nothing", 0))
+        entries = next(entries for entries in logs if len(set(entries)) > 1)
+        rank = next(rank for rank, entry in enumerate(entries) if entry != entries[0])
+        first, other = entries[0][0], entries[rank][0]
+        self._forget()
+        raise _marked(
+            ValueError(
+                f"{first} is not the same on rank {rank} as on rank 0; give all ranks the same numbers, random ones by "
+                "the same seed"
+                if first == other
+                else f"rank {rank} came to {other} where rank 0 came to {first}; let nothing depend on the number of "
+                "the rank, on a clock or on numbers of one rank"
+            )
+        )
+
+    def _forget(self):
+        self._mark = 0
+        self._log.clear()
+
+    # ------------------------------------------------------------ numbers
+
+    def reduced(self, number, act):
+        """The numbers of all ranks in one, in the order of the ranks: the same bits on each, whatever MPI does."""
+        if active:
+            count("ranks", "reduction")
+        number = np.asarray(number)
+        content, label = number.tobytes(), f"{act.__name__} of shape {number.shape}"
+        found = self.meet(label, content) if len(content) <= ROOM else b"".join(self.gathered(content, label))
+        return act.reduce(np.ndarray((self.comm.size, *number.shape), number.dtype, found), axis=0)[()]
+
+    def gathered(self, value, label="gather"):
+        """A value of each rank -> the list of all, on every rank."""
+        self.meet(label)
+        return self.comm.allgather(value)
+
+    # ------------------------------------------------------------ errors
+
+    def agreed(self, label, act, *args):
+        """act(*args), which may fail on one rank only: then it fails on all. Inside of `together`, that tells them."""
+        try:
+            result = act(*args)
+        except Exception as error:
+            if course.begun is None:
+                self.fail(error)
+            if not hasattr(error, "on_all_ranks"):
+                self.tell(f"an error in {label}", b"failed")  # if it is caught on the way, the ranks differ
+            raise
+        if course.begun is None:
+            self.meet(label)
+        return result
+
+    def fail(self, error):
+        """Raise an error on all ranks: that of the lowest one which has failed, in its words and with its place."""
+        if hasattr(error, "on_all_ranks"):
+            raise error
+        watch = Timer(PATIENCE, end_all, (type(error), error, error.__traceback__))
+        watch.daemon = True
+        watch.start()
+        self._sent(FAILED, crc32(f"{type(error)}{error}".encode()).to_bytes(8, "little"))
+        self._raise_together(error, watch)
+
+    def _raise_together(self, error, watch=None):
+        heads = self._all[:, :16].tobytes()
+        alike = heads == heads[:16] * self.comm.size  # all have failed in the same way
+        rank = next(rank for rank in range(self.comm.size) if heads[16 * rank :].startswith(FAILED))
+        mine = _packed(error, f" (on rank {rank}{self.where})") if rank == self.comm.rank and not alike else None
+        told = error if alike else self.comm.bcast(mine, rank)
+        if watch:
+            watch.cancel()
+        self._forget()
+        if alike:
+            raise _marked(error)
+        raise _marked(told) from error
+
+
+def _marked(error):
+    """An error that all ranks raise: on its way out nobody asks the others again."""
+    error.on_all_ranks = True
+    return error
+
+
+def _packed(error, where):
+    """An error as others can raise it: of the nearest class that is made of words alone; with the place added."""
+    for kind in type(error).__mro__:
+        try:
+            return pickle.loads(pickle.dumps(kind(f"{error}{where}")))
+        except Exception:
+            continue  # it takes other arguments, or other ranks do not know it
+
+
+def end_all(kind, error, trace):
+    """An error that ends one rank ends all: nobody waits for a message that never comes."""
+    comm = MPI.COMM_WORLD
+    told = "".join(traceback.format_exception(kind, error, trace))
+    sys.stderr.write(f"rank {comm.rank} of {comm.size}: {told}")
+    sys.stderr.flush()
+    comm.Abort(1)

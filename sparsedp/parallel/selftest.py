@@ -1,0 +1,99 @@
+"""`python -m sparsedp ranks`: what of MPI and PETSc is here, and whether two processes get what one gets."""
+
+import os
+import re
+import subprocess
+import sys
+from shutil import which
+from sysconfig import get_path
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp.conditions import dirichlet
+from sparsedp.derivative import value_and_grad
+from sparsedp.grid import Grid
+from sparsedp.operators.difference import laplacian
+from sparsedp.parallel.front import distribute
+from sparsedp.solvers.inverses import inverse
+
+__all__ = ["report"]
+
+SECONDS = 300  # after which a test is given up; the first one compiles loops
+WITHIN = 1e-10  # of one process, relative
+DEBIAN = "apt-get install -y --no-install-recommends"
+# Debian keeps petsc4py in a folder of its own, which a virtual environment of its python has to be told.
+PETSC4PY = f"ls -d /usr/lib/petscdir/*/*-real/lib/python3/dist-packages > {get_path('purelib')}/petsc.pth"
+COMMANDS = {  # words of what is wrong -> what helps
+    "'mpirun'": f"{DEBIAN} openmpi-bin",
+    "'mpi4py'": "python -m pip install mpi4py",
+    "'petsc4py'": f"{DEBIAN} python3-petsc4py && {PETSC4PY} (not on Debian: conda install -c conda-forge petsc4py)",
+    "run as root": "export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1",
+    "numpy.dtype size changed": 'python -m pip install "numpy<2"',
+    "another MPI": "python -m pip install --force-reinstall --no-binary mpi4py mpi4py",
+}
+
+
+def report():
+    """Lines on what is here and how two processes do; the last one is empty where they cannot."""
+    script = [sys.executable, "-m", __name__]
+    for command in (script, ["mpirun", "-n", "2", sys.executable, "-m", "mpi4py", *script[1:], "compare"]):
+        lines, wrong = run(command)
+        yield from lines
+        if wrong:
+            yield "; write ".join([wrong, *(told for word, told in COMMANDS.items() if word in wrong)])
+            yield ""
+            return
+    yield "ranks work; write mpirun -n 2 python -m mpi4py scene.py"
+
+
+def run(command):
+    """A command -> (lines that it prints, what went wrong in a few words or nothing)."""
+    settings = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMP_NUM_THREADS": "1", **os.environ}
+    try:
+        done = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=SECONDS, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return [], str(error)
+    told = [line for line in done.stderr.splitlines() if line.strip(" -")] or [f"exit code {done.returncode}"]
+    errors = [line for line in told if re.match(r"[\w.]+Error: ", line)] or told
+    return done.stdout.splitlines(), errors[0] if done.returncode else ""
+
+
+# ---- in processes of their own ---------------------------------------------------------------------------------------
+
+
+def versions():
+    """What loads here, in lines."""
+    yield f"Python {sys.version.split()[0]}, NumPy {np.__version__}, {which('mpirun') or 'no mpirun'}"
+    import mpi4py
+    from mpi4py import MPI
+
+    yield f"mpi4py {mpi4py.__version__} on {MPI.Get_library_version().split(',')[0].strip()}"
+    import petsc4py
+    from petsc4py import PETSc
+
+    hypre = "with" if PETSc.Sys.hasExternalPackage("hypre") else "WITHOUT"
+    yield f"petsc4py {petsc4py.__version__} for {np.dtype(PETSc.ScalarType)}, {hypre} hypre"
+
+
+def compare():
+    """Poisson's equation and a gradient, on all processes and on each alone: how far they differ, in one line."""
+    from mpi4py import MPI
+
+    def loss(grid):
+        solution = inverse(-laplacian(grid, dirichlet), rtol=1e-12)
+        return value_and_grad(lambda b: anp.sum(anp.sin(100.0 * solution(b)) ** 2))
+
+    alone = Grid((24, 20), size=1.0)
+    b = np.sin(np.arange(480.0)).reshape(24, 20)
+    (wanted, slope), (value, gradient) = (loss(grid)(b) for grid in (alone, distribute(alone)))
+    off = np.max([abs(value / wanted - 1), np.max(np.abs(gradient - slope)) / np.max(np.abs(slope))])
+    if not off <= WITHIN:
+        raise ArithmeticError(f"a gradient is off by {off:.1e} from one process")
+    if MPI.COMM_WORLD.rank == 0:
+        yield f"Poisson's equation on {MPI.COMM_WORLD.size} processes: value and gradient within {off:.0e} of one"
+
+
+if __name__ == "__main__":
+    for line in compare() if sys.argv[1:] else versions():
+        sys.stdout.write(line + "\n")

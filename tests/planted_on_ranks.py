@@ -1,0 +1,45 @@
+"""Bugs of `parallel/` that several processes see: what stands there, what instead, and the tests that fail then."""
+
+BUGS_ON_RANKS = {
+    "on ranks, a gradient of which one block comes back": (
+        "back = DistributedField.gather if shape else _sum",
+        "back = (lambda g: g.like(g.flat * (g.layout.comm.rank == 0)).gather()) if shape else _sum",
+        "tests/test_ranks.py::test_as_on_one_process[fields-2]",
+    ),
+    "on ranks, a cotangent of a number that is not summed": (
+        "act = _sum if np.ndim(wanted) == 0 else DistributedField.gather",
+        "act = (lambda g: g.flat.sum()) if np.ndim(wanted) == 0 else DistributedField.gather",
+        "tests/test_ranks.py::test_as_on_one_process[fields-2]",
+    ),
+    "on ranks, a sum of the block": (
+        "return x.layout.sum(x.flat.sum())",
+        "return x.flat.sum()",
+        "tests/test_ranks.py::test_as_on_one_process[fields-2]",
+    ),
+    "on ranks, a halo that is too thin": (
+        "side = (int(columns.min()), int(columns.max()) + 1)",
+        "side = (int(columns.min()), int(columns.max()))",
+        "tests/test_ranks.py::test_as_on_one_process[fields-2]",
+    ),
+    "on ranks, a halo that was brought before": (
+        '            self.agreement.meet("exchange")',
+        "            given = vars(self).setdefault('sent', given.copy()).astype(given.dtype)\n"
+        '            self.agreement.meet("exchange")',
+        "tests/test_ranks.py::test_as_on_one_process[fields-2]",
+    ),
+    "on ranks, what a halo gives back that is not added": (
+        '"reduce", MPI.SUM',
+        '"reduce", MPI.REPLACE',
+        "tests/test_ranks.py::test_as_on_one_process[transport-2]",
+    ),
+    "on ranks, A for the transpose of A": (
+        "self.acts[transposed].product(x)",
+        "self.acts[False].product(x)",
+        "tests/test_ranks.py::test_as_on_one_process[solves-2]",
+    ),
+    "on ranks, a number that is not compared": (
+        "        self.layout.tell(value)\n        return value",
+        "        return value",
+        "tests/test_errors_ranks.py::test_an_error_of_one_rank_is_that_of_all",
+    ),
+}

@@ -1,0 +1,246 @@
+"""Errors on ranks: planted on one of them, each is raised on all, of the same type and in the same words.
+
+    mpirun -n 2 python -m mpi4py tests/ranks/faults.py
+    mpirun -n 2 python -m mpi4py tests/ranks/faults.py kill
+
+With a word the last rank is killed, finds no file, or fails where the others wait for a message of the user's own:
+the job must end.
+"""
+
+import os
+import signal
+import sys
+from contextlib import contextmanager
+
+import autograd.numpy as anp
+import numpy as np
+from mpi4py import MPI
+
+import sparsedp as dp
+from sparsedp.parallel import cut, solve
+
+COMM = MPI.COMM_WORLD
+LAST = COMM.rank == COMM.size - 1 and COMM.size > 1  # where faults are planted
+PLAIN = dp.Grid((12, 10), size=1.0)
+GRID = dp.distribute(PLAIN, COMM)
+U = np.random.default_rng(0).standard_normal(PLAIN.shape)
+RUNS = np.random.default_rng(None if LAST else 1)  # a generator without a seed, on the last rank
+
+
+@contextmanager
+def planted(owner, name, error):
+    """A method that raises on the last rank."""
+    kept = getattr(owner, name)
+
+    def fault(*args, **options):
+        if LAST:
+            raise error
+        return kept(*args, **options)
+
+    setattr(owner, name, fault)
+    try:
+        yield
+    finally:
+        setattr(owner, name, kept)
+
+
+def within(owner, name, error, act):
+    """A case: the action, while a method raises on the last rank."""
+
+    def case():
+        with planted(owner, name, error):
+            act()
+
+    return case
+
+
+def fails(error=None):
+    """An error of the user's own code on the last rank."""
+    if LAST:
+        raise error or ZeroDivisionError("of one rank")
+    return 0.0
+
+
+def here(usual, on_the_last):
+    """What only the last rank is given otherwise."""
+    return on_the_last if LAST else usual
+
+
+class Shy(Exception):
+    """An error that is not made of words."""
+
+    def __init__(self, one, two):
+        super().__init__(f"{one} and {two}")
+
+
+def laplacian():
+    """A fresh operator, not yet cut."""
+    return dp.laplacian(GRID, dp.dirichlet)
+
+
+def misfit(u):
+    """A loss that meets operators."""
+    return anp.sum(anp.sin(laplacian()(u)) ** 2)
+
+
+def caught(u):
+    """A loss that goes on without what failed."""
+    try:
+        return misfit(u)
+    except MemoryError:
+        return anp.sum(u)
+
+
+def poked(value):
+    """The field with another number in the last cell, on all ranks: it lies in the block of the last."""
+    u = U.copy()
+    u[-1, -1] = value
+    return dp.identity(GRID.cells)(u)
+
+
+def rollout(step, u=None):
+    """Nine steps from a field on ranks."""
+    return dp.rollout(step, poked(1.0) if u is None else u, 0.7, 9)
+
+
+def heat(u, k):
+    """One step."""
+    return u + 1e-3 * k * laplacian()(u)
+
+
+FIELD, STEP = poked(1.0), dp.identity(GRID.cells) - 0.3 * dp.laplacian(GRID)
+WALL = -dp.laplacian(GRID)
+
+# name: (type, words, what meets it). Nothing is planted on one rank in those whose words tell no rank.
+FAULTS = {
+    "NaN in one block": (dp.errors.NonFiniteError, "the first at (11, 9)", lambda: dp.inverse(STEP)(poked(np.nan))),
+    "NaN in one block of a state": (dp.errors.NonFiniteError, "rollout", lambda: rollout(heat, poked(np.nan))),
+    "singular": (dp.errors.IncompatibleError, "is singular", lambda: dp.inverse(WALL)(1.0 + U)),
+    "no convergence": (
+        dp.errors.ConvergenceError, "petsc on", lambda: dp.inverse(-laplacian(), rtol=1e-13, maxiter=1)(U)
+    ),
+    "shape": (dp.errors.ShapeError, "on rank", lambda: laplacian()(here(U, np.zeros(3)))),
+    "dtype": (TypeError, "on rank", lambda: laplacian()(here(U, U.astype(str)))),
+    "cutting": (OverflowError, "on rank", within(cut, "_entries", OverflowError("too large"), lambda: laplacian()(U))),
+    "matrix": (MemoryError, "on rank", within(cut._Cut, "explicit", MemoryError(), lambda: dp.inverse(STEP))),
+    "kernel": (MemoryError, "on rank", within(cut._Cut, "product", MemoryError(), lambda: laplacian()(FIELD))),
+    "kernel in a product": (
+        FloatingPointError, "overflow",
+        within(cut._Cut, "product", FloatingPointError("overflow"), lambda: (laplacian() @ STEP)(FIELD)),
+    ),
+    "kernel in a gradient": (
+        MemoryError, "no room", within(cut._Cut, "product", MemoryError("no room"), lambda: dp.grad(misfit)(FIELD))
+    ),
+    "engine": (RuntimeError, "no", within(solve.PetscEngine, "solve", RuntimeError("no"), lambda: dp.inverse(STEP)(U))),
+    "adjoint": (
+        RuntimeError, "no", within(solve.PetscEngine, "solve", RuntimeError("no"), lambda: dp.inverse(STEP).T(U))
+    ),
+    "set-up": (MemoryError, "PETSc", within(solve, "assembled", MemoryError("PETSc"), lambda: dp.inverse(STEP))),
+    "loss": (ZeroDivisionError, "of one rank", lambda: dp.value_and_grad(lambda u: fails() + misfit(u))(FIELD)),
+    "loss, at its end": (ZeroDivisionError, "one", lambda: dp.value_and_grad(lambda u: misfit(u) + fails())(FIELD)),
+    "tangent": (ZeroDivisionError, "of one rank", lambda: dp.jvp(lambda u: fails() + misfit(u), FIELD, FIELD)),
+    "product with the Hessian": (ZeroDivisionError, "one", lambda: dp.hvp(lambda u: fails() + misfit(u), FIELD, FIELD)),
+    "step": (ZeroDivisionError, "of one rank", lambda: rollout(lambda u, k: heat(u, k) + fails())),
+    "step, before": (Exception, "1 and 2", lambda: rollout(lambda u, k: fails(Shy(1, 2)) + heat(u, k))),
+    "step, its gradient": (
+        KeyError, "of one rank",
+        lambda: dp.grad(lambda u: anp.sum(rollout(lambda u, k: heat(u, k) + fails(KeyError("of one rank")), u)))(FIELD),
+    ),
+    "callback": (
+        ZeroDivisionError, "of one rank",
+        lambda: dp.minimize(misfit, U, maxiter=3, callback=lambda *_: fails()),
+    ),
+    "loss of minimize, later": (
+        ZeroDivisionError, "of one rank",
+        lambda: dp.minimize(counted(lambda u, n: misfit(u) + (fails() if n > 2 else 0.0)), U, maxiter=5),
+    ),
+    "argument": (ValueError, "argument 0['k'] of the loss is not the same", lambda: seen({"k": here(0.5, 0.7)})),
+    "argument, one entry": (
+        ValueError, "argument 0['k'] of the loss is not the same on rank",
+        lambda: seen({"k": np.where(U == U[3, 3], here(0.0, 1.0), U)}),
+    ),
+    "random numbers": (
+        ValueError, "an array of shape (12, 10) beside a field on ranks is not the same",
+        lambda: dp.value_and_grad(lambda u: misfit(u + RUNS.standard_normal(PLAIN.shape)))(FIELD),
+    ),
+    "a random number": (
+        ValueError, "a number beside a field on ranks is not the same on rank", lambda: np.sum(FIELD * RUNS.random())
+    ),
+    "loss of one rank": (
+        ValueError, "the result[0] of the loss is not the same on rank",
+        lambda: dp.value_and_grad(lambda u: misfit(u) + RUNS.random())(FIELD),
+    ),
+    "operator of one rank": (
+        ValueError, "is not the same on rank", lambda: dp.diagonal(GRID.cells, RUNS.random(PLAIN.shape))(FIELD)
+    ),
+    "kernel, caught by its rank": (
+        ValueError, "came to an error in laplacian where",
+        within(cut._Cut, "product", MemoryError(), lambda: dp.grad(caught)(FIELD)),
+    ),
+    "clock": (TypeError, "by the clock", lambda: dp.workprec(lambda: (misfit, U), [{}])),
+    "another way": (
+        ValueError, "let nothing depend on the number of the rank", lambda: here(np.sum, np.max)(FIELD)
+    ),
+}  # fmt: skip
+
+
+def counted(loss):
+    """A loss that is told how often it was asked before."""
+    calls = []
+
+    def counts(u):
+        calls.append(None)
+        return loss(u, len(calls) - 1)
+
+    return counts
+
+
+def seen(x):
+    """Value and gradient of a loss of a number or a field that every rank has."""
+    return dp.value_and_grad(lambda x: anp.sum(anp.exp(x["k"] * FIELD)))(x)
+
+
+def all_are_told_the_same():
+    """Every fault on all ranks; after each, all go on together."""
+    for name, (kind, words, act) in FAULTS.items():
+        try:
+            act()
+            told = "nothing"
+        except Exception as error:
+            told = f"{type(error).__name__}: {error}"
+            assert isinstance(error, kind) and words in str(error), (name, told)
+        assert len(set(COMM.allgather(told))) == 1, (name, COMM.allgather(told))
+        assert told != "nothing", name
+        assert np.sum(GRID.volumes) > 0.99, name
+        if COMM.rank == 0:
+            print(f"{name}: {told}")
+
+
+def a_point_that_one_rank_refuses_is_refused():
+    """The search goes back on all ranks, and the history says why."""
+    loss = counted(lambda u, n: (fails(dp.errors.NonFiniteError("of one rank")) if n == 1 else 0.0) + misfit(u))
+    best = dp.minimize(loss, U, maxiter=2)
+    [failure] = best.history[1].failed
+    assert failure.message.startswith(f"of one rank (on rank {COMM.size - 1}, whose block begins at cell (")
+    assert len(set(COMM.allgather(best.x.tobytes()))) == 1
+
+
+def nobody_waits(how):
+    """The last rank ends otherwise: killed, or by an error that the others cannot be told."""
+    if how == "kill" and LAST:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if how == "file" and LAST:
+        np.load("/nowhere/rank.npy")
+    if how == "waits":
+        dp.value_and_grad(lambda u: misfit(u) + (fails() if LAST else COMM.recv(source=COMM.size - 1)))(FIELD)
+    while True:
+        np.sum(FIELD)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:]:
+        nobody_waits(sys.argv[1])
+    all_are_told_the_same()
+    a_point_that_one_rank_refuses_is_refused()
+    if COMM.rank == 0:
+        print("all agree")

@@ -1,0 +1,133 @@
+"""Flow on ranks, beside one process: projections, a plume that they keep incompressible, and its gradients.
+
+mpirun -n 2 python -m mpi4py tests/ranks/flow_on_ranks.py
+"""
+
+import autograd.numpy as anp
+import numpy as np
+from mpi4py import MPI
+
+import sparsedp as dp
+
+COMM = MPI.COMM_WORLD
+SOLID = np.zeros((12, 10), dtype=bool)
+SOLID[4:7, 3:5] = SOLID[9] = True  # a block, and a wall that parts the room
+BLOCK = np.zeros((16, 12), dtype=bool)
+BLOCK[6:9, 5:8] = True
+
+
+def close(value, wanted, tol, name):
+    """Compare, and see that all ranks have the same."""
+    value, wanted = np.asarray(dp.gather(value)), np.asarray(wanted)
+    assert len(set(COMM.allgather(value.tobytes()))) == 1, name
+    error = np.max(np.abs(value - wanted), initial=0.0) / np.max(np.abs(wanted), initial=1e-300)
+    assert value.shape == wanted.shape and error <= tol, (name, error)
+
+
+def derivatives(loss, x, along):
+    """Value, gradient, tangent and Hessian product."""
+    return *dp.value_and_grad(loss)(x), dp.jvp(loss, x, along)[1], dp.hvp(loss, x, along)
+
+
+def whole(space, u):
+    """A field that every rank knows."""
+    return u
+
+
+def lying(space, u):
+    """The same, in blocks."""
+    return dp.identity(space)(u)
+
+
+def on_both(name, plain, look, tol=1e-10, fields=(whole, lying)):
+    """What ``look(grid, field)`` gives on one process, and on ranks of whole arrays and of fields in blocks."""
+    grid = dp.distribute(plain, COMM)
+    wanted = look(plain, whole)
+    for field in fields:
+        for number, pair in enumerate(zip(look(grid, field), wanted, strict=True)):
+            close(*pair, tol, f"{name} on {plain}, number {number}")
+
+
+def projections():
+    """P, its transpose, its pressure and derivatives: obstacles, regions, openings, widths, lines that are shut."""
+    uneven = dp.Grid((12, 10), spacing=[np.linspace(1, 2, 12), np.linspace(2, 1, 10)])
+    cases = [
+        (dp.Grid((12, 10), size=(1.0, 2.0)), {}),
+        (dp.Grid((12, 10), size=1.0, periodic=(True, False)), {}),
+        (dp.Grid((12, 10), size=1e-3), {"solid": SOLID}),
+        (uneven, {"boundary": {"x": (dp.inflow, dp.outflow)}}),
+        (uneven, {"boundary": {"y": dp.outflow}, "solid": SOLID}),
+        (dp.Grid((6, 4, 5), size=1.0), {"boundary": {"z": dp.outflow}}),
+        (dp.Grid((12, 1)), {}),
+    ]
+    rng = np.random.default_rng(0)
+    for plain, options in cases:
+        v, t = rng.standard_normal((2, plain.faces.size))
+        g = rng.standard_normal(plain.shape)
+
+        def look(grid, field, v=v, t=t, g=g, options=options):
+            P = dp.projection(grid, rtol=1e-13, **options)
+            loss = lambda v: anp.sum(anp.sin(P(v * v)) ** 2) + anp.sum(anp.cos(P.pressure(v)))
+            x, along = field(grid.faces, v), field(grid.faces, t)
+            maps = P(x), P.T(x), P.pressure(x), P.pressure.T(field(grid.cells, g)), P(1e-200 * x)
+            assert P.info.forward.status.startswith(("converged", "exact"))
+            return *maps, *derivatives(loss, x, along)
+
+        on_both("projection", plain, look)
+
+
+def plume():
+    """Smoke that rises round an obstacle, 20 steps with a projection each, in a rollout."""
+    plain = dp.Grid((16, 12), size=1.0)
+    x, y = plain.centres()
+    smoke, along = np.exp(-((x - 0.3) ** 2 + (y - 0.5) ** 2) / 0.02), np.sin(3 * x + y)
+
+    def look(grid, field):
+        P, D, A = dp.projection(grid, BLOCK, rtol=1e-13), dp.divergence(grid), dp.average(grid)
+        lift = dp.component(grid, 0).T @ dp.component(grid, 0)
+
+        def step(state, buoyancy):
+            s, v = state
+            v = P(v + 0.02 * buoyancy * lift(A(s)))
+            return s - 0.02 * D(v * A(s)), v
+
+        def loss(start, memory=None):
+            still = np.zeros(grid.faces.size)
+            s, v = dp.rollout(step, (start["s"], still), start["b"], 20, memory=memory)
+            return anp.sum((s - 0.1) ** 2) + anp.sum(v * v)
+
+        start = {"s": field(grid.cells, smoke), "b": 1.5}
+        value, slope, tangent, bent = derivatives(loss, start, {"s": field(grid.cells, along), "b": -0.2})
+        again = dp.value_and_grad(lambda start: loss(start, "30 kB"))(start)
+        return value, *slope.values(), tangent, *bent.values(), again[0], *again[1].values()
+
+    on_both("plume", plain, look)
+
+
+def refused(kind, words, act):
+    """An error with the same words on all ranks."""
+    try:
+        act()
+    except kind as error:
+        told = COMM.allgather(str(error))
+        assert len(set(told)) == 1 and words in told[0], told
+    else:
+        raise AssertionError(words)
+
+
+def errors_are_the_same_on_all_ranks():
+    """An inflow that cannot leave, a velocity that is not finite."""
+    grid = dp.distribute(dp.Grid((12, 10)), COMM)
+    words = "the inflow on the lower x side enters a region without an outflow"
+    refused(ValueError, words, lambda: dp.projection(grid, SOLID, {"x": (dp.inflow, dp.no_slip)}))
+    v = np.zeros(grid.faces.size)
+    v[0] = np.nan  # in a wall
+    refused(dp.errors.NonFiniteError, "takes finite numbers, got 1 that", lambda: dp.projection(grid)(v))
+
+
+if __name__ == "__main__":
+    projections()
+    plume()
+    errors_are_the_same_on_all_ranks()
+    if COMM.rank == 0:
+        print("all agree")

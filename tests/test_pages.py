@@ -1,0 +1,203 @@
+"""The pages in docs/: their code runs, every public name is on them, and what Sphinx makes of them is sound.
+
+Made with warnings as errors; every link leads somewhere, no page asks the network, and in a browser every page loads
+without an error, at the widths of a phone and of a desk, with its formulas and pictures; search works from disk.
+"""
+
+import functools
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from urllib.parse import unquote, urlsplit
+
+import pytest
+from pages import SHELL, blocks, check_install, commands, run_blocks
+from sources import ROOT
+
+import sparsedp
+
+DOCS = ROOT / "docs"
+PAGES = sorted(path.name for path in DOCS.glob("*.md"))
+RUN = [name for name in PAGES if "```python" in (DOCS / name).read_text(encoding="utf-8")]
+QUICK = "/(ensemble|heat_rod|new_operator|plan|update_directions|velocity_recovery)"  # examples that are run here
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+WIDTHS = {"desk": (1280, 900), "phone": (390, 844)}
+
+
+# ---- the sources -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("name", RUN)
+def test_python_blocks(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_blocks(DOCS / name)
+
+
+def test_every_public_name_is_on_the_page_of_the_api():
+    listed = re.findall(r"^   (\w[\w.]*)$", (DOCS / "api.rst").read_text(encoding="utf-8"), re.MULTILINE)
+    public = [name for name in dir(sparsedp) if not name.startswith("__")]
+    rooms = {room: getattr(sparsedp, room).__all__ for room in sparsedp._ROOMS}
+    rooms["report"] = [name for name in rooms["report"] if name not in public]  # these stand in the window as well
+    assert sorted(listed) == sorted([*public, *(f"{room}.{name}" for room in rooms for name in rooms[room])])
+
+
+def test_commands_of_the_pages():
+    found = [words for name in PAGES for block in blocks((DOCS / name).read_text(encoding="utf-8"))
+             if block.language in SHELL for words in commands(block.text)]  # fmt: skip
+    assert found
+    for words in found:
+        if words[:3] == ["python", "-m", "pip"]:
+            check_install(words[3:])
+        elif words[:3] == ["python", "-m", "pytest"]:
+            assert (ROOT / words[-1]).exists()
+        else:
+            assert words[:4] in (["python", "-m", "sparsedp", "demo"], ["python", "-m", "sphinx", "-W"])
+
+
+# ---- what Sphinx makes of them ---------------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """What a page links to, and where in it one can link to."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.links, self.places, self.formulas = [], set(), 0
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attributes):
+        given = dict(attributes)
+        self.formulas += tag == "math"
+        self.places |= {given[key] for key in ("id", "name") if given.get(key)}
+        self.links += [given[key] for key in ("href", "src") if given.get(key)]
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory):
+    """The pages, made in a copy; only the quickest examples are run."""
+    for module in ("sphinx", "myst_parser", "sphinx_gallery", "sphinx_design", "sphinx_copybutton"):
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f'{module} is not installed: python -m pip install -e ".[docs]"')
+    copy = tmp_path_factory.mktemp("site")
+    shutil.copytree(DOCS, copy / "docs", ignore=shutil.ignore_patterns("_build", "gallery", "api", "__pycache__"))
+    shutil.copytree(ROOT / "examples", copy / "examples")
+    (copy / "tests").mkdir()
+    shutil.copy(ROOT / "tests" / "scripts.py", copy / "tests")
+    options = ["-W", "--keep-going", "-q", "-D", f"sphinx_gallery_conf.filename_pattern={QUICK}"]
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", *options, str(copy / "docs"), str(copy / "html")],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"},
+        capture_output=True,
+        text=True,
+        timeout=570,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return copy / "html"
+
+
+def pages(site):
+    return sorted(path for path in site.rglob("*.html") if "_static" not in path.relative_to(site).parts)
+
+
+def dead_links(site):
+    """Links of all pages that lead to no file, to no place in it, or to another site; and how many were followed."""
+    read = functools.cache(Page)
+    dead, followed = set(), 0
+    for path in pages(site):
+        for link in read(path).links:
+            parts = urlsplit(link)
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            target = target / "index.html" if target.is_dir() else target
+            place = unquote(parts.fragment) if target.suffix == ".html" else ""
+            followed += 1
+            if parts.scheme == "data":
+                continue
+            if parts.scheme or parts.netloc or not target.exists() or (place and place not in read(target).places):
+                dead.add(f"{path.relative_to(site)}: {link}")
+    return sorted(dead), followed
+
+
+@pytest.mark.slow
+def test_links(site):
+    dead, followed = dead_links(site)
+    assert not dead, "\n".join(dead)
+    assert followed > 1000 and Page(site / "ideas.html").formulas > 20
+
+
+def test_dead_links_are_seen(tmp_path):
+    (tmp_path / "b.html").write_text('<p id="here"></p>', encoding="utf-8")
+    links = ["b.html#here", "b.html", "data:,x", "b.html#there", "c.html", "https://example.org", "#nowhere"]
+    text = "".join(f'<a href="{link}"></a>' for link in links)
+    (tmp_path / "a.html").write_text(text, encoding="utf-8")
+    assert dead_links(tmp_path) == (sorted(f"a.html: {link}" for link in links[3:]), len(links))
+
+
+@pytest.mark.slow
+def test_every_example_and_name_has_a_page(site):
+    examples = {path.stem for path in (ROOT / "examples").glob("*.py")}
+    assert examples <= {path.stem for path in (site / "gallery").glob("*.html")}
+    assert {f"sparsedp.{name}" for name in sparsedp.__all__} <= {path.stem for path in (site / "api").glob("*.html")}
+    thumbnails = {path.name for path in (site / "_images").glob("sphx_glr_*_thumb.png")}
+    assert len(thumbnails) >= len(examples)
+
+
+@pytest.fixture(scope="session")
+def browser():
+    if CHROMIUM is None or importlib.util.find_spec("playwright") is None:
+        pytest.skip("Chromium or playwright is not installed")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as api:
+        running = api.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield running
+        running.close()
+
+
+def opened(browser, width):
+    """A page of the browser, and the list that its errors, and what it asks of the network, go to."""
+    tab, wrong = browser.new_page(viewport=dict(zip(("width", "height"), WIDTHS[width]))), []
+    tab.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: wrong.append(str(error)))
+    tab.on("requestfailed", lambda request: wrong.append(f"failed {request.url}"))
+    tab.on("request", lambda request: None if request.url.startswith(("file:", "data:")) else wrong.append(request.url))
+    return tab, wrong
+
+
+LOOK = """() => ({
+    over: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+    broken: [...document.images].filter(i => i.complete && !i.naturalWidth).map(i => i.src),
+    flat: [...document.querySelectorAll("article math")].filter(m => m.getBoundingClientRect().height < 5).length,
+})"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", WIDTHS)
+def test_in_a_browser(site, browser, width):
+    """No error, no picture missing, no formula without a height, nothing wider than the window."""
+    tab, wrong = opened(browser, width)
+    found = []
+    for path in pages(site):
+        tab.goto(path.as_uri())
+        seen = tab.evaluate(LOOK)
+        found += [f"{path.relative_to(site)}: {what}" for what in (*wrong, *seen["broken"])]
+        found += [f"{path.relative_to(site)}: {key} {seen[key]}" for key in ("over", "flat") if seen[key] > 0]
+        wrong.clear()
+    tab.close()
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.slow
+def test_search_from_disk(site, browser):
+    tab, wrong = opened(browser, "desk")
+    tab.goto((site / "search.html").as_uri() + "?q=checkpoint")
+    tab.wait_for_selector("#search-results li a", timeout=10_000)
+    tab.wait_for_timeout(500)
+    titles = tab.locator("#search-results li").all_inner_texts()
+    tab.close()
+    assert any("ideas" in title.lower() for title in titles) and not wrong, (titles, wrong)
