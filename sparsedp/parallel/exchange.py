@@ -10,9 +10,21 @@ from sparsedp import results
 from sparsedp.ledger import active, count
 from sparsedp.parallel.partition import lengths, slices
 
-__all__ = ["Exchange", "of_boxes", "of_entries"]
+__all__ = ["Exchange", "hold", "of_boxes", "of_entries"]
 
 KINDS = {"f": MPI.FLOAT, "d": MPI.DOUBLE, "D": MPI.C_DOUBLE_COMPLEX}  # PETSc adds up no floats
+
+HELD = MPI.Comm.Create_keyval()
+
+
+def hold(comm):
+    """Keep PETSc's own copy of a communicator. Called by all ranks together.
+
+    Without a holder it is freed with the last object on it, which Python drops sooner on one rank than on another: the
+    one would then wait for the others to make a new one.
+    """
+    if comm.Get_attr(HELD) is None:
+        comm.Set_attr(HELD, PETSc.Comm(comm).duplicate())
 
 
 class Exchange:

@@ -10,6 +10,7 @@ import numpy as np
 from sparsedp.errors import ShapeError
 from sparsedp.fields import field_array
 from sparsedp.parallel.cut import OnBlocks, localized
+from sparsedp.parallel.exchange import hold
 from sparsedp.parallel.fields import DistributedField, block, everywhere
 from sparsedp.parallel.partition import Partition
 from sparsedp.parallel.solve import RanksSystem
@@ -35,6 +36,7 @@ class Layout(Partition):
 
     def __init__(self, shape, periodic, comm):
         super().__init__(shape, periodic, comm)
+        hold(comm)
         self._cuts: WeakKeyDictionary = WeakKeyDictionary()  # structure of whole fields -> that of blocks
 
     def __repr__(self):
