@@ -30,7 +30,6 @@ Adams-Bashforth, by the largest root |z| of
     z^2 - z = (3/2 z - 1/2) (i c - d),      or, with implicit damping,  (z^2 - z) + d z (z + 1) / 2 = (3/2 z - 1/2) i c.
 """
 
-from math import prod
 from typing import Any
 
 import numpy as np
@@ -42,6 +41,7 @@ from sparsedp.fields import check_finite, check_function, check_number, check_ta
 from sparsedp.flow.momentum import convection, face_laplacian, free_faces
 from sparsedp.flow.pressure import projection
 from sparsedp.grid import check_grid
+from sparsedp.operator import Operator
 from sparsedp.operators.boundary import identity, lift, mask
 from sparsedp.operators.difference import divergence, gradient, laplacian
 from sparsedp.operators.transfer import average
@@ -210,6 +210,7 @@ class FlowStep(Remade):
         self.strict, self.implicit = given["unstable"] == "raise", given["implicit"]
         self.project = projection(grid, solid, boundary)
         self.pressure, self.divergence = self.project.pressure, divergence(grid)
+        self.passing = Operator(self.divergence.structure.absolute, grid.faces, grid.cells, "passing")
         setup = self.project.setup
         self.slope = gradient(grid, setup.pressure_conditions, solid)
         self.open = mask(grid.faces, setup.open)
@@ -294,8 +295,7 @@ class FlowStep(Remade):
 
     def _check_convection(self, v):
         """Refuse a step in which a wave that the flow carries would grow."""
-        rows = np.abs(plain(v)).astype(float).reshape(prod(np.shape(v)[:-1]), -1)  # of a batch
-        passing = [*map(self.divergence.structure.magnitude(), rows)]  # twice the mean |v| / h
+        passing = self.passing.apply(np.abs(plain(v)).astype(float))  # twice the mean |v| / h
         fastest = 0.5 * float(np.max(passing, initial=0.0))
         if SURE < self.dt * fastest < np.inf:
             terms = [self.viscous, *(one.diffused for one in self.scalars.values())]
@@ -389,7 +389,7 @@ class Scalar:
         if values is not None:
             slopes, normal = lift(grid, boundary)(values), flow.divergence.T(np.ones(grid.shape))
             bend = flow.divergence(slopes)
-            self.held = np.divide(slopes, 2 * normal, out=np.zeros_like(slopes), where=slopes != 0)  # the wall's value
+            self.held = slopes / np.where(slopes != 0, 2 * normal, 1.0)  # the wall's value
         if diffusivity:
             op = laplacian(grid, boundary, solid)
             self.diffused = Diffusion(f"diffusivity of {name!r}", float(diffusivity), op, bend, flow)

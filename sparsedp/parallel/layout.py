@@ -23,8 +23,8 @@ __all__ = ["Layout"]
 
 # What asks by `check_grid` or `check_operator`, and is known to be right on ranks; all others are refused by name.
 RIGHT = {
-    "component", "curl", "distribute", "divergence", "flux", "harmonic_average", "interior", "inverse", "laplacian",
-    "projection", "prolong", "restrict", "sample", "sponge", "transport", "upwind",
+    "component", "curl", "distribute", "divergence", "flow_step", "flux", "harmonic_average", "interior", "inverse",
+    "laplacian", "projection", "prolong", "restrict", "sample", "sponge", "transport", "upwind",
 }  # fmt: skip
 
 

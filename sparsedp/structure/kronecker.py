@@ -147,10 +147,11 @@ class Kronecker(Structure):
         )
 
     def magnitude(self):
-        return self._absolute.product
+        return self.absolute.product
 
     @cached_property
-    def _absolute(self):
+    def absolute(self):
+        """The same of magnitudes, term by term."""
         return self._each(_absolute)
 
     # ------------------------------------------------------------ forms

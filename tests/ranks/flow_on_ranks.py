@@ -1,4 +1,4 @@
-"""Flow on ranks, beside one process: projections, a plume that they keep incompressible, and its gradients.
+"""Flow on ranks, beside one process: projections, a plume and a cavity that they keep incompressible, and gradients.
 
 mpirun -n 2 python -m mpi4py tests/ranks/flow_on_ranks.py
 """
@@ -104,6 +104,66 @@ def plume():
     on_both("plume", plain, look)
 
 
+def cavity():
+    """The flow under a lid, 20 steps of `flow_step` in a rollout: in the viscosity, the lid and the first velocity."""
+    plain = dp.Grid((32, 32), size=1.0)
+    v, along = 0.05 * np.random.default_rng(0).standard_normal((2, plain.faces.size))
+
+    def look(grid, field):
+        lift = dp.face_lift(grid)
+        lid = lift(lift.domain.join(0.0, 0.0, 0.0, 1.0))
+        step = dp.flow_step(grid, 0.01, lambda p: p["nu"], lambda v, p: p["nu"] * p["lid"] * lid)
+
+        def loss(x, memory=None):
+            state = dp.rollout(step, step.start(x["v"], x), x, 20, memory=memory)
+            return anp.sum((state["v"] - 0.1) ** 2) + anp.mean(anp.sin(state["p"]))
+
+        start = {"v": field(grid.faces, v), "nu": 0.01, "lid": 1.5}
+        value, slope, tangent, bent = derivatives(
+            loss, start, {"v": field(grid.faces, along), "nu": 0.002, "lid": -0.3}
+        )
+        again = dp.value_and_grad(lambda x: loss(x, "300 kB"))(start)
+        return value, *slope.values(), tangent, *bent.values(), again[0], *again[1].values()
+
+    on_both("cavity", plain, look)
+
+
+def flows():
+    """Every part that `flow_step` takes: obstacles, openings, heat, implicit viscosity, friction, three axes."""
+    box, room = dp.Grid((12, 10), size=1.0), dp.Grid((6, 4, 5), size=1.0, periodic=(False, True, False))
+    mild, x = 0.02 * SOLID, {"x": (dp.inflow, dp.outflow)}
+    hot = {"diffusivity": 0.01, "boundary": {"x": dp.dirichlet}, "source": lambda s, p: p * s["heat"] - s["dye"]}
+    scalars = {"heat": hot | {"values": np.linspace(0.5, 1.0, 44)}, "dye": {}}
+    push = lambda v, s, p: p * anp.mean(s["heat"]) * v
+    rub = lambda p: p * np.arange(262.0)
+    cases = [
+        (box, {"viscosity": 0.01, "implicit": True, "solid": BLOCK[:12, :10]}),
+        (box, {"viscosity": 0.01, "boundary": x, "convective": False, "walls": np.linspace(0, 1, 262)}),
+        (box, {"viscosity": 0.01, "scalars": scalars, "force": push}),
+        (box, {"scalars": scalars, "solid": mild > 0, "implicit": True, "viscosity": 0.1}),
+        (box, {"viscosity": lambda p: 0.01 * p, "friction": rub}),
+        (room, {"viscosity": 0.001, "friction": 0.5 + np.zeros(room.faces.size)}),
+    ]
+    for plain, options in cases:
+        v, t = 0.05 * np.random.default_rng(0).standard_normal((2, plain.faces.size))
+        s, r = np.random.default_rng(1).random((2, *plain.shape))
+
+        def look(grid, field, v=v, t=t, s=s, r=r, options=options):
+            step = dp.flow_step(grid, 0.02, **options)
+
+            def loss(x):
+                scalars = {"heat": x["s"], "dye": 1.0 - x["s"]} if "scalars" in options else None
+                end = dp.rollout(step, step.start(x["v"], x["p"], scalars), x["p"], 3)
+                carried = anp.sum(end["s"]["heat"] ** 2) if scalars else 0.0
+                return anp.sum(anp.sin(1.0 + end["v"])) + anp.sum(end["p"] ** 2) + carried
+
+            start = {"v": field(grid.faces, v), "s": field(grid.cells, s), "p": 0.3}
+            value, slope, tangent, bent = derivatives(loss, start, {"v": field(grid.faces, t), "s": r, "p": 0.1})
+            return value, *slope.values(), tangent, *bent.values()
+
+        on_both(f"flow_step {sorted(options)}", plain, look, 1e-9)  # its solves are good to 1e-10
+
+
 def refused(kind, words, act):
     """An error with the same words on all ranks."""
     try:
@@ -116,11 +176,15 @@ def refused(kind, words, act):
 
 
 def errors_are_the_same_on_all_ranks():
-    """An inflow that cannot leave, a velocity that is not finite."""
+    """An inflow that cannot leave, a step that is too long, a velocity that is not finite."""
     grid = dp.distribute(dp.Grid((12, 10)), COMM)
     words = "the inflow on the lower x side enters a region without an outflow"
     refused(ValueError, words, lambda: dp.projection(grid, SOLID, {"x": (dp.inflow, dp.no_slip)}))
     v = np.zeros(grid.faces.size)
+    step = dp.flow_step(grid, 0.1)
+    v[grid.faces.size // 4] = 20.0
+    state = {"v": dp.identity(grid.faces)(v), "p": np.zeros(grid.shape), "a": 0.0 * v}
+    refused(dp.errors.UnstableStepError, "waves grow by", lambda: step(state))
     v[0] = np.nan  # in a wall
     refused(dp.errors.NonFiniteError, "takes finite numbers, got 1 that", lambda: dp.projection(grid)(v))
 
@@ -128,6 +192,8 @@ def errors_are_the_same_on_all_ranks():
 if __name__ == "__main__":
     projections()
     plume()
+    cavity()
+    flows()
     errors_are_the_same_on_all_ranks()
     if COMM.rank == 0:
         print("all agree")
