@@ -71,10 +71,10 @@ class Mask(Diagonal):
 
 
 class Chain(Structure):
-    """A product of structures, applied from right to left."""
+    """A product of structures, applied from right to left; products among them are taken apart."""
 
     def __init__(self, members):
-        self.members = tuple(members)
+        self.members = tuple(inner for member in members for inner in _members(member, Chain))
         self.shape = (members[0].shape[0], members[-1].shape[1])
         self.dtype = np.result_type(*(member.dtype for member in members))
         self.has_entries = all(member.has_entries for member in members)

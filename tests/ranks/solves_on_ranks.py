@@ -65,14 +65,18 @@ def inverses_are_those_of_one_process():
 
 
 def elliptic_misfits():
-    """Value, gradient, tangent and Hessian product in a coefficient on cells, data and shift, whole or on ranks."""
+    """Value, gradient, tangent and Hessian product in a coefficient on cells, data and shift, whole or on ranks.
+
+    Without obstacles, and with one cell in eight of them.
+    """
     for plain in (GRIDS[2], GRIDS[3]):
         rng = np.random.default_rng(4)
         k, b, t = rng.uniform(0.5, 2.0, plain.shape), *rng.standard_normal((2, *plain.shape))
-        for boundary in (dp.dirichlet, dp.neumann):
+        holes = rng.random(plain.shape) < 0.125
+        for boundary, solid in ((dp.dirichlet, None), (dp.neumann, None), (dp.dirichlet, holes)):
             results = []
             for grid, lay in ((plain, False), (dp.distribute(plain, COMM), False), (dp.distribute(plain, COMM), True)):
-                D, G, mean = dp.divergence(grid), dp.gradient(grid, boundary), dp.harmonic_average(grid)
+                D, G, mean = dp.divergence(grid), dp.gradient(grid, boundary, solid), dp.harmonic_average(grid)
                 solve = dp.elliptic_solver(D, G, rtol=1e-13, nullspace="project")
                 field = dp.identity(grid.cells) if lay else lambda u: u
                 x, along = (field(np.log(k)), field(b), 0.2), (field(t), field(b[::-1].copy()), 0.3)
