@@ -136,7 +136,7 @@ def summed(shape, axes, shift):
 
     def act(u, out, *_):
         given = u.reshape(shape), out.reshape(shape)
-        if not u.size or not run("stencil", "kronecker_sum", rows, u.size, threads(), *given, *bands, uniform, shift):
+        if u.size and not run("stencil", "kronecker_sum", rows, u.size, threads(), *given, *bands, uniform, shift):
             reference.kronecker_sum(*given, axes, shift)
 
     return act

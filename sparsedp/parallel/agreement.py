@@ -129,7 +129,7 @@ class Agreement:
         if active:
             count("ranks", "reduction")
         number = np.asarray(number)
-        content, label = number.tobytes(), f"{act.__name__} of shape {number.shape}"
+        content, label = number.tobytes(), f"{act.__name__} of shape {number.shape}, {number.dtype}"
         found = self.meet(label, content) if len(content) <= ROOM else b"".join(self.gathered(content, label))
         return act.reduce(np.ndarray((self.comm.size, *number.shape), number.dtype, found), axis=0)[()]
 

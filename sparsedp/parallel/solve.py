@@ -31,6 +31,8 @@ HYPRE_3D = {
     "pc_hypre_boomeramg_agg_nl": 1,
     "pc_hypre_boomeramg_strong_threshold": 0.5,
 }
+# On the coarsest level BoomerAMG eliminates, which a singular matrix may end by a pivot of 0.
+HYPRE_SINGULAR = {"pc_hypre_boomeramg_relax_type_coarse": "symmetric-SOR/Jacobi"}
 MOST = 500  # iterations of one call
 TIGHT = 1e-14  # least relative residual that PETSc is asked for; the contract refines
 
@@ -246,7 +248,8 @@ class RanksNullSpace(NullSpace):
         return self._sums(side * values)
 
     def _sums(self, values):
-        return self.layout.sum(np.bincount(self.labels + 1, values, self.count + 1)[1:])
+        sums = np.bincount(self.labels + 1, values, self.count + 1)[1:]
+        return self.layout.sum(sums.astype(float))  # of an empty block they are whole numbers
 
     def projected(self, b, transposed=False, into=None, sums=None):
         """As in `NullSpace`."""
@@ -296,6 +299,7 @@ class PetscEngine(Engine):
             ksp.setPCSide(PETSc.PC.Side.RIGHT)
         ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         chosen = HYPRE_3D if w is not None and len(system.parts[0]) == 3 else {}
+        chosen = chosen | HYPRE_SINGULAR if space.count else chosen
         options = PETSc.Options("sparsedp_")
         for name, value in chosen.items():
             options[name] = value

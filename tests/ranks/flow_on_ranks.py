@@ -3,6 +3,8 @@
 mpirun -n 2 python -m mpi4py tests/ranks/flow_on_ranks.py
 """
 
+import warnings
+
 import autograd.numpy as anp
 import numpy as np
 from mpi4py import MPI
@@ -59,6 +61,10 @@ def projections():
         (uneven, {"boundary": {"y": dp.outflow}, "solid": SOLID}),
         (dp.Grid((6, 4, 5), size=1.0), {"boundary": {"z": dp.outflow}}),
         (dp.Grid((12, 1)), {}),
+        (
+            dp.Grid((3,), spacing=0.37, periodic=True),
+            {},
+        ),  # one level, whose matrix is singular
     ]
     rng = np.random.default_rng(0)
     for plain, options in cases:
@@ -190,6 +196,7 @@ def errors_are_the_same_on_all_ranks():
 
 
 if __name__ == "__main__":
+    warnings.simplefilter("error", RuntimeWarning)
     projections()
     plume()
     cavity()
