@@ -66,3 +66,25 @@ def test_bits_follow_the_coefficients(how, dim, method, capfd):
     ctypes.CDLL(None).fflush(None)
     printed, told = capfd.readouterr()
     assert (printed, told.replace(NOTICE, "")) == ("", "")  # PyAMG prints, in C++, where entries are far from 1
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("method", ["direct", "multigrid", "structured", "krylov"])
+def test_a_region_with_faint_data_has_digits_of_its_own(method, closed):
+    """Two rooms that nothing links, with data of 1e-30 in one of them, forward and backward."""
+    if method == "structured" and not kernels.compiled():
+        pytest.skip("structured needs numba")
+    grid, rng = dp.Grid((12, 11), size=1.0), np.random.default_rng(3)
+    wall = np.zeros(grid.shape, dtype=bool)
+    wall[6] = True
+    op = -dp.laplacian(grid, dp.neumann if closed else {"x": dp.dirichlet}, wall)
+    b = rng.standard_normal(grid.shape) * np.where(np.arange(12) < 6, 1e-30, 1.0)[:, None]
+    b[wall] = 0.0
+    for room in (slice(6), slice(7, 12)):
+        b[room] -= np.mean(b[room]) * closed
+    inv = dp.inverse(op, method, nullspace="project")
+    wanted = np.linalg.lstsq(op.matrix.toarray() * 1e30, 1e30 * b.ravel(), rcond=None)[0].reshape(grid.shape)
+    faint = np.linalg.lstsq(op.matrix.toarray(), np.where(wall.cumsum(0) > 0, 0.0, 1e30 * b).ravel(), rcond=None)[0]
+    for x in (inv(b), inv.T(b)):
+        np.testing.assert_allclose(x[7:], wanted[7:], rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(1e30 * x[:6], faint.reshape(grid.shape)[:6], rtol=1e-7, atol=1e-8)

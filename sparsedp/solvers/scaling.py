@@ -93,11 +93,11 @@ def largest(x):
 
 
 def shifted(x, exponent):
-    """x * 2^exponent, exact unless it leaves the range of floats; always a fresh array."""
+    """x * 2^exponent, one for all or one for each, exact unless it leaves the range of floats; always a fresh array."""
     if x.dtype.kind == "c":
         return shifted(x.view(float), exponent).view(complex)
     with np.errstate(over="ignore", under="ignore"):  # what overflows is found by the caller
-        return x * 2.0**exponent if -1000 < exponent < 1000 else np.ldexp(x, exponent)
+        return x * 2.0**exponent if np.max(np.abs(exponent)) < 1000 else np.ldexp(x, exponent)
 
 
 def inverted(values, out=None):

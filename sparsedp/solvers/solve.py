@@ -202,6 +202,7 @@ class Solver(Remade):
             b = shifted(b, -exponent)
             size = self.system.size_of(b)
         exponent -= self.system.exponent
+        run.exponent = exponent
         if start is not None:
             start = shifted(start, -exponent).astype(b.dtype)
         x = self._compatible(b, size, run, start)
@@ -233,7 +234,14 @@ class Solver(Remade):
         if size <= 8 * EPS * raw and start is None:
             run.status = "converged_at_roundoff" if size else "exact_zero_rhs"
             return np.zeros_like(b)
-        return self._refined(b, size, run, start)
+        lift = self.system.lift(b, size) if self.engine.iterative else None
+        if lift is None:
+            return self._refined(b, size, run, start)
+        # A tolerance relative to the whole would leave no digits to a region whose data are faint.
+        run.exponent = run.exponent - lift
+        b, start = (None if x is None else shifted(x, lift) for x in (b, start))
+        b = space.project(b, run.transposed, into=b)
+        return shifted(self._refined(b, self.system.size_of(b), run, start), -lift)
 
     def _on_unknowns(self, b, raw, run, refuses):
         outside = np.where(self.system.active, 0.0, b)
@@ -307,7 +315,7 @@ class Solver(Remade):
             f"{how}{self.engine.method} on {op}: relative residual {run.residual:.1e} after {run.iterations} "
             f"{self.engine.unit}, wanted {run.rtol:g}{why}",
             info=run.info(),
-            best=self.system.shaped(x, op.domain),
+            best=self.system.shaped(shifted(x, run.exponent), op.domain),
         )
 
     def _word(self, run, residual, goal, length, data):
@@ -427,6 +435,7 @@ class Run:
     residual: float = 0.0
     backward_error: float = 0.0
     defect: float = 0.0
+    exponent: Any = 0  # the solution is what the engine works on, times 2 to this power
     clock: float = field(default_factory=perf_counter)
 
     def measure(self, residual, data, terms):

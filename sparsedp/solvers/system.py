@@ -19,6 +19,7 @@ from sparsedp.structure.lazy import Mask
 __all__ = ["System"]
 
 SYMMETRIC = 1e-13  # share of the sizes of two products that is rounding
+FAINT = 1e-3  # share of the size of the data, below which those of a component are solved for at a size of their own
 FAR = 200  # binary exponents of |A| beyond this are scaled away: squares of solutions must not overflow
 
 
@@ -192,6 +193,17 @@ class System:
             links = sp.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
             count, labels = connected_components(links, directed=False)
         return (None, 1) if count == 1 else (labels, count)
+
+    def lift(self, b, size):
+        """Powers of two that bring the data of faint components to the size of the whole; None where none is faint."""
+        labels, count = self.components
+        if labels is None:
+            return None
+        sizes = self.counts(labels, np.abs(b), count)
+        faint = (sizes > 0) & (sizes < FAINT * size)
+        if not np.any(faint):
+            return None
+        return np.where(faint, np.frexp(size / np.where(faint, sizes, 1.0))[1], 0)[labels]
 
     @cached_property
     def null_space(self):
