@@ -87,7 +87,7 @@ def cool(u):
 # %%
 # What is seen is a rod that was warm around :math:`x = 0.6`. The loss is how far we are from it,
 #
-# .. math:: J(u) = \sum_i h \, \big(\text{cool}(u)_i - w_i\big)^2 .
+# .. math:: J(u) = \sum_i h \, \left(\text{cool}(u)_i - w_i\right)^2 .
 
 truth = np.exp(-(((x - 0.6) / 0.1) ** 2))
 wanted = cool(truth)
