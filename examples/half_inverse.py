@@ -1,6 +1,20 @@
-"""A network steers two oscillators, trained three ways. Run: python examples/half_inverse.py [epochs] [--out FOLDER]"""
+r"""
+A network that steers two oscillators
+=====================================
 
-import sys
+Half-inverse gradients, Adam and Levenberg-Marquardt, beside each other.
+
+Two masses hang on springs. A network sees how they should end, and chooses 24 pushes on the second mass that bring them
+there. It is trained through the physics. The two masses answer to pushes with very different strength, so the gradient
+is badly scaled, and the way in which a step is made from it matters more than how many steps are made.
+
+The problem, the method and the figures: P. Schnell, P. Holl, N. Thuerey, "Half-inverse gradients for physical deep
+learning", ICLR 2022.
+
+Run it: ``python examples/half_inverse.py [epochs] [--out FOLDER]``
+"""
+
+import argparse
 from pathlib import Path
 
 import autograd.numpy as np
@@ -8,52 +22,160 @@ import autograd.numpy as np
 import sparsedp as dp
 from sparsedp import network
 
-epochs, rng = int(sys.argv[1]) if sys.argv[1:2] and sys.argv[1] != "--out" else 4, np.random.default_rng(0)
-SPRINGS = np.array([[0, 0, -1.2, 0.2], [0, 0, 0.2, -1.2], [1, 0, 0, 0], [0, 1, 0, 0]])  # to the wall 1, between 0.2
-move = dp.stepper("rk4", lambda u, force: u @ SPRINGS + force[:, None] * np.eye(4)[3], 0.5)  # two places, two speeds
-free = dp.rollout(move, np.eye(4), np.zeros(4), 24)  # linear physics: the ends of unit states, and of unit forces
-driven = dp.rollout(lambda u, _, force: move(u, force), np.zeros((24, 4)), None, 24, inputs=np.eye(24))
+parser = argparse.ArgumentParser(description="A network steers two oscillators, trained three ways.")
+parser.add_argument("epochs", nargs="?", type=int, default=4)
+parser.add_argument("--out", type=Path, metavar="FOLDER", help="draw a picture into this folder")
+options = parser.parse_args()
+
+# %%
+# The physics
+# -----------
+# A state has four numbers: two places and two speeds. Each mass hangs on the wall by a spring of strength 1, and the
+# two are tied to each other by one of strength 0.2:
+#
+# .. math:: \ddot x_1 = -x_1 - 0.2 \, (x_1 - x_2), \qquad \ddot x_2 = -x_2 - 0.2 \, (x_2 - x_1) + f .
+#
+# A row of the matrix holds what one entry of the state does to the rates of all.
+
+SPRINGS = np.array(
+    [
+        [0, 0, -1.2, 0.2],  # place 1
+        [0, 0, 0.2, -1.2],  # place 2
+        [1, 0, 0, 0],  # speed 1
+        [0, 1, 0, 0],  # speed 2
+    ]
+)
+PUSHED = np.array([0, 0, 0, 1])  # a force changes the speed of the second mass
+STEPS = 24
+
+
+def rate(u, force):
+    """Change of states, shape (samples, 4), under forces, shape (samples,)."""
+    return u @ SPRINGS + force[:, None] * PUSHED
+
+
+move = dp.stepper("rk4", rate, 0.5)
+
+# %%
+# The physics is linear. So we run it once from each unit state, and once under each unit push, and know it all: the end
+# of any run is a sum of these.
+
+ends_of_states = dp.rollout(move, np.eye(4), np.zeros(4), STEPS)
+ends_of_pushes = dp.rollout(lambda u, _, force: move(u, force), np.zeros((STEPS, 4)), None, STEPS, inputs=np.eye(STEPS))
+
+# %%
+# The network
+# -----------
+# Four numbers in, 24 pushes out, three hidden layers of 20 tanh units: 1444 weights. The state at the start is also
+# the one that is wanted at the end.
+
+rng = np.random.default_rng(0)
 seen, unseen = rng.random((2, 4096, 4))
-sizes, curves = ((4, 20), (20, 20), (20, 20), (20, 24)), {}
-start = [{"weight": rng.uniform(-1, 1, s) * np.sqrt(6 / sum(s)), "bias": np.zeros(s[1])} for s in sizes]  # Glorot
+sizes = (4, 20), (20, 20), (20, 20), (20, STEPS)
+
+
+def layer(inputs, outputs):
+    """Glorot's choice of first weights."""
+    bound = np.sqrt(6 / (inputs + outputs))
+    return {"weight": rng.uniform(-1, 1, (inputs, outputs)) * bound, "bias": np.zeros(outputs)}
+
+
+start = [layer(*size) for size in sizes]
 
 
 def misses(weights, states):
-    """End minus wanted end, which is the start, under the forces that the network chooses."""
-    hidden = states
-    for layer in weights[:-1]:
-        hidden = network.tanh(network.dense(layer, hidden))
-    return states @ free + network.dense(weights[-1], hidden) @ driven - states
+    """End minus wanted end, under the pushes that the network chooses. Shape (samples, 4)."""
+    *hidden, last = weights
+    signal = states
+    for one in hidden:
+        signal = network.tanh(network.dense(one, signal))
+    pushes = network.dense(last, signal)
+    return states @ ends_of_states + pushes @ ends_of_pushes - states
 
 
-loss = lambda weights, states=seen: np.mean(np.sum(misses(weights, states) ** 2, axis=1))
+def loss(weights, states=seen):
+    """Mean squared miss of a sample."""
+    return np.mean(np.sum(misses(weights, states) ** 2, axis=1))
 
 
-def train(label, f, method, maxiter, every, budget=np.inf, published="", **options):
-    def watch(record, x):
-        if record.iteration % every == 0 or record.seconds > budget:
-            curves.setdefault(label, []).append((record.seconds, loss(x)))
-            told = f"{label:22} {record.iteration:9} {record.seconds:8.2f} {loss(x):10.1e} {loss(x, unseen):10.1e}"
-            print(told, *published.split()[len(curves[label]) - 1 :][:1])
-        return record.seconds > budget
+# %%
+# Three ways to make a step
+# -------------------------
+# Let :math:`r` be the misses of a batch and :math:`B` their Jacobian in the weights, with singular values
+# :math:`\sigma`. Steps differ in the power of :math:`\sigma` that they hold:
+#
+# - gradient descent goes along :math:`B^T r`, with :math:`\sigma` itself: what is weakly felt is hardly learned. Adam
+#   scales each weight, which does not mend that;
+# - Gauss-Newton divides by the Jacobian, :math:`B^{+} r`, which multiplies components by :math:`1 / \sigma`:
+#   what is weakly felt gets huge steps. Levenberg-Marquardt damps that;
+# - a **half-inverse** step stands between them: with :math:`B = U \Sigma V^T` it is :math:`V \Sigma^{-1/2} U^T r`,
+#   with half of the power of Gauss-Newton. What is weakly felt is learned, and nothing needs damping.
+#
+# The function below trains in one of these ways, and keeps seconds and loss on the way.
 
-    return dp.minimize(f, start, method, maxiter, 0, watch, **options)
-
-
+curves = {}
 print("method                 gradients  seconds       loss     unseen published")
-batches = list(seen[rng.permuted(np.tile(np.arange(4096), (epochs, 1)), axis=1)].reshape(-1, 32, 4))
-options = {"batches": batches, "rate": 2 / 32, "apart": True}  # the published loss is a mean: 2 / 32 of the misses
-train("half-inverse", misses, "half_inverse", 128 * epochs, 128, published="5.4e-5 1.1e-5 3.2e-6 1.2e-6", **options)
-few, options = seen[:128], {"apart": True, "damping": 1e-4}  # 512 misses for 1444 weights
-best = train("Levenberg-Marquardt", lambda w: misses(w, few), "levenberg_marquardt", 90, 30, **options)
+
+
+def train(label, f, method, maxiter, every, budget=np.inf, published="", **settings):
+    """Train from the same start; print a row every so many gradients, and when the budget of seconds is spent."""
+    curve = curves[label] = []
+    figures = published.split()
+
+    def watch(record, weights):
+        late = record.seconds > budget
+        if record.iteration % every == 0 or late:
+            curve.append((record.seconds, loss(weights)))
+            known = figures[len(curve) - 1] if len(curve) <= len(figures) else ""
+            spent = f"{label:22} {record.iteration:9} {record.seconds:8.2f}"
+            print(f"{spent} {curve[-1][1]:10.1e} {loss(weights, unseen):10.1e} {known}".rstrip())
+        return late
+
+    return dp.minimize(f, start, method, maxiter, 0, watch, **settings)
+
+
+# %%
+# Half-inverse steps on batches of 32; an epoch goes once through all samples. The published loss is a mean, so that the
+# rate 1 there is 2 / 32 of our sum of misses.
+
+shuffled = rng.permuted(np.tile(np.arange(4096), (options.epochs, 1)), axis=1)
+batches = list(seen[shuffled].reshape(-1, 32, 4))
+settings = {"batches": batches, "rate": 2 / 32, "apart": True, "published": "5.4e-5 1.1e-5 3.2e-6 1.2e-6"}
+train("half-inverse", misses, "half_inverse", 128 * options.epochs, 128, **settings)
+
+# %%
+# Levenberg-Marquardt sees 128 samples, always the same: 512 misses for 1444 weights.
+
+few = seen[:128]
+settings = {"apart": True, "damping": 1e-4}
+best = train("Levenberg-Marquardt", lambda weights: misses(weights, few), "levenberg_marquardt", 90, 30, **settings)
 print(f"  on the 128 samples that it sees: {loss(best.x, few):.1e}")
-train("Adam, equal time", loss, "adam", 10**6, 1500, max(curve[-1][0] for curve in curves.values()), batches=batches)
 
-if "--out" in sys.argv:
-    from matplotlib import pyplot
+# %%
+# Adam gets as much time as the slower of the two.
 
-    for label, curve in curves.items():
-        pyplot.loglog(*zip(*curve), "o-", label=label)
-    pyplot.legend()
-    Path(sys.argv[-1]).mkdir(exist_ok=True)
-    pyplot.savefig(Path(sys.argv[-1]) / "half_inverse.png", dpi=120)
+longest = max(curve[-1][0] for curve in curves.values())
+train("Adam, equal time", loss, "adam", 10**6, 1500, longest, batches=batches)
+
+# %%
+# The picture
+# -----------
+# Loss on the samples that were seen, over time; both axes are logarithmic.
+#
+# Exercises
+# ---------
+# 1. Tie the masses by a spring of 0.02 instead of 0.2. The first mass then hardly feels the pushes. Which way suffers?
+# 2. Let Levenberg-Marquardt see 16 samples. What do the two losses say?
+# 3. Plot the 24 pushes for one sample. Are they what you would do by hand?
+
+if options.out:
+    from matplotlib import pyplot, style
+
+    style.use("tableau-colorblind10")
+    picture, ax = pyplot.subplots(figsize=(6, 4), layout="constrained")
+    for (label, curve), mark in zip(curves.items(), "os^"):
+        ax.loglog(*zip(*curve), marker=mark, label=label)
+    ax.set(title="training through the physics", xlabel="time [s]", ylabel="mean squared miss")
+    ax.legend(frameon=False)
+    options.out.mkdir(parents=True, exist_ok=True)
+    picture.savefig(options.out / "half_inverse.png", dpi=120)

@@ -109,8 +109,9 @@ for pairs in range(2, 7):  # the first adjoint only starts it
 # %%
 # The picture
 # -----------
-# Left: the wind that we set. Middle: what pressure makes of it; this one has no divergence. Right: what was wanted. Most
-# of it cannot be had: it has divergence, and it has eddies, while all that pressure makes on the right is a gradient.
+# Left: the wind that we set. Middle: what pressure makes of it; this one has no divergence. Right: what was wanted.
+# Most of it cannot be had: it has divergence, and it has eddies, while all that pressure makes on the right is a
+# gradient.
 #
 # Exercises
 # ---------
@@ -124,7 +125,6 @@ if options.out:
     picture, places = pyplot.subplots(1, 3, figsize=(13, 3.2), layout="constrained")
     fields = {"ours": left(best), "becomes": project(left(best)), "wanted": target}
     for ax, (title, field) in zip(places, fields.items()):
-        dp.plot(grid, field, ax=ax, title=title)
-    places[0].figure.suptitle("speed and direction of the wind")
+        dp.plot(grid, field, ax=ax, title=title, label="speed")
     options.out.mkdir(parents=True, exist_ok=True)
     picture.savefig(options.out / "pressure_projection.png", dpi=120)
