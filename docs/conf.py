@@ -46,6 +46,7 @@ sphinx_gallery_conf = {
     "gallery_dirs": ["gallery"],
     # All are run whose libraries are here; -D sphinx_gallery_conf.filename_pattern=heat_rod runs one.
     "filename_pattern": gallery_scripts.runnable(),
+    "subsection_order": "gallery_scripts.section_order",
     "within_subsection_order": "gallery_scripts.order",
     "reset_argv": "gallery_scripts.arguments",
     "image_scrapers": ("gallery_scripts.pictures", "matplotlib"),

@@ -25,11 +25,13 @@ import sparsedp as dp
 ROOT = Path(__file__).parent.parent
 STAGE = Path(__file__).parent / "_build" / "examples"  # the scripts with a title; Sphinx-Gallery runs these
 DRAWN = Path(__file__).parent / "_build" / "drawn"  # what they write with --out
-HEADER = """Gallery
+HEADER = "GALLERY_HEADER.rst"
+INTRODUCTION = """Gallery
 =======
 
 Each example is one script, run when these pages were made. What it printed and drew stands below its code.
 Times are those of that run. Sizes are smaller than the defaults of some scripts, so that all run in about ten minutes.
+The first ten are a course. The others stand by topic.
 """
 
 
@@ -40,10 +42,24 @@ def size(name):
     return small.get(name, "16")
 
 
+def sections():
+    """The parts of examples/README.md that have a table: title, paragraph, {name of an example: what it shows}."""
+    text = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
+    for part in text.split("\n## ")[1:]:
+        rows = dict(re.findall(r"^\| \d+ \| `(\w+\.py)` \| \d+ \| (.*) \|$", part, re.MULTILINE))
+        title, _, rest = part.partition("\n")
+        if rows:
+            yield title, rest.partition("| order")[0].strip(), rows
+
+
 def table():
     """Name of each example -> what it shows, in the order of examples/README.md."""
-    rows = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
-    return dict(re.findall(r"^\| \d+ \| `(\w+\.py)` \| \d+ \| (.*) \|$", rows, re.MULTILINE))
+    return {name: shows for _, _, rows in sections() for name, shows in rows.items()}
+
+
+def folder(title):
+    """Where the examples of a section are, and their pages."""
+    return re.sub(r"\W+", "_", title.lower())
 
 
 def titled(text, shows):
@@ -62,15 +78,19 @@ def titled(text, shows):
 
 def stage():
     """Write the scripts that Sphinx-Gallery runs, where they changed."""
-    for folder in (STAGE, DRAWN):
-        folder.mkdir(parents=True, exist_ok=True)
-    shows = table()
-    for old in STAGE.glob("*.py"):
-        if old.name not in shows:
+    DRAWN.mkdir(parents=True, exist_ok=True)
+    texts = {Path(HEADER): INTRODUCTION}
+    for title, paragraph, rows in sections():
+        place = Path(folder(title))
+        texts[place / HEADER] = f"{title}\n{'-' * len(title)}\n\n{paragraph}\n"
+        for name, shows in rows.items():
+            texts[place / name] = titled((ROOT / "examples" / name).read_text(encoding="utf-8"), shows)
+    for old in [path for kind in ("*.py", HEADER) for path in STAGE.rglob(kind)]:
+        if old.relative_to(STAGE) not in texts:
             old.unlink()
-    texts = {name: titled((ROOT / "examples" / name).read_text(encoding="utf-8"), shows[name]) for name in shows}
-    for name, text in {**texts, "GALLERY_HEADER.rst": HEADER}.items():
-        (STAGE / name).write_text(text, encoding="utf-8")
+    for place, text in texts.items():
+        (STAGE / place).parent.mkdir(parents=True, exist_ok=True)
+        (STAGE / place).write_text(text, encoding="utf-8")
 
 
 def runnable():
@@ -86,13 +106,18 @@ def order(name):
     return list(table()).index(Path(name).name)
 
 
+def section_order(path):
+    """Sort key: the place of a section in examples/README.md."""
+    return [folder(title) for title, *_ in sections()].index(Path(path).name)
+
+
 def arguments(gallery_conf, script_vars):
     """What an example is called with."""
     script = Path(script_vars["src_file"])
-    name, folder = script.stem, DRAWN / script.stem
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    target = folder / "picture.png" if name == "velocity_recovery" else folder
+    name, out = script.stem, DRAWN / script.stem
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir()
+    target = out / "picture.png" if name == "velocity_recovery" else out
     draws = "--out" in script.read_text(encoding="utf-8")
     return [size(script.name), *(["--out", str(target)] if draws else [])]
 
@@ -104,7 +129,8 @@ def let_processes_in():
     def from_file(name):
         main = sys.modules["__main__"]
         if main.__spec__ is not None and main.__spec__.loader is None:
-            main.__spec__, main.__file__ = None, str(STAGE / Path(sys.argv[0]).name)
+            [script] = STAGE.rglob(Path(sys.argv[0]).name)
+            main.__spec__, main.__file__ = None, str(script)
         return prepare(name)
 
     spawn.get_preparation_data = from_file
@@ -125,8 +151,8 @@ def pictures(block, block_vars, gallery_conf):
 
 def thumbnails(app):
     """For an example without a picture: what it printed, small."""
-    folder = Path(app.srcdir) / "gallery"
-    for page in (folder / f"{Path(name).stem}.rst" for name in table()):
+    gallery = Path(app.srcdir) / "gallery"
+    for page in (gallery / folder(title) / f"{Path(name).stem}.rst" for title, _, rows in sections() for name in rows):
         text = page.read_text(encoding="utf-8")
         if ".. image-sg::" in text:
             continue
@@ -134,7 +160,7 @@ def thumbnails(app):
         lines = textwrap.dedent(printed[1] if printed else page.stem).splitlines()[:12]
         figure = Figure(figsize=(4, 2.8), facecolor="#f3f4f5")
         figure.text(0.04, 0.94, "\n".join(line[:38] for line in lines), va="top", family="monospace", size=9)
-        figure.savefig(folder / "images" / "thumb" / f"sphx_glr_{page.stem}_thumb.png", dpi=100)
+        figure.savefig(page.parent / "images" / "thumb" / f"sphx_glr_{page.stem}_thumb.png", dpi=100)
 
 
 def membrane(method, cells):
@@ -146,8 +172,8 @@ def membrane(method, cells):
 
 def measured(app):
     """Picture and table of numbers.md: error against run time of every solver, on this machine."""
-    folder = Path(app.srcdir)
-    if (folder / "_build" / "error_against_time.md").exists():
+    home = Path(app.srcdir)
+    if (home / "_build" / "error_against_time.md").exists():
         return
     methods = {name: {"method": name} for name in ("direct", "separable", "structured", "multigrid", "krylov")}
     exact = 0.07367135328151
@@ -159,7 +185,8 @@ def measured(app):
         times = (f"{1e3 * row[f'seconds_{part}']:.3g} ms" for part in ("setup", "forward", "backward"))
         ends = f"{row['gradient_error']:.1e}", *times, f"{row['iterations']}"
         lines.append(f"| {row['method']} | {json.loads(row['settings'])['cells']}^2 | " + " | ".join(ends) + " |")
-    (folder / "_build" / "error_against_time.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (home / "_build" / "error_against_time.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     table.plot(figure.subplots())
-    figure.savefig(folder / "gallery" / "images" / "error_against_time.png", dpi=120)
+    (home / "gallery" / "images").mkdir(exist_ok=True)
+    figure.savefig(home / "gallery" / "images" / "error_against_time.png", dpi=120)

@@ -141,7 +141,7 @@ def test_dead_links_are_seen(tmp_path):
 @pytest.mark.slow
 def test_every_example_and_name_has_a_page(site):
     examples = {path.stem for path in (ROOT / "examples").glob("*.py")}
-    assert examples <= {path.stem for path in (site / "gallery").glob("*.html")}
+    assert examples <= {path.stem for path in (site / "gallery").rglob("*.html")}
     assert {f"sparsedp.{name}" for name in sparsedp.__all__} <= {path.stem for path in (site / "api").glob("*.html")}
     thumbnails = {path.name for path in (site / "_images").glob("sphx_glr_*_thumb.png")}
     assert len(thumbnails) >= len(examples)
