@@ -114,12 +114,11 @@ def section_order(path):
 def arguments(gallery_conf, script_vars):
     """What an example is called with."""
     script = Path(script_vars["src_file"])
-    name, out = script.stem, DRAWN / script.stem
+    out = DRAWN / script.stem
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
-    target = out / "picture.png" if name == "velocity_recovery" else out
     draws = "--out" in script.read_text(encoding="utf-8")
-    return [size(script.name), *(["--out", str(target)] if draws else [])]
+    return [size(script.name), *(["--out", str(out)] if draws else [])]
 
 
 def let_processes_in():
