@@ -100,7 +100,8 @@ print("a gradient that is given:", foreign.verdict)
 # %%
 # The picture
 # -----------
-# The V of a right gradient, the plateau of one that is off by 0.1 %, and what noise looks like.
+# The V of a right gradient, and the plateau of one that is off by 0.1 %. The solve that stops early has plateaus as
+# well, but they lie below what its tolerance may leave.
 #
 # Exercises
 # ---------
