@@ -45,9 +45,10 @@ wind = along * 4 * y * (1 - y)  # strongest in the middle
 # An ellipse has the radius :math:`r` of the disc of its area, a height :math:`y_0` of its centre, and a slenderness
 # :math:`s`: its axes are :math:`r e^s` and :math:`r e^{-s}`. The penalty brakes what flows through it,
 #
-# .. math:: v_t + v \cdot \nabla v = \nu \, \Delta v - \nabla p - \frac{\chi}{\eta} \, v, \qquad \chi = 1 \text{ inside}, \; 0 \text{ outside},
+# .. math:: v_t + v \cdot \nabla v = \nu \, \Delta v - \nabla p - \frac{\chi}{\eta} \, v .
 #
-# and its drag is the brake itself, summed up. Source: P. Angot, C.-H. Bruneau, P. Fabrie, Numer. Math. 81 (1999).
+# Here :math:`\chi` is 1 inside and 0 outside, and :math:`\eta` is a short time. The fan adds a push along x. The drag
+# is the brake itself, summed up. Source: P. Angot, C.-H. Bruneau, P. Fabrie, Numer. Math. 81 (1999).
 
 brake = 1 / (4 * dt)
 
