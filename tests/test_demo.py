@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import io
 import os
 import re
 import subprocess
@@ -65,6 +66,26 @@ def test_it_prints_a_line_for_each_iteration(finished):
     with open(finished[0] / "table.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(lines) == sum(int(row["iterations"]) for row in rows)
+
+
+def test_it_ends_with_what_to_try_next(finished):
+    *_, first, second, third = finished[1].stdout.splitlines()
+    commands = [line.split("    ")[0].split() for line in (first, second, third)]
+    assert [words[:3] for words in commands] == [["python", "-m", "sparsedp"]] * 3
+    assert [words[3] for words in commands] == ["demo", "check", "report"]
+
+
+def test_a_log_is_written_before_each_long_piece_of_work(monkeypatch):
+    """Into a file or a pipe too: what was printed before a minimization is there when it begins."""
+    raw, seen, real = io.BytesIO(), [], dp.minimize
+    ground = terrain.load(None)
+    study = story.prepare(ground, story.grids_for(ground, 12))
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="utf-8"))
+    monkeypatch.setattr(story, "ITERATIONS", 1)
+    monkeypatch.setattr(dp, "minimize", lambda *given, **how: seen.append(raw.getvalue()) or real(*given, **how))
+    story.recover(study, study.grids[0])
+    assert seen and b"Is the gradient right?" in seen[0] and seen[0].endswith(b"seconds\n")
+    assert raw.getvalue().endswith(b" setups\n\n")  # the counts, before the next grid
 
 
 def test_table(finished):

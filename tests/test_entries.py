@@ -1,5 +1,6 @@
 """matrix_solver: solves differentiable in the entries of a sparse matrix, on its pattern only."""
 
+import pickle
 import tracemalloc
 
 import autograd.numpy as anp
@@ -210,3 +211,56 @@ def test_what_is_refused(rng):
         matrix_solver(np.ones(3))
     with pytest.raises(ValueError, match="^method must be"):
         matrix_solver(np.eye(2), "magic")
+
+
+# ---- places in any order, some many times ----------------------------------------------------------------------------
+
+
+def test_values_on_one_place_are_summed_and_differentiable(rng):
+    n, many = 6, 40
+    rows, columns = rng.integers(0, n, many), rng.integers(0, n, many)
+    rows, columns = np.append(rows, np.arange(n)), np.append(columns, np.arange(n))
+    values, b = np.append(rng.standard_normal(many), np.full(n, 30.0)), rng.standard_normal(n)
+    solve = matrix_solver.from_coo(rows, columns)
+    A = sp.coo_array((values, (rows, columns)), shape=(n, n)).toarray()
+    x, pull = pullback(lambda p: solve(*p), (values, b))
+    np.testing.assert_allclose(x, np.linalg.solve(A, b), rtol=1e-11)
+    g = rng.standard_normal(n)
+    y = np.linalg.solve(A.T, g)
+    of_values, of_b = pull(g)
+    np.testing.assert_allclose(of_values, -y[rows] * x[columns], rtol=1e-10)
+    np.testing.assert_allclose(of_b, y, rtol=1e-10)
+    loss = lambda p: anp.sum(solve(*p) ** 2)
+    assert dp.check.gradient(loss, (values, b), quick=True).verdict == "agrees"
+    again = pickle.loads(pickle.dumps(solve))
+    assert np.array_equal(again(values, b), x)
+    turned = values * np.exp(0.3j)
+    np.testing.assert_allclose(solve(turned, b), np.linalg.solve(A * np.exp(0.3j), b), rtol=1e-11)
+
+
+def test_a_domain_of_a_grid_takes_flat_places(rng):
+    grid = dp.Grid((4, 3))
+    places = -dp.laplacian(grid, dp.dirichlet).matrix.tocoo()
+    b = rng.standard_normal(grid.shape)
+    solve = dp.matrix_solver.from_coo(places.row, places.col, domain=grid.cells)
+    np.testing.assert_allclose(solve(places.data, b), dp.inverse(-dp.laplacian(grid, dp.dirichlet))(b), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "options", "error", "message"),
+    [
+        ([0, 1], [0], {}, ShapeError, r"^from_coo takes flat rows and columns, got shapes \(2,\) and \(1,\)$"),
+        ([0.0], [0], {}, TypeError, "^rows and columns must be integers, got dtypes float64 and int64$"),
+        ([-1], [0], {}, ShapeError, "^from_coo takes rows and columns from 0 to 0, one place at least; give others$"),
+        ([3], [0], {"domain": 3}, ShapeError, "^from_coo takes rows and columns from 0 to 2, one place at least"),
+        (np.zeros(0, int), np.zeros(0, int), {}, ShapeError, "one place at least; give others$"),
+    ],
+)
+def test_places_that_are_refused(rows, columns, options, error, message):
+    with pytest.raises(error, match=message):
+        matrix_solver.from_coo(rows, columns, **options)
+
+
+def test_one_value_for_each_place_given():
+    with pytest.raises(ShapeError, match=r"^sum of entries takes a field on space\(3\), got an array of shape \(2,\)$"):
+        matrix_solver.from_coo([0, 1, 0], [0, 1, 0])(np.ones(2), np.ones(2))

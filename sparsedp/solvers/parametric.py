@@ -348,7 +348,8 @@ def matrix_solver(pattern, method="auto", rtol=1e-10, maxiter=None, nullspace="r
     Parameters
     ----------
     pattern : sparse matrix or 2-D array, square
-        Its places count, not its values; a stored 0 is a place.
+        Its places count, not its values; a stored 0 is a place. `matrix_solver.from_coo(rows, columns)` takes places
+        in any order, some of them many times, as assembly gives them.
     method, rtol, maxiter, nullspace, **options
         As in `inverse`; options go to the method.
     domain : Space, int or tuple of int, optional
@@ -401,6 +402,58 @@ def matrix_solver(pattern, method="auto", rtol=1e-10, maxiter=None, nullspace="r
     return MatrixSolver(pattern, domain, settings)
 
 
+def from_coo(rows, columns, domain=None, **settings):
+    """Places of entries -> solve(values, b): x of A x = b, where values[i] is added to A at rows[i], columns[i].
+
+    What assembly gives: places in any order, some of them many times. Values on one place are summed.
+
+    Parameters
+    ----------
+    rows, columns : int arrays, shape (entries,)
+    domain : Space, int or tuple of int, optional
+        Where b and x live. Default: flat arrays, as long as the largest place asks for.
+    **settings
+        method, rtol and the others of `matrix_solver`.
+
+    Returns
+    -------
+    MatrixSolver
+        Differentiable in values, one for each place given, and b. `solve.rows` and `solve.columns` are the places of A.
+
+    Raises
+    ------
+    TypeError
+        If rows or columns are no integers.
+    ShapeError
+        If rows and columns differ in shape, are not flat, or do not fit the domain.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> solve = dp.matrix_solver.from_coo([0, 1, 0], [0, 1, 0])  # two values on the first place
+    >>> solve(np.array([1.5, 4.0, 0.5]), np.array([2.0, 8.0]))
+    array([1., 2.])
+    """
+    places = np.asarray(rows), np.asarray(columns)
+    if places[0].ndim != 1 or places[0].shape != places[1].shape:
+        raise ShapeError(f"from_coo takes flat rows and columns, got shapes {places[0].shape} and {places[1].shape}")
+    if any(one.dtype.kind not in "iu" for one in places):
+        raise TypeError(f"rows and columns must be integers, got dtypes {places[0].dtype} and {places[1].dtype}")
+    domain = domain if domain is None or isinstance(domain, Space) else Space(domain)
+    size = 1 + max(int(one.max(initial=-1)) for one in places) if domain is None else domain.size
+    if places[0].size == 0 or min(map(np.min, places)) < 0 or max(map(np.max, places)) >= size:
+        raise ShapeError(f"from_coo takes rows and columns from 0 to {size - 1}, one place at least; give others")
+    keys, slot = np.unique(places[0].astype(np.int64) * size + places[1], return_inverse=True)
+    pattern = sp.csr_array((np.ones(keys.size), np.divmod(keys, size)), shape=(size, size))
+    solve = matrix_solver(pattern, domain=domain, **settings)
+    adding = sp.csc_array((np.ones(slot.size), slot, np.arange(slot.size + 1)), shape=(keys.size, slot.size))
+    solve.assembly = from_matrix(adding, name="sum of entries")
+    return solve
+
+
+matrix_solver.from_coo = from_coo  # type: ignore[attr-defined]
+
+
 class MatrixSolver(ParametricSolver):
     """solve(data, b), made by `matrix_solver`.
 
@@ -408,20 +461,22 @@ class MatrixSolver(ParametricSolver):
     ----------
     rows, columns : int arrays, shape (entries,)
         Place of each entry, in the order of data: row by row, columns ascending.
+    assembly : Operator or None
+        What was given -> data; None where data is given (`matrix_solver.from_coo` sums on one place).
     domain : Space
     """
 
     name = "matrix_solver"
 
-    def __init__(self, pattern, domain, settings):
-        self.domain, self._pattern = domain, pattern
+    def __init__(self, pattern, domain, settings, assembly=None):
+        self.domain, self._pattern, self.assembly = domain, pattern, assembly
         self.rows = rows_of(pattern)
         self.columns = pattern.indices
         super().__init__(self._picking(self.rows, -1.0).T, self._picking(self.columns, 1.0), settings)
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
-        return MatrixSolver, (self._pattern, self.domain, self._settings)
+        return MatrixSolver, (self._pattern, self.domain, self._settings, self.assembly)
 
     def _picking(self, place, sign):
         """Operator: a field -> for each entry the value at its row, or its column, times the sign."""
@@ -442,6 +497,8 @@ class MatrixSolver(ParametricSolver):
         array of the shape of b
         """
         check_plain(self.name, data, b)
+        if self.assembly is not None:
+            data = self.assembly(data)
         values = np.asarray(plain(data))
         if values.shape != self.rows.shape:
             raise ShapeError(f"data takes one value for each of {self.rows.size} entries, got shape {values.shape}")

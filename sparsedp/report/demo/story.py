@@ -90,7 +90,7 @@ def recover(study, grid):
         rows.append({"iterations": len(rows) + 1, "seconds": record.seconds, "misfit": misfit, "error": error})
         print("  {iterations:9d}   {misfit:12.3f}   {error:5.3f}   {seconds:7.2f}".format(**rows[-1]), flush=True)
 
-    print("  iteration   misfit/noise   error   seconds")
+    print("  iteration   misfit/noise   error   seconds", flush=True)  # a log is read while it is written
     with recording() as calls:
         best = dp.minimize(loss, np.zeros(grid.shape), maxiter=ITERATIONS, callback=note, memory=20)
     if best.message.startswith("interrupted"):  # minimize keeps its best point; the demo ends
@@ -98,7 +98,7 @@ def recover(study, grid):
     if best.history[-1].iteration > len(rows):  # the iteration that meets the tolerance is not reported
         note(best.history[-1], best.x)
     counts = {name: total(calls, kind) for name, kind in COUNTED.items()}
-    print(f"  {', '.join(f'{many} {name}' for name, many in counts.items())}\n")
+    print(f"  {', '.join(f'{many} {name}' for name, many in counts.items())}\n", flush=True)
     row = {"grid": " x ".join(map(str, grid.shape)), "unknowns": best.x.size, **rows[-1], **counts}
     row |= {"gradient": check.verdict, "gradient_error": max((line.share for line in check.lines), default=np.nan)}
     return best.x, row, tuple([one[name] for one in rows] for name in ("seconds", "error"))
@@ -142,7 +142,7 @@ def tell(study, folder, force):
         plots.write_picture(folder / "convergence.png", partial(_convergence, rows, curves))
     except ImportError as error:
         print(f"No pictures: {error}")
-    print(f"Written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    print(f"Written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}", NEXT, sep="\n")
     return all(row["gradient"] == "agrees" for row in rows)
 
 
@@ -152,6 +152,12 @@ The survey   {d.readings.shape} wells pumped in turn and pressure sensors, {nois
 The law      -div(k grad p) = b, rivers at both ends in x, no flow through the other sides
 The task     find log k in every cell from the readings: L-BFGS through the adjoint, from a flat start
 """
+
+NEXT = """
+To try next:
+  python -m sparsedp demo --input FIELD.npy --out MINE    a field of your own, as .npy, .npz or .png
+  python -m sparsedp check FILE.py                        is the gradient of the loss in a file right?
+  python -m sparsedp report FILE.py                       all instruments on it, in one folder"""
 
 
 def _map(study, title, field, ax):
