@@ -49,6 +49,7 @@ _WINDOW = {
     "report.work_precision": "workprec",
     "report.plan": "explain",
     "blackbox": "adopt",
+    "storage": "from_image load save",
     "parallel.scenes": "ensemble",
     "parallel.front": "distribute gather",
 }

@@ -64,7 +64,7 @@ def _array(op, u):
 
 
 def check_plain(name, *values):
-    """Refuse masked arrays: NumPy would drop the mask without a word; and those of torch and jax."""
+    """Refuse masked arrays: NumPy would drop the mask without a word; and those of torch, jax and xarray."""
     if any(isinstance(value, np.ma.MaskedArray) for value in values):
         raise TypeError(f"{name} takes plain arrays, got a masked array; fill it first")
     check_native(name, *values)
@@ -73,6 +73,11 @@ def check_plain(name, *values):
 def check_native(name, *values):
     """Refuse tensors of torch and arrays of jax: NumPy would drop their gradients, or they ours."""
     for value in values:
+        if type(value) is not np.ndarray and type(value).__module__.startswith("xarray."):
+            raise TypeError(
+                f"{name} takes plain arrays, got a {type(value).__name__} of xarray, whose coordinates would be lost; "
+                "write u.transpose('x', 'y').values"
+            )
         library = type(value) is not np.ndarray and LIBRARIES.get(type(value).__module__.partition(".")[0])
         if library:
             raise TypeError(

@@ -44,6 +44,7 @@ FLOORS = [
     ("packing", 2),
     ("space", 2),
     ("conditions", 4),
+    ("storage", 4),
     ("grid", 3),
     ("structure", 3),
     ("operator", 4),
@@ -79,6 +80,7 @@ DOORS = [
     ("petsc4py", r"parallel/.*", ()),
     ("torch", r"interop/torch_bridge\.py", ()),
     ("jax", r"interop/jax_bridge\.py", ()),
+    ("PIL", r"storage\.py|report/plots\.py", ()),
 ]
 TALKS = r"report/.*|__main__\.py"  # may print
 NOWHERE = {"utils.py", "util.py", "helpers.py", "helper.py", "misc.py", "common.py"}
@@ -86,7 +88,8 @@ LENGTHS = {"sparsedp": 600, "tests": 600, "benchmarks": 300, "examples": 300}
 # Nodes of the syntax tree that each room may have, docstrings left out; what a line says is free, what it does is not.
 # They may be lowered at any time, and raised only with a sentence on what that buys. "": the whole package.
 BUDGETS = {
-    "": 221_350,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
+    # fields in files, pictures: 745
+    "": 221_595,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
     "advection": 14_000,
     "check": 14_700,  # fields on ranks on a tape: 10
     "flow": 11_800,  # conservation laws: 2 850; forces: 780; scalars, Courant limit, friction: 1 650; on ranks: 175
@@ -112,6 +115,7 @@ EXTRAS = (
     "petsc4py",
     "torch",
     "jax",
+    "PIL",
 )  # foreign libraries that need not be there
 LAZY = (
     "pyamg",
