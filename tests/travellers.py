@@ -295,5 +295,5 @@ NOTHING_TO_CALL = {
     "rollout", "minimize", "update_direction",
     "set_threads", "convergence", "v_curve", "animate", "plot", "certify", "stress", "workprec", "explain", "check",
     "errors", "report", "vjp", "jvp", "hvp", "sponge", "steady", "distribute", "gather",
-    "flatten", "interop",
+    "flatten", "from_image", "interop", "load", "save",
 }  # fmt: skip
