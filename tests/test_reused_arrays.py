@@ -27,6 +27,7 @@ exponential face_laplacian flux function face_lift free_slip from_functions from
 gradient harmonic_average hvp identity inflow interior jvp laplacian lift mask minimize neumann no_slip Operator outflow
 physical_gradient plot power projection prolong report restrict robin sample set_threads smoothness stress
 brinkman distribute flatten gather interop total_variation update_direction upwind v_curve value_and_grad vjp workprec
+from_image load save
 """.split()
 
 
