@@ -88,12 +88,11 @@ LENGTHS = {"sparsedp": 600, "tests": 600, "benchmarks": 300, "examples": 300}
 # Nodes of the syntax tree that each room may have, docstrings left out; what a line says is free, what it does is not.
 # They may be lowered at any time, and raised only with a sentence on what that buys. "": the whole package.
 BUDGETS = {
-    # fields in files, pictures: 745
-    "": 221_595,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
+    "": 221_020,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
     "advection": 14_000,
     "check": 14_700,  # fields on ranks on a tape: 10
     "flow": 11_800,  # conservation laws: 2 850; forces: 780; scalars, Courant limit, friction: 1 650; on ranks: 175
-    "integrators": 17_350,  # radau: 4 400; leapfrog and sponge: 1 250; a term for each field, batches of etdrk4: 850
+    "integrators": 17_380,  # radau: 4 430 (an error filtered again: 30); leapfrog and sponge: 1 250; a term for each field, batches of etdrk4: 850
     "kernels": 14_000,
     "network": 2_450,
     "operators": 6_900,  # tensors: 800; flux: 300; coarse grids on ranks: 15

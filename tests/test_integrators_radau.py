@@ -10,6 +10,7 @@ from test_integrators_variation import KNOWN, oscillator
 import sparsedp as dp
 from sparsedp.derivative import pushforward, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
+from sparsedp.integrators.problem import untraced
 from sparsedp.integrators.radau import A, C, Flat
 
 RATES = np.array([0.04, 1e4, 3e7])
@@ -44,11 +45,18 @@ def test_order_five():
 @pytest.mark.parametrize("stiffness", [1e2, 1e6])
 def test_prothero_robinson(stiffness):
     """u' = -k (u - cos t) - sin t, whose solution is cos t: at every tolerance, and better with the tolerance."""
-    rate = lambda u, k, t: -k * (u - anp.cos(t)) - anp.sin(t)
+    calls = []
+
+    def rate(u, k, t):
+        calls.append(t)
+        return -k * (u - anp.cos(t)) - anp.sin(t)
+
     errors, tolerances = [], (1e-3, 1e-5, 1e-8)
     for tolerance in tolerances:
+        calls.clear()
         step = dp.stepper("radau", rate, 5.0, tolerance=tolerance)
         errors.append(abs(step((1.0, 0.0), stiffness)[0] - np.cos(5.0)))
+        assert len(calls) < 10 * len(step.taken)  # 11 to 42 with an error of the start in every trial from it
         forced = dp.stepper("radau", lambda u, p, t: p * rate(u / p, stiffness, t), 5.0, tolerance=tolerance)
         slope = value_and_grad(lambda p: forced((1.0, 0.0), p)[0])(1.0)[1]  # of p cos t
         assert slope == pytest.approx(np.cos(5.0), rel=10 * tolerance)
@@ -184,6 +192,19 @@ def test_runs_that_meet_in_a_jump(tolerance):
             assert "give a smaller floor or tolerance" in str(error)
         else:
             assert abs(g / slope - 1) <= 10 * tolerance
+
+
+def test_an_audit_of_a_wrong_loss_blames_no_step():
+    """Random cotangents, which a step with error control refuses, end no search for the culprit."""
+    step = dp.stepper("radau", robertson, 50.0, tolerance=1e-4, floor=SMALL["Robertson"])
+    bypass = dp.differentiable("double", lambda u: 2.0 * u, lambda nums, ans, u: lambda g: (2.1 * g,))
+    ends = lambda p: step(np.array([1.0, 0, 0]), RATES * p)[2]
+    found = dp.check.gradient(lambda p: bypass(ends(p)), np.ones(3), directions=1, quick=True)
+    assert found.verdict == "disagrees" and found.culprit == "double"
+    wrong = dp.check.gradient(
+        lambda p: ends(p) * (1 + 0.1 * anp.sum(untraced(p))), np.ones(3), directions=1, quick=True
+    )
+    assert wrong.verdict == "disagrees" and wrong.culprit is None
 
 
 def test_long_oscillation():

@@ -12,6 +12,7 @@ from sparsedp.check.nodes import calls_seen, in_order
 from sparsedp.check.operators import fault_of, field
 from sparsedp.check.sweep import Point, Trials, generator
 from sparsedp.derivative import pullback, value_and_grad
+from sparsedp.errors import DerivativeError
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
 from sparsedp.solvers.inverses import Inverse
@@ -21,7 +22,8 @@ __all__ = ["culprit_of"]
 MOST = 6  # calls of one rule that are examined, spread over its calls
 DIRECTIONS = 2
 SKIPPED = "constant", "gradient"
-NOBODY = "every call on the tape is right at the values it met; a value may bypass the tape"
+JUDGES = ".variation"  # in error control: with its transpose it is right along one of three runs, and refuses
+NOBODY = "every call on the tape is right or refused at the values it met; a value may bypass the tape"
 
 
 def culprit_of(loss, point):
@@ -44,7 +46,10 @@ def culprit_of(loss, point):
         with calls_seen() as nodes:
             value_and_grad(loss)(point.fresh())
         for node in _examined(nodes):
-            fault = _fault(node, cleared, rng)
+            try:
+                fault = _fault(node, cleared, rng)
+            except DerivativeError:  # of a step with error control: right, or refused
+                continue
             if fault:
                 return fault[0], ", ".join(fault)
     return None, NOBODY
@@ -53,7 +58,7 @@ def culprit_of(loss, point):
 def _examined(nodes):
     """Calls that can be judged alone, those inside of a call before it; of many calls of one rule some."""
     groups: dict[int, list] = {}
-    nodes = list(in_order(nodes))
+    nodes = [node for node in in_order(nodes) if JUDGES not in node.name]
     for node in nodes:
         groups.setdefault(id(node.subject), []).append(node)
     chosen = {id(node) for calls in groups.values() for node in calls[:: -(-len(calls) // MOST)]}
