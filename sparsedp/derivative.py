@@ -154,11 +154,15 @@ def backward_each(nodes, ends, cotangents, sums):
     """`backward` for many cotangents, side by side along a last axis: of them and of the sums; plain values alone."""
 
     def add(parent, g):
+        total, ours = sums.get(parent, (None, False))
         if type(g) is Part:
             part, index, shape = g
-            g = np.zeros((*shape, part.shape[-1]))
-            g[index] = part
-        sums[parent] = (sums[parent][0] + g if parent in sums else g), False
+            if not ours:  # a sum that was made here is written into
+                total = np.zeros((*shape, part.shape[-1])) if total is None else np.array(total)
+                sums[parent] = total, True
+            total[index] += part
+        else:
+            sums[parent] = (g, False) if total is None else (total + g, True)
 
     for end, g in zip(ends, cotangents, strict=True):
         if end is not None:

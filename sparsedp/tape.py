@@ -313,7 +313,7 @@ def _install():
         act = _of_two(function)
         setattr(BOX, f"__{name}__", act)
         setattr(BOX, f"__r{name}__", lambda box, other, act=act: act(other, box))
-    copy = direct(COPY)
+    BOX.__neg__, copy = direct(anp.negative), direct(COPY)
 
     @wraps(COPY)
     def copy_of(args, options, value):
