@@ -224,11 +224,14 @@ def picture(found, folder):
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 6), layout="constrained")
-    for ax, (name, part) in zip(figure.subplots(2, 4).ravel(), found.items(), strict=False):
+    *axes, last = figure.subplots(2, 4).ravel()
+    for ax, (name, part) in zip(axes, found.items(), strict=True):
         for k, label in enumerate(("radau (ours)", "Radau (SciPy)", "BDF (SciPy)")):
             ax.loglog(*np.array([row[2][k] for row in part]).T[::-1], ".-", label=label)
         ax.set(title=name, xlabel="seconds", ylabel="error")
-    ax.legend(frameon=False)
+        ax.xaxis.set_minor_formatter("")  # within one decade its labels overlap
+    last.axis("off")
+    last.legend(*axes[0].get_legend_handles_labels(), frameon=False, loc="center")
     Path(folder).mkdir(exist_ok=True)
     figure.savefig(Path(folder) / "stiff.png", dpi=150)
 
