@@ -249,7 +249,7 @@ def test_every_builder_is_here():
     )
     calls = "function adopt minimize certify certified explain stress workprec rollout grad value_and_grad vjp jvp hvp"
     calls += " differentiable set_threads steady distribute gather"
-    shown = "animate plot convergence v_curve update_direction"
+    shown = "animate plot convergence v_curve update_direction save load from_image"
     public = {name for name in dir(dp) if callable(getattr(dp, name)) and name.islower() and name[0] != "_"}
     here = {name.split(",")[0].split(" ")[0] for name in BUILDERS}
     assert public - here == set(f"{unbuilt} {calls} {shown}".split()) - here

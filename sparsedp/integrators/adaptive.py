@@ -286,7 +286,8 @@ class Adaptive(Scheme):
             derivative, *shadows = arrived
             size = max(np.max(np.abs(derivative), initial=0.0), SHARE * scale[0])
             error = np.max(sum(np.abs(shadow - derivative) for shadow in shadows), initial=0.0) / unit
-            if error <= limit * size or not np.all(np.isfinite(derivative)):
+            # What comes in not finite was named where it came up.
+            if error <= limit * size or not np.isfinite(scale[0]):
                 return derivative.copy()
             # Without extrapolation errors fall more slowly than the tolerance: a smaller one is refused all the more.
             cure = "give a smaller floor or tolerance" if self.weight else "take tr_bdf2, which extrapolates"

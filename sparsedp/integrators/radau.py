@@ -67,6 +67,7 @@ NEWTON = 1e-3  # error of Newton's method in units of the tolerance: at 0.03 HIR
 ROUNDING = 1e-15  # relative correction that no iteration is asked to go below
 STALLED = 1e-11  # relative correction that is taken for rounding where it does not shrink
 ITERATIONS = 10  # of Newton's method in a step with error control
+REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError  # of a rate that is given a state too far away
 FAST = 0.03  # share of a correction that is left after an iteration, up to which the Jacobian serves the next step
 
 
@@ -230,7 +231,10 @@ class Interval(Adaptive):
             units, e = self.units(v, v + z[2]) * self.tolerance, E @ z / h
             error = self.real(self.f + e, False)
             if again and norm(error / units) > 1:
-                error = self.real(self.problem(v + error, params, t) + e, False)
+                try:
+                    error = self.real(self.problem(v + error, params, t) + e, False)
+                except REFUSALS:
+                    pass  # the step is too long
             ratio = norm(error / units)
         return z, v + z[2], ratio if np.isfinite(ratio) else np.inf
 
@@ -255,7 +259,7 @@ class Interval(Adaptive):
                 self.fresh, self.held = True, None
                 self.J = self.jacobian(v, t)
                 z = self._newton(v, t, h)
-        except (UnstableStepError, NonFiniteError, ConvergenceError):
+        except REFUSALS:
             return None
         if z is not None:
             self.guess = v, h, CUBIC @ np.vstack([v, v + z])

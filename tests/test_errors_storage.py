@@ -1,0 +1,98 @@
+"""Messages of files, pictures and of a matrix from coordinates, in full."""
+
+import sys
+
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+GRID = dp.Grid((3, 2))
+LABELLED = type("DataArray", (), {"__module__": "xarray.core.dataarray"})()
+from_coo = dp.matrix_solver.from_coo
+
+CASES = {
+    "op DataArray": (
+        TypeError,
+        "gradient takes plain arrays, got a DataArray of xarray, whose coordinates would be lost; "
+        "write u.transpose('x', 'y').values",
+        lambda: dp.gradient(GRID)(LABELLED),
+    ),
+    "from_coo shapes": (
+        ValueError,
+        "from_coo takes flat rows and columns, got shapes (2,) and (1,)",
+        lambda: from_coo([0, 1], [0]),
+    ),
+    "from_coo dtypes": (
+        TypeError,
+        "rows and columns must be integers, got dtypes float64 and int64",
+        lambda: from_coo([0.0], [0]),
+    ),
+    "from_coo places": (
+        ValueError,
+        "from_coo takes rows and columns from 0 to 1, one place at least; give others",
+        lambda: from_coo([0, 2], [0, 1], domain=2),
+    ),
+    "times": (
+        ValueError,
+        "save takes times of shape (n,), got (); write np.atleast_1d(times)",
+        lambda: dp.save("u.npz", GRID, times=0.0),
+    ),
+    "suffix": (
+        ValueError,
+        "save takes a path that ends in .npz, got 'u.nc'; write 'fields.npz'",
+        lambda: dp.save("u.nc", GRID),
+    ),
+    "numbers": (
+        TypeError,
+        "save takes arrays of numbers, u is of type str; write np.asarray(u), or dp.gather(u) on ranks",
+        lambda: dp.save("u.npz", GRID, u="hot"),
+    ),
+    "series": (
+        ValueError,
+        "u has shape (3, 2), and there are 2 times; write np.stack(states)",
+        lambda: dp.save("u.npz", GRID, times=[0.0, 1.0], u=np.zeros((3, 2))),
+    ),
+    "place": (
+        ValueError,
+        "u has shape (4,), which is no field on cells, faces, nodes or edges of Grid(3 x 2 cells, size 3 x 2); "
+        "those on cells have (3, 2)",
+        lambda: dp.save("u.npz", GRID, u=np.zeros(4)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_message(name):
+    kind, message, act = CASES[name]
+    with pytest.raises(kind) as caught:
+        act()
+    assert str(caught.value) == message
+
+
+def test_a_file_that_is_none_of_ours(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.savez("other.npz", u=np.zeros(3))
+    with pytest.raises(ValueError) as caught:
+        dp.load("other.npz")
+    assert str(caught.value) == (
+        "load takes a file that dp.save wrote, other.npz is another one or damaged; write np.load(path)"
+    )
+
+
+def test_pictures(tmp_path, monkeypatch):
+    image = pytest.importorskip("PIL.Image", reason="Pillow reads pictures")
+    monkeypatch.chdir(tmp_path)
+    image.new("RGBA", (2, 2)).save("clear.png")
+    with pytest.raises(ValueError) as caught:
+        dp.from_image("clear.png")
+    assert str(caught.value) == (
+        "from_image takes grey or RGB pictures without transparency, clear.png has mode RGBA; save it as RGB"
+    )
+
+
+def test_pictures_without_pillow(monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(ImportError) as caught:
+        dp.from_image("any.png")
+    assert str(caught.value) == "from_image needs Pillow; install sparsedp[plot]"
