@@ -174,8 +174,8 @@ PLANTED = {
         "ones by the same seed"
     ),
     "another way: ValueError": (
-        "rank 1 came to maximum of shape () where rank 0 came to add of shape (); let nothing depend on the number of "
-        "the rank, on a clock or on numbers of one rank"
+        "rank 1 came to maximum of shape (), float64 where rank 0 came to add of shape (), float64; let nothing depend "
+        "on the number of the rank, on a clock or on numbers of one rank"
     ),
 }
 
