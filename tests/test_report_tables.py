@@ -8,10 +8,12 @@ import math
 import pytest
 
 import sparsedp as dp
+from sparsedp.check.summary import Result
+from sparsedp.check.table import table_of
 from sparsedp.report.certificate import Certificate
 from sparsedp.report.plan import Plan
+from sparsedp.report.plots import write_result
 from sparsedp.report.stress_table import Stress
-from sparsedp.report.table import Result, csv_text, markdown_table, text_table, write_table
 from sparsedp.report.work_precision import Rows
 
 ROWS = [
@@ -22,30 +24,38 @@ NAMES = ("name", "error", "count", "note", "absent")
 
 
 def test_text_has_columns():
-    head, first, second = text_table(ROWS, NAMES[:3]).splitlines()
+    head, first, second = str(table_of(ROWS, NAMES[:3])).splitlines()
     assert head.split() == ["name", "error", "count"] and first.split() == ["a|b", "1.2e-05", "12"]
     assert second.split() == ["plain", "3"]  # NaN is left empty
     assert len(head) == len(first) == len(second)  # numbers stand below each other
 
 
 def test_markdown_keeps_its_columns_whatever_the_cells_hold():
-    lines = markdown_table(ROWS, NAMES)
+    lines = table_of(ROWS, NAMES).markdown().splitlines()
     assert lines[1] == "|---|---|---|---|---|"
     assert lines[2] == "| a\\|b | 1.2e-05 | 12 | two lines |  |"
     assert {line.replace("\\|", "").count("|") for line in lines} == {6}
 
 
 def test_csv_reads_back_whole():
-    rows = list(csv.DictReader(io.StringIO(csv_text(ROWS))))
+    rows = list(csv.DictReader(io.StringIO(table_of(ROWS).csv())))
     assert [row["note"] for row in rows] == ["two\nlines", ""] and float(rows[0]["error"]) == ROWS[0]["error"]
-    assert csv_text([], ("a", "b")) == "a,b\n" and csv_text([]) == "nothing\n"
+    assert table_of([], ("a", "b")).csv() == "a,b\n" and table_of([]).csv() == "nothing\n"
 
 
 def test_files(tmp_path):
-    paths = write_table(tmp_path, "t", "# t", csv_text(ROWS))
+    found = dp.explain(lambda x: x**2, 1.5)
+    paths = write_result(found, tmp_path, "t", heading="# t\n\n")
     assert [path.name for path in paths] == ["t.md", "t.csv"] and all(path.exists() for path in paths)
-    drawn = write_table(tmp_path, "t", "# t", csv_text(ROWS), lambda ax: ax)
+    assert paths[0].read_text().startswith("# t\n\n### value 2.25: ")
+    drawn = write_result(found, tmp_path, "t", lambda ax: ax)
     assert [path.name for path in drawn[2:]] == (["t.png"] if importlib.util.find_spec("matplotlib") else [])
+
+
+def test_an_audit_is_a_table_in_markdown_too():
+    text = dp.check.gradient(lambda x: x**2, 1.5).markdown()
+    assert text.startswith("### gradient at 1 values") and "\n| step | random 1 |" in text
+    assert "\n- verdict: agrees to" in text
 
 
 def test_results_are_frozen_and_print_themselves():

@@ -16,8 +16,9 @@ from sparsedp.check.judge import (
     looked_at,
     verdict,
 )
-from sparsedp.check.summary import Result, table
+from sparsedp.check.summary import Result
 from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, generator
+from sparsedp.check.table import Table, table_of
 from sparsedp.derivative import hvp, value_and_grad
 from sparsedp.fields import check_function, is_whole
 from sparsedp.progress import bar
@@ -287,34 +288,39 @@ class Audit(Result):
             for level in one.line.levels
         )
 
-    def __str__(self):
-        parts = [f"gradient at {self.size} values, loss {self.value:.6g}, {self.evaluations} evaluations"]
-        if self.lines:
-            parts += [self._curves(), self._table()]
-        parts += [f"  {note}" for note in self.notes if note != self.reason]
+    def parts(self):
+        """Gaps over steps and directions, one line for each direction, notes, the verdict."""
         proved = f" to {self.digits} digits" if self.digits is not None else ""
-        return "\n".join([*parts, f"verdict: {self.verdict}{proved}{': ' if self.reason else ''}{self.reason}"])
+        return [
+            f"gradient at {self.size} values, loss {self.value:.6g}, {self.evaluations} evaluations",
+            *([self._gaps(), self._directions()] if self.lines else []),
+            *(f"  {note}" for note in self.notes if note != self.reason),
+            f"verdict: {self.verdict}{proved}{': ' if self.reason else ''}{self.reason}",
+        ]
 
     def __repr__(self):
         """One line, which is what pytest shows of an assertion that fails."""
         words = [self.reason, *(note for note in self.notes if note.startswith("culprit"))]
         return f"<gradient {self.verdict}: {'; '.join(filter(None, words)) or f'{self.digits} digits'}>"
 
-    def _curves(self):
+    def _gaps(self):
         """|difference - g . d| relative to the derivative, over the steps (down) and directions (across)."""
-        cells = {(r["step"], r["direction"]): "-" if r["note"] else abs(r["gap"]) for r in self.rows}
-        names, steps = [one.direction for one in self.lines], sorted({step for step, _ in cells}, reverse=True)
-        return table([(step, *(cells.get((step, name)) for name in names)) for step in steps], ("step", *names))
+        cells: dict = {}
+        for row in self.rows:
+            cells.setdefault(row["step"], {})[row["direction"]] = "-" if row["note"] else abs(row["gap"])
+        rows = [{"step": step, **cells[step]} for step in sorted(cells, reverse=True)]
+        return table_of(rows, ["step", *(one.direction for one in self.lines)])
 
-    def _table(self):
+    def _directions(self):
         """One line for each direction."""
         lines = [
             (one.direction, f"{one.slope:.9g}", f"{one.difference:.9g}", one.share, one.resolution,
              *map(_order, (one.rate1, one.rate2, one.rate3)), one.word, one.note)
             for one in self.lines
         ]  # fmt: skip
-        head = ("direction", "g . d", "differences", "gap", "bar", "order 1", "order 2", "order 3", "", "")
-        return table(lines, head)
+        return Table(
+            ("direction", "g . d", "differences", "gap", "bar", "order 1", "order 2", "order 3", "", ""), lines
+        )
 
 
 def _order(rate):

@@ -421,7 +421,8 @@ class OperatorSummary(Summary):
         """The summary as plain numbers, strings and lists."""
         return super().to_dict() | self.facts
 
-    def _head(self):
+    def parts(self):
+        """The verdict, the facts, and the rows."""
+        verdict, rows = super().parts()
         texts = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in self.facts.items())
-        facts = (f"  {name}: {value}" for name, value in texts if value is not None)
-        return [*super()._head(), *facts]
+        return [verdict, *(f"  {name}: {value}" for name, value in texts if value is not None), rows]

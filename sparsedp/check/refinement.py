@@ -4,7 +4,8 @@ from math import inf, isnan, nan
 
 import numpy as np
 
-from sparsedp.check.summary import Result, table
+from sparsedp.check.summary import Result
+from sparsedp.check.table import Table
 from sparsedp.fields import check_function
 
 __all__ = ["Refinement", "order"]
@@ -83,7 +84,8 @@ class Refinement(Result):
     def __float__(self):
         return self.order
 
-    def __str__(self):
+    def parts(self):
+        """The order, and the error on each grid with the order of the step to it."""
         orders = ("", *(f"{slope:.2f}" for slope in self.orders))
-        head = f"order {self.order:.2f} over the last three sizes: {self.verdict} ({self.reason})\n"
-        return head + table(zip(self.sizes, self.errors, orders), ("n", "error", "order"))
+        head = f"order {self.order:.2f} over the last three sizes: {self.verdict} ({self.reason})"
+        return [head, Table(("n", "error", "order"), list(zip(self.sizes, self.errors, orders)))]

@@ -1,26 +1,25 @@
-"""What checks and instruments give: frozen values that print themselves, and their columns of text."""
+"""What checks and instruments give: frozen values that print themselves, as text and in Markdown."""
 
-import csv
-import io
-import math
-import re
 from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp.check.table import Table, table_of
 from sparsedp.recipe import Frozen
 
-__all__ = ["Result", "Row", "Summary", "csv_text", "error_text", "table", "text_of"]
+__all__ = ["Result", "Row", "Summary", "error_text"]
 
 
 class Result(Frozen):
     """What an instrument gives: frozen, as plain data, as text; true unless it has a verdict other than "agrees".
 
     The attributes are the values it is made with; the docstring of each kind lists them, and nothing else does.
+    ``parts()`` of each kind is its text from top to bottom: lines, the first one a title, and Tables.
     """
 
     _columns: tuple = ()  # of its table as CSV; default: those of the first row
     _plain: tuple = ()  # names of the attributes that are plain data; default: all that were given
+    left_out: tuple | list = ()  # sentences
 
     def __getattr__(self, name):  # also tells type checkers that there are attributes which no class body names
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
@@ -37,13 +36,22 @@ class Result(Frozen):
         """The result as plain numbers, strings, lists and dicts; None where an array holds NaN."""
         return {name: _plain(getattr(self, name)) for name in self._plain or vars(self)}
 
+    def omissions(self):
+        """What was left out, with the reason: lines of its text."""
+        return [f"  left out: {sentence}" for sentence in self.left_out]
+
+    def __str__(self):
+        return "\n".join(map(str, self.parts()))
+
     def markdown(self):
-        """The text in Markdown."""
-        return f"```text\n{self}\n```\n"
+        """The text in Markdown: a heading, tables, and the other lines as a list."""
+        title, *parts = self.parts()
+        blocks = (part.markdown() if isinstance(part, Table) else f"- {part.strip()}" for part in parts)
+        return "\n\n".join([f"### {title}", *blocks, ""])
 
     def csv(self):
         """The rows as CSV."""
-        return csv_text(_plain(self.rows), self._columns)
+        return table_of(_plain(self.rows), self._columns).csv()
 
     def __repr__(self):
         return str(self)
@@ -102,58 +110,14 @@ class Summary(Result):
         """Largest figure of the tested rows; 0 without any."""
         return max((row.figure for row in self.rows if row.figure is not None), default=0.0)
 
-    def _head(self):
-        """Lines above the rows."""
-        return [f"{self.title}: {self.verdict}"]
-
-    def __str__(self):
+    def parts(self):
+        """The verdict, and the rows."""
         words = {True: "ok", False: "FAILS", None: "-"}
         limits = ["" if row.limit is None else f"<= {row.limit:g}" for row in self.rows]
         cells = [(*row[:2], limit, words[row.ok], row.note) for row, limit in zip(self.rows, limits)]
-        return "\n".join([*self._head(), table(cells)])
+        return [f"{self.title}: {self.verdict}", Table(("property", "figure", "limit", "", ""), cells)]
 
 
 def error_text(error):
     """An error in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
-
-
-def text_of(value):
-    """A cell: two digits of a float, nothing for NaN and None."""
-    if isinstance(value, float):
-        return "" if math.isnan(value) else f"{value:.2g}"
-    return "" if value is None else str(value)
-
-
-def csv_text(rows, names=()):
-    """Table -> CSV with a line of names; default: the keys of the first row."""
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, names or list(rows[0] if rows else ["nothing"]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return stream.getvalue()
-
-
-def table(lines, head=None):
-    """Rows of cells -> text in columns: words to the left, numbers to the right.
-
-    Parameters
-    ----------
-    lines : sequence of equally long sequences
-    head : sequence of str, optional
-
-    Returns
-    -------
-    str
-    """
-    rows = [list(map(text_of, line)) for line in (*([head] if head else []), *lines)]
-    if not rows:
-        return "  nothing to show"
-    columns = []
-    for column in zip(*rows, strict=True):
-        side, width = ">" if all(map(NUMBER, column[bool(head) :])) else "<", max(map(len, column))
-        columns.append([f"{cell:{side}{width}}" for cell in column])
-    return "\n".join(f"  {'  '.join(cells)}".rstrip() for cells in zip(*columns))
-
-
-NUMBER = re.compile(r"[-+]?(\d[\d.]*(e[-+]\d+)?|nan|inf|exact)?").fullmatch  # what is set to the right of a column

@@ -6,8 +6,7 @@ work_precision.py    workprec: error against run time
 stress_table.py      stress: one word for each extreme case
 stress_cases.py      the table of those cases, and the judges of what comes out
 stability.py         the growth factor of a time step, and its map
-table.py             the one writer of tables: text, Markdown, CSV, files
-plots.py             pictures of fields and charts; all of matplotlib
+plots.py             pictures of fields and charts, files of a result; all of matplotlib
 scene_report.py      a scene in a file, and all instruments on it in one folder (the command `report`)
 demo/                the command `demo`
 

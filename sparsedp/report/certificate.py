@@ -18,11 +18,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp.check.summary import Result
+from sparsedp.check.table import table_of
 from sparsedp.derivative import value_and_grad
 from sparsedp.fields import is_number
 from sparsedp.ledger import recording, thread
 from sparsedp.report.plan import total
-from sparsedp.report.table import Table
 from sparsedp.tree import leaves, norm
 
 __all__ = ["Certificate", "Certified", "certified", "certify", "distance"]
@@ -244,7 +245,7 @@ def _advice(total, causes, solves, target):
     return f"the tolerances are as they should be {goal}"
 
 
-class Certificate(Table):
+class Certificate(Result):
     """The result of `certify`. Frozen.
 
     Attributes
@@ -269,11 +270,15 @@ class Certificate(Table):
         """Estimated error of the value, with its sign."""
         return self.corrected_value - self.value
 
-    def _parts(self):
+    def parts(self):
+        """Errors of value and gradient, a row for each solver, the advice."""
         causes = ", ".join(f"{error:.1e} from {name}" for name, error in self.causes.items())
-        value = f"value {self.value:.9g}, off by about {self.value_error:.1e}; corrected {self.corrected_value:.12g}"
-        gradient = f"gradient off by about {self.gradient_error:.1e} of itself: {causes}"
-        return [value, gradient], self.solves, SHOWN, [f"advice: {self.advice}"]
+        return [
+            f"value {self.value:.9g}, off by about {self.value_error:.1e}; corrected {self.corrected_value:.12g}",
+            f"gradient off by about {self.gradient_error:.1e} of itself: {causes}",
+            table_of(self.solves, SHOWN),
+            f"advice: {self.advice}",
+        ]
 
 
 # ---------------------------------------------------------------- adaptive tolerances for minimize

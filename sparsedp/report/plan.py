@@ -5,12 +5,13 @@ from importlib.util import find_spec
 from time import perf_counter
 
 from sparsedp.check.nodes import bytes_held
+from sparsedp.check.summary import Result
 from sparsedp.check.sweep import solvers_of
+from sparsedp.check.table import table_of
 from sparsedp.derivative import value_and_grad, witnessed
 from sparsedp.fields import check_function
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
-from sparsedp.report.table import Table
 from sparsedp.tape import is_variable
 from sparsedp.tree import leaves
 
@@ -110,7 +111,7 @@ def total(calls, *kinds):
     return sum(many for (_, kind), many in calls.items() if kind in kinds)
 
 
-class Plan(Table):
+class Plan(Result):
     """The result of `explain`. Frozen.
 
     Attributes
@@ -141,15 +142,18 @@ class Plan(Table):
             counts.setdefault(name, {})[kind] = many
         return super().to_dict() | {"counts": counts}
 
-    def _parts(self):
+    def parts(self):
+        """The sums, a row for each name, and what was left out."""
         forward, backward = self.seconds
         used = [kind for kind in COLUMNS if any(row[kind] for row in self.rows)]
         rows = [{name: value or None for name, value in row.items()} for row in self.rows]
-        above = (
+        return [
             f"value {self.value:.6g}: {forward:.2g} s forward, {backward:.2g} s backward; tape: {self.tape_nodes} "
-            f"calls that keep {self.tape_bytes} bytes, recomputation factor {self.recomputation:.2f}"
-        )
-        return [above], rows, ("name", *used, "seconds", "how"), [f"totals: {self.sums}"]
+            f"calls that keep {self.tape_bytes} bytes, recomputation factor {self.recomputation:.2f}",
+            table_of(rows, ("name", *used, "seconds", "how")),
+            *self.omissions(),
+            f"totals: {self.sums}",
+        ]
 
     @property
     def sums(self):

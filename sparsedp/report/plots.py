@@ -1,5 +1,6 @@
 """Pictures of fields, charts of measurements. The only file of the package that imports matplotlib (extra `plot`)."""
 
+import contextlib
 import io
 from functools import partial
 from importlib import import_module
@@ -14,7 +15,7 @@ from sparsedp.tape import plain
 
 __all__ = [
     "animate", "convergence", "current", "curves", "figure", "plot", "read_picture", "sample_file",
-    "stability_chart", "unbeaten", "v_curve", "write_picture",
+    "stability_chart", "unbeaten", "v_curve", "write_picture", "write_result",
 ]  # fmt: skip
 
 ARROWS = 24  # arrows along an axis of a face field, at most
@@ -335,6 +336,18 @@ def write_picture(path, draw):
     picture = draw(figure().add_subplot()).figure
     options = {"format": "png", "dpi": 150, "bbox_inches": "tight", "pad_inches": 0.15}
     write_file(path, lambda stream: picture.savefig(stream, **options))
+
+
+def write_result(result, folder, stem, draw=None, heading=""):
+    """A result, and ``draw(axes) -> axes`` -> paths of stem.md, stem.csv and, with matplotlib, stem.png in a folder."""
+    page, numbers, picture = [folder / f"{stem}.{kind}" for kind in ("md", "csv", "png")]
+    write_file(page, heading + result.markdown())
+    write_file(numbers, result.csv())
+    if draw:
+        with contextlib.suppress(ImportError):
+            write_picture(picture, draw)
+            return [page, numbers, picture]
+    return [page, numbers]
 
 
 def sample_file(name):

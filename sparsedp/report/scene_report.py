@@ -22,7 +22,6 @@ from sparsedp.report import plots
 from sparsedp.report.certificate import certify
 from sparsedp.report.plan import explain
 from sparsedp.report.stress_table import stress
-from sparsedp.report.table import Result, write_table
 from sparsedp.report.work_precision import words_of, workprec
 
 __all__ = ["Source", "audited", "claim", "load", "write_report"]
@@ -30,7 +29,9 @@ __all__ = ["Source", "audited", "claim", "load", "write_report"]
 STARTS = ("start", "x")  # names of the point, the first that is there
 OPTIONS = ("workprec_options", "stress_options")  # dicts of arguments in the file
 PAGE = "report.md"
-NO_PROBLEM = "the file gives no workprec_options (problem, methods, over, reference)"
+NO_PROBLEM = (
+    "error against run time: not measured, the file gives no workprec_options (problem, methods, over)"
+)
 GOALS = 0.1, 0.01, 1e-3, 1e-4, 1e-6  # the errors that the page recommends a method for, as far as one reaches them
 MEANING = {  # the worst first: one that is wrong beats one that is open
     "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
@@ -167,17 +168,16 @@ def write_report(source, folder, force=False):
     """
     claim(folder, [PAGE], force)
     with audited(source.name):
-        results = [_attempt(chapter.run, source) for chapter in CHAPTERS]
-    words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
+        findings = [_attempt(chapter, source) for chapter in CHAPTERS]
+    words = [getattr(result, "verdict", "inconclusive") for result, *_ in (findings[0], findings[-1])]
     verdict = next(word for word in MEANING if word in words)
     page, lines = [f"# {source.name}: {verdict}", "", MEANING[verdict]], []
-    for chapter, result in zip(CHAPTERS, results):
-        sentences, files = [f"{chapter.subject}: {chapter.failed}, {result}"], []
-        if isinstance(result, Result):
-            left_out = (f"{chapter.subject} left out: {sentence}" for sentence in getattr(result, "left_out", ()))
-            sentences = [*chapter.tell(result), *left_out]
-            text, stem = f"# {chapter.title}\n\n{result.markdown()}", getattr(result, "stem", chapter.stem)
-            files = write_table(folder, stem, text, result.csv(), chapter.draw(result))
+    for chapter, (result, sentences, draw) in zip(CHAPTERS, findings):
+        files = []
+        if result is not None:
+            sentences = [*sentences, *(f"{chapter.stem} left out: {sentence}" for sentence in result.left_out)]
+            stem, heading = getattr(result, "stem", chapter.stem), f"# {chapter.title}\n\n"
+            files = plots.write_result(result, folder, stem, draw, heading)
         links = (f"{'!' if path.suffix == '.png' else ''}[{path.name}]({path.name})" for path in files)
         page += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in sentences), "", *links]
         lines += sentences
@@ -185,67 +185,71 @@ def write_report(source, folder, force=False):
     return verdict, lines
 
 
-def _attempt(run, source):
-    """What an instrument gives, or the error in words: one that fails does not take the others with it."""
+def _attempt(chapter, source):
+    """What a chapter finds, or the error in words: an instrument that fails does not take the others with it."""
     try:
-        return run(source)
+        return chapter.find(source)
     except Exception as error:  # the loss is the user's: it may raise anything
-        return error_text(error)
+        return None, [f"{chapter.failed}, {error_text(error)}"], None
 
 
-def _audit(audit):
+# Chapters: source -> (result or None, sentences for the page, what draws it on axes or None).
+
+
+def _audit(source):
+    audit = check.gradient(source.loss, source.x)
     digits = f", {audit.digits} digits" if audit.digits is not None else ""
-    yield f"gradient: {audit.verdict}{digits}{': ' if audit.reason else ''}{audit.reason}"
+    sentences = [f"gradient: {audit.verdict}{digits}{': ' if audit.reason else ''}{audit.reason}"]
     if audit.culprit:
-        yield f"at fault: {audit.culprit}"
+        sentences.append(f"at fault: {audit.culprit}")
+    return audit, sentences, partial(plots.v_curve, audit)
 
 
-def _workprec(table):
+def _workprec(source):
+    if not source.workprec:
+        return None, [NO_PROBLEM], None
+    rows, sentences = workprec(**source.workprec), []
     for goal in GOALS:
-        words, row = f"a {table.judged.replace('_', ' ')} of {100 * goal:g} %", table.best(goal, table.judged)
+        words, row = f"a {rows.judged.replace('_', ' ')} of {100 * goal:g} %", rows.best(goal, rows.judged)
         if row is None:
-            yield f"error against run time: no method reaches {words}, see {table.stem}.md"
-            return
-        settings = words_of(json.loads(row["settings"]))
-        yield f"fastest at {words}: {row['method']} ({settings}), {table.seconds(row, table.judged):.1e} s"
+            sentences.append(f"error against run time: no method reaches {words}, see {rows.stem}.md")
+            break
+        settings, seconds = words_of(json.loads(row["settings"])), rows.seconds(row, rows.judged)
+        sentences.append(f"fastest at {words}: {row['method']} ({settings}), {seconds:.1e} s")
+    return rows, sentences, rows.plot
 
 
-def _certificate(certificate):
-    yield f"error of the gradient from its solves: about {certificate.gradient_error:.1e}; {certificate.advice}"
+def _certificate(source):
+    found = certify(source.loss, source.x)
+    return found, [f"error of the gradient from its solves: about {found.gradient_error:.1e}; {found.advice}"], None
 
 
-def _plan(plan):
-    yield f"one gradient: {plan.sums}"
+def _plan(source):
+    plan = explain(source.loss, source.x)
+    return plan, [f"one gradient: {plan.sums}"], None
 
 
-def _stress(trial):
-    yield trial.summary
-    for row in trial.failures:
-        yield ": ".join(["FAILED", f"{row['parameter']} {row['case']}".strip(), row["note"]])
+def _stress(source):
+    trial = stress(source.loss, source.x, **source.stress)
+    failed = [": ".join(["FAILED", f"{row['parameter']} {row['case']}".strip(), row["note"]]) for row in trial.failures]
+    return trial, [trial.summary, *failed], trial.plot if trial.map else None
 
 
 class Chapter(NamedTuple):
-    """An instrument of the report, the file it writes, and the sentences it tells."""
+    """An instrument of the report."""
 
-    stem: str
+    stem: str  # of its files
     title: str
-    subject: str  # what its sentences begin with
     failed: str  # what is said when it fails
-    run: Any
-    tell: Any
-    draw: Any = lambda result: None  # result -> what draws it on axes, or None
+    find: Any
 
 
 # The audit comes first and the stress cases last: both have a say in the verdict.
 CHAPTERS = (
-    Chapter("audit", "Is the gradient right?", "gradient", "not audited",
-            lambda s: check.gradient(s.loss, s.x), _audit, lambda audit: partial(plots.v_curve, audit)),
-    Chapter("workprec", "Which method for which error?", "error against run time", "not measured",
-            lambda s: workprec(**s.workprec) if s.workprec else NO_PROBLEM, _workprec,
-            lambda rows: rows.plot),
-    Chapter("certificate", "How exact is the gradient, and how exact need the solves be?", "certificate", "not made",
-            lambda s: certify(s.loss, s.x), _certificate),
-    Chapter("plan", "What one gradient computes", "plan", "not made", lambda s: explain(s.loss, s.x), _plan),
-    Chapter("stress", "Stiff and extreme cases", "stress", "not run",
-            lambda s: stress(s.loss, s.x, **s.stress), _stress, lambda trial: trial.plot if trial.map else None),
+    Chapter("audit", "Is the gradient right?", "gradient: not audited", _audit),
+    Chapter("workprec", "Which method for which error?", "error against run time: not measured", _workprec),
+    Chapter("certificate", "How exact is the gradient, and how exact need the solves be?", "certificate: not made",
+            _certificate),
+    Chapter("plan", "What one gradient computes", "plan: not made", _plan),
+    Chapter("stress", "Stiff and extreme cases", "stress: not run", _stress),
 )  # fmt: skip

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.check.summary import Result, table
+from sparsedp.check.summary import Result
 from sparsedp.check.sweep import Point
+from sparsedp.check.table import Table
 from sparsedp.derivative import jvp
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
@@ -96,10 +97,12 @@ class StabilityMap(Result):
 
     _plain = ("time_steps", "viscosities", "factors")
 
-    def __str__(self):
+    @property
+    def table(self):
+        """The factors."""
         cells = np.where(np.isnan(self.factors), "refused", self.factors.astype(object))
         rows = [(dt, *row) for dt, row in zip(self.time_steps, cells)]
-        return table(rows, (" \\ ".join(self.names), *self.viscosities))
+        return Table((" \\ ".join(self.names), *self.viscosities), rows)
 
 
 def stability_map(scene):

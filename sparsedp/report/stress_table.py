@@ -4,11 +4,12 @@ import warnings
 
 import numpy as np
 
+from sparsedp.check.summary import Result
+from sparsedp.check.table import table_of
 from sparsedp.fields import check_function
 from sparsedp.report import plots
 from sparsedp.report.stability import stability_map
 from sparsedp.report.stress_cases import FAILED, GROUPS, WORDS, Scene, cases
-from sparsedp.report.table import Table
 
 __all__ = ["Stress", "stress"]
 
@@ -92,7 +93,7 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     return Stress(rows=rows, left_out=[*skipped, *ELSEWHERE], map=growth)
 
 
-class Stress(Table):
+class Stress(Result):
     """The result of `stress`.
 
     Attributes
@@ -122,9 +123,10 @@ class Stress(Table):
         """ "disagrees" when something FAILED, else "agrees"."""
         return "disagrees" if self.failures else "agrees"
 
-    def _parts(self):
-        growth = ["growth factor of a step:", str(self.map)] if self.map else []
-        return ["stress"], self.rows, COLUMNS, [*growth, self.summary]
+    def parts(self):
+        """All cases, what was left out, the map, and the counts."""
+        growth = ["growth factor of a step:", self.map.table] if self.map else []
+        return ["stress", table_of(self.rows, COLUMNS), *self.omissions(), *growth, self.summary]
 
     def plot(self, ax=None):
         """Stability map -> picture: growth factor of a step, time step against viscosity.

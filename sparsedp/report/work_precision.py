@@ -14,7 +14,8 @@ from timeit import repeat, timeit
 
 import numpy as np
 
-from sparsedp.check.summary import text_of
+from sparsedp.check.summary import Result
+from sparsedp.check.table import table_of, text_of
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.fields import check_function, is_whole
@@ -23,7 +24,6 @@ from sparsedp.ledger import recording
 from sparsedp.report import plots
 from sparsedp.report.certificate import distance
 from sparsedp.report.plan import total
-from sparsedp.report.table import Table, csv_text, write_table
 from sparsedp.shortcuts import ranks
 from sparsedp.tree import leaves
 
@@ -132,7 +132,7 @@ def workprec(
             figures |= _errors(exact, compare, {name: settings[name] for name in over}, *result)
             finished[key] = {name: figures.get(name, nan) for name in COLUMNS} | dict(zip(KEY, key))
             if file:
-                write_file(file, csv_text([*_stored(file), finished[key]], COLUMNS))
+                write_file(file, table_of([*_stored(file), finished[key]], COLUMNS).csv())
         rows.append(finished[key])
     return Rows(scene=scene, over=tuple(over), rows=rows, left_out=skipped)
 
@@ -288,7 +288,7 @@ def _exact(problem, given, compare):
 # ---------------------------------------------------------------- the table
 
 
-class Rows(Table):
+class Rows(Result):
     """Error against run time. Made by `workprec`.
 
     Attributes
@@ -331,16 +331,20 @@ class Rows(Table):
         """The fastest row whose error is at most `error`, or None."""
         return next((row for row in self.pareto(which) if row[which] <= error), None)
 
-    def _parts(self):
-        """The table for readers: what is known of the runs, and the settings that tell those of a method apart."""
+    def parts(self):
+        """The figures, and the settings that tell those of a method apart; what was left out."""
         best = [*self.pareto(), *self.pareto("forward_error")]
         rows = [json.loads(row["settings"]) | row | {"best": "*" * (row in best)} for row in self.rows]
         first, *used = [name for name in SHOWN if any(text_of(row[name]) for row in rows)]
         apart = [name for name in self.over if name not in COLUMNS]
-        star = "A star: no other row is both faster and more exact (the Pareto set, in gradient or value)."
         errors = [row["reference_error"] for row in rows if text_of(row["reference_error"])]
-        stated = [f"Error of the reference: {max(errors):.1e}."] if errors else []
-        return [f"{self.scene}: error against run time"], rows, [first, *apart, *used, "best"], [star, *stated]
+        return [
+            f"{self.scene}: error against run time",
+            table_of(rows, [first, *apart, *used, "best"]),
+            *self.omissions(),
+            "A star: no other row is both faster and more exact (the Pareto set, in gradient or value).",
+            *([f"Error of the reference: {max(errors):.1e}."] if errors else []),
+        ]
 
     def plot(self, ax=None, error=None):
         """Log-log picture: run time across, error up, one curve for each method, the Pareto set marked.
@@ -374,7 +378,7 @@ class Rows(Table):
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        return write_table(folder, self.stem, self.markdown(), self.csv(), self.plot)
+        return plots.write_result(self, folder, self.stem, self.plot)
 
 
 # ---------------------------------------------------------------- a file that can be continued

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 import sparsedp as dp
+from sparsedp.check.table import table_of
 from sparsedp.files import write_file
 from sparsedp.ledger import recording
 from sparsedp.report import plots
@@ -16,7 +17,6 @@ from sparsedp.report.demo.scene import NOISE, Ground, Survey, objective, regular
 from sparsedp.report.demo.terrain import Terrain, hidden_ground, remap
 from sparsedp.report.plan import total
 from sparsedp.report.scene_report import claim
-from sparsedp.report.table import csv_text, text_table
 
 __all__ = ["FILES", "Study", "grids_for", "prepare", "tell"]
 
@@ -132,9 +132,9 @@ def tell(study, folder, force):
     print(INTRODUCTION.format(s=study, d=study.data, noise=100 * NOISE), flush=True)
     (*_, logk), rows, curves = zip(*(recover(study, grid) for grid in study.grids))
     print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
-    print(text_table(rows, SHOWN), end="\n\n")
+    print(table_of(rows, SHOWN), end="\n\n")
     claim(folder, FILES, force)  # once more: it is a while since the run began
-    write_file(folder / "table.csv", csv_text(rows))
+    write_file(folder / "table.csv", table_of(rows).csv())
     write_file(folder / "recovered.npy", lambda stream: np.save(stream, logk, allow_pickle=False))
     try:
         plots.write_picture(folder / "truth.png", partial(_map, study, "Hidden ground", study.truth))

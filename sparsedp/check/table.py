@@ -1,0 +1,55 @@
+"""The one writer of tables: as text, in Markdown, as CSV."""
+
+import csv
+import io
+import math
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+__all__ = ["Table", "table_of", "text_of"]
+
+NUMBER = re.compile(r"[-+]?(\d[\d.]*(e[-+]\d+)?|nan|inf|exact)?").fullmatch  # what is set to the right of a column
+
+
+class Table(NamedTuple):
+    """Rows of cells, and the names of the columns. str() sets words to the left, numbers to the right."""
+
+    names: Sequence
+    rows: Sequence[Sequence[Any]]
+
+    def texts(self):
+        """The cells in words, below the names."""
+        return [list(map(text_of, row)) for row in (self.names, *self.rows)]
+
+    def __str__(self):
+        columns = []
+        for column in zip(*self.texts(), strict=True):
+            side, width = ">" if all(map(NUMBER, column[1:])) else "<", max(map(len, column))
+            columns.append([f"{cell:{side}{width}}" for cell in column])
+        return "\n".join(f"  {'  '.join(cells)}".rstrip() for cells in zip(*columns))
+
+    def markdown(self):
+        """The table in Markdown."""
+        cells = [[" ".join(text.split()).replace("|", "\\|") for text in row] for row in self.texts()]
+        head, *body = [f"| {' | '.join(row)} |" for row in cells]
+        return "\n".join([head, f"|{'---|' * len(self.names)}", *body])
+
+    def csv(self):
+        """The table as CSV: every digit of a number, a line of names."""
+        stream = io.StringIO()
+        csv.writer(stream, lineterminator="\n").writerows([self.names, *self.rows])
+        return stream.getvalue()
+
+
+def table_of(rows, names=()):
+    """Dicts -> Table of the entries of these names; default: all that the first one has."""
+    names = names or list(rows[0] if rows else ["nothing"])
+    return Table(names, [[row.get(name) for name in names] for row in rows])
+
+
+def text_of(value):
+    """A cell: two digits of a float, nothing for NaN and None."""
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.2g}"
+    return "" if value is None else str(value)
