@@ -110,7 +110,7 @@ def test_the_report(scene, tmp_path, capsys):
     page = (out / "report.md").read_text(encoding="utf-8")
     assert page.startswith("# poisson: agrees")
     assert "fastest at a gradient error of 1 %: direct" in page
-    assert "left out: multigrid hierarchy" in page and "stress left out: 10^4 steps" in page
+    assert "left out: multigrid hierarchy" in page and "left out: 10^4 steps" in page
     assert "may stop at" in page
     assert (
         "of 1 %: direct (cells=16, method=direct), " in page and "no method reaches a gradient error of 0.1 %" in page
@@ -132,7 +132,7 @@ def test_the_report(scene, tmp_path, capsys):
     assert "is there already; name another folder with --out, or write --force" in capsys.readouterr().err
     assert main(["report", f"{scene}:wrong", "--out", str(out), "--force"]) == 1
     page = (out / "report.md").read_text(encoding="utf-8")
-    assert page.startswith("# poisson-wrong: disagrees") and "at fault: cube" in page
+    assert page.startswith("# poisson-wrong: disagrees") and "culprit: cube" in page
 
 
 def test_a_report_of_a_loss_that_does_not_run(scene, tmp_path, capsys):

@@ -148,9 +148,8 @@ def _scalar(grid, u, at=None):
         return u, kind, []
     if grid.dim == 1:
         return u, "nodes", []
-    pairs = [(part, np.roll(part, -1, a)) for a, part in enumerate(grid.split(u))]
     inside = tuple(map(slice, grid.shape))  # the last face of a bounded axis has no other beyond it
-    parts = [0.5 * (lower + upper)[inside] for lower, upper in pairs]
+    parts = [0.5 * (part + np.roll(part, -1, a))[inside] for a, part in enumerate(grid.split(u))]
     return np.sqrt(sum(part**2 for part in parts)), "cells", parts
 
 

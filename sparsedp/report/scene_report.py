@@ -5,7 +5,6 @@ The folder gets Markdown, CSV and pictures of each instrument, and a page that s
 
 import contextlib
 import inspect
-import json
 import os
 import re
 import runpy
@@ -16,23 +15,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sparsedp import check
-from sparsedp.check.summary import error_text
+from sparsedp.check.summary import Result, error_text
 from sparsedp.files import write_file
 from sparsedp.report import plots
 from sparsedp.report.certificate import certify
 from sparsedp.report.plan import explain
 from sparsedp.report.stress_table import stress
-from sparsedp.report.work_precision import words_of, workprec
+from sparsedp.report.work_precision import workprec
 
 __all__ = ["Source", "audited", "claim", "load", "write_report"]
 
 STARTS = ("start", "x")  # names of the point, the first that is there
 OPTIONS = ("workprec_options", "stress_options")  # dicts of arguments in the file
 PAGE = "report.md"
-NO_PROBLEM = (
-    "error against run time: not measured, the file gives no workprec_options (problem, methods, over)"
-)
-GOALS = 0.1, 0.01, 1e-3, 1e-4, 1e-6  # the errors that the page recommends a method for, as far as one reaches them
+NO_PROBLEM = "error against run time: not measured, the file gives no workprec_options (problem, methods, over)"
 MEANING = {  # the worst first: one that is wrong beats one that is open
     "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
     "inconclusive": "Nothing is proved: the reason stands below. This is no pass.",
@@ -168,16 +164,16 @@ def write_report(source, folder, force=False):
     """
     claim(folder, [PAGE], force)
     with audited(source.name):
-        findings = [_attempt(chapter, source) for chapter in CHAPTERS]
-    words = [getattr(result, "verdict", "inconclusive") for result, *_ in (findings[0], findings[-1])]
+        results = [_attempt(chapter.run, source) for chapter in CHAPTERS]
+    words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
     verdict = next(word for word in MEANING if word in words)
     page, lines = [f"# {source.name}: {verdict}", "", MEANING[verdict]], []
-    for chapter, (result, sentences, draw) in zip(CHAPTERS, findings):
-        files = []
-        if result is not None:
-            sentences = [*sentences, *(f"{chapter.stem} left out: {sentence}" for sentence in result.left_out)]
+    for chapter, result in zip(CHAPTERS, results):
+        sentences, files = [f"{chapter.failed}, {result}"], []
+        if isinstance(result, Result):
+            sentences = [part.strip() for part in result.parts() if isinstance(part, str)]
             stem, heading = getattr(result, "stem", chapter.stem), f"# {chapter.title}\n\n"
-            files = plots.write_result(result, folder, stem, draw, heading)
+            files = plots.write_result(result, folder, stem, chapter.draw(result), heading)
         links = (f"{'!' if path.suffix == '.png' else ''}[{path.name}]({path.name})" for path in files)
         page += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in sentences), "", *links]
         lines += sentences
@@ -185,54 +181,12 @@ def write_report(source, folder, force=False):
     return verdict, lines
 
 
-def _attempt(chapter, source):
-    """What a chapter finds, or the error in words: an instrument that fails does not take the others with it."""
+def _attempt(run, source):
+    """What an instrument gives, or the error in words: one that fails does not take the others with it."""
     try:
-        return chapter.find(source)
+        return run(source)
     except Exception as error:  # the loss is the user's: it may raise anything
-        return None, [f"{chapter.failed}, {error_text(error)}"], None
-
-
-# Chapters: source -> (result or None, sentences for the page, what draws it on axes or None).
-
-
-def _audit(source):
-    audit = check.gradient(source.loss, source.x)
-    digits = f", {audit.digits} digits" if audit.digits is not None else ""
-    sentences = [f"gradient: {audit.verdict}{digits}{': ' if audit.reason else ''}{audit.reason}"]
-    if audit.culprit:
-        sentences.append(f"at fault: {audit.culprit}")
-    return audit, sentences, partial(plots.v_curve, audit)
-
-
-def _workprec(source):
-    if not source.workprec:
-        return None, [NO_PROBLEM], None
-    rows, sentences = workprec(**source.workprec), []
-    for goal in GOALS:
-        words, row = f"a {rows.judged.replace('_', ' ')} of {100 * goal:g} %", rows.best(goal, rows.judged)
-        if row is None:
-            sentences.append(f"error against run time: no method reaches {words}, see {rows.stem}.md")
-            break
-        settings, seconds = words_of(json.loads(row["settings"])), rows.seconds(row, rows.judged)
-        sentences.append(f"fastest at {words}: {row['method']} ({settings}), {seconds:.1e} s")
-    return rows, sentences, rows.plot
-
-
-def _certificate(source):
-    found = certify(source.loss, source.x)
-    return found, [f"error of the gradient from its solves: about {found.gradient_error:.1e}; {found.advice}"], None
-
-
-def _plan(source):
-    plan = explain(source.loss, source.x)
-    return plan, [f"one gradient: {plan.sums}"], None
-
-
-def _stress(source):
-    trial = stress(source.loss, source.x, **source.stress)
-    failed = [": ".join(["FAILED", f"{row['parameter']} {row['case']}".strip(), row["note"]]) for row in trial.failures]
-    return trial, [trial.summary, *failed], trial.plot if trial.map else None
+        return error_text(error)
 
 
 class Chapter(NamedTuple):
@@ -241,15 +195,19 @@ class Chapter(NamedTuple):
     stem: str  # of its files
     title: str
     failed: str  # what is said when it fails
-    find: Any
+    run: Any  # source -> result, or in words why there is none
+    draw: Any = lambda result: None  # result -> what draws it on axes, or None
 
 
 # The audit comes first and the stress cases last: both have a say in the verdict.
 CHAPTERS = (
-    Chapter("audit", "Is the gradient right?", "gradient: not audited", _audit),
-    Chapter("workprec", "Which method for which error?", "error against run time: not measured", _workprec),
+    Chapter("audit", "Is the gradient right?", "gradient: not audited",
+            lambda s: check.gradient(s.loss, s.x), lambda audit: partial(plots.v_curve, audit)),
+    Chapter("workprec", "Which method for which error?", "error against run time: not measured",
+            lambda s: workprec(**s.workprec) if s.workprec else NO_PROBLEM, lambda rows: rows.plot),
     Chapter("certificate", "How exact is the gradient, and how exact need the solves be?", "certificate: not made",
-            _certificate),
-    Chapter("plan", "What one gradient computes", "plan: not made", _plan),
-    Chapter("stress", "Stiff and extreme cases", "stress: not run", _stress),
+            lambda s: certify(s.loss, s.x)),
+    Chapter("plan", "What one gradient computes", "plan: not made", lambda s: explain(s.loss, s.x)),
+    Chapter("stress", "Stiff and extreme cases", "stress: not run",
+            lambda s: stress(s.loss, s.x, **s.stress), lambda trial: trial.plot if trial.map else None),
 )  # fmt: skip

@@ -124,9 +124,10 @@ class Stress(Result):
         return "disagrees" if self.failures else "agrees"
 
     def parts(self):
-        """All cases, what was left out, the map, and the counts."""
+        """All cases, what was left out, the map, the failures, and the counts."""
         growth = ["growth factor of a step:", self.map.table] if self.map else []
-        return ["stress", table_of(self.rows, COLUMNS), *self.omissions(), *growth, self.summary]
+        failed = (f"{FAILED}: {row['parameter']} {row['case']}: {row['note']}" for row in self.failures)
+        return ["stress", table_of(self.rows, COLUMNS), *self.omissions(), *growth, *failed, self.summary]
 
     def plot(self, ax=None):
         """Stability map -> picture: growth factor of a step, time step against viscosity.

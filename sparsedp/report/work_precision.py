@@ -27,7 +27,7 @@ from sparsedp.report.plan import total
 from sparsedp.shortcuts import ranks
 from sparsedp.tree import leaves
 
-__all__ = ["COLUMNS", "Rows", "words_of", "workprec"]
+__all__ = ["COLUMNS", "Rows", "workprec"]
 
 COLUMNS = (
     "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
@@ -42,6 +42,7 @@ COUNTS = {"solves_forward": "solve", "solves_adjoint": "adjoint", "iterations": 
 SETTLED = 2.0  # a run that is not faster than the last one by more is warm
 MOST_WARM_UPS = 7
 SHORT = 2e-3  # [s]: below, times differ for other reasons
+GOALS = 0.1, 0.01, 1e-3, 1e-4, 1e-6  # errors that a method is recommended for, as far as one reaches them
 FAILURES = (SparsedpError, ArithmeticError, ValueError, MemoryError, np.linalg.LinAlgError)
 
 
@@ -342,9 +343,20 @@ class Rows(Result):
             f"{self.scene}: error against run time",
             table_of(rows, [first, *apart, *used, "best"]),
             *self.omissions(),
+            *self._recommended(),
             "A star: no other row is both faster and more exact (the Pareto set, in gradient or value).",
             *([f"Error of the reference: {max(errors):.1e}."] if errors else []),
         ]
+
+    def _recommended(self):
+        """The fastest method for each error of GOALS, in words."""
+        for goal in GOALS:
+            words, row = f"a {self.judged.replace('_', ' ')} of {100 * goal:g} %", self.best(goal, self.judged)
+            if row is None:
+                yield f"no method reaches {words}"
+                return
+            settings, seconds = words_of(json.loads(row["settings"])), self.seconds(row, self.judged)
+            yield f"fastest at {words}: {row['method']} ({settings}), {seconds:.1e} s"
 
     def plot(self, ax=None, error=None):
         """Log-log picture: run time across, error up, one curve for each method, the Pareto set marked.
