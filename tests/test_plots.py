@@ -155,7 +155,7 @@ def test_traced_fields_can_be_drawn(ax):
 
 
 def test_curves_mark_the_best_so_far(ax):
-    plots.curves({"a": ([1.0, 4.0], [3.0, 1.0]), "b": ([2.0, 3.0], [2.0, 5.0])}, ax, "s", "error")
+    plots.curves({"a": [(1.0, 3.0), (4.0, 1.0)], "b": [(2.0, 2.0), (3.0, 5.0)]}, ax, "s", "error")
     x, y = ax.lines[0].get_data()
     assert np.array_equal(x, [1.0, 2.0, 4.0]) and np.array_equal(y, [3.0, 2.0, 1.0])
 

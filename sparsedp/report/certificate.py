@@ -63,21 +63,22 @@ class RecordedSolve(NamedTuple):
 class RecordedSolves(dict):
     """The solves of a run, by (name, "forward" or "adjoint", turn); while it runs, their observer.
 
+    A root and its Jacobian have one name.
+
     Parameters
     ----------
     before : RecordedSolves, optional
         Of an earlier run: each is the start of the same solve.
-    correct : callable, optional
+    correct : callable or None
         ``correct(key)``: whether the error of the solution is taken away, or kept. Default: always taken away.
-    share : float or None
-        Relative tolerance of each correction. None: the solutions are taken as they are, without a solve.
-    fresh : float, optional
-        Tolerance of solves that were not recorded before. Default: their own.
+        None: the solutions are taken as they are, without a solve, and what was not recorded is solved to `share`.
+    share : float
+        Relative tolerance of each correction.
     """
 
-    def __init__(self, before=None, correct=lambda key: True, share: float | None = SHARE, fresh=None):
+    def __init__(self, before=None, correct: Any = lambda key: True, share=SHARE):
         super().__init__()
-        self.before, self.correct, self.share, self.fresh = before or {}, correct, share, fresh
+        self.before, self.correct, self.share = before or {}, correct, share
         self.iterations = 0
         self._turns: Counter = Counter()
 
@@ -95,15 +96,18 @@ class RecordedSolves(dict):
         """The solution of one linear solve, flat. The solver calls this in place of its own `solved`."""
         product = (solver.system.given.T if transposed else solver.system.given)._flat.apply
         first = partial(solver.solved, b, transposed, checked, start)
-        if self.fresh:
-            first = partial(solver.approximate, b, self.fresh, transposed)
+        if self.correct is None:
+            first = partial(solver.approximate, b, self.share, transposed)
+
+        def residual(x):
+            return b - product(x)
 
         def corrected(x, left):
-            return x + solver.approximate(b - product(x) - left, self.share, transposed)
+            return x + solver.approximate(residual(x) - left, self.share, transposed)
 
+        name = solver.name.removesuffix(".jacobian"), "adjoint" if transposed else "forward"
         facts = float(np.linalg.norm(b)), solver.system.rtol, solver.engine.iterative
-        kind = "adjoint" if transposed else "forward"
-        return self._solved((solver.name, kind), b.size, first, corrected, lambda x: b - product(x), facts)
+        return self._solved(name, b.size, first, corrected, residual, facts)
 
     def root(self, root, equation, guess, leaves):
         """The solution of one nonlinear solve, flat."""
@@ -123,24 +127,23 @@ class RecordedSolves(dict):
         if solve is None or solve.x.size != size:
             x = first()
         else:
-            x = solve.x if self.share is None else corrected(solve.x, 0.0 if self.correct(key) else solve.r)
+            x = solve.x if self.correct is None else corrected(solve.x, 0.0 if self.correct(key) else solve.r)
         self[key] = RecordedSolve(x, residual(x), *facts)
         return x
 
-    def products(self):
-        """y . r for each forward solve, or None when there is one without its adjoint solve.
+    def correction(self):
+        """The sum of y . r over the forward solves; 0 when there is one without its adjoint solve.
 
         They are paired by order: the last solve forward is the first one back.
         """
-        products = []
+        products = [0.0]
         for (name, kind, turn), solve in self.items():
             if kind == "forward":
-                other = name if (name, "adjoint", 0) in self else f"{name}.jacobian"
-                adjoint = self.get((other, "adjoint", self._turns[name, kind] - 1 - turn))
+                adjoint = self.get((name, "adjoint", self._turns[name, kind] - 1 - turn))
                 if adjoint is None or adjoint.x.size != solve.r.size:
-                    return None
+                    return 0.0
                 products.append(float(np.sum(adjoint.x * solve.r).real))
-        return products
+        return sum(products)
 
 
 # ---------------------------------------------------------------- certify
@@ -199,12 +202,12 @@ def certify(loss, x, target=TARGET):
     left = RecordedSolves(solves)
     slope, half = left.run(gradient_of, x)[1], corrected(lambda key: key[1] == "adjoint")
     causes = {"forward solves": distance(slope, half, gradient), "adjoint solves": distance(half, gradient)}
-    error, names = distance(slope, gradient), dict.fromkeys(map(_solver, solves))
+    error, names = distance(slope, gradient), dict.fromkeys(name for name, *_ in solves)
     rows = []
     for name in names:
-        alone = slope if len(names) == 1 else corrected(lambda key, name=name: _solver(key) == name)
-        pairs = [(key[1], solve) for key, solve in solves.items() if _solver(key) == name]
-        rows.append(_row(name, distance(alone, gradient), pairs))
+        alone = slope if len(names) == 1 else corrected(lambda key, name=name: key[0] == name)
+        sides = {way: [solves[key] for key in solves if key[:2] == (name, way)] for way in ("forward", "adjoint")}
+        rows.append(_row(name, distance(alone, gradient), sides))
     best = RecordedSolves(left).run(loss, x)  # once more: a value tells its own error, and that of the correction
     return Certificate(
         value=value, gradient=gradient, corrected_value=best, corrected_gradient=slope, gradient_error=error,
@@ -212,18 +215,14 @@ def certify(loss, x, target=TARGET):
     )  # fmt: skip
 
 
-def _solver(key):
-    """A root and its Jacobian are one solver to the user."""
-    return key[0].removesuffix(".jacobian")
-
-
-def _row(name, error, solves):
-    """What is known about one solver, from pairs of kind and solve."""
-    row = {"solver": name, "rtol": max(solve.rtol for _, solve in solves), "error": error}
-    row["iterative"] = any(solve.iterative for _, solve in solves)
-    for kind in ("forward", "adjoint"):
-        residuals = [np.linalg.norm(solve.r) / (solve.size or inf) for way, solve in solves if way == kind]
-        row |= {kind: len(residuals), f"{kind} residual": float(max(residuals, default=0.0))}
+def _row(name, error, sides):
+    """What is known about one solver, from its solves forward and adjoint."""
+    solves = sum(sides.values(), [])
+    row = {"solver": name, "rtol": max(solve.rtol for solve in solves), "error": error}
+    row["iterative"] = any(solve.iterative for solve in solves)
+    for kind, some in sides.items():
+        largest = max((np.linalg.norm(solve.r) / (solve.size or inf) for solve in some), default=0.0)
+        row |= {kind: len(some), f"{kind} residual": float(largest)}
     return row
 
 
@@ -365,7 +364,7 @@ class Certified:
 
     def _settled(self, gradient_of, x):
         # Without a correction first, which takes no solve: what the next one moves tells how far off it was.
-        value, gradient = self._pass(gradient_of, x, RecordedSolves(self._solves, share=None, fresh=self.share))
+        value, gradient = self._pass(gradient_of, x, RecordedSolves(self._solves, None, self.share))
         self.evaluations += 1
         for _ in range(CORRECTIONS if any(solve.iterative for solve in self._solves.values()) else 0):
             before = value, gradient
@@ -379,7 +378,7 @@ class Certified:
         self._solves = dict(solves)
         self.passes += 1
         self.iterations += solves.iterations
-        return value + sum(solves.products() or ()), gradient
+        return value + solves.correction(), gradient
 
     def _close(self, value, gradient, new_value, new_gradient):
         """Whether the error of the new value and gradient, share / (1 - share) times the last move, is allowed."""

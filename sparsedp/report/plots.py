@@ -4,7 +4,6 @@ import contextlib
 import io
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 
 import numpy as np
 
@@ -14,8 +13,8 @@ from sparsedp.grid import check_grid
 from sparsedp.tape import plain
 
 __all__ = [
-    "animate", "convergence", "current", "curves", "figure", "plot", "read_picture", "sample_file",
-    "stability_chart", "unbeaten", "v_curve", "write_picture", "write_result",
+    "animate", "convergence", "current", "curves", "figure", "opened", "plot", "sample_data", "stability_chart",
+    "unbeaten", "v_curve", "write_picture", "write_result",
 ]  # fmt: skip
 
 ARROWS = 24  # arrows along an axis of a face field, at most
@@ -77,8 +76,7 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, cmap="viridis", 
         # pcolormesh wants rows along y, so the array is turned here and nowhere else.
         # It takes nodes, or the ends of cells.
         lines = [grid.coordinates(a, "nodes" if kind == "nodes" else "ends") for a in axes]
-        options = {"vmin": low, "vmax": high, "cmap": cmap}
-        image = view.pcolormesh(*lines, values.T, shading="auto", rasterized=True, **options)
+        image = view.pcolormesh(*lines, values.T, shading="auto", vmin=low, vmax=high, cmap=cmap, rasterized=True)
         view.set(aspect="equal", xlabel=grid.axes[axes[0]], ylabel=grid.axes[axes[1]])
     bar = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the map, whatever its shape
     ax.figure.colorbar(image, cax=bar, label=label or "")
@@ -126,14 +124,14 @@ def animate(grid, frames, path, title=None, limits=None, cmap="viridis", rate=12
     if not frames:
         raise ValueError("animate needs at least one frame, got none; run with keep='all'")
     limits = limits or _range(np.concatenate([_scalar(grid, frame)[0].ravel() for frame in frames]))
-    image, images = _images(), []
+    images = []
     for frame in frames:
         picture, pixels = figure(), io.BytesIO()
         plot(grid, frame, ax=picture.add_subplot(), title=title, limits=limits, cmap=cmap)
         picture.savefig(pixels, format="png", dpi="figure")
-        images.append(image.open(pixels).convert("RGB").quantize(256))
-    options = {"save_all": True, "append_images": images[1:], "duration": round(1000 / rate), "loop": 0}
-    film = partial(images[0].save, format="GIF", **options)
+        images.append(opened(pixels).convert("RGB").quantize(256))
+    first, *others = images
+    film = partial(first.save, format="GIF", save_all=True, append_images=others, duration=round(1000 / rate), loop=0)
     film(path) if hasattr(path, "write") else write_file(path, film)
 
 
@@ -191,7 +189,7 @@ def curves(lines, ax, xlabel, ylabel):
     Parameters
     ----------
     lines : dict
-        Name -> (x, y), two sequences of positive numbers.
+        Name -> points (x, y) of positive numbers.
     ax : matplotlib Axes
     xlabel, ylabel : str
 
@@ -199,16 +197,16 @@ def curves(lines, ax, xlabel, ylabel):
     -------
     matplotlib Axes
     """
-    best = unbeaten([point for x, y in lines.values() for point in zip(x, y) if point[1] > 0])
+    best = unbeaten([point for points in lines.values() for point in points if point[1] > 0])
     ax.plot(*np.reshape(best, (-1, 2)).T, color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
     return _dressed(lines, ax, xlabel, ylabel)
 
 
 def _dressed(lines, ax, xlabel, ylabel, title=None, xscale="log"):
-    for name, (x, y) in lines.items():
-        heights = np.where(np.greater(y, 0), y, np.nan)  # 0 has no logarithm, and leaves a gap
-        ax.plot(x, heights, marker=".", markersize=4, linewidth=1, label=name)
-    ax.set(xlabel=xlabel, ylabel=ylabel, title=title, xscale=xscale, yscale="log")
+    for name, points in lines.items():
+        ax.plot(*np.reshape(points, (-1, 2)).T, marker=".", markersize=4, linewidth=1, label=name)
+    ax.set(xlabel=xlabel, ylabel=ylabel, title=title, xscale=xscale)
+    ax.set_yscale("log", nonpositive="mask")  # 0 has no logarithm, and leaves a gap
     ax.grid(visible=True, color="0.93")
     ax.legend(frameon=False, fontsize="small")
     return ax
@@ -253,7 +251,7 @@ def convergence(best, ax=None, against="iteration"):
     across, values, norms = np.array(records, float).T
     least = min(values.min(), 0.0)
     name = "loss - least loss" if values.min() <= 0 else "loss"
-    lines = {name: (across, values - least), "gradient norm": (across, norms)}
+    lines = {name: np.stack([across, values - least], 1), "gradient norm": np.stack([across, norms], 1)}
     return _dressed(lines, ax, against, "", f"{best.method}: {best.message.split(':')[0]}", xscale="linear")
 
 
@@ -286,10 +284,10 @@ def v_curve(audit, ax=None):
     >>> v_curve(result, figure().add_subplot()).get_xlabel()
     'step'
     """
-    lines = {}
-    for one in audit.lines:
-        gaps = [(level.step, abs(level.difference - level.slope) / one.scale) for level in one.line.usable]
-        lines[one.direction] = np.reshape(gaps, (-1, 2)).T
+    lines: dict = {one.direction: [] for one in audit.lines}
+    for row in audit.rows:
+        if not row["note"]:
+            lines[row["direction"]].append((row["step"], abs(row["gap"])))
     title = f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}"
     return _dressed(lines, current(ax), "step", "|difference - gradient| / |derivative|", title)
 
@@ -306,14 +304,12 @@ def stability_chart(growth, ax):
     -------
     matplotlib Axes
     """
-    ax.set_facecolor("0.75")
-    values = np.ma.masked_invalid(np.clip(growth.factors, 0.0, 2.0))
-    axes = growth.viscosities, growth.time_steps
-    image = ax.pcolormesh(*axes, values, vmin=0, vmax=2, cmap="coolwarm", shading="nearest")
+    ylabel, xlabel = growth.names
+    ax.set(xlabel=xlabel, ylabel=ylabel, title="stable: blue; grows: red; refused: grey", facecolor="0.75")
+    factors = np.clip(growth.factors, 0.0, 2.0)
+    image = ax.pcolormesh(growth.viscosities, growth.time_steps, factors, cmap="coolwarm", vmin=0, vmax=2)
     ax.figure.colorbar(image, ax=ax, label="growth factor of a step (2 and more: red)")
-    ax.plot(*growth.here[::-1], marker="*", color="black", markersize=12)
-    words = {"ylabel": growth.names[0], "xlabel": growth.names[1], "title": "stable: blue; grows: red; refused: grey"}
-    ax.set(**words, xscale="log", yscale="log")
+    ax.loglog(*growth.here[::-1], marker="*", color="black", markersize=12)
     return ax
 
 
@@ -333,8 +329,7 @@ def current(ax):
 def write_picture(path, draw):
     """``draw(axes) -> axes`` -> PNG at a path."""
     picture = draw(figure().add_subplot()).figure
-    options = {"format": "png", "dpi": 150, "bbox_inches": "tight", "pad_inches": 0.15}
-    write_file(path, lambda stream: picture.savefig(stream, **options))
+    write_file(path, partial(picture.savefig, format="png", dpi=150, bbox_inches="tight", pad_inches=0.15))
 
 
 def write_result(result, folder, stem, draw=None, heading=""):
@@ -349,21 +344,15 @@ def write_result(result, folder, stem, draw=None, heading=""):
     return [page, numbers]
 
 
-def sample_file(name):
-    """Name of a file in matplotlib's sample data -> its Path."""
-    return Path(_matplotlib().get_data_path(), "sample_data", name)
+def sample_data(name):
+    """Name of an archive in matplotlib's sample data -> the archive."""
+    return _matplotlib(".cbook").get_sample_data(name)
 
 
-def read_picture(path):
-    """Picture file -> grey values, shape (rows, columns), rows from the top; one too large for memory is refused."""
-    with _images().open(path) as picture:
-        return np.asarray(picture.convert("F"))
-
-
-def _images():
-    """Pillow, which comes with matplotlib."""
+def opened(file):
+    """File or stream -> picture of Pillow, which comes with matplotlib; one too large for memory is refused."""
     _matplotlib()
-    return import_module("PIL.Image")
+    return import_module("PIL.Image").open(file)
 
 
 def _matplotlib(part=""):

@@ -3,6 +3,7 @@
 import csv
 import itertools
 import json
+import os
 import platform
 import tracemalloc
 from functools import partial
@@ -11,6 +12,7 @@ from math import inf, isfinite, nan
 from pathlib import Path
 from time import perf_counter
 from timeit import repeat, timeit
+from typing import Any
 
 import numpy as np
 
@@ -116,9 +118,10 @@ def workprec(
     if not methods or not isinstance(methods, dict):
         raise ValueError("workprec needs at least one method; write {'name': {settings}}")
     scene, over, now, rows = scene or getattr(problem, "__name__", "scene"), over or {}, _versions(), []
-    compare = compare or distance
-    exact = _exact(problem, reference, compare)
-    finished = {tuple(map(row.get, KEY)): row for row in _stored(file)}
+    exact, finished = (
+        Reference(problem, reference, compare or distance),
+        {tuple(map(row.get, KEY)): row for row in _stored(file)},
+    )
     other = sum(row["versions"] != now for row in finished.values())
     skipped = [f"{other} rows of {Path(file).name} from other versions: run again"] if other else []
     for (method, choice), *values in itertools.product(methods.items(), *over.values()):
@@ -129,8 +132,9 @@ def workprec(
             continue
         key = scene, str(method), _text_of(settings), str(seed), now
         if key not in finished:
-            figures, *result = _measured(problem, settings, repeats)
-            figures |= _errors(exact, compare, {name: settings[name] for name in over}, *result)
+            figures = _measured(problem, settings, repeats)
+            if "answer" in figures:
+                figures |= exact.errors({name: settings[name] for name in over}, figures)
             finished[key] = {name: figures.get(name, nan) for name in COLUMNS} | dict(zip(KEY, key))
             if file:
                 write_file(file, table_of([*_stored(file), finished[key]], COLUMNS).csv())
@@ -182,22 +186,23 @@ def _prepared(problem, settings):
 
 
 def _measured(problem, settings, repeats):
-    """Settings of one run -> (figures, answer, gradient). What fails keeps a row with its status."""
+    """Settings of one run -> its figures, with answer and gradient. What fails has a status only."""
     try:
         clock = perf_counter()
         runs, facts, answers = _prepared(problem, settings)
         seconds = perf_counter() - clock
         status, first, last = _warm(runs[-1])
-        times = _times(runs, int(repeats))
+        times = _times(runs, int(repeats)) if status == "ok" else {}
         peak, result = _peak(runs[-1])
         answer, gradient = answers(result)
     except FAILURES as error:
-        return {"status": _failure(error)}, None, None
-    row = {"unknowns": answer.size, **facts, "peak_bytes": peak, **(times if status == "ok" else {})}
-    row |= {name: total(last, kind) for name, kind in COUNTS.items()}
-    row["seconds_setup"] = seconds + total(first.seconds, "setup")
-    row["status"] = status if np.all(np.isfinite(answer)) else "nonfinite"
-    return row, answer, gradient
+        return {"status": _failure(error)}
+    return {
+        "answer": answer, "gradient": gradient, "unknowns": answer.size, **facts, "peak_bytes": peak, **times,
+        **{name: total(last, kind) for name, kind in COUNTS.items()},
+        "seconds_setup": seconds + total(first.seconds, "setup"),
+        "status": status if np.all(np.isfinite(answer)) else "nonfinite",
+    }  # fmt: skip
 
 
 def _warm(run):
@@ -250,40 +255,36 @@ def _failure(error):
 # ---------------------------------------------------------------- exact answers
 
 
-def _errors(exact, compare, shared, answer, gradient):
-    """The columns of errors of one run, beside the exact answer for the settings that the methods share."""
-    if answer is None:
-        return {}
-    try:
-        value, slope, error = exact(shared)
-        pairs = {"forward_error": (answer, value), "gradient_error": (gradient, slope)}
-        gaps = {name: compare(a, b) for name, (a, b) in pairs.items() if a is not None and b is not None}
-        return gaps | {"reference_error": error}
-    except FAILURES as trouble:
-        return {"status": f"reference: {_failure(trouble)}"}
+class Reference:
+    """The exact answers in any form that `workprec` takes; one for the settings that all methods share."""
 
+    def __init__(self, problem, given, compare):
+        self.problem, self.given, self.compare, self.results = problem, given, compare, {}  # type: Any, Any, Any, dict
 
-def _exact(problem, given, compare):
-    """The reference in any of its forms -> function of the shared settings: (answer, gradient, error of both)."""
-    results: dict = {}  # by the settings, in words: one for all methods
+    def errors(self, shared, figures):
+        """The columns of errors of a run."""
+        words = _text_of(shared)
+        try:
+            if words not in self.results:
+                self.results[words] = self._result(shared)
+            value, slope, error = self.results[words]
+            pairs = {"forward_error": (figures["answer"], value), "gradient_error": (figures["gradient"], slope)}
+            gaps = {name: self.compare(a, b) for name, (a, b) in pairs.items() if a is not None and b is not None}
+            return gaps | {"reference_error": error}
+        except FAILURES as trouble:
+            return {"status": f"reference: {_failure(trouble)}"}
 
-    def result_of(shared):
+    def _result(self, shared):
+        """(Answer, gradient, error of both)."""
+        given = self.given(**shared) if callable(self.given) else self.given
         if given is None:
             return None, None, nan
-        if callable(given) or isinstance(given, tuple):
-            return *(given(**shared) if callable(given) else given), 0.0
-        tasks = [_prepared(problem, shared | finer) for finer in ([given] if isinstance(given, dict) else given)]
+        if callable(self.given) or isinstance(given, tuple):
+            return *given, 0.0
+        tasks = [_prepared(self.problem, shared | finer) for finer in ([given] if isinstance(given, dict) else given)]
         *coarser, finest = [answers(runs[-1]()) for runs, _, answers in tasks]
-        gaps = [compare(a, b) for rough in coarser for a, b in zip(rough, finest) if a is not None]
+        gaps = [self.compare(a, b) for rough in coarser for a, b in zip(rough, finest) if a is not None]
         return *finest, max(gaps, default=nan)
-
-    def exact(shared):
-        words = _text_of(shared)
-        if words not in results:
-            results[words] = result_of(shared)
-        return results[words]
-
-    return exact
 
 
 # ---------------------------------------------------------------- the table
@@ -374,11 +375,10 @@ class Rows(Result):
         """
         ax, error = plots.current(ax), error or self.judged
         lines: dict = {}
-        for seconds, gap, row in sorted(self._points(error), key=lambda point: point[0]):
-            lines.setdefault(row["method"], []).append((seconds, gap))
+        for *point, row in sorted(self._points(error), key=lambda point: point[0]):
+            lines.setdefault(row["method"], []).append(point)
         if lines:  # nothing has no logarithm
-            curves = {name: np.transpose(points) for name, points in lines.items()}
-            plots.curves(curves, ax, "run time [s]", error.replace("_", " "))
+            plots.curves(lines, ax, "run time [s]", error.replace("_", " "))
         ax.set_title(self.scene)
         return ax
 
@@ -398,13 +398,12 @@ class Rows(Result):
 
 def _stored(file):
     """CSV file -> its rows, without one that was cut off; none without a file."""
-    path = file and Path(file)
-    if not path or not path.exists() or not path.stat().st_size:
+    if not file or not os.path.exists(file):
         return []
-    with path.open(encoding="utf-8", newline="") as stream:
+    with open(file, encoding="utf-8", newline="") as stream:
         reader = csv.DictReader(stream)
-        if tuple(reader.fieldnames or ()) != COLUMNS:
-            raise ValueError(f"{path.name} is no table of workprec; give another file name")
+        if reader.fieldnames not in (None, list(COLUMNS)):
+            raise ValueError(f"{Path(file).name} is no table of workprec; give another file name")
         whole = [row for row in reader if row[COLUMNS[-1]] is not None]
     return [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in whole]
 

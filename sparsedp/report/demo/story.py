@@ -13,6 +13,7 @@ from sparsedp.check.table import table_of
 from sparsedp.files import write_file
 from sparsedp.ledger import recording
 from sparsedp.report import plots
+from sparsedp.report.certificate import distance
 from sparsedp.report.demo.scene import NOISE, Ground, Survey, objective, regulariser, survey
 from sparsedp.report.demo.terrain import Terrain, hidden_ground, remap
 from sparsedp.report.plan import total
@@ -70,7 +71,7 @@ def prepare(terrain, grids):
 
 
 def recover(study, grid):
-    """Study and grid -> (log-conductivity, row of the table, (seconds, errors)); prints a line for each iteration.
+    """Study and grid -> (log-conductivity, row of the table, pairs of seconds and error); prints a line for each iteration.
 
     The gradient is checked, then the ground is found by L-BFGS.
     Misfit: root mean square of (computed - read) / noise, 1 is a fit within the noise. Error: distance from the truth,
@@ -86,7 +87,7 @@ def recover(study, grid):
 
     def note(record, logk):
         misfit = float(np.sqrt(max(0.0, 2 * (record.value - roughness(logk)))))
-        error = float(np.linalg.norm(to_finest(logk) - study.truth) / np.linalg.norm(study.truth))
+        error = distance(to_finest(logk), study.truth)
         rows.append({"iterations": len(rows) + 1, "seconds": record.seconds, "misfit": misfit, "error": error})
         print("  {iterations:9d}   {misfit:12.3f}   {error:5.3f}   {seconds:7.2f}".format(**rows[-1]), flush=True)
 
@@ -101,7 +102,7 @@ def recover(study, grid):
     print(f"  {', '.join(f'{many} {name}' for name, many in counts.items())}\n", flush=True)
     row = {"grid": " x ".join(map(str, grid.shape)), "unknowns": best.x.size, **rows[-1], **counts}
     row |= {"gradient": check.verdict, "gradient_error": max((line.share for line in check.lines), default=np.nan)}
-    return best.x, row, tuple([one[name] for one in rows] for name in ("seconds", "error"))
+    return best.x, row, [(one["seconds"], one["error"]) for one in rows]
 
 
 # ---------------------------------------------------------------- what the reader sees

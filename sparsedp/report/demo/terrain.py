@@ -49,7 +49,7 @@ def load(path=None):
     if path is not None:
         return Terrain(read_field(path), f"your file {path}")
     try:
-        with np.load(plots.sample_file(SAMPLE), allow_pickle=False) as archive:
+        with plots.sample_data(SAMPLE) as archive:
             rows = archive["elevation"]
     except (ImportError, OSError, KeyError, ValueError):
         return Terrain(generated((403, 344)), "a generated terrain (the real one comes with matplotlib)")
@@ -149,7 +149,7 @@ def read_field(path):
     readers: dict[str, Any] = {
         ".npy": partial(np.load, mmap_mode="r"),  # mapped into memory: its header may promise more than it holds
         ".npz": _only_map,
-        ".png": lambda path: plots.read_picture(path)[::-1].T,  # its rows run from the top
+        ".png": _grey,
     }
     reader = readers.get(path.suffix.lower())
     if reader is None:
@@ -174,6 +174,12 @@ def read_field(path):
     check_finite(path, field, "needs finite values")
     # By a power of two: nothing is rounded, nothing overflows.
     return np.ldexp(field, -np.frexp(np.abs(field).max())[1])
+
+
+def _grey(path):
+    """Path of a picture -> its grey values; its rows run from the top."""
+    with plots.opened(path) as picture:
+        return np.asarray(picture.convert("F"))[::-1].T
 
 
 def _only_map(path):
