@@ -1,7 +1,9 @@
 """Every node of a reverse-mode tape, seen while it is made: what was called, with which values, inside what."""
 
+import gc
 from contextlib import contextmanager
-from types import CellType
+from functools import partial
+from types import CellType, FunctionType, MethodType
 
 import numpy as np
 
@@ -11,8 +13,8 @@ from sparsedp.tape import called, isbox
 
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
 
-EMPTY = CellType()
-DEEPEST = 12  # levels of containers inside each other; deeper ones are not the tape's
+HOLDERS = tuple, list, set, dict, FunctionType, MethodType, CellType, partial
+DEEPEST = 36  # holders inside each other; deeper ones are not the tape's. A function, its closure and a cell are three
 
 
 class Node:
@@ -99,13 +101,8 @@ def bytes_held(nodes):
 
 
 def _parts(thing):
-    if isinstance(thing, (tuple, list, set)):
-        return thing
-    if isinstance(thing, dict):
-        return thing.values()
+    """What a box, a function or a container refers to; of a function not the names of its module."""
     if isbox(thing):
         return (thing._value,)
-    if hasattr(thing, "func") and hasattr(thing, "keywords"):  # functools.partial
-        return (thing.func, thing.args, thing.keywords)
-    held = [cell.cell_contents for cell in getattr(thing, "__closure__", None) or () if cell != EMPTY]
-    return (*held, *(getattr(thing, "__defaults__", None) or ()))
+    module = getattr(thing, "__globals__", None)
+    return [part for part in gc.get_referents(thing) if part is not module] if isinstance(thing, HOLDERS) else ()

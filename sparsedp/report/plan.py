@@ -100,7 +100,7 @@ def explain(loss, x, gradient=True):
     steps = sum(calls[name, "forward"] for name, kind in list(calls) if kind == "recomputed")
     return Plan(
         value=float(value), counts=calls, totals=totals, rows=_rows(calls), tape_nodes=forward[1],
-        left_out=[*_gradient(x, gradient), *_skipped(calls, forward[3], gradient), *_extras()],
+        left_out=list(dict.fromkeys([*_gradient(x, gradient), *_skipped(calls, forward[3], gradient), *_extras()])),
         tape_bytes=forward[2] + total(calls, "bytes"), seconds=seconds,
         recomputation=1.0 + totals["steps recomputed"] / steps if steps else 1.0,
     )  # fmt: skip
@@ -174,13 +174,13 @@ def _rows(calls):
 
 def _how(calls, name):
     """Form or method, and why."""
-    words = list(calls.notes.get((name, "method"), ()))
+    words = dict(calls.notes.get((name, "method"), ()))
     for actor in calls.actors.get(name, {}).values():
         if hasattr(actor, "engine"):
-            words.append(f"{actor.engine.method}: {actor.reason}")
+            words[f"{actor.engine.method}: {actor.reason}"] = 1
         elif _applied(actor):
-            words.append(actor.form)
-    return "; ".join(dict.fromkeys(words)) or "rule"
+            words[actor.form] = 1
+    return "; ".join(words) or "rule"
 
 
 def _applied(actor):
@@ -213,32 +213,30 @@ def _skipped(calls, forward, gradient):
     if gradient and not total(calls, "jvp"):
         yield "JVPs: forward mode was not asked"
     for name, actors in calls.actors.items():
-        yield from _matrices(calls, name, list(filter(_applied, actors.values())))
-    yield from _solves(calls)
+        for actor in actors.values():
+            yield from (_solver(calls, name, actor) if hasattr(actor, "engine") else _operator(calls, name, actor))
+    if not solvers_of(calls):
+        yield "solves: none, so no hierarchy, no factors, no set-up"
     for (name, kind), many in calls.items():
         if kind == "skipped":
             yield f"{many} solves of {name}: the right-hand side is 0, so is the solution"
 
 
-def _matrices(calls, name, operators):
-    if not calls[name, "assembled"] and any(op.form == "matrix-free" for op in operators):
+def _operator(calls, name, actor):
+    if _applied(actor) and actor.form == "matrix-free" and not calls[name, "assembled"]:
         yield f"matrix of {name}: not assembled, applied without one"
-    if any(op.structure.is_identity for op in operators):
+    if _applied(actor) and actor.structure.is_identity:
         yield f"arithmetic of {name}: an identity, {calls[name, 'forward']} copies"
 
 
-def _solves(calls):
-    """What the solvers did not build or solve."""
-    solvers = solvers_of(calls)
-    if not solvers:
-        yield "solves: none, so no hierarchy, no factors, no set-up"
-    for name, engine in {(name, one.engine.method): (name, one.engine) for name, one in solvers}.values():
-        if not engine.hierarchical:
-            yield f"multigrid hierarchy for {name}: not built, {engine.method} needs none"
-        if not calls[name, "setup"]:
-            yield f"set-up of {name}: made before, {calls[name, 'reused']} solves reuse it"
-        if calls[name, "solve"] > 0 == calls[name, "adjoint"]:
-            yield f"adjoint solve of {name}: nothing asks for it"
+def _solver(calls, name, actor):
+    """What it did not build or solve."""
+    if not actor.engine.hierarchical:
+        yield f"multigrid hierarchy for {name}: not built, {actor.engine.method} needs none"
+    if not calls[name, "setup"]:
+        yield f"set-up of {name}: made before, {calls[name, 'reused']} solves reuse it"
+    if calls[name, "solve"] > 0 == calls[name, "adjoint"]:
+        yield f"adjoint solve of {name}: nothing asks for it"
 
 
 def _extras():

@@ -12,7 +12,6 @@ from math import inf, isfinite, nan
 from pathlib import Path
 from time import perf_counter
 from timeit import repeat, timeit
-from typing import Any
 
 import numpy as np
 
@@ -259,7 +258,7 @@ class Reference:
     """The exact answers in any form that `workprec` takes; one for the settings that all methods share."""
 
     def __init__(self, problem, given, compare):
-        self.problem, self.given, self.compare, self.results = problem, given, compare, {}  # type: Any, Any, Any, dict
+        self.problem, self.given, self.compare, self.results = problem, given, compare, {}  # type: Any, Any, Any, dict[str, tuple]
 
     def errors(self, shared, figures):
         """The columns of errors of a run."""

@@ -71,9 +71,9 @@ def prepare(terrain, grids):
 
 
 def recover(study, grid):
-    """Study and grid -> (log-conductivity, row of the table, pairs of seconds and error); prints a line for each iteration.
+    """Study and grid -> (log-conductivity, row of the table, pairs of seconds and error).
 
-    The gradient is checked, then the ground is found by L-BFGS.
+    A line for each iteration is printed. The gradient is checked, then the ground is found by L-BFGS.
     Misfit: root mean square of (computed - read) / noise, 1 is a fit within the noise. Error: distance from the truth,
     relative, 1 for the flat start.
     """
