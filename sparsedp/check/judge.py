@@ -63,7 +63,6 @@ GOAL = 1e-5  # error bar, relative, above which a sweep is extended
 COARSER = tuple(2.0**k for k in range(1, 38, 3))
 BETWEEN = 2.0 ** np.arange(-9, 7)  # around the step of the plateau
 FINER = tuple(2.0**-k for k in range(33, 46, 3))
-HALVES = 2.0 ** np.arange(-1, -21, -1)  # for a third order that the sweep leaves open
 
 # Ripples: a small part of the loss with a derivative that is not small.
 RIPPLED = 2.0 ** -np.arange(27, 46)  # steps that may see one
@@ -495,7 +494,7 @@ def orders_of_hessians(e):
 
 
 @np.errstate(all="ignore")
-def curvature(result, bend, extend=True):
+def curvature(result, bend):
     """Judgement of a gradient and a Hessian product d . H d -> word and reason, by the third Taylor remainder.
 
     The order is read on the finest usable levels, those that stand out of noise, gap and the rounding of x.
@@ -504,9 +503,6 @@ def curvature(result, bend, extend=True):
     rests = e.rests - e.t**2 / 2 * bend
     usable = both(rests) >= CLEAR * (e.noise + e.t * (result.size + e.floor))
     used, rates = orders(e.t, both(rests), usable, FEWEST)  # coarse ones are no limit t -> 0
-    if extend and result.line.trials.extend and 0 < used < FEWEST:
-        result.line.sweep(HALVES)
-        return curvature(result, bend, False)
     finest = np.max(np.flatnonzero(usable), initial=0)
     ahead, behind = rests[:, finest]
     result.learn(

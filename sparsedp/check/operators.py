@@ -66,7 +66,7 @@ class Probe:
     def __init__(self, op, seeds=1, rng=None):
         self.op, self.rng, self.seeds = op.tangent, generator(rng), max(seeds, 1)
         self.real = op.dtype.kind != "c"
-        structure = self.op.structure
+        structure, self.tolerance = self.op.structure, tolerance_of(self.op.structure)
         self.listed = max(op.shape) <= (LARGEST if structure.has_entries else MOST_COLUMNS)
         entries = self.listed and structure.has_entries
         self.bounds: tuple = (structure.magnitude(), structure.transpose().magnitude()) if entries else ()
@@ -110,8 +110,7 @@ class Probe:
 
     def gap(self, name, dtype):
         """Distance of the two sides of an identity in units of rounding, at worst over entries and seeds."""
-        worst, tolerance = 0.0, 0.0 if name in EXACT else tolerance_of(self.op.structure)
-        rounding = max(tolerance, float(np.finfo(dtype).eps))
+        worst, rounding = 0.0, max(0.0 if name in EXACT else self.tolerance, float(np.finfo(dtype).eps))
         for _ in range(self.seeds):
             left, right, bound = IDENTITIES[name](self, self.domain(dtype), self.domain(dtype), self.codomain(dtype))
             gaps = np.abs(left - right).reshape(-1, max(np.size(bound), 1))
@@ -312,14 +311,11 @@ def fault_of(op, rng):
     """Operator -> what is wrong with its linearity or its transpose, in words; "" if nothing."""
     probe = Probe(op, 1, rng)
     kinds = DTYPES[:1] if probe.real else DTYPES[1:2]
-    rows = probe.rows("linearity", kinds) + probe.rows("transpose", kinds)
-    failed = [one for one in rows if one.ok is False]
+    failed = [one for name in ("linearity", "transpose") for one in probe.rows(name, kinds) if one.ok is False]
     if not failed:
         return ""
     worst = max(failed, key=lambda one: one.figure)
-    how = (
-        worst.note or f"is off by about {worst.figure * max(tolerance_of(probe.op.structure), np.finfo(float).eps):.0e}"
-    )
+    how = worst.note or f"is off by about {worst.figure * max(probe.tolerance, np.finfo(float).eps):.0e}"
     return f"its {worst.name.split(',')[0]} {how}"
 
 

@@ -1,6 +1,7 @@
 """Order of accuracy: how the error falls when the grid is refined."""
 
 from math import inf, isnan, nan
+from statistics import linear_regression
 
 import numpy as np
 
@@ -52,14 +53,17 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
     errors = tuple(float(error_at(n)) for n in sizes)
     rise = np.log([error if 0 < error < inf else nan for error in errors])
     run = -np.log(sizes)
-    slopes, away = np.diff(rise) / np.diff(run), run[-3:] - np.mean(run[-3:])
-    slope, verdict, reason = float(away @ rise[-3:] / (away @ away)), "inconclusive", "no order was expected"
+    slope, verdict, reason = (
+        float(linear_regression(run[-3:], rise[-3:]).slope),
+        "inconclusive",
+        "no order was expected",
+    )
     if isnan(slope):
         reason = "an error is 0 or not finite: no slope"
     elif expected is not None:
         verdict = "agrees" if expected[0] <= slope <= expected[1] else "disagrees"
         reason = f"expected {expected[0]:g} to {expected[1]:g}"
-    orders = tuple(slopes.tolist())
+    orders = tuple((np.diff(rise) / np.diff(run)).tolist())
     return Refinement(
         sizes=sizes, errors=errors, orders=orders, order=slope, expected=expected, verdict=verdict, reason=reason
     )

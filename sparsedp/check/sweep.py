@@ -90,7 +90,11 @@ class Point(Packing):
 
     def sizes(self, vector):
         """Root mean square of each leaf, 1 of zeros, for each of its entries."""
-        return np.concatenate([np.full(part.size, rms(part) or 1.0) for part in self.split(vector)])
+        return self._each([rms(part) or 1.0 for part in self.split(vector)])
+
+    def _each(self, values):
+        """A value for each leaf -> one for each entry."""
+        return np.repeat(values, [part.size for part in self.split(self.vector)])
 
     def directions(self, gradient, count, rng, wanted=None):
         """Names and displacements: random ones, and structured ones that see what random ones average away.
@@ -98,7 +102,7 @@ class Point(Packing):
         Each leaf alone, all by the same, along the gradient, its largest entry; ``wanted(name)``: whether it is.
         """
         displacements = {f"random {number + 1}": self._random(rng) for number in range(count)}
-        leaf = np.concatenate([np.full(part.size, place) for place, part in enumerate(self.split(self.vector))])
+        leaf = self._each(range(len(self.values)))
         for place, name in enumerate(self.names if 1 < len(self.names) <= MOST_LEAVES else ()):
             displacements[f"random in {name}"] = self._random(rng) * (leaf == place)
         slopes = self.units * np.where(np.isfinite(gradient), gradient, 0.0)

@@ -258,7 +258,7 @@ class Reference:
     """The exact answers in any form that `workprec` takes; one for the settings that all methods share."""
 
     def __init__(self, problem, given, compare):
-        self.problem, self.given, self.compare, self.results = problem, given, compare, {}  # type: Any, Any, Any, dict[str, tuple]
+        self.problem, self.given, self.compare, self.results = problem, given, compare, {}
 
     def errors(self, shared, figures):
         """The columns of errors of a run."""
