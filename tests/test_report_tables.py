@@ -32,9 +32,10 @@ def test_text_has_columns():
 
 def test_markdown_keeps_its_columns_whatever_the_cells_hold():
     lines = table_of(ROWS, NAMES).markdown().splitlines()
-    assert lines[1] == "|---|---|---|---|---|"
-    assert lines[2] == "| a\\|b | 1.2e-05 | 12 | two lines |  |"
-    assert {line.replace("\\|", "").count("|") for line in lines} == {6}
+    assert lines[0] == "| name | error | count | note |" and lines[1] == "|---|---|---|---|"  # an empty one is left out
+    assert lines[2] == "| a\\|b | 1.2e-05 | 12 | two lines |"
+    assert {line.replace("\\|", "").count("|") for line in lines} == {5}
+    assert table_of([], NAMES).markdown().splitlines()[0] == "| name | error | count | note | absent |"
 
 
 def test_csv_reads_back_whole():

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-__all__ = ["Table", "table_of", "text_of"]
+__all__ = ["Table", "table_of"]
 
 NUMBER = re.compile(r"[-+]?(\d[\d.]*(e[-+]\d+)?|nan|inf|exact)?").fullmatch  # what is set to the right of a column
 
@@ -19,8 +19,9 @@ class Table(NamedTuple):
     rows: Sequence[Sequence[Any]]
 
     def texts(self):
-        """The cells in words, below the names."""
-        return [list(map(text_of, row)) for row in (self.names, *self.rows)]
+        """The cells in words, below the names; without the columns that are empty."""
+        columns = zip(*([text_of(cell) for cell in row] for row in (self.names, *self.rows)), strict=True)
+        return list(zip(*(column for column in columns if any(column[1:]) or not self.rows)))
 
     def __str__(self):
         columns = []
@@ -33,7 +34,7 @@ class Table(NamedTuple):
         """The table in Markdown."""
         cells = [[" ".join(text.split()).replace("|", "\\|") for text in row] for row in self.texts()]
         head, *body = [f"| {' | '.join(row)} |" for row in cells]
-        return "\n".join([head, f"|{'---|' * len(self.names)}", *body])
+        return "\n".join([head, f"|{'---|' * len(cells[0])}", *body])
 
     def csv(self):
         """The table as CSV: every digit of a number, a line of names."""

@@ -145,12 +145,11 @@ class Plan(Result):
     def parts(self):
         """The sums, a row for each name, and what was left out."""
         forward, backward = self.seconds
-        used = [kind for kind in COLUMNS if any(row[kind] for row in self.rows)]
         rows = [{name: value or None for name, value in row.items()} for row in self.rows]
         return [
             f"value {self.value:.6g}: {forward:.2g} s forward, {backward:.2g} s backward; tape: {self.tape_nodes} "
             f"calls that keep {self.tape_bytes} bytes, recomputation factor {self.recomputation:.2f}",
-            table_of(rows, ("name", *used, "seconds", "how")),
+            table_of(rows, ("name", *COLUMNS, "seconds", "how")),
             *self.omissions(),
             f"totals: {self.sums}",
         ]

@@ -16,8 +16,7 @@ from sparsedp.check.table import Table
 from sparsedp.derivative import jvp
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
-from sparsedp.packing import joined
-from sparsedp.tree import leaves, mapped, norm
+from sparsedp.tree import mapped, norm
 
 __all__ = ["SEED", "STEADY", "Growth", "StabilityMap", "growth_of", "stability_map"]
 
@@ -71,9 +70,9 @@ def _first_rollout(loss, x):
 def _measured(advance, state):
     change, steps = np.random.default_rng(SEED).standard_normal(Point(state).size), []
     for _ in range(STEPS):
-        before = change / norm(change)
-        state, moved = jvp(advance, state, Point(state).unpack(before))
-        change = joined([np.asarray(leaf) for leaf in leaves(moved) if leaf is not None])
+        point, before = Point(state), change / norm(change)
+        state, moved = jvp(advance, state, point.unpack(before))
+        change = point.pack(moved)
         size = norm(change)
         if size == 0 or not np.isfinite(size):
             return Growth(float(size), flips=size > 0)

@@ -17,7 +17,6 @@ from sparsedp.check.sweep import Line, Point, Trials, generator, rms
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
-from sparsedp.packing import joined
 from sparsedp.report.certificate import distance
 from sparsedp.report.stability import SEED, STEADY, growth_of
 from sparsedp.tree import copied, leaves, norm
@@ -27,6 +26,7 @@ __all__ = ["FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 WORDS = PASSED, REFUSED, DEGRADED, FAILED = "passed", "refused correctly", "degraded", "FAILED"
 TIME_STEPS, VISCOSITIES = ("dt", "time_step", "tau"), ("nu", "viscosity", "diffusivity", "kappa", "mu")
 EPS = np.finfo(float).eps
+DIRECTIONS = "random 1", "gradient"  # along which a gradient is compared, the last one that there is
 DIFFERENCES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-2, 1e-7)  # their steps, in units of x; the one that mostly serves comes first
 GOOD, BAD = 1e-5, 1e-2  # gaps between gradient and differences
 UNSEEN = 100 * EPS  # changes of the value, relative, that no difference sees
@@ -60,9 +60,8 @@ class Scene:
         names = [re.sub(r"^x\['?([^\[\]']*)'?\]$", r"\1", name) for name in self.point.names]  # x['dt'] is called dt
         self.leaves = dict(zip(names, self.point.values))
         self.ranges = ranges if isinstance(ranges, dict) else {"x": ranges} if ranges else {}
-        for name in (*self.ranges, time_step, viscosity):
-            if name is not None and name not in names:
-                raise ValueError(f"stress knows the parameters {', '.join(names)}, got {name!r}; write one of them")
+        for name in {*self.ranges, time_step, viscosity} - {None, *names}:
+            raise ValueError(f"stress knows the parameters {', '.join(names)}, got {name!r}; write one of them")
         for name, limits in self.ranges.items():
             if np.size(limits) != 2 or not -inf < limits[0] < limits[1] < inf:
                 raise ValueError(f"stress needs ranges of two finite numbers, low < high, got {limits!r} for {name}")
@@ -103,10 +102,10 @@ class Scene:
 
 
 class Outcome(NamedTuple):
-    """What one run gave: value and gradient leaves; and what a judge says of the error, if there was one."""
+    """What one run gave: value and gradient; and what a judge says of the error, if there was one."""
 
     value: float
-    gradient: list
+    gradient: Any
     refusal: tuple = ()  # the word is right for an error that the library raises on purpose
     flagged: bool = False  # the gradient grew without bound on its way back
 
@@ -119,8 +118,8 @@ def run(loss, x):
     except Exception as error:  # a scene may raise anything: its row shows it
         chance = isinstance(error, (np.linalg.LinAlgError, UnicodeError))
         typed = isinstance(error, (SparsedpError, ValueError, TypeError)) and not chance
-        return Outcome(nan, [], (REFUSED if typed else DEGRADED, nan, error_text(error)))
-    return Outcome(float(value), [np.asarray(g) for g in leaves(gradient) if g is not None], (), thread.grown > grown)
+        return Outcome(nan, None, (REFUSED if typed else DEGRADED, nan, error_text(error)))
+    return Outcome(float(value), gradient, (), thread.grown > grown)
 
 
 # ---------------------------------------------------------------- judges: (scene, other values) -> (word, figure, note)
@@ -220,11 +219,10 @@ def _against_differences(scene, other, out):
 
     One difference that meets it is enough, else all are judged.
     """
-    point, gradient = Point(scene.at(other)), joined([np.conj(g) for g in out.gradient])
-    name, direction = point.directions(gradient, 1, generator(SEED), ("random 1", "gradient").__contains__)[-1]
+    point = Point(scene.at(other))
     trials = Trials(scene.sheltered, point, out.gradient)
-    trials.base, trials.gradient = out.value, gradient
-    line = Line(name, direction, trials)
+    trials.base, trials.gradient = out.value, point.gradient(out.gradient)
+    line = Line(*point.directions(trials.gradient, 1, generator(SEED), DIRECTIONS.__contains__)[-1], trials)
     unseen, gap = abs(line.slope) <= UNSEEN * abs(out.value), inf
     for step in DIFFERENCES:
         line.sweep([step])
@@ -282,8 +280,7 @@ def legal_range(scene, name, x):
         values = {f"all {value:.3g}": value for value in spread(low, high, 5)}
         values |= {"below its range": 2 * low - high, "above its range": 2 * high - low}
         for case, value in values.items():
-            if isfinite(value):
-                yield case, np.full_like(x, value), sound
+            yield case, np.full_like(x, value), sound
 
 
 def zeros_and_signs(scene, name, x):
@@ -319,7 +316,8 @@ def constants_added(scene, name, x):
 
 def not_finite(scene, name, x):
     """One entry, that with the largest derivative, where the loss depends on it."""
-    slope = np.abs(dict(zip(scene.leaves, scene.base.gradient)).get(name, 0.0))  # no gradient where it is refused
+    slopes = [] if scene.base.refusal else scene.point.slopes(scene.base.gradient)
+    slope = np.abs(dict(zip(scene.leaves, slopes)).get(name, 0.0))
     for bad in (nan, inf) if np.max(slope, initial=0.0) > 0 else ():
         spoilt = np.array(x)
         spoilt.flat[np.argmax(slope)] = bad

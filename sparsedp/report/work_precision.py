@@ -16,7 +16,7 @@ from timeit import repeat, timeit
 import numpy as np
 
 from sparsedp.check.summary import Result
-from sparsedp.check.table import table_of, text_of
+from sparsedp.check.table import table_of
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.fields import check_function, is_whole
@@ -38,7 +38,7 @@ COLUMNS = (
 )  # fmt: skip
 TEXTS = ("scene", "method", "status", "seed", "versions", "settings")
 KEY = ("scene", "method", "settings", "seed", "versions")  # what a row of an earlier run is found by
-SHOWN = COLUMNS[1:15]
+SHOWN = COLUMNS[2:15]
 COUNTS = {"solves_forward": "solve", "solves_adjoint": "adjoint", "iterations": "iterations"}  # in the ledger
 SETTLED = 2.0  # a run that is not faster than the last one by more is warm
 MOST_WARM_UPS = 7
@@ -117,10 +117,15 @@ def workprec(
     if not methods or not isinstance(methods, dict):
         raise ValueError("workprec needs at least one method; write {'name': {settings}}")
     scene, over, now, rows = scene or getattr(problem, "__name__", "scene"), over or {}, _versions(), []
-    exact, finished = (
-        Reference(problem, reference, compare or distance),
-        {tuple(map(row.get, KEY)): row for row in _stored(file)},
-    )
+    finished = {tuple(map(row.get, KEY)): row for row in _stored(file)}
+    compare, known = compare or distance, {}
+
+    def exact(shared):  # one for all methods
+        words = _text_of(shared)
+        if words not in known:
+            known[words] = _exact(problem, reference, compare, shared)
+        return known[words]
+
     other = sum(row["versions"] != now for row in finished.values())
     skipped = [f"{other} rows of {Path(file).name} from other versions: run again"] if other else []
     for (method, choice), *values in itertools.product(methods.items(), *over.values()):
@@ -133,7 +138,7 @@ def workprec(
         if key not in finished:
             figures = _measured(problem, settings, repeats)
             if "answer" in figures:
-                figures |= exact.errors({name: settings[name] for name in over}, figures)
+                figures |= _errors(figures, partial(exact, {name: settings[name] for name in over}), compare)
             finished[key] = {name: figures.get(name, nan) for name in COLUMNS} | dict(zip(KEY, key))
             if file:
                 write_file(file, table_of([*_stored(file), finished[key]], COLUMNS).csv())
@@ -254,36 +259,27 @@ def _failure(error):
 # ---------------------------------------------------------------- exact answers
 
 
-class Reference:
-    """The exact answers in any form that `workprec` takes; one for the settings that all methods share."""
+def _errors(figures, exact, compare):
+    """The columns of errors of one run, beside the exact answer."""
+    try:
+        value, slope, error = exact()
+        pairs = {"forward_error": (figures["answer"], value), "gradient_error": (figures["gradient"], slope)}
+        gaps = {name: compare(a, b) for name, (a, b) in pairs.items() if a is not None and b is not None}
+        return gaps | {"reference_error": error}
+    except FAILURES as trouble:
+        return {"status": f"reference: {_failure(trouble)}"}
 
-    def __init__(self, problem, given, compare):
-        self.problem, self.given, self.compare, self.results = problem, given, compare, {}
 
-    def errors(self, shared, figures):
-        """The columns of errors of a run."""
-        words = _text_of(shared)
-        try:
-            if words not in self.results:
-                self.results[words] = self._result(shared)
-            value, slope, error = self.results[words]
-            pairs = {"forward_error": (figures["answer"], value), "gradient_error": (figures["gradient"], slope)}
-            gaps = {name: self.compare(a, b) for name, (a, b) in pairs.items() if a is not None and b is not None}
-            return gaps | {"reference_error": error}
-        except FAILURES as trouble:
-            return {"status": f"reference: {_failure(trouble)}"}
-
-    def _result(self, shared):
-        """(Answer, gradient, error of both)."""
-        given = self.given(**shared) if callable(self.given) else self.given
-        if given is None:
-            return None, None, nan
-        if callable(self.given) or isinstance(given, tuple):
-            return *given, 0.0
-        tasks = [_prepared(self.problem, shared | finer) for finer in ([given] if isinstance(given, dict) else given)]
-        *coarser, finest = [answers(runs[-1]()) for runs, _, answers in tasks]
-        gaps = [self.compare(a, b) for rough in coarser for a, b in zip(rough, finest) if a is not None]
-        return *finest, max(gaps, default=nan)
+def _exact(problem, given, compare, shared):
+    """The reference in any of its forms, at the settings that the methods share -> (answer, gradient, error of both)."""
+    if given is None:
+        return None, None, nan
+    if callable(given) or isinstance(given, tuple):
+        return *(given(**shared) if callable(given) else given), 0.0
+    tasks = [_prepared(problem, shared | finer) for finer in ([given] if isinstance(given, dict) else given)]
+    *coarser, finest = [answers(runs[-1]()) for runs, _, answers in tasks]
+    gaps = [compare(a, b) for rough in coarser for a, b in zip(rough, finest) if a is not None]
+    return *finest, max(gaps, default=nan)
 
 
 # ---------------------------------------------------------------- the table
@@ -336,12 +332,11 @@ class Rows(Result):
         """The figures, and the settings that tell those of a method apart; what was left out."""
         best = [*self.pareto(), *self.pareto("forward_error")]
         rows = [json.loads(row["settings"]) | row | {"best": "*" * (row in best)} for row in self.rows]
-        first, *used = [name for name in SHOWN if any(text_of(row[name]) for row in rows)]
         apart = [name for name in self.over if name not in COLUMNS]
-        errors = [row["reference_error"] for row in rows if text_of(row["reference_error"])]
+        errors = [row["reference_error"] for row in rows if row["reference_error"] >= 0]
         return [
             f"{self.scene}: error against run time",
-            table_of(rows, [first, *apart, *used, "best"]),
+            table_of(rows, ["method", *apart, *SHOWN, "best"]),
             *self.omissions(),
             *self._recommended(),
             "A star: no other row is both faster and more exact (the Pareto set, in gradient or value).",
