@@ -211,7 +211,7 @@ def certify(loss, x, target=TARGET):
     best = RecordedSolves(left).run(loss, x)  # once more: a value tells its own error, and that of the correction
     return Certificate(
         value=value, gradient=gradient, corrected_value=best, corrected_gradient=slope, gradient_error=error,
-        causes=causes, solves=rows, rows=rows, advice=_advice(error, causes, rows, target),
+        value_error=best - value, causes=causes, solves=rows, rows=rows, advice=_advice(error, causes, rows, target),
     )  # fmt: skip
 
 
@@ -263,11 +263,6 @@ class Certificate(Result):
     """
 
     _plain = ("value", "corrected_value", "value_error", "gradient_error", "causes", "solves", "advice")
-
-    @property
-    def value_error(self):
-        """Estimated error of the value, with its sign."""
-        return self.corrected_value - self.value
 
     def parts(self):
         """Errors of value and gradient, a row for each solver, the advice."""

@@ -90,7 +90,12 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     ]
     if scene.growth is None:
         skipped.append("growth in one step: no rollout in the loss; give step=lambda x: (advance, state)")
-    return Stress(rows=rows, left_out=[*skipped, *ELSEWHERE], map=growth)
+    counts = {word: sum(row["outcome"] == word for row in rows) for word in WORDS}
+    return Stress(
+        rows=rows, counts=counts, failures=[row for row in rows if row["outcome"] == FAILED], map=growth,
+        verdict="disagrees" if counts[FAILED] else "agrees", left_out=[*skipped, *ELSEWHERE],
+        summary=f"stress: {', '.join(f'{many} {word}' for word, many in counts.items())}",
+    )  # fmt: skip
 
 
 class Stress(Result):
@@ -100,6 +105,13 @@ class Stress(Result):
     ----------
     rows : list of dict
         group, parameter, case, outcome, figure (a gap, relative, or a growth factor), note.
+    counts : dict
+        Number of rows by outcome.
+    failures : list of dict
+        The rows that FAILED.
+    verdict : "disagrees" when something FAILED, else "agrees"
+    summary : str
+        One line.
     left_out : list of str
         Cases that do not apply, with the reason.
     map : StabilityMap or None
@@ -107,21 +119,6 @@ class Stress(Result):
 
     _plain = ("counts", "rows", "left_out", "map")
     _columns = COLUMNS
-
-    @property
-    def counts(self):
-        """Number of rows by outcome."""
-        return {word: sum(row["outcome"] == word for row in self.rows) for word in WORDS}
-
-    @property
-    def failures(self):
-        """The rows that FAILED."""
-        return [row for row in self.rows if row["outcome"] == FAILED]
-
-    @property
-    def verdict(self):
-        """ "disagrees" when something FAILED, else "agrees"."""
-        return "disagrees" if self.failures else "agrees"
 
     def parts(self):
         """All cases, what was left out, the map, the failures, and the counts."""
@@ -149,8 +146,3 @@ class Stress(Result):
         if self.map is None:
             raise ValueError("this scene has no stability map; it needs a rollout, a time step and a viscosity by name")
         return plots.stability_chart(self.map, plots.current(ax))
-
-    @property
-    def summary(self):
-        """One line."""
-        return "stress: " + ", ".join(f"{many} {word}" for word, many in self.counts.items())

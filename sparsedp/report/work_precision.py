@@ -271,7 +271,7 @@ def _errors(figures, exact, compare):
 
 
 def _exact(problem, given, compare, shared):
-    """The reference in any of its forms, at the settings that the methods share -> (answer, gradient, error of both)."""
+    """The reference in any of its forms, at the settings that methods share -> (answer, gradient, error of both)."""
     if given is None:
         return None, None, nan
     if callable(given) or isinstance(given, tuple):
