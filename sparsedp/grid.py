@@ -16,6 +16,7 @@ from itertools import compress
 import numpy as np
 
 from sparsedp.errors import ShapeError
+from sparsedp.markup import facts
 from sparsedp.recipe import Uncached, Value
 from sparsedp.space import Space, whole_lengths
 
@@ -286,6 +287,20 @@ class Grid(Value, Uncached):
         if self.layout is not None:
             words.append(str(self.layout))
         return f"Grid({', '.join(words)})"
+
+    def _repr_html_(self):
+        """For a notebook: a line for each axis and for each space."""
+        entries = {}
+        for name, n, size, start, widths, around in zip(
+            self.axes, self.shape, self.size, self.origin, self.widths, self.periodic, strict=True
+        ):
+            narrow, wide = np.min(widths, initial=np.inf), np.max(widths, initial=0.0)
+            width = f"width {wide:.4g}" if wide <= narrow else f"widths {narrow:.4g} to {wide:.4g}"
+            ends = f"from {start:.6g} to {start + size:.6g}{', periodic' if around else ''}"
+            entries[name] = f"{n} cells {ends}, {width}"
+        for space in (self.cells, self.faces, self.nodes, self.edges):
+            entries[space.kind] = f"{space.size} values, shape {space.shape}"
+        return facts(repr(self), entries)
 
 
 def check_grid(name, grid):

@@ -12,6 +12,7 @@ from sparsedp import kernels, results
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_native, check_out, field_array
 from sparsedp.ledger import active
+from sparsedp.markup import facts, spy
 from sparsedp.recipe import Frozen, Remade
 from sparsedp.space import Space, fits
 from sparsedp.structure.base import Matrix, Structure, assembled, result_dtype
@@ -23,6 +24,7 @@ __all__ = ["Operator"]
 # Most unknowns for which one sparse product costs less than stencil passes, for each pass: see benchmarks/apply.py.
 EXPLICIT_BELOW_COMPILED = 4608
 EXPLICIT_BELOW_PLAIN = 262144
+SPY_BELOW = 20_000  # rows and columns of a matrix that a notebook draws: that takes 0.1 s
 
 
 class Operator(Frozen, Remade):
@@ -303,6 +305,20 @@ class Operator(Frozen, Remade):
 
     def __repr__(self):
         return f"<{self.name}: {self.domain} -> {self.codomain}, {self.form}>"
+
+    def _repr_html_(self):
+        """For a notebook: what it is, and where the entries of a small one are."""
+        small = self.layout is None and self.structure.has_entries and max(self.shape) <= SPY_BELOW
+        matrix = self._acting.explicit() if small else None
+        entries = {
+            "from": self.domain,
+            "to": self.codomain,
+            "acts": self.form,
+            "dtype": self.dtype,
+            "entries": None if matrix is None else f"{matrix.nnz} of {self.shape[0]} x {self.shape[1]}",
+            "where": matrix if matrix is None or not matrix.nnz else spy(matrix),
+        }
+        return facts(self.name, entries)
 
 
 def _with_matrix(matrix, *given):

@@ -12,7 +12,7 @@ def bar(steps=None, needed=True, **options):
         If a bar is needed and tqdm is not installed.
     """
     try:
-        from tqdm import tqdm
+        from tqdm.auto import tqdm  # a widget in a notebook
     except ImportError as error:
         if needed:
             raise ImportError("a progress bar needs tqdm; install sparsedp[plot], or leave progress out") from error

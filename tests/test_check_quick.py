@@ -72,7 +72,7 @@ def test_a_terminal_is_told_how_many_evaluations_come(quick, monkeypatch):
 def test_a_terminal_without_tqdm_gets_the_first_line_only(monkeypatch):
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
-    monkeypatch.setitem(sys.modules, "tqdm", None)
+    monkeypatch.setitem(sys.modules, "tqdm.auto", None)
     dp.check.gradient(lambda x: np.sum(np.sin(x)), np.linspace(1.0, 2.0, 5))
     assert len(screen.getvalue().splitlines()) == 1
 

@@ -136,7 +136,7 @@ def audit(verdict):
 def test_without_matplotlib_and_tqdm(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(dp.check, "gradient", audit("agrees"))
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    monkeypatch.setitem(sys.modules, "tqdm", None)
+    monkeypatch.setitem(sys.modules, "tqdm.auto", None)
     monkeypatch.setattr(story, "ITERATIONS", 1)
     assert main(["demo", "--size", "12", "--out", str(tmp_path)]) == 0
     assert sorted(os.listdir(tmp_path)) == sorted(story.ARRAYS)

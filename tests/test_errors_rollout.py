@@ -332,7 +332,7 @@ def test_message(call, kind, message):
 
 
 def test_progress_without_tqdm(monkeypatch):
-    monkeypatch.setitem(sys.modules, "tqdm", None)
+    monkeypatch.setitem(sys.modules, "tqdm.auto", None)
     message = r"a progress bar needs tqdm; install sparsedp\[plot\], or leave progress out"
     with pytest.raises(ImportError, match=message):
         dp.rollout(same, U, None, 2, progress=True)

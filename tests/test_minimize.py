@@ -221,7 +221,7 @@ def test_progress_bar(capsys, monkeypatch):
     dp.minimize(walled(valley, 1.3), np.array([-1.2, 1.0]), maxiter=3, progress="fit")
     shown = capsys.readouterr()
     assert "fit" in shown.err and "loss" in shown.err and shown.out == ""
-    monkeypatch.setitem(sys.modules, "tqdm", None)
+    monkeypatch.setitem(sys.modules, "tqdm.auto", None)
     with pytest.raises(
         ImportError, match=r"a progress bar needs tqdm; install sparsedp\[plot\], or leave progress out"
     ):

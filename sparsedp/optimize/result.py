@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp.markup import curves, facts
 from sparsedp.recipe import Frozen
 
 __all__ = ["Failure", "Minimum", "Record", "Stuck", "Trial"]
@@ -106,6 +107,20 @@ class Minimum(Frozen):
         return "\n".join(filter(None, [head, *lines, self.message, self.resumed]))
 
     __repr__ = __str__
+
+    def _repr_html_(self):
+        """For a notebook: how it ended, and how the loss fell."""
+        path = [(one.iteration, one.value) for one in self.history]
+        entries = {
+            "loss": f"{self.value:.6g}",
+            "converged": "yes" if self.converged else "no",
+            "why it stopped": self.message,
+            "iterations": self.history[-1].iteration,
+            "evaluations": self.evaluations,
+            "resumed": self.resumed or None,
+            "convergence": curves({"loss": tuple(zip(*path))}, "iteration", "loss") or None,
+        }
+        return facts(self.method, entries)
 
 
 def _line(record):

@@ -34,7 +34,7 @@ need not be exact: the contract refines with further calls on the residual. Attr
 Its builder is a function (system, **options) -> engine; `system` is a System (system.py).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from time import perf_counter
 from typing import Any
 
@@ -43,6 +43,7 @@ import numpy as np
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
 from sparsedp.fields import check_finite, place
 from sparsedp.ledger import count, thread, timed
+from sparsedp.markup import facts, table
 from sparsedp.recipe import Remade
 from sparsedp.solvers.scaling import in_range, norm, shifted
 from sparsedp.tape import plain
@@ -399,6 +400,10 @@ class SolveInfo:
     defect: float
     seconds: float
 
+    def _repr_html_(self):
+        """For a notebook."""
+        return facts("solve", asdict(self))
+
 
 @dataclass(slots=True)
 class SolveLog:
@@ -421,6 +426,13 @@ class SolveLog:
     def note(self, info, transposed):
         """Record a solve."""
         setattr(self, "adjoint" if transposed else "forward", info)
+
+    def _repr_html_(self):
+        """For a notebook: the two solves side by side."""
+        runs = {"forward": self.forward, "adjoint": self.adjoint}
+        rows = [{"": name, **asdict(info)} for name, info in runs.items() if info]
+        title = f"set-up {self.setup_seconds:.2g} s{self.hierarchy and ': '}{self.hierarchy}"
+        return table([row.values() for row in rows], rows[0] if rows else (), title)
 
 
 @dataclass(slots=True)
