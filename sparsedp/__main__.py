@@ -93,7 +93,7 @@ def run_report(options):
     from sparsedp.report.scene_report import load, write_report
 
     verdict, lines = write_report(load(options.scene), options.out, options.force)
-    print(*lines, f"{verdict}; see {options.out / 'report.md'}", sep="\n")
+    print(*lines, f"{verdict}; see {options.out / 'report.html'}", sep="\n")
     return CODES[verdict]
 
 

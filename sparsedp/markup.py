@@ -9,7 +9,7 @@ from math import isnan
 
 import numpy as np
 
-__all__ = ["Markup", "cell", "curves", "facts", "folded", "spy", "table"]
+__all__ = ["Markup", "cell", "curves", "facts", "folded", "paragraphs", "spy", "table"]
 
 # Of Okabe and Ito: safe for all eyes.
 COLOURS = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999"
@@ -49,9 +49,15 @@ def facts(title, entries):
     return table([line for line in entries.items() if line[1] is not None], title=title)
 
 
-def folded(title, *parts):
-    """Parts that are seen after a click on the title."""
-    return Markup(f"<details><summary>{cell(title)}</summary>\n{''.join(map(cell, parts))}\n</details>")
+def paragraphs(lines, tag="p"):
+    """Lines -> a paragraph of each, or another element."""
+    return Markup("\n".join(f"<{tag}>{cell(line)}</{tag}>" for line in lines))
+
+
+def folded(title, lines):
+    """Lines that are seen after a click on the title, as a list; nothing without any."""
+    body = f"<details><summary>{cell(title)}</summary><ul>\n{paragraphs(lines, 'li')}\n</ul></details>"
+    return Markup(body if lines else "")
 
 
 def spy(matrix):
@@ -73,8 +79,8 @@ def spy(matrix):
     )
 
 
-def curves(lines, across, up, log=(False, True)):
-    """Lines {name: (x, y)} -> a picture of them; empty where nothing can be drawn.
+def curves(lines, across, up, *, log=(False, True)):
+    """Lines {name: points (x, y)} -> a picture of them; empty where nothing can be drawn.
 
     across, up: names of the axes; log: whether each is logarithmic. Points that are not finite, or not positive on such
     an axis, are left out.
@@ -111,13 +117,10 @@ def curves(lines, across, up, log=(False, True)):
 
 def _points(line, log):
     """The points of a line that can be drawn, as rows."""
-    points = np.array([[*map(float, point)] for point in zip(*line)]).reshape(-1, 2)
-    seen = np.isfinite(points).all(axis=1)
-    for axis, scale in enumerate(log):
-        if scale:
-            seen &= points[:, axis] > 0
-    points = points[seen]
-    return np.stack([np.log10(points[:, k]) if scale else points[:, k] for k, scale in enumerate(log)], axis=-1)
+    points = np.array(list(line), float).reshape(-1, 2)
+    points[~((points > 0) | ~np.array(log))] = np.nan
+    points = points[np.isfinite(points).all(axis=1)]
+    return np.where(log, np.log10(np.where(log, points, 1.0)), points)
 
 
 def _text(x, y, words, anchor, colour="currentColor"):

@@ -128,6 +128,13 @@ def test_the_report(scene, tmp_path, capsys):
     for path in out.glob("*.csv"):
         with path.open(encoding="utf-8", newline="") as stream:
             assert list(csv.DictReader(stream)), path
+    whole = (out / "report.html").read_text(encoding="utf-8")
+    places = "<h1>poisson</h1>", "<strong>agrees</strong>", "Is the gradient right?", "V. Of a wrong one", "fastest at"
+    assert sorted(places, key=whole.index) == list(places)
+    assert whole.count('src="data:image/png;base64,') == len(drawn) and ("<polyline" in whole) == (not drawn)
+    assert not re.search(r"https?:|@import|url\(|<link|src=\"(?!data:)", whole)  # one file, no network
+    assert whole.count("<section>") == 5 and "<tbody>\n</tbody>" not in whole
+    assert "<li>multigrid hierarchy" in whole.partition("<summary>What was left out</summary>")[2]
     assert main(["report", str(scene), "--out", str(out)]) == 2
     assert "is there already; name another folder with --out, or write --force" in capsys.readouterr().err
     assert main(["report", f"{scene}:wrong", "--out", str(out), "--force"]) == 1
@@ -138,6 +145,8 @@ def test_the_report(scene, tmp_path, capsys):
 def test_a_report_of_a_loss_that_does_not_run(scene, tmp_path, capsys):
     assert main(["report", f"{scene}:broken", "--out", str(tmp_path / "out")]) == 3
     assert "gradient: not audited, LookupError: no such well" in capsys.readouterr().out
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "<li>gradient: not audited, LookupError: no such well</li>" in page and "Is the gradient right?" not in page
 
 
 def test_as_a_command(scene):

@@ -91,9 +91,40 @@ def test_minimum_that_starts_at_zero_has_no_picture():
     assert not list(shown(best).iter("polyline"))
 
 
+def test_audit_with_its_curves():
+    audit = dp.check.gradient(lambda u: anp.sum(anp.sin(u) ** 2), np.array([0.3, 0.7]))
+    tree = shown(audit)
+    assert "verdict: agrees" in "".join(tree.itertext())
+    assert len(list(tree.iter("polyline"))) == len(audit.lines) and len(list(tree.iter("table"))) == 2
+    assert len(list(tree.iter("tr"))) == len(audit.lines) + len({row["step"] for row in audit.rows}) + 2
+
+
+def test_plan_folds_what_was_left_out():
+    plan = dp.explain(lambda u: anp.sum(dp.laplacian(GRID)(u) ** 2), np.ones(GRID.shape))
+    tree = shown(plan)
+    [folded] = tree.iter("details")
+    assert [line.text for line in folded.iter("li")] == list(plan.left_out)
+    assert "left out" not in "".join("".join(part.itertext()) for part in tree.iter("p"))
+
+
+def test_work_precision_table():
+    box = dp.Grid((8, 8))
+    problem = lambda method: (lambda s: anp.sum(dp.inverse(dp.identity(box.cells) - dp.laplacian(box), method)(s)), S)
+    S = np.ones(box.shape)
+    table = dp.workprec(
+        problem, {"a": {"method": "direct"}, "b": {"method": "krylov"}}, reference=(64.01, np.ones((8, 8)))
+    )
+    tree = shown(table)
+    assert [row[0] for row in cells(tree) if row] == ["a", "b"] and len(list(tree.iter("polyline"))) == 2
+
+
+def test_check_of_an_operator():
+    assert "transpose" in "".join(shown(dp.check.operator(dp.gradient(GRID))).itertext())
+
+
 def test_curves():
-    lines = {"<one>": ([1e-3, 1.0, np.nan, 2.0], [1.0, 1e6, 1.0, -1.0]), "two": ([1.0], [1e3])}
-    picture = ElementTree.fromstring(markup.curves(lines, "step & co", "gap", (True, True)))
+    lines = {"<one>": [(1e-3, 1.0), (1.0, 1e6), (np.nan, 1.0), (2.0, -1.0)], "two": [(1.0, 1e3)]}
+    picture = ElementTree.fromstring(markup.curves(lines, "step & co", "gap", log=(True, True)))
     first, second = picture.iter("polyline")
     left, right = (tuple(map(float, point.split(","))) for point in first.get("points").split())
     [middle] = (tuple(map(float, point.split(","))) for point in second.get("points").split())
@@ -104,7 +135,7 @@ def test_curves():
 
 
 def test_curves_of_nothing():
-    assert markup.curves({"a": ([], []), "b": ([1.0], [0.0])}, "x", "y") == ""
+    assert markup.curves({"a": [], "b": [(1.0, 0.0)]}, "x", "y") == ""
 
 
 def test_words_of_the_user_are_no_markup():

@@ -19,6 +19,7 @@ from pages import SHELL, blocks, check_install, commands, run_blocks
 from sources import ROOT
 
 import sparsedp
+from sparsedp.__main__ import main
 
 DOCS = ROOT / "docs"
 PAGES = sorted(path.name for path in DOCS.glob("*.md"))
@@ -201,3 +202,35 @@ def test_search_from_disk(site, browser):
     titles = tab.locator("#search-results li").all_inner_texts()
     tab.close()
     assert any("ideas" in title.lower() for title in titles) and not wrong, (titles, wrong)
+
+
+SCENE = """
+import autograd.numpy as np
+import sparsedp as dp
+
+solve = dp.inverse(dp.identity(dp.Grid(12).cells) - dp.laplacian(dp.Grid(12)))
+loss, start = lambda u: np.sum(solve(u) ** 3), np.linspace(1.0, 2.0, 12)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", WIDTHS)
+def test_the_report_in_a_browser(tmp_path, browser, width):
+    """It opens from disk without network, fits the window, and its tables sort by a click on a name, or by a key."""
+    (tmp_path / "scene.py").write_text(SCENE, encoding="utf-8")
+    assert main(["report", str(tmp_path / "scene.py"), "--out", str(tmp_path)]) == 0
+    tab, wrong = opened(browser, width)
+    tab.goto((tmp_path / "report.html").as_uri())
+    seen = tab.evaluate(LOOK)
+    assert seen["over"] <= 0 and not seen["broken"] and not wrong, (seen, wrong)
+    assert tab.locator("body > *").nth(1).inner_text().startswith("agrees")
+    assert not tab.locator("details li").first.is_visible()
+    tab.locator("summary").first.click()
+    assert tab.locator("details li").first.is_visible()
+    head, column = tab.locator("th").first, tab.locator("table").first.locator("td:first-child")
+    head.click()
+    rising = list(map(float, column.all_inner_texts()))
+    head.press("Enter")
+    falling = list(map(float, column.all_inner_texts()))
+    tab.close()
+    assert rising == sorted(rising) == falling[::-1] and len(set(rising)) > 5

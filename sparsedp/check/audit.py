@@ -298,6 +298,14 @@ class Audit(Result):
             f"verdict: {self.verdict}{proved}{': ' if self.reason else ''}{self.reason}",
         ]
 
+    def picture(self):
+        """|difference - gradient| of the derivative over the step, a curve for each direction."""
+        lines: dict = {one.direction: [] for one in self.lines}
+        for row in self.rows:
+            if not row["note"]:
+                lines[row["direction"]].append((row["step"], abs(row["gap"])))
+        return lines, "step", "|difference - gradient| / |derivative|"
+
     def __repr__(self):
         """One line, which is what pytest shows of an assertion that fails."""
         words = [self.reason, *(note for note in self.notes if note.startswith("culprit"))]

@@ -1,10 +1,11 @@
-"""What checks and instruments give: frozen values that print themselves, as text and in Markdown."""
+"""What checks and instruments give: frozen values that print themselves, as text, in Markdown and as HTML."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from sparsedp.check.table import Table, table_of
+from sparsedp.markup import Markup, curves, folded, paragraphs
 from sparsedp.recipe import Frozen
 
 __all__ = ["Result", "Row", "Summary", "error_text"]
@@ -48,6 +49,23 @@ class Result(Frozen):
         title, *parts = self.parts()
         blocks = (part.markdown() if isinstance(part, Table) else f"- {part.strip()}" for part in parts)
         return "\n\n".join([f"### {title}", *blocks, ""])
+
+    def html(self):
+        """The text as HTML: a title, tables, the other lines; what was left out is folded away."""
+        title, *parts = self.parts()
+        left_out = self.omissions()
+        blocks = (
+            part.html() if isinstance(part, Table) else paragraphs([part]) for part in parts if part not in left_out
+        )
+        return Markup("\n".join([paragraphs([title], "h4"), *blocks, folded("What was left out", self.left_out)]))
+
+    def picture(self):
+        """Curves {name: points}, and what is across and up, on logarithmic axes; no curve: no picture."""
+        return {}, "", ""
+
+    def _repr_html_(self):
+        """For a notebook: with its picture, if it has one."""
+        return Markup(self.html() + curves(*self.picture(), log=(True, True)))
 
     def csv(self):
         """The rows as CSV."""

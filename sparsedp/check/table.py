@@ -1,4 +1,4 @@
-"""The one writer of tables: as text, in Markdown, as CSV."""
+"""The one writer of tables: as text, in Markdown, as HTML, as CSV."""
 
 import csv
 import io
@@ -6,6 +6,8 @@ import math
 import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
+
+from sparsedp import markup
 
 __all__ = ["Table", "table_of"]
 
@@ -35,6 +37,11 @@ class Table(NamedTuple):
         cells = [[" ".join(text.split()).replace("|", "\\|") for text in row] for row in self.texts()]
         head, *body = [f"| {' | '.join(row)} |" for row in cells]
         return "\n".join([head, f"|{'---|' * len(cells[0])}", *body])
+
+    def html(self):
+        """The table as HTML; nothing without a row."""
+        names, *rows = self.texts()
+        return markup.table(rows, names) if rows else markup.Markup("")
 
     def csv(self):
         """The table as CSV: every digit of a number, a line of names."""

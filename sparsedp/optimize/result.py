@@ -118,7 +118,7 @@ class Minimum(Frozen):
             "iterations": self.history[-1].iteration,
             "evaluations": self.evaluations,
             "resumed": self.resumed or None,
-            "convergence": curves({"loss": tuple(zip(*path))}, "iteration", "loss") or None,
+            "convergence": curves({"loss": path}, "iteration", "loss") or None,
         }
         return facts(self.method, entries)
 

@@ -284,12 +284,9 @@ def v_curve(audit, ax=None):
     >>> v_curve(result, figure().add_subplot()).get_xlabel()
     'step'
     """
-    lines: dict = {one.direction: [] for one in audit.lines}
-    for row in audit.rows:
-        if not row["note"]:
-            lines[row["direction"]].append((row["step"], abs(row["gap"])))
+    lines, across, up = audit.picture()
     title = f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}"
-    return _dressed(lines, current(ax), "step", "|difference - gradient| / |derivative|", title)
+    return _dressed(lines, current(ax), across, up, title)
 
 
 def stability_chart(growth, ax):

@@ -1,6 +1,7 @@
 """A scene in a file, named on the command line, and the report on it: all instruments in one folder.
 
-The folder gets Markdown, CSV and pictures of each instrument, and a page that says what they say.
+The folder gets Markdown, CSV and pictures of each instrument, and a page that says what they say, twice: report.md, and
+report.html, which holds all of it.
 """
 
 import contextlib
@@ -19,6 +20,7 @@ from sparsedp.check.summary import Result, error_text
 from sparsedp.files import write_file
 from sparsedp.report import plots
 from sparsedp.report.certificate import certify
+from sparsedp.report.html_page import page, section
 from sparsedp.report.plan import explain
 from sparsedp.report.stress_table import stress
 from sparsedp.report.work_precision import workprec
@@ -27,7 +29,7 @@ __all__ = ["Source", "audited", "claim", "load", "write_report"]
 
 STARTS = ("start", "x")  # names of the point, the first that is there
 OPTIONS = ("workprec_options", "stress_options")  # dicts of arguments in the file
-PAGE = "report.md"
+PAGES = "report.md", "report.html"
 NO_PROBLEM = "error against run time: not measured, the file gives no workprec_options (problem, methods, over)"
 MEANING = {  # the worst first: one that is wrong beats one that is open
     "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
@@ -162,22 +164,27 @@ def write_report(source, folder, force=False):
     OSError
         If a file cannot be written.
     """
-    claim(folder, [PAGE], force)
+    claim(folder, PAGES, force)
     with audited(source.name):
         results = [_attempt(chapter.run, source) for chapter in CHAPTERS]
     words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
     verdict = next(word for word in MEANING if word in words)
-    page, lines = [f"# {source.name}: {verdict}", "", MEANING[verdict]], []
+    text, lines, sections, missing = [f"# {source.name}: {verdict}", "", MEANING[verdict]], [], [], []
     for chapter, result in zip(CHAPTERS, results):
         sentences, files = [f"{chapter.failed}, {result}"], []
         if isinstance(result, Result):
             sentences = [part.strip() for part in result.parts() if isinstance(part, str)]
             stem, heading = getattr(result, "stem", chapter.stem), f"# {chapter.title}\n\n"
             files = plots.write_result(result, folder, stem, chapter.draw(result), heading)
-        links = (f"{'!' if path.suffix == '.png' else ''}[{path.name}]({path.name})" for path in files)
-        page += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in sentences), "", *links]
+            sections.append(section(chapter.title, result, files, chapter.caption))
+        else:
+            missing += sentences
+        links = [f"{'!' if path.suffix == '.png' else ''}[{path.name}]({path.name})" for path in files]
+        caption = ["", chapter.caption] if "!" in "".join(links) else []
+        text += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in sentences), "", *links, *caption]
         lines += sentences
-    write_file(folder / PAGE, "\n".join([*page, ""]))
+    write_file(folder / PAGES[0], "\n".join([*text, ""]))
+    write_file(folder / PAGES[1], page(source.name, verdict, MEANING[verdict], sections, missing))
     return verdict, lines
 
 
@@ -197,17 +204,24 @@ class Chapter(NamedTuple):
     failed: str  # what is said when it fails
     run: Any  # source -> result, or in words why there is none
     draw: Any = lambda result: None  # result -> what draws it on axes, or None
+    caption: str = ""  # how to read the picture
 
 
 # The audit comes first and the stress cases last: both have a say in the verdict.
 CHAPTERS = (
     Chapter("audit", "Is the gradient right?", "gradient: not audited",
-            lambda s: check.gradient(s.loss, s.x), lambda audit: partial(plots.v_curve, audit)),
+            lambda s: check.gradient(s.loss, s.x), lambda audit: partial(plots.v_curve, audit),
+            "Each curve is a direction. Of a right gradient it falls with the step, from the right to the left, until "
+            "rounding lifts it: a V. Of a wrong one it stays up: a plateau."),
     Chapter("workprec", "Which method for which error?", "error against run time: not measured",
-            lambda s: workprec(**s.workprec) if s.workprec else NO_PROBLEM, lambda rows: rows.plot),
+            lambda s: workprec(**s.workprec) if s.workprec else NO_PROBLEM, lambda rows: rows.plot,
+            "Further to the left is faster, further down is more exact. The grey band joins the best runs: no other "
+            "one is both faster and more exact."),
     Chapter("certificate", "How exact is the gradient, and how exact need the solves be?", "certificate: not made",
             lambda s: certify(s.loss, s.x)),
     Chapter("plan", "What one gradient computes", "plan: not made", lambda s: explain(s.loss, s.x)),
     Chapter("stress", "Stiff and extreme cases", "stress: not run",
-            lambda s: stress(s.loss, s.x, **s.stress), lambda trial: trial.plot if trial.map else None),
+            lambda s: stress(s.loss, s.x, **s.stress), lambda trial: trial.plot if trial.map else None,
+            "How much a small change grows in one step, over viscosity (across) and time step (up): above 1 the step "
+            "is unstable, grey ones are refused, the star is where the scene is."),
 )  # fmt: skip

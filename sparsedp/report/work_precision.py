@@ -367,14 +367,19 @@ class Rows(Result):
         -------
         matplotlib Axes
         """
-        ax, error = plots.current(ax), error or self.judged
-        lines: dict = {}
-        for *point, row in sorted(self._points(error), key=lambda point: point[0]):
-            lines.setdefault(row["method"], []).append(point)
+        ax, (lines, across, up) = plots.current(ax), self.picture(error)
         if lines:  # nothing has no logarithm
-            plots.curves(lines, ax, "run time [s]", error.replace("_", " "))
+            plots.curves(lines, ax, across, up)
         ax.set_title(self.scene)
         return ax
+
+    def picture(self, error=None):
+        """The error over the run time, a curve for each method."""
+        lines: dict = {}
+        error = error or self.judged
+        for *point, row in sorted(self._points(error), key=lambda point: point[0]):
+            lines.setdefault(row["method"], []).append(point)
+        return lines, "run time [s]", error.replace("_", " ")
 
     def save(self, folder):
         """Write scene.md, scene.csv and, where matplotlib is installed, scene.png into a folder -> list of paths.

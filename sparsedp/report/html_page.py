@@ -1,0 +1,76 @@
+"""The report as one page of HTML: it needs no other file and no network."""
+
+import base64
+
+from sparsedp.markup import cell, curves, folded
+
+__all__ = ["page", "section"]
+
+STYLE = """
+:root { color-scheme: light dark; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 0 auto; padding: 1rem; }
+h1 { margin-bottom: 0; }
+.verdict { border-left: 0.5rem solid; padding: 0.5rem 1rem; font-size: 1.2rem; }
+.agrees { border-color: #009e73; } .disagrees { border-color: #d55e00; } .inconclusive { border-color: #e69f00; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; margin: 1rem 0; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
+th, td { padding: 0.15rem 0.6rem; text-align: left; border-bottom: 1px solid #8884; }
+th { cursor: pointer; white-space: nowrap; }
+th[aria-sort=ascending]::after { content: " \\2191"; } th[aria-sort=descending]::after { content: " \\2193"; }
+figure { margin: 1rem 0; } img, svg { max-width: 100%; height: auto; } img { background: white; width: 44rem; }
+figcaption { font-size: 0.9rem; }
+"""
+
+# A click on the name of a column sorts its table by it: numbers by size, words by letters, what is empty last.
+SORTING = """
+for (const table of document.querySelectorAll("table")) {
+  table.querySelectorAll("th").forEach((head, column) => {
+    head.tabIndex = 0;
+    const sort = () => {
+      const up = head.ariaSort !== "ascending";
+      const key = row => row.cells[column].textContent.trim();
+      const order = (a, b) => {
+        if (!a || !b) return !a - !b;
+        const numbers = !isNaN(a) && !isNaN(b);
+        return (up ? 1 : -1) * (numbers ? a - b : a.localeCompare(b));
+      };
+      const rows = [...table.tBodies[0].rows].sort((one, other) => order(key(one), key(other)));
+      table.tBodies[0].append(...rows);
+      table.querySelectorAll("th").forEach(other => other.removeAttribute("aria-sort"));
+      head.ariaSort = up ? "ascending" : "descending";
+    };
+    head.addEventListener("click", sort);
+    head.addEventListener("keydown", event => { if (event.key === "Enter") sort(); });
+  });
+}
+"""
+
+
+def section(title, result, files, caption):
+    """A result with its picture: the PNG among its files, or a plainer one, and how to read it."""
+    pictures = [base64.b64encode(path.read_bytes()).decode() for path in files if path.suffix == ".png"]
+    drawn = [f'<img alt="{cell(title)}" src="data:image/png;base64,{one}">' for one in pictures]
+    picture = "".join(drawn) or curves(*result.picture(), log=(True, True))
+    figure = f"<figure>{picture}<figcaption>{cell(caption)}</figcaption></figure>" if picture else ""
+    return f'<section><h2>{cell(title)}</h2>{figure}<div class="wide">{result.html()}</div></section>'
+
+
+def page(title, verdict, meaning, sections, left_out):
+    """Title, verdict with its meaning, sections, what was left out -> the page."""
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{cell(title)}: {verdict}</title>
+<style>{STYLE}</style>
+</head>
+<body>
+<h1>{cell(title)}</h1>
+<p class="verdict {verdict}"><strong>{verdict}</strong>. {cell(meaning)}</p>
+{"".join(sections)}
+{folded("What was left out", left_out)}
+<script>{SORTING}</script>
+</body>
+</html>
+"""
