@@ -95,7 +95,7 @@ def stage():
 
 def runnable():
     """A pattern of the scripts that need no library which is not here."""
-    missing = [name for name in ("jax", "optax", "torch") if find_spec(name) is None]
+    missing = [name for name in ("jax", "optax", "pylops", "skfem", "torch") if find_spec(name) is None]
     needs = re.compile(rf"^import ({'|'.join(missing)})$", re.MULTILINE)
     scripts = [path for path in (ROOT / "examples").glob("*.py") if missing and needs.search(path.read_text())]
     return r"/(?!({})\.py$)[^/]*$".format("|".join(path.stem for path in scripts)) if scripts else ".*"

@@ -46,8 +46,15 @@ SMALL = {
     "residual_or_physics.py": "10",
     "solver_in_the_loop.py": "48",
     "ensemble.py": "5",
+    "mesh_design.py": "3",
+    "pylops_exchange.py": "32",
 }  # cells, the end time, or gradients; the others run with 16
-NEEDS = {"torch_training.py": "torch", "jax_optimiser.py": "optax"}  # extras that `all` leaves out
+NEEDS = {
+    "torch_training.py": "torch",
+    "jax_optimiser.py": "optax",
+    "mesh_design.py": "skfem",
+    "pylops_exchange.py": "pylops",
+}  # libraries that need not be there
 DEFAULT = {"heat_rod.py", "new_operator.py", "plan.py", "pressure_projection.py", "two_families.py"}
 
 

@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 from scripts import example, run
 
 
@@ -64,3 +65,22 @@ def test_jax_optimiser():
     x, y = map(float, re.search(r"fell at \((\S+), (\S+)\), true", printed).groups())
     assert abs(x - 0.35) < 0.01 and abs(y - 0.6) < 0.01
     assert abs(float(re.search(r"diffusivity (\S+),", printed)[1]) - 0.01) < 5e-4
+
+
+@example("mesh_design.py")
+def test_mesh_design():
+    """A mesh of scikit-fem: the textbook's derivative, and near the exact optimum, which coarse elements undercut."""
+    printed = run("mesh_design.py")
+    assert float(re.search(r"textbooks: difference (\S+)", printed)[1]) < 1e-9 and "differences: agrees" in printed
+    assert abs(float(re.search(r"iterations (\S+) ", printed)[1]) / (np.pi / 9) - 1) < 0.02
+    assert float(re.search(r"mean difference (\S+)", printed)[1]) < 0.05
+
+
+@example("pylops_exchange.py")
+def test_pylops_exchange():
+    """PyLops solves with our heat, and we search through a camera of PyLops."""
+    printed = run("pylops_exchange.py")
+    edges, squares = map(float, re.search(r"off by (\S+) with jumps counted, (\S+) by squares", printed).groups())
+    before, after = map(float, re.search(r"off by (\S+) -> (\S+)$", printed, re.MULTILINE).groups())
+    assert edges < 0.05 and edges < squares / 2 and after < before / 2
+    assert printed.count("agrees") == 2 and "PyLops finds the transpose right" in printed
