@@ -131,6 +131,16 @@ def test_links(site):
     assert followed > 1000 and Page(site / "ideas.html").formulas > 20
 
 
+def test_pictures_of_the_readme():
+    """Those that docs/readme_pictures.py makes, shown, and light: every clone carries them."""
+    pictures = sorted((DOCS / "pictures").iterdir())
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert re.findall(r"\]\(docs/pictures/(\w+)\.png\)", text) == ["truth", "recovery", "convergence"]
+    made = re.search(r"^NAMES = (.*)$", (DOCS / "readme_pictures.py").read_text(encoding="utf-8"), re.MULTILINE)[1]
+    assert [f'"{path.stem}"' for path in pictures] == sorted(made.split(", "))
+    assert sum(path.stat().st_size for path in pictures) <= 300_000
+
+
 def test_dead_links_are_seen(tmp_path):
     (tmp_path / "b.html").write_text('<p id="here"></p>', encoding="utf-8")
     links = ["b.html#here", "b.html", "data:,x", "b.html#there", "c.html", "https://example.org", "#nowhere"]
