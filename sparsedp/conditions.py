@@ -11,15 +11,16 @@ What a fluid does at a wall implies conditions of its velocity along the wall an
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from sparsedp.grid import AXES, Grid, real_numbers
+from sparsedp.fields import check_number
+from sparsedp.grid import AXES, Grid
 from sparsedp.recipe import Value
 
 __all__ = [
     "Condition", "FlowCondition", "check_condition", "dirichlet", "free_slip", "inflow", "neumann", "no_slip",
     "outflow", "resolve", "robin",
 ]  # fmt: skip
+
+EXAMPLE = "; write for example robin(1.0, 0.5)"
 
 
 class Condition(Value):
@@ -82,9 +83,9 @@ def robin(a, b):
     >>> robin(1, 0)
     dirichlet
     """
-    a, b = (float(real_numbers(weight, "robin", "robin(1.0, 0.5)")) for weight in (a, b))
-    if not (np.isfinite(a) and np.isfinite(b) and a >= 0 and b >= 0 and a + b > 0):
-        raise ValueError(f"robin needs finite a, b >= 0, not both 0, got a = {a:g}, b = {b:g}")
+    a, b = (check_number(f"{name} of robin", weight, ">= 0", EXAMPLE) for name, weight in (("a", a), ("b", b)))
+    if a == b == 0:
+        raise ValueError(f"a and b of robin must not both be 0{EXAMPLE}")
     return Condition(a, b)
 
 

@@ -19,6 +19,7 @@ __all__ = [
     "check_out",
     "check_plain",
     "check_takes",
+    "check_whole",
     "field_array",
     "is_number",
     "is_whole",
@@ -147,15 +148,27 @@ def check_takes(name, fun, count, example):
         raise TypeError(f"{name} calls a function with {count} arguments, got one that takes {most}; write {example}")
 
 
-def check_number(name, value, sign="", advice=""):
-    """Refuse what is not one finite real number, or has not the sign that is needed, "> 0" or ">= 0"."""
+def check_number(name, value, needs="", advice=""):
+    """One finite real number -> a float. Refuse all else, and what is not in the range that is needed, in words."""
     if not is_number(value):
         given = f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
-        raise TypeError(f"{name} must be one real number, got {given}")
+        raise TypeError(f"{name} must be one real number, got {given}{advice}")
     if not np.isfinite(value):
-        raise NonFiniteError(f"{name} must be finite, got {value}")
-    if {"": False, ">= 0": value < 0, "> 0": value <= 0}[sign]:
-        raise ValueError(f"{name} must be {sign}, got {value:g}{advice}")
+        raise NonFiniteError(f"{name} must be finite, got {value}{advice}")
+    ranges = {
+        "": True, "> 0": value > 0, ">= 0": value >= 0, "from 0 to 1": 0 <= value <= 1,
+        "from 0 to below 1": 0 <= value < 1,
+    }  # fmt: skip
+    if not ranges[needs]:
+        raise ValueError(f"{name} must be {needs}, got {value:g}{advice}")
+    return float(value)
+
+
+def check_whole(name, value, least, advice=""):
+    """One whole number from `least` on -> an int; all else is refused."""
+    if not is_whole(value, least):
+        raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}{advice}")
+    return int(value)
 
 
 def leaves_by_name(what, tree, wanted, other):

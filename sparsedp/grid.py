@@ -16,6 +16,7 @@ from itertools import compress
 import numpy as np
 
 from sparsedp.errors import ShapeError
+from sparsedp.fields import check_number
 from sparsedp.markup import facts
 from sparsedp.recipe import Uncached, Value
 from sparsedp.space import Space, whole_lengths
@@ -80,7 +81,7 @@ class Grid(Value, Uncached):
             dim=len(shape),
             axes=AXES[: len(shape)],
             periodic=tuple(flag(entry, shape) for entry in per_axis(periodic, shape, "periodic")),
-            origin=tuple(finite_number(entry, "origin") for entry in per_axis(origin, shape, "origin")),
+            origin=numbers_per_axis(origin, shape, "origin"),
             widths=cell_widths(shape, size, spacing),
         )
 
@@ -353,11 +354,10 @@ def real_numbers(entry, name, example):
     return values
 
 
-def finite_number(entry, name):
-    """One finite float, or an error that names the argument."""
-    if real_numbers(entry, name, f"{name}=1.0").ndim or not np.isfinite(entry):
-        raise ValueError(f"{name} needs finite numbers, got {entry}; write one for each axis, or one for all")
-    return float(entry)
+def numbers_per_axis(value, shape, name, needs=""):
+    """One finite float for each axis, in the range that is needed; a number serves all of them."""
+    advice = "; write one number for each axis, or one for all"
+    return tuple(check_number(name, entry, needs, advice) for entry in per_axis(value, shape, name))
 
 
 def flag(entry, shape):
@@ -371,8 +371,7 @@ def flag(entry, shape):
 def cell_widths(shape, size, spacing):
     """Size or spacing argument -> tuple of read-only arrays of cell widths, one for each axis."""
     if size is not None:
-        extents = [finite_number(extent, "size") for extent in per_axis(size, shape, "size")]
-        _check_positive("size", np.array(extents))
+        extents = numbers_per_axis(size, shape, "size", "> 0")
         spacing = [extent / max(n, 1) for n, extent in zip(shape, extents, strict=True)]
     elif len(shape) == 1 and isinstance(spacing, np.ndarray) and spacing.ndim == 1:
         spacing = [spacing]  # in 1-D an array is the widths themselves
@@ -384,13 +383,9 @@ def _axis_widths(n, entry, axis):
     line = np.array(real_numbers(entry, "spacing", "spacing=0.5"), dtype=float)
     if line.shape not in ((), (n,)):
         raise ShapeError(f"spacing along {axis} needs {n} cell widths, got an array of shape {line.shape}")
-    _check_positive("spacing", line)
+    wrong = ~((line > 0) & (line < np.inf))  # NaN too
+    if np.any(wrong):
+        raise ValueError(f"spacing must be positive and finite, got {line[wrong][0]}")
     line = np.full(n, line)
     line.flags.writeable = False
     return line
-
-
-def _check_positive(name, numbers):
-    wrong = ~((numbers > 0) & (numbers < np.inf))  # NaN too
-    if np.any(wrong):
-        raise ValueError(f"{name} must be positive and finite, got {numbers[wrong][0]}")

@@ -50,13 +50,13 @@ TABLE = [
     (
         lambda: dp.Grid(4, size=np.inf),
         VALUE,
-        "size needs finite numbers, got inf; write one for each axis, or one for all",
+        "size must be finite, got inf; write one number for each axis, or one for all",
     ),
-    (lambda: dp.Grid(4, size=-2.0), VALUE, "size must be positive and finite, got -2.0"),
+    (lambda: dp.Grid(4, size=-2.0), VALUE, "size must be > 0, got -2; write one number for each axis, or one for all"),
     (
         lambda: dp.Grid(4, origin=np.nan),
         VALUE,
-        "origin needs finite numbers, got nan; write one for each axis, or one for all",
+        "origin must be finite, got nan; write one number for each axis, or one for all",
     ),
     (lambda: dp.Grid((4, 4), size=(1.0,)), SHAPE, "size needs one entry for each of 2 axes, got 1"),
     (lambda: dp.Grid((4, 4), periodic=[True]), SHAPE, "periodic needs one entry for each of 2 axes, got 1"),
@@ -67,9 +67,21 @@ TABLE = [
     ),
     (lambda: dp.Grid(2, periodic=1), TYPE, "periodic needs True or False for each axis, got 1; write periodic=True"),
     (lambda: dp.Grid(2, spacing="a"), TYPE, "spacing needs real numbers, got 'a'; write for example spacing=0.5"),
-    (lambda: dp.Grid(2, size="a"), TYPE, "size needs real numbers, got 'a'; write for example size=1.0"),
-    (lambda: dp.Grid(2, origin="a"), TYPE, "origin needs real numbers, got 'a'; write for example origin=1.0"),
-    (lambda: dp.Grid(2, origin=1j), TYPE, "origin needs real numbers, got 1j; write for example origin=1.0"),
+    (
+        lambda: dp.Grid(2, size="a"),
+        TYPE,
+        "size must be one real number, got 'a'; write one number for each axis, or one for all",
+    ),
+    (
+        lambda: dp.Grid(2, origin="a"),
+        TYPE,
+        "origin must be one real number, got 'a'; write one number for each axis, or one for all",
+    ),
+    (
+        lambda: dp.Grid(2, origin=1j),
+        TYPE,
+        "origin must be one real number, got 1j; write one number for each axis, or one for all",
+    ),
     (lambda: dp.Grid(4, spacing=np.ones(3)), SHAPE, "spacing along x needs 4 cell widths, got an array of shape (3,)"),
     (
         lambda: BOX.axis("z"),
@@ -107,10 +119,10 @@ TABLE = [
         "Operator is frozen; make a new one instead of setting form",
     ),
     # boundary conditions
-    (lambda: dp.robin(-1, 1), VALUE, "robin needs finite a, b >= 0, not both 0, got a = -1, b = 1"),
-    (lambda: dp.robin(0, 0), VALUE, "robin needs finite a, b >= 0, not both 0, got a = 0, b = 0"),
-    (lambda: dp.robin(np.nan, 1), VALUE, "robin needs finite a, b >= 0, not both 0, got a = nan, b = 1"),
-    (lambda: dp.robin("a", 1), TYPE, "robin needs real numbers, got 'a'; write for example robin(1.0, 0.5)"),
+    (lambda: dp.robin(-1, 1), VALUE, "a of robin must be >= 0, got -1; write for example robin(1.0, 0.5)"),
+    (lambda: dp.robin(0, 0), VALUE, "a and b of robin must not both be 0; write for example robin(1.0, 0.5)"),
+    (lambda: dp.robin(np.nan, 1), VALUE, "a of robin must be finite, got nan; write for example robin(1.0, 0.5)"),
+    (lambda: dp.robin("a", 1), TYPE, "a of robin must be one real number, got 'a'; write for example robin(1.0, 0.5)"),
     (
         lambda: dp.gradient(LINE, solid_boundary="dirichlet"),
         TYPE,

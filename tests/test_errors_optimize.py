@@ -69,8 +69,7 @@ WRONG = [
     ),
     (
         run(method="newton_cg", inner=0), ValueError,
-        "newton_cg needs inner >= 1, a whole number, got 0; the "
-        "default is 200",
+        "inner of newton_cg must be a whole number >= 1, got 0; the default is 200",
     ),
     (
         run(method="newton_cg", gradient=lambda x: x), TypeError,
@@ -82,9 +81,9 @@ WRONG = [
     ),
     (
         run(method="levenberg_marquardt", damping=0), ValueError,
-        "levenberg_marquardt needs a positive damping, got 0; the default is 1e-3",
+        "damping of levenberg_marquardt must be > 0, got 0; the default is 1e-3",
     ),
-    (run(method="half_inverse", rate=0), ValueError, "half_inverse needs a positive rate, got 0; the default is 1"),
+    (run(method="half_inverse", rate=0), ValueError, "rate of half_inverse must be > 0, got 0; the default is 1"),
     (
         run(method="physical_gradient"), TypeError,
         "physical_gradient needs physics and inverse; write minimize(loss_of_y, x, 'physical_gradient', physics=f, "
@@ -95,7 +94,7 @@ WRONG = [
         "the outputs are one number; return the residuals as an array, do not sum them",
     ),
     (direction(power=2), ValueError, "power must be from 0 to 1, got 2; 0.75 gives half-inverse gradients"),
-    (direction(damping=-1), ValueError, "damping must be finite and >= 0, got -1; the default is 0"),
+    (direction(damping=-1), ValueError, "damping must be >= 0, got -1; the default is 0"),
     (direction(truncation=1), ValueError, "truncation must be from 0 to below 1, got 1; the default is 1e-10"),
     (direction(method="svd"), ValueError, "method must be auto, dense or krylov, got 'svd'"),
     (direction(rank=0), ValueError, "rank must be a whole number >= 1, got 0; leave it out for no limit"),
@@ -120,7 +119,7 @@ WRONG = [
     ),
     (
         lambda: dp.physical_gradient(lambda x: x, lambda y, x: y, rate=0), ValueError,
-        "physical_gradient needs a positive rate, got 0; the default is 1",
+        "rate of physical_gradient must be > 0, got 0; the default is 1",
     ),
     (
         back(lambda y, x: y[:1]), ShapeError,

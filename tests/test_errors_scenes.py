@@ -248,12 +248,12 @@ TABLE = [
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=0.0),
         VALUE,
-        "admm needs a positive weight, got 0.0; write weight=0.1",
+        "weight of admm must be > 0, got 0; write weight=0.1",
     ),
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, inner=0),
         VALUE,
-        "admm needs inner >= 1 steps in a round, or a function, got 0; write inner=10",
+        "inner of admm, steps or a function, must be a whole number >= 1, got 0; write inner=10",
     ),
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, batches=[1]),

@@ -66,36 +66,42 @@ def test_methods_and_options():
         dp.minimize(bowl, np.ones(2), "newton")
     with pytest.raises(TypeError, match="lbfgs has no option 'rate'; it has memory, line_search"):
         dp.minimize(bowl, np.ones(2), rate=1.0)
-    with pytest.raises(ValueError, match="minimize needs maxiter >= 0, a whole number, got -1; the default is 100"):
+    with pytest.raises(ValueError, match="maxiter of minimize must be a whole number >= 0, got -1; the default is 100"):
         dp.minimize(bowl, np.ones(2), maxiter=-1)
-    with pytest.raises(ValueError, match="minimize needs maxiter >= 0, a whole number, got True; the default is 100"):
+    with pytest.raises(
+        ValueError, match="maxiter of minimize must be a whole number >= 0, got True; the default is 100"
+    ):
         dp.minimize(bowl, np.ones(2), maxiter=True)
-    with pytest.raises(ValueError, match="minimize needs maxiter >= 0, a whole number, got None; the default is 100"):
+    with pytest.raises(
+        ValueError, match="maxiter of minimize must be a whole number >= 0, got None; the default is 100"
+    ):
         dp.minimize(bowl, np.ones(2), maxiter=None)
-    with pytest.raises(ValueError, match="minimize needs a tolerance >= 0, got nan; the default is 1e-8"):
+    with pytest.raises(ValueError, match="tolerance of minimize must be finite, got nan; the default is 1e-8"):
         dp.minimize(bowl, np.ones(2), tolerance=np.nan)
-    with pytest.raises(ValueError, match="minimize needs a tolerance >= 0, got 'a'; the default is 1e-8"):
+    with pytest.raises(ValueError, match="tolerance of minimize must be >= 0, got -1; the default is 1e-8"):
+        dp.minimize(bowl, np.ones(2), tolerance=-1)
+    with pytest.raises(TypeError, match="tolerance of minimize must be one real number, got 'a'; the default is 1e-8"):
         dp.minimize(bowl, np.ones(2), tolerance="a")
 
 
 def test_ranges_of_options():
-    with pytest.raises(
-        ValueError, match="lbfgs needs memory >= 1 and line_search >= 2, got 0 and 20; write whole numbers"
-    ):
+    with pytest.raises(ValueError, match="memory of lbfgs must be a whole number >= 1, got 0; the default is 10"):
         dp.minimize(bowl, np.ones(2), memory=0)
-    with pytest.raises(ValueError, match="gd needs a positive rate, got -1; leave it out and it is searched for"):
+    with pytest.raises(ValueError, match="line_search of lbfgs must be a whole number >= 2, got 1; the default is 20"):
+        dp.minimize(bowl, np.ones(2), line_search=1)
+    with pytest.raises(ValueError, match="rate of gd must be > 0, got -1; leave it out and it is searched for"):
         dp.minimize(bowl, np.ones(2), "gd", rate=-1)
-    with pytest.raises(ValueError, match="gd needs a momentum from 0 to below 1, got 1; leave it out for none"):
+    with pytest.raises(ValueError, match="momentum of gd must be from 0 to below 1, got 1; leave it out for none"):
         dp.minimize(bowl, np.ones(2), "gd", momentum=1)
     with pytest.raises(
         ValueError, match="gd has no line search 'wolfe'; write line_search='backtracking' or leave it out"
     ):
         dp.minimize(bowl, np.ones(2), "gd", line_search="wolfe")
-    with pytest.raises(ValueError, match="adam needs a positive rate, got 0; the default is 1e-3"):
+    with pytest.raises(ValueError, match="rate of adam must be > 0, got 0; the default is 1e-3"):
         dp.minimize(bowl, np.ones(2), "adam", rate=0)
-    with pytest.raises(ValueError, match="adam needs a positive rate, got None; the default is 1e-3"):
+    with pytest.raises(TypeError, match="rate of adam must be one real number, got None; the default is 1e-3"):
         dp.minimize(bowl, np.ones(2), "adam", rate=None)
-    with pytest.raises(ValueError, match="adam needs a positive epsilon, got 0; the default is 1e-8"):
+    with pytest.raises(ValueError, match="epsilon of adam must be > 0, got 0; the default is 1e-8"):
         dp.minimize(bowl, np.ones(2), "adam", epsilon=0)
     with pytest.raises(
         ValueError, match=r"adam needs two betas from 0 to below 1, got \(1, 2\); the default is \(0.9, 0.999\)"

@@ -121,7 +121,7 @@ def test_admm_stops_when_asked():
 
 def test_admm_refuses():
     loss = lambda x: anp.sum(x**2)
-    with pytest.raises(ValueError, match="admm needs a positive weight, got -1"):
+    with pytest.raises(ValueError, match="weight of admm must be > 0, got -1"):
         dp.minimize(loss, np.ones(2), "admm", weight=-1)
     with pytest.raises(TypeError, match="admm has no option 'weights'; it has weight, operator, rho, inner, prox"):
         dp.minimize(loss, np.ones(2), "admm", weights=1)

@@ -26,7 +26,7 @@ from sparsedp.conditions import no_slip, resolve
 from sparsedp.fields import check_finite, check_number, field_array
 from sparsedp.flow.momentum import face_laplacian, momentum_fluxes, stresses
 from sparsedp.flow.setup import pressure_conditions
-from sparsedp.grid import check_grid, finite_number, per_axis
+from sparsedp.grid import check_grid, numbers_per_axis
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, mask, region_of, solid_faces
 from sparsedp.operators.difference import gradient
@@ -189,7 +189,7 @@ class Forces(Remade):
         sides = resolve(grid, boundary, no_slip)
         held = check_solid(grid, solid) if cells is None else region_of(grid, cells)
         chosen = np.logical_or(*solid_faces(grid, held))
-        point = [finite_number(x, "about") for x in per_axis(about, grid.shape, "about")]
+        point = numbers_per_axis(about, grid.shape, "about")
         self.total = _total(grid, chosen, point)
         viscous = Operator(stresses(grid, sides, solid, solid_boundary), grid.faces, grid.faces, "stresses")
         wet = np.ones(grid.shape, bool) if solid is None else ~check_solid(grid, solid)

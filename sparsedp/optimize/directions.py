@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_finite, check_function, is_number
+from sparsedp.fields import check_finite, check_function, check_number, check_whole
 from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.linearised import Linearised, singular
 
@@ -64,16 +64,10 @@ class Family:
     """
 
     def __init__(self, power=0.75, damping=0.0, truncation=1e-10, rank=None):
-        if not (is_number(power) and 0 <= power <= 1):
-            raise ValueError(f"power must be from 0 to 1, got {power!r}; 0.75 gives half-inverse gradients")
-        if not (is_number(damping) and 0 <= damping < np.inf):
-            raise ValueError(f"damping must be finite and >= 0, got {damping!r}; the default is 0")
-        if not (is_number(truncation) and 0 <= truncation < 1):
-            raise ValueError(f"truncation must be from 0 to below 1, got {truncation!r}; the default is 1e-10")
-        if rank is not None and not (isinstance(rank, int) and rank >= 1):
-            raise ValueError(f"rank must be a whole number >= 1, got {rank!r}; leave it out for no limit")
-        self.power, self.damping, self.truncation = float(power), float(damping), float(truncation)
-        self.rank = rank
+        self.power = check_number("power", power, "from 0 to 1", "; 0.75 gives half-inverse gradients")
+        self.damping = check_number("damping", damping, ">= 0", "; the default is 0")
+        self.truncation = check_number("truncation", truncation, "from 0 to below 1", "; the default is 1e-10")
+        self.rank = np.inf if rank is None else check_whole("rank", rank, 1, "; leave it out for no limit")
 
     def __call__(self, linearised, g):
         """Flat Direction for a flat cotangent g of the outputs."""
@@ -96,7 +90,7 @@ class Family:
         Source: G. H. Golub, W. Kahan, SIAM J. Numer. Anal. 2, 1965; C. C. Paige, M. A. Saunders, ACM TOMS 8, 1982.
         """
         left, right = map(_Rows, linearised.shape)
-        limit, look, weights = min(*linearised.shape, self.rank or np.inf), LOOK, np.zeros(0)
+        limit, look, weights = min(*linearised.shape, self.rank), LOOK, np.zeros(0)
         length = left.add(g)
         sizes: list = []  # of B: diagonal, below it, diagonal, ...
         while len(sizes) < 2 * limit:

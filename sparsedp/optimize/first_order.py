@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.fields import is_number
+from sparsedp.fields import check_number, is_number
 from sparsedp.optimize.flat import power_of_two
 from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.tree import norm
@@ -43,9 +43,8 @@ class Descent:
 
     def __init__(self, rate=None, momentum=0.0, line_search=None):
         if rate is not None:
-            check_positive("gd", "rate", rate, "leave it out and it is searched for")
-        if not (is_number(momentum) and 0 <= momentum < 1):
-            raise ValueError(f"gd needs a momentum from 0 to below 1, got {momentum}; leave it out for none")
+            check_number("rate of gd", rate, "> 0", "; leave it out and it is searched for")
+        check_number("momentum of gd", momentum, "from 0 to below 1", "; leave it out for none")
         if line_search not in (None, "backtracking"):
             raise ValueError(f"gd has no line search {line_search!r}; write line_search='backtracking' or leave it out")
         self.rate, self.momentum = rate, momentum
@@ -109,12 +108,6 @@ def admissible(point, step, share, trials):
     raise Stuck("no admissible point along the step")
 
 
-def check_positive(method, name, value, advice):
-    """Refuse what is not a number above 0, and finite."""
-    if not (is_number(value) and 0 < value < np.inf):
-        raise ValueError(f"{method} needs a positive {name}, got {value!r}; {advice}")
-
-
 class AdamState(NamedTuple):
     """State of Adam: point, the two means, count of steps, size of the first gradient, share to try first."""
 
@@ -146,10 +139,10 @@ class Adam:
     residuals, searches = False, False
 
     def __init__(self, rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8):
-        check_positive("adam", "rate", rate, "the default is 1e-3")
+        check_number("rate of adam", rate, "> 0", "; the default is 1e-3")
         if np.shape(betas) != (2,) or not all(is_number(beta) and 0 <= beta < 1 for beta in betas):
             raise ValueError(f"adam needs two betas from 0 to below 1, got {betas}; the default is (0.9, 0.999)")
-        check_positive("adam", "epsilon", epsilon, "the default is 1e-8")
+        check_number("epsilon of adam", epsilon, "> 0", "; the default is 1e-8")
         self.rate, self.betas, self.epsilon = rate, tuple(betas), epsilon
 
     def begin(self, first):

@@ -9,8 +9,9 @@ import numpy as np
 import scipy.linalg
 from scipy.sparse.linalg import LinearOperator, lsmr
 
+from sparsedp.fields import check_number
 from sparsedp.optimize.directions import Family, form_of
-from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked, check_positive
+from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked
 from sparsedp.optimize.result import Trial
 from sparsedp.tree import norm
 
@@ -96,7 +97,7 @@ class LevenbergMarquardt(GaussNewton):
     """
 
     def __init__(self, damping=1e-3, apart=False, dense=None):
-        check_positive("levenberg_marquardt", "damping", damping, "the default is 1e-3")
+        check_number("damping of levenberg_marquardt", damping, "> 0", "; the default is 1e-3")
         super().__init__(apart, dense)
         self.damping = damping
 
@@ -142,7 +143,7 @@ class HalfInverse(GaussNewton):
     searches = False
 
     def __init__(self, rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto"):
-        check_positive("half_inverse", "rate", rate, "the default is 1")
+        check_number("rate of half_inverse", rate, "> 0", "; the default is 1")
         super().__init__(apart, form_of(form))
         self.rate, self._family = rate, Family(power, 0.0, truncation, rank)
 

@@ -3,7 +3,7 @@
 import inspect
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_function, is_number, is_whole
+from sparsedp.fields import check_function, check_number, check_whole
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.checkpoint import Checkpoint
@@ -119,7 +119,7 @@ def minimize(
     KeyboardInterrupt
         If Ctrl-C comes before the loss is known at the start, or a second time.
     TypeError
-        If the method has no such option.
+        If the method has no such option, or what must be a number is none.
     UnstableStepError, ConvergenceError, NonFiniteError
         If the loss raises one of them, or is NaN or infinite, at the start. At a trial point the same
         counts as an infinite loss: the search goes back, and the record of the iteration lists it.
@@ -140,10 +140,9 @@ def minimize(
     if callback is not None:
         check_function("callback of minimize", callback, "lambda record, x: False")
     stepper = _stepper(method, options) if method != "admm" else None
-    if not is_whole(maxiter, 0):
-        raise ValueError(f"minimize needs maxiter >= 0, a whole number, got {maxiter!r}; the default is 100")
-    if not callable(tolerance) and not (is_number(tolerance) and tolerance >= 0):
-        raise ValueError(f"minimize needs a tolerance >= 0, got {tolerance!r}; the default is 1e-8")
+    maxiter = check_whole("maxiter of minimize", maxiter, 0, "; the default is 100")
+    if not callable(tolerance):
+        check_number("tolerance of minimize", tolerance, ">= 0", "; the default is 1e-8")
     unused = dict(progress=progress, gradient=gradient, project=project, batches=batches, checkpoint=checkpoint)
     for leaf in leaves(start):
         if type(leaf) in ELSEWHERE:
@@ -175,7 +174,7 @@ def minimize(
     }  # fmt: skip
     kept, covariance = Checkpoint(checkpoint, settings), None
     watch = Watch(trials, packing, tolerance, callback)
-    steps = shown_steps(progress, range(int(maxiter)), "minimize")
+    steps = shown_steps(progress, range(maxiter), "minimize")
     try:
         begin = box.inside(packing.pack(start))
         together("minimize", (start,), _run, stepper, trials, watch, kept, begin, steps)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.fields import is_whole
+from sparsedp.fields import check_whole
 from sparsedp.optimize.flat import power_of_two
 from sparsedp.optimize.result import Trial
 from sparsedp.tree import norm
@@ -40,9 +40,7 @@ class NewtonCG:
     residuals, searches = False, True
 
     def __init__(self, inner=200):
-        if not is_whole(inner, 1):
-            raise ValueError(f"newton_cg needs inner >= 1, a whole number, got {inner!r}; the default is 200")
-        self.inner = int(inner)
+        self.inner = check_whole("inner of newton_cg", inner, 1, "; the default is 200")
 
     def begin(self, first):
         """State at the start."""

@@ -3,7 +3,8 @@
 import autograd.numpy as anp
 
 from sparsedp.errors import ShapeError
-from sparsedp.optimize.first_order import Descent, check_positive
+from sparsedp.fields import check_number
+from sparsedp.optimize.first_order import Descent
 from sparsedp.tape import differentiable, plain
 
 __all__ = ["PhysicalGradient", "physical_gradient"]
@@ -58,8 +59,7 @@ def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
     >>> round(1.0 - update, 12)  # x - update is the solution
     2.0
     """
-    check_positive("physical_gradient", "rate", rate, "the default is 1")
-    rate = float(rate)
+    rate = check_number("rate of physical_gradient", rate, "> 0", "; the default is 1")
 
     def vjp(nums, y, x):
         def pull(g):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import LbfgsInvHessProduct
 
-from sparsedp.fields import is_whole
+from sparsedp.fields import check_whole
 from sparsedp.optimize.first_order import first_length
 from sparsedp.optimize.flat import power_of_two
 from sparsedp.optimize.result import Stuck, Trial
@@ -53,11 +53,8 @@ class Quasi:
     residuals, searches = False, True
 
     def __init__(self, memory=10, line_search=20):
-        if not (is_whole(memory, 1) and is_whole(line_search, 2)):
-            raise ValueError(
-                f"lbfgs needs memory >= 1 and line_search >= 2, got {memory} and {line_search}; write whole numbers"
-            )
-        self.memory, self.line_search = int(memory), int(line_search)
+        self.memory = check_whole("memory of lbfgs", memory, 1, "; the default is 10")
+        self.line_search = check_whole("line_search of lbfgs", line_search, 2, "; the default is 20")
 
     def begin(self, first):
         """State at the start."""

@@ -19,9 +19,8 @@ import numpy as np
 
 from sparsedp.derivative import vjp
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_function, is_whole
+from sparsedp.fields import check_function, check_number, check_whole
 from sparsedp.ledger import thread
-from sparsedp.optimize.first_order import check_positive
 from sparsedp.optimize.result import Minimum, Record
 from sparsedp.tree import norm
 
@@ -36,9 +35,9 @@ def admm(
 ):
     """The method "admm" of `minimize`, which is `search`: see there."""
     for name, value in (("weight", weight), ("rho", 1.0 if rho is None else rho)):
-        check_positive("admm", name, value, f"write {name}=0.1")
-    if not (callable(inner) or is_whole(inner, 1)):
-        raise ValueError(f"admm needs inner >= 1 steps in a round, or a function, got {inner!r}; write inner=10")
+        check_number(f"{name} of admm", value, "> 0", f"; write {name}=0.1")
+    if not callable(inner):
+        check_whole("inner of admm, steps or a function,", inner, 1, "; write inner=10")
     if callable(inner) and bounds is not None:
         raise TypeError("admm with a function as inner does not use bounds; leave them out, or keep to them in inner")
     K = (lambda x: 1.0 * x) if operator is None else operator
@@ -68,7 +67,7 @@ def admm(
 
     minimized = (lambda *state: (inner(*state), 1)) if callable(inner) else searched
     record(z, np.inf)
-    for number in range(int(maxiter)):
+    for number in range(maxiter):
         x, spent = minimized(z - w, rho, x)
         count += spent
         image, pull = vjp(K, x)
