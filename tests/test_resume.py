@@ -95,6 +95,16 @@ def test_damaged_and_foreign_files_are_named_and_skipped(tmp_path, monkeypatch):
     assert "state-000000007.npz.part: an unfinished write" in best.resumed
 
 
+def test_a_new_state_stays_beside_damaged_newer_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr("sparsedp.optimize.checkpoint.SHARE", np.inf)
+    dp.minimize(valley, START, maxiter=5, tolerance=0, checkpoint=tmp_path)
+    for number in (7, 8, 9):
+        (tmp_path / f"state-00000000{number}.npz").write_text("{}")
+    for last, begin in ((6, 5), (6, 6)):
+        best = dp.minimize(valley, START, maxiter=last, tolerance=0, checkpoint=tmp_path)
+        assert best.resumed.startswith(f"resumed from iteration {begin} in")
+
+
 def test_a_single_changed_byte_is_seen(tmp_path):
     """Wherever it is: the state is skipped, or it is the same."""
     whole = dp.minimize(valley, START, maxiter=3, tolerance=0, checkpoint=tmp_path)

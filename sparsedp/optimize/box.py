@@ -16,34 +16,36 @@ class Box:
 
     Parameters
     ----------
-    lower, upper : (n,) array or number
+    bounds : (lower, upper) or None
+        As for `minimize`.
+    packing, start : Unknowns, tree
+        `start` is the tree that `packing` packs.
+
+    Attributes
+    ----------
+    lower, upper : (n,) array, or a number where there are no bounds
+
+    Raises
+    ------
+    ValueError
+        If bounds is not a pair, has another structure than start, is NaN, or a lower bound is above an upper.
+    ShapeError
+        If a bound has another shape than its array.
     """
 
-    def __init__(self, lower=-np.inf, upper=np.inf):
-        self.lower, self.upper = lower, upper
-
-    @classmethod
-    def of(cls, bounds, packing, start):
-        """What a user writes as bounds -> Box. `start` is the tree that `packing` packs.
-
-        Raises
-        ------
-        ValueError
-            If bounds is not a pair, has another structure than start, is NaN, or a lower bound is above an upper.
-        ShapeError
-            If a bound has another shape than its array.
-        """
+    def __init__(self, bounds=None, packing=None, start=None):
+        self.lower, self.upper = -np.inf, np.inf
         if bounds is None:
-            return cls()
+            return
         if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
             raise ValueError(
                 "bounds must be a pair (lower, upper), each a number, None or a tree like start, "
                 f"got {bounds!r}; write (0.0, None) for x >= 0"
             )
-        lower, upper = (_side(side, packing, start, value) for side, value in zip(bounds, (-np.inf, np.inf)))
-        if not np.all((lower <= upper) & (lower < np.inf) & (upper > -np.inf)):  # nor NaN
+        lower, upper = bounds
+        self.lower, self.upper = (_side(*side, packing, start) for side in ((lower, -np.inf), (upper, np.inf)))
+        if not np.all((self.lower <= self.upper) & (self.lower < np.inf) & (self.upper > -np.inf)):  # nor NaN
             raise ValueError("bounds must be numbers with lower <= upper; write None for a side without a bound")
-        return cls(lower, upper)
 
     def inside(self, vector):
         """The nearest point of the box."""
@@ -55,10 +57,10 @@ class Box:
         return ~(((vector - near <= self.lower) & (slope > 0)) | ((vector + near >= self.upper) & (slope < 0)))
 
 
-def _side(side, packing, start, without):
-    if side is None or (not isinstance(side, (tuple, list, dict)) and is_number(side)):
-        return np.full(packing.size, without if side is None else float(side))
+def _side(side, without, packing, start):
     given, wanted = leaves(side), leaves(start)
+    if side is None or (not isinstance(side, (tuple, list, dict)) and is_number(side)):
+        given *= len(wanted)
     if len(given) != len(wanted):
         raise ValueError(
             f"a bound must be a number or have the structure of start, got {len(given)} leaves where start has "

@@ -51,7 +51,7 @@ class Checkpoint:
             return None
         self._folder.mkdir(parents=True, exist_ok=True)
         self._settings = {name: fingerprint(value) for name, value in self._settings.items()}
-        self._settings |= {"loss at the start": _bits(template.trial), "list of batches": ""}
+        self._settings["list of batches"] = ""
         content, skipped = self._load()
         for number in range(content["iteration"] + 1 if content else 1):
             self._pass(trials.batches, number)
@@ -59,18 +59,18 @@ class Checkpoint:
             self.resumed = f"nothing to resume in {self._folder}{skipped}"
             return None
         self.resumed = f"resumed from iteration {content['iteration']} in {self._folder}{skipped}"
-        history = [_record(row) for row in content["history"]]
-        value, size = history[0].value, history[0].gradient_norm
-        near = lambda one, other, size: content["ranks"] != ranks() and norm(one - other) <= NEAR * abs(size)
-        if near(template.trial.value, value, value) and near(norm(trials.downhill(template.trial)), size, size):
-            self._settings["loss at the start"] = content["settings"]["loss at the start"]
         for name, setting in self._settings.items():
             self._check(name, setting == content["settings"].get(name))
+        history, start = [_record(row) for row in content["history"]], template.trial
+        value, size, others = history[0].value, history[0].gradient_norm, content["ranks"] != ranks()
+        same = lambda now, then, size: np.array_equal(now, then) or others and norm(now - then) <= NEAR * abs(size)
+        same_norm = same(norm(trials.downhill(start)), size, size)
+        self._check("loss at the start", same_norm and same(start.value, value, value))
         state = flatten(template)[1](content["state"])
         trials.iteration = content["iteration"]
         again, last = trials(state.trial.vector), state.trial
-        same = near(again.value, last.value, value) and near(again.slope, last.slope, size)
-        self._check("loss at the last point", not again.refused and (same or _bits(again) == _bits(last)))
+        same_value = same(again.value, last.value, value)
+        self._check("loss at the last point", same_value and same(again.slope, last.slope, size))
         trials.best, trials.count = Trial(*content["best"]), content["evaluations"]
         watch.resume(history)
         return state
@@ -116,9 +116,10 @@ class Checkpoint:
         if self._latest is None:
             return
         begun, number = time.perf_counter(), self._latest["iteration"]
-        save_tree(self._folder / f"state-{number:09d}.npz", {**self._latest, "history": history[: number + 1]}, FORMAT)
-        for path in self._states()[KEPT:]:
-            path.unlink(missing_ok=True)
+        path = self._folder / f"state-{number:09d}.npz"
+        save_tree(path, {**self._latest, "history": history[: number + 1]}, FORMAT)
+        for older in [state for state in self._states() if state <= path][KEPT:]:  # newer ones are damaged
+            older.unlink(missing_ok=True)
         self._latest, self._written = None, time.perf_counter()
         self._cost = self._written - begun
 
@@ -141,10 +142,6 @@ def _word(leaf):
     if callable(leaf):
         return f"{getattr(leaf, '__module__', '')} {getattr(leaf, '__qualname__', kind)}"
     return kind if " at 0x" in repr(leaf) else f"{kind} {leaf!r}"  # an address is another one in the next process
-
-
-def _bits(trial):
-    return _digest(np.float64(trial.value).tobytes() + trial.slope.tobytes())
 
 
 def _record(row):

@@ -59,11 +59,12 @@ class Watch:
             self.message = f"converged: the gradient is {f'{share:.1e} of that at the start' if share else 0}"
 
     def _met(self, record):
-        first, once = self.history[0], not self._trials.batches.varied  # a batch may have the gradient 0 alone
+        if record.gradient_norm == 0:
+            return not self._trials.batches.varied  # a batch may have the gradient 0 alone
+        first = self.history[0]
         if callable(self._tolerance):
-            return bool(record.gradient_norm == 0 and once or self._tolerance(record, first))
-        goal = self._tolerance * first.gradient_norm
-        return record.gradient_norm <= goal if once else record.gradient_norm < goal
+            return bool(self._tolerance(record, first))
+        return record.gradient_norm <= self._tolerance * first.gradient_norm
 
     def give_up(self, reason):
         """The method found no admissible point."""
