@@ -1,7 +1,7 @@
 """Space: where the numbers of a field live, as a value. No numbers are stored here."""
 
 from functools import cached_property
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from math import prod
 from typing import Any
 
@@ -13,7 +13,7 @@ from sparsedp.fields import check_plain
 from sparsedp.recipe import Uncached, Value
 from sparsedp.tape import dtype_of, isbox
 
-__all__ = ["Space", "fits", "whole_lengths"]
+__all__ = ["Space", "components", "fits", "whole_lengths"]
 
 
 class Space(Value, Uncached):
@@ -107,8 +107,7 @@ class Space(Value, Uncached):
         if self.layout is not None and self.layout.holds(v):
             return self.layout.split(self, v)
         check_plain("split", v)
-        flat, spans = anp.reshape(v, (-1,)), pairwise(self.offsets)
-        return tuple(flat[start:stop].reshape(part) for (start, stop), part in zip(spans, self.parts))
+        return tuple(components(anp.reshape(v, (-1,)), self.parts))
 
     def join(self, *parts):
         """Components -> one field of shape `shape`. Differentiable; inverse of `split`.
@@ -154,6 +153,12 @@ class Space(Value, Uncached):
         """Its name for messages, with the shape of a field where the name does not show it: faces are flat."""
         shape = self.shape if self.grid is None else self.grid.shape
         return str(self) if shape == self.shape else f"{self} of shape {self.shape}"
+
+
+def components(flat, parts):
+    """Flat field, traced or not -> its components, of these shapes."""
+    ends = accumulate(map(prod, parts))
+    return [flat[end - prod(part) : end].reshape(part) for end, part in zip(ends, parts)]
 
 
 def whole_lengths(shape):

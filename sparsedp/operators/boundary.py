@@ -7,7 +7,7 @@ from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
-from sparsedp.operators.stencils import along, wall_slopes
+from sparsedp.operators.stencils import along, between, wall_slopes
 from sparsedp.space import Space
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Diagonal, Mask
@@ -56,7 +56,7 @@ def lift(grid, boundary):
             blocks[axis, len(parts)] = along(axis, grid.dim, wall_slopes(grid, axis, side, condition))
             parts.append(tuple(1 if a == axis else n for a, n in enumerate(grid.shape)))
     walls = Space(None, "walls", grid, parts)
-    return Operator(Kronecker(grid.faces.parts, parts, blocks), walls, grid.faces, "lift")
+    return between(walls, grid.faces, blocks, "lift")
 
 
 def mask(space, keep):
@@ -112,15 +112,8 @@ def interior(grid, solid=None):
     array([0., 1., 1., 0.])
     """
     check_grid("interior", grid)
-    keep = [np.ones(part, dtype=bool) for part in grid.faces.parts]
-    for axis, inner in enumerate(keep):
-        if not grid.periodic[axis]:
-            np.moveaxis(inner, axis, 0)[[0, -1]] = False
-    flat = np.concatenate([part.ravel() for part in keep])
-    if solid is not None:
-        below, above = solid_faces(grid, check_solid(grid, solid))
-        flat &= ~(below | above)
-    return Operator(Mask(flat), grid.faces, grid.faces, "interior")
+    below, above = solid_faces(grid, np.ones(grid.shape, bool) if solid is None else ~check_solid(grid, solid))
+    return Operator(Mask(below & above), grid.faces, grid.faces, "interior")
 
 
 def identity(space):
@@ -231,9 +224,9 @@ def _is_run(side):
 
 
 def solid_faces(grid, solid):
-    """Cell mask -> two flat face masks: the cell below the face is solid, the cell above is.
+    """Cell mask, of a solid or of what is none -> two flat face masks: the cell below the face is in it, that above is.
 
-    Beyond a wall there is no cell, so nothing solid.
+    Beyond a wall there is no cell.
     """
     below, above = [], []
     for axis in range(grid.dim):

@@ -9,10 +9,9 @@ from sparsedp.conditions import check_condition, neumann, resolve
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, region_of, solid_faces
-from sparsedp.operators.stencils import along, differences, one_sided, pick, slopes
+from sparsedp.operators.stencils import along, between, differences, one_sided, pick, slopes, to_faces
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
-from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Mask, compose, total
 
 __all__ = ["curl", "divergence", "flux", "gradient", "laplacian", "upwind"]
@@ -59,24 +58,16 @@ def gradient(grid, boundary=neumann, solid=None, solid_boundary=neumann):
     """
     sides = resolve(grid, boundary)
     check_condition("solid_boundary", solid_boundary)
-    blocks = {(a, 0): along(a, grid.dim, slopes(grid, a, sides[a])) for a in range(grid.dim)}
-    structure = Kronecker(grid.faces.parts, grid.cells.parts, blocks)
-    if solid is not None:
-        structure = _around(grid, structure, check_solid(grid, solid), solid_boundary)
+    slope = to_faces(grid, "gradient", lambda grid, axis: slopes(grid, axis, sides[axis]))
+    if solid is None:
+        return slope
+    # The faces of solid cells are closed; there a slope from one side unless the condition is neumann.
+    below, above = solid_faces(grid, check_solid(grid, solid))
+    structure = compose(Mask(~(below | above)), slope.structure)
+    for upper, faces in ((True, below & ~above), (False, above & ~below)) if solid_boundary.a else ():
+        side = to_faces(grid, "gradient", one_sided, upper, solid_boundary)
+        structure = total(structure, compose(Mask(faces), side.structure))
     return Operator(structure, grid.cells, grid.faces, "gradient")
-
-
-def _around(grid, structure, solid, condition):
-    """Close the faces of solid cells; a one-sided slope there unless the condition is neumann."""
-    below, above = solid_faces(grid, solid)
-    found = compose(Mask(~(below | above)), structure)
-    if condition.a == 0:
-        return found
-    for upper, faces in ((True, below & ~above), (False, above & ~below)):
-        blocks = {(a, 0): along(a, grid.dim, one_sided(grid, a, upper, condition)) for a in range(grid.dim)}
-        from_one_side = Kronecker(grid.faces.parts, grid.cells.parts, blocks)
-        found = total(found, compose(Mask(faces), from_one_side))
-    return found
 
 
 def divergence(grid):
@@ -104,7 +95,7 @@ def divergence(grid):
     """
     check_grid("divergence", grid)
     blocks = {(0, a): along(a, grid.dim, differences(grid, a)) for a in range(grid.dim)}
-    return Operator(Kronecker(grid.cells.parts, grid.faces.parts, blocks), grid.faces, grid.cells, "divergence")
+    return between(grid.faces, grid.cells, blocks, "divergence")
 
 
 def flux(grid, cells):
@@ -218,15 +209,13 @@ def curl(grid):
     check_grid("curl", grid)
     if grid.dim == 1:
         raise ValueError(f"curl needs a 2-D or 3-D grid, got {grid}; a 1-D slope is gradient(grid)")
-    if grid.dim == 2:
-        blocks = {(0, 0): along(1, 2, differences(grid, 1)), (1, 0): along(0, 2, differences(grid, 0), -1.0)}
-        return Operator(Kronecker(grid.faces.parts, grid.nodes.parts, blocks), grid.nodes, grid.faces, "curl")
-    blocks = {}
-    for a in range(3):
-        b, c = (a + 1) % 3, (a + 2) % 3
-        blocks[a, c] = along(b, 3, differences(grid, b))
-        blocks[a, b] = along(c, 3, differences(grid, c), -1.0)
-    return Operator(Kronecker(grid.faces.parts, grid.edges.parts, blocks), grid.edges, grid.faces, "curl")
+    flat, blocks = grid.dim == 2, {}  # in 2-D nodes are edges along z, the only ones
+    for a in range(grid.dim):
+        for along_edge, across, sign in ((a + 2, a + 1, 1.0), (a + 1, a + 2, -1.0)):
+            edge, axis = along_edge % 3, across % 3
+            if axis < grid.dim:
+                blocks[a, 0 if flat else edge] = along(axis, grid.dim, differences(grid, axis), sign)
+    return between(grid.nodes if flat else grid.edges, grid.faces, blocks, "curl")
 
 
 def upwind(grid, axis=0, direction=1, boundary=neumann):
@@ -264,5 +253,4 @@ def upwind(grid, axis=0, direction=1, boundary=neumann):
         raise ValueError(f"upwind needs direction 1 or -1, got {direction!r}")
     sides = resolve(grid, boundary)[axis]
     factor = pick(grid, axis, direction == -1) @ slopes(grid, axis, sides)
-    structure = Kronecker(grid.cells.parts, grid.cells.parts, {(0, 0): along(axis, grid.dim, factor)})
-    return Operator(structure, grid.cells, grid.cells, "upwind")
+    return between(grid.cells, grid.cells, {(0, 0): along(axis, grid.dim, factor)}, "upwind")

@@ -14,11 +14,9 @@ import numpy as np
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_finite, check_native
 from sparsedp.grid import check_grid
-from sparsedp.operator import Operator
-from sparsedp.operators.stencils import along, cell_beside
+from sparsedp.operators.stencils import cell_beside, to_faces
 from sparsedp.recipe import Made
 from sparsedp.shortcuts import array
-from sparsedp.structure.kronecker import Kronecker
 from sparsedp.tape import entrywise, plain
 
 __all__ = ["harmonic_average"]
@@ -54,10 +52,8 @@ def harmonic_average(grid):
     array([1. , 1.5, 3. ])
     """
     check_grid("harmonic_average", grid)
-    below, above = (_beside(grid, upper) for upper in (False, True))
-    widths = grid.join(*(_full_widths(grid, axis, upper=False) for axis in range(grid.dim)))
-    others = grid.join(*(_full_widths(grid, axis, upper=True) for axis in range(grid.dim)))
-    pair = _pair_rule(widths / (widths + others))
+    below, above = to_faces(grid, "cell below", cell_beside, False), to_faces(grid, "cell above", cell_beside, True)
+    pair = _pair_rule(grid.join(*(_lower_share(grid, axis) for axis in range(grid.dim))))
 
     def average(k):
         check_native("harmonic_average", k)
@@ -74,15 +70,10 @@ def harmonic_average(grid):
     return Made(average, harmonic_average, grid)
 
 
-def _beside(grid, upper):
-    blocks = {(a, 0): along(a, grid.dim, cell_beside(grid, a, upper)) for a in range(grid.dim)}
-    structure = Kronecker(grid.faces.parts, grid.cells.parts, blocks)
-    return Operator(structure, grid.cells, grid.faces, "cell above" if upper else "cell below")
-
-
-def _full_widths(grid, axis, upper):
-    line = cell_beside(grid, axis, upper).matrix @ grid.widths[axis]
-    return line.reshape([-1 if a == axis else 1 for a in range(grid.dim)])
+def _lower_share(grid, axis):
+    """The module's w_l of the faces across an axis, as it broadcasts."""
+    low, high = (cell_beside(grid, axis, upper).matrix @ grid.widths[axis] for upper in (False, True))
+    return (low / (low + high)).reshape([-1 if a == axis else 1 for a in range(grid.dim)])
 
 
 def _pair_rule(share):

@@ -1,11 +1,15 @@
-"""The 1-D factors from which the catalogue is built. One axis, a few diagonals each."""
+"""The 1-D factors from which the catalogue is built, a few diagonals each, and how operators are made of them."""
 
 import numpy as np
 
+from sparsedp.operator import Operator
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker, Term
 
-__all__ = ["along", "cell_beside", "differences", "means", "one_sided", "pick", "single", "slopes", "wall_slopes"]
+__all__ = [
+    "along", "between", "cell_beside", "differences", "means", "one_sided", "pick", "slopes", "to_faces",
+    "wall_slopes",
+]  # fmt: skip
 
 
 def along(axis, dim, factor, scale=1.0):
@@ -13,9 +17,15 @@ def along(axis, dim, factor, scale=1.0):
     return (Term(scale, tuple(factor if a == axis else None for a in range(dim))),)
 
 
-def single(domain, codomain, factors):
-    """One Kronecker product between two spaces of one component -> structure."""
-    return Kronecker(codomain.parts, domain.parts, {(0, 0): (Term(1.0, tuple(factors)),)})
+def between(domain, codomain, blocks, name):
+    """Two spaces and the terms for each pair (component of the result, component of the field) -> Operator."""
+    return Operator(Kronecker(codomain.parts, domain.parts, blocks), domain, codomain, name)
+
+
+def to_faces(grid, name, factor, *args):
+    """``factor(grid, axis, *args)``, from cells to the faces across that axis -> Operator from cells to all faces."""
+    blocks = {(axis, 0): along(axis, grid.dim, factor(grid, axis, *args)) for axis in range(grid.dim)}
+    return between(grid.cells, grid.faces, blocks, name)
 
 
 def differences(grid, axis):

@@ -11,11 +11,11 @@ from sparsedp.fields import check_finite, is_whole
 from sparsedp.grid import Grid, check_grid, real_numbers
 from sparsedp.operator import Operator
 from sparsedp.operators.interpolation import linear_weights
-from sparsedp.operators.stencils import along, means, single
+from sparsedp.operators.stencils import along, between, means, to_faces
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.factor import Factor
-from sparsedp.structure.kronecker import Kronecker
+from sparsedp.structure.kronecker import Term
 
 __all__ = ["average", "component", "prolong", "restrict", "sample"]
 
@@ -40,8 +40,7 @@ def average(grid, boundary=neumann):
     array([1. , 1.5, 3. , 4. ])
     """
     sides = resolve(grid, boundary)
-    blocks = {(a, 0): along(a, grid.dim, means(grid, a, sides[a])) for a in range(grid.dim)}
-    return Operator(Kronecker(grid.faces.parts, grid.cells.parts, blocks), grid.cells, grid.faces, "average")
+    return to_faces(grid, "average", lambda grid, axis: means(grid, axis, sides[axis]))
 
 
 def sample(grid, points):
@@ -83,17 +82,14 @@ def sample(grid, points):
     if not grid.cells.size:
         raise ShapeError(f"sample needs a grid with cells, got {grid}")
     check_finite("points", given, "need finite coordinates")
-    corners = [linear_weights(grid, axis, points[:, axis]) for axis in range(grid.dim)]
-    count = np.arange(len(points))
-    rows, columns, values = [], [], []
-    for sides in product((0, 1), repeat=grid.dim):
-        cells = [corner[side] for corner, side in zip(corners, sides, strict=True)]
-        weights = [corner[2] if side else 1 - corner[2] for corner, side in zip(corners, sides, strict=True)]
-        rows.append(count)
+    lines = [linear_weights(grid, axis, points[:, axis]) for axis in range(grid.dim)]
+    columns, values = [], []
+    for corner in product(*(((lower, 1 - weight), (upper, weight)) for lower, upper, weight in lines)):
+        cells, weights = zip(*corner)
         columns.append(np.ravel_multi_index(cells, grid.shape))
         values.append(np.prod(weights, axis=0))
-    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    matrix = sp.coo_array(entries, shape=(len(points), grid.cells.size))
+    rows = np.broadcast_to(np.arange(len(points)), np.shape(values))
+    matrix = sp.coo_array((np.ravel(values), (np.ravel(rows), np.ravel(columns))), (len(points), grid.cells.size))
     return Operator(Matrix(matrix), grid.cells, Space(len(points)), "sample")
 
 
@@ -129,7 +125,7 @@ def restrict(grid, factor):
         fine = np.arange(h.size)
         weights = h / np.repeat(h.reshape(-1, size).sum(axis=1), size)
         lines.append(Factor.from_diagonals((h.size // size, h.size), (fine // size, fine, weights)))
-    return Operator(single(grid.cells, coarse.cells, lines), grid.cells, coarse.cells, "restrict")
+    return between(grid.cells, coarse.cells, {(0, 0): (Term(1.0, tuple(lines)),)}, "restrict")
 
 
 def prolong(grid, factor, interpolation="constant"):
@@ -177,7 +173,7 @@ def prolong(grid, factor, interpolation="constant"):
         else:
             lower, upper, weight = linear_weights(coarse, axis, grid.coordinates(axis))
             lines.append(Factor.from_diagonals(shape, (fine, lower, 1 - weight), (fine, upper, weight)))
-    return Operator(single(coarse.cells, grid.cells, lines), coarse.cells, grid.cells, "prolong")
+    return between(coarse.cells, grid.cells, {(0, 0): (Term(1.0, tuple(lines)),)}, "prolong")
 
 
 def _coarse(grid, factor):
@@ -219,5 +215,4 @@ def component(grid, axis):
     check_grid("component", grid)
     axis = grid.axis(axis)
     own = Space(grid.face_shape(axis), f"{grid.axes[axis]}-faces", grid)
-    blocks = {(0, axis): along(axis, grid.dim, None)}
-    return Operator(Kronecker(own.parts, grid.faces.parts, blocks), grid.faces, own, "component")
+    return between(grid.faces, own, {(0, axis): along(axis, grid.dim, None)}, "component")

@@ -18,9 +18,10 @@ from sparsedp.parallel.exchange import of_boxes, of_entries
 from sparsedp.parallel.partition import lengths, slices
 from sparsedp.solvers.inverses import Solution
 from sparsedp.solvers.nullspace import Projector
+from sparsedp.space import components
 from sparsedp.structure.base import Matrix, Structure, rows_of
 from sparsedp.structure.factor import Factor
-from sparsedp.structure.kronecker import Kronecker, Term, components
+from sparsedp.structure.kronecker import Kronecker, Term
 from sparsedp.structure.lazy import Chain, Diagonal, Mask, Sum
 
 __all__ = ["Entries", "Rows", "OnBlocks", "between", "localized"]

@@ -26,8 +26,7 @@ from sparsedp.grid import Grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.parallel.exchange import of_boxes
 from sparsedp.parallel.fields import DistributedField, block
-from sparsedp.space import Space
-from sparsedp.structure.kronecker import components
+from sparsedp.space import Space, components
 from sparsedp.tape import Rule, isbox, plain
 
 __all__ = ["Carry"]

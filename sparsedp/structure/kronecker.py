@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from functools import cached_property, partial, reduce
-from itertools import accumulate, product
+from itertools import product
 from math import prod
 from operator import add
 from typing import Any, NamedTuple
@@ -12,10 +12,11 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from sparsedp import kernels
+from sparsedp.space import components
 from sparsedp.structure.base import Structure, compact
 from sparsedp.structure.factor import Factor
 
-__all__ = ["Kronecker", "Term", "components"]
+__all__ = ["Kronecker", "Term"]
 
 
 class Term(NamedTuple):
@@ -215,12 +216,6 @@ def _pass(term, shape):
 
 def _absolute(term):
     return Term(abs(term.scale), tuple(factor and Factor(abs(factor.matrix)) for factor in term.factors))
-
-
-def components(flat, parts):
-    """Flat field -> its components."""
-    ends = accumulate(map(prod, parts))
-    return [flat[end - prod(part) : end].reshape(part) for end, part in zip(ends, parts)]
 
 
 def _block(terms, out_part, in_part):

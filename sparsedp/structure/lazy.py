@@ -12,8 +12,9 @@ from sparsedp import kernels
 from sparsedp.constants import frozen
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.recipe import Remade
+from sparsedp.space import components
 from sparsedp.structure.base import Structure, compact, rows_of
-from sparsedp.structure.kronecker import Kronecker, components
+from sparsedp.structure.kronecker import Kronecker
 
 __all__ = [
     "Chain",
