@@ -7,7 +7,7 @@ from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
-from sparsedp.operators.stencils import along, between, wall_slopes
+from sparsedp.operators.stencils import along, kronecker_operator, wall_slopes
 from sparsedp.space import Space
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Diagonal, Mask
@@ -56,7 +56,7 @@ def lift(grid, boundary):
             blocks[axis, len(parts)] = along(axis, grid.dim, wall_slopes(grid, axis, side, condition))
             parts.append(tuple(1 if a == axis else n for a, n in enumerate(grid.shape)))
     walls = Space(None, "walls", grid, parts)
-    return between(walls, grid.faces, blocks, "lift")
+    return kronecker_operator(walls, grid.faces, blocks, "lift")
 
 
 def mask(space, keep):

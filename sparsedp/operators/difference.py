@@ -9,7 +9,7 @@ from sparsedp.conditions import check_condition, neumann, resolve
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, region_of, solid_faces
-from sparsedp.operators.stencils import along, between, differences, one_sided, pick, slopes, to_faces
+from sparsedp.operators.stencils import along, differences, kronecker_operator, one_sided, pick, slopes, to_faces
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.lazy import Mask, compose, total
@@ -95,7 +95,7 @@ def divergence(grid):
     """
     check_grid("divergence", grid)
     blocks = {(0, a): along(a, grid.dim, differences(grid, a)) for a in range(grid.dim)}
-    return between(grid.faces, grid.cells, blocks, "divergence")
+    return kronecker_operator(grid.faces, grid.cells, blocks, "divergence")
 
 
 def flux(grid, cells):
@@ -215,7 +215,7 @@ def curl(grid):
             edge, axis = along_edge % 3, across % 3
             if axis < grid.dim:
                 blocks[a, 0 if flat else edge] = along(axis, grid.dim, differences(grid, axis), sign)
-    return between(grid.nodes if flat else grid.edges, grid.faces, blocks, "curl")
+    return kronecker_operator(grid.nodes if flat else grid.edges, grid.faces, blocks, "curl")
 
 
 def upwind(grid, axis=0, direction=1, boundary=neumann):
@@ -253,4 +253,4 @@ def upwind(grid, axis=0, direction=1, boundary=neumann):
         raise ValueError(f"upwind needs direction 1 or -1, got {direction!r}")
     sides = resolve(grid, boundary)[axis]
     factor = pick(grid, axis, direction == -1) @ slopes(grid, axis, sides)
-    return between(grid.cells, grid.cells, {(0, 0): along(axis, grid.dim, factor)}, "upwind")
+    return kronecker_operator(grid.cells, grid.cells, {(0, 0): along(axis, grid.dim, factor)}, "upwind")

@@ -7,7 +7,7 @@ from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker, Term
 
 __all__ = [
-    "along", "between", "cell_beside", "differences", "means", "one_sided", "pick", "slopes", "to_faces",
+    "along", "kronecker_operator", "cell_beside", "differences", "means", "one_sided", "pick", "slopes", "to_faces",
     "wall_slopes",
 ]  # fmt: skip
 
@@ -17,7 +17,7 @@ def along(axis, dim, factor, scale=1.0):
     return (Term(scale, tuple(factor if a == axis else None for a in range(dim))),)
 
 
-def between(domain, codomain, blocks, name):
+def kronecker_operator(domain, codomain, blocks, name):
     """Two spaces and the terms for each pair (component of the result, component of the field) -> Operator."""
     return Operator(Kronecker(codomain.parts, domain.parts, blocks), domain, codomain, name)
 
@@ -25,7 +25,7 @@ def between(domain, codomain, blocks, name):
 def to_faces(grid, name, factor, *args):
     """``factor(grid, axis, *args)``, from cells to the faces across that axis -> Operator from cells to all faces."""
     blocks = {(axis, 0): along(axis, grid.dim, factor(grid, axis, *args)) for axis in range(grid.dim)}
-    return between(grid.cells, grid.faces, blocks, name)
+    return kronecker_operator(grid.cells, grid.faces, blocks, name)
 
 
 def differences(grid, axis):

@@ -11,7 +11,7 @@ from sparsedp.fields import check_finite, is_whole
 from sparsedp.grid import Grid, check_grid, real_numbers
 from sparsedp.operator import Operator
 from sparsedp.operators.interpolation import linear_weights
-from sparsedp.operators.stencils import along, between, means, to_faces
+from sparsedp.operators.stencils import along, kronecker_operator, means, to_faces
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.factor import Factor
@@ -125,7 +125,7 @@ def restrict(grid, factor):
         fine = np.arange(h.size)
         weights = h / np.repeat(h.reshape(-1, size).sum(axis=1), size)
         lines.append(Factor.from_diagonals((h.size // size, h.size), (fine // size, fine, weights)))
-    return between(grid.cells, coarse.cells, {(0, 0): (Term(1.0, tuple(lines)),)}, "restrict")
+    return kronecker_operator(grid.cells, coarse.cells, {(0, 0): (Term(1.0, tuple(lines)),)}, "restrict")
 
 
 def prolong(grid, factor, interpolation="constant"):
@@ -173,7 +173,7 @@ def prolong(grid, factor, interpolation="constant"):
         else:
             lower, upper, weight = linear_weights(coarse, axis, grid.coordinates(axis))
             lines.append(Factor.from_diagonals(shape, (fine, lower, 1 - weight), (fine, upper, weight)))
-    return between(coarse.cells, grid.cells, {(0, 0): (Term(1.0, tuple(lines)),)}, "prolong")
+    return kronecker_operator(coarse.cells, grid.cells, {(0, 0): (Term(1.0, tuple(lines)),)}, "prolong")
 
 
 def _coarse(grid, factor):
@@ -215,4 +215,4 @@ def component(grid, axis):
     check_grid("component", grid)
     axis = grid.axis(axis)
     own = Space(grid.face_shape(axis), f"{grid.axes[axis]}-faces", grid)
-    return between(grid.faces, own, {(0, axis): along(axis, grid.dim, None)}, "component")
+    return kronecker_operator(grid.faces, own, {(0, axis): along(axis, grid.dim, None)}, "component")
