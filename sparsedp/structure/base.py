@@ -147,10 +147,7 @@ def compact(matrix):
     matrix = sp.csr_array(matrix)
     matrix.sum_duplicates()
     matrix.sort_indices()
-    if matrix.indices.dtype != np.int32 or matrix.indptr.dtype != np.int32:
-        arrays = matrix.data, matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32)
-        matrix = sp.csr_array(arrays, shape=matrix.shape)
-        matrix.has_canonical_format = True
+    matrix.indices, matrix.indptr = (part.astype(np.int32, copy=False) for part in (matrix.indices, matrix.indptr))
     return matrix
 
 
