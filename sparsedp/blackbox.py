@@ -13,10 +13,11 @@ import scipy.sparse as sp
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite, check_function
 from sparsedp.ledger import active, count
+from sparsedp.operators.given import from_matrix
 from sparsedp.recipe import Remade
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
-from sparsedp.tape import Rule, isbox, linear, plain
+from sparsedp.tape import Rule, isbox, plain
 
 __all__ = ["Adopted", "adopt"]
 
@@ -117,8 +118,8 @@ class Adopted(Remade):
         self._rule = Rule(
             name,
             self._run,
-            lambda nums, y, x: lambda g: (self._products(x, y)[1](g),),
-            lambda nums, tangents, y, x: self._products(x, y)[0](tangents[0]),
+            lambda nums, y, x: lambda g: (self._operator(x, y).T(g),),
+            lambda nums, tangents, y, x: self._operator(x, y)(tangents[0]),
         )
 
     def recipe(self):
@@ -153,8 +154,8 @@ class Adopted(Remade):
             raise TypeError(f"{self.name} must return real numbers, got dtype {y.dtype}; take the real part")
         return y.astype(float) if y.dtype.kind in "biu" else y
 
-    def _products(self, x, y):
-        """v -> J v and g -> J^T g at the argument of a run with the result y, each the other's derivative."""
+    def _operator(self, x, y):
+        """The Jacobian as an Operator, at the argument of a run with the result y."""
         if isbox(x):
             raise DerivativeError(
                 f"{self.name} is adopted: its Jacobian is known, its second derivative is not; use a method with "
@@ -166,12 +167,7 @@ class Adopted(Remade):
                 f"{self.name} gives another result for the same argument than before; it must depend on its argument "
                 "only, so what changes from call to call must be a part of it"
             )
-        (inputs, outputs), turned = self._shapes, matrix.T
-        return linear(
-            f"{self.name}.J",
-            lambda v: (matrix @ np.ravel(v)).reshape(outputs),
-            lambda g: (turned @ np.ravel(g)).reshape(inputs),
-        )
+        return from_matrix(matrix, *self._shapes, f"{self.name}.J")
 
     def jacobian(self, x):
         """dy/dx at a point, csr_array; kept for the last two points.

@@ -26,14 +26,12 @@ def pad(x, widths, padding):
 def fold(x, widths, padding):
     """The transpose of `pad`."""
     for axis, width in zip((-2, -1), widths):
-        if width == 1:
-            continue
         wide, reach, n = np.moveaxis(x, axis, 0), width // 2, x.shape[axis] - width + 1
         core = wide[reach : reach + n].copy()
         if padding != "zero" and n:
             sources = np.pad(np.arange(n), reach, MODES[padding])
-            for ghosts in (slice(reach), slice(n + reach, None)):
-                np.add.at(core, sources[ghosts], wide[ghosts])
+            ghosts = np.r_[:reach, n + reach : n + 2 * reach]
+            np.add.at(core, sources[ghosts], wide[ghosts])
         x = np.moveaxis(core, 0, axis)
     return np.ascontiguousarray(x)
 

@@ -88,28 +88,6 @@ def _check(weight, bias, x, padding):
         raise ShapeError(f"convolution got x {x}, weight {weight} and bias {bias}; inputs, outputs or samples differ")
 
 
-def by_parts(name, forward, backs, forths):
-    """A rule from its derivatives in each of its first arguments.
-
-    Parameters
-    ----------
-    name : str
-    forward : callable
-        ``forward(*args) -> y``.
-    backs, forths : tuples of callables
-        ``back(g, y, *args)``, the cotangent of one argument, and ``forth(t, y, *args)``, the tangent of y along one.
-    """
-
-    def vjp(nums, y, *args):
-        return lambda g: tuple(backs[num](g, y, *args) for num in nums)
-
-    def jvp(nums, tangents, y, *args):
-        parts = [forths[num](t, y, *args) for num, t in zip(nums, tangents, strict=True)]
-        return sum(parts[1:], parts[0])
-
-    return Rule(name, forward, vjp, jvp)
-
-
 def _third(a, b, slot, shape, padding):
     """Of x, w and g in T(x, w, g), slots 0, 1 and 2, what multiplies the one in a slot: made of the next two in turn.
 
@@ -126,12 +104,16 @@ def _third(a, b, slot, shape, padding):
     return correlate(pad(a, widths, padding), b)
 
 
-_trilinear: Rule = by_parts(
-    "convolution",
-    _third,
-    (
-        lambda g, y, a, b, slot, *rest: _trilinear(b, g, (slot + 1) % 3, *rest),
-        lambda g, y, a, b, slot, *rest: _trilinear(g, a, (slot + 2) % 3, *rest),
-    ),
-    (lambda t, y, a, *rest: _trilinear(t, *rest), lambda t, y, a, b, *rest: _trilinear(a, t, *rest)),
-)
+def _vjp(nums, y, a, b, slot, *rest):
+    """The cotangent of a, which stands two slots before the third, and of b, which stands one before."""
+    return lambda g: tuple(
+        _trilinear(g, a, (slot + 2) % 3, *rest) if num else _trilinear(b, g, (slot + 1) % 3, *rest) for num in nums
+    )
+
+
+def _jvp(nums, tangents, y, a, b, *rest):
+    parts = [_trilinear(a, t, *rest) if num else _trilinear(t, b, *rest) for num, t in zip(nums, tangents, strict=True)]
+    return sum(parts[1:], parts[0])
+
+
+_trilinear = Rule("convolution", _third, _vjp, _jvp)

@@ -4,8 +4,8 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.network.filters import by_parts, convolution, weight_and_bias
-from sparsedp.tape import plain
+from sparsedp.network.filters import convolution, weight_and_bias
+from sparsedp.tape import Rule, plain
 
 __all__ = ["dense", "relu", "residual_block", "softplus", "tanh"]
 
@@ -45,14 +45,9 @@ def dense(p, x):
     return product + bias
 
 
-def _activation(name, forward, slope):
-    """A function of each number from its value and slope(x, y), y the value."""
-    along = (lambda t, y, x: t * slope(x, y),)
-    return by_parts(name, forward, along, along)
-
-
-_TANH = _activation("tanh", np.tanh, lambda x, y: 1.0 - y * y)
-_RELU = _activation("relu", lambda x: np.maximum(x, 0.0), lambda x, y: 0.5 * (1.0 + anp.sign(plain(x))))
+_TANH = Rule(  # autograd's own overflows
+    "tanh", np.tanh, lambda nums, y, x: lambda g: (g * (1.0 - y * y),), lambda nums, t, y, x: t[0] * (1.0 - y * y)
+)
 
 
 def tanh(x):
@@ -76,7 +71,7 @@ def relu(x):
     >>> relu(np.array([-1.0, 2.0]))
     array([0., 2.])
     """
-    return _RELU(x)
+    return anp.maximum(x, 0.0)
 
 
 def softplus(x):
