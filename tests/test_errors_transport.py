@@ -52,14 +52,18 @@ CASES = [
     (
         call(dt=0.0),
         ValueError,
-        "transport upwind needs dt > 0, got 0; to go back in time turn the velocity round",
+        "dt of transport upwind must be > 0, got 0; write dt=0.01, or turn the velocity round",
     ),
     (
         call(dt="soon"),
         TypeError,
-        "transport upwind needs one real number as dt, got 'soon'; write for example dt=0.01",
+        "dt of transport upwind must be one real number, got 'soon'; write dt=0.01, or turn the velocity round",
     ),
-    (call(dt=np.nan), NonFiniteError, "transport upwind needs a finite dt, got nan; write a finite number"),
+    (
+        call(dt=np.nan),
+        NonFiniteError,
+        "dt of transport upwind must be finite, got nan; write dt=0.01, or turn the velocity round",
+    ),
     (call(u=U[0]), ShapeError, "transport upwind takes u of shape (3, 2), got an array of shape (2,)"),
     (
         call(v=U),

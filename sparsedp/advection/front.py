@@ -223,9 +223,8 @@ class Transport(Frozen, Remade):
             raise DerivativeError(
                 f"{name}.operator needs constant v and dt, got traced ones; call move(u, v, dt) instead"
             )
-        check_step(name, dt)
-        flat = flat_numbers(name, "v", v, self.law.velocity_shapes)
-        return Operator(Matrix(self.law.matrix(flat, float(dt))), self.space, self.space, name)
+        dt, flat = check_step(name, dt), flat_numbers(name, "v", v, self.law.velocity_shapes)
+        return Operator(Matrix(self.law.matrix(flat, dt)), self.space, self.space, name)
 
     def __getattr__(self, name):
         advice = "; write lambda u, v: move(u, v, dt)" if name == "step" else ""  # of the first edition

@@ -5,7 +5,7 @@ import numpy as np
 
 from sparsedp.advection.law import INFLOW, STEP
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_finite, check_native, is_number
+from sparsedp.fields import check_native, check_number
 from sparsedp.tape import cast, dtype_of, isbox, plain
 
 __all__ = ["LETTERS", "check_given", "check_step", "flat_numbers", "prepare", "raised", "result_like", "unflatten"]
@@ -17,20 +17,16 @@ LETTERS = "u", "v", "dt", "inflow"
 def prepare(law, u, v, dt, inflow):
     """Arguments of a step -> the arguments of a law."""
     if type(dt) is not float or not 0 < dt < np.inf:
-        check_step(law.name, plain(dt))
-        dt = dt if isbox(dt) else float(dt)
+        number = check_step(law.name, plain(dt))
+        dt = dt if isbox(dt) else number
     u = flat_numbers(law.name, "u", u, law.field_shapes)
     v = flat_numbers(law.name, "v", v, law.velocity_shapes)
     return u, v, dt, _inflow(law.name, inflow, law.walls)
 
 
 def check_step(name, dt):
-    """Refuse a time step that is no positive number."""
-    if not is_number(dt):
-        raise TypeError(f"{name} needs one real number as dt, got {dt!r}; write for example dt=0.01")
-    check_finite(name, dt, "needs a finite dt")
-    if not dt > 0:
-        raise ValueError(f"{name} needs dt > 0, got {dt:g}; to go back in time turn the velocity round")
+    """A time step, a positive number -> a float."""
+    return check_number(f"dt of {name}", dt, "> 0", "; write dt=0.01, or turn the velocity round")
 
 
 def flat_numbers(name, letter, value, shapes):

@@ -29,7 +29,7 @@ from sparsedp.conditions import free_slip, outflow, resolve
 from sparsedp.conditions import inflow as inflow_side
 from sparsedp.constants import constant, frozen
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_finite, check_plain, check_takes, is_number, is_whole
+from sparsedp.fields import check_finite, check_number, check_plain, check_takes, is_whole
 from sparsedp.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.recipe import Remade
@@ -279,8 +279,7 @@ class ConservationLaw(Remade):
         float [time]
             Infinite where nothing moves. Not differentiated.
         """
-        if not (is_number(cfl) and 0 < cfl < np.inf):
-            raise ValueError(f"time_step needs a finite cfl > 0, got {cfl!r}; write cfl=0.4")
+        check_number("cfl of time_step", cfl, "> 0", "; write cfl=0.4")
         u, params = mapped(plain, (self._state(u), params))
         speeds = [np.max(np.abs(self._speeds(axis.number, u, params)), axis=0) / axis.widths for axis in self.axes]
         most = np.max(sum(speeds), initial=0.0)

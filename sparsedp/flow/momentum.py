@@ -16,7 +16,7 @@ from sparsedp.grid import Grid
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.difference import divergence, gradient
-from sparsedp.operators.stencils import along, differences, means, pick, slopes, wall_slopes
+from sparsedp.operators.stencils import along, differences, kronecker_operator, means, pick, slopes, wall_slopes
 from sparsedp.recipe import Made
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
@@ -202,9 +202,9 @@ def momentum_fluxes(grid, sides):
         gain[c, number] = along(a, grid.dim, back)
         flux.append(tuple(mean.shape[0] if b == a else n for b, n in enumerate(grid.face_shape(c))))
     faces, sites = grid.faces, Space(None, "fluxes", grid, flux)
-    A = Operator(Kronecker(flux, faces.parts, carried), faces, sites, "carried")
-    B = Operator(Kronecker(flux, faces.parts, carrier), faces, sites, "carrier")
-    return A, B, Operator(Kronecker(faces.parts, flux, gain), sites, faces, "gain")
+    A = kronecker_operator(faces, sites, carried, "carried")
+    B = kronecker_operator(faces, sites, carrier, "carrier")
+    return A, B, kronecker_operator(sites, faces, gain, "gain")
 
 
 # ------------------------------------------------------------ the factors

@@ -30,12 +30,11 @@ from sparsedp.grid import check_grid, numbers_per_axis
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, mask, region_of, solid_faces
 from sparsedp.operators.difference import gradient
-from sparsedp.operators.stencils import along
+from sparsedp.operators.stencils import along, kronecker_operator
 from sparsedp.recipe import Made, Remade
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.factor import Factor
-from sparsedp.structure.kronecker import Kronecker
 from sparsedp.tape import plain
 from sparsedp.tree import copied
 
@@ -178,7 +177,7 @@ def _differences(grid, axis, back):
         ones = np.ones(here.size)
         factor = Factor.from_diagonals((here.size,) * 2, (here, (low + 1) % n, ones), (here, low, -ones))
         blocks[c, c] = along(axis, grid.dim, factor)
-    return Operator(Kronecker(grid.faces.parts, grid.faces.parts, blocks), grid.faces, grid.faces, "brinkman")
+    return kronecker_operator(grid.faces, grid.faces, blocks, "brinkman")
 
 
 class Forces(Remade):

@@ -1,6 +1,7 @@
 """The Jacobian of a function of a tree at one point: products with it, and all of it when it fits."""
 
 from copy import copy
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -60,11 +61,8 @@ class Linearised:
     def __init__(self, outputs, packing, vector, rest=(), apart=False, dense=None):
         self._outputs, self._packing, self._apart = lambda x: outputs(x, *rest), packing, apart
         self._tree, self._free = packing.unpack(vector), True
-        self._pull = self._jacobian = None
-        if apart:  # a product with J^T is sure to come
-            self.value, self._pull = pullback(self._outputs, self._tree)
-        else:
-            self.value = np.asarray(self._outputs(packing.unpack(vector)))
+        # With samples a product with J^T is sure to come.
+        self.value = self._taped[0] if apart else np.asarray(self._outputs(packing.unpack(vector)))
         if np.ndim(self.value) == 0:
             raise DerivativeError("the outputs are one number; return the residuals as an array, do not sum them")
         if np.iscomplexobj(self.value) or packing.complex:
@@ -75,6 +73,10 @@ class Linearised:
         small = rows * columns <= DENSE and min(rows, columns) <= DENSE_SIDE
         self.dense = small if dense is None else dense
         self._forward = columns < rows and not apart  # fewer products give the columns than the rows
+
+    @cached_property
+    def _taped(self):
+        return pullback(self._outputs, self._tree)
 
     def among(self, free):
         """The same where the unknowns that are not free stand still: their columns of J are 0.
@@ -89,29 +91,29 @@ class Linearised:
         """(m,) -> J^T w, (n,). Columns that are formed anyway spare the tape."""
         if self.dense and self._forward:
             return w @ self.rows()
-        if self._pull is None:
-            self._pull = pullback(self._outputs, self._tree)[1]
         g = w.reshape(self.value.shape).astype(self.value.dtype)
-        return self._free * self._packing.pack_gradient(self._pull(g))
+        return self._free * self._packing.pack_gradient(self._taped[1](g))
 
     def push(self, v):
         """(n,) -> J v, (m,)."""
-        if self._jacobian is not None:
+        if "_jacobian" in vars(self):
             return self._jacobian @ (self._free * v)
         tangents = [leaf if is_variable(leaf) else None for leaf in leaves(self._packing.unpack(self._free * v))]
         return push(self._outputs, self._tree, tangents)[1].reshape(-1).astype(float)
 
     def rows(self):
-        """J, m x n, by a product for each column or for each row, whichever are fewer; apart: for each of a sample."""
-        if self._jacobian is None:
-            rows, columns = self.shape
-            if self._apart:
-                self._jacobian = self._rows_apart()
-            elif self._forward:
-                self._jacobian = np.array([self.push(unit) for unit in np.eye(columns)]).reshape(columns, rows).T
-            else:
-                self._jacobian = np.array([self.pull(unit) for unit in np.eye(rows)]).reshape(self.shape)
+        """J, m x n."""
         return self._jacobian if self._free is True else self._jacobian * self._free
+
+    @cached_property
+    def _jacobian(self):
+        """By a product for each column or for each row, whichever are fewer; apart: for each of a sample."""
+        rows, columns = self.shape
+        if self._apart:
+            return self._rows_apart()
+        if self._forward:
+            return np.array([self.push(unit) for unit in np.eye(columns)]).reshape(columns, rows).T
+        return np.array([self.pull(unit) for unit in np.eye(rows)]).reshape(self.shape)
 
     def covariance(self):
         """s^2 (J^T J)^(-1), n x n, with s^2 = |outputs|^2 / (m - n); infinite where J has not the rank n.
