@@ -30,7 +30,12 @@ __all__ = [
 ]
 
 FLOAT = np.dtype(float)
-LIBRARIES = {"torch": "torch", "jax": "jax", "jaxlib": "jax"}  # by the package that the type of an array comes from
+WRAP = "{0}; wrap what is computed in dp.interop.to_{0}(f), which keeps gradients"
+# By the package that the type of an array comes from: which library that is, and what to write instead.
+LIBRARIES = {
+    "torch": WRAP.format("torch"), "jax": WRAP.format("jax"), "jaxlib": WRAP.format("jax"),
+    "xarray": "xarray, whose coordinates would be lost; write u.transpose('x', 'y').values",
+}  # fmt: skip
 BLOCK = 8192  # numbers of which one product of BLAS is taken: it uses one thread up to 10000, and wakes no others
 
 
@@ -74,17 +79,9 @@ def check_plain(name, *values):
 def check_native(name, *values):
     """Refuse tensors of torch and arrays of jax: NumPy would drop their gradients, or they ours."""
     for value in values:
-        if type(value) is not np.ndarray and type(value).__module__.startswith("xarray."):
-            raise TypeError(
-                f"{name} takes plain arrays, got a {type(value).__name__} of xarray, whose coordinates would be lost; "
-                "write u.transpose('x', 'y').values"
-            )
-        library = type(value) is not np.ndarray and LIBRARIES.get(type(value).__module__.partition(".")[0])
-        if library:
-            raise TypeError(
-                f"{name} needs arrays of NumPy, got a {type(value).__name__} of {library}; wrap what is computed in "
-                f"dp.interop.to_{library}(f), which keeps gradients"
-            )
+        kind = type(value)
+        if kind is not np.ndarray and (library := kind.__module__.partition(".")[0]) in LIBRARIES:
+            raise TypeError(f"{name} needs arrays of NumPy, got a {kind.__name__} of {LIBRARIES[library]}")
 
 
 def check_out(op, out, u, dtype, shape):

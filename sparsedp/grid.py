@@ -10,7 +10,7 @@
 * Lengths carry whatever unit the user chose; every docstring says [length].
 """
 
-from functools import cached_property, reduce
+from functools import cached_property
 from itertools import compress
 
 import numpy as np
@@ -146,12 +146,8 @@ class Grid(Value, Uncached):
             return 0.5 * (h + np.roll(h, 1))
         return 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
 
-    def control_volumes(self, kind, axis):
-        """Volumes that belong to one component of a space; they sum to the volume of the box."""
-        return reduce(np.multiply.outer, self.control_lengths(kind, axis))
-
     def control_lengths(self, kind, axis):
-        """The lengths along each axis whose products are the control volumes of a component."""
+        """The lengths along each axis whose products are the control volumes of a component; they fill the box."""
         on_nodes = node_axes(kind, axis, self.dim)
         if on_nodes is None:
             raise ShapeError(f"values on {kind} have no volumes; take those of grid.cells, faces, nodes or edges")
@@ -331,10 +327,10 @@ def node_axes(kind, component, dim):
 
     kind: cells, nodes, faces, edges, or one component of faces, such as x-faces; component: its number.
     """
-    if kind in [f"{axis}-faces" for axis in AXES[:dim]]:
-        return (AXES.index(kind[0]),)
     across = tuple(axis for axis in range(dim) if axis != component)
-    return {"cells": (), "nodes": tuple(range(dim)), "faces": (component,), "edges": across}.get(kind)
+    places = {f"{axis}-faces": (number,) for number, axis in enumerate(AXES)}
+    places |= {"cells": (), "nodes": tuple(range(dim)), "faces": (component,), "edges": across}
+    return places.get(kind)
 
 
 def per_axis(value, shape, name):

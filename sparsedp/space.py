@@ -1,6 +1,6 @@
 """Space: where the numbers of a field live, as a value. No numbers are stored here."""
 
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import accumulate
 from math import prod
 from typing import Any
@@ -79,7 +79,8 @@ class Space(Value, Uncached):
         if self.layout is not None:
             return self.layout.volumes(self)
         with np.errstate(over="ignore"):  # what overflows is refused
-            flat = [self.grid.control_volumes(self.kind, axis).ravel() for axis in range(len(self.parts))]
+            lengths = (self.grid.control_lengths(self.kind, axis) for axis in range(len(self.parts)))
+            flat = [reduce(np.multiply.outer, lines).ravel() for lines in lengths]
         volumes = np.concatenate(flat).reshape(self.shape)
         if not np.all(np.isfinite(volumes)):
             raise NonFiniteError("volumes overflow: the spacing is too large; rescale the lengths of the grid")
@@ -131,12 +132,9 @@ class Space(Value, Uncached):
         check_plain("join", *parts)
         if self.layout is not None and self.layout.holds(*parts):
             return self.layout.join(self, parts)
-        components = [
-            part if np.shape(part) == shape else _broadcast(self, part, shape)
-            for part, shape in zip(parts, self.parts, strict=True)
-        ]
-        numpy = anp if any(map(isbox, components)) else np  # the same, without the tape
-        return numpy.reshape(numpy.concatenate([numpy.reshape(part, (-1,)) for part in components]), self.shape)
+        numpy = anp if any(map(isbox, parts)) else np  # the same, without the tape
+        flat = [numpy.reshape(_broadcast(self, part, shape), (-1,)) for part, shape in zip(parts, self.parts)]
+        return numpy.reshape(numpy.concatenate(flat), self.shape)
 
     @cached_property
     def _key(self):
@@ -176,6 +174,8 @@ def fits(one, other):
 
 
 def _broadcast(space, part, shape):
+    if np.shape(part) == shape:
+        return part
     if [n for n in np.shape(part) if n != 1] == [n for n in shape if n != 1]:
         return anp.reshape(part, shape)
     try:

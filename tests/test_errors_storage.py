@@ -14,7 +14,7 @@ from_coo = dp.matrix_solver.from_coo
 CASES = {
     "op DataArray": (
         TypeError,
-        "gradient takes plain arrays, got a DataArray of xarray, whose coordinates would be lost; "
+        "gradient needs arrays of NumPy, got a DataArray of xarray, whose coordinates would be lost; "
         "write u.transpose('x', 'y').values",
         lambda: dp.gradient(GRID)(LABELLED),
     ),

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from sparsedp.conditions import neumann, resolve
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_finite, is_whole
-from sparsedp.grid import Grid, check_grid, real_numbers
+from sparsedp.grid import Grid, check_grid, per_axis, real_numbers
 from sparsedp.operator import Operator
 from sparsedp.operators.interpolation import linear_weights
 from sparsedp.operators.stencils import along, kronecker_operator, means, to_faces
@@ -177,8 +177,8 @@ def prolong(grid, factor, interpolation="constant"):
 
 
 def _coarse(grid, factor):
-    factors = (factor,) * grid.dim if np.ndim(factor) == 0 else tuple(factor)
-    whole = len(factors) == grid.dim and all(is_whole(f, 1) and np.asarray(f).dtype.kind in "iu" for f in factors)
+    factors = per_axis(factor, grid.shape, "factor")
+    whole = all(is_whole(f, 1) and np.asarray(f).dtype.kind in "iu" for f in factors)
     if not whole or any(n % f for n, f in zip(grid.shape, factors, strict=True)):
         raise ShapeError(f"a factor must be a whole number >= 1 that divides {grid.shape}, got {factor}")
     spacing = [h.reshape(-1, f).sum(axis=1) for h, f in zip(grid.widths, factors, strict=True)]
