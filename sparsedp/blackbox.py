@@ -22,6 +22,7 @@ from sparsedp.tape import Rule, isbox, plain
 __all__ = ["Adopted", "adopt"]
 
 STEP, DIFFERENCES = "complex step", "central differences"
+WAYS = {"auto": "", "complex": STEP, "difference": DIFFERENCES}
 COMPLEX = 1e-30  # step of the complex step: no difference is taken, so nothing cancels
 CENTRAL = np.finfo(float).eps ** (1 / 3)  # step of central differences, relative to x
 SHARES = 1.0, 1e-2  # of the step of central differences: Jacobians and probes
@@ -89,7 +90,7 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     (14.0, array([2., 4., 6.]))
     """
     check_function("adopt", f, "dp.adopt(lambda x: ...)")
-    if derivative not in ("auto", "complex", "difference"):
+    if derivative not in tuple(WAYS):
         raise ValueError(f"derivative must be auto, complex or difference, got {derivative!r}")
     return Adopted(f, sparsity, derivative, name or getattr(f, "__name__", "simulator"))
 
@@ -112,7 +113,7 @@ class Adopted(Remade):
         self._f, self._derivative, self.name = f, derivative, name
         self._sparsity = None if sparsity is None else pattern_like(sparsity)
         self._shapes, self.way, self._coloured = jacobian
-        self.way = self.way or {"auto": "", "complex": STEP, "difference": DIFFERENCES}[derivative]
+        self.way = self.way or WAYS[derivative]
         self.runs = 0
         self._points, self._alone = Cache(), RLock()  # foreign code may work in arrays of its own: one thread at a time
         self._rule = Rule(
@@ -225,7 +226,7 @@ class Adopted(Remade):
         elif earlier is not None:
             if earlier.shape != (rows, columns):
                 raise ShapeError(f"the sparsity of {self.name} must have shape {(rows, columns)}, got {earlier.shape}")
-            yield Coloured(earlier, shapes, by_rows=False)
+            yield Coloured(earlier, shapes)
         elif not np.array_equal(self._flat(x), y):
             raise DerivativeError(f"{self.name} gives two results for one argument; fix its random state first")
         if self._sparsity is not None:
@@ -237,7 +238,7 @@ class Adopted(Remade):
         ]
 
         def coloured(pattern):
-            return Coloured(pattern if earlier is None else pattern_like(pattern + earlier), shapes, by_rows=False)
+            return Coloured(pattern if earlier is None else pattern_like(pattern + earlier), shapes)
 
         guess = None if shapes is None else stencil_pattern(products, shapes)
         if guess is not None:

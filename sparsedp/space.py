@@ -174,10 +174,9 @@ def fits(one, other):
 
 
 def _broadcast(space, part, shape):
-    if np.shape(part) == shape:
-        return part
+    """As many numbers as the shape has, in the order of C."""
     if [n for n in np.shape(part) if n != 1] == [n for n in shape if n != 1]:
-        return anp.reshape(part, shape)
+        return part
     try:
         np.broadcast_shapes(np.shape(part), shape)
         # autograd cannot broadcast_to into more dimensions; a product with ones can.

@@ -53,18 +53,16 @@ class Watch:
                 self.message = "stopped by the callback"
 
     def _judge(self, record):
-        if self._met(record):
-            share = record.gradient_norm / (self.history[0].gradient_norm or 1.0)
-            self.converged = True
-            self.message = f"converged: the gradient is {f'{share:.1e} of that at the start' if share else 0}"
-
-    def _met(self, record):
-        if record.gradient_norm == 0:
-            return not self._trials.batches.varied  # a batch may have the gradient 0 alone
-        first = self.history[0]
-        if callable(self._tolerance):
-            return bool(self._tolerance(record, first))
-        return record.gradient_norm <= self._tolerance * first.gradient_norm
+        first, size = self.history[0], record.gradient_norm
+        if size == 0:
+            met = not self._trials.batches.varied  # a batch may have the gradient 0 alone
+        elif callable(self._tolerance):
+            met = self._tolerance(record, first)
+        else:
+            met = size <= self._tolerance * first.gradient_norm
+        if met:
+            share = f"{size / (first.gradient_norm or 1.0):.1e} of that at the start" if size else 0
+            self.converged, self.message = True, f"converged: the gradient is {share}"
 
     def give_up(self, reason):
         """The method found no admissible point."""

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from sparsedp.optimize.trials import ENOUGH
+
 __all__ = ["line_search"]
 
-ENOUGH = 1e-4  # share of the predicted fall that is asked for (Armijo)
 FLATTER = 0.9  # the slope at the new point is at most this share of that at the start
 BRACKET = (0.1, 0.9)  # the next point stays inside this part of a bracket
 LONGER = 4.0  # a step grows by this when the loss still falls steeply
