@@ -119,6 +119,21 @@ def test_admm_stops_when_asked():
     assert len(best.history) == 3 and best.message == "stopped by the callback"
 
 
+def test_an_interrupted_round_of_admm_ends_the_run():
+    """The search inside gives back its best point; that is no reason to go on."""
+    calls = []
+
+    def loss(x):
+        calls.append(1)
+        if len(calls) == 40:
+            raise KeyboardInterrupt
+        return anp.sum((x[1:] - x[:-1] - 1.0) ** 4) + anp.sum(x**2)
+
+    best = dp.minimize(loss, np.ones(3), "admm", maxiter=50, tolerance=0.0, weight=0.1)
+    assert len(calls) == 40 and best.message == "interrupted" and not best.converged
+    assert 1 <= best.history[-1].iteration < 49 and best.value == best.history[-1].value
+
+
 def test_admm_refuses():
     loss = lambda x: anp.sum(x**2)
     with pytest.raises(ValueError, match="weight of admm must be > 0, got -1"):

@@ -1,7 +1,5 @@
 """Regularization: total_variation and smoothness of a cell field, walls and obstacles left out."""
 
-from itertools import pairwise
-
 import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
@@ -111,11 +109,11 @@ def _square(grid, name, solid):
     """(function from a cell field to its squared slope in the cells, volumes of the cells that count)."""
     check_grid(name, grid)
     slope, inside = gradient(grid), interior(grid, solid)
-    beside, blocks = abs(divergence(grid).matrix) @ inside.matrix != 0, []
-    for start, stop in pairwise(grid.faces.offsets):
-        faces = sp.csr_array(beside[:, start:stop], dtype=float)
-        blocks.append(sp.diags_array(1 / np.maximum(faces.sum(axis=1), 1)) @ faces)
-    mean = from_matrix(sp.hstack(blocks, format="csr"), grid.faces, grid.cells, name="mean over faces")
+    beside = sp.coo_array(abs(divergence(grid).matrix) @ inside.matrix != 0)  # the open faces of each cell
+    across = np.repeat(np.arange(grid.dim), np.diff(grid.faces.offsets))[beside.col]
+    pair = grid.dim * beside.row + across  # number of a cell and an axis
+    matrix = sp.csr_array((1 / np.bincount(pair)[pair], (beside.row, beside.col)), beside.shape)
+    mean = from_matrix(matrix, grid.faces, grid.cells, name="mean over faces")
     volumes = grid.volumes if solid is None else np.where(solid, 0.0, grid.volumes)
 
     def square(u):

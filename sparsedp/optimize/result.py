@@ -94,8 +94,8 @@ class Minimum(Frozen):
     message: str
     converged: bool
     evaluations: int
-    resumed: str
-    covariance: Any
+    resumed: str = ""
+    covariance: Any = None
 
     def __str__(self):
         last = self.history[-1]

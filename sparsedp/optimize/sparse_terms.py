@@ -13,6 +13,7 @@ B. Wohlberg, arXiv:1704.06209 (2017) (relative residuals).
 """
 
 import time
+from itertools import count, islice
 
 import autograd.numpy as anp
 import numpy as np
@@ -45,31 +46,51 @@ def admm(
     prox = (lambda v, t: np.sign(v) * np.maximum(np.abs(v) - t, 0.0)) if prox is None else prox
     check_function("admm, as operator,", K, "lambda x: ...")
     check_function("admm, as prox,", prox, "lambda v, t: ...")
-    x, clock, solves, count = start, time.perf_counter(), thread.solves, 0
+    clock, solves, evaluations = time.perf_counter(), thread.solves, 0
     history: list = []
-    z = np.asarray(K(x))
-    w = np.zeros(z.shape)
-    if rho is None:  # so that the threshold is a typical entry, or 1 where all are 0
-        rho = weight / (float(np.mean(np.abs(z))) or 1.0)
     message, converged = f"stopped after {maxiter} rounds, as maxiter asks", False
 
-    def record(image, residual):
+    def record(x, image, residual):
         value = float(loss(x)) + penalty * float(np.sum(np.abs(image)))
         now = time.perf_counter() - clock
-        history.append(Record(len(history), value, residual, now, count, (), thread.solves - solves))
+        history.append(Record(len(history), value, residual, now, evaluations, (), thread.solves - solves))
         return callback is not None and len(history) > 1 and callback(history[-1], x)
 
     def searched(target, rho, x):
         """The x of a round, from that of the last one, and the evaluations it took."""
         split = lambda x: loss(x) + 0.5 * rho * anp.sum((K(x) - target) ** 2)
         best = search(split, x, maxiter=inner, bounds=bounds, tolerance=1e-6)
+        if best.message == "interrupted":
+            raise KeyboardInterrupt
         return best.x, best.evaluations
 
     minimized = (lambda *state: (inner(*state), 1)) if callable(inner) else searched
-    record(z, np.inf)
-    for number in range(maxiter):
+    x, first = start, np.asarray(K(start))
+    record(x, first, np.inf)
+    try:
+        for x, spent, image, primal, dual in islice(_rounds(minimized, start, K, first, weight, rho, prox), maxiter):
+            evaluations += spent
+            if record(x, image, primal):
+                message = "stopped by the callback"
+                break
+            if max(primal, dual) <= tolerance:
+                message, converged = f"converged: both residuals are below {tolerance:g} of their terms", True
+                break
+    except KeyboardInterrupt:
+        message = "interrupted"
+    return Minimum(
+        x=x, value=history[-1].value, history=tuple(history), method="admm", message=message, converged=converged,
+        evaluations=evaluations,
+    )  # fmt: skip
+
+
+def _rounds(minimized, x, K, z, weight, rho, prox):
+    """Round after round: x, the evaluations it took, K x, and both residuals, relative to their terms."""
+    w = np.zeros(z.shape)
+    if rho is None:  # so that the threshold is a typical entry, or 1 where all are 0
+        rho = weight / (float(np.mean(np.abs(z))) or 1.0)
+    for number in count():
         x, spent = minimized(z - w, rho, x)
-        count += spent
         image, pull = vjp(K, x)
         if np.shape(image) != z.shape:
             raise ShapeError(f"the operator of admm gave shape {np.shape(image)} after {z.shape}; it must not change")
@@ -77,16 +98,7 @@ def admm(
         w = w + image - z
         primal = norm(image - z) / (max(norm(image), norm(z)) or 1.0)
         dual = norm(pull(z - before)) / (norm(pull(w)) or 1.0)
-        if record(image, primal):
-            message = "stopped by the callback"
-            break
-        if max(primal, dual) <= tolerance:
-            message, converged = f"converged: both residuals are below {tolerance:g} of their terms", True
-            break
+        yield x, spent, image, primal, dual
         if number < SETTLED and max(primal, dual) > BALANCE * min(primal, dual):
             factor = STEP if primal > dual else 1 / STEP
             rho, w = rho * factor, w / factor
-    return Minimum(
-        x=x, value=history[-1].value, history=tuple(history), method="admm", message=message, converged=converged,
-        evaluations=count, resumed="", covariance=None,
-    )  # fmt: skip

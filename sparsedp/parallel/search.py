@@ -91,7 +91,7 @@ def minimized(comm, loss, start, method, maxiter, tolerance, callback, bounds, m
     return Minimum(
         x=blocks.tree(packing.unpack(trials.best.vector)), value=trials.best.value, history=tuple(watch.history),
         method=method, message=watch.message or f"stopped after {watch.iteration} iterations, as maxiter asks",
-        converged=watch.converged, evaluations=trials.count, resumed="", covariance=None,
+        converged=watch.converged, evaluations=trials.count,
     )  # fmt: skip
 
 
