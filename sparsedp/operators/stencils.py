@@ -64,12 +64,8 @@ def wall_slopes(grid, axis, side, condition):
 
 def one_sided(grid, axis, upper, condition):
     """Cells -> faces: the slope seen from the lower (upper) cell when a wall stands on the face."""
-    h = grid.widths[axis]
-    cell = np.arange(h.size)
-    face = cell if upper else (cell + 1) % max(grid.node_count(axis), 1)
-    sign = 1.0 if upper else -1.0
-    slope = sign * condition.a / (0.5 * condition.a * h + condition.b)
-    return Factor.from_diagonals(_cells_to_faces(grid, axis), (face, cell, slope))
+    slope = condition.a / (0.5 * condition.a * grid.widths[axis] + condition.b)
+    return Factor(pick(grid, axis, not upper).matrix.T * (slope if upper else -slope))
 
 
 def pick(grid, axis, upper):
