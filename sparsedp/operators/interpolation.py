@@ -23,27 +23,19 @@ def linear_weights(grid, axis, x):
     ValueError
         If a coordinate lies outside a bounded axis.
     """
-    n, start, extent = grid.shape[axis], grid.origin[axis], grid.size[axis]
-    centres = grid.coordinates(axis)
-    if n < 2:
-        index = np.zeros(x.shape, dtype=np.int64)
-        _check_inside(grid, axis, x)
-        return index, index, np.zeros(x.shape)
-    if grid.periodic[axis]:
-        x = start + np.mod(x - start, extent)
-        lower = np.searchsorted(centres, x, side="right") - 1
-        upper = (lower + 1) % n
-        distance = np.where(upper > lower, centres[upper] - centres[lower], centres[0] + extent - centres[-1])
-        return lower % n, upper, np.mod(x - centres[lower], extent) / np.mod(distance, extent)
-    _check_inside(grid, axis, x)
-    lower = np.clip(np.searchsorted(centres, x, side="right") - 1, 0, n - 2)
-    return lower, lower + 1, (x - centres[lower]) / (centres[lower + 1] - centres[lower])
-
-
-def _check_inside(grid, axis, x):
-    start, extent = grid.origin[axis], grid.size[axis]
+    n, start, extent, periodic = grid.shape[axis], grid.origin[axis], grid.size[axis], grid.periodic[axis]
     slack = 8 * np.finfo(float).eps * (abs(start) + extent)
     outside = (x < start - slack) | (x > start + extent + slack)
-    if not grid.periodic[axis] and np.any(outside):
+    if not periodic and np.any(outside):
         name = grid.axes[axis]
         raise ValueError(f"points need {name} from {start:g} to {start + extent:g}, got {name} = {x[outside][0]:g}")
+    if n < 2:
+        index = np.zeros(x.shape, dtype=np.int64)
+        return index, index, np.zeros(x.shape)
+    centres = grid.coordinates(axis)
+    if periodic:  # the last cell is beside the first one, and the first beside the last
+        x = start + np.mod(x - start, extent)
+        centres = np.concatenate([centres[-1:] - extent, centres, centres[:1] + extent])
+    lower = np.clip(np.searchsorted(centres, x, side="right") - 1, 0, centres.size - 2)
+    weight = (x - centres[lower]) / (centres[lower + 1] - centres[lower])
+    return (lower - periodic) % n, (lower + 1 - periodic) % n, weight
