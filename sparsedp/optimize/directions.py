@@ -135,10 +135,6 @@ class _Rows:
     def rows(self):
         return self._memory[: self._count]
 
-    @property
-    def last(self):
-        return self._memory[self._count - 1]
-
     def add(self, vector):
         """Append the direction of what of a vector is orthogonal to the rows; the length of that."""
         rest = vector - (self.rows @ vector) @ self.rows
@@ -147,7 +143,7 @@ class _Rows:
         if self._count == len(self._memory):
             self._memory = np.concatenate([self._memory, np.empty((BLOCK, vector.size))])
         size = float(np.linalg.norm(rest))
-        self._memory[self._count] = rest / (size or 1.0)
+        self._memory[self._count] = self.last = rest / (size or 1.0)
         self._count += 1
         return size
 

@@ -10,6 +10,7 @@ import numpy as np
 from sparsedp.fields import check_number, is_number
 from sparsedp.optimize.flat import power_of_two
 from sparsedp.optimize.result import Stuck, Trial
+from sparsedp.solvers.scaling import largest
 from sparsedp.tree import norm
 
 __all__ = ["Adam", "AdamState", "Descent", "DescentState"]
@@ -148,7 +149,7 @@ class Adam:
     def begin(self, first):
         """State at the start."""
         zero = np.zeros_like(first.vector)
-        return AdamState(first, zero, zero, 0, power_of_two(np.max(np.abs(first.slope), initial=0.0)), 1.0)
+        return AdamState(first, zero, zero, 0, power_of_two(largest(first.slope)), 1.0)
 
     def advance(self, state, trials):
         """One iteration. A step to a refused point is halved until the loss has a value."""

@@ -10,6 +10,7 @@ from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite
 from sparsedp.optimize.flat import power_of_two
+from sparsedp.solvers.scaling import largest
 from sparsedp.tape import is_variable
 from sparsedp.tree import leaves, mapped
 
@@ -167,7 +168,7 @@ def singular(matrix):
     W <- E2^T W, until no group is left: one to four times, for an SVD of W that costs five times as much.
     Raises NonFiniteError if W is not finite.
     """
-    scale = power_of_two(max(np.max(matrix, initial=0.0), -np.min(matrix, initial=0.0)))  # no square overflows
+    scale = power_of_two(largest(matrix))  # no square overflows
     rows = matrix / scale
     with np.errstate(invalid="ignore"):
         gram = rows @ rows.T

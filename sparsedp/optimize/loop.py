@@ -13,7 +13,7 @@ from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergM
 from sparsedp.optimize.newton import NewtonCG
 from sparsedp.optimize.physical import PhysicalGradient
 from sparsedp.optimize.quasi_newton import Quasi
-from sparsedp.optimize.result import Minimum, Stuck
+from sparsedp.optimize.result import Stuck
 from sparsedp.optimize.sparse_terms import admm
 from sparsedp.optimize.trials import Trials
 from sparsedp.optimize.watch import Watch
@@ -190,11 +190,7 @@ def minimize(
         given, x = x, project(x)
         if len(leaves(x)) != len(leaves(given)):
             raise ShapeError("project must return a tree like start; write project=lambda x: ...")
-    return Minimum(
-        x=x, value=trials.best.value, history=tuple(watch.history), method=method,
-        message=watch.message or f"stopped after {watch.iteration} iterations, as maxiter asks",
-        converged=watch.converged, evaluations=trials.count, resumed=kept.resumed, covariance=covariance,
-    )  # fmt: skip
+    return watch.minimum(x, method, resumed=kept.resumed, covariance=covariance)
 
 
 def _run(stepper, trials, watch, kept, start, steps):

@@ -3,7 +3,7 @@
 import time
 
 from sparsedp.ledger import thread
-from sparsedp.optimize.result import Record
+from sparsedp.optimize.result import Minimum, Record
 from sparsedp.tree import norm
 
 __all__ = ["Watch"]
@@ -63,6 +63,14 @@ class Watch:
         if met:
             share = f"{size / (first.gradient_norm or 1.0):.1e} of that at the start" if size else 0
             self.converged, self.message = True, f"converged: the gradient is {share}"
+
+    def minimum(self, x, method, **more):
+        """What the run comes to."""
+        return Minimum(
+            x=x, value=self._trials.best.value, history=tuple(self.history), method=method,
+            message=self.message or f"stopped after {self.iteration} iterations, as maxiter asks",
+            converged=self.converged, evaluations=self._trials.count, **more,
+        )  # fmt: skip
 
     def give_up(self, reason):
         """The method found no admissible point."""

@@ -11,7 +11,7 @@ from sparsedp.fields import check_finite
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.flat import FINITE, Unknowns
-from sparsedp.optimize.result import Minimum, Trial
+from sparsedp.optimize.result import Trial
 from sparsedp.optimize.trials import Trials
 from sparsedp.optimize.watch import Watch
 from sparsedp.parallel.fields import DistributedField
@@ -88,11 +88,7 @@ def minimized(comm, loss, start, method, maxiter, tolerance, callback, bounds, m
     trials = Spread(loss, blocks, packing, Box(bounds, packing, blocks.of(start)))
     watch = Watch(trials, packing, tolerance, callback and (lambda record, x: callback(record, blocks.tree(x))))
     _search(comm, trials, watch, trials.box.inside(packing.pack(blocks.of(start))), int(maxiter))
-    return Minimum(
-        x=blocks.tree(packing.unpack(trials.best.vector)), value=trials.best.value, history=tuple(watch.history),
-        method=method, message=watch.message or f"stopped after {watch.iteration} iterations, as maxiter asks",
-        converged=watch.converged, evaluations=trials.count,
-    )  # fmt: skip
+    return watch.minimum(blocks.tree(packing.unpack(trials.best.vector)), method)
 
 
 def _search(comm, trials, watch, x, maxiter):
