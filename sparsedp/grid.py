@@ -328,7 +328,7 @@ def node_axes(kind, component, dim):
     kind: cells, nodes, faces, edges, or one component of faces, such as x-faces; component: its number.
     """
     across = tuple(axis for axis in range(dim) if axis != component)
-    places = {f"{axis}-faces": (number,) for number, axis in enumerate(AXES)}
+    places: dict = {f"{axis}-faces": (number,) for number, axis in enumerate(AXES)}
     places |= {"cells": (), "nodes": tuple(range(dim)), "faces": (component,), "edges": across}
     return places.get(kind)
 
