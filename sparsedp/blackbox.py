@@ -168,7 +168,8 @@ class Adopted(Remade):
                 f"{self.name} gives another result for the same argument than before; it must depend on its argument "
                 "only, so what changes from call to call must be a part of it"
             )
-        return from_matrix(matrix, *self._shapes, name=f"{self.name}.J")
+        inputs, outputs = self._shapes
+        return from_matrix(matrix, inputs, outputs, f"{self.name}.J")
 
     def jacobian(self, x):
         """dy/dx at a point, csr_array; kept for the last two points.
