@@ -366,15 +366,9 @@ class Inverse(Operator):
         check_native(self.name, start)
         if np.shape(start) != self.codomain.shape:
             raise ShapeError(f"{self.name} takes a start on {self.codomain}, got an array of shape {np.shape(start)}")
+        field_array(self, plain(b))  # a start is for one field
         structure, start = self.structure, np.asarray(plain(start)).reshape(-1)
         return Inverse(Solution(self.solver, structure.transposed, structure.checked, start))(b)
-
-    def apply(self, u, out=None):
-        """Solve for a plain array, without the tape; see `Operator.apply`."""
-        batch = np.ndim(u) > len(self.domain.shape) and self.structure.start is None
-        if out is not None or batch or self.layout is not None:
-            return super().apply(u, out)
-        return self.structure.solved(field_array(self, u).reshape(-1)).reshape(self.codomain.shape)
 
     # ------------------------------------------------------------ words
 

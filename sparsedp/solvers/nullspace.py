@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 
-from sparsedp.solvers.scaling import norm, subtracted
+from sparsedp.solvers.scaling import dot, norm
 from sparsedp.structure.base import Structure
 
 __all__ = ["NullSpace", "Projector", "find_null_space"]
@@ -35,14 +35,16 @@ class NullSpace:
 
     def __init__(self, labels, right, left, count):
         self.labels, self.count = labels, count
-        self.right, self.left = self._sides = right, left
-        self._products = self._dots(right, left)
-        # A null vector that is one number everywhere, as that number: one pass less for each projection.
-        self._numbers = [_number(side) if labels is None else None for side in self._sides]
+        self.right, self.left = right, left
+        self._sides = [_plainest(side) if labels is None else side for side in (right, left)]
+        self._products = self._dots(self._sides[0], left)
 
     def _dots(self, side, values):
         """Sum of side * values over each component; `side` is 0 beside them."""
-        return np.array([np.einsum("i,i->", side, values)]) if self.count == 1 else self._sums(side * values)
+        if self.count != 1:
+            return self._sums(side * values)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
+            return np.array([dot(side, values) if np.ndim(side) else side * values.sum()])
 
     def _sums(self, values):
         if self.labels is None:
@@ -53,11 +55,7 @@ class NullSpace:
 
     def sums(self, b, transposed=False):
         """l.b on each component."""
-        number = self._numbers[not transposed]
-        if number is None or b.dtype != float:
-            return self._dots(self._sides[not transposed], b)
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
-            return np.array([number * b.sum()])
+        return self._dots(self._sides[not transposed], b)
 
     def project(self, b, transposed=False, into=None):
         """Take out, component by component, the part along the null space. The same map for b and x.
@@ -69,12 +67,9 @@ class NullSpace:
     def projected(self, b, transposed=False, into=None, sums=None):
         """What `project` gives, and its norm. `sums`: what `sums(b)` gave, when it is known."""
         shares = (self.sums(b, transposed) if sums is None else sums) / self._products
-        number = self._numbers[transposed]
-        if number is not None and b.dtype == float:
-            into = np.empty_like(b) if into is None else into
-            return into, subtracted(b, number * shares[0], into)
         part = self._sides[transposed] * (shares[0] if self.count == 1 else np.append(shares, 0.0)[self.labels])
-        b = np.subtract(b, part, out=into)
+        with np.errstate(over="ignore", invalid="ignore"):
+            b = np.subtract(b, part, out=into)
         return b, norm(b)
 
     def defect(self, b, sums, size, floor, transposed=False):
@@ -121,8 +116,9 @@ class Projector(Structure):
         self.space.project(x, self.transposed, into=out)
 
 
-def _number(side):
-    return float(side[0]) if side.dtype == float and side.size and np.all(side == side[0]) else None
+def _plainest(side):
+    """A null vector that is one number everywhere as that number: a pass less for each projection."""
+    return side[0] if side.size and np.all(side == side[0]) else side
 
 
 def find_null_space(system):

@@ -18,7 +18,6 @@ __all__ = [
     "norm",
     "remainder",
     "shifted",
-    "subtracted",
 ]
 
 SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve computes leaves the range of floats
@@ -31,8 +30,8 @@ def _blocks(*arrays):
 
 
 def dot(x, y):
-    """Inner product of flat real arrays."""
-    return float(sum(one @ other for one, other in _blocks(x, y)))
+    """Sum of the products of the entries of flat arrays."""
+    return sum(one @ other for one, other in _blocks(x, y))
 
 
 def _square(x):
@@ -63,16 +62,6 @@ def remainder(b, out, x):
             np.subtract(given, part, out=part)
             rest, solution = rest + _square(part), solution + _square(values)
     return float(np.sqrt(rest)), float(np.sqrt(solution))
-
-
-def subtracted(x, number, out):
-    """out = x - number -> its norm. `out` may be `x`; both flat."""
-    total = 0.0
-    with np.errstate(over="ignore", invalid="ignore"):
-        for given, part in _blocks(x, out):
-            np.subtract(given, number, out=part)
-            total += _square(part)
-    return float(np.sqrt(total))
 
 
 def in_range(size):
