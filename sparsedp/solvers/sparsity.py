@@ -135,38 +135,37 @@ def stencil_pattern(products, shapes):
     csr_array or None
         None when the fields are small, or a cell touches too many.
     """
-    own, index = np.array([(1, *shape) for shape in shapes])[:, :, None], _places(shapes)
-    lengths = np.max(own, axis=0)
-    lengths[0] = len(own)  # the first axis counts fields
-    number = np.full(lengths[:, 0], -1)
-    number[tuple(index)] = np.arange(index.shape[1])
-    far = lengths > SHORT  # axes that count places; the others count kinds
+    index = _places(shapes)
+    lengths = np.max(index, axis=1, initial=0) + 1
+    far = lengths > SHORT  # axes that count places; the others, and the fields, count kinds of values
     far[0] = False
-    if not far.any() or not products or index.shape[1] < SMALLEST or np.prod(lengths[~far]) > SHORT:
+    kind = np.unique(index[~far], axis=1, return_inverse=True)[1].reshape(-1)
+    at, lengths, kinds = index[far], lengths[far, None], np.max(kind, initial=0) + 1
+    if not far.any() or not products or kind.size < SMALLEST or kinds > SHORT:
         return None
-    moves, wraps, rng = set(), np.zeros(far.shape, dtype=bool), np.random.default_rng(0)
-    kinds = np.unique(np.where(far, 0, index), axis=1).T[:, :, None]
-    period = np.where(far, lengths, 2 * lengths)
-    for kind, product, place in combinations(kinds, products, (0 * lengths, lengths // 2, lengths - 1)):
-        cell, v = np.where(far, np.minimum(place, own[kind[0, 0]] - 1), kind), np.zeros(index.shape[1])
-        v[number[tuple(cell)]] = rng.uniform(0.5, 1.5) * rng.choice((-1.0, 1.0))
-        ways = index[:, np.flatnonzero(product(v))] - cell
-        if ways.shape[1] > WIDEST:
+    number = np.full((kinds, *lengths[:, 0]), -1)
+    number[(kind, *at)] = np.arange(kind.size)
+    moves, wraps, rng = set(), np.zeros(lengths.shape, dtype=bool), np.random.default_rng(0)
+    for one, product, place in combinations(range(kinds), products, (0 * lengths, lengths // 2, lengths - 1)):
+        cell, v = np.minimum(place, np.max(at[:, kind == one], axis=1, keepdims=True)), np.zeros(kind.size)
+        v[number[(one, *cell)]] = rng.uniform(0.5, 1.5) * rng.choice((-1.0, 1.0))
+        row = np.flatnonzero(product(v))
+        if row.size > WIDEST:
             return None
-        steps = (ways + period // 2) % period - period // 2  # the short way
+        ways = at[:, row] - cell
+        steps = (ways + lengths // 2) % lengths - lengths // 2  # the short way
         wraps |= np.any(steps != ways, axis=1, keepdims=True)
-        moves |= {(*kind[:, 0].tolist(), *step) for step in steps.T.tolist()}
+        moves |= {(one, *move) for move in np.vstack([kind[row], steps]).T.tolist()}
     places = [np.empty((2, 0), dtype=int)]
-    for move in sorted(moves):
-        kind, step = np.reshape(move, (2, -1, 1))
-        column = np.flatnonzero(np.all(far | (index == kind), axis=0))
-        to = index[:, column] + step
+    for one, other, *step in sorted(moves):
+        column = np.flatnonzero(kind == one)
+        to = at[:, column] + np.reshape(step, (-1, 1))
         to = np.where(wraps, to % lengths, to)  # steps over an edge count where the field goes round
         inside = np.all((to >= 0) & (to < lengths), axis=0)
-        row = number[tuple(to[:, inside])]
+        row = number[(other, *to[:, inside])]
         places.append(np.stack([row, column[inside]])[:, row >= 0])
     row, column = np.hstack(places)
-    return pattern_of(row, column, (index.shape[1],) * 2)
+    return pattern_of(row, column, (kind.size,) * 2)
 
 
 # ---------------------------------------------------------------- colours
