@@ -318,25 +318,19 @@ class Elliptic(Sum):
     shift : a number or a field on the cells
     """
 
-    def __init__(self, D, G, k, shift, transposed=False):
-        self.D, self.G, self.k = D, G, k.reshape(-1)
+    def __init__(self, D, G, k, shift):
+        self.D, self.G, self.k = D, G, Diagonal(k)
         self.shift = Diagonal(np.broadcast_to(np.ravel(shift), D.shape[0]))
-        self.transposed = transposed
-        left, right = (G.T, D.T) if transposed else (D, G)
-        product = Chain([left.structure, Diagonal(self.k), right.structure])
-        super().__init__([self.shift, product])
+        super().__init__([self.shift, Chain([D.structure, self.k, G.structure])])
 
     def transpose(self):
-        return Elliptic(self.D, self.G, self.k, self.shift.values, not self.transposed)
+        return Elliptic(self.G.T, self.D.T, self.k.values, self.shift.values)
 
     def scaled(self, factor):
         return None  # so that the entries are the same bits, scaled
 
     def explicit(self):
-        D, G = self.D.matrix, self.G.matrix
-        slopes = sp.csr_array((G.data * self.k[rows_of(G)], G.indices, G.indptr), shape=G.shape)
-        matrix = compact(self.shift.explicit() + D @ slopes)
-        return matrix.T.tocsr() if self.transposed else matrix
+        return compact(self.shift.explicit() + self.D.matrix @ (self.k.explicit() @ self.G.matrix))
 
 
 # ---------------------------------------------------------------- the entries of a matrix
