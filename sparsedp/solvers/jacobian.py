@@ -109,7 +109,7 @@ class Jacobians:
     def __init__(self, name, jacobian, sparsity, settings):
         self.name, self.given, self.settings = name, jacobian, dict(settings, name=f"{name}.jacobian")
         self.sparsity: Any = None if sparsity is None else pattern_like(sparsity)
-        self.by_rows = None  # True: the residual has no JVP
+        self.ways: list = []  # whether rows are coloured, for VJPs, or columns, for JVPs: what the residual has
         self.way = ""
         # size -> (Coloured, or None when only products will do; the cells that the unknowns were found to lie on)
         self._patterns: dict = {}
@@ -252,8 +252,10 @@ class Jacobians:
     def _coloured(self, equation, x, leaves):
         """The coloured pattern for this many unknowns (None: only products will do), and the cells that they lie on."""
         size, pattern = equation.size, self.sparsity
-        if self.by_rows is None:
-            self.by_rows = not _can(pushforward, lambda y: equation(y, *leaves), x, np.ones_like(x))
+        if not self.ways:
+            has_jvp = _can(pushforward, lambda y: equation(y, *leaves), x, np.ones_like(x))
+            has_vjp = _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
+            self.ways = [False] * has_jvp + [True] * (has_vjp or not has_jvp)
         if pattern is not None:
             self.way = "assembled on the pattern given"
             if pattern.shape != (size, size):
@@ -276,27 +278,24 @@ class Jacobians:
         return self._patterns.setdefault(size, (None, None))
 
     def _colour(self, pattern, equation, x, leaves):
-        has_vjp = _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
         cells, shapes = fields_met(equation, x, leaves)
-        coloured = Coloured(pattern, shapes, self.by_rows or (None if has_vjp else False))
+        coloured = Coloured(pattern, shapes, None if len(self.ways) > 1 else self.ways[0])
         known = self._patterns[equation.size] = coloured, cells if (pattern - pattern.T).nnz == 0 else None
         return known
 
     def _guessed(self, equation, points, leaves):
         """Whether J has entries on a stencil only: what its products with colours give acts as it does. It is kept."""
-        shapes = fields_met(equation, points[0], leaves)[1]
-        guess = stencil_pattern(self._products(equation, points, leaves, self.by_rows), shapes)
+        by_rows, shapes = self.ways[0], fields_met(equation, points[0], leaves)[1]
+        guess = stencil_pattern(self._products(equation, points, leaves, by_rows), shapes)
         if guess is None:
             return False
-        coloured = self._colour(guess.T.tocsr() if self.by_rows else guess, equation, points[0], leaves)[0]
+        coloured = self._colour(guess.T.tocsr() if by_rows else guess, equation, points[0], leaves)[0]
         (product,) = self._products(equation, points[-1:], leaves, coloured.by_rows)
-        matrix, v = coloured.matrix(product), np.random.default_rng(1).uniform(0.5, 1.5, equation.size)
-        matrix = matrix.T if coloured.by_rows else matrix
-        return not np.any(np.abs(matrix @ v - product(v)) > AGREES * (abs(matrix) @ v))
+        return coloured.acts_as(product, AGREES)
 
     def _probed(self, equation, points, leaves):
         """The union of the patterns of J at the points, by columns or by rows; None where it is not sparse."""
-        for by_rows in (True,) if self.by_rows else (False, True):
+        for by_rows in self.ways:
             found = find_pattern(self._products(equation, points, leaves, by_rows), *(equation.size,) * 2)
             if found is not None:
                 return found.T.tocsr() if by_rows else found

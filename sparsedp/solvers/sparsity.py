@@ -220,6 +220,12 @@ class Coloured:
             table[number] = product((self.colours == number).astype(float))
         return sp.csr_array((table[self._place], self.pattern.indices, self.pattern.indptr), shape=self.pattern.shape)
 
+    def acts_as(self, product, share):
+        """Whether that matrix has all entries: it gives the products along a random direction too, to a share of them."""
+        matrix, v = self.matrix(product), np.random.default_rng(1).uniform(0.5, 1.5, self.pattern.shape[0])
+        matrix = matrix.T if self.by_rows else matrix
+        return not np.any(np.abs(matrix @ v - product(v)) > share * (abs(matrix) @ v))
+
 
 def colour(pattern, shapes=None):
     """Pattern -> a colour for each column; columns that share a row get different ones.
