@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 
 from sparsedp.errors import ConvergenceError
 from sparsedp.solvers.nullspace import NullSpace
-from sparsedp.solvers.scaling import in_range, length
+from sparsedp.solvers.scaling import in_range
 from sparsedp.solvers.solve import Engine, failure
 from sparsedp.solvers.system import System
 from sparsedp.structure.base import probes, rows_of
@@ -115,9 +115,9 @@ class DenseSystem(System):
     def __init__(self, matrix, make, rtol):
         self.dense, self._make = matrix, make
         self.size, self.rtol, self.maxiter = len(matrix), rtol, None
-        self.sizes = np.abs(matrix)
-        self._magnitudes = self.sizes.dot, self.sizes.T.dot
-        self.norms = float(self.sizes.sum(1).max(initial=0.0)), float(self.sizes.sum(0).max(initial=0.0))
+        sizes = np.abs(matrix)
+        self._magnitudes = sizes.dot, sizes.T.dot
+        self.norms = float(sizes.sum(1).max(initial=0.0)), float(sizes.sum(0).max(initial=0.0))
 
     @cached_property
     def given(self):
@@ -133,9 +133,6 @@ class DenseSystem(System):
         return (self.dense.T if transposed else self.dense) @ x
 
     applied = product
-
-    def terms(self, x):
-        return length(self.sizes @ np.abs(x))
 
 
 def dense_engine(system):

@@ -49,14 +49,15 @@ class Linearisation:
 
     def __init__(self, solver, point, checked):
         self.solver, self.point, self.checked = solver, point, checked
-        self.product, self.terms = solver.system.applied, solver.system.terms  # J x; a size of the terms of that
+        self.product = solver.system.applied  # J x
 
     def __str__(self):
         return str(Inverse(Solution(self.solver)))
 
     def magnitude(self, x):
         """|J| x, row by row, for x >= 0."""
-        return self.solver.system.given.structure.magnitude()(x)
+        system = self.solver.system
+        return np.ldexp(system.magnitude(x), system.exponent)
 
     @property
     def singular(self):

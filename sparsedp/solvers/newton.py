@@ -5,7 +5,7 @@ for linear systems (see solve.py), x is accepted when
 
     |F| <= rtol |b|,    or    |F| <= 8 eps (|J| |x| + |b|)    (converged_at_roundoff).
 
-Of small systems |J| |x| is taken entry by entry: unknowns of different sizes (species of 1 and 1e-10 with rates of 1e7)
+|J| |x| is taken entry by entry: unknowns of different sizes (species of 1 and 1e-10 with rates of 1e7)
 would else be accepted with errors that add up over many steps. Of a tree of fields each is judged by itself, for
 pressures of 1e6 would hide a temperature that is no solution; a step lowers the sum of all in these units.
 
@@ -138,8 +138,8 @@ class Equation:
     ----------
     statics : list
         The leaves of the parameters, None in place of those that are floating.
-    left : (int, float) or None
-        Check sum and norm of the residual at the root, once Newton's method has found it.
+    left : float or None
+        Norm of the residual at the root, once Newton's method has found it.
     """
 
     left: Any = None
@@ -445,8 +445,8 @@ class Newton:
         with np.errstate(over="ignore", invalid="ignore"):
             F = np.ldexp(self.F, self._unit)
             data = self._norms(np.ldexp(self.J.product(self.x), self._unit) - F)
-            terms = self._norms(self.J.magnitude(np.abs(self.x))) if self.cuts.size else self.J.terms(self.x)
-            return self._norms(F), data, np.ldexp(terms, self._unit) + data
+            terms = self._norms(np.ldexp(self.J.magnitude(np.abs(self.x)), self._unit))
+            return self._norms(F), data, terms + data
 
     @property
     def _unit(self):

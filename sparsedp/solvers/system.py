@@ -11,7 +11,7 @@ from sparsedp.errors import NonFiniteError
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import ROUNDING, NullSpace, find_null_space
-from sparsedp.solvers.scaling import largest, length, norm, remainder
+from sparsedp.solvers.scaling import largest, norm, remainder
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Mask
@@ -73,10 +73,6 @@ class System:
     def applied(self, x):
         """A x as it was given: not scaled, for all that is not an unknown too."""
         return self.given._acting.product(x)
-
-    def terms(self, x):
-        """A size of the terms that A x is the sum of."""
-        return float(np.ldexp(self.norm() * length(x), self.exponent))
 
     def residual(self, x, b, transposed=False):
         """(b - A x for the unknowns, fresh; its norm; that of x). b is 0 elsewhere."""
