@@ -7,7 +7,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
-from sparsedp.fields import check_native, field_array, is_number, is_whole
+from sparsedp.fields import check_finite, check_native, field_array, is_number, is_whole
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, spent
 from sparsedp.operator import Operator
@@ -364,6 +364,7 @@ class Inverse(Operator):
         if start is None:
             return super().__call__(b)
         check_native(self.name, start)
+        check_finite(f"the start of {self.name}", plain(start))
         if np.shape(start) != self.codomain.shape:
             raise ShapeError(f"{self.name} takes a start on {self.codomain}, got an array of shape {np.shape(start)}")
         field_array(self, plain(b))  # a start is for one field

@@ -206,6 +206,7 @@ class Solver(Remade):
         run.exponent = exponent
         if start is not None:
             start = shifted(start, -exponent).astype(b.dtype)
+            start = start if in_range(self.system.size_of(start)) else None  # 0, or as far from x as from 0
         x = self._compatible(b, size, run, start)
         if not exponent:
             return x
@@ -286,7 +287,7 @@ class Solver(Remade):
         for _ in range(ROUNDS if not word else 0):
             # A correction need not go below what rounding leaves of the whole; an engine sees the correction alone.
             floor = 0.0 if x is None else system.rounding(x, data, transposed)
-            step, used, trouble = self._correction(r, residual, max(goal, floor), transposed)
+            step, used, trouble = self._correction(r, max(goal, floor), transposed)
             run.iterations += used
             trial = step if x is None else np.add(x, step, out=step)
             trial = system.null_space.project(trial, transposed, into=trial)
@@ -325,16 +326,13 @@ class Solver(Remade):
             return ""
         return self.system.accepts(residual, goal, self.system.norm(run.transposed) * length + data)
 
-    def _correction(self, r, residual, goal, transposed):
-        """One call of the engine, on a residual in the middle of the range of floats."""
-        exponent = 0 if in_range(residual) else int(np.frexp(self.system.largest(r))[1])
-        if exponent:
-            r, goal = shifted(r, -exponent), float(np.ldexp(goal, -exponent))
+    def _correction(self, r, goal, transposed):
+        """One call of the engine."""
         solve = self.engine.solve if self.engine.last is None else self._in_order
         step, used, trouble = solve(r, goal, transposed)
         if self.system.active is not None:
             step[~self.system.active] = 0.0
-        return (shifted(step, exponent) if exponent else step), used, trouble
+        return step, used, trouble
 
     def _in_order(self, r, goal, transposed):
         """One call of an engine of all unknowns but the last ones: those follow; of the transpose they come first."""

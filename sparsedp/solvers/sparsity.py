@@ -221,7 +221,7 @@ class Coloured:
         return sp.csr_array((table[self._place], self.pattern.indices, self.pattern.indptr), shape=self.pattern.shape)
 
     def acts_as(self, product, share):
-        """Whether that matrix has all entries: it gives the products along a random direction too, to a share of them."""
+        """Whether that matrix gives the product along a random direction too, up to this share."""
         matrix, v = self.matrix(product), np.random.default_rng(1).uniform(0.5, 1.5, self.pattern.shape[0])
         matrix = matrix.T if self.by_rows else matrix
         return not np.any(np.abs(matrix @ v - product(v)) > share * (abs(matrix) @ v))
