@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from sparsedp.fields import is_number, is_whole
 from sparsedp.solvers.krylov import Krylov
 
-__all__ = ["Hierarchy", "Level", "Multigrid", "coarse_solver", "multigrid_engine", "ruge_stueben"]
+__all__ = ["Hierarchy", "Level", "Multigrid", "coarse_solver", "coloured_graph", "multigrid_engine", "ruge_stueben"]
 
 CYCLES = {"V": 1, "W": 2}
 SWEEPS = {"forward": "backward", "backward": "forward"}  # each with its mirror image
@@ -179,6 +179,13 @@ def ruge_stueben(matrix, strength, levels):
         max_coarse=COARSEST,
     )
     return _without_residues([*built.levels])
+
+
+def coloured_graph(links):
+    """Symmetric sparse matrix -> a colour for each row: of those that are linked, two different ones."""
+    from pyamg.graph import vertex_coloring
+
+    return vertex_coloring(csr_matrix(links), method="MIS")  # by maximal independent sets; it draws no random numbers
 
 
 def _without_residues(built):

@@ -31,6 +31,7 @@ from math import prod
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.solvers.amg import coloured_graph
 from sparsedp.structure.base import rows_of
 
 __all__ = ["Coloured", "colour", "dense_pattern", "find_pattern", "pattern_like", "pattern_of", "stencil_pattern"]
@@ -247,7 +248,7 @@ def colour(pattern, shapes=None):
     links = sp.csr_array(pattern.astype(np.int32))
     links = sp.csr_array(links.T @ links + sp.eye_array(size, dtype=np.int32))  # every column is linked to itself
     found = _lattice(links, _places(shapes or [(size,)]), least)
-    return found if found.max() < 2 * least else min(found, _one_by_one(links), key=np.max)
+    return found if found.max() < 2 * least else min(found, coloured_graph(links), key=np.max)
 
 
 def _places(shapes):
@@ -280,12 +281,3 @@ def _differences(links, index):
     found[number[links.indices[upper]] - number[row[upper]] + np.ravel_multi_index(tuple(reach[:, 0]), box)] = True
     found = np.flatnonzero(found)
     return np.array(np.unravel_index(found, box)) - reach if found.size <= MOST_DIFFERENCES else None
-
-
-def _one_by_one(links):
-    """The first colour that no linked column has yet, for the columns with most links first."""
-    colours = np.full(links.shape[0], -1)
-    for column in np.argsort(-np.diff(links.indptr), kind="stable"):
-        taken = set(colours[links.indices[links.indptr[column] : links.indptr[column + 1]]].tolist())
-        colours[column] = next(number for number in range(len(taken) + 1) if number not in taken)
-    return colours
