@@ -104,10 +104,11 @@ def test_what_cannot_be_represented_is_refused():
         inv(np.full(3, 1e300))
     assert inv.info.forward.status == "not_representable"
     assert inv(np.full(3, 1e-310)) == pytest.approx(np.full(3, 1e-300))  # a subnormal keeps the digits it has
-    with pytest.raises(
-        dp.errors.NonFiniteError, match=r"the solution of .* is beyond float32; give it double precision"
-    ):
-        inv(np.full(3, 1e30, dtype=np.float32))
+    for dtype in (np.float32, np.complex64):
+        with pytest.raises(
+            dp.errors.NonFiniteError, match=rf"the solution of .* is beyond {np.dtype(dtype)}; give it double precision"
+        ):
+            inv(np.full(3, 1e30, dtype))
 
 
 # ---------------------------------------------------------------- judged by the true residual

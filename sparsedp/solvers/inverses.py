@@ -21,7 +21,7 @@ from sparsedp.solvers.separable import eigenbasis, separable_engine, transformin
 from sparsedp.solvers.solve import EmptySystem, SolveLog, Solver, failure
 from sparsedp.solvers.system import System
 from sparsedp.space import fits
-from sparsedp.structure.base import Structure, result_dtype
+from sparsedp.structure.base import Structure
 from sparsedp.tape import plain
 from sparsedp.tree import copied
 
@@ -284,20 +284,14 @@ class Solution(Structure):
         self.shape, self.dtype = (solver.system.size,) * 2, solver.system.op.dtype
 
     def apply(self, x, out):
-        np.copyto(out, self.solved(x))
-
-    def solved(self, b):
-        """A^-1 b as a fresh flat array: solved in double precision, rounded once."""
-        wide, dtype = np.result_type(b, float), result_dtype(self, b.dtype)
+        """A^-1 x: solved in double precision, rounded once."""
+        wide = np.result_type(x, float)
         start = None if self.start is None else self.start.astype(wide)
-        x = self.solver.solve(b.astype(wide, copy=False), self.transposed, self.checked, start)
-        if x.dtype == dtype:
-            return x
+        solution = self.solver.solve(x.astype(wide, copy=False), self.transposed, self.checked, start)
         with np.errstate(over="ignore"):
-            rounded = x.astype(dtype)
-        if not np.isfinite(self.solver.system.largest(rounded)):
-            raise NonFiniteError(f"the solution of {self.solver.name} is beyond {dtype}; give it double precision")
-        return rounded
+            np.copyto(out, solution, casting="same_kind")
+        if out.dtype != solution.dtype and not np.isfinite(self.solver.system.largest(np.abs(out))):
+            raise NonFiniteError(f"the solution of {self.solver.name} is beyond {out.dtype}; give it double precision")
 
     def transpose(self):
         return Solution(self.solver, not self.transposed, checked=False)
