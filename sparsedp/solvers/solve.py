@@ -95,7 +95,7 @@ class Solver(Remade):
 
     def __init__(self, system, engine, nullspace, log, name, made, reason=""):
         self.made, self.reason = made, reason
-        self.served = not thread.calls  # whether a solve was counted for this set-up
+        self.served = not thread.calls  # whether this set-up served before, or was made where nobody counts
         self.system, self.engine = system, engine
         self.nullspace, self.log, self.name = nullspace, log, name
 
@@ -105,9 +105,10 @@ class Solver(Remade):
         return _remade, self.made
 
     def solve(self, b, transposed=False, checked=True, start=None):
-        """Flat b (float64 or complex128) -> flat x. `checked`: primal data, refused when not compatible."""
-        if b.dtype.kind == "c" and not self.system.complex:
-            return self._in_parts(b, transposed, checked, start)
+        """Flat b (float64, or where the operator is complex complex128) -> flat x.
+
+        `checked`: primal data, refused when not compatible.
+        """
         if self.system.complex:
             b = b.astype(complex)
         if thread.solve_hooks:
@@ -116,10 +117,7 @@ class Solver(Remade):
 
     def solved(self, b, transposed=False, checked=True, start=None, rtol=None):
         """The solve itself, counted and recorded. One to a tolerance of its own, `rtol`, is not in the log."""
-        if not thread.calls:
-            return self._solved(b, transposed, checked, start, rtol)
-        if self.served:
-            count(self.name, "reused")
+        count(self.name, "reused", self.served)
         self.served = True
         return timed(self.name, "adjoint" if transposed else "solve", self._solved, b, transposed, checked, start, rtol)
 
@@ -140,9 +138,8 @@ class Solver(Remade):
         finally:
             if rtol is None:
                 self.log.note(run.info(), transposed)
-            if thread.calls:
-                count(self.name, "iterations", run.iterations)
-                count(self.name, "skipped", int(run.status == "exact_zero_rhs"))
+            count(self.name, "iterations", run.iterations)
+            count(self.name, "skipped", run.status == "exact_zero_rhs")
 
     def judged(self, b, data, terms, residual, adjoint, transposed):
         """Flat x by one call of the engine, where ``residual(x)``, its true residual, is known to the caller.
@@ -158,8 +155,7 @@ class Solver(Remade):
             return None
         run.measure(left, data, max(terms - data, 0.0))
         thread.solves += 1
-        if thread.calls:
-            count(self.name, "adjoint" if adjoint else "solve")
+        count(self.name, "adjoint" if adjoint else "solve")
         self.log.note(run.info(), adjoint)
         return x
 
@@ -174,18 +170,6 @@ class Solver(Remade):
         if run.status == "max_iterations" and self.engine.refines:
             self._refuse(run, plain(x), "unrolled ")
         return x
-
-    def _in_parts(self, b, transposed, checked, start):
-        """A real operator acts on the real and on the imaginary part."""
-
-        def part(take):
-            begin = None if start is None else take(start).copy()
-            x = self.solve(take(b).copy(), transposed, checked, begin)
-            return x, self.log.adjoint if transposed else self.log.forward
-
-        (real, one), (imaginary, other) = map(part, (np.real, np.imag))
-        self.log.note(merged(one, other), transposed)
-        return real + 1j * imaginary
 
     def _scaled(self, b, run, start):
         """The solve with data and solution in the middle of the range of floats."""
@@ -330,9 +314,7 @@ class Solver(Remade):
         """One call of the engine."""
         solve = self.engine.solve if self.engine.last is None else self._in_order
         step, used, trouble = solve(r, goal, transposed)
-        if self.system.active is not None:
-            step[~self.system.active] = 0.0
-        return step, used, trouble
+        return self.system.masked(step), used, trouble
 
     def _in_order(self, r, goal, transposed):
         """One call of an engine of all unknowns but the last ones: those follow; of the transpose they come first."""
@@ -352,7 +334,6 @@ def _remade(build, arguments):
 
 # ---------------------------------------------------------------- what a solve leaves behind
 
-# In order of gravity: of two solves (real and imaginary part) the later word is reported.
 STATUS_WORDS = (
     "exact_zero_rhs",
     "converged",
@@ -462,14 +443,3 @@ class Run:
 def failure(status):
     """The record of a set-up that failed."""
     return Run(status=status).info()
-
-
-def merged(one, other):
-    """The record of two solves that belong together."""
-    names = "residual", "backward_error", "defect"
-    return SolveInfo(
-        max(one.status, other.status, key=STATUS_WORDS.index),
-        one.iterations + other.iterations,
-        **{name: max(getattr(one, name), getattr(other, name)) for name in names},
-        seconds=one.seconds + other.seconds,
-    )
