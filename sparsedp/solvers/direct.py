@@ -117,6 +117,7 @@ class DenseSystem(System):
         self.size, self.rtol, self.maxiter = len(matrix), rtol, None
         sizes = np.abs(matrix)
         self._magnitudes = sizes.dot, sizes.T.dot
+        self.norms = float(sizes.sum(1).max(initial=0.0)), float(sizes.sum(0).max(initial=0.0))
 
     @cached_property
     def given(self):

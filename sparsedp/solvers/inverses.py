@@ -291,7 +291,7 @@ class Solution(Structure):
                 one = Solution(self.solver, self.transposed, self.checked, start)
                 getattr(out, part)[...] = one.product(getattr(x, part).copy())
             return
-        wide = np.result_type(x, float)
+        wide = np.result_type(x, float, self.dtype)
         start = None if self.start is None else self.start.astype(wide)
         solution = self.solver.solve(x.astype(wide, copy=False), self.transposed, self.checked, start)
         with np.errstate(over="ignore"):

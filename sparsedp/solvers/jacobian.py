@@ -148,9 +148,7 @@ class Jacobians:
     def _solver(self, matrix, make, near):
         """The Solver of a Jacobian, of which ``make()`` is the Operator: found again or set up. No matrix: products."""
         if matrix is None:
-            op = make()
-            products = {} if op.structure.has_entries else dict(method="krylov")
-            return build(op, **self.settings | products, solves="few").solver
+            return build(make(), **self.settings, solves="few").solver
         if near:
             return self._set_up(matrix, make, near)
         key = matrix.indptr, matrix.indices, matrix.data

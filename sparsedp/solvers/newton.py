@@ -42,7 +42,7 @@ from sparsedp.ledger import note
 from sparsedp.shortcuts import on_every_rank, refuse_elsewhere
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.scaling import far_exponent, in_range, length
+from sparsedp.solvers.scaling import length
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tree import flatten, leaves
@@ -336,7 +336,7 @@ class Newton:
     def _weigh(self):
         """Units for the residual of several fields: the sizes of the terms of each, at this Jacobian."""
         if self.cuts.size:
-            sizes = np.ldexp(self._sizes()[2], -self._unit)
+            sizes = self._sizes()[2]
             sizes[sizes == 0] = np.max(sizes) or 1.0  # a field that is 0 and solved: in the units of the others
             self.units = 1 / np.repeat(sizes, np.diff(self.cuts, prepend=0, append=self.x.size))
             self.size = self._measure(self.F)
@@ -432,7 +432,7 @@ class Newton:
         whole = length(data)
         self.run.residual = length(residual) / whole if whole else 1.0
         self.run.backward_error = length(residual) / length(size)
-        self.largest = np.maximum(self.largest, np.ldexp(residual, -self._unit))
+        self.largest = np.maximum(self.largest, residual)
         if not np.all(np.isfinite(size)):
             return ""
         enough = residual <= share * self.rtol * data
@@ -441,25 +441,15 @@ class Newton:
         return "converged_at_roundoff" if np.all(enough | (residual <= ROUNDING * size)) else ""
 
     def _sizes(self):
-        """|F|, |b| and |J| |x| + |b| of each field, in a unit in which no square leaves the range of floats."""
+        """|F|, |b| and |J| |x| + |b| of each field."""
         with np.errstate(over="ignore", invalid="ignore"):
-            F = np.ldexp(self.F, self._unit)
-            data = self._norms(np.ldexp(self.J.product(self.x), self._unit) - F)
-            terms = self._norms(np.ldexp(self.J.magnitude(np.abs(self.x)), self._unit))
-            return self._norms(F), data, terms + data
-
-    @property
-    def _unit(self):
-        size = length(self.F)
-        if in_range(size):
-            return 0
-        terms = np.append(self.F, self.J.product(self.x))  # F alone may be the rest of large terms
-        return -far_exponent(terms, length(terms))
+            data = self._norms(self.J.product(self.x) - self.F)
+            return self._norms(self.F), data, self._norms(self.J.magnitude(np.abs(self.x))) + data
 
     def _rounding(self, step):
         """The status word when what is left of F is rounding, else ""."""
         residual, _, size = self._sizes()
-        size = size + np.ldexp(self.largest + self._norms(self._terms()), self._unit)
+        size = size + self.largest + self._norms(self._terms())
         far = self._value(self.x + FAR * step)
         if far is None or not np.all(residual <= 8 * ROUNDING * size):
             return ""

@@ -20,7 +20,7 @@ __all__ = [
     "shifted",
 ]
 
-SMALL, LARGE = 2.0**-100, 2.0**100  # norms of data between which nothing a solve computes leaves the range of floats
+SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve computes leaves the range of floats
 
 
 def _blocks(*arrays):

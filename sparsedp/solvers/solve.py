@@ -16,7 +16,7 @@ An engine is what solves inside the contract. It is any object with
     solve(b, goal, transposed) -> (x, iterations, word)
 
 on flat float64 arrays (complex128 for the direct method, when the operator is complex). `b` is left as it is, and
-compatible, 0 on what is not an unknown, of a norm between 2^-200 and 2^200. Stop when |b - A x| <= goal
+compatible, 0 on what is not an unknown, of a norm between 2^-255 and 2^200. Stop when |b - A x| <= goal
 (2-norm), or when |b - A x| is below rounding; `word` is "" when that was met, else a status word. An
 engine is homogeneous: no absolute thresholds. `x` is a fresh array; its part along the null space, and
 its values on what is not an unknown, do not matter. The engine
@@ -105,12 +105,7 @@ class Solver(Remade):
         return _remade, self.made
 
     def solve(self, b, transposed=False, checked=True, start=None):
-        """Flat b (float64, or where the operator is complex complex128) -> flat x.
-
-        `checked`: primal data, refused when not compatible.
-        """
-        if self.system.complex:
-            b = b.astype(complex)
+        """Flat b, float64 or of a complex operator complex128 -> flat x. `checked`: primal data, to be compatible."""
         if thread.solve_hooks:
             return thread.solve_hooks[-1].linear(self, b, transposed, checked, start)
         return self.solved(b, transposed, checked, start)
@@ -189,7 +184,7 @@ class Solver(Remade):
         exponent -= self.system.exponent
         run.exponent = exponent
         if start is not None:
-            start = shifted(start, -exponent).astype(b.dtype)
+            start = shifted(start, -exponent)
             start = start if in_range(self.system.size_of(start)) else None  # 0, or as far from x as from 0
         x = self._compatible(b, size, run, start)
         if not exponent:
