@@ -164,7 +164,7 @@ def test_small_systems_take_the_same_path_while_calls_are_counted():
 
 
 def dense(A):
-    return build_dense(A, lambda: dp.from_matrix(A), 1e-12, "raise", "dense")
+    return build_dense(dp.from_matrix(A), 1e-12, "raise", "dense")
 
 
 def test_dense_factors_solve_and_know_when_they_cannot():
@@ -182,7 +182,7 @@ def test_dense_factors_solve_and_know_when_they_cannot():
     with pytest.raises(NonFiniteError, match="dense"):
         solver.solve(b * np.nan)
     beyond = (2.0**900 * A, 2.0**-900 * A)  # for these the general path scales
-    for matrix in (np.zeros((3, 3)), np.ones((3, 3)), np.diag([1.0, 1e-14]), np.diag([1.0, np.nan]), *beyond):
+    for matrix in (np.zeros((3, 3)), np.ones((3, 3)), np.diag([1.0, 1e-14]), *beyond):
         assert dense(matrix) is None
 
 

@@ -8,8 +8,6 @@ SciPy changes the pivots of LAPACK while a solve runs, and back: every solve get
 thread may be solving with the same factors.
 """
 
-from functools import cached_property
-
 import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csc_array
@@ -103,31 +101,21 @@ class DenseSystem(System):
 
     Parameters
     ----------
-    matrix : float64 array, shape (n, n)
-    make : callable
-        ``make()``: the Operator, for those who ask.
+    op : Operator
+        Explicit, and real.
     rtol : float
     """
 
     active, null_space = None, NullSpace(None, np.zeros(0), np.zeros(0), 0)
-    complex, exponent = False, 0
+    exponent = 0
 
-    def __init__(self, matrix, make, rtol):
-        self.dense, self._make = matrix, make
-        self.size, self.rtol, self.maxiter = len(matrix), rtol, None
-        sizes = np.abs(matrix)
+    def __init__(self, op, rtol):
+        self.given = self.op = op
+        self.size, self.rtol, self.maxiter = op.shape[0], rtol, None
+        self.dense = op.matrix.toarray()
+        sizes = np.abs(self.dense)
         self._magnitudes = sizes.dot, sizes.T.dot
         self.norms = float(sizes.sum(1).max(initial=0.0)), float(sizes.sum(0).max(initial=0.0))
-
-    @cached_property
-    def given(self):
-        """The matrix as an Operator."""
-        return self._make()
-
-    @property
-    def op(self):
-        """The same: it is not scaled."""
-        return self.given
 
     def product(self, x, transposed=False):
         return (self.dense.T if transposed else self.dense) @ x

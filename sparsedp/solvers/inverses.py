@@ -149,10 +149,10 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
     return Inverse(Solution(_set_up(solver, clock)))
 
 
-def build_dense(matrix, make, rtol, nullspace, name):
-    """Small 2-D array, and ``make()`` that gives the Operator -> Solver; None where the array may be singular."""
+def build_dense(op, rtol, nullspace, name):
+    """Small explicit Operator -> Solver; None where it may be singular."""
     clock = perf_counter()
-    engine = dense_engine(system := DenseSystem(matrix, make, rtol))
+    engine = dense_engine(system := DenseSystem(op, rtol))
     if engine is None:
         return None
     return _set_up(Solver(system, engine, nullspace, SolveLog(), name, None, "a small full matrix"), clock)

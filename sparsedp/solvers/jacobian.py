@@ -4,7 +4,6 @@ Set-ups are cached by content, the last two: of the point (x and the parameters,
 and of the entries (a residual that is linear in x is set up once). Forward solves never look a point up.
 """
 
-from functools import partial
 from threading import RLock
 from typing import Any
 
@@ -22,6 +21,7 @@ from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.inverses import Inverse, Solution, build, build_dense
 from sparsedp.solvers.solve import failure
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
+from sparsedp.space import Space
 from sparsedp.structure.base import rows_of
 from sparsedp.tape import isbox
 from sparsedp.tree import copied
@@ -128,8 +128,8 @@ class Jacobians:
 
     def fresh(self, equation, x, leaves, near=None):
         """The Jacobian at this point, made now. One that leans on the engine of another, `near`, is not kept."""
-        matrix, make, exact = self._assembled(equation, x, leaves)
-        known = Linearisation(self._solver(matrix, make, near), (equation, *copied((x, leaves))), exact)
+        op, exact = self._operator(equation, x, leaves)
+        known = Linearisation(self._solver(op, near), (equation, *copied((x, leaves))), exact)
         return known if near else self._points.put(_key(equation, x, leaves), known)
 
     def cached(self, equation, x, leaves):
@@ -139,26 +139,22 @@ class Jacobians:
 
     def relaxed(self, equation, x, leaves, pace, near):
         """The Solver of J + D / pace, D the rates of its rows; None where its entries are not known."""
-        matrix, make, _ = self._assembled(equation, x, leaves)
-        if matrix is None:
+        op, _ = self._operator(equation, x, leaves)
+        if op.form != "explicit":
             return None
-        matrix = sp.csr_array(matrix + sp.diags_array(_rates(matrix, equation.layout) / pace))
-        return self._set_up(matrix, partial(from_matrix, matrix, *(make().domain,) * 2, self.settings["name"]), near)
+        matrix = op.matrix + sp.diags_array(_rates(op.matrix, equation.layout) / pace)
+        return self._solver(from_matrix(matrix, op.domain, op.domain, op.name), near)
 
-    def _solver(self, matrix, make, near):
-        """The Solver of a Jacobian, of which ``make()`` is the Operator: found again or set up. No matrix: products."""
-        if matrix is None:
-            return build(make(), **self.settings, solves="few").solver
-        if near:
-            return self._set_up(matrix, make, near)
-        key = matrix.indptr, matrix.indices, matrix.data
-        return self._matrices.find(key) or self._matrices.put(key, self._set_up(matrix, make))
-
-    def _set_up(self, matrix, make, near=None):
-        settings, solver = self.settings, None
-        if len(matrix.indptr) <= DENSE_UP_TO + 1 and settings["method"] in ("auto", "direct"):
-            solver = build_dense(matrix.toarray(), make, settings["rtol"], settings["nullspace"], settings["name"])
-        return solver or build(make(), **settings, solves="few", near=near).solver
+    def _solver(self, op, near):
+        """The Solver of a Jacobian: found again by its entries, or set up."""
+        settings, solver, key = self.settings, None, ()
+        if op.form == "explicit" and not near:
+            key = op.matrix.indptr, op.matrix.indices, op.matrix.data
+            solver = self._matrices.find(key)
+            if not solver and op.shape[0] <= DENSE_UP_TO and settings["method"] in ("auto", "direct"):
+                solver = build_dense(op, settings["rtol"], settings["nullspace"], settings["name"])
+        solver = solver or build(op, **settings, solves="few", near=near).solver
+        return self._matrices.put(key, solver) if key else solver
 
     def suspected(self, known):
         """As `enlarged`, for a Newton step that did not do well. A Jacobian that was given may be a simpler one."""
@@ -201,24 +197,22 @@ class Jacobians:
 
     # ------------------------------------------------------------ three ways to a Jacobian
 
-    def _assembled(self, equation, x, leaves):
-        """(its matrix, None where it is products; what makes the Operator; whether it is exact for certain)."""
+    def _operator(self, equation, x, leaves):
+        """(J as an Operator, explicit where its entries are known; whether it is exact for certain)."""
         size, name = equation.size, self.settings["name"]
         if self.given is not None:
             self.way = "given"
-            given = self.given(equation.layout.split(x), *equation.params(leaves))
-            op = self._as_operator(given, size, name)
-            return op.matrix if op.form == "explicit" else None, lambda: op, False
+            return self._as_operator(self.given(equation.layout.split(x), *equation.params(leaves)), size, name), False
         with self._alone:
             coloured, space = self._patterns.get(size) or self._coloured(equation, x, leaves)
         if coloured is None:
             forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
-            return None, lambda: from_functions(forward, backward, size, size, name), True
+            return from_functions(forward, backward, size, size, name), True
         matrix = coloured.matrix(self._product(equation, x, leaves, coloured.by_rows))
         # A field of another shape may have as many unknowns.
-        suits = space is not None and equation.layout.shapes[0] == space.shape and _is_symmetric(matrix, space)
-        make = partial(from_matrix, matrix, *(space if suits else size,) * 2, name)
-        return matrix, make, coloured.by_rows and coloured.pattern.nnz == size**2
+        if space is None or equation.layout.shapes[0] != space.shape or not _is_symmetric(matrix, space):
+            space = Space(size)
+        return from_matrix(matrix, space, space, name), coloured.by_rows and coloured.pattern.nnz == size**2
 
     def _as_operator(self, given, size, name):
         if isbox(given):
