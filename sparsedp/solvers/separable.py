@@ -310,9 +310,9 @@ class Sweep:
         self.inverses *= sign
 
     def solve(self, x, transposed):
-        """x, shape (n, m), is overwritten with the solution."""
+        """x, shape (n, ...) with m numbers for each of the n, is overwritten with the solution."""
         bands = (np.roll(self.upper, 1), np.roll(self.lower, -1)) if transposed else (self.lower, self.upper)
-        kernels.sweep(x, *bands, self.inverses)
+        kernels.sweep(x.view(float).reshape(len(x), -1), *bands, self.inverses)
 
 
 def sweep(factor, modes):
@@ -340,25 +340,24 @@ def sweep(factor, modes):
 class Separable(Engine):
     """The engine: forward transforms, division by the eigenvalues, backward transforms.
 
-    With an `elimination`, the spectrum is that of all axes but the first, and elimination takes the place of division.
+    Parameters
+    ----------
+    spectrum : Spectrum
+        Of all axes; where elimination takes the place of division, of all but the first.
+    divide : callable
+        ``divide(y, transposed)``: coefficients, which are overwritten.
+    hierarchy : str
     """
 
     method = "separable"
     unit = "refinements"
 
-    def __init__(self, found, eigenvalues, elimination=None):
-        self.spectrum, self.elimination = found, elimination
-        self.weights = inverted(eigenvalues) if elimination is None else None
-        self.hierarchy = found.words
-        if elimination is not None:
-            self.hierarchy = f"elimination({found.shape[0]}) x {found.words.split(' x ', 1)[1]}"
+    def __init__(self, spectrum, divide, hierarchy):
+        self.spectrum, self.divide, self.hierarchy = spectrum, divide, hierarchy
 
     def solve(self, b, goal, transposed):
         y = self.spectrum.forward(b, transposed)
-        if self.elimination is None:
-            y *= self.weights
-        else:
-            self.elimination.solve(y.view(float).reshape(len(y), -1), transposed)
+        self.divide(y, transposed)
         return self.spectrum.backward(y, transposed), 0, ""
 
 
@@ -367,12 +366,15 @@ def transforming(system, found, eigenvalues):
     structure, first, wide = system.op.structure, found.shape[0], WIDE_COMPILED if kernels.compiled() else WIDE_PLAIN
     if not structure.separable and np.all(eigenvalues):  # an eigenvalue 1 beside 1e16 would count as 0 in products
         system.null_space = NullSpace(None, np.zeros(system.size), np.zeros(system.size), 0)
-    if not structure.separable or 0 not in structure.lines or first < 3 or found.eigenvalues[0].size < wide:
-        return Separable(found, eigenvalues)
-    rest = Spectrum(found.shape, (Axis("identity", np.zeros(first)), *found.axes[1:]), found.shift)
-    sums = rest.eigenvalues[0].reshape(-1)
-    elimination = sweep(structure.lines[0], np.repeat(sums, 2) if rest.fourier else sums)  # real and imaginary parts
-    return Separable(found, eigenvalues) if elimination is None else Separable(rest, None, elimination)
+    if structure.separable and 0 in structure.lines and first >= 3 and found.eigenvalues[0].size >= wide:
+        rest = Spectrum(found.shape, (Axis("identity", np.zeros(first)), *found.axes[1:]), found.shift)
+        sums = rest.eigenvalues[0].reshape(-1)
+        elimination = sweep(structure.lines[0], np.repeat(sums, 2) if rest.fourier else sums)  # both parts of complex
+        if elimination is not None:
+            words = f"elimination({first}) x {found.words.split(' x ', 1)[1]}"
+            return Separable(rest, elimination.solve, words)
+    weights = inverted(eigenvalues)
+    return Separable(found, lambda y, transposed: np.multiply(y, weights, out=y), found.words)
 
 
 def separable_engine(system):
