@@ -12,14 +12,14 @@ from functools import partial
 
 import numpy as np
 
-from sparsedp.derivative import of_argument
+from sparsedp.derivative import of_argument, push
 from sparsedp.errors import NonFiniteError
 from sparsedp.tape import Rule, plain
 
-__all__ = ["solve_rule"]
+__all__ = ["solve_rule", "vary"]
 
 
-def solve_rule(name, solve, back, along, transposed=False, checked=False):
+def solve_rule(name, solve, back, product, transposed=False, checked=False):
     """The Rule of (b, *params): s of A(params) s = b, or of the transposed system. It is not kept: it holds its solver.
 
     Parameters
@@ -29,11 +29,10 @@ def solve_rule(name, solve, back, along, transposed=False, checked=False):
         ``solve(transposed, checked, b, *params)``, of plain values. `checked`: b are primal data, not a derivative.
     back : callable
         ``back(params, places, y, s)``: -grad <y, A s> in the params at these places, one after the other.
-    along : callable
-        ``along(params, places, tangents, s, transposed)``: the derivative of A s, or of A^T s, along the tangents of
-        the params at these places.
+    product : callable
+        ``product(transposed, s, *params)``: A s or A^T s, differentiable in the params.
     """
-    helper = partial(solve_rule, name, solve, back, along)
+    helper = partial(solve_rule, name, solve, back, product)
 
     def vjp(nums, ans, b, *params):
         places = [num - 1 for num in nums if num]
@@ -51,11 +50,24 @@ def solve_rule(name, solve, back, along, transposed=False, checked=False):
     def jvp(nums, tangents, ans, b, *params):
         places, total = [num - 1 for num in nums if num], 0.0 if nums[0] else tangents[0]
         if places:
-            total = total - along(params, places, tangents[-len(places) :], ans, transposed)
+            varied, chosen = vary(lambda *params: product(transposed, ans, *params), params, places)
+            total = total - push(varied, chosen, tangents[-len(places) :])[1]
         return helper(transposed)(total, *params)
 
     forward = partial(solve, transposed, checked)  # the rule has the names of its arguments
     return Rule(f"{name}.T" if transposed else name, forward, vjp, jvp)
+
+
+def vary(fun, args, places):
+    """fun(*args) -> (function of the list of the arguments at `places`, that list)."""
+
+    def varied(chosen):
+        values = list(args)
+        for place, value in zip(places, chosen, strict=True):
+            values[place] = value
+        return fun(*values)
+
+    return varied, [args[place] for place in places]
 
 
 def _finite(name, cotangent):

@@ -57,7 +57,7 @@ class ParametricSolver(Remade):
         self._settings, self._cache = settings, Cache()
 
     def _solution(self, k, b, shift):
-        return solve_rule(self.name, self._solve, self._back, self._along, checked=True)(b, k, shift)
+        return solve_rule(self.name, self._solve, self._back, self._applied, checked=True)(b, k, shift)
 
     def _solve(self, transposed, checked, b, k, shift):
         inv = self._inverse(k, shift)
@@ -67,10 +67,9 @@ class ParametricSolver(Remade):
         slopes = [lambda: self.D.T(y) * self.G(x), lambda: -y * x]
         return [of_argument(slopes[place](), params[place]) for place in places]
 
-    def _along(self, params, places, tangents, x, transposed):
+    def _applied(self, transposed, x, k, shift):
         first, last = (self.D.T, self.G.T) if transposed else (self.G, self.D)
-        changes = [lambda t: -last(t * first(x)), lambda t: t * x]
-        return sum(changes[place](t) for place, t in zip(places, tangents, strict=True))
+        return shift * x - last(k * first(x))
 
     def _inverse(self, k, shift):
         """The set-up for this content, from the last two or new."""

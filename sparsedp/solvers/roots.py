@@ -19,7 +19,7 @@ from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note, thread
 from sparsedp.recipe import Remade
 from sparsedp.shortcuts import on_every_rank, together
-from sparsedp.solvers.adjoint import solve_rule
+from sparsedp.solvers.adjoint import solve_rule, vary
 from sparsedp.solvers.inverses import check_settings
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation, Layout, Newton
@@ -293,7 +293,7 @@ class Root(Remade):
 
     def _linear(self, transposed):
         """The Rule of (b, equation, x, *leaves): s of J s = b or J^T s = b."""
-        return solve_rule(self.name, self._solve, _back, _along, transposed)
+        return solve_rule(self.name, self._solve, _back, _product, transposed)
 
     def _solve(self, transposed, checked, b, equation, x, *leaves):
         known = self._jacobians.cached(equation, x, leaves)
@@ -314,23 +314,10 @@ class Root(Remade):
 
 def _back(point, places, y, s):
     """-grad <y, J s> = -grad <s, J^T y>: the pullback of (x, p) -> J^T y."""
-    varied, chosen = vary(lambda equation, x, *leaves: equation.transposed(x, leaves)(y), point, places)
+    varied, chosen = vary(lambda *point: _product(True, y, *point), point, places)
     return pullback(varied, chosen)[1](-s)
 
 
-def _along(point, places, tangents, s, transposed):
-    product = lambda equation, x, *leaves: (equation.transposed if transposed else equation.tangent)(x, leaves)(s)
-    varied, chosen = vary(product, point, places)
-    return push(varied, chosen, tangents)[1]
-
-
-def vary(fun, args, places):
-    """fun(*args) -> (function of the list of the arguments at `places`, that list)."""
-
-    def varied(chosen):
-        values = list(args)
-        for place, value in zip(places, chosen, strict=True):
-            values[place] = value
-        return fun(*values)
-
-    return varied, [args[place] for place in places]
+def _product(transposed, s, equation, x, *leaves):
+    """J s or J^T s."""
+    return (equation.transposed if transposed else equation.tangent)(x, leaves)(s)
