@@ -147,7 +147,8 @@ class Jacobians:
 
     def _solver(self, op, near):
         """The Solver of a Jacobian: found again by its entries, or set up."""
-        settings, solver, key = self.settings, None, ()
+        settings, solver = self.settings, None
+        key: Any = None
         if op.form == "explicit" and not near:
             key = op.matrix.indptr, op.matrix.indices, op.matrix.data
             solver = self._matrices.find(key)
