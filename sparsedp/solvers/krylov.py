@@ -6,12 +6,12 @@ stretched grids. Then A x = b is S x = sign w b, and A^T y = g is S z = sign g w
 Both keep the best iterate, and name what went wrong with a status word ("" when nothing did).
 """
 
-from functools import partial
 from itertools import count
 from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
+from scipy.sparse.linalg import LinearOperator, gmres
 
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import dot, norm
@@ -128,23 +128,24 @@ class Krylov(Engine):
     def _gmres(self, b, goal, accepted, transposed):
         """Restarted GMRES from 0, preconditioned from the right: its residuals are those of A.
 
-        A cycle ends at the residual `goal`; accepted(|b - A x|, x) is asked at the end of each.
+        A cycle, one call of SciPy's, ends at the residual `goal`; accepted(|b - A x|, x) is asked at the end of each.
         Source: Saad and Schultz, SIAM J. Sci. Stat. Comput. 7, 1986.
         """
-        system, apply = self.system, partial(self.system.product, transposed=transposed)
+        system = self.system
 
         def precondition(r):
             z = r.copy() if self.precondition is None else self.precondition(r, transposed)
             return system.null_space.project(z, transposed)
 
-        x, r, used = np.zeros_like(b), b, 0
-        residual, basis = norm(r), np.empty((self.restart + 1, b.size), self.dtype)
+        right = LinearOperator((b.size,) * 2, lambda r: system.product(precondition(r), transposed), dtype=self.dtype)
+        x, r, used, residual = np.zeros_like(b), b, 0, norm(b)
         while True:
-            steps = min(self.restart, self.maxiter - used)
-            change, steps = _gmres_cycle(apply, r, residual, precondition, goal, basis, steps)
-            used += steps
+            most, norms = min(self.restart, self.maxiter - used), []
+            cycle = dict(rtol=0.0, atol=goal, restart=most, maxiter=1, callback=norms.append, callback_type="pr_norm")
+            change = gmres(right, r, **cycle)[0]
+            used += len(norms)
             trial = x + precondition(change)
-            r = b - apply(trial)
+            r = b - system.product(trial, transposed)
             before, residual = residual, norm(r)
             if not residual < before:
                 return x, used, "stagnated" if np.isfinite(residual) else "diverged"
@@ -202,30 +203,3 @@ def _without_descent(pq, rz, p, q, r, z):
     noise = 1e-13 * np.sqrt(dot(p, p) * dot(q, q)), 1e-13 * np.sqrt(dot(r, r) * dot(z, z))
     return "stagnated" if abs(pq) <= noise[0] or abs(rz) <= noise[1] else "indefinite_operator"
 
-
-def _gmres_cycle(apply, r, residual, precondition, goal, basis, steps):
-    """(the combination of basis vectors with the smallest residual, how many there are).
-
-    In the basis, A acts as a Hessenberg matrix with one row more than columns. With `null`, the vector that is 0 times
-    that matrix and begins with 1, the smallest residual is |r| / |null|: no system need be solved to know it.
-    """
-    hessenberg, null = np.zeros((steps + 1, steps), basis.dtype), np.zeros(steps + 1, basis.dtype)
-    null[0] = 1.0
-    np.divide(r, residual, out=basis[0])
-    for j in range(steps):
-        w = apply(precondition(basis[j]))
-        for _ in range(2):  # once is not enough: orthogonality is lost to rounding
-            overlap = (basis[: j + 1] @ w.conj()).conj()
-            w -= overlap @ basis[: j + 1]
-            hessenberg[: j + 1, j] += overlap
-        hessenberg[j + 1, j] = length = norm(w)
-        if not length > 0:
-            break
-        null[j + 1] = -(null[: j + 1] @ hessenberg[: j + 1, j]) / length
-        if residual <= 0.9 * goal * norm(null):
-            break
-        np.divide(w, length, out=basis[j + 1])
-    data = np.zeros(j + 2)
-    data[0] = residual
-    shares = np.linalg.lstsq(hessenberg[: j + 2, : j + 1], data, rcond=None)[0]  # of rank j for a singular A
-    return shares @ basis[: j + 1], j + 1
