@@ -57,15 +57,14 @@ from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
 from sparsedp.operator import Operator
+from sparsedp.operators.boundary import identity
 from sparsedp.operators.given import from_matrix
-from sparsedp.shortcuts import FLOAT
+from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.inverses import build
 from sparsedp.solvers.nullspace import Projector
 from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
-from sparsedp.structure.kronecker import Kronecker
-from sparsedp.tape import Rule
 
 __all__ = [
     "EXPLICIT",
@@ -186,64 +185,43 @@ class Resolvent:
     """
 
     def __init__(self, op, name, settings, most=2, log=None):
-        self.op, self.name, self.settings = op, name, settings
-        self._one = Operator(Kronecker.identity(op.domain.parts), op.domain, op.domain, "identity")
+        self.op, self.name, self.settings, self._one = op, name, settings, identity(op.domain)
         self.info, self._inverse = log or SolveLog(), lru_cache(most)(self._set_up)
-        self._checked, self._rules = self._rule(False, True), [self._rule(False), self._rule(True)]
 
     def __call__(self, z, b):
-        return self._checked(z, b)
+        return solve_rule(f"{self.name}.solve", self._solved, self._back, self._along, checked=True)(b, z)
 
-    def _rule(self, transposed, checked=False):
-        """The solve (or the transposed solve) as a rule in (z, b)."""
-        L = self.op.T if transposed else self.op
-
-        def vjp(nums, ans, z, b):
-            def pull(g):
-                y = self._rules[not transposed](z, g)
-                return tuple(of_argument(y if num else anp.sum(y * L(ans)), (z, b)[num]) for num in nums)
-
-            return pull
-
-        def jvp(nums, tangents, ans, z, b):
-            total = sum(t if num else t * L(ans) for num, t in zip(nums, tangents, strict=True))
-            return self._rules[transposed](z, total)
-
-        def forward(z, b):
-            return self._solved(z, b, transposed, checked)
-
-        return Rule(f"{self.name}.solve{'.T' * transposed}", forward, vjp, jvp)
-
-    def _solved(self, z, b, transposed, checked):
+    def _solved(self, transposed, checked, b, z):
         if z == 0:
             if recordings:
-                note(self._checked.name, "skipped", "dt or coefficient 0, no solve and no set-up")
+                note(f"{self.name}.solve", "skipped", "dt or coefficient 0, no solve and no set-up")
             return self._one.apply(b)  # whole numbers become floating ones
         inv = self._inverse(float(z))
-        inv = inv.T if transposed else inv if checked else inv.tangent
-        if self._moving is None:
-            return inv.apply(b)
-        part = self._moving[transposed]
-        field = b if type(b) is np.ndarray and b.dtype is FLOAT else self._one.apply(b)
-        wide = field.astype(np.result_type(field, np.float64), copy=False)
-        moving = part.apply(wide)
-        x = part.apply(inv.apply(moving)) + (wide - moving)
-        return x.astype(field.dtype, copy=False)
+        return (inv.T if transposed else inv if checked else inv.tangent).apply(b)
+
+    def _back(self, params, places, y, x):
+        return [of_argument(anp.sum(y * self.op(x)), params[0])]
+
+    def _along(self, params, places, tangents, x, transposed):
+        return -tangents[0] * (self.op.T if transposed else self.op)(x)
+
+    def _set_up(self, z):
+        """The inverse of 1 - z L."""
+        inv, P = build(self._one - z * self.op, name=self.name, log=self.info, **self.settings), self._moving
+        return inv if P is None else self._named(((P @ inv - self._one) @ P + self._one).structure)
+
+    def _named(self, structure):
+        return Operator(structure, self.op.domain, self.op.domain, self.name)
 
     @cached_property
     def _moving(self):
-        """Projections, for L and L^T, of what they do not leave as it is; None where that is all, or L unsymmetric."""
-        make, space = System if self.op.layout is None else self.op.layout.system, self.op.domain
+        """Projection from what L leaves as it is; None where that is nothing, or L unsymmetric."""
+        make = System if self.op.layout is None else self.op.layout.system
         system = make(self.op, self.settings["rtol"], None)
         if not self.op.structure.has_entries or system.complex or system.weights is None:
             return None
         null = system.null_space
-        both = (Projector(null, space.size, transposed) for transposed in (False, True))
-        return [Operator(projector, space, space, self.name) for projector in both] if null.count else None
-
-    def _set_up(self, z):
-        """The inverse of 1 - z L."""
-        return build(self._one - z * self.op, name=self.name, log=self.info, **self.settings)
+        return self._named(Projector(null, self.op.domain.size)) if null.count else None
 
 
 # ---- implicit: steps made of stages ----------------------------------------------------------------------------------

@@ -115,6 +115,9 @@ class Projector(Structure):
     def act(self, x, out):
         self.space.project(x, self.transposed, into=out)
 
+    def transpose(self):
+        return Projector(self.space, self.shape[0], not self.transposed)
+
 
 def _plainest(side):
     """A null vector that is one number everywhere as that number: a pass less for each projection."""
