@@ -77,7 +77,7 @@ def between(members, given, made):
     known = lambda parts: (layout, parts) if len(parts[0]) == len(layout.shape) else None
     for place in range(len(members) - 1, 0, -1):
         left, right = members[place - 1], members[place]
-        if isinstance(right, Diagonal):
+        if isinstance(right, (Diagonal, Projector)):
             sides[place] = sides[place + 1]
         elif isinstance(right, Kronecker):
             sides[place] = known(right.out_parts)
@@ -86,7 +86,7 @@ def between(members, given, made):
         elif isinstance(left, Kronecker):
             sides[place] = known(left.in_parts)
     for place, member in enumerate(members[:-1]):
-        if isinstance(member, Diagonal):
+        if isinstance(member, (Diagonal, Projector)):
             sides[place + 1] = sides[place]
     return sides
 
