@@ -172,7 +172,7 @@ TABLE = [
     (
         lambda: dp.stepper("radau", fast, 0.1, solver="krylov"),
         TYPE,
-        "radau solves full systems by LU; leave out solver",
+        "radau does not use solver; leave it out",
     ),
     (
         lambda: dp.stepper("leapfrog", RATES[0], 0.1),
@@ -187,7 +187,7 @@ TABLE = [
     (
         lambda: dp.stepper("rk4", fast, 0.1, damping=(1.0, 1.0)),
         TYPE,
-        "rk4 takes no damping; put it into the rate, or write method 'leapfrog'",
+        "rk4 does not use damping; leave it out",
     ),
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=1.0),

@@ -5,7 +5,7 @@ from scipy.sparse.linalg import ArpackError, eigsh
 
 from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.fields import check_finite, is_number, rounded_down, surely_finite
-from sparsedp.integrators.problem import Problem, like, number
+from sparsedp.integrators.problem import Problem, like, number, pair
 from sparsedp.integrators.runge_kutta import (
     EXPLICIT,
     IMPLICIT,
@@ -24,7 +24,14 @@ from sparsedp.tree import copied, labels, leaves
 
 __all__ = ["METHODS", "Step", "stepper"]
 
-METHODS = (*EXPLICIT, *IMPLICIT, "radau", "etdrk4", "leapfrog")
+# Of each method the arguments that it does not use; options are for those that are IMPLICIT.
+UNUSED = {
+    **dict.fromkeys(EXPLICIT, ("jacobian", "damping")),
+    **dict.fromkeys((*IMPLICIT, "radau"), ("damping",)),
+    "etdrk4": ("jacobian", "damping"),
+    "leapfrog": ("linear", "source", "timed", "tolerance", "jacobian"),
+}
+METHODS = tuple(UNUSED)
 KEPT = {False: 2, True: 12}  # set-ups of linear steps, without and with error control
 ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
 DENSE_UP_TO = 64
@@ -152,10 +159,11 @@ def stepper(
         raise ValueError(f"unstable must be 'raise' or 'allow', got {unstable!r}")
     known = {word: value for word, value in options.items() if word != "sparsity"}  # which `implicit` takes
     settings = check_settings(solver, rtol, maxiter, "raise", known) | dict(options=given["options"])
-    if (method in EXPLICIT or method in ("etdrk4", "leapfrog")) and (options or jacobian is not None):
-        raise TypeError(f"{method} solves nothing; leave out {', '.join([*options] or ['jacobian'])}")
-    if method == "radau" and (options or solver not in ("auto", "direct")):
-        raise TypeError(f"radau solves full systems by LU; leave out {', '.join(options) or 'solver'}")
+    unused = [word for word in UNUSED[method] if given[word] is not None] + [*options] * (method not in IMPLICIT)
+    if method == "radau" and solver not in ("auto", "direct"):
+        unused.append("solver")  # full systems are solved by LU
+    if unused:
+        raise TypeError(f"{method} does not use {', '.join(unused)}; leave it out")
     if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
         raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
     if not all(map(_is_floor, leaves(floor))):
@@ -182,14 +190,9 @@ def _remade(given):
 def _scheme(method, given, settings):
     """What makes the steps; what few of them need is imported by those."""
     if method == "leapfrog":
-        unused = [word for word in ("linear", "source", "timed", "tolerance", "jacobian") if given[word] is not None]
-        if unused:
-            raise TypeError(f"leapfrog does not use {', '.join(unused)}; leave it out")
         from sparsedp.integrators.leapfrog import Leapfrog
 
         return Leapfrog(given["rate"], given["damping"])
-    if given["damping"] is not None:
-        raise TypeError(f"{method} takes no damping; put it into the rate, or write method 'leapfrog'")
     problem = Problem(given["rate"], given["linear"], given["source"], given["timed"])
     jacobian, tolerance, floor = given["jacobian"], given["tolerance"], given["floor"]
     if method == "radau":
@@ -319,10 +322,7 @@ class Step(Remade):
     def _parts(self, state):
         if not self.problem.timed:
             return state, None
-        if not (isinstance(state, (tuple, list)) and len(state) == 2):
-            given = type(state).__name__
-            raise TypeError(f"the rate of {self.name} takes a time, so its state is the pair (u, t), got {given}")
-        return state
+        return pair(f"the rate of {self.name} takes a time, so its state is the pair (u, t)", state)
 
     def _blame(self, state, params):
         """Refuse arguments that are not finite."""

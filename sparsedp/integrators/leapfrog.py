@@ -27,10 +27,10 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
 from sparsedp.derivative import push
 from sparsedp.errors import ShapeError, UnstableStepError
-from sparsedp.fields import check_takes, is_number, is_whole, rounded_down
+from sparsedp.fields import check_function, check_takes, is_number, is_whole, rounded_down
 from sparsedp.grid import AXES, check_grid
 from sparsedp.integrators.adaptive import Moving
-from sparsedp.integrators.problem import combine, of_fields, untraced
+from sparsedp.integrators.problem import combine, of_fields, pair, untraced
 from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.shortcuts import on_every_rank
 from sparsedp.solvers.cache import Cache
@@ -60,17 +60,12 @@ class Leapfrog(Scheme):
 
     def __init__(self, rates, damping):
         super().__init__(self, "leapfrog", 2)
-        if not (isinstance(rates, (tuple, list)) and len(rates) == 2 and all(map(callable, rates))):
-            raise TypeError(
-                f"leapfrog needs a pair of rates, got {type(rates).__name__}; write "
-                "(lambda v, c: ..., lambda p, c: ...) for the state (p, v)"
-            )
-        for rate in rates:
+        example = "; write (lambda v, c: ..., lambda p, c: ...) for the state (p, v)"
+        for rate in pair("leapfrog needs a pair of rates", rates, example):
+            check_function("a rate of leapfrog", rate, "lambda field, params: ...")
             check_takes("leapfrog", rate, 2, "lambda field, params: ...")
-        if damping is not None and not (isinstance(damping, (tuple, list)) and len(damping) == 2):
-            raise TypeError(
-                f"damping needs a pair, for both fields of the state, got {type(damping).__name__}; write (s, None)"
-            )
+        if damping is not None:
+            pair("damping needs a pair, for both fields of the state", damping, "; write (s, None)")
         for rate in map(plain, leaves(damping)):
             if rate is not None and not (np.all(np.isfinite(rate)) and np.all(rate >= 0)):
                 raise ValueError("damping needs finite rates >= 0 [1 / time]; take dp.sponge(grid, cells, speed)")
@@ -137,9 +132,7 @@ class Leapfrog(Scheme):
 
 
 def _pair(state):
-    if not (isinstance(state, (tuple, list)) and len(state) == 2):
-        raise TypeError(f"the state of leapfrog is a pair of fields, got {type(state).__name__}; write (p, v)")
-    return state
+    return pair("the state of leapfrog is a pair of fields", state, "; write (p, v)")
 
 
 def _advanced(x, rate, h, damping):
@@ -203,15 +196,13 @@ def sponge(grid, cells, speed, echo=1e-3):
     depths = cells if isinstance(cells, dict) else dict.fromkeys(bounded, cells)
     if set(depths) - set(bounded) or any(np.shape(deep) not in ((), (2,)) for deep in depths.values()):
         raise ValueError(f"sponge needs a number of cells or a pair for axes of {bounded}, got {cells!r}")
-    rates = []
-    for places in (grid.centres(), *map(grid.face_centres, range(grid.dim))):
-        total = np.zeros(places[0].shape)
-        for axis, name in enumerate(grid.axes):
-            for upper, count in enumerate(np.broadcast_to(depths.get(name, 0), 2)):
-                rate = _rate(grid, axis, upper, count, places[axis]) * (POWER + 1) / 2 * speed * log(1 / echo)
-                total = total + rate
-        rates.append(total)
-    return rates[0], grid.join(*rates[1:])
+    sides = enumerate(np.broadcast_to(depths.get(name, 0), 2) for name in grid.axes)
+    ends = [(axis, upper, count) for axis, counts in sides for upper, count in enumerate(counts)]
+
+    def rates(places):
+        return sum(_rate(grid, *end, places[end[0]]) * (POWER + 1) / 2 * speed * log(1 / echo) for end in ends)
+
+    return rates(grid.centres()), grid.join(*(rates(grid.face_centres(axis)) for axis in range(grid.dim)))
 
 
 def _rate(grid, axis, upper, count, x):
@@ -222,4 +213,4 @@ def _rate(grid, axis, upper, count, x):
     count = int(count)  # 2.0 counts as a whole number
     width = np.sum(widths[-count:] if upper else widths[:count]) if count else np.inf
     wall = grid.origin[axis] + upper * np.sum(widths)
-    return np.maximum(1 - np.abs(x - wall) / width, 0.0) ** POWER / width if count else 0.0
+    return np.maximum(1 - np.abs(x - wall) / width, 0.0) ** POWER / width

@@ -14,7 +14,7 @@ from sparsedp.space import fits
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tree import copied, flatten, keys, leaves, leaves_like, mapped, subscript
 
-__all__ = ["Problem", "combine", "later", "like", "number", "of_fields", "untraced"]
+__all__ = ["Problem", "combine", "later", "like", "number", "of_fields", "pair", "untraced"]
 
 
 def combine(u, *pairs):
@@ -83,6 +83,13 @@ def _rounded(leaf, old):
     if dtype_of(leaf).kind == "c" != kind.kind:
         raise TypeError(f"a rate of complex numbers needs a complex state, got {kind}; write u.astype(complex)")
     return cast(leaf, kind)
+
+
+def pair(what, value, advice=""):
+    """Two things, as they were given; `what`: begins the message that refuses others."""
+    if not (isinstance(value, (tuple, list)) and len(value) == 2):
+        raise TypeError(f"{what}, got {type(value).__name__}{advice}")
+    return value
 
 
 def later(t, h):
