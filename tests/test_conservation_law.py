@@ -314,8 +314,10 @@ def test_refused_functions():
 
 def test_refused_values():
     law = dp.conservation_law(LINE, carry, carry)
-    with pytest.raises(dp.errors.ShapeError, match=r"conservation_law takes u of shape \(fields, 4\), got \(5,\)"):
+    with pytest.raises(dp.errors.ShapeError, match=r"takes a field on cells\(4\), got an array of shape \(5,\)"):
         law(np.ones(5))
+    with pytest.raises(dp.errors.ShapeError, match=r"takes u of shape \(fields, 4\), got \(2, 3, 4\)"):
+        law(np.ones((2, 3, 4)))
     channel = dp.Grid((3, 4), periodic=(True, False))  # its walls would turn the sign of a row of cells
     with pytest.raises(
         dp.errors.ShapeError, match=r"field for each number in momentum=\(0, 1\), got u of shape \(3, 4\)"

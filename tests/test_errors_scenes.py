@@ -110,7 +110,12 @@ TABLE = [
     (
         lambda: law()(np.ones(5)),
         SHAPE,
-        "conservation_law takes u of shape (fields, 4), got (5,)",
+        "conservation_law takes a field on cells(4), got an array of shape (5,)",
+    ),
+    (
+        lambda: law()(np.ones((2, 3, 4))),
+        SHAPE,
+        "conservation_law takes u of shape (fields, 4), got (2, 3, 4)",
     ),
     (
         lambda: law()(np.ones(4, complex)),

@@ -211,7 +211,7 @@ def test_implicit_viscosity_is_stable_at_any_step():
 def test_what_a_scene_does_not_need_is_not_built():
     grid = dp.Grid((8, 8), periodic=True)
     plain = dp.flow_step(grid, 0.1)
-    assert plain.viscous is None and plain.scalars == {}
+    assert plain.viscous.op is None and plain.scalars == {}
     assert repr(plain).endswith("pressure, convection>")
     state = plain.start(field(grid))
     with recording() as calls:

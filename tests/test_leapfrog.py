@@ -206,9 +206,7 @@ def test_refusals():
     rates = (lambda v, c: v), (lambda p, c: p)
     with pytest.raises(TypeError, match="leapfrog needs a pair of rates, got function; write"):
         dp.stepper("leapfrog", rates[0], 0.1)
-    with pytest.raises(
-        TypeError, match="a rate of leapfrog takes a function, got float; write lambda field"
-    ):
+    with pytest.raises(TypeError, match="a rate of leapfrog takes a function, got float; write lambda field"):
         dp.stepper("leapfrog", (rates[0], 1.0), 0.1)
     with pytest.raises(TypeError, match="leapfrog does not use linear; leave it out"):
         dp.stepper("leapfrog", rates, 0.1, linear=dp.laplacian(dp.Grid(3)))

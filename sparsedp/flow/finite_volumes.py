@@ -29,17 +29,18 @@ from sparsedp.conditions import free_slip, outflow, resolve
 from sparsedp.conditions import inflow as inflow_side
 from sparsedp.constants import constant, frozen
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_finite, check_number, check_plain, check_takes, is_whole
+from sparsedp.fields import check_finite, check_number, check_plain, check_takes, field_array, is_number, is_whole
 from sparsedp.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.recipe import Remade
-from sparsedp.tape import cast, dtype_of, entrywise, plain
+from sparsedp.tape import cast, dtype_of, entrywise, isbox, plain
 from sparsedp.tree import mapped
 
 __all__ = ["ConservationLaw", "conservation_law"]
 
 GHOSTS = 2  # cells beyond each end: the slope in the first of them needs the second
-GHOST_CELLS = (0, GHOSTS), (-GHOSTS, None)  # of the lower and of the upper end
+# What a side is -> how np.pad repeats cells there; None: the axis is periodic.
+REPEATED: dict = {None: "wrap", free_slip: "symmetric", outflow: "edge", inflow_side: "edge"}
 
 
 def conservation_law(
@@ -132,7 +133,7 @@ def conservation_law(
         check_takes(f"conservation_law, as {name},", function, count, _example(name, count))
     sides = resolve(grid, boundary, outflow)
     conditions = {side for pair in sides for side in pair or ()}
-    for side in conditions - {outflow, free_slip, inflow_side}:
+    for side in conditions - {*REPEATED}:
         raise ValueError(f"conservation_law takes outflow, free_slip or inflow, got {side}; write one of them")
     if (inflow_side in conditions) != (inflow is not None):
         raise ValueError(
@@ -170,7 +171,8 @@ class ConservationLaw(Remade):
     def __init__(self, grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium):
         inflow, equilibrium = constant(inflow), constant(equilibrium)
         self.given = grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium
-        self.grid, self.flux, self.speed, self.source, self.equilibrium = grid, flux, speed, source, equilibrium
+        self.grid, self.domain, self.flux, self.speed = grid, grid.cells, flux, speed
+        self.source, self.equilibrium = source, equilibrium
         self.axes = [
             Axis(grid, axis, sides[axis] or (None, None), momentum and momentum[axis], inflow, SCHEMES[scheme])
             for axis in range(grid.dim if grid.cells.size else 0)
@@ -205,20 +207,19 @@ class ConservationLaw(Remade):
 
     def _state(self, u):
         """The state, of floating numbers."""
-        check_plain(self.name, u)
-        u, shape = u if hasattr(u, "shape") else np.asarray(u), self.grid.shape
-        if u.shape[-len(shape) :] != shape or u.ndim > len(shape) + 1:
-            raise ShapeError(f"conservation_law takes u of shape (fields, {', '.join(map(str, shape))}), got {u.shape}")
-        fields, momentum = u.shape[0] if u.ndim > len(shape) else 1, self.given[5]
-        if momentum and fields <= max(momentum):
+        values, momentum, shape = field_array(self, plain(u), batch=True), self.given[5], self.grid.shape
+        fields = values.shape[: -len(shape)]
+        if len(fields) > 1:
+            wanted = ", ".join(map(str, ("fields", *shape)))
+            raise ShapeError(f"conservation_law takes u of shape ({wanted}), got {values.shape}")
+        if momentum and max(momentum) >= (*fields, 1)[0]:
             raise ShapeError(
-                f"conservation_law needs a field for each number in momentum={momentum}, got u of shape {u.shape}; "
+                f"conservation_law needs a field for each number in momentum={momentum}, got u of shape {values.shape}; "
                 "give a state that holds them all"
             )
-        kind = dtype_of(u)
-        if kind.kind not in "biuf":
-            raise TypeError(f"conservation_law takes real numbers as u, got dtype {kind}; write u.real")
-        return frozen(u if kind.kind == "f" else u * 1.0)
+        if np.iscomplexobj(values):
+            raise TypeError(f"conservation_law takes real numbers as u, got dtype {values.dtype}; write u.real")
+        return frozen(u if isbox(u) else values)
 
     def _rate(self, u, e, params):
         """The rate; of an equilibrium e only the slopes take notice."""
@@ -317,13 +318,9 @@ class Axis:
         self.number, self.place, self.dim = number, number - grid.dim, grid.dim
         self.sides, self.momentum, self.inflow = sides, momentum, inflow
         line, n = grid.widths[number], grid.shape[number]
-        beyond = np.arange(-GHOSTS, n + GHOSTS)
-        self.cell = beyond % n  # what a place of the padded line repeats
-        for upper, side in enumerate(sides if sides[0] else ()):
-            ghosts = slice(*GHOST_CELLS[upper])
-            mirror = 2 * n * upper - 1 - beyond[ghosts]
-            self.cell[ghosts] = np.clip(mirror, 0, n - 1) if side is free_slip else upper * (n - 1)
-        self.widths, padded = self._along(line), line[self.cell]
+        lower, upper = (np.pad(np.arange(n), GHOSTS, REPEATED[side]) for side in sides)
+        self.ghosts = lower[:GHOSTS], upper[-GHOSTS:]  # the cells that those beyond the ends repeat
+        self.widths, padded = self._along(line), np.concatenate([line[lower[:-GHOSTS]], line[upper[-GHOSTS:]]])
         gaps = padded[1:] + padded[:-1]
         self.distances = [self._along(gap / padded[1:-1]) for gap in (gaps[:-1], gaps[1:])]
         ends = () if scheme.limiter is None else (0,) if scheme.symmetric else (0, 1)
@@ -353,7 +350,7 @@ class Axis:
 
     def _ghosts(self, u, params, upper, flows):
         """What stands beyond an end."""
-        ghosts, side = u[self._at(self.cell[slice(*GHOST_CELLS[upper])])], self.sides[upper]
+        ghosts, side = u[self._at(self.ghosts[upper])], self.sides[upper]
         if side is free_slip:  # the momentum changes its sign
             signs = 1.0 - 2.0 * (np.arange(len(u)) == self.momentum)
             return -ghosts if u.ndim == self.dim else ghosts * self._fields(signs)

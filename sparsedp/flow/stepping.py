@@ -30,6 +30,7 @@ Adams-Bashforth, by the largest root |z| of
     z^2 - z = (3/2 z - 1/2) (i c - d),      or, with implicit damping,  (z^2 - z) + d z (z + 1) / 2 = (3/2 z - 1/2) i c.
 """
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -205,7 +206,7 @@ class FlowStep(Remade):
 
     def __init__(self, given):
         self.given = given
-        grid, boundary, solid, viscosity = (given[word] for word in ("grid", "boundary", "solid", "viscosity"))
+        grid, boundary, solid = given["grid"], given["boundary"], given["solid"]
         self.grid, self.dt, self.force, self.friction = grid, float(given["dt"]), given["force"], given["friction"]
         self.strict, self.implicit = given["unstable"] == "raise", given["implicit"]
         self.project = projection(grid, solid, boundary)
@@ -217,10 +218,8 @@ class FlowStep(Remade):
         # A force is for faces that are free: an implicit viscosity would carry it from the others into the fluid.
         self.free = mask(grid.faces, free_faces(grid, setup.sides, solid))
         self.convect: Any = convection(grid, boundary, solid) if given["convective"] else None
-        self.viscous: Any = None
-        if viscosity:
-            op = face_laplacian(grid, boundary, solid, given["solid_boundary"])
-            self.viscous = Diffusion("viscosity", viscosity, op, given["walls"], self)
+        viscous = partial(face_laplacian, grid, boundary, solid, given["solid_boundary"])
+        self.viscous = Diffusion("viscosity", given["viscosity"], viscous, given["walls"], self)
         self.scalars = {name: Scalar(name, solid, self, **parts) for name, parts in (given["scalars"] or {}).items()}
 
     def recipe(self):
@@ -252,8 +251,7 @@ class FlowStep(Remade):
         ahead = v + dt * (1.5 * a - 0.5 * state["a"] - self.slope(p))
         if rub is not None:
             ahead = (ahead - dt * rub * v) / (1.0 + dt * rub)
-        if self.viscous is not None:
-            ahead = self.viscous.relaxed(ahead, v)
+        ahead = self.viscous.relaxed(ahead, v)
         q = self.pressure(ahead)
         new = {"v": self.open(ahead) + self.slope(q), "p": p - q / dt, "a": a}
         if s:
@@ -271,7 +269,7 @@ class FlowStep(Remade):
             a = a + self.free(self._pushed(v, params, *([s] if self.scalars else [])))
         if rub is not None:
             a = a + rub * v
-        return a if self.viscous is None else a + self.viscous.rate(v, params)
+        return self.viscous.added(a, v, params)
 
     def _pushed(self, v, params, *scalars):
         """The force; a number is the same on all faces."""
@@ -299,7 +297,7 @@ class FlowStep(Remade):
         fastest = 0.5 * float(np.max(passing, initial=0.0))
         if SURE < self.dt * fastest < np.inf:
             terms = [self.viscous, *(one.diffused for one in self.scalars.values())]
-            growth = max(_growth(self.dt * fastest, term.damping if term else 0.0, self.implicit) for term in terms)
+            growth = max(_growth(self.dt * fastest, term.damping, self.implicit) for term in terms)
             if growth > GROWTH:
                 raise UnstableStepError(
                     f"flow_step is unstable for this velocity with dt = {self.dt:.12g}: waves grow by {growth - 1:.0%} "
@@ -310,7 +308,7 @@ class FlowStep(Remade):
     def __repr__(self):
         parts = {
             "convection": self.convect,
-            "viscosity": self.viscous,
+            "viscosity": self.viscous.op,
             "force": self.force,
             "friction": self.friction,
             "scalars": self.scalars or None,
@@ -320,7 +318,7 @@ class FlowStep(Remade):
 
 
 class Diffusion:
-    """A term nu (L u + held) of a flow step: the trapezoidal rule, or a rate.
+    """A term nu (L u + held) of a flow step, by the trapezoidal rule or explicit. For nu = 0 nothing is built.
 
     Parameters
     ----------
@@ -328,47 +326,56 @@ class Diffusion:
         Of nu in messages.
     number : number or callable
         nu.
-    op : Operator
-        L.
+    laplacian : callable
+        Makes L.
     held : array or None
         What walls add to L u.
     flow : FlowStep
 
     Attributes
     ----------
+    op : Operator or None
+        L.
     relax : Operator or None
         The solve of the trapezoidal rule.
     damping : float
         dt nu |L|; 0 where nu is a function.
     """
 
-    def __init__(self, name, number, op, held, flow):
-        self.name, self.number, self.op, self.held, self.flow = name, number, op, held, flow
-        rows = op.structure.magnitude()(np.ones(op.domain.size))  # no eigenvalue is beyond the largest sum of a row
-        self._steepest, self.relax = float(np.max(rows, initial=0.0)), None
-        self.damping = 0.0 if callable(number) else flow.dt * number * self._steepest
+    def __init__(self, name, number, laplacian, held, flow):
+        self.name, self.number, self.held, self.flow = name, number, held, flow
+        self.op, self.relax, self.damping = laplacian() if number else None, None, 0.0
+        if self.op is None:
+            return
+        rows = self.op.structure.magnitude()(np.ones(self.op.domain.size))
+        self._steepest = float(np.max(rows, initial=0.0))  # no eigenvalue is beyond the largest sum of a row
+        if not callable(number):
+            self.damping = flow.dt * number * self._steepest
         if flow.implicit:
-            self.relax = inverse(identity(op.domain) - (0.5 * flow.dt * number) * op)
+            self.relax = inverse(identity(self.op.domain) - (0.5 * flow.dt * number) * self.op)
         elif not callable(number):
             self._check_stable(number)
 
-    def rate(self, u, params):
-        """nu (L u + held); 0 where the trapezoidal rule takes it."""
-        if self.relax is not None:
-            return 0.0
+    def added(self, rate, u, params):
+        """A rate and nu (L u + held), where that is explicit."""
+        if self.op is None or self.relax is not None:
+            return rate
         number = self.number
         if callable(number):
             number = number(params)
             check_number("the viscosity of flow_step", plain(number), ">= 0")
             self._check_stable(float(plain(number)))
-        return number * (self.op(u) if self.held is None else self.op(u) + self.held)
+        return rate + number * self._slope(u, 1.0)
 
     def relaxed(self, ahead, u):
         """The new field, from that which all other terms lead to, and the old one u."""
         if self.relax is None:
             return ahead
-        half = self.op(u) if self.held is None else self.op(u) + 2.0 * self.held  # of the old and of the new field
-        return self.relax(ahead + (0.5 * self.flow.dt * self.number) * half)
+        return self.relax(ahead + (0.5 * self.flow.dt * self.number) * self._slope(u, 2.0))
+
+    def _slope(self, u, share):
+        """L u and that share of what walls add: 2 for the old and the new field."""
+        return self.op(u) if self.held is None else self.op(u) + share * self.held
 
     def _check_stable(self, number):
         """Adams-Bashforth is stable for dt nu |lambda| <= 1."""
@@ -385,14 +392,13 @@ class Scalar:
 
     def __init__(self, name, solid, flow, diffusivity=0.0, boundary=neumann, values=None, source=None):
         grid, self.name, self.flow, self.source = flow.grid, name, flow, source
-        self.mean, self.held, self.diffused, bend = average(grid, boundary), 0.0, None, None  # type: Any, Any, Any, Any
+        self.mean, self.held, bend = average(grid, boundary), 0.0, None  # type: Any, Any, Any
         if values is not None:
             slopes, normal = lift(grid, boundary)(values), flow.divergence.T(np.ones(grid.shape))
             bend = flow.divergence(slopes)
             self.held = slopes / np.where(slopes != 0, 2 * normal, 1.0)  # the wall's value
-        if diffusivity:
-            op = laplacian(grid, boundary, solid)
-            self.diffused = Diffusion(f"diffusivity of {name!r}", float(diffusivity), op, bend, flow)
+        op = partial(laplacian, grid, boundary, solid)
+        self.diffused = Diffusion(f"diffusivity of {name!r}", float(diffusivity), op, bend, flow)
 
     def rate(self, v, s, params):
         """What is explicit."""
@@ -406,14 +412,13 @@ class Scalar:
                     f"{np.shape(plain(source))}; write one number for each cell"
                 )
             rate = rate + source
-        rate = rate if self.diffused is None else rate + self.diffused.rate(u, params)
+        rate = self.diffused.added(rate, u, params)
         check_finite(f"the rate of {self.name!r}", plain(rate))
         return rate
 
     def step(self, u, rate, before):
         """The field after a step."""
-        ahead = u + self.flow.dt * (1.5 * rate - 0.5 * before)
-        return ahead if self.diffused is None else self.diffused.relaxed(ahead, u)
+        return self.diffused.relaxed(u + self.flow.dt * (1.5 * rate - 0.5 * before), u)
 
 
 def _growth(courant, damping, implicit):
