@@ -214,8 +214,8 @@ class ConservationLaw(Remade):
             raise ShapeError(f"conservation_law takes u of shape ({wanted}), got {values.shape}")
         if momentum and max(momentum) >= (*fields, 1)[0]:
             raise ShapeError(
-                f"conservation_law needs a field for each number in momentum={momentum}, got u of shape {values.shape}; "
-                "give a state that holds them all"
+                f"conservation_law needs a field for each number in momentum={momentum}, got u of shape "
+                f"{values.shape}; give a state that holds them all"
             )
         if np.iscomplexobj(values):
             raise TypeError(f"conservation_law takes real numbers as u, got dtype {values.dtype}; write u.real")
