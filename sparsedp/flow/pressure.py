@@ -108,7 +108,7 @@ class Potential(Projected):
     def act(self, x, out):
         scale = 2.0**self.setup.exponent
         if self.transposed:
-            self.setup.split(np.zeros(out.size), out, True, scale * x)
+            self.setup.pressed(scale * x, out)
         else:
             p = self.setup.split(x, np.empty(x.size))
             np.multiply(scale, self.setup.inverse.solver.system.null_space.project(p), out=out)

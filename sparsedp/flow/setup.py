@@ -1,12 +1,12 @@
 """What a projection is made of, set up once, and the solve itself: forward and transposed.
 
 With K the mask of the faces that are not closed, D the divergence, G the gradient of the pressure
-(0 on closed and on given faces), A = -D G, and a source s on cells that may be added,
+(0 on closed and on given faces), and A = -D G,
 
-    A p   = D K x + s,      w = K x + G p,
-    A^T q = G^T g + s,      z = K (g + D^T q).
+    A p   = D K x,      w = K x + G p,
+    A^T q = G^T g,      z = K (g + D^T q).
 
-The second line is the transpose of the first: cotangents g of w and s of p give z, that of x, by one solve.
+The second line is the transpose of x -> w; that of x -> p takes a source s on cells in the place of G^T g, and g = 0.
 """
 
 from functools import cached_property
@@ -22,7 +22,7 @@ from sparsedp.operators.boundary import check_solid, diagonal, solid_faces
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.recipe import Remade
 from sparsedp.solvers.inverses import build
-from sparsedp.solvers.scaling import in_range, largest, norm, shifted
+from sparsedp.solvers.scaling import in_range, largest, shifted
 
 __all__ = ["Setup", "faces_that", "pressure_conditions"]
 
@@ -80,56 +80,51 @@ class Setup(Remade):
     def _exact(self):
         return self.inverse.method == "separable" and self.grid.cells.size > 0
 
-    def split(self, x, out, transposed=False, source=None):
-        """Flat face field, and source on cells -> p (q); w (z) is written into `out`."""
-        if source is not None:
-            source = self.inverse.solver.system.null_space.project(source, transposed)
-        p = self._split(x, out, transposed, source)
-        if self.still and source is None:  # P; the transposed pressure alone makes something of a source
+    def split(self, x, out, transposed=False):
+        """Flat face field -> p (q); w (z) is written into `out`."""
+        p = self._split(x, out, transposed)
+        if self.still:
             out[:] = 0.0
         return p
 
-    def _split(self, x, out, transposed, source):
+    def _split(self, x, out, transposed):
         turned, solver = transposed and not self.symmetric, self.inverse.solver
         passes, reach, b = self.passes[transposed], self._reach[transposed], np.empty(self.grid.cells.size)
-
-        def net_flow(v):
-            """Right-hand side, of which the norm is returned, and that of all terms in it."""
-            flow, size = passes.net_flow(v, b)
-            if source is None:
-                return flow, reach * size
-            np.add(b, source, out=b)
-            return norm(b), reach * size + norm(source)
 
         def residual(p):
             """The net flow of the result is what the solve left: the contract need not look for it."""
             passes.push(x, p, out)
-            return net_flow(out)[0]
+            return passes.net_flow(out, b)[0]
 
-        data, terms = net_flow(x)
-        if in_range(terms):
-            p = solver.judged(b, data, terms, residual, transposed, turned) if self._exact else None
+        data, size = passes.net_flow(x, b)
+        if in_range(reach * size):
+            p = solver.judged(b, data, reach * size, residual, transposed, turned) if self._exact else None
             if p is not None:
                 return p
-            net_flow(x)
-        elif exponent := _exponent(x, source):
-            source = None if source is None else shifted(source, -exponent)
-            p = self._split(shifted(x, -exponent), out, transposed, source)
+            passes.net_flow(x, b)
+        elif 0 < (top := largest(x)) < np.inf and not in_range(top):  # beyond the middle of the range of floats
+            exponent = int(np.frexp(top)[1])
+            p = self._split(shifted(x, -exponent), out, transposed)
             out[:] = shifted(out, exponent)
             return shifted(p, exponent)
         try:
             before = self.info.forward
             p = solver.solve(b, turned, checked=False)
         except NonFiniteError:
-            self._refuse(x, source, transposed)
+            self._refuse(x, transposed)
             raise
         if transposed and self.symmetric:
             self.info.adjoint, self.info.forward = self.info.forward, before
         passes.push(x, p, out)
         return p
 
-    def _refuse(self, x, source, transposed):
-        """Name the argument that is not finite."""
+    def pressed(self, source, out):
+        """The transpose of x -> p: a flat source s on cells gives z = K D^T q with A^T q = s, written into `out`."""
+        q = self.inverse.solver.solve(source, True, checked=False)
+        self.passes[True].push(np.zeros(out.size), q, out)
+
+    def _refuse(self, x, transposed):
+        """Name the face whose velocity, or cotangent, is not finite."""
         space = self.grid.faces
 
         def where(index):
@@ -137,8 +132,6 @@ class Setup(Remade):
             return f"{self.grid.axes[axis]}-face {place(index - space.offsets[axis], space.parts[axis])}"
 
         check_finite(f"{'the cotangent of' if transposed else 'the velocity in'} projection", x, where=where)
-        if source is not None:
-            check_finite("the cotangent of pressure", source.reshape(self.grid.shape))
 
     @cached_property
     def still(self):
@@ -175,12 +168,6 @@ def _inverse(op, settings):
         except ValueError:  # an axis that cannot be diagonalised with all its digits
             pass
     return build(op, name="pressure solve", **settings)
-
-
-def _exponent(x, source):
-    """The power of two by which data beyond the middle of the range of floats are scaled; 0: by none."""
-    top = max(largest(x), 0.0 if source is None else largest(source))
-    return 0 if in_range(top) or not 0 < top < np.inf else int(np.frexp(top)[1])
 
 
 def pressure_conditions(grid, sides):
