@@ -29,8 +29,10 @@ stiff parts are large in it.
 """
 
 from collections import deque
+from copy import copy
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
@@ -69,40 +71,6 @@ STALLED = 1e-11  # relative correction that is taken for rounding where it does 
 ITERATIONS = 10  # of Newton's method in a step with error control
 REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError  # of a rate that is given a state too far away
 FAST = 0.03  # share of a correction that is left after an iteration, up to which the Jacobian serves the next step
-
-
-class Radau(Scheme):
-    """Steps of a problem with few unknowns: any tree of real arrays.
-
-    Parameters
-    ----------
-    problem : Problem
-    jacobian : callable or None
-        For Newton's method alone; derivatives are made from the rate.
-    tolerance : float or None
-        As `Adaptive`; None: one step.
-    floor : None, number, or tree like the state
-        As `Adaptive`.
-    settings : dict
-        rtol and maxiter, of Newton's method where there is no error control.
-    """
-
-    def __init__(self, problem, jacobian, tolerance, floor, settings):
-        super().__init__(problem, "radau", 5)
-        self.jacobian, self.tolerance, self.floor, self.taken = jacobian, tolerance, constant(floor), [1.0]
-        self.goal = NEWTON * tolerance if tolerance else settings["rtol"]
-        self.most = ITERATIONS if tolerance else settings["maxiter"] or 50
-
-    def __call__(self, u, params, t, h):
-        """The state after the interval h."""
-        interval = Interval(self, u, params)
-        v = flat([cast(leaf, float) for leaf in leaves(u)])
-        if not v.size:
-            return u
-        interval.check(u, params, t, h)
-        new = interval(v, [leaf for leaf in leaves(params) if isbox(leaf)], 0.0 if t is None else t + 0.0, h)
-        self.taken = interval.taken
-        return interval.problem.layout.rounded(new)
 
 
 def flat(parts):
@@ -153,17 +121,25 @@ class Flat:
         return np.concatenate(parts).T
 
 
-class Interval(Adaptive):
-    """One interval: its steps, Newton's method for their stages, and the derivative of the steps taken.
+class Radau(Adaptive):
+    """Steps of a problem with few unknowns, any tree of real arrays, and the derivative of those taken.
 
     Parameters
     ----------
-    scheme : Radau
-    u, params : trees
-        At the start.
+    problem : Problem
+    jacobian : callable or None
+        For Newton's method alone; derivatives are made from the rate.
+    tolerance : float or None
+        As `Adaptive`; None: one step.
+    floor : None, number, or tree like the state
+        As `Adaptive`.
+    settings : dict
+        rtol and maxiter, of Newton's method where there is no error control.
 
     Attributes
     ----------
+    params, moving : tree, list of bool
+        Of an interval, plain, and which leaves are traced. Each interval has a copy of the scheme.
     f : flat array
         The rate at the start of the step.
     real, complex : callable
@@ -171,14 +147,31 @@ class Interval(Adaptive):
     """
 
     window = 10 * WINDOW  # a jump at a fine tolerance takes thousands of steps, of little cost
+    v: Any = None
+    J: Any = None
+    held: Any = None
+    guess: Any = None
+    fresh = slow = False
 
-    def __init__(self, scheme, u, params):
-        super().__init__(scheme, scheme.tolerance, scheme.floor)
-        self.problem, self.params = Flat(scheme.problem, u, self.name), constant(untraced(params))
-        self.moving = [isbox(leaf) for leaf in leaves(params)]
+    def __init__(self, problem, jacobian, tolerance, floor, settings):
+        super().__init__(Scheme(problem, "radau", 5), tolerance, floor)
+        self.given, self.taken = jacobian, [1.0]
+        self.goal = NEWTON * tolerance if tolerance else settings["rtol"]
+        self.most = ITERATIONS if tolerance else settings["maxiter"] or 50
         self.compared, self.ratio, self.weight = EMBEDDED, 1.0, 1.0
-        self.v = self.J = self.held = self.guess = None
-        self.fresh = self.slow = False
+
+    def __call__(self, u, params, t, h):
+        """The state after the interval h."""
+        run = copy(self)
+        run.problem, run.params = Flat(self.problem, u, self.name), constant(untraced(params))
+        run.moving = [isbox(leaf) for leaf in leaves(params)]
+        v = flat([cast(leaf, float) for leaf in leaves(u)])
+        if not v.size:
+            return u
+        run.check(u, params, t, h)
+        new = run.flat(v, [leaf for leaf in leaves(params) if isbox(leaf)], 0.0 if t is None else t + 0.0, h)
+        self.taken = run.taken
+        return run.problem.layout.rounded(new)
 
     def check(self, *given):
         """Refuse a state, a rate, or derivatives that it cannot serve."""
@@ -200,7 +193,7 @@ class Interval(Adaptive):
         if self.tolerance is not None:
             self._check_tolerance(u)
 
-    def __call__(self, *given):
+    def flat(self, *given):
         """(flat state, params that are traced, time, length) -> the flat state at the end."""
         v, _, t, h = untraced(given)
         traced = any(map(isbox, leaves(given)))
@@ -268,10 +261,10 @@ class Interval(Adaptive):
     def jacobian(self, v, t):
         """df/du for Newton's method."""
         n = self.problem.size
-        if self.scheme.jacobian is None:
+        if self.given is None:
             return self.problem.rows(v, self.params, t, [False] * len(self.moving))[:, :n]
         args = (self.problem.state(v), self.params, t)
-        J = as_matrix(self.scheme.jacobian(*args[: 2 + self.problem.timed])).toarray()
+        J = as_matrix(self.given(*args[: 2 + self.problem.timed])).toarray()
         if J.shape != (n, n):
             raise ShapeError(f"the jacobian of {self.name} must have shape {(n, n)}, got {J.shape}")
         return J
@@ -285,7 +278,7 @@ class Interval(Adaptive):
             start, before, cubic = self.guess
             z = np.vander(C * h / before + (start is not v), 4, increasing=True) @ cubic - v
         w = BACK @ z
-        for iteration in range(1, self.scheme.most + 1):
+        for iteration in range(1, self.most + 1):
             rates = [self.problem(v + part, self.params, t + c * h) for part, c in zip(z, C, strict=True)]
             f = BACK @ np.array(rates)
             one = self.real(f[0] - REAL / h * w[0], False)
@@ -298,9 +291,9 @@ class Interval(Adaptive):
             moved = norm(step / size)
             left = moved / last if last else 0.0
             error = moved * left / (1 - left) if left < 1 else np.inf
-            if moved == 0.0 or last and error <= max(self.scheme.goal, ROUNDING):
+            if moved == 0.0 or last and error <= max(self.goal, ROUNDING):
                 break
-            if not (np.isfinite(error) and left ** (self.scheme.most - iteration - 1) * error <= self.scheme.goal):
+            if not (np.isfinite(error) and left ** (self.most - iteration - 1) * error <= self.goal):
                 return z if moved <= STALLED else None
             last = moved
         self.slow = left > FAST and iteration > 2
