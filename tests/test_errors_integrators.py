@@ -190,17 +190,17 @@ TABLE = [
     (
         lambda: dp.stepper("rk4", lambda x, p: {"w": x["v"], "u": x["u"]}, 0.6)({"u": U, "v": U}),
         SHAPE,
-        "a rate must have the names of the state, ['u', 'v'], got ['w', 'u']",
+        "a rate must have the fields of the state, u['u'], u['v'], got u['w'], u['u']",
     ),
     (
         lambda: dp.stepper("rk4", lambda x, p: (x["v"], x["u"]), 0.6)({"u": U, "v": U}),
         SHAPE,
-        "a rate must have the names of the state, ['u', 'v'], got tuple",
+        "a rate must have the fields of the state, u['u'], u['v'], got u[0], u[1]",
     ),
     (
         lambda: dp.stepper("rk4", lambda x, p: (x[0], [*x[1].values()]), 0.6)((U, {"u": U, "v": U})),
         SHAPE,
-        "a rate must have the names of the state, ['u', 'v'], got list",
+        "a rate must have the fields of the state, u[0], u[1]['u'], u[1]['v'], got u[0], u[1][0], u[1][1]",
     ),
     (
         lambda: dp.stepper("tr_bdf2", dp.laplacian(dp.Grid(3)), 0.6)(U),

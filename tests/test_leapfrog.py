@@ -223,7 +223,7 @@ def test_refusals():
         step((np.ones(3), np.ones(3)))
     step = dp.stepper("leapfrog", (rates[0], lambda p, c: (p, p)), 0.1, damping=(None, 1.0))
     with pytest.raises(
-        dp.errors.ShapeError, match=r"a rate must have the shape of the state, \(3,\), got \(3,\), \(3,\)"
+        dp.errors.ShapeError, match=r"a rate must have the fields of the state, u, got u\[0\], u\[1\]"
     ):
         step((np.ones(3), np.ones(3)))
     with pytest.raises(ValueError, match="sponge on x needs 0 to 4 cells, got 5"):

@@ -442,11 +442,11 @@ BUGS = {
         "h * self.stiff[0].coefficient(params)",
         "tests/test_integrators_fields.py",
     ),
-    "rates that go to fields by their place": Bug(
+    "numbers that go to fields by their place": Bug(
         "tree.py",
         "names is None or wanted is None or set(names) != set(wanted)",
         "True",
-        "tests/test_integrators_fields.py",
+        "tests/test_leapfrog.py",
     ),
     "eigenvalues of a factor without its scale": Bug(
         "solvers",

@@ -12,7 +12,7 @@ from sparsedp.fields import check_number, check_takes
 from sparsedp.operator import Operator
 from sparsedp.space import fits
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
-from sparsedp.tree import copied, flatten, keys, leaves, leaves_like, mapped, subscript
+from sparsedp.tree import copied, flatten, keys, labels, leaves, mapped, subscript
 
 __all__ = ["Problem", "combine", "later", "like", "number", "of_fields", "pair", "untraced"]
 
@@ -48,27 +48,23 @@ def combine(u, *pairs):
 
 def of_fields(tree, u):
     """The leaves of a rate, one for each of the state; broadcasting one into another would hide a mistake."""
-    _check_names(tree, u)
-    found = leaves_like(tree, u)
-    if _shapes(found) != (shapes := _shapes(leaves(u))):
-        given, wanted = (", ".join(map(str, words)) or "nothing" for words in (_shapes(found), shapes))
-        raise ShapeError(f"a rate must have the shape of the state, {wanted}, got {given}")
-    return found
+    found, wanted = _by_place(tree), _by_place(u)
+    if found.keys() != wanted.keys():
+        names = (", ".join(labels(x, "u")) or "nothing" for x in (u, tree))
+        raise ShapeError("a rate must have the fields of the state, {}, got {}".format(*names))
+    shapes = [[np.shape(fields[place]) for place in wanted] for fields in (wanted, found)]
+    if shapes[0] != shapes[1]:
+        words = (", ".join(map(str, row)) for row in shapes)
+        raise ShapeError("a rate must have the shape of the state, {}, got {}".format(*words))
+    return [found[place] for place in wanted]
 
 
-def _check_names(tree, u):
-    """Refuse a rate that would meet fields with names by its order."""
-    names, wanted = keys(tree), keys(u)
-    if isinstance(tree, dict) != isinstance(u, dict) or (isinstance(u, dict) and names != wanted):
-        both = ([*x] if isinstance(x, dict) else type(x).__name__ for x in (u, tree))
-        raise ShapeError("a rate must have the names of the state, {}, got {}".format(*both))
-    for name in wanted or ():
-        if name in (names or ()):
-            _check_names(tree[name], u[name])
-
-
-def _shapes(found):
-    return [np.shape(leaf) for leaf in found]
+def _by_place(tree):
+    """{the keys that lead to a leaf: the leaf}, from left to right."""
+    names = keys(tree)
+    if names is None:
+        return {(): tree}
+    return {(name, *rest): leaf for name in names for rest, leaf in _by_place(tree[name]).items()}
 
 
 def like(new, u):
