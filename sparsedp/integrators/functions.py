@@ -1,12 +1,10 @@
-"""Functions of z L for an operator L, differentiable in z: one rule for all of them.
+"""Functions of z L for a separable operator L, differentiable in z: one rule for all of them.
 
 A sum f of such functions has a derivative f' of the same kind, and with y = f(z L) b
 
     dy = f(z L) db + L f'(z L) b dz,     b_bar = f(z L)^T g,     z_bar = g . L f'(z L) b.
 
-Taylor: T_p(x) = 1 + x + ... + x^p / p!, by products with L, for any L; T_p' = T_{p-1}.
-
-Function: sums of phi_k, by transforms, where L is separable:
+They are sums of phi_k, by transforms, where L is separable:
 
     phi_0(x) = exp(x),    phi_{k+1}(x) = (phi_k(x) - 1/k!) / x,    phi_k'(x) = phi_k(x) - k phi_{k+1}(x)
 
@@ -16,10 +14,9 @@ Sources: Cox and Matthews, J. Comput. Phys. 176 (2002); Kassam and Trefethen, SI
 the trouble.
 """
 
-from functools import lru_cache, partial, reduce
+from functools import lru_cache
 from math import factorial, prod
-from operator import add
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
@@ -32,95 +29,10 @@ from sparsedp.shortcuts import refuse_elsewhere
 from sparsedp.solvers.separable import diagonalised
 from sparsedp.tape import Rule, isbox
 
-__all__ = ["Function", "PhiFunctions", "Taylor", "TaylorPolynomials", "phi"]
+__all__ = ["Function", "PhiFunctions", "phi"]
 
 NEAR, LARGEST = 3.0, 1e3  # of x; beyond the second even the exponential is infinite
 KEPT = 64  # tables of weights, for a few z
-
-
-class Functions:
-    """combine(functions, z, *fields): the sum of f_j(z L) b_j, differentiable in z and the fields.
-
-    A kind of functions says by `plain` what their values are.
-
-    Parameters
-    ----------
-    op : Operator
-        L.
-    name : str
-        For messages and counts.
-    """
-
-    plain: Any
-
-    def __init__(self, op, name):
-        self.op, self.name, self.domain = op, name, op.domain
-        self._rule = lru_cache(None)(self._made)  # rules made once, for every z, step and adjoint
-
-    def __call__(self, functions, z, *fields):
-        return self._rule(functions, False)(z, *fields)
-
-    def _made(self, functions, transposed):
-        """The sum as a rule in (z, *fields)."""
-
-        def forward(z, *fields):
-            return self.plain([functions], z, fields, transposed)[0]
-
-        def slope(z, fields):
-            return self._rule(tuple(f.derivative() for f in functions), transposed)(z, *fields)
-
-        def vjp(nums, ans, z, *fields):
-            chosen = [(functions[num - 1],) for num in nums if num]
-
-            def pull(g):
-                if isbox(g) or isbox(z):
-                    backs = iter([self._rule(row, not transposed)(z, g) for row in chosen])
-                else:  # all at once
-                    backs = iter(self.plain(chosen, z, [g], not transposed))
-                found = [next(backs) if num else anp.sum(g * slope(z, fields)) for num in nums]
-                return tuple(of_argument(back, (z, *fields)[num]) for num, back in zip(nums, found, strict=True))
-
-            return pull
-
-        def jvp(nums, tangents, ans, z, *fields):
-            chosen, moves = [functions[num - 1] for num in nums if num], tangents[nums[0] == 0 :]
-            total = tangents[0] * slope(z, fields) if nums[0] == 0 else 0.0
-            return total + self._rule(tuple(chosen), transposed)(z, *moves) if chosen else total
-
-        return Rule(f"{self.name}{'.T' * transposed}", forward, vjp, jvp)
-
-
-class Taylor(NamedTuple):
-    """L^power T_order(z L); 0 below order 0."""
-
-    order: int
-    power: int = 0
-
-    def derivative(self):
-        """The function of the same kind for d/dz."""
-        return Taylor(self.order - 1, self.power + 1)
-
-
-class TaylorPolynomials(Functions):
-    """By products with L, which may be any operator from a space to itself."""
-
-    def plain(self, rows, z, fields, transposed=False):
-        """[the sum for each row of functions], on plain values, or with the transpose of L."""
-        op, z = (self.op.T if transposed else self.op), float(z)  # a NumPy scalar would round float32
-        # Not by sum(), which starts from 0 with one pass more.
-        return [reduce(add, map(partial(_horner, op, z), row, fields)) for row in rows]
-
-
-def _horner(op, z, function, u):
-    """L^power T_order(z L) u by Horner's rule."""
-    total = u if function.order >= 0 else 0.0 * u
-    for k in range(function.order, 0, -1):
-        total = op.apply(total)
-        total *= z / k
-        total += u
-    for _ in range(function.power):
-        total = op.apply(total)
-    return total
 
 
 def phi(k, x):
@@ -167,14 +79,17 @@ class Function(NamedTuple):
             return eigenvalues**self.power * sum(a * value for a, value in zip(self.weights, found, strict=True) if a)
 
 
-class PhiFunctions(Functions):
-    """By one transform for each field and one back.
+class PhiFunctions:
+    """combine(functions, z, *fields): the sum of f_j(z L) b_j, differentiable in z and the fields.
+
+    By one transform for each field and one back.
 
     Parameters
     ----------
     op : Operator
         L, separable, or a power of a separable operator.
     name : str
+        For messages and counts.
 
     Raises
     ------
@@ -183,9 +98,42 @@ class PhiFunctions(Functions):
     """
 
     def __init__(self, op, name):
-        super().__init__(op, name)
+        self.op, self.name, self.domain = op, name, op.domain
         self.found, self.eigenvalues = diagonalised(op, name, "; try imex or tr_bdf2")
+        self._rule = lru_cache(None)(self._made)  # rules made once, for every z, step and adjoint
         self._table = lru_cache(KEPT)(self._values)  # plain values only, of a few z
+
+    def __call__(self, functions, z, *fields):
+        return self._rule(functions, False)(z, *fields)
+
+    def _made(self, functions, transposed):
+        """The sum as a rule in (z, *fields)."""
+
+        def forward(z, *fields):
+            return self.plain([functions], z, fields, transposed)[0]
+
+        def slope(z, fields):
+            return self._rule(tuple(f.derivative() for f in functions), transposed)(z, *fields)
+
+        def vjp(nums, ans, z, *fields):
+            chosen = [(functions[num - 1],) for num in nums if num]
+
+            def pull(g):
+                if isbox(g) or isbox(z):
+                    backs = iter([self._rule(row, not transposed)(z, g) for row in chosen])
+                else:  # all at once
+                    backs = iter(self.plain(chosen, z, [g], not transposed))
+                found = [next(backs) if num else anp.sum(g * slope(z, fields)) for num in nums]
+                return tuple(of_argument(back, (z, *fields)[num]) for num, back in zip(nums, found, strict=True))
+
+            return pull
+
+        def jvp(nums, tangents, ans, z, *fields):
+            chosen, moves = [functions[num - 1] for num in nums if num], tangents[nums[0] == 0 :]
+            total = tangents[0] * slope(z, fields) if nums[0] == 0 else 0.0
+            return total + self._rule(tuple(chosen), transposed)(z, *moves) if chosen else total
+
+        return Rule(f"{self.name}{'.T' * transposed}", forward, vjp, jvp)
 
     def plain(self, rows, z, fields, transposed=False):
         """[the sum for each row of functions], on plain values, or with the transpose of L."""

@@ -1,7 +1,7 @@
 """Runge-Kutta steps. An explicit one is a table of numbers; an implicit one a few stages, x of x = b + h f(x, t).
 
-Where the rate is c L u and nothing else, an explicit step of order p in p stages is the Taylor polynomial T_p(z L) u,
-z = h c, and one node on the tape (functions.py).
+Where the rate is c L u and nothing else, an explicit step of order p in p stages is the Taylor polynomial of order p of
+exp(z L), z = h c, times u: by Horner's rule x <- u + z/k L x for k = p, ..., 1.
 
 Sources: Heun, Z. Math. Phys. 45 (1900); Kutta, Z. Math. Phys. 46 (1901);
 Shu and Osher, J. Comput. Phys. 77 (1988), the strong-stability-preserving step of order 3.
@@ -41,7 +41,7 @@ Source: Cox and Matthews, J. Comput. Phys. 176 (2002), formulas 26 to 29; Hochbr
 Acta Numerica 19 (2010), section 2.2, exponential quadrature.
 """
 
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from math import factorial, sqrt
 from typing import Any, NamedTuple
 
@@ -52,7 +52,7 @@ from numpy.polynomial import Polynomial as Line
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import ConvergenceError
-from sparsedp.integrators.functions import Function, PhiFunctions, Taylor, TaylorPolynomials
+from sparsedp.integrators.functions import Function, PhiFunctions
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
@@ -142,17 +142,17 @@ def _ahead(u, h, row, rates):
     return combine(u, *((h * share, rate) for share, rate in zip(row, rates, strict=True) if share))
 
 
-class Polynomial(Scheme):
-    """The same for u' = c L u."""
-
-    def __init__(self, problem, name):
-        super().__init__(problem, name, EXPLICIT[name].order)
-        self.polynomials = problem.engines(
-            lambda op: partial(TaylorPolynomials(op, f"stepper({name})"), (Taylor(self.order),)), unchanged
-        )
+class Polynomial(Explicit):
+    """The same for u' = c L u, by Horner's rule."""
 
     def __call__(self, u, params, t, h):
-        return self.problem.on_fields(lambda op, z, leaf: self.polynomials[op](z, leaf), h, params, u)
+        def ahead(L, z, leaf, x):
+            return leaf + z * L(x) if L else leaf
+
+        x = u
+        for k in range(self.order, 0, -1):
+            x = self.problem.on_fields(ahead, h / k, params, u, x)
+        return x
 
 
 def unchanged(z, leaf):
