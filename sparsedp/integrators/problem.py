@@ -165,6 +165,8 @@ class Problem:
     ----------
     stiff : list of Stiff
         Those of all fields.
+    operators : set of Operator
+        Every L there is.
     timed : bool
         Whether the state is the pair (u, t).
     driven, moving : bool
@@ -180,6 +182,7 @@ class Problem:
             rate, linear = None, (rate, lambda params: 1.0 if params is None else params)
         self.rate, self.source, self._terms = rate, source, _terms(linear, "linear")
         self.stiff = [term for term in leaves(self._terms) if term is not None]
+        self.operators = {term.op for term in self.stiff}
         self._check_functions()
         self.driven, self.moving = _takes(rate, 3), _takes(source, 2)
         self.timed = self.driven or self.moving if timed is None else timed
@@ -200,10 +203,6 @@ class Problem:
     def terms(self, u):
         """The Stiff of each field of a state, None where there is none."""
         return _matched(self._terms, u, "linear")
-
-    def engines(self, make, free):
-        """{L: make(L)} for every L there is, and {None: free}: what serves the fields without one."""
-        return {term.op: make(term.op) for term in self.stiff} | {None: free}
 
     def on_fields(self, act, h, params, u, *trees):
         """act(L, h c, leaf, ...) for each field of the state u, and of trees like it -> a tree like u.

@@ -155,11 +155,6 @@ class Polynomial(Explicit):
         return x
 
 
-def unchanged(z, leaf):
-    """What becomes of a field without a stiff part."""
-    return leaf
-
-
 # ---- the linear solve ------------------------------------------------------------------------------------------------
 
 
@@ -299,14 +294,12 @@ class Linear(Stages):
 
     def __init__(self, problem, name, settings, most):
         super().__init__(problem, name)
-        self.info, most = SolveLog(), most * len(problem.stiff)
-        self.resolvents = problem.engines(
-            lambda op: Resolvent(op, f"stepper({name})", settings, most, self.info), unchanged
-        )
+        self.info, most, name = SolveLog(), most * len(problem.stiff), f"stepper({name})"
+        self.resolvents = {op: Resolvent(op, name, settings, most, self.info) for op in problem.operators}
 
     def _resolved(self, h, params, b):
         """(1 - h c L)^-1 b, field by field."""
-        return self.problem.on_fields(lambda op, z, leaf: self.resolvents[op](z, leaf), h, params, b)
+        return self.problem.on_fields(lambda L, z, leaf: self.resolvents[L](z, leaf) if L else leaf, h, params, b)
 
     def solve(self, guess, b, params, t, h):
         """x of x = b + h (c L x + s(t))."""
@@ -414,7 +407,7 @@ class Exponential(Scheme):
 
     def __init__(self, problem):
         super().__init__(problem, "etdrk4", 4)
-        self.functions = problem.engines(lambda op: PhiFunctions(op, "stepper(etdrk4)"), _free)
+        self.functions = {op: PhiFunctions(op, "stepper(etdrk4)") for op in problem.operators} | {None: _free}
         self.nodes = () if problem.source is None else NODES if problem.moving else NODES[:1]
         self.parts = [quadrature(self.nodes, *ends) for ends in ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0))]
 
