@@ -12,7 +12,8 @@ import numpy as np
 
 from sparsedp.check.summary import error_text
 from sparsedp.derivative import check_loss
-from sparsedp.errors import NonFiniteError, SparsedpError
+from sparsedp.errors import SparsedpError
+from sparsedp.fields import check_finite
 from sparsedp.ledger import recording, thread
 from sparsedp.packing import Packing, joined
 from sparsedp.shortcuts import whole
@@ -69,8 +70,7 @@ class Point(Packing):
         number = lambda leaf: np.asarray(leaf)[()] if isinstance(leaf, (float, complex)) else whole(leaf)
         super().__init__(mapped(number, x))
         for name, values in zip(self.names, self.values):
-            if not np.all(np.isfinite(values)):
-                raise NonFiniteError(f"a gradient is checked at finite values, and {name} holds NaN or infinity")
+            check_finite(name, values, "must be finite where a gradient is checked")
         self.vector = joined(self.values)
         self.values = self.arrays(self.vector)  # the caller may write into those of x
         self.units = self.sizes(self.vector)

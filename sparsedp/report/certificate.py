@@ -235,12 +235,12 @@ def _advice(total, causes, solves, target):
         return "solves are exact to rounding"
     worst = max(open_to, key=lambda row: row["error"])
     side = "adjoint" if causes["adjoint solves"] > causes["forward solves"] else "forward solve"
-    wanted = min(worst["rtol"] * target / total, LOOSEST)
     name, now, goal = worst["solver"], worst["rtol"], f"for {100 * target:g} %"
+    wanted = min(now * target / total, LOOSEST) / 2
     if total > target:
-        return f"tighten the {side} of {name} from {now:.0e} to {wanted / 2:.0e} {goal}"
-    if wanted > 2 * now:
-        return f"{name} may stop at {wanted / 2:.0e} in place of {now:.0e} {goal}"
+        return f"tighten the {side} of {name} from {now:.0e} to {wanted:.0e} {goal}"
+    if wanted > now:
+        return f"{name} may stop at {wanted:.0e} in place of {now:.0e} {goal}"
     return f"the tolerances are as they should be {goal}"
 
 

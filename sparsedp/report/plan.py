@@ -20,18 +20,18 @@ __all__ = ["Plan", "explain", "total"]
 EXTRAS = {"numba": "compiled kernels", "pyamg": "multigrid", "matplotlib": "pictures", "tqdm": "bars"}
 COLUMNS = ("forward", "vjp", "jvp", "solve", "adjoint", "setup", "reused", "iterations", "assembled")
 TOTALS = {
-    "applications": ("forward", "vjp", "jvp"),
-    "forward solves": ("solve",),
-    "adjoint solves": ("adjoint",),
-    "set-ups built": ("setup",),
-    "set-ups reused": ("reused",),
-    "hierarchies built": ("hierarchy",),
-    "matrices assembled": ("assembled",),
-    "solves skipped": ("skipped",),
-    "steps recomputed": ("recomputed",),
-    "exchanges between ranks": ("exchange",),
-    "bytes in them": ("sent",),
-    "reductions": ("reduction",),
+    "applications": "forward vjp jvp",
+    "forward solves": "solve",
+    "adjoint solves": "adjoint",
+    "set-ups built": "setup",
+    "set-ups reused": "reused",
+    "hierarchies built": "hierarchy",
+    "matrices assembled": "assembled",
+    "solves skipped": "skipped",
+    "steps recomputed": "recomputed",
+    "exchanges between ranks": "exchange",
+    "bytes in them": "sent",
+    "reductions": "reduction",
 }
 
 
@@ -87,21 +87,21 @@ def explain(loss, x, gradient=True):
 
     def watched(tree):
         value = loss(tree)
-        forward[:] = perf_counter(), len(nodes), bytes_held(nodes), calls.copy()
+        forward[:] = perf_counter(), len(nodes), bytes_held(nodes), calls.copy(), perf_counter()
         nodes.clear()
-        forward.append(perf_counter())
         return value
 
     start = perf_counter()
     with recording() as calls, witnessed(lambda node, *_: nodes.append(node)):
         value = value_and_grad(watched)(x)[0] if gradient else watched(x)
-    seconds = forward[0] - start, perf_counter() - forward[4]
-    totals = {word: total(calls, *kinds) for word, kinds in TOTALS.items()}
+    end, tape_nodes, tape_bytes, before, begin = forward
+    seconds = end - start, perf_counter() - begin
+    totals = {word: total(calls, *kinds.split()) for word, kinds in TOTALS.items()}
     steps = sum(calls[name, "forward"] for name, kind in list(calls) if kind == "recomputed")
     return Plan(
-        value=float(value), counts=calls, totals=totals, rows=_rows(calls), tape_nodes=forward[1],
-        left_out=list(dict.fromkeys([*_gradient(x, gradient), *_skipped(calls, forward[3], gradient), *_extras()])),
-        tape_bytes=forward[2] + total(calls, "bytes"), seconds=seconds,
+        value=float(value), counts=calls, totals=totals, rows=_rows(calls), seconds=seconds, tape_nodes=tape_nodes,
+        left_out=list(dict.fromkeys([*_gradient(x, gradient), *_skipped(calls, before, gradient), *_extras()])),
+        tape_bytes=tape_bytes + total(calls, "bytes"),
         recomputation=1.0 + totals["steps recomputed"] / steps if steps else 1.0,
     )  # fmt: skip
 

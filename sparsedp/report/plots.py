@@ -248,10 +248,10 @@ def convergence(best, ax=None, against="iteration"):
         raise ValueError(f"convergence is drawn against iteration, seconds, evaluations or solves, got {against!r}")
     ax = current(ax)
     records = [(getattr(record, against), record.value, record.gradient_norm) for record in best.history]
-    across, values, norms = np.array(records, float).T
-    least = min(values.min(), 0.0)
-    name = "loss - least loss" if values.min() <= 0 else "loss"
-    lines = {name: np.stack([across, values - least], 1), "gradient norm": np.stack([across, norms], 1)}
+    numbers = np.array(records, float)
+    least = numbers[:, 1].min()
+    lines = {"loss - least loss" if least <= 0 else "loss": numbers[:, :2] - (0.0, min(least, 0.0))}
+    lines["gradient norm"] = numbers[:, ::2]
     return _dressed(lines, ax, against, "", f"{best.method}: {best.message.split(':')[0]}", xscale="linear")
 
 

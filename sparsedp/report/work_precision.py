@@ -36,8 +36,8 @@ COLUMNS = (
     "seed", "versions", "settings", "reference_error", "seconds_forward_median", "seconds_forward_max",
     "seconds_backward_median", "seconds_backward_max",
 )  # fmt: skip
-TEXTS = ("scene", "method", "status", "seed", "versions", "settings")
 KEY = ("scene", "method", "settings", "seed", "versions")  # what a row of an earlier run is found by
+TEXTS = (*KEY, "status")  # the other columns are numbers
 SHOWN = COLUMNS[2:15]
 COUNTS = {"solves_forward": "solve", "solves_adjoint": "adjoint", "iterations": "iterations"}  # in the ledger
 SETTLED = 2.0  # a run that is not faster than the last one by more is warm
