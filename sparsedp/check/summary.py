@@ -47,8 +47,8 @@ class Result(Frozen):
     def markdown(self):
         """The text in Markdown: a heading, tables, and the other lines as a list."""
         title, *parts = self.parts()
-        blocks = (part.markdown() if isinstance(part, Table) else f"- {part.strip()}" for part in parts)
-        return "\n\n".join([f"### {title}", *blocks, ""])
+        blocks = (f"\n{part.markdown()}\n" if isinstance(part, Table) else f"- {part.strip()}" for part in parts)
+        return "\n".join([f"### {title}", "", *blocks, ""])
 
     def html(self):
         """The text as HTML: a title, tables, the other lines; what was left out is folded away."""

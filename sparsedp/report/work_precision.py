@@ -345,7 +345,7 @@ class Rows(Result):
 
     def _recommended(self):
         """The fastest method for each error of GOALS, in words."""
-        for goal in GOALS:
+        for goal in GOALS if self.pareto(self.judged) else ():
             words, row = f"a {self.judged.replace('_', ' ')} of {100 * goal:g} %", self.best(goal, self.judged)
             if row is None:
                 yield f"no method reaches {words}"
