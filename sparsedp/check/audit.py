@@ -19,7 +19,7 @@ from sparsedp.check.judge import (
 from sparsedp.check.summary import Result
 from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, generator
 from sparsedp.check.table import Table, table_of
-from sparsedp.derivative import hvp, value_and_grad
+from sparsedp.derivative import grad, hvp
 from sparsedp.fields import check_function, is_whole
 from sparsedp.progress import bar
 
@@ -27,7 +27,7 @@ __all__ = ["Audit", "gradient"]
 
 FEWEST_STEPS = 8
 RANDOM = 3  # random directions
-SHIFT = 7, 2.0**-6  # seed and length of the step to the point where a kinked loss is looked at again
+SHIFT, BESIDE = 2.0**-6, 7  # length and seed of the step to the point where a kinked loss is looked at again
 LOOSE = 1e-8  # a tolerance of solves above this may explain any gap that no call is to blame for
 QUICK = ("random 1", "gradient")  # the directions of a quick audit
 LEFT_OUT = "other directions, single leaves and entries, complex steps and the Hessian product were not looked at"
@@ -121,7 +121,7 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
     if steps is not None and (len(set(chosen)) < FEWEST_STEPS or not all(0 < step < inf for step in chosen)):
         raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {chosen}")
     point, count = Point(x), min(directions, 1) if quick else directions
-    trials = Trials(loss, point, (lambda tree: value_and_grad(loss)(tree)[1]) if gradient is None else gradient, chosen)
+    trials = Trials(loss, point, grad(loss) if gradient is None else gradient, chosen)
     names = QUICK.__contains__ if quick else None
     lines = len(point.directions(point.vector, count, generator(0), names))
     ticks = _announced(3 + POINTS * min(lines, 2) + 2 * len(trials.steps) * lines)
@@ -178,9 +178,8 @@ def _look_beside(trials, judged):
     What is wrong beside the kinks as well is wrong.
     """
     point = trials.point
-    away = point.directions(point.vector, 1, generator(SHIFT[0]))[0][1]
     with suppress(*REFUSALS):
-        beside = Point(point.unpack(point.vector + SHIFT[1] * away))
+        beside = Point(point.unpack(point.vector + SHIFT * point.random(generator(BESIDE))))
         other = Trials(trials.loss, beside, trials.slope, tick=trials.tick)
         if verdict(*looked_at(other, RANDOM, generator(None)))[0] != "disagrees":
             for one in judged:

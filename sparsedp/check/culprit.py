@@ -11,7 +11,7 @@ from sparsedp.check.judge import forward_mode, looked_at
 from sparsedp.check.nodes import calls_seen, in_order
 from sparsedp.check.operators import fault_of, field
 from sparsedp.check.sweep import Point, Trials, generator
-from sparsedp.derivative import pullback, value_and_grad
+from sparsedp.derivative import grad, pullback
 from sparsedp.errors import DerivativeError
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
@@ -44,7 +44,7 @@ def culprit_of(loss, point):
     cleared: set[int] = set()  # Operators that are right
     with np.errstate(all="ignore"):
         with calls_seen() as nodes:
-            value_and_grad(loss)(point.fresh())
+            grad(loss)(point.fresh())
         for node in _examined(nodes):
             try:
                 fault = _fault(node, cleared, rng)
@@ -101,7 +101,7 @@ def _wrong_rule(node, rng):
         return anp.sum(anp.real(g * node.again(values)))
 
     # In each argument alone, and the largest entry: a loss of many entries hides single ones.
-    trials = Trials(loss, point, lambda tree: value_and_grad(loss)(tree)[1])
+    trials = Trials(loss, point, grad(loss))
     judged, doubts = looked_at(trials, DIRECTIONS, rng, lambda name: name not in SKIPPED)
     if "broken" in dict(doubts):
         return "its VJP gives NaN or infinity"

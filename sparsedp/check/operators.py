@@ -76,8 +76,8 @@ class Probe:
 
     @cached_property
     def turned(self):
-        """The entries that the transpose assembles by itself."""
-        return self.op.structure.transpose().explicit()
+        """The forms of the transpose, and the entries that it assembles by itself."""
+        return [self.op.structure.transpose().explicit(), *(form.T for form in self.forms)]
 
     def domain(self, dtype=float):
         """Random field of the domain."""
@@ -125,12 +125,12 @@ class Probe:
         Functions round relative to the whole result (transforms, solves): |A| |u| in norms.
         """
         if self.bounds:
-            return self.bounds[transposed](np.abs(u).reshape(-1).astype(float))
+            return self.bounds[transposed](np.abs(u).ravel().astype(float))
         return self.size * norm(u)
 
     def transposed(self, g, real):
         """A^T g by the transposed matrix, or by `.T` when no matrix can be listed; its real part, of real fields."""
-        back = (self.matrix.T @ g.reshape(-1)).reshape(self.op.domain.shape) if self.listed else self.op.T.apply(g)
+        back = (self.matrix.T @ g.ravel()).reshape(self.op.domain.shape) if self.listed else self.op.T.apply(g)
         return back.real if real else back
 
     def _size(self):
@@ -187,13 +187,13 @@ IDENTITIES = {
     "same bits twice": lambda p, u, v, g: _twice(p.op, u),
     "same bits twice, transposed": lambda p, u, v, g: _twice(p.op.T, g),
     "forward": lambda p, u, v, g: (
-        p.matrix @ u.reshape(-1),
-        np.stack([form.apply(u).reshape(-1) for form in p.forms]),
+        p.matrix @ u.ravel(),
+        np.stack([form @ u.ravel() for form in p.forms]),
         p.bound(u),
     ),
     "transposed": lambda p, u, v, g: (
-        p.matrix.T @ g.reshape(-1),
-        np.stack([p.turned @ g.reshape(-1), *(form.T.apply(g).reshape(-1) for form in p.forms)]),
+        p.matrix.T @ g.ravel(),
+        np.stack([form @ g.ravel() for form in p.turned]),
         p.bound(g, True),
     ),
 }

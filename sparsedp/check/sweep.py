@@ -101,11 +101,11 @@ class Point(Packing):
 
         Each leaf alone, all by the same, along the gradient, its largest entry; ``wanted(name)``: whether it is.
         """
-        displacements = {f"random {number + 1}": self._random(rng) for number in range(count)}
+        displacements = {f"random {number + 1}": self.random(rng) for number in range(count)}
         leaf = self._each(range(len(self.values)))
         for place, name in enumerate(self.names if 1 < len(self.names) <= MOST_LEAVES else ()):
-            displacements[f"random in {name}"] = self._random(rng) * (leaf == place)
-        slopes = self.units * np.where(np.isfinite(gradient), gradient, 0.0)
+            displacements[f"random in {name}"] = self.random(rng) * (leaf == place)
+        slopes = self.units * gradient
         largest = np.max(np.abs(slopes), initial=0.0)
         if self.entries > 1:
             displacements["constant"] = self.units
@@ -116,7 +116,7 @@ class Point(Packing):
             displacements["largest entry"] = self.units * (np.arange(slopes.size) == np.argmax(np.abs(slopes)))
         return [(name, way) for name, way in displacements.items() if np.any(way) and (wanted is None or wanted(name))]
 
-    def _random(self, rng):
+    def random(self, rng):
         """Random displacement, of root mean square 1 in each leaf."""
         values = rng.standard_normal(self.vector.size)
         return self.units * (values / self.sizes(values))

@@ -222,7 +222,8 @@ def _against_differences(scene, other, out):
     point = Point(scene.at(other))
     trials = Trials(scene.sheltered, point, out.gradient)
     trials.base, trials.gradient = out.value, point.gradient(out.gradient)
-    line = Line(*point.directions(trials.gradient, 1, generator(SEED), DIRECTIONS.__contains__)[-1], trials)
+    name, direction = point.directions(trials.gradient, 1, generator(SEED), DIRECTIONS.__contains__)[-1]
+    line = Line(name, direction, trials)
     unseen, gap = abs(line.slope) <= UNSEEN * abs(out.value), inf
     for step in DIFFERENCES:
         line.sweep([step])

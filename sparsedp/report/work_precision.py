@@ -345,12 +345,13 @@ class Rows(Result):
 
     def _recommended(self):
         """The fastest method for each error of GOALS, in words."""
-        for goal in GOALS if self.pareto(self.judged) else ():
-            words, row = f"a {self.judged.replace('_', ' ')} of {100 * goal:g} %", self.best(goal, self.judged)
+        error = self.judged
+        for goal in GOALS if self.pareto(error) else ():
+            words, row = f"a {error.replace('_', ' ')} of {100 * goal:g} %", self.best(goal, error)
             if row is None:
                 yield f"no method reaches {words}"
                 return
-            settings, seconds = words_of(json.loads(row["settings"])), self.seconds(row, self.judged)
+            settings, seconds = words_of(json.loads(row["settings"])), self.seconds(row, error)
             yield f"fastest at {words}: {row['method']} ({settings}), {seconds:.1e} s"
 
     def plot(self, ax=None, error=None):
