@@ -191,7 +191,7 @@ def test_what_it_is_as_data_and_text(stable):
     assert sum(result.counts.values()) == len(result.rows)
     assert len(result.csv().splitlines()) == len(result.rows) + 1
     assert "| group |" in result.markdown() and "left out" in result.markdown()
-    assert str(result).endswith(result.summary) and "growth factor of a step" in str(result)
+    assert str(result).endswith(result.summary) and str(result.map) in str(result)
     assert np.shape(data["map"]["factors"]) == (9, 9)
 
 

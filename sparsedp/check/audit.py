@@ -17,7 +17,7 @@ from sparsedp.check.judge import (
     verdict,
 )
 from sparsedp.check.summary import Result
-from sparsedp.check.sweep import POINTS, REFUSALS, Point, Trials, generator
+from sparsedp.check.sweep import POINTS, QUICK, REFUSALS, Point, Trials, generator
 from sparsedp.check.table import Table, table_of
 from sparsedp.derivative import grad, hvp
 from sparsedp.fields import check_function, is_whole
@@ -29,7 +29,6 @@ FEWEST_STEPS = 8
 RANDOM = 3  # random directions
 SHIFT, BESIDE = 2.0**-6, 7  # length and seed of the step to the point where a kinked loss is looked at again
 LOOSE = 1e-8  # a tolerance of solves above this may explain any gap that no call is to blame for
-QUICK = ("random 1", "gradient")  # the directions of a quick audit
 LEFT_OUT = "other directions, single leaves and entries, complex steps and the Hessian product were not looked at"
 FORGIVEN = 1e3  # tolerances of the solves inside that the modes may differ by; beyond, no solve is to blame
 APART = 1e-10  # of the derivative: what rounding leaves of a complex step

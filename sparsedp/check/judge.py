@@ -191,7 +191,7 @@ class Judgement(Result):
     split = beyond = uncertain = used1 = used2 = off = jumps = nan
     close = wrong = zero = resolved = flat = False
 
-    __repr__ = object.__repr__
+    __str__ = __repr__ = object.__repr__
 
     def learn(self, **values):
         """Evidence that comes later, from more than the levels."""

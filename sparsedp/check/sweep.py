@@ -21,6 +21,7 @@ from sparsedp.tree import copied, mapped, norm
 
 __all__ = [
     "POINTS",
+    "QUICK",
     "REFUSALS",
     "Line",
     "Point",
@@ -35,6 +36,7 @@ __all__ = [
 REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # what a loss may raise away from x
 MOST_LEAVES = 8  # with more leaves than this, none gets a direction for itself
 SAME = "the loss does not change"
+QUICK = "random 1", "gradient"  # the directions that are looked at where there is time for two
 
 
 def generator(rng):

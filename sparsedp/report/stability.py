@@ -96,12 +96,11 @@ class StabilityMap(Result):
 
     _plain = ("time_steps", "viscosities", "factors")
 
-    @property
-    def table(self):
+    def parts(self):
         """The factors."""
         cells = np.where(np.isnan(self.factors), "refused", self.factors.astype(object))
         rows = [(dt, *row) for dt, row in zip(self.time_steps, cells)]
-        return Table((" \\ ".join(self.names), *self.viscosities), rows)
+        return ["growth factor of a step:", Table((" \\ ".join(self.names), *self.viscosities), rows)]
 
 
 def stability_map(scene):

@@ -13,7 +13,7 @@ import numpy as np
 from sparsedp.check.judge import judgement
 from sparsedp.check.operators import layouts
 from sparsedp.check.summary import error_text
-from sparsedp.check.sweep import Line, Point, Trials, generator, rms
+from sparsedp.check.sweep import QUICK, Line, Point, Trials, generator, rms
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.ledger import thread
@@ -26,7 +26,6 @@ __all__ = ["FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 WORDS = PASSED, REFUSED, DEGRADED, FAILED = "passed", "refused correctly", "degraded", "FAILED"
 TIME_STEPS, VISCOSITIES = ("dt", "time_step", "tau"), ("nu", "viscosity", "diffusivity", "kappa", "mu")
 EPS = np.finfo(float).eps
-DIRECTIONS = "random 1", "gradient"  # along which a gradient is compared, the last one that there is
 DIFFERENCES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-2, 1e-7)  # their steps, in units of x; the one that mostly serves comes first
 GOOD, BAD = 1e-5, 1e-2  # gaps between gradient and differences
 UNSEEN = 100 * EPS  # changes of the value, relative, that no difference sees
@@ -222,7 +221,7 @@ def _against_differences(scene, other, out):
     point = Point(scene.at(other))
     trials = Trials(scene.sheltered, point, out.gradient)
     trials.base, trials.gradient = out.value, point.gradient(out.gradient)
-    name, direction = point.directions(trials.gradient, 1, generator(SEED), DIRECTIONS.__contains__)[-1]
+    name, direction = point.directions(trials.gradient, 1, generator(SEED), QUICK.__contains__)[-1]
     line = Line(name, direction, trials)
     unseen, gap = abs(line.slope) <= UNSEEN * abs(out.value), inf
     for step in DIFFERENCES:

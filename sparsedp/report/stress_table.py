@@ -122,7 +122,7 @@ class Stress(Result):
 
     def parts(self):
         """All cases, what was left out, the map, the failures, and the counts."""
-        growth = ["growth factor of a step:", self.map.table] if self.map else []
+        growth = self.map.parts() if self.map else []
         failed = (f"{FAILED}: {row['parameter']} {row['case']}: {row['note']}" for row in self.failures)
         return ["stress", table_of(self.rows, COLUMNS), *self.omissions(), *growth, *failed, self.summary]
 
