@@ -33,7 +33,7 @@ html_math_renderer = "mathml"  # formulas.py: no script, no fonts to fetch
 
 # The API, from docstrings.
 default_role = "code"
-autodoc_mock_imports = ["jax", "torch"]  # the bridges have pages without them
+autodoc_mock_imports = ["jax", "torch", "xarray"]  # the bridges have pages without them
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 napoleon_custom_sections = ["Source"]

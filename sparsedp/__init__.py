@@ -49,7 +49,8 @@ _WINDOW = {
     "report.work_precision": "workprec",
     "report.plan": "explain",
     "blackbox": "adopt",
-    "storage": "from_image load save",
+    "storage.archive": "load save",
+    "storage.pictures": "from_image",
     "parallel.scenes": "ensemble",
     "parallel.front": "distribute gather",
 }

@@ -77,9 +77,9 @@ from .solvers.spectral import exponential as exponential
 from .solvers.spectral import function as function
 from .solvers.spectral import power as power
 from .space import Space as Space
-from .storage import from_image as from_image
-from .storage import load as load
-from .storage import save as save
+from .storage.archive import load as load
+from .storage.archive import save as save
+from .storage.pictures import from_image as from_image
 from .tape import differentiable as differentiable
 from .trajectory.front import rollout as rollout
 

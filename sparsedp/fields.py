@@ -34,7 +34,7 @@ WRAP = "{0}; wrap what is computed in dp.interop.to_{0}(f), which keeps gradient
 # By the package that the type of an array comes from: which library that is, and what to write instead.
 LIBRARIES = {
     "torch": WRAP.format("torch"), "jax": WRAP.format("jax"), "jaxlib": WRAP.format("jax"),
-    "xarray": "xarray, whose coordinates would be lost; write u.transpose('x', 'y').values",
+    "xarray": "xarray, whose coordinates would be lost; write dp.interop.from_xarray(grid, u)",
 }  # fmt: skip
 BLOCK = 8192  # numbers of which one product of BLAS is taken: it uses one thread up to 10000, and wakes no others
 

@@ -5,11 +5,12 @@ import json
 import os
 import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from uuid import uuid4
 
 import numpy as np
 
-__all__ = ["UNFINISHED", "load_tree", "save_tree", "write_file"]
+__all__ = ["UNFINISHED", "load_tree", "save_tree", "write_file", "write_through"]
 
 SEQUENCES = {"list": list, "tuple": tuple}
 UNFINISHED = ".part"  # how the name of a file ends that is being written, or was when its run was killed
@@ -55,7 +56,8 @@ def write_file(path, content):
         os.replace(part, target)
         _sync(target.parent)
     except OSError as error:
-        error.filename, error.filename2 = str(path), None
+        error.filename = str(path)
+        del error.filename2
         raise
     finally:
         with contextlib.suppress(OSError):  # it is gone when all went well
@@ -81,6 +83,38 @@ def _sync(folder):
             os.fsync(handle)
         finally:
             os.close(handle)
+
+
+def write_through(path, write):
+    """``write(name)`` of a library that takes no stream -> a file or a folder that is whole, under its own name.
+
+    Parameters
+    ----------
+    path : str or path
+    write : callable
+        Gets a name that ends as `path` does, in lower case, in a folder beside it.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written. It names `path`, and what stood there stands there still.
+    """
+    target = Path(os.path.realpath(path))
+    try:
+        with TemporaryDirectory(suffix=UNFINISHED, dir=target.parent) as folder:
+            part = Path(folder, f"new{target.suffix.lower()}")
+            write(part)
+            if part.is_file():
+                with open(part, "rb") as whole:
+                    write_file(target, lambda stream: shutil.copyfileobj(whole, stream))
+                return
+            if target.exists():
+                os.replace(target, Path(folder, "old"))
+            os.replace(part, target)
+    except OSError as error:
+        error.filename = str(path)
+        del error.filename2
+        raise
 
 
 def save_tree(path, tree, kind):

@@ -11,7 +11,7 @@ from sources import FUNCTION, modules
 
 import sparsedp
 
-EXTRAS = {"torch": "torch", "jax": "jax"}  # what the names of dp.interop that end so need
+EXTRAS = {"torch": "torch", "jax": "jax", "xarray": "xarray"}  # what the names of dp.interop that end so need
 SECTION = r"(?m)^\s*(?:{numpydoc})\s*\n\s*-{{3,}}\s*$|^\s*{short}\s*:"
 
 

@@ -1,11 +1,13 @@
 """Messages of files, pictures and of a matrix from coordinates, in full."""
 
+import re
 import sys
 
 import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp.storage import archive
 
 GRID = dp.Grid((3, 2))
 LABELLED = type("DataArray", (), {"__module__": "xarray.core.dataarray"})()
@@ -15,7 +17,7 @@ CASES = {
     "op DataArray": (
         TypeError,
         "gradient needs arrays of NumPy, got a DataArray of xarray, whose coordinates would be lost; "
-        "write u.transpose('x', 'y').values",
+        "write dp.interop.from_xarray(grid, u)",
         lambda: dp.gradient(GRID)(LABELLED),
     ),
     "from_coo shapes": (
@@ -40,8 +42,8 @@ CASES = {
     ),
     "suffix": (
         ValueError,
-        "save takes a path that ends in .npz, got 'u.nc'; write 'fields.npz'",
-        lambda: dp.save("u.nc", GRID),
+        "save takes a path that ends in .npz, .nc, .zarr, .vti, .vtr or .pvd, got 'u.txt'; write 'fields.npz'",
+        lambda: dp.save("u.txt", GRID),
     ),
     "numbers": (
         TypeError,
@@ -52,6 +54,57 @@ CASES = {
         ValueError,
         "u has shape (3, 2), and there are 2 times; write np.stack(states)",
         lambda: dp.save("u.npz", GRID, times=[0.0, 1.0], u=np.zeros((3, 2))),
+    ),
+    "at an unknown field": (
+        ValueError,
+        "save takes at as a dict with keys from ['u'], got ['w']; leave them out",
+        lambda: dp.save("u.npz", GRID, at={"w": "cells"}, u=np.zeros((3, 2))),
+    ),
+    "at an unknown place": (
+        ValueError,
+        "u has shape (3, 2), which is no field on corners of Grid(3 x 2 cells, size 3 x 2); those on cells have (3, 2)",
+        lambda: dp.save("u.npz", GRID, at={"u": "corners"}, u=np.zeros((3, 2))),
+    ),
+    "attributes": (
+        ValueError,
+        "save keeps attrs in .nc and .zarr files, got 'u.npz'; write 'fields.nc'",
+        lambda: dp.save("u.npz", GRID, attrs={"u": {"units": "K"}}, u=np.zeros((3, 2))),
+    ),
+    "ParaView and back": (
+        ValueError,
+        "load takes a path that ends in .npz, .nc or .zarr, got 'u.vti'; write 'fields.npz'",
+        lambda: dp.load("u.vti"),
+    ),
+    "ParaView, complex": (
+        TypeError,
+        "u has dtype complex128, which such a file does not hold; write u.real and u.imag",
+        lambda: dp.save("u.vtr", GRID, u=np.zeros((3, 2), complex)),
+    ),
+    "ParaView, bool": (
+        TypeError,
+        "u has dtype bool, which such a file does not hold; write u.astype(float)",
+        lambda: dp.save("u.vti", GRID, u=np.zeros((3, 2), bool)),
+    ),
+    "ParaView, stretched": (
+        ValueError,
+        "save puts fields on uniform grids into .vti, got 1 on Grid(2 cells, size 3, stretched in x); "
+        "write 'fields.vtr'",
+        lambda: dp.save("u.vti", dp.Grid(2, spacing=np.array([1.0, 2.0])), u=np.zeros(2)),
+    ),
+    "ParaView, nothing": (
+        ValueError,
+        "save puts fields on uniform grids into .vti, got 0 on Grid(3 x 2 cells, size 3 x 2); write 'fields.vtr'",
+        lambda: dp.save("u.vti", GRID),
+    ),
+    "ParaView, a series in one file": (
+        ValueError,
+        "save puts one state into .vti or .vtr, and a series with times into .pvd, got .vti",
+        lambda: dp.save("u.vti", GRID, times=[0.0], u=np.zeros((1, 3, 2))),
+    ),
+    "ParaView, one state in a series": (
+        ValueError,
+        "save puts one state into .vti or .vtr, and a series with times into .pvd, got .pvd",
+        lambda: dp.save("u.pvd", GRID, u=np.zeros((3, 2))),
     ),
     "place": (
         ValueError,
@@ -96,3 +149,25 @@ def test_pictures_without_pillow(monkeypatch):
     with pytest.raises(ImportError) as caught:
         dp.from_image("any.png")
     assert str(caught.value) == "from_image needs Pillow; install sparsedp[plot]"
+
+
+MISSING = {
+    "xarray": "save needs xarray for .nc files; install sparsedp[files]",
+    "h5netcdf": "save needs h5netcdf for .nc files; install sparsedp[files]",
+    "h5py": "save needs h5py for .nc files; install sparsedp[files]",
+    "zarr": "save needs zarr for .zarr files; install sparsedp[files]",
+    "pyevtk": "save needs pyevtk for .vti files; install sparsedp[files]",
+}
+
+
+@pytest.mark.parametrize("library", MISSING)
+def test_files_without_their_library(library, tmp_path, monkeypatch):
+    monkeypatch.setattr(archive, "find_spec", lambda name: None if name == library else True)
+    path = tmp_path / f"a{re.search(r'[.][a-z]+', MISSING[library])[0]}"
+    with pytest.raises(ImportError) as caught:
+        dp.save(path, GRID, u=np.zeros((3, 2)))
+    assert str(caught.value) == MISSING[library] and not list(tmp_path.iterdir())
+    if library != "pyevtk":
+        with pytest.raises(ImportError) as caught:
+            dp.load(path)
+        assert str(caught.value) == MISSING[library].replace("save", "load")

@@ -81,7 +81,10 @@ DOORS = [
     ("petsc4py", r"parallel/.*", ()),
     ("torch", r"interop/torch_bridge\.py", ()),
     ("jax", r"interop/jax_bridge\.py", ()),
-    ("PIL", r"storage\.py|report/plots\.py", ()),
+    ("PIL", r"storage/pictures\.py|report/plots\.py", ()),
+    ("xarray", r"storage/labelled\.py", ()),
+    ("h5netcdf", r"storage/labelled\.py", ()),
+    ("pyevtk", r"storage/paraview\.py", ()),
 ]
 TALKS = r"report/.*|__main__\.py"  # may print
 NOWHERE = {"utils.py", "util.py", "helpers.py", "helper.py", "misc.py", "common.py"}
@@ -117,6 +120,8 @@ EXTRAS = (
     "torch",
     "jax",
     "PIL",
+    "xarray",
+    "pyevtk",
 )  # foreign libraries that need not be there
 LAZY = (
     "pyamg",
@@ -127,6 +132,8 @@ LAZY = (
     "petsc4py",
     "torch",
     "jax",
+    "xarray",
+    "pyevtk",
     "scipy",
     "autograd",
     "numpy",

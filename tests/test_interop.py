@@ -18,19 +18,21 @@ L = dp.laplacian(GRID)
 
 
 def test_a_name_that_is_not_there():
-    message = "module 'sparsedp.interop' has no attribute 'to_numpy'; it has from_jax, from_torch, to_jax, to_torch"
+    message = "module 'sparsedp.interop' has no attribute 'to_numpy'; "
+    message += "it has from_jax, from_torch, from_xarray, to_jax, to_torch, to_xarray"
     with pytest.raises(AttributeError, match="^module .* has no attribute .*; it has .*$") as found:
         dp.interop.to_numpy
     assert str(found.value) == message
 
 
-@pytest.mark.parametrize("library", ["jax", "torch"])
-def test_a_library_that_is_not_installed(library, monkeypatch):
-    monkeypatch.delitem(sys.modules, f"sparsedp.interop.{library}_bridge", raising=False)
+@pytest.mark.parametrize(("library", "extra"), [("jax", "jax"), ("torch", "torch"), ("xarray", "files")])
+def test_a_library_that_is_not_installed(library, extra, monkeypatch):
+    for module in (f"interop.{library}_bridge", "storage.labelled"):
+        monkeypatch.delitem(sys.modules, f"sparsedp.{module}", raising=False)
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ImportError, match=r"^dp.interop.to_.* needs .*; install sparsedp\[.*\]$") as found:
         getattr(dp.interop, f"to_{library}")
-    assert str(found.value) == f"dp.interop.to_{library} needs {library}; install sparsedp[{library}]"
+    assert str(found.value) == f"dp.interop.to_{library} needs {library}; install sparsedp[{extra}]"
 
 
 def like_one_of(module):

@@ -45,11 +45,11 @@ BUGS = {
         "part[::2] - 1j * part[1::2] if",
         "tests/test_interop.py",
     ),
+    "a field in a file that lives elsewhere than its call says": Bug(
+        "storage", "if at.get(field, space.kind) == space.kind and shape", "if shape", "tests/test_errors_storage.py"
+    ),
     "a tensor whose gradient is cut without a word": Bug(
-        "fields.py",
-        "if kind is not np.ndarray and (library",
-        "if False and (library",
-        "tests/test_interop.py",
+        "fields.py", "if kind is not np.ndarray and (library", "if False and (library", "tests/test_interop.py"
     ),
     "an ensemble whose gradient has no weights": Bug(
         "parallel",

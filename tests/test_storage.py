@@ -59,8 +59,10 @@ def test_grid_alone_and_nothing_left_behind(tmp_path):
 
 
 REFUSED = {
-    "suffix": (lambda p: dp.save(p / "a.nc", GRID), ValueError, "save takes a path that ends in .npz, got 'a.nc'"),
-    "no suffix": (lambda p: dp.load(p / "a"), ValueError, "load takes a path that ends in .npz, got 'a'; write "),
+    "suffix": (lambda p: dp.save(p / "a.txt", GRID), ValueError,
+               "save takes a path that ends in .npz, .nc, .zarr, .vti, .vtr or .pvd, got 'a.txt'"),
+    "no suffix": (lambda p: dp.load(p / "a"), ValueError,
+                  "load takes a path that ends in .npz, .nc or .zarr, got 'a'; write "),
     "no grid": (lambda p: dp.save(p / "a.npz", 3), TypeError, "save takes a Grid, got int; write dp.Grid"),
     "shape": (lambda p: dp.save(p / "a.npz", GRID, u=np.ones(5)), dp.errors.ShapeError,
               "u has shape .5,., which is no field on cells, .* of Grid.*; those on cells have .4, 3."),
@@ -134,7 +136,7 @@ def test_image_axes_and_shades(tmp_path):
 
 def test_array_of_xarray_is_refused():
     kind = type("DataArray", (), {"__module__": "xarray.core.dataarray"})  # the name is what is looked at
-    message = r"^laplacian needs arrays of NumPy, got a DataArray of xarray, whose coordinates would be lost; write"
+    message = r"^laplacian needs arrays of NumPy, got a DataArray of xarray, whose coordinates would be lost; write dp\.in"
     with pytest.raises(TypeError, match=message):
         dp.laplacian(GRID)(kind())
 

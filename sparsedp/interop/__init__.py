@@ -1,21 +1,29 @@
 """Bridges to PyTorch and JAX: functions of this library there, theirs here, with derivatives of every order both ways.
 
-to_torch, from_torch   torch_bridge.py, the extra `torch`
-to_jax, from_jax       jax_bridge.py, the extra `jax`
+to_torch, from_torch     torch_bridge.py, the extra `torch`
+to_jax, from_jax         jax_bridge.py, the extra `jax`
+to_xarray, from_xarray   fields with coordinates: ../storage/labelled.py, the extra `files`
 
-Either library is imported when one of its two names is first used.
+A library is imported when one of its two names is first used.
 """
 
 from importlib import import_module
 
-__all__ = ["from_jax", "from_torch", "to_jax", "to_torch"]
+__all__ = ["from_jax", "from_torch", "from_xarray", "to_jax", "to_torch", "to_xarray"]
+
+EXTRAS = {  # of each library, and the module with its two functions
+    "torch": ("torch", "sparsedp.interop.torch_bridge"),
+    "jax": ("jax", "sparsedp.interop.jax_bridge"),
+    "xarray": ("files", "sparsedp.storage.labelled"),
+}
 
 
 def __getattr__(name):
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
     library = name.partition("_")[2]
+    extra, module = EXTRAS[library]
     try:
-        return getattr(import_module(f"{__name__}.{library}_bridge"), name)
+        return getattr(import_module(module), name)
     except ImportError as error:
-        raise ImportError(f"dp.interop.{name} needs {library}; install sparsedp[{library}]") from error
+        raise ImportError(f"dp.interop.{name} needs {library}; install sparsedp[{extra}]") from error
