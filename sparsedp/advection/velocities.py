@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from sparsedp.conditions import neumann
 from sparsedp.operator import Operator
-from sparsedp.operators.stencils import cell_beside, means, pick
+from sparsedp.operators.stencils import cell_beside, mean_of_faces, means, with_ends
 from sparsedp.space import Space
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker, Term
@@ -54,7 +54,7 @@ def _between(setting, own, axis, along):
     grid, on_faces = setting.grid, setting.velocity == "faces" and along == axis
     if on_faces == (along == own):
         return None
-    return _mean_of_faces(grid, along) if on_faces else _mean_of_cells(grid, along)
+    return mean_of_faces(grid, along) if on_faces else _mean_of_cells(grid, along)
 
 
 def _onto_sides(setting, own, axis, along):
@@ -63,10 +63,6 @@ def _onto_sides(setting, own, axis, along):
     if along == own:
         return _inside(grid, along, on_faces) if axis == own else _shared(grid, along)
     return _mean_of_cells(grid, along) if along == axis and not on_faces else None
-
-
-def _mean_of_faces(grid, axis):
-    return pick(grid, axis, False).scaled(0.5) + pick(grid, axis, True).scaled(0.5)
 
 
 def _mean_of_cells(grid, axis):
@@ -83,8 +79,7 @@ def _shared(grid, axis):
 def _inside(grid, axis, on_faces):
     """Faces (or cells) of an axis -> the cell centres, as interfaces between faces, and the walls."""
     n = grid.shape[axis]
-    centres = _mean_of_faces(grid, axis).matrix if on_faces else sp.eye_array(n, format="csr")
+    centres = mean_of_faces(grid, axis).matrix if on_faces else sp.eye_array(n, format="csr")
     if grid.periodic[axis]:  # interface f is cell f - 1
         return Factor(centres[np.arange(-1, n - 1)])
-    walls = sp.eye_array(centres.shape[1], format="csr")
-    return Factor(sp.vstack([walls[[0]], centres, walls[[-1]]], "csr"))
+    return with_ends(centres)

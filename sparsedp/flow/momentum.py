@@ -16,7 +16,16 @@ from sparsedp.grid import Grid
 from sparsedp.operator import Operator
 from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.difference import divergence, gradient
-from sparsedp.operators.stencils import along, differences, kronecker_operator, means, pick, slopes, wall_slopes
+from sparsedp.operators.stencils import (
+    along,
+    differences,
+    kronecker_operator,
+    mean_of_faces,
+    means,
+    slopes,
+    wall_slopes,
+    with_ends,
+)  # fmt: skip
 from sparsedp.recipe import Made
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
@@ -243,11 +252,8 @@ def _to_centres(grid, c):
     """Nodes -> cells: means; on a bounded axis the wall values stand before and after them, for the half control volume
     of an open side.
     """
-    inner = (pick(grid, c, False) + pick(grid, c, True)).scaled(0.5)
-    if grid.periodic[c]:
-        return inner
-    nodes = sp.eye_array(grid.node_count(c), format="csr")
-    return Factor(sp.vstack([nodes[:1], inner.matrix, nodes[-1:]], format="csr"))
+    inner = mean_of_faces(grid, c)
+    return inner if grid.periodic[c] else with_ends(inner.matrix)
 
 
 def _from_centres(grid, c):

@@ -1,14 +1,15 @@
 """The 1-D factors from which the catalogue is built, a few diagonals each, and how operators are made of them."""
 
 import numpy as np
+import scipy.sparse as sp
 
 from sparsedp.operator import Operator
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker, Term
 
 __all__ = [
-    "along", "kronecker_operator", "cell_beside", "differences", "means", "one_sided", "pick", "slopes", "to_faces",
-    "wall_slopes",
+    "along", "cell_beside", "differences", "kronecker_operator", "mean_of_faces", "means", "one_sided", "pick",
+    "slopes", "to_faces", "wall_slopes", "with_ends",
 ]  # fmt: skip
 
 
@@ -72,6 +73,17 @@ def pick(grid, axis, upper):
     """Faces -> cells: the value on the lower (upper) face of each cell."""
     cell, nodes = np.arange(grid.shape[axis]), grid.node_count(axis)
     return Factor.from_diagonals((cell.size, nodes), (cell, (cell + upper) % max(nodes, 1), np.ones(cell.size)))
+
+
+def mean_of_faces(grid, axis):
+    """Faces -> cells: the mean of the lower and the upper face of each cell."""
+    return (pick(grid, axis, False) + pick(grid, axis, True)).scaled(0.5)
+
+
+def with_ends(matrix):
+    """A sparse matrix -> the factor that has the first number it takes before its rows, and the last one after them."""
+    ends = sp.eye_array(matrix.shape[1], format="csr")
+    return Factor(sp.vstack([ends[[0]], matrix, ends[[-1]]], format="csr"))
 
 
 def cell_beside(grid, axis, upper):
