@@ -87,6 +87,10 @@ class Space(Value, Uncached):
         volumes.flags.writeable = False
         return volumes
 
+    def component(self, axis):
+        """The space of one component of faces or edges, such as x-faces: see node_axes in grid.py."""
+        return Space(self.parts[axis], f"{self.grid.axes[axis]}-{self.kind}", self.grid)
+
     def split(self, v):
         """Flat field -> tuple of its components, each of shape `parts[axis]`. Differentiable.
 

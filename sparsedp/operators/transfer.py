@@ -214,5 +214,5 @@ def component(grid, axis):
     """
     check_grid("component", grid)
     axis = grid.axis(axis)
-    own = Space(grid.face_shape(axis), f"{grid.axes[axis]}-faces", grid)
+    own = grid.faces.component(axis)
     return kronecker_operator(grid.faces, own, {(0, axis): along(axis, grid.dim, None)}, "component")

@@ -15,7 +15,6 @@ from sparsedp.parallel.fields import DistributedField, block, everywhere
 from sparsedp.parallel.partition import Partition
 from sparsedp.parallel.solve import RanksSystem
 from sparsedp.parallel.transport import Carry
-from sparsedp.space import Space
 from sparsedp.structure.base import result_dtype
 from sparsedp.tape import Rule, linear, plain
 
@@ -174,8 +173,7 @@ def laid(grid, layout):
 
 def _components(space):
     """The space of each component of a field."""
-    grid, kind = space.grid, space.kind
-    return [Space(part, f"{name}-{kind}", grid) for name, part in zip(grid.axes, space.parts)]
+    return [space.component(axis) for axis in range(len(space.parts))]
 
 
 def _side(space):
