@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_finite, check_function
+from sparsedp.fields import check_choice, check_finite, check_function
 from sparsedp.ledger import active, count
 from sparsedp.operators.given import from_matrix
 from sparsedp.recipe import Remade
@@ -90,8 +90,7 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
     (14.0, array([2., 4., 6.]))
     """
     check_function("adopt", f, "dp.adopt(lambda x: ...)")
-    if derivative not in tuple(WAYS):
-        raise ValueError(f"derivative must be auto, complex or difference, got {derivative!r}")
+    check_choice("derivative", derivative, WAYS)
     return Adopted(f, sparsity, derivative, name or getattr(f, "__name__", "simulator"))
 
 

@@ -12,6 +12,7 @@ from sparsedp.tree import leaves_like
 
 __all__ = [
     "BLOCK",
+    "check_choice",
     "check_finite",
     "check_function",
     "check_native",
@@ -134,6 +135,12 @@ def check_function(name, thing, example):
     """Refuse what cannot be called."""
     if not callable(thing):
         raise TypeError(f"{name} takes a function, got {type(thing).__name__}; write {example}")
+
+
+def check_choice(name, word, choices):
+    """Refuse what is none of some words."""
+    if word not in tuple(choices):
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {word!r}")
 
 
 def check_takes(name, fun, count, example):

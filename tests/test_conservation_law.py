@@ -288,7 +288,7 @@ def carry(u, params, axis):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (dict(scheme="weno"), "conservation_law takes scheme from upwind, van_leer, got 'weno'; write one of them"),
+        (dict(scheme="weno"), "scheme of conservation_law must be one of upwind, van_leer, got 'weno'"),
         (dict(boundary=dp.no_slip), "conservation_law takes outflow, free_slip or inflow, got no_slip"),
         (
             dict(boundary=dp.free_slip),

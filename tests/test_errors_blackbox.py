@@ -36,7 +36,7 @@ WRONG = [
         lambda: dp.adopt(3.0), TypeError,
         r"adopt takes a function, got float; write dp.adopt\(lambda x: ...\)",
     ),
-    (first(np.sin, derivative="exact"), ValueError, "derivative must be auto, complex or difference, got 'exact'"),
+    (first(np.sin, derivative="exact"), ValueError, "derivative must be one of auto, complex, difference, got 'exact'"),
     (first(drifting), DerivativeError, "drifting gives two results for one argument; fix its random state first"),
     (first(np.sin, sparsity=np.eye(3)), ShapeError, r"the sparsity of sin must have shape \(2, 2\), got \(3, 3\)"),
     (

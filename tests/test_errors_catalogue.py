@@ -201,7 +201,7 @@ TABLE = [
     (
         lambda: dp.prolong(LINE, 3, "cubic"),
         VALUE,
-        "prolong needs interpolation 'constant' or 'linear', got 'cubic'",
+        "interpolation of prolong must be one of constant, linear, got 'cubic'",
     ),
     (lambda: dp.restrict(LINE, 2), SHAPE, "a factor must be a whole number >= 1 that divides (3,), got 2"),
     (lambda: dp.restrict(LINE, 0), SHAPE, "a factor must be a whole number >= 1 that divides (3,), got 0"),

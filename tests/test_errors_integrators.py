@@ -24,7 +24,7 @@ TABLE = [
         "method must be one of euler, heun, ssprk3, rk4, backward_euler, crank_nicolson, tr_bdf2, imex, "
         "radau, etdrk4, leapfrog, got 'rk5'",
     ),
-    (lambda: dp.stepper("euler", L, 0.1, unstable="warn"), VALUE, "unstable must be 'raise' or 'allow', got 'warn'"),
+    (lambda: dp.stepper("euler", L, 0.1, unstable="warn"), VALUE, "unstable must be one of raise, allow, got 'warn'"),
     (
         lambda: dp.stepper("euler", decay, 0.1, tolerance=0),
         VALUE,
@@ -113,7 +113,7 @@ TABLE = [
     (
         lambda: dp.stepper("imex", lambda u, p: u, 0.1, linear={"a": (L, -1.0)})({"a": U}),
         VALUE,
-        "the coefficient of laplacian['a'] must be >= 0, got -1; put the sign into the operator",
+        "the coefficient of laplacian['a'] must be >= 0, got -1; write a number >= 0, the sign is that of the operator",
     ),
     (
         lambda: dp.stepper("euler", None, 0.1),
@@ -139,12 +139,12 @@ TABLE = [
     (
         lambda: dp.stepper("backward_euler", L, 0.1)(U, -1.0),
         VALUE,
-        "the coefficient of laplacian must be >= 0, got -1; put the sign into the operator",
+        "the coefficient of laplacian must be >= 0, got -1; write a number >= 0, the sign is that of the operator",
     ),
     (
         lambda: dp.stepper("backward_euler", None, 0.1, linear=(L, np.nan))(U),
         FINITE,
-        "the coefficient of laplacian must be finite, got nan",
+        "the coefficient of laplacian must be finite, got nan; write a number >= 0, the sign is that of the operator",
     ),
     (
         lambda: dp.stepper("euler", L, 0.6)(U, 1.0),

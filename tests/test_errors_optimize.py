@@ -96,7 +96,7 @@ WRONG = [
     (direction(power=2), ValueError, "power must be from 0 to 1, got 2; 0.75 gives half-inverse gradients"),
     (direction(damping=-1), ValueError, "damping must be >= 0, got -1; the default is 0"),
     (direction(truncation=1), ValueError, "truncation must be from 0 to below 1, got 1; the default is 1e-10"),
-    (direction(method="svd"), ValueError, "method must be auto, dense or krylov, got 'svd'"),
+    (direction(method="svd"), ValueError, "method must be one of auto, dense, krylov, got 'svd'"),
     (direction(rank=0), ValueError, "rank must be a whole number >= 1, got 0; leave it out for no limit"),
     (
         direction(x=(1j, 1.0)), DerivativeError,

@@ -78,7 +78,7 @@ TABLE = [
     (
         lambda: law(scheme="weno"),
         VALUE,
-        "conservation_law takes scheme from upwind, van_leer, got 'weno'; write one of them",
+        "scheme of conservation_law must be one of upwind, van_leer, got 'weno'",
     ),
     (
         lambda: law(boundary=dp.no_slip),

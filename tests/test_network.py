@@ -159,7 +159,7 @@ def test_files(tmp_path, rng):
 
 def test_refusals(rng):
     p, x = setting(rng, (3,), (6,))
-    with pytest.raises(ValueError, match="padding must be periodic, zero or replicate, got 'same'"):
+    with pytest.raises(ValueError, match="padding must be one of periodic, zero, replicate, got 'same'"):
         nn.convolution(p, x, "same")
     with pytest.raises(
         dp.errors.ShapeError,

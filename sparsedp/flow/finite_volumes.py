@@ -29,7 +29,16 @@ from sparsedp.conditions import free_slip, outflow, resolve
 from sparsedp.conditions import inflow as inflow_side
 from sparsedp.constants import constant, frozen
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_finite, check_number, check_plain, check_takes, field_array, is_number, is_whole
+from sparsedp.fields import (
+    check_choice,
+    check_finite,
+    check_number,
+    check_plain,
+    check_takes,
+    field_array,
+    is_number,
+    is_whole,
+)
 from sparsedp.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.recipe import Remade
@@ -125,8 +134,7 @@ def conservation_law(
            [ 0.  ,  7.5 ,  7.5 ,  0.  ]])
     """
     check_grid("conservation_law", grid)
-    if scheme not in SCHEMES:
-        raise ValueError(f"conservation_law takes scheme from {', '.join(SCHEMES)}, got {scheme!r}; write one of them")
+    check_choice("scheme of conservation_law", scheme, SCHEMES)
     for name, function, count in (("flux", flux, 3), ("speed", speed, 3), ("source", source, 2)):
         if not callable(function) and (function is not None or name != "source"):
             raise TypeError(f"{name} must be a function, got {type(function).__name__}; write {_example(name, count)}")

@@ -38,7 +38,7 @@ import numpy as np
 from sparsedp.conditions import neumann, no_slip
 from sparsedp.constants import frozen
 from sparsedp.errors import DerivativeError, ShapeError, UnstableStepError
-from sparsedp.fields import check_finite, check_function, check_number, check_takes, rounded_down
+from sparsedp.fields import check_choice, check_finite, check_function, check_number, check_takes, rounded_down
 from sparsedp.flow.momentum import convection, face_laplacian, free_faces
 from sparsedp.flow.pressure import projection
 from sparsedp.grid import check_grid
@@ -166,8 +166,7 @@ def flow_step(
         _check_faces("walls", grid, walls, "write face_lift(grid, boundary)(values)")
     if friction is not None and implicit:
         raise ValueError("flow_step takes no friction beside implicit viscosity; write implicit=False")
-    if unstable not in ("raise", "allow"):
-        raise ValueError(f"unstable must be 'raise' or 'allow', got {unstable!r}")
+    check_choice("unstable", unstable, ("raise", "allow"))
     for name, parts in (scalars or {}).items():
         if not isinstance(parts, dict) or not parts.keys() <= set(SCALAR):
             raise ValueError(f"scalar {name!r} of flow_step needs a dict of {', '.join(SCALAR)}, got {parts!r}")

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.sparse.linalg import ArpackError, eigsh
 
 from sparsedp.errors import NonFiniteError, UnstableStepError
-from sparsedp.fields import check_finite, is_number, rounded_down, surely_finite
+from sparsedp.fields import check_choice, check_finite, is_number, rounded_down, surely_finite
 from sparsedp.integrators.problem import Problem, like, number, pair
 from sparsedp.integrators.runge_kutta import (
     EXPLICIT,
@@ -153,10 +153,8 @@ def stepper(
     (1.5, -0.375)
     """
     given = copied(locals())  # the caller may reuse the arrays
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    if unstable not in ("raise", "allow"):
-        raise ValueError(f"unstable must be 'raise' or 'allow', got {unstable!r}")
+    check_choice("method", method, METHODS)
+    check_choice("unstable", unstable, ("raise", "allow"))
     known = {word: value for word, value in options.items() if word != "sparsity"}  # which `implicit` takes
     settings = check_settings(solver, rtol, maxiter, "raise", known) | dict(options=given["options"])
     unused = [word for word in UNUSED[method] if given[word] is not None] + [*options] * (method not in IMPLICIT)

@@ -122,7 +122,7 @@ class Stiff:
         """The number c >= 0, traced or not."""
         given = self._coefficient
         given = given(params) if callable(given) else given
-        return number(given, self.name, ">= 0", "; put the sign into the operator")
+        return number(given, self.name, ">= 0", "; write a number >= 0, the sign is that of the operator")
 
 
 def _terms(linear, place):

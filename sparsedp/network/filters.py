@@ -14,6 +14,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ShapeError
+from sparsedp.fields import check_choice
 from sparsedp.network.correlation import MODES, correlate, fold, pad, weigh
 from sparsedp.tape import Rule, plain
 
@@ -74,8 +75,7 @@ def check_widths(widths):
 
 
 def _check(weight, bias, x, padding):
-    if padding not in MODES:
-        raise ValueError(f"padding must be periodic, zero or replicate, got {padding!r}")
+    check_choice("padding", padding, MODES)
     dim = len(x) - 2
     if dim not in (1, 2) or len(weight) not in (dim + 2, dim + 3):
         raise ShapeError(

@@ -7,7 +7,7 @@ import scipy.sparse as sp
 
 from sparsedp.conditions import neumann, resolve
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_finite, is_whole
+from sparsedp.fields import check_choice, check_finite, is_whole
 from sparsedp.grid import Grid, check_grid, per_axis, real_numbers
 from sparsedp.operator import Operator
 from sparsedp.operators.interpolation import linear_weights
@@ -161,8 +161,7 @@ def prolong(grid, factor, interpolation="constant"):
     array([0.5, 1.5, 2.5, 3.5])
     """
     check_grid("prolong", grid)
-    if interpolation not in ("constant", "linear"):
-        raise ValueError(f"prolong needs interpolation 'constant' or 'linear', got {interpolation!r}")
+    check_choice("interpolation of prolong", interpolation, ("constant", "linear"))
     coarse, factors = _coarse(grid, factor)
     lines = []
     for axis, size in enumerate(factors):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_finite, check_function, check_number, check_whole
+from sparsedp.fields import check_choice, check_finite, check_function, check_number, check_whole
 from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.linearised import Linearised, singular
 
@@ -150,8 +150,7 @@ class _Rows:
 
 def form_of(word):
     """Whether the Jacobian is formed: True, False, or None for when it is small."""
-    if word not in tuple(FORMS):
-        raise ValueError(f"method must be auto, dense or krylov, got {word!r}")
+    check_choice("method", word, FORMS)
     return FORMS[word]
 
 

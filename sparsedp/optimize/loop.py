@@ -3,7 +3,7 @@
 import inspect
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_function, check_number, check_whole
+from sparsedp.fields import check_choice, check_function, check_number, check_whole
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.checkpoint import Checkpoint
@@ -221,8 +221,7 @@ def _composed(loss, inner):
 
 
 def _stepper(method, options):
-    if method not in tuple(METHODS):
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, admm, got {method!r}")
+    check_choice("method", method, (*METHODS, "admm"))
     _check_options(method, options, list(inspect.signature(METHODS[method]).parameters))
     return METHODS[method](**options)
 
