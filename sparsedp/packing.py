@@ -102,8 +102,8 @@ class Packing:
         Whether one of them is.
     eps : float
         Rounding of the coarsest dtype.
-    size : int
-        Length of the vector.
+    count, size : int
+        Of leaves, and of numbers in the vector.
 
     Raises
     ------
@@ -122,6 +122,7 @@ class Packing:
     def __init__(self, tree, root="x"):
         self.root = root
         self._leaves, self._rebuild = taken_apart(tree)
+        self.count = len(self._leaves)
         check_native(root, *self._leaves)
         self._floating = list(map(is_variable, self._leaves))
         self.values = [np.asarray(leaf) for leaf in compress(self._leaves, self._floating)]
@@ -137,9 +138,13 @@ class Packing:
         """Of the floating leaves, as one would write them: ``x['u'][0]``."""
         return list(compress(labels(self._rebuild(self._leaves), self.root), self._floating))
 
+    def floating(self, tree):
+        """Tree of as many leaves -> those in the places of the floating ones."""
+        return list(compress(leaves(tree), self._floating))
+
     def pack(self, tree):
         """Tree of as many leaves -> flat vector of doubles."""
-        return joined(compress(leaves(tree), self._floating))
+        return joined(self.floating(tree))
 
     def slopes(self, gradient):
         """Gradient of the same structure -> its floating leaves, dL/dRe + i dL/dIm of complex ones.
@@ -147,10 +152,10 @@ class Packing:
         The tape gives dL/dRe - i dL/dIm there. Joined, they are the gradient with respect to the packed vector.
         """
         slopes = leaves(gradient)
-        if len(slopes) != len(self._leaves):
-            numbers = f"{len(slopes)} leaves where {self.root} has {len(self._leaves)}"
+        if len(slopes) != self.count:
+            numbers = f"{len(slopes)} leaves where {self.root} has {self.count}"
             raise DerivativeError(f"the gradient has {numbers}; return a tree like {self.root}")
-        given = [np.asarray(leaf) for leaf in compress(slopes, self._floating)]
+        given = list(map(np.asarray, self.floating(slopes)))
         for place, (g, x) in enumerate(zip(given, self.values)):
             if g.shape != x.shape:
                 shapes = f"shape {g.shape} where {x.shape} is needed"

@@ -98,6 +98,15 @@ def test_bounds_as_trees_and_on_one_side():
     assert np.allclose(dp.minimize(lambda x: x - 2.0, np.zeros(3), "levenberg_marquardt", bounds=(None, 1.0)).x, 1.0)
 
 
+def test_bounds_do_not_see_what_is_no_unknown():
+    """A static leaf may be far too large to be filled."""
+    huge = np.broadcast_to(1, (10**7, 10**7))
+    loss = lambda tree: anp.sum((tree["x"] - 2.0) ** 2)
+    for bounds in ((None, 1.0), (None, {"A": None, "x": 1.0, "word": None})):
+        best = dp.minimize(loss, {"A": huge, "x": np.zeros(2), "word": "a"}, bounds=bounds)
+        assert np.allclose(best.x["x"], 1, rtol=1e-14) and best.x["A"] is huge
+
+
 def test_a_start_outside_is_moved_inside():
     best = dp.minimize(lambda x: anp.sum(x**2), np.full(3, -7.0), bounds=(1.0, 2.0), maxiter=0)
     assert np.array_equal(best.x, np.ones(3))

@@ -4,6 +4,7 @@ import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import is_number
+from sparsedp.packing import joined
 from sparsedp.tree import leaves
 
 __all__ = ["Box"]
@@ -18,8 +19,7 @@ class Box:
     ----------
     bounds : (lower, upper) or None
         As for `minimize`.
-    packing, start : Unknowns, tree
-        `start` is the tree that `packing` packs.
+    packing : Unknowns
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Box:
         If a bound has another shape than its array.
     """
 
-    def __init__(self, bounds=None, packing=None, start=None):
+    def __init__(self, bounds=None, packing=None):
         self.lower, self.upper = -np.inf, np.inf
         if bounds is None:
             return
@@ -43,7 +43,7 @@ class Box:
                 f"got {bounds!r}; write (0.0, None) for x >= 0"
             )
         lower, upper = bounds
-        self.lower, self.upper = (_side(*side, packing, start) for side in ((lower, -np.inf), (upper, np.inf)))
+        self.lower, self.upper = (_side(*side, packing) for side in ((lower, -np.inf), (upper, np.inf)))
         if not np.all((self.lower <= self.upper) & (self.lower < np.inf) & (self.upper > -np.inf)):  # nor NaN
             raise ValueError("bounds must be numbers with lower <= upper; write None for a side without a bound")
 
@@ -57,16 +57,17 @@ class Box:
         return ~(((vector - near <= self.lower) & (slope > 0)) | ((vector + near >= self.upper) & (slope < 0)))
 
 
-def _side(side, without, packing, start):
-    given, wanted = leaves(side), leaves(start)
+def _side(side, without, packing):
+    given = leaves(side)
     if side is None or (not isinstance(side, (tuple, list, dict)) and is_number(side)):
-        given *= len(wanted)
-    if len(given) != len(wanted):
+        given *= packing.count
+    if len(given) != packing.count:
         raise ValueError(
             f"a bound must be a number or have the structure of start, got {len(given)} leaves where start has "
-            f"{len(wanted)}; write one number, or a tree like start"
+            f"{packing.count}; write one number, or a tree like start"
         )
-    return packing.pack([_full(x, without if b is None else b) for x, b in zip(wanted, given)])
+    pairs = zip(packing.values, packing.floating(given))
+    return joined([_full(x, without if b is None else b) for x, b in pairs])
 
 
 def _full(x, bound):

@@ -1,13 +1,10 @@
 """The unknowns of a search as one flat vector of doubles, and back."""
 
-from itertools import compress
-
 import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.fields import check_finite
 from sparsedp.packing import Packing, joined
-from sparsedp.tree import leaves
 
 __all__ = ["Unknowns", "power_of_two"]
 
@@ -26,7 +23,7 @@ class Unknowns(Packing):
 
     def join(self, tree):
         """The floating leaves of a tree that may be traced, as one traced vector."""
-        return anp.concatenate([anp.reshape(leaf, (-1,)) for leaf in compress(leaves(tree), self._floating)])
+        return anp.concatenate([anp.reshape(leaf, (-1,)) for leaf in self.floating(tree)])
 
 
 def power_of_two(value):

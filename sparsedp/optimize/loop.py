@@ -166,7 +166,7 @@ def minimize(
     for inner in (getattr(stepper, "rule", None), project):
         if inner is not None:
             loss = _composed(loss, inner)
-    box = Box(bounds, packing, start)
+    box = Box(bounds, packing)
     trials = Trials(loss, gradient, packing, box, batches, stepper if stepper.residuals else None)
     settings = {
         "method": method, "set of options": sorted(options.items()), "pair of bounds": (box.lower, box.upper),

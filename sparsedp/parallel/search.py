@@ -85,7 +85,7 @@ def minimized(comm, loss, start, method, maxiter, tolerance, callback, bounds, m
         )
     blocks = Blocks(comm, start)
     packing = Unknowns(blocks.of(start), "start")
-    trials = Spread(loss, blocks, packing, Box(bounds, packing, blocks.of(start)))
+    trials = Spread(loss, blocks, packing, Box(bounds, packing))
     watch = Watch(trials, packing, tolerance, callback and (lambda record, x: callback(record, blocks.tree(x))))
     _search(comm, trials, watch, trials.box.inside(packing.pack(blocks.of(start))), int(maxiter))
     return watch.minimum(blocks.tree(packing.unpack(trials.best.vector)), method)
