@@ -168,12 +168,6 @@ BUGS = {
         "        turned = Factor(rows.tocsr())",
         "tests/test_operators.py",
     ),
-    "complex inner products without a conjugate": Bug(
-        "solvers",
-        "            overlap = (basis[: j + 1] @ w.conj()).conj()",
-        "            overlap = basis[: j + 1] @ w",
-        "tests/test_elliptic_complex.py",
-    ),
     "waves damped to the wrong side": Bug(
         "solvers",
         "    turn = -1.0 if np.sum(rows.imag) > 0 else 1.0",
@@ -333,8 +327,8 @@ BUGS = {
     # ---- solvers
     "an adjoint solve with the operator itself": Bug(
         "solvers",
-        "partial(self.system.product, transposed=transposed)",
-        "partial(self.system.product, transposed=False)",
+        "system.product(precondition(r), transposed)",
+        "system.product(precondition(r))",
         "tests/test_solvers.py tests/test_solvers_methods.py",
     ),
     "a transposed cycle with the sweeps of the forward one": Bug(

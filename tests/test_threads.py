@@ -142,8 +142,8 @@ PLANE, ROOM = dp.Grid((16, 17), size=1.0), dp.Grid((8, 7, 9), size=1.0)
 OPERATORS = {
     "dense": ("direct", lambda: wind(dp.Grid((8, 8), size=1.0))),
     "dense and complex": ("direct", lambda: dp.from_matrix(wind(dp.Grid(40)).matrix * (1 + 2j))),
-    "banded": ("direct", lambda: wind(dp.Grid(400, size=1.0))),
-    "SuperLU": ("direct", lambda: wind(PLANE)),
+    "sparse LU, 1-D": ("direct", lambda: wind(dp.Grid(400, size=1.0))),
+    "sparse LU": ("direct", lambda: wind(PLANE)),
     "multigrid": ("multigrid", lambda: heat(PLANE)),
     "multigrid with wind": ("multigrid", lambda: wind(PLANE)),
     "multigrid, one level": ("multigrid", lambda: heat(dp.Grid((8, 8), size=1.0))),

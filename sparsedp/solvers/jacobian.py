@@ -374,7 +374,7 @@ def fields_met(equation, x, leaves):
     Returns
     -------
     cells : Space or None
-        The cells of a grid, if x is one field on them. On one axis banded LU needs no geometry.
+        The cells of a grid, if x is one field on them. On one axis LU needs no geometry.
     shapes : list of tuples of int
         Of the fields, one after the other, a velocity by its components where all are on one grid; of one dimension.
     """

@@ -202,4 +202,3 @@ def _without_descent(pq, rz, p, q, r, z):
         return "diverged"
     noise = 1e-13 * np.sqrt(dot(p, p) * dot(q, q)), 1e-13 * np.sqrt(dot(r, r) * dot(z, z))
     return "stagnated" if abs(pq) <= noise[0] or abs(rz) <= noise[1] else "indefinite_operator"
-
