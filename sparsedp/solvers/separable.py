@@ -12,7 +12,7 @@ one elimination is possible too, and only 1.1 to 1.7 times as fast as the transf
 Sources: Lynch, Rice, Thomas, Numer. Math. 6 (1964), direct solution by tensor products;
 Strang, SIAM Review 41 (1999), the discrete cosine transform; Hockney, J. ACM 12 (1965), transforms along one
 axis and elimination along the other; Grassmann, Taksar, Heyman, Operations Research 33 (1985), pivots without
-subtractions; Bracewell, J. Opt. Soc. Am. 73 (1983), the real form of the Fourier transform.
+subtractions.
 """
 
 from functools import reduce
@@ -43,7 +43,6 @@ __all__ = [
 
 WORTH_THREADS = 131072  # unknowns below which a second thread costs more than it brings
 WIDE_COMPILED, WIDE_PLAIN = 16, 1024  # modes from which elimination along the first axis beats transforms
-SHORT, WORK = 64, 2**18  # points of an axis, and its points times all unknowns, up to which a transform is a matrix
 EPS = np.finfo(float).eps
 ZERO = 4 * EPS  # a sum of eigenvalues below this share of the largest one is 0
 ROUNDING = 16 * EPS  # entries that should be equal may differ by this share
@@ -71,23 +70,11 @@ class Axis:
         "identity", "dct-2", "dst-2", "dct-4", "dst-4", "fourier" or "eigenvectors".
     eigenvalues : array, shape (n,)
     matrices : (Q^-1 S, S^-1 Q), optional
-        Where they are written out.
+        Of eigenvectors.
     """
 
     def __init__(self, kind, eigenvalues, matrices=None):
         self.kind, self.eigenvalues, self.matrices = kind, eigenvalues, matrices
-
-    def dense(self):
-        """The same axis, its transform written as a matrix: on a short axis one product is less than one call."""
-        n = self.eigenvalues.size
-        if self.kind in ("identity", "eigenvectors"):
-            return self
-        if self.kind == "fourier":  # the real form of it: both modes of a pair have the same eigenvalue
-            angle = 2 * np.pi / n * (np.outer(np.arange(n), np.arange(n)) % n)
-            vectors = (np.cos(angle) + np.sin(angle)) / np.sqrt(n)
-        else:
-            vectors = self.turned(1, np.eye(n), 0, False, None, False)
-        return Axis(self.kind, self.eigenvalues, (vectors.T, vectors))
 
     def turned(self, back, x, axis, transposed, workers, overwrite):
         """Field along `axis` -> coefficients, or `back`; a Fourier axis is left as it is.
@@ -204,10 +191,8 @@ class Spectrum:
     """
 
     def __init__(self, shape, axes, shift):
-        short = [n <= SHORT and n * prod(shape) <= WORK for n in shape]
-        axes = tuple(axis.dense() if few else axis for axis, few in zip(axes, short, strict=True))
         self.shape, self.axes, self.shift = shape, axes, shift
-        self.fourier = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier" and axis.matrices is None)
+        self.fourier = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier")
         lines = [axis.eigenvalues for axis in axes]
         for last in self.fourier[-1:]:
             lines[last] = lines[last][: shape[last] // 2 + 1]
