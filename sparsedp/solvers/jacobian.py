@@ -274,7 +274,7 @@ class Jacobians:
     def _colour(self, pattern, equation, x, leaves):
         cells, shapes = fields_met(equation, x, leaves)
         coloured = Coloured(pattern, shapes, None if len(self.ways) > 1 else self.ways[0])
-        known = self._patterns[equation.size] = coloured, cells if (pattern - pattern.T).nnz == 0 else None
+        known = self._patterns[equation.size] = coloured, cells
         return known
 
     def _guessed(self, equation, points, leaves):

@@ -140,7 +140,8 @@ class Krylov(Engine):
         right = LinearOperator((b.size,) * 2, lambda r: system.product(precondition(r), transposed), dtype=self.dtype)
         x, r, used, residual = np.zeros_like(b), b, 0, norm(b)
         while True:
-            most, norms = min(self.restart, self.maxiter - used), []
+            norms: list = []  # one for each iteration
+            most = min(self.restart, self.maxiter - used)
             cycle = dict(rtol=0.0, atol=goal, restart=most, maxiter=1, callback=norms.append, callback_type="pr_norm")
             change = gmres(right, r, **cycle)[0]
             used += len(norms)

@@ -198,10 +198,7 @@ class EllipticSolver(ParametricSolver):
         """
         check_plain("elliptic_solver.flux", k, slopes)
         k, solver = self._settled(k)
-        if solver is self:
-            return k * slopes
-        to_corners, from_corners = self._corners[:2]
-        return from_corners(k * to_corners(slopes))
+        return k * slopes if solver is self else solver.fluxes(k * solver.slopes(slopes))
 
     def operator(self, k, shift=0.0):
         """Plain k and shift -> the Operator shift - D diag(k) G that is solved with.
@@ -230,21 +227,13 @@ class EllipticSolver(ParametricSolver):
             return self._coefficient(k), self
         if self.D.layout is not None:
             self.D.layout.check("a tensor")
-        _, _, at_corners, solver = self._corners
+        solver = self._tensors
         check_tensor("k", k, self.D.codomain.grid)
-        return at_corners(cast(k, np.result_type(dtype_of(k), float))), solver
+        return solver.at_corners(cast(k, np.result_type(dtype_of(k), float))), solver
 
     @cached_property
-    def _corners(self):
-        """Operators to corners and back, the function from tensors in cells to those at corners, its solver."""
-        grid = self.D.codomain.grid
-        if grid is None or (self.D.codomain, self.D.domain) != (grid.cells, grid.faces):
-            raise ShapeError(
-                f"a tensor needs D from the faces to the cells of a grid, got {self.D}; write k for each face"
-            )
-        closed = self.G.structure.magnitude()(np.ones(self.G.shape[1])) == 0
-        slopes, fluxes, at_corners = corners(grid, closed)
-        return slopes, fluxes, at_corners, TensorSolver(self.D @ fluxes, slopes @ self.G, self)
+    def _tensors(self):
+        return TensorSolver(self)
 
     def _coefficient(self, k):
         k = _values("k", k, self.D.domain, "harmonic_average(grid)(k)", self.D.codomain)
@@ -280,8 +269,13 @@ class TensorSolver(ParametricSolver):
 
     name = "elliptic_solver"
 
-    def __init__(self, D, G, front):
-        super().__init__(D, G, front._settings)
+    def __init__(self, front):
+        D, G, grid = front.D, front.G, front.D.codomain.grid
+        if grid is None or (D.codomain, D.domain) != (grid.cells, grid.faces):
+            raise ShapeError(f"a tensor needs D from the faces to the cells of a grid, got {D}; write k for each face")
+        closed = G.structure.magnitude()(np.ones(G.shape[1])) == 0
+        self.slopes, self.fluxes, self.at_corners = corners(grid, closed)  # to corners and back, and of tensors
+        super().__init__(D @ self.fluxes, self.slopes @ G, front._settings)
         self.info, self._cache = front.info, front._cache
 
     def _operator(self, k, shift):
