@@ -222,9 +222,7 @@ def test_refusals():
     with pytest.raises(dp.errors.ShapeError, match="damping has 2 parts for a field of 1; give one for each"):
         step((np.ones(3), np.ones(3)))
     step = dp.stepper("leapfrog", (rates[0], lambda p, c: (p, p)), 0.1, damping=(None, 1.0))
-    with pytest.raises(
-        dp.errors.ShapeError, match=r"a rate must have the fields of the state, u, got u\[0\], u\[1\]"
-    ):
+    with pytest.raises(dp.errors.ShapeError, match=r"a rate must have the fields of the state, u, got u\[0\], u\[1\]"):
         step((np.ones(3), np.ones(3)))
     with pytest.raises(ValueError, match="sponge on x needs 0 to 4 cells, got 5"):
         dp.sponge(dp.Grid(4), 5, 1.0)

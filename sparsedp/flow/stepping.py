@@ -343,7 +343,8 @@ class Diffusion:
 
     def __init__(self, name, number, laplacian, held, flow):
         self.name, self.number, self.held, self.flow = name, number, held, flow
-        self.op, self.relax, self.damping = laplacian() if number else None, None, 0.0
+        self.op, self.damping = laplacian() if number else None, 0.0
+        self.relax: Any = None
         if self.op is None:
             return
         rows = self.op.structure.magnitude()(np.ones(self.op.domain.size))

@@ -147,6 +147,8 @@ class Radau(Adaptive):
     """
 
     window = 10 * WINDOW  # a jump at a fine tolerance takes thousands of steps, of little cost
+    params: Any
+    moving: Any
     v: Any = None
     J: Any = None
     held: Any = None
