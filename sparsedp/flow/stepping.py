@@ -343,7 +343,7 @@ class Diffusion:
 
     def __init__(self, name, number, laplacian, held, flow):
         self.name, self.number, self.held, self.flow = name, number, held, flow
-        self.op, self.damping = laplacian() if number else None, 0.0
+        self.op, self.damping = laplacian() if number else None, 0.0  # type: Any, float
         self.relax: Any = None
         if self.op is None:
             return
