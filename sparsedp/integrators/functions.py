@@ -1,10 +1,10 @@
 """Functions of z L for a separable operator L, differentiable in z: one rule for all of them.
 
-A sum f of such functions has a derivative f' of the same kind, and with y = f(z L) b
+Such a function f has a derivative f' of the same kind, and with y = f(z L) b
 
     dy = f(z L) db + L f'(z L) b dz,     b_bar = f(z L)^T g,     z_bar = g . L f'(z L) b.
 
-They are sums of phi_k, by transforms, where L is separable:
+They are sums of phi_k, by one transform and one back:
 
     phi_0(x) = exp(x),    phi_{k+1}(x) = (phi_k(x) - 1/k!) / x,    phi_k'(x) = phi_k(x) - k phi_{k+1}(x)
 
@@ -14,8 +14,9 @@ Sources: Cox and Matthews, J. Comput. Phys. 176 (2002); Kassam and Trefethen, SI
 the trouble.
 """
 
-from functools import lru_cache
-from math import factorial, prod
+from functools import lru_cache, reduce
+from math import factorial
+from operator import matmul
 from typing import NamedTuple
 
 import autograd.numpy as anp
@@ -24,15 +25,17 @@ from scipy.special import hyp1f1
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import NonFiniteError
-from sparsedp.fields import field_array
+from sparsedp.operator import Operator
+from sparsedp.operators.boundary import identity
 from sparsedp.shortcuts import refuse_elsewhere
-from sparsedp.solvers.separable import diagonalised
-from sparsedp.tape import Rule, isbox
+from sparsedp.solvers.separable import SpectralFunction, diagonalised
+from sparsedp.space import Space
+from sparsedp.tape import Rule
 
 __all__ = ["Function", "PhiFunctions", "phi"]
 
 NEAR, LARGEST = 3.0, 1e3  # of x; beyond the second even the exponential is infinite
-KEPT = 64  # tables of weights, for a few z
+KEPT = 64  # operators f(z L), for a few z
 
 
 def phi(k, x):
@@ -66,11 +69,10 @@ class Function(NamedTuple):
             found[k + 1] -= k * weight
         return Function(tuple(self.scale * weight for weight in found), self.scale, self.power + 1)
 
-    def at_zero(self, op, field):
-        """For z = 0, where f is a number."""
-        for _ in range(self.power):
-            field = op.apply(field)
-        return sum(a / factorial(k) for k, a in enumerate(self.weights)) * field
+    @property
+    def start(self):
+        """f(0)."""
+        return sum(a / factorial(k) for k, a in enumerate(self.weights))
 
     def values(self, z, eigenvalues):
         """On the eigenvalues of L."""
@@ -80,14 +82,12 @@ class Function(NamedTuple):
 
 
 class PhiFunctions:
-    """combine(functions, z, *fields): the sum of f_j(z L) b_j, differentiable in z and the fields.
-
-    By one transform for each field and one back.
+    """f(function, z, b): f(z L) b, differentiable in z and b, to every order.
 
     Parameters
     ----------
     op : Operator
-        L, separable, or a power of a separable operator.
+        L, separable, or made of such ones.
     name : str
         For messages and counts.
 
@@ -98,73 +98,54 @@ class PhiFunctions:
     """
 
     def __init__(self, op, name):
-        self.op, self.name, self.domain = op, name, op.domain
-        self.found, self.eigenvalues = diagonalised(op, name, "; try imex or tr_bdf2")
+        self.op, self.name, self.space = op, name, Space(op.domain.shape, op.domain.kind)  # on no ranks
+        self.spectrum, self.eigenvalues = diagonalised(op, name, "; try imex or tr_bdf2")
         self._rule = lru_cache(None)(self._made)  # rules made once, for every z, step and adjoint
-        self._table = lru_cache(KEPT)(self._values)  # plain values only, of a few z
+        self._operator = lru_cache(KEPT)(self._set_up)  # of a few z
 
-    def __call__(self, functions, z, *fields):
-        return self._rule(functions, False)(z, *fields)
+    def __call__(self, function, z, b):
+        return self._rule(function, False)(z, b)
 
-    def _made(self, functions, transposed):
-        """The sum as a rule in (z, *fields)."""
+    def _made(self, function, transposed):
+        """f(z L) b, or f(z L^T) b, as a rule in (z, b)."""
 
-        def forward(z, *fields):
-            return self.plain([functions], z, fields, transposed)[0]
+        def forward(z, b):
+            refuse_elsewhere(self.name, [b])
+            op = self._operator(function, float(z))
+            return (op.T if transposed else op).apply(b)
 
-        def slope(z, fields):
-            return self._rule(tuple(f.derivative() for f in functions), transposed)(z, *fields)
+        def change(num, by, z, b):
+            """What a change of z or b makes."""
+            return (
+                self._rule(function, transposed)(z, by)
+                if num
+                else by * self._rule(function.derivative(), transposed)(z, b)
+            )
 
-        def vjp(nums, ans, z, *fields):
-            chosen = [(functions[num - 1],) for num in nums if num]
-
+        def vjp(nums, ans, z, b):
             def pull(g):
-                if isbox(g) or isbox(z):
-                    backs = iter([self._rule(row, not transposed)(z, g) for row in chosen])
-                else:  # all at once
-                    backs = iter(self.plain(chosen, z, [g], not transposed))
-                found = [next(backs) if num else anp.sum(g * slope(z, fields)) for num in nums]
-                return tuple(of_argument(back, (z, *fields)[num]) for num, back in zip(nums, found, strict=True))
+                turned = self._rule(function, not transposed)
+                backs = (turned(z, g) if num else anp.sum(change(0, g, z, b)) for num in nums)
+                return tuple(of_argument(back, (z, b)[num]) for num, back in zip(nums, backs, strict=True))
 
             return pull
 
-        def jvp(nums, tangents, ans, z, *fields):
-            chosen, moves = [functions[num - 1] for num in nums if num], tangents[nums[0] == 0 :]
-            total = tangents[0] * slope(z, fields) if nums[0] == 0 else 0.0
-            return total + self._rule(tuple(chosen), transposed)(z, *moves) if chosen else total
+        def jvp(nums, tangents, ans, z, b):
+            return sum(change(num, tangent, z, b) for num, tangent in zip(nums, tangents, strict=True))
 
         return Rule(f"{self.name}{'.T' * transposed}", forward, vjp, jvp)
 
-    def plain(self, rows, z, fields, transposed=False):
-        """[the sum for each row of functions], on plain values, or with the transpose of L."""
-        op, z = (self.op.T if transposed else self.op), float(z)
-        refuse_elsewhere(self.name, fields)
-        fields = [field_array(self, field, batch=True) for field in fields]
-        if z == 0:  # no transform, and for phi_0 the field itself, bit for bit
-            return [sum(f.at_zero(op, field) for f, field in zip(row, fields, strict=True)) for row in rows]
-        if any(map(np.iscomplexobj, fields)):
-            parts = (self.plain(rows, z, [*map(part, fields)], transposed) for part in (np.real, np.imag))
-            return [real + 1j * imaginary for real, imaginary in zip(*parts, strict=True)]
-        shape, lone = fields[0].shape, op.domain.shape
-        if shape == lone:
-            return [total.reshape(shape) for total in self._sums(rows, z, fields, transposed)]
-        count = prod(shape[: len(shape) - len(lone)])  # of a batch
-        batches = [field.reshape(count, *lone) for field in fields]
-        sums = [self._sums(rows, z, row, transposed) for row in zip(*batches, strict=True)]
-        each = np.reshape(sums, (count, len(rows), op.domain.size))
-        return [total.reshape(shape) for total in np.moveaxis(each, 1, 0)]
-
-    def _sums(self, rows, z, fields, transposed):
-        """The sum for each row of functions, on one field each."""
-        moved = [self.found.forward(field.astype(float, copy=False), transposed) for field in fields]
-        sums = (sum(c * self._table(f, z) for f, c in zip(row, moved, strict=True)) for row in rows)
-        return [self.found.backward(total, transposed) for total in sums]
-
-    def _values(self, function, z):
-        """The values of a function on the eigenvalues of z L."""
+    def _set_up(self, function, z):
+        """The Operator f(z L), of plain z; for z = 0 without transforms: then exp(z L) keeps every bit."""
+        if z == 0:
+            product = reduce(matmul, [self.op] * function.power, identity(self.op.domain))
+            return self._named((function.start * product).structure)
         values = function.values(z, self.eigenvalues)
         if not np.all(np.isfinite(values)):
             raise NonFiniteError(
                 f"{self.name}: exp({z:g} * {self.op.name}) is beyond 1.8e308; take a smaller dt or the other sign"
             )
-        return values
+        return self._named(SpectralFunction(self.spectrum, values))
+
+    def _named(self, structure):
+        return Operator(structure, self.space, self.space, self.name)

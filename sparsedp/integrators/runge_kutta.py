@@ -41,8 +41,9 @@ Source: Cox and Matthews, J. Comput. Phys. 176 (2002), formulas 26 to 29; Hochbr
 Acta Numerica 19 (2010), section 2.2, exponential quadrature.
 """
 
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from math import factorial, sqrt
+from operator import add
 from typing import Any, NamedTuple
 
 import autograd.numpy as anp
@@ -65,6 +66,7 @@ from sparsedp.solvers.nullspace import Projector
 from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
+from sparsedp.tree import mapped
 
 __all__ = [
     "EXPLICIT",
@@ -413,27 +415,30 @@ class Exponential(Scheme):
 
     def __call__(self, u, params, t, h):
         def f(functions, *trees):
-            def of_field(op, z, leaf, *rates):
-                return self.functions[op](functions, z, leaf, *(h * rate for rate in rates))
+            def of_field(L, z, *row):
+                return reduce(add, (self.functions[L](f, z, leaf) for f, leaf in zip(functions, row, strict=True)))
 
             return self.problem.on_fields(of_field, h, params, *trees)
 
-        s = [self.problem.given(params, later(t, node * h)) for node in self.nodes]
+        def scaled(rate):
+            return mapped(lambda leaf: leaf if leaf is None else h * leaf, rate)
+
+        s = [scaled(self.problem.given(params, later(t, node * h))) for node in self.nodes]
         whole, first, second = self.parts
         if self.problem.rate is None:
             return f((WHOLE, *whole), u, *s)
 
         def n(v, share):
-            return self.problem.explicit(v, params, later(t, share * h))
+            return scaled(self.problem.explicit(v, params, later(t, share * h)))
 
-        n0 = n(u, 0.0)
-        a = f((HALF, MEAN, *first), u, n0, *s)
+        n0, half = n(u, 0.0), f((HALF, *first), u, *s)
+        a = combine(half, (1.0, f((MEAN,), n0)))
         n1 = n(a, 0.5)
-        n2 = n(f((HALF, MEAN, *first), u, n1, *s), 0.5)
+        n2 = n(combine(half, (1.0, f((MEAN,), n1))), 0.5)
         n3 = n(f((HALF, MEAN, *second), a, combine(n2, (1.0, n2), (-1.0, n0)), *s), 1.0)
         return f((WHOLE, BEGIN, MIDDLE, END, *whole), u, n0, combine(n1, (1.0, n2)), n3, *s)
 
 
-def _free(functions, z, *fields):
-    """The sum of functions where L is 0."""
-    return sum(function.at_zero(None, field) for function, field in zip(functions, fields, strict=True))
+def _free(function, z, b):
+    """The same where L is 0."""
+    return function.start * b
