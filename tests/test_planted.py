@@ -523,7 +523,7 @@ BUGS = {
         "tests/test_stress.py::test_a_wrong_gradient_and_a_swallowed_nan_fail",
     ),
     "a table that leaves a bar in a cell": Bug(
-        "report",
+        "check",
         '.replace("|", "\\\\|")',
         "",
         "tests/test_report_tables.py",
