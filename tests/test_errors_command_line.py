@@ -165,6 +165,7 @@ REFUSALS = [
     ("bare.py", "bare.py has no 'start or x', the point; write bare.py:loss:NAME"),
     ("ends.py", "ends.py does not run: line 2: ZeroDivisionError: division by zero"),
     ("typo.py", "typo.py does not run: line 1: SyntaxError: "),
+    ("imports.py", "imports.py does not run: line 2: SyntaxError: "),
     ("options.py", "stress_options in options.py must be a dict of arguments, got int"),
     ("poisson.py:broken", "poisson.py:broken cannot be audited: LookupError: no such well"),
     ("poisson.py:grid", "poisson.py has no function 'grid'; write poisson.py:NAME of the function to examine"),
@@ -178,6 +179,7 @@ def test_refusals(scene, monkeypatch, capsys, target, sentence):
         "bare.py": "loss = abs",
         "ends.py": "y = 0\n1 / y",
         "typo.py": "a b",
+        "imports.py": "\nimport typo",
         "options.py": "loss, x, stress_options = abs, 1.0, 3",
     }.items():
         (scene.parent / name).write_text(text, encoding="utf-8")

@@ -143,12 +143,13 @@ def _audit(trials, taped, count, rng, quick):
     if at_kinks(judged) and callable(trials.slope):
         _look_beside(trials, judged)
     random = judged[:count]
+    first = None if quick or not random else random[0]
     if taped and random:
         doubts.append(_modes(forward_mode(loss, random), trials.tolerance))
-    if random and not quick and not point.complex:
-        doubts += _complex_step(loss, point, judged[0], trials.base)
-    if taped and random and not quick and judged[0].word in PROVED:
-        hessian, note = _hessian(loss, point, judged[0])
+    if first and not point.complex:
+        doubts += _complex_step(loss, point, first, trials.base)
+    if first and taped and first.word in PROVED:
+        hessian, note = _hessian(loss, point, first)
         doubts.append(("note", note))
     if judged and trials.value(point.fresh()) != trials.base:
         doubts.append(("unsound", "the loss gives another value after the audit: it keeps a state"))

@@ -13,7 +13,7 @@ from sparsedp.tape import called, isbox
 
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
 
-HOLDERS = tuple, list, set, dict, FunctionType, MethodType, CellType, partial
+HOLDERS = tuple, list, set, dict, MethodType, CellType, partial
 DEEPEST = 36  # holders inside each other; deeper ones are not the tape's. A function, its closure and a cell are three
 
 
@@ -101,8 +101,9 @@ def bytes_held(nodes):
 
 
 def _parts(thing):
-    """What a box, a function or a container refers to; of a function not the names of its module."""
+    """What a box, a function or a container refers to."""
     if isbox(thing):
         return (thing._value,)
-    module = getattr(thing, "__globals__", None)
-    return [part for part in gc.get_referents(thing) if part is not module] if isinstance(thing, HOLDERS) else ()
+    if isinstance(thing, FunctionType):  # not the names of its module
+        return (thing.__closure__, thing.__defaults__)
+    return gc.get_referents(thing) if isinstance(thing, HOLDERS) else ()

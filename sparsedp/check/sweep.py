@@ -172,7 +172,7 @@ class Trials:
     def __init__(self, loss, point, slope, steps=(), tick=lambda: None):
         self.loss, self.point, self.slope, self.tick = loss, point, slope, tick
         self.steps, self.extend = steps or default_steps(point.eps), not steps
-        self.base, self.gradient = np.nan, np.full(point.vector.size, np.nan)
+        self.base = self.gradient = np.nan  # until it is started
         self.count, self.solved, self.tolerance, self.noise = 0, False, 0.0, 0.0
         self.eps = eps_of(float)
 

@@ -124,7 +124,7 @@ def _run(file):
 def _where(error, file):
     """The last line of the file itself that took part, in words."""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-    lines += [error.lineno] if isinstance(error, SyntaxError) else []
+    lines += [error.lineno] if isinstance(error, SyntaxError) and error.filename == file else []
     return f"line {lines[-1]}: " if lines else ""
 
 
