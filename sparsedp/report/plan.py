@@ -146,18 +146,14 @@ class Plan(Result):
         """The sums, a row for each name, and what was left out."""
         forward, backward = self.seconds
         rows = [{name: value or None for name, value in row.items()} for row in self.rows]
+        sums = ", ".join(f"{many} {word}" for word, many in self.totals.items() if many)
         return [
             f"value {self.value:.6g}: {forward:.2g} s forward, {backward:.2g} s backward; tape: {self.tape_nodes} "
             f"calls that keep {self.tape_bytes} bytes, recomputation factor {self.recomputation:.2f}",
             table_of(rows, ("name", *COLUMNS, "seconds", "how")),
             *self.omissions(),
-            f"totals: {self.sums}",
+            f"totals: {sums or 'nothing was called'}",
         ]
-
-    @property
-    def sums(self):
-        """The totals that are not 0, in words."""
-        return ", ".join(f"{many} {word}" for word, many in self.totals.items() if many) or "nothing was called"
 
 
 def _rows(calls):

@@ -66,16 +66,12 @@ class Scene:
                 raise ValueError(f"stress needs ranges of two finite numbers, low < high, got {limits!r} for {name}")
         self.time_step = time_step or next((name for name in TIME_STEPS if name in names), None)
         self.viscosity = viscosity or next((name for name in VISCOSITIES if name in names), None)
-        self.base = self.run({})
+        self.base = run(loss, self.at({}))
         self.growth = self.growth_at({})
 
     def at(self, other):
         """The tree x with other values of some parameters; the rest are fresh copies."""
         return self.point.tree(list((copied(self.leaves) | other).values()))
-
-    def run(self, other):
-        """What the loss gives there."""
-        return run(self.loss, self.at(other))
 
     def sheltered(self, x):
         """The loss there, NaN whatever it raises."""
@@ -121,15 +117,28 @@ def run(loss, x):
     return Outcome(float(value), gradient, (), thread.grown > grown)
 
 
-# ---------------------------------------------------------------- judges: (scene, other values) -> (word, figure, note)
+# ---------------------------------------------------------------- judges: what came out -> (word, figure, note)
 
 
-def sound(scene, other):
+def judged(judge, scene, other):
+    """The verdict on a run with other values of some parameters, which it may not change."""
+    x = scene.at(other)
+    before = _bits(x)
+    out = run(scene.loss, x)
+    if not out.refusal and _bits(x) != before:
+        return FAILED, nan, "the input was modified"
+    return judge(scene, other, out)
+
+
+def _bits(x):
+    return [leaf.tobytes() for leaf in leaves(x) if isinstance(leaf, np.ndarray)]
+
+
+def sound(scene, other, out):
     """The run ends with finite numbers, the gradient agrees with differences, and no step grows by fault of the scheme.
 
     As given it may not be refused; its growth is a case of its own.
     """
-    out = scene.run(other)
     if out.refusal:
         word, *rest = out.refusal
         return FAILED if word == REFUSED and not other else word, *rest
@@ -144,22 +153,14 @@ def sound(scene, other):
     return verdict
 
 
-def near(scene, other, good=0.0, bad=1e-10, note="differs from the plain case", unit=1.0):
+def near(scene, other, out, good=0.0, bad=1e-10, note="differs from the plain case", unit=1.0):
     """Value and gradient are those of the plain case to `good` (0: to the last bit), or to `bad`, which is degraded."""
-    x, base = scene.at(other), scene.base
-    before = _bits(x)
-    out = run(scene.loss, x)
+    base = scene.base
     refusal = out.refusal or base.refusal
     if refusal:
         return refusal[0] if good else FAILED, *refusal[1:]
-    if _bits(x) != before:
-        return FAILED, nan, "the input was modified"
     gaps = distance(out.value, base.value), distance(out.gradient, base.gradient)
     return _graded(max(gaps), good, bad, note, unit)
-
-
-def _bits(x):
-    return [leaf.tobytes() for leaf in leaves(x) if isinstance(leaf, np.ndarray)]
 
 
 def _graded(gap, good, bad, note, unit=1.0):
@@ -167,9 +168,8 @@ def _graded(gap, good, bad, note, unit=1.0):
     return word, gap, "" if word == PASSED else note.format(gap / unit)
 
 
-def scaled(scene, other, power):
+def scaled(scene, other, out, power):
     """The value is 2^power times the plain one, exactly."""
-    out = scene.run(other)
     if out.refusal:
         return out.refusal
     if abs(log2(abs(scene.base.value)) + power) > LARGEST:
@@ -178,13 +178,12 @@ def scaled(scene, other, power):
     return _graded(gap, 1e-12, 1e-3, f"is not 2^{power} times the plain value")
 
 
-def refused(scene, other, located=False):
+def refused(scene, other, out, located=False):
     """The run ends with a typed error.
 
     located: it has to say which number is wrong, or where the first one stands (a loss may have moved it on the
     way), or to name the parameter.
     """
-    out = scene.run(other)
     if out.refusal:
         word, figure, words = out.refusal
         place = rf"the first at|got -?(nan|inf)\b|\b{re.escape(next(iter(other)))}\b"
@@ -196,7 +195,7 @@ def refused(scene, other, located=False):
     return DEGRADED, nan, f"taken without an error; value {out.value:g}"
 
 
-def growing(scene, _):
+def growing(scene, *_):
     """The growth factor of a step: above 1 is right only if the physics grows."""
     growth, dt = scene.growth, scene.time_step
     if growth.refusal:
@@ -369,4 +368,4 @@ def cases(scene, groups):
         for name, x in [("", None)] if whole else scene.leaves.items():
             for case, value, judge in GROUPS[group].cases(scene, name, x):
                 if not legal or judge is refused or scene.legal(name, value):
-                    yield group, name, case, partial(judge, scene, value if whole else {name: value})
+                    yield group, name, case, partial(judged, judge, scene, value if whole else {name: value})
