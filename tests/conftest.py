@@ -3,11 +3,15 @@
 import gc
 import os
 import random
+import signal
 import sys
 import zlib
 from pathlib import Path
 
 os.environ["MPLBACKEND"] = "Agg"  # before anything can import matplotlib
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell did that which started the run in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # or tests of Ctrl-C, and their processes, never end
 
 if sys.dont_write_bytecode:  # then not beside the sources; but a third of a run's start is compiling, each time again
     sys.dont_write_bytecode = False

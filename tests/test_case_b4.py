@@ -47,6 +47,7 @@ def test_plume_forward():
     assert np.mean(found[0][0]) == pytest.approx(0.008125, rel=1e-12)
 
 
+@pytest.mark.whole
 def test_plume_inverse_at_zero():
     """B5: the three losses before anything is learned, MacCormack clamped to the cell of the back-trace."""
     grid = dp.Grid((32, 40))

@@ -52,7 +52,7 @@ def test_what_somebody_sees_is_never_handed_out(hold):
     first[:] = 7.0
     where, seen = first.ctypes.data, hold(first)
     del first
-    gc.collect()
+    gc.collect(1)  # what is new; a whole one looks at all that the tests before have left
     others = [results.empty(SHAPE, float) for _ in range(3)]
     assert where not in [other.ctypes.data for other in others]
     for other in others:

@@ -511,7 +511,7 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 
 @NUMBA
-@pytest.mark.parametrize("layer", ["workqueue", "default"])
+@pytest.mark.parametrize("layer", ["workqueue", pytest.param("default", marks=pytest.mark.whole)])
 def test_teams_of_several_solvers_take_turns(layer):
     """numba's own threads end the process where two teams meet; the bits do not depend on who gets the team.
 
