@@ -154,13 +154,10 @@ WRITERS = {
 }  # fmt: skip
 
 
-DRAWS = {
-    "table.save",
-    "animate",
-}  # by matplotlib, whose start takes longest; what they write goes the way of the others
+ALIKE = {"table.save", "animate", "workprec(file)"}  # what they write goes the way of the others
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.whole] if n in DRAWS else []) for n in WRITERS])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.whole] if n in ALIKE else []) for n in WRITERS])
 def test_no_room(tmp_path, name):
     """The second, larger write fails: the files of the first one stand there, and nothing else."""
     if name == "animate":

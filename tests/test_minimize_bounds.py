@@ -50,7 +50,13 @@ def test_starts_on_bounds_and_close_to_them(seed):
     assert best.converged and best.value <= known.fun + 1e-9 * abs(known.fun)
 
 
-@pytest.mark.parametrize("problem", PROBLEMS, ids=lambda problem: problem.__name__)
+LONG = {"deconvolution", "tomography"}
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [pytest.param(one, id=one.__name__, marks=[pytest.mark.whole] * (one.__name__ in LONG)) for one in PROBLEMS],
+)
 def test_evaluations_beside_scipy(problem):
     """At most 1.5 times what SciPy takes to the loss that it ends at."""
     best, ours, scipys = compared(problem)

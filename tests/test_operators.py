@@ -157,6 +157,7 @@ WALLS = {  # least orders of gradient and laplacian over the whole field, L2: th
 }
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("stretched", [False, True], ids=["uniform", "stretched"])
 @pytest.mark.parametrize("dim", [1, 2, 3])
 @pytest.mark.parametrize("kind", WALLS)

@@ -116,7 +116,9 @@ def test_the_place_can_be_named(ax):
     assert corners[0, 0, 0] == -0.5  # node 0 is in the middle of its patch
 
 
-@pytest.mark.parametrize("kind", ["cells", "faces", "nodes"])
+@pytest.mark.parametrize(
+    "kind", ["faces", *(pytest.param(kind, marks=pytest.mark.whole) for kind in ("cells", "nodes"))]
+)
 def test_three_middle_slices(ax, kind):
     grid = dp.Grid((4, 3, 2))
     dp.plot(grid, np.ones(getattr(grid, kind).shape), ax=ax, title="box")

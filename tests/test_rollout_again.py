@@ -69,6 +69,7 @@ def by_loop(name, keep, inputs, truncate, p):
     return KEEPS[keep][2](states)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
 @pytest.mark.parametrize("keep", KEEPS)
 @pytest.mark.parametrize("name", STEPS)
@@ -292,6 +293,7 @@ def stored_in(name):
     return step, stored
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
 @pytest.mark.parametrize("keep", KEEPS)
 @pytest.mark.parametrize(

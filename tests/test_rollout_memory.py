@@ -169,7 +169,7 @@ def test_peak_is_the_trajectory(step, keep, monkeypatch):
 
 
 @KINDS
-@pytest.mark.parametrize("states", [7, 9, 12, 24])
+@pytest.mark.parametrize("states", [7, 12, *(pytest.param(states, marks=pytest.mark.whole) for states in (9, 24))])
 def test_peak_under_a_budget(step, states):
     u, n = np.random.default_rng(0).random(20_000), 60
     c = np.full(u.shape, 0.5)

@@ -29,6 +29,7 @@ def error(n, dim, boundary, periodic, stretched):
     return np.sqrt(np.sum(grid.volumes * gap**2))
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("stretched", [False, True], ids=["uniform", "stretched"])
 @pytest.mark.parametrize("dim", [1, 2, 3])
 @pytest.mark.parametrize("kind", SIDES)

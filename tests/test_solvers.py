@@ -75,6 +75,7 @@ def test_the_adjoint_is_the_transpose(problem, method, rng):
     assert inv.info.forward.status.startswith("converged") and inv.info.adjoint.status.startswith("converged")
 
 
+@pytest.mark.sampled
 @EVERY
 @pytest.mark.parametrize("problem", ["robin, stretched", "wind", "stretched neumann"])
 @pytest.mark.parametrize("exponent", [-963, -900, 17, 900, 963])

@@ -163,7 +163,7 @@ def test_cavity_at_32():
     assert scene.figures(x) == pytest.approx((-0.21404, 0.17957, -0.25380), rel=0.025)  # Botella and Peyret, 1998
 
 
-@pytest.mark.parametrize("kind", ["cavity", "convection"])
+@pytest.mark.parametrize("kind", ["cavity", pytest.param("convection", marks=pytest.mark.whole)])
 def test_gradients_of_flows(kind):
     """Min u in Re, Nu in Ra: both orders, forward and backward."""
     scene = Flow(4)

@@ -11,7 +11,8 @@ from pairwise import sample
 import sparsedp as dp
 from sparsedp.conditions import resolve
 
-SHAPES = [(1,), (2,), (3,), (1, 4), (4, 1), (1, 1), (2, 1), (3, 2), (1, 1, 4), (3, 1, 3), (1, 2, 1), (2, 2, 3)]
+SHAPES = [(1,), (2,), (3,), (1, 4), (4, 1), (1, 1), (2, 1), (3, 2), (1, 1, 4), (3, 1, 3), (1, 2, 1)]
+SHAPES += [pytest.param((2, 2, 3), marks=pytest.mark.whole)]  # no thin one
 WORDS = (dp.no_slip, dp.free_slip, dp.inflow, dp.outflow)
 
 

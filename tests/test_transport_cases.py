@@ -125,6 +125,7 @@ def test_a3_fingerprint():
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
 
 
+@pytest.mark.whole
 def test_a3_van_leer_is_at_least_three_times_better():
     assert 3 * rotate(128, "van_leer", 16 * 128)[0] <= rotate(128, "upwind", 8 * 128)[0]
 

@@ -84,6 +84,7 @@ def test_gradient_is_that_of_the_value(scheme, form, of):
 # ---------------------------------------------------------------- solids
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
 @pytest.mark.parametrize("of", ["cells", "faces"])
 def test_solid(without_numba, scheme, form, of):

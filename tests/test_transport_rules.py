@@ -47,6 +47,7 @@ def scene(scheme, grid, velocity, form, of="cells", **options):
     return move, args, loss
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", GRIDS)
 @pytest.mark.parametrize("velocity, form", FORMS)
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])

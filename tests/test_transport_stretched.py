@@ -33,6 +33,7 @@ def scene(shape, periodic, scheme, form, interpolation="linear", of="cells", vel
     return move, (rng.standard_normal(move.space.shape), v, 0.31, 0.4)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("boundary", [dp.neumann, dp.dirichlet], ids=repr)
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
 @pytest.mark.parametrize(("shape", "periodic"), GRIDS)
@@ -69,6 +70,7 @@ def test_rest_is_the_identity_and_its_slope_the_mean_of_both_sides(scheme, form,
             assert slope[k] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5, abs=1e-6)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
 def test_gradient_is_that_of_the_value(scheme, form, interpolation):
