@@ -26,6 +26,7 @@ def weighted_mean(grid, x):
 # ---------------------------------------------------------------- defects
 
 
+@pytest.mark.sampled
 @EVERY
 @pytest.mark.parametrize("grid", [dp.Grid((20, 22)), stretched(20, 22)], ids=["uniform", "stretched"])
 @pytest.mark.parametrize("defect", [1e-14, 1e-7, 1.0])
