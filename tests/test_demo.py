@@ -38,7 +38,7 @@ def demo(folder, *arguments, way=("-m", "sparsedp")):
 
 
 FEWER = (
-    "import sys; from sparsedp.report.demo import story; story.ITERATIONS = 15; from sparsedp.__main__ import main; "
+    "import sys; from sparsedp.report.demo import story; story.ITERATIONS = 10; from sparsedp.__main__ import main; "
 )
 
 
