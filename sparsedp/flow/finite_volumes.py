@@ -33,10 +33,8 @@ from sparsedp.fields import (
     check_choice,
     check_finite,
     check_number,
-    check_plain,
     check_takes,
     field_array,
-    is_number,
     is_whole,
 )
 from sparsedp.grid import AXES, check_grid
