@@ -15,8 +15,8 @@ import sparsedp as dp
 from benchmarks.triad import best_times
 from sparsedp import network
 from sparsedp.optimize.directions import Family
-from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.linearised import Linearised
+from sparsedp.packing import Packing
 
 SIZES = (64, 64), (64, 128), (128, 64), (64, 64)  # 24896 weights
 
@@ -91,7 +91,7 @@ def oscillators(rng):
 def by_svd(quick):
     """A half-inverse direction for the 128 x 1444 Jacobian of the oscillators: limit 4 x a dense SVD."""
     misses, weights = oscillators(np.random.default_rng(0))
-    packing, family = Unknowns(weights), Family()
+    packing, family = Packing(weights), Family()
     point = packing.pack(weights)
 
     def by_hand(jacobian, g):

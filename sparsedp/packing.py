@@ -7,13 +7,15 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_native
+from sparsedp.fields import check_finite, check_native
 from sparsedp.recipe import Made
 from sparsedp.tape import cast, is_variable, isbox
 from sparsedp.tree import copied, labels, leaves
 from sparsedp.tree import flatten as taken_apart
 
-__all__ = ["Packing", "flatten", "joined"]
+__all__ = ["FINITE", "Packing", "flatten", "joined"]
+
+FINITE = "must be finite (dp.check.gradient(loss, x) shows where it comes from)"
 
 
 def flatten(tree):
@@ -163,6 +165,17 @@ class Packing:
                     f"the gradient of {self.names[place]} has {shapes}; return a tree like {self.root}"
                 )
         return [np.conj(g).astype(complex) if np.iscomplexobj(x) else g.real for g, x in zip(given, self.values)]
+
+    def pack_gradient(self, gradient):
+        """Finite gradient of the same structure -> flat gradient with respect to the packed vector."""
+        slopes = self.slopes(gradient)
+        for name, g in zip(self.names, slopes):
+            check_finite(f"the gradient of {name}", g, FINITE)
+        return joined(slopes)
+
+    def traced(self, tree):
+        """The floating leaves of a tree that may be traced, as one traced vector."""
+        return anp.concatenate([anp.reshape(leaf, (-1,)) for leaf in self.floating(tree)])
 
     def split(self, vector):
         """Flat vector -> views of what belongs to each floating leaf."""

@@ -9,7 +9,18 @@ from math import hypot, isfinite
 import numpy as np
 import scipy.sparse as sp
 
-__all__ = ["copied", "flatten", "keys", "labels", "leaves", "leaves_like", "mapped", "norm", "subscript"]
+__all__ = [
+    "copied",
+    "flatten",
+    "keys",
+    "labels",
+    "leaves",
+    "leaves_like",
+    "mapped",
+    "norm",
+    "power_of_two",
+    "subscript",
+]
 
 
 def flatten(tree):
@@ -132,6 +143,11 @@ def norm(tree):
     if largest == 0 or not isfinite(largest):
         return largest
     return largest * hypot(*(float(np.linalg.norm(a / largest)) for a in arrays))
+
+
+def power_of_two(value):
+    """The power of two next above, so that dividing by it changes no digits."""
+    return 2.0 ** float(np.clip(np.frexp(value)[1], -900, 900)) if value > 0 else 1.0
 
 
 def keys(tree):

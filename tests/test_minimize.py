@@ -12,8 +12,8 @@ from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.first_order import Adam, Descent
-from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.trials import Trials
+from sparsedp.packing import Packing
 from sparsedp.tape import plain
 
 Rest = namedtuple("Rest", "b nothing")
@@ -231,7 +231,7 @@ def test_progress_bar(capsys, monkeypatch):
 def test_states_are_values_that_can_be_resumed():
     """Every step depends on its state alone: continuing from a stored state gives the same bits."""
     for stepper in (Adam(rate=0.05), Descent(rate=1e-3, momentum=0.9), Descent()):
-        packing = Unknowns(np.array([-1.2, 1.0]))
+        packing = Packing(np.array([-1.2, 1.0]))
         trials = Trials(valley, None, packing, Box(), Batches())
         state = stepper.begin(trials.first(np.array([-1.2, 1.0])))
         states = [state]

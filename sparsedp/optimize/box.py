@@ -19,7 +19,7 @@ class Box:
     ----------
     bounds : (lower, upper) or None
         As for `minimize`.
-    packing : Unknowns
+    packing : Packing
 
     Attributes
     ----------

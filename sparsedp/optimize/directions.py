@@ -11,8 +11,8 @@ import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_choice, check_finite, check_function, check_number, check_whole
-from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.linearised import Linearised, singular
+from sparsedp.packing import Packing
 
 __all__ = ["Direction", "Family", "form_of", "update_direction"]
 
@@ -198,7 +198,7 @@ def update_direction(outputs, x, g=None, method="auto", apart=False, **options):
     array([4., 1.])
     """
     check_function("update_direction", outputs, "lambda x: A @ x - b")
-    family, packing = Family(**options), Unknowns(x)
+    family, packing = Family(**options), Packing(x)
     linearised = Linearised(outputs, packing, packing.pack(x), apart=apart, dense=form_of(method))
     g = linearised.value if g is None else g
     if np.shape(g) != linearised.value.shape:

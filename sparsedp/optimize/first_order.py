@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import check_number, is_number
-from sparsedp.optimize.flat import power_of_two
 from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.solvers.scaling import largest
-from sparsedp.tree import norm
+from sparsedp.tree import norm, power_of_two
 
 __all__ = ["Adam", "AdamState", "Descent", "DescentState"]
 

@@ -9,10 +9,9 @@ import scipy.linalg
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite
-from sparsedp.optimize.flat import power_of_two
 from sparsedp.solvers.scaling import largest
 from sparsedp.tape import is_variable
-from sparsedp.tree import leaves, mapped
+from sparsedp.tree import leaves, mapped, power_of_two
 
 __all__ = ["Linearised", "singular"]
 
@@ -33,7 +32,7 @@ class Linearised:
     ----------
     outputs : callable
         ``outputs(x, *rest) -> array``, of any shape.
-    packing : Unknowns
+    packing : Packing
     vector : (n,) array
     rest : tuple
         What `outputs` is given after x.

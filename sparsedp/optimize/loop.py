@@ -8,7 +8,6 @@ from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.checkpoint import Checkpoint
 from sparsedp.optimize.first_order import Adam, Descent
-from sparsedp.optimize.flat import Unknowns
 from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
 from sparsedp.optimize.newton import NewtonCG
 from sparsedp.optimize.physical import PhysicalGradient
@@ -17,6 +16,7 @@ from sparsedp.optimize.result import Stuck
 from sparsedp.optimize.sparse_terms import admm
 from sparsedp.optimize.trials import Trials
 from sparsedp.optimize.watch import Watch
+from sparsedp.packing import Packing
 from sparsedp.progress import shown_steps
 from sparsedp.shortcuts import ELSEWHERE, together
 from sparsedp.tree import leaves
@@ -160,7 +160,7 @@ def minimize(
                 "number"
             )
         loss, gradient = tolerance.inside(loss, gradient)
-    packing, batches = Unknowns(start, "start"), Batches(batches)
+    packing, batches = Packing(start, "start"), Batches(batches)
     if batches.varied and stepper.searches:
         raise ValueError(f"{method} compares losses and cannot use batches; write method='adam', or give gd a rate")
     for inner in (getattr(stepper, "rule", None), project):

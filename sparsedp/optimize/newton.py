@@ -5,9 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import check_whole
-from sparsedp.optimize.flat import power_of_two
 from sparsedp.optimize.result import Trial
-from sparsedp.tree import norm
+from sparsedp.tree import norm, power_of_two
 
 __all__ = ["NewtonCG", "NewtonState"]
 

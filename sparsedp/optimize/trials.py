@@ -22,7 +22,7 @@ class Trials:
     loss : callable
     gradient : callable or None
         None: reverse mode.
-    packing : Unknowns
+    packing : Packing
     box : Box
         The points that are allowed.
     batches : Batches
@@ -159,7 +159,7 @@ class Trials:
         if packing.complex:
             raise DerivativeError("newton_cg takes real numbers, got complex ones; split them into two real arrays")
         slope, pull = pullback(
-            lambda x: packing.join(value_and_grad(self._loss)(x, *batch)[1]), packing.unpack(trial.vector)
+            lambda x: packing.traced(value_and_grad(self._loss)(x, *batch)[1]), packing.unpack(trial.vector)
         )
         return lambda v: np.where(free, packing.pack_gradient(pull(np.asarray(v, dtype=slope.dtype))), 0.0)
 

@@ -10,10 +10,10 @@ from sparsedp.derivative import value_and_grad
 from sparsedp.fields import check_finite
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
-from sparsedp.optimize.flat import FINITE, Unknowns
 from sparsedp.optimize.result import Trial
 from sparsedp.optimize.trials import Trials
 from sparsedp.optimize.watch import Watch
+from sparsedp.packing import FINITE, Packing
 from sparsedp.parallel.fields import DistributedField
 from sparsedp.tape import is_variable
 from sparsedp.tree import labels, leaves, mapped
@@ -84,7 +84,7 @@ def minimized(comm, loss, start, method, maxiter, tolerance, callback, bounds, m
             f"got {', '.join([method, *given])}; leave the rest out, or start from dp.gather(u)"
         )
     blocks = Blocks(comm, start)
-    packing = Unknowns(blocks.of(start), "start")
+    packing = Packing(blocks.of(start), "start")
     trials = Spread(loss, blocks, packing, Box(bounds, packing))
     watch = Watch(trials, packing, tolerance, callback and (lambda record, x: callback(record, blocks.tree(x))))
     _search(comm, trials, watch, trials.box.inside(packing.pack(blocks.of(start))), int(maxiter))
