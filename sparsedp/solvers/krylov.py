@@ -1,15 +1,13 @@
 """Krylov engines: conjugate gradients for symmetric operators, GMRES for the rest, around any preconditioner.
 
-Conjugate gradients run on S = sign * diag(w) * A, symmetric and positive, with w the volumes on
-stretched grids. Then A x = b is S x = sign w b, and A^T y = g is S z = sign g with y = w z.
+Conjugate gradients run in the inner product in which the operator is symmetric: that of the volumes w on stretched
+grids, where W A = A^T W, and for A^T that of 1 / w.
 
 Both keep the best iterate, and name what went wrong with a status word ("" when nothing did).
 """
 
-from itertools import count
 from typing import Any
 
-import autograd.numpy as anp
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
 
@@ -73,57 +71,65 @@ class Krylov(Engine):
             near = self.refines and residual <= ROUNDING * (size * norm(x) + data)
             return near and residual <= self.system.rounding(x, data, transposed)
 
+        def product(p):  # what rounding leaves along the null space no step can take back: residuals would end on it
+            q = self.system.product(p, transposed)
+            return self.system.null_space.project(q, transposed, into=q)
+
         if self.symmetric:
-            return self._conjugate_gradients(b, accepted, transposed)
+            return self._conjugate_gradients(b, accepted, transposed, product)
         x, used, word = self._gmres(b.astype(self.dtype, copy=False), goal, accepted, transposed)
         return (x if b.dtype == self.dtype else x.real.copy()), used, word
 
-    def _conjugate_gradients(self, b, accepted, transposed):
-        """Preconditioned conjugate gradients from 0, until accepted(|b - A x|, x)."""
-        system, weights = self.system, self.system.weights
-        factor, gauged = self.sign * weights, not transposed and not np.isscalar(weights)
-        r = self.sign * b if transposed else factor * b
-        x, scratch, best, found = np.zeros_like(r), np.empty_like(r), np.zeros_like(r), 0
-        first = least = norm(r / weights if gauged else r)
-        z = self._corrected(r, factor)
-        p, rz, word = z.copy(), dot(r, z), "max_iterations"
+    def unroll(self, b, goal, transposed):
+        """As `solve`, differentiable as it runs: b may be traced."""
+        op = (self.system.given.T if transposed else self.system.given)._flat
+        accepted = lambda residual, x: residual <= goal and self.refines
+        return self._conjugate_gradients(b, accepted, transposed, op)
+
+    def _conjugate_gradients(self, b, accepted, transposed, product):
+        """Preconditioned conjugate gradients from 0, until accepted(|b - A x|, x); A p by ``product(p)``."""
+        weights, uniform = self.system.weights, np.isscalar(self.system.weights)
+        measure = 1.0 / weights if transposed else weights
+
+        def inner(x, y):
+            return self.sign * dot(x if uniform else measure * x, y)
+
+        def corrected(r):  # z ~ A^-1 r; A^-T = W A^-1 W^-1
+            if self.precondition is None:
+                return self.sign * weights * r  # W A has a smaller condition number than A
+            turned = transposed and not uniform
+            z = weights * self.precondition(r / weights, False) if turned else self.precondition(r, False)
+            return self.system.null_space.project(z, transposed)
+
+        x = best = np.zeros(b.shape)
+        r, p, found, word = b, corrected(b), 0, "max_iterations"
+        z, rz, first = p, inner(r, p), norm(plain(r))
+        least = first
         for number in range(1, self.maxiter + 1):
-            q = system.product(p)
-            q *= factor
-            # What rounding leaves along the null space no step can take back: residuals would end on it.
-            q = system.null_space.project(q, True, into=q)
-            pq = dot(p, q)
+            q = product(p)
+            pq = inner(p, q)
             if not (pq > 0 and rz > 0):
-                number, word = number - 1, _without_descent(pq, rz, p, q, r, z)
+                number, word = number - 1, _without_descent(inner, *map(plain, (pq, rz, p, q, r, z)))
                 break
-            x += np.multiply(p, rz / pq, out=scratch)
-            r -= np.multiply(q, rz / pq, out=scratch)
-            residual = norm(r / weights if gauged else r)
-            if accepted(residual, weights * x if transposed else x):
+            x, r = x + rz / pq * p, r - rz / pq * q
+            residual = norm(plain(r))
+            if accepted(residual, plain(x)):
                 best, word = x, ""
                 break
             if not np.isfinite(residual) or residual > DIVERGED * first:
                 word = "diverged"
                 break
             if residual < least:
-                np.copyto(best, x)
-                least, found = residual, number
+                best, least, found = x, residual, number
             if number - found >= self.window:
                 word = "stagnated"
                 break
-            z = self._corrected(r, factor)
-            rz, before = dot(r, z), rz
-            p *= rz / before
-            p += z
+            z = corrected(r)
+            rz, before = inner(r, z), rz
+            p = z + rz / before * p
         else:
             best = best if self.refines else x  # of a fixed number of iterations, the last iterate
-        return (weights * best if transposed else best), number, word
-
-    def _corrected(self, r, factor):
-        """z ~ S^-1 r, a fresh array or r itself."""
-        if self.precondition is None:
-            return r
-        return self.system.null_space.project(self.precondition(r / factor, False))
+        return best, number, word
 
     def _gmres(self, b, goal, accepted, transposed):
         """Restarted GMRES from 0, preconditioned from the right: its residuals are those of A.
@@ -158,33 +164,6 @@ class Krylov(Engine):
             if residual > 0.999 * before:
                 return x, used, "stagnated"
 
-    def unroll(self, b, start, transposed):
-        """As `solve`, on the tape: conjugate gradients in the inner product in which the operator is symmetric."""
-        system = self.system
-        op = system.given.T if transposed else system.given
-        weights = np.broadcast_to(system.weights, system.size).reshape(op.domain.shape)
-        weights = 1.0 / weights if transposed else weights
-        x = anp.zeros(op.domain.shape) if start is None else start
-        r = b * 1.0 if start is None else b - op(x)
-        p, rr = r, anp.sum(weights * r * r)
-        data = _plain_norm(b)
-        goal = system.rtol * data
-        for number in count():
-            residual = _plain_norm(r)
-            if residual == 0 or number == self.maxiter or (self.refines and residual <= goal):
-                word = "max_iterations" if residual > goal else "converged" if data else "exact_zero_rhs"
-                return x, number, word
-            q = op(p)
-            step = rr / anp.sum(weights * p * q)
-            x, r = x + step * p, r - step * q
-            rr, before = anp.sum(weights * r * r), rr
-            p = r + (rr / before) * p
-
-
-def _plain_norm(x):
-    """Norm of a field, traced or not."""
-    return norm(np.ravel(np.asarray(plain(x), dtype=float)))
-
 
 def _probed_sign(system):
     """The sign of x.Ax, for an operator whose diagonal is not known."""
@@ -197,9 +176,9 @@ def _probed_sign(system):
 # ---------------------------------------------------------------- the iterations
 
 
-def _without_descent(pq, rz, p, q, r, z):
-    """Why p.Sp or r.z is not positive: rounding, or an operator that is not definite."""
+def _without_descent(inner, pq, rz, p, q, r, z):
+    """Why p.Ap or r.z is not positive: rounding, or an operator that is not definite."""
     if not np.isfinite(pq) or not np.isfinite(rz):
         return "diverged"
-    noise = 1e-13 * np.sqrt(dot(p, p) * dot(q, q)), 1e-13 * np.sqrt(dot(r, r) * dot(z, z))
+    noise = 1e-13 * np.sqrt(inner(p, p) * inner(q, q)), 1e-13 * np.sqrt(inner(r, r) * inner(z, z))
     return "stagnated" if abs(pq) <= noise[0] or abs(rz) <= noise[1] else "indefinite_operator"

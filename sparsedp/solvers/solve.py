@@ -28,7 +28,7 @@ need not be exact: the contract refines with further calls on the residual. Attr
     iterative        True: what it leaves depends on the tolerance
     hierarchical     True: its set-up is a multigrid hierarchy
     refines          False: one call, no refinement and no error (fixed numbers of iterations)
-    unrolled         True: inv(b) is engine.unroll(b, start, transposed)[0], differentiated as it runs
+    unrolled         True: inv(b) is engine.unroll(b, goal, transposed)[0], differentiated as it runs
     last             None, or the unknowns that it leaves to the contract: see System.last
 
 Its builder is a function (system, **options) -> engine; `system` is a System (system.py).
@@ -38,6 +38,7 @@ from dataclasses import asdict, dataclass, field
 from time import perf_counter
 from typing import Any
 
+import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
@@ -156,13 +157,18 @@ class Solver(Remade):
 
     def unroll(self, b, start, transposed):
         """The engine's iterations on the tape. The record is that of the solve: its derivatives are no solves."""
-        run = Run(transposed, rtol=self.system.rtol)
-        x, run.iterations, run.status = self.engine.unroll(b, start, transposed)
-        data, solution = (np.array(plain(value), dtype=float).reshape(-1) for value in (b, x))
-        _, rest, length = self.system.residual(shifted(solution, self.system.exponent), data, transposed)
-        run.measure(rest, norm(data), self.system.norm(transposed) * length)
+        system, run = self.system, Run(transposed, rtol=self.system.rtol)
+        op = system.given.T if transposed else system.given
+        r = b * 1.0 if start is None else b - op(start)
+        data = np.array(plain(b), dtype=float).reshape(-1)
+        x, run.iterations, word = self.engine.unroll(anp.reshape(r, (-1,)), run.rtol * norm(data), transposed)
+        x = anp.reshape(x, op.domain.shape) + (0.0 if start is None else start)
+        solution = shifted(np.array(plain(x)).reshape(-1), system.exponent)
+        _, rest, length = system.residual(solution, data, transposed)
+        run.status = ("converged" if data.any() else "exact_zero_rhs") if word == "" or not rest else word
+        run.measure(rest, norm(data), system.norm(transposed) * length)
         self.log.note(run.info(), transposed)
-        if run.status == "max_iterations" and self.engine.refines:
+        if run.status == word and self.engine.refines:
             self._refuse(run, plain(x), "unrolled ")
         return x
 
