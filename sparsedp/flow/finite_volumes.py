@@ -157,11 +157,8 @@ def _example(name, count):
 def _momentum(grid, momentum):
     """Numbers of the fields that are the momentum along each axis."""
     fields = momentum if isinstance(momentum, (tuple, list)) else (momentum,)
-    if (
-        len(fields) != grid.dim
-        or len({*fields}) != grid.dim
-        or not all(field is not None and is_whole(field, 0) for field in fields)
-    ):
+    numbers = {field for field in fields if field is not None and is_whole(field, 0)}
+    if not len(fields) == len(numbers) == grid.dim:
         raise ValueError(
             f"conservation_law at a free_slip wall needs momentum, the number of a field for each axis, "
             f"got {momentum!r}; write for example momentum={tuple(range(1, grid.dim + 1))}"

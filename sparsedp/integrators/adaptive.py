@@ -32,7 +32,6 @@ derivative.
 
 from collections import deque
 from functools import reduce
-from math import prod
 from typing import Any, NamedTuple
 
 import autograd.numpy as anp
@@ -318,7 +317,7 @@ class Moving:
         self.moving = [(n, plain(leaf), np.where(size > 0, size, 1.0)) for n, (leaf, size) in rows if moves(leaf)]
         self.units = [size for *_, size in self.moving]
         shapes = [np.shape(leaf) for _, leaf, _ in self.moving for _ in range(1 + np.iscomplexobj(leaf))]
-        self.space = Space(sum(map(prod, shapes)), parts=shapes)
+        self.space = Space(None, parts=shapes)
 
     def off(self, tree):
         """Tree -> flat."""

@@ -299,22 +299,19 @@ class Linear(Stages):
         self.info, most, name = SolveLog(), most * len(problem.stiff), f"stepper({name})"
         self.resolvents = {op: Resolvent(op, name, settings, most, self.info) for op in problem.operators}
 
-    def _resolved(self, h, params, b):
-        """(1 - h c L)^-1 b, field by field."""
+    def _resolved(self, h, params, b, *shares):
+        """(1 - h c L)^-1 (b + the sum of factor * s(t) over pairs (factor, t)), field by field."""
+        if self.problem.source is not None:
+            b = combine(b, *((factor, self.problem.given(params, t)) for factor, t in shares))
         return self.problem.on_fields(lambda L, z, leaf: self.resolvents[L](z, leaf) if L else leaf, h, params, b)
 
     def solve(self, guess, b, params, t, h):
         """x of x = b + h (c L x + s(t))."""
-        source = self.problem.given(params, t)
-        b = b if source is None else combine(b, (h, source))
-        return self._resolved(h, params, b)
+        return self._resolved(h, params, b, (h, t))
 
     def trapezium(self, u, params, t, h):
         """x of x = u + h/2 (f(u, t) + f(x, t + h))."""
-        b = u
-        if self.problem.source is not None:
-            b = combine(u, *((0.25 * h, self.problem.given(params, at)) for at in (t, later(t, h))))
-        w = self._resolved(0.5 * h, params, b)
+        w = self._resolved(0.5 * h, params, u, *((0.25 * h, at) for at in (t, later(t, h))))
         return combine(w, (1.0, w), (-1.0, u))
 
 
