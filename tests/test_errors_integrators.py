@@ -155,7 +155,7 @@ TABLE = [
     (
         lambda: dp.stepper("euler", lambda u, p, t: u, 0.6)(U),
         TYPE,
-        "the rate of stepper(euler) takes a time, so its state is the pair (u, t), got ndarray",
+        "the state of stepper(euler), whose rate takes a time, must be a pair, got ndarray; write (u, t)",
     ),
     (
         lambda: dp.stepper("euler", lambda u, p: 1j * u, 0.6)(U),

@@ -182,7 +182,8 @@ TABLE = [
     (
         lambda: dp.stepper("leapfrog", RATES[0], 0.1),
         TYPE,
-        "leapfrog needs a pair of rates, got function; write (lambda v, c: ..., lambda p, c: ...) for the state (p, v)",
+        "the rates of leapfrog must be a pair, got function; write (lambda v, c: ..., lambda p, c: ...) for the state "
+        "(p, v)",
     ),
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, tolerance=0.1),
@@ -197,7 +198,7 @@ TABLE = [
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=1.0),
         TYPE,
-        "damping needs a pair, for both fields of the state, got float; write (s, None)",
+        "damping, for both fields of the state, must be a pair, got float; write (s, None)",
     ),
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=(-1.0, 0.0)),
@@ -218,7 +219,7 @@ TABLE = [
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1)(1.0),
         TYPE,
-        "the state of leapfrog is a pair of fields, got float; write (p, v)",
+        "the state of leapfrog must be a pair, got float; write (p, v)",
     ),
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=((1.0, 2.0), None))((1.0, 1.0)),

@@ -204,7 +204,7 @@ def test_sponge_on_some_sides():
 
 def test_refusals():
     rates = (lambda v, c: v), (lambda p, c: p)
-    with pytest.raises(TypeError, match="leapfrog needs a pair of rates, got function; write"):
+    with pytest.raises(TypeError, match="the rates of leapfrog must be a pair, got function; write"):
         dp.stepper("leapfrog", rates[0], 0.1)
     with pytest.raises(TypeError, match="a rate of leapfrog takes a function, got float; write lambda field"):
         dp.stepper("leapfrog", (rates[0], 1.0), 0.1)
@@ -212,12 +212,12 @@ def test_refusals():
         dp.stepper("leapfrog", rates, 0.1, linear=dp.laplacian(dp.Grid(3)))
     with pytest.raises(TypeError, match="rk4 does not use damping; leave it out"):
         dp.stepper("rk4", rates[0], 0.1, damping=(1.0, 1.0))
-    with pytest.raises(TypeError, match="damping needs a pair, for both fields of the state, got float"):
+    with pytest.raises(TypeError, match="damping, for both fields of the state, must be a pair, got float"):
         dp.stepper("leapfrog", rates, 0.1, damping=1.0)
     with pytest.raises(ValueError, match=r"damping needs finite rates >= 0 \[1 / time\]; take dp.sponge"):
         dp.stepper("leapfrog", rates, 0.1, damping=(-1.0, 0.0))
     step = dp.stepper("leapfrog", rates, 0.1, damping=((1.0, 2.0), None))
-    with pytest.raises(TypeError, match=r"the state of leapfrog is a pair of fields, got ndarray; write \(p, v\)"):
+    with pytest.raises(TypeError, match=r"the state of leapfrog must be a pair, got ndarray; write \(p, v\)"):
         step(np.ones(3))
     with pytest.raises(dp.errors.ShapeError, match="damping has 2 parts for a field of 1; give one for each"):
         step((np.ones(3), np.ones(3)))

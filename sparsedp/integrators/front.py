@@ -319,7 +319,7 @@ class Step(Remade):
     def _parts(self, state):
         if not self.problem.timed:
             return state, None
-        return pair(f"the rate of {self.name} takes a time, so its state is the pair (u, t)", state)
+        return pair(f"the state of {self.name}, whose rate takes a time,", state, "(u, t)")
 
     def _blame(self, state, params):
         """Refuse arguments that are not finite."""

@@ -60,12 +60,12 @@ class Leapfrog(Scheme):
 
     def __init__(self, rates, damping):
         super().__init__(self, "leapfrog", 2)
-        example = "; write (lambda v, c: ..., lambda p, c: ...) for the state (p, v)"
-        for rate in pair("leapfrog needs a pair of rates", rates, example):
+        example = "(lambda v, c: ..., lambda p, c: ...) for the state (p, v)"
+        for rate in pair("the rates of leapfrog", rates, example):
             check_function("a rate of leapfrog", rate, "lambda field, params: ...")
             check_takes("leapfrog", rate, 2, "lambda field, params: ...")
         if damping is not None:
-            pair("damping needs a pair, for both fields of the state", damping, "; write (s, None)")
+            pair("damping, for both fields of the state,", damping, "(s, None)")
         for rate in map(plain, leaves(damping)):
             if rate is not None and not (np.all(np.isfinite(rate)) and np.all(rate >= 0)):
                 raise ValueError("damping needs finite rates >= 0 [1 / time]; take dp.sponge(grid, cells, speed)")
@@ -132,7 +132,7 @@ class Leapfrog(Scheme):
 
 
 def _pair(state):
-    return pair("the state of leapfrog is a pair of fields", state, "; write (p, v)")
+    return pair("the state of leapfrog", state, "(p, v)")
 
 
 def _advanced(x, rate, h, damping):

@@ -81,10 +81,10 @@ def _rounded(leaf, old):
     return cast(leaf, kind)
 
 
-def pair(what, value, advice=""):
-    """Two things, as they were given; `what`: begins the message that refuses others."""
+def pair(what, value, example):
+    """Two things, as they were given."""
     if not (isinstance(value, (tuple, list)) and len(value) == 2):
-        raise TypeError(f"{what}, got {type(value).__name__}{advice}")
+        raise TypeError(f"{what} must be a pair, got {type(value).__name__}; write {example}")
     return value
 
 
