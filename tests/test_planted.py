@@ -137,8 +137,8 @@ BUGS = {
     ),
     "the rate of a scalar that is not carried on": Bug(
         "flow",
-        "ahead = u + self.flow.dt * (1.5 * rate - 0.5 * before)",
-        "ahead = u + self.flow.dt * rate",
+        "u + self.flow.dt * (1.5 * rate - 0.5 * before)",
+        "u + self.flow.dt * rate",
         "tests/test_flow_scalars.py::test_second_order_in_time",
     ),
     "a variation that counts walls": Bug(
