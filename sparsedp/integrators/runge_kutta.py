@@ -186,7 +186,7 @@ class Resolvent:
         self.info, self._inverse = log or SolveLog(), lru_cache(most)(self._set_up)
 
     def __call__(self, z, b):
-        return solve_rule(f"{self.name}.solve", self._solved, self._back, self._along, checked=True)(b, z)
+        return solve_rule(f"{self.name}.solve", self._solved, self._back, self._product, checked=True)(b, z)
 
     def _solved(self, transposed, checked, b, z):
         if z == 0:
@@ -199,8 +199,8 @@ class Resolvent:
     def _back(self, params, places, y, x):
         return [of_argument(anp.sum(y * self.op(x)), params[0])]
 
-    def _along(self, params, places, tangents, x, transposed):
-        return -tangents[0] * (self.op.T if transposed else self.op)(x)
+    def _product(self, transposed, x, z):
+        return x - z * (self.op.T if transposed else self.op)(x)
 
     def _set_up(self, z):
         """The inverse of 1 - z L."""

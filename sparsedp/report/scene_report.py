@@ -28,7 +28,7 @@ from sparsedp.report.work_precision import workprec
 __all__ = ["Source", "audited", "claim", "load", "write_report"]
 
 STARTS = ("start", "x")  # names of the point, the first that is there
-OPTIONS = ("workprec_options", "stress_options")  # dicts of arguments in the file
+OPTIONS = "workprec", "stress"  # instruments whose arguments the file may hold, as dicts of the name NAME_options
 PAGES = "report.md", "report.html"
 NO_PROBLEM = "error against run time: not measured, the file gives no workprec_options (problem, methods, over)"
 MEANING = {  # the worst first: one that is wrong beats one that is open
@@ -47,8 +47,7 @@ class Source(NamedTuple):
     name: str
     loss: Any
     x: Any
-    workprec: dict
-    stress: dict
+    options: dict  # by instrument
 
 
 def load(target):
@@ -77,11 +76,11 @@ def load(target):
     if place is None:
         raise ValueError(f"{file} has no {start or ' or '.join(STARTS)!r}, the point; write {file}:{loss}:NAME")
     name = file.stem if loss == "loss" else f"{file.stem}-{loss}"
-    options = [names.get(key, {}) for key in OPTIONS]
-    for key, given in zip(OPTIONS, options):
+    options = {key: names.get(f"{key}_options", {}) for key in OPTIONS}
+    for key, given in options.items():
         if not isinstance(given, dict):
-            raise ValueError(f"{key} in {file} must be a dict of arguments, got {type(given).__name__}")
-    return Source(name, _of_one(names[loss], names[place]), names[place], *options)
+            raise ValueError(f"{key}_options in {file} must be a dict of arguments, got {type(given).__name__}")
+    return Source(name, _of_one(names[loss], names[place]), names[place], options)
 
 
 @contextlib.contextmanager
@@ -163,7 +162,7 @@ def write_report(source, folder, force=False):
     """
     claim(folder, PAGES, force)
     with audited(f"{source.name} cannot be audited"):
-        results = [_attempt(chapter.run, source) for chapter in CHAPTERS]
+        results = [_attempt(chapter, source) for chapter in CHAPTERS]
     words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
     verdict = next(word for word in MEANING if word in words)
     text, lines, sections, missing = [f"# {source.name}: {verdict}", "", MEANING[verdict]], [], [], []
@@ -185,12 +184,16 @@ def write_report(source, folder, force=False):
     return verdict, lines
 
 
-def _attempt(run, source):
+def _attempt(chapter, source):
     """What an instrument gives, or the error in words: one that fails does not take the others with it."""
     try:
-        return run(source)
+        return chapter.run(source.loss, source.x, **source.options.get(chapter.stem, {}))
     except Exception as error:  # the loss is the user's: it may raise anything
         return error_text(error)
+
+
+def _workprec(loss, x, **options):
+    return workprec(**options) if options else NO_PROBLEM
 
 
 class Chapter(NamedTuple):
@@ -199,26 +202,26 @@ class Chapter(NamedTuple):
     stem: str  # of its files
     title: str
     failed: str  # what is said when it fails
-    run: Any  # source -> result, or in words why there is none
+    run: Any  # loss, x and options -> result, or in words why there is none
     draw: Any = lambda result: None  # result -> what draws it on axes, or None
     caption: str = ""  # how to read the picture
 
 
 # The audit comes first and the stress cases last: both have a say in the verdict.
 CHAPTERS = (
-    Chapter("audit", "Is the gradient right?", "gradient: not audited",
-            lambda s: check.gradient(s.loss, s.x), lambda audit: partial(plots.v_curve, audit),
+    Chapter("audit", "Is the gradient right?", "gradient: not audited", check.gradient,
+            lambda audit: partial(plots.v_curve, audit),
             "Each curve is a direction. Of a right gradient it falls with the step, from the right to the left, until "
             "rounding lifts it: a V. Of a wrong one it stays up: a plateau."),
-    Chapter("workprec", "Which method for which error?", "error against run time: not measured",
-            lambda s: workprec(**s.workprec) if s.workprec else NO_PROBLEM, lambda rows: rows.plot,
+    Chapter("workprec", "Which method for which error?", "error against run time: not measured", _workprec,
+            lambda rows: rows.plot,
             "Further to the left is faster, further down is more exact. The grey band joins the best runs: no other "
             "one is both faster and more exact."),
     Chapter("certificate", "How exact is the gradient, and how exact need the solves be?", "certificate: not made",
-            lambda s: certify(s.loss, s.x)),
-    Chapter("plan", "What one gradient computes", "plan: not made", lambda s: explain(s.loss, s.x)),
-    Chapter("stress", "Stiff and extreme cases", "stress: not run",
-            lambda s: stress(s.loss, s.x, **s.stress), lambda trial: trial.plot if trial.map else None,
+            certify),
+    Chapter("plan", "What one gradient computes", "plan: not made", explain),
+    Chapter("stress", "Stiff and extreme cases", "stress: not run", stress,
+            lambda trial: trial.plot if trial.map else None,
             "How much a small change grows in one step, over viscosity (across) and time step (up): above 1 the step "
             "is unstable, grey ones are refused, the star is where the scene is."),
 )  # fmt: skip
