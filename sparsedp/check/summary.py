@@ -18,7 +18,6 @@ class Result(Frozen):
     ``parts()`` of each kind is its text from top to bottom: lines, the first one a title, and Tables.
     """
 
-    _columns: tuple = ()  # of its table as CSV; default: those of the first row
     _plain: tuple = ()  # names of the attributes that are plain data; default: all that were given
     left_out: tuple | list = ()  # sentences
 
@@ -69,7 +68,7 @@ class Result(Frozen):
 
     def csv(self):
         """The rows as CSV."""
-        return table_of(_plain(self.rows), self._columns).csv()
+        return table_of(_plain(self.rows)).csv()
 
     def __repr__(self):
         return str(self)
@@ -131,8 +130,7 @@ class Summary(Result):
     def parts(self):
         """The verdict, and the rows."""
         words = {True: "ok", False: "FAILS", None: "-"}
-        limits = ["" if row.limit is None else f"<= {row.limit:g}" for row in self.rows]
-        cells = [(*row[:2], limit, words[row.ok], row.note) for row, limit in zip(self.rows, limits)]
+        cells = [(*row[:2], row.limit and f"<= {row.limit:g}", words[row.ok], row.note) for row in self.rows]
         return [f"{self.title}: {self.verdict}", Table(("property", "figure", "limit", "", ""), cells)]
 
 

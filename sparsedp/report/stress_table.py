@@ -118,7 +118,6 @@ class Stress(Result):
     """
 
     _plain = ("counts", "rows", "left_out", "map")
-    _columns = COLUMNS
 
     def parts(self):
         """All cases, what was left out, the map, the failures, and the counts."""

@@ -299,8 +299,6 @@ class Rows(Result):
         Runs that were not made, with the reason.
     """
 
-    _columns = COLUMNS
-
     @property
     def stem(self):
         """What the files of `save` are called."""
