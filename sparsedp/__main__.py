@@ -82,7 +82,7 @@ def run_check(options):
     from sparsedp.report.scene_report import audited, load
 
     source = load(options.scene)
-    with audited(f"{options.scene} cannot be audited"):
+    with audited(options.scene):
         audit = gradient(source.loss, source.x, quick=options.quick)
     print(audit)
     return CODES[audit.verdict]

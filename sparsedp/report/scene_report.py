@@ -84,10 +84,10 @@ def load(target):
 
 
 @contextlib.contextmanager
-def audited(refusal, file=""):
+def audited(name="", file=""):
     """In it code of the user's runs: it prints to stderr, and what it raises, an exit too, is refused.
 
-    refusal: words before what is raised. file: it is the file itself that runs.
+    name: of its loss. file: it is the file itself that runs.
     """
     try:
         with contextlib.redirect_stdout(sys.stderr):
@@ -96,7 +96,10 @@ def audited(refusal, file=""):
         raise
     except BaseException as error:
         cure = "" if isinstance(error, Exception) else "; it ended the program, let it return its value"
-        raise ValueError(f"{refusal}: {_where(error, file)}{type(error).__name__}: {error}{cure}") from error
+        reason = f"{_where(error, file)}{type(error).__name__}: {error}{cure}"
+        if file:
+            raise ValueError(f"{file} does not run: {reason}") from error
+        raise ValueError(f"{name} cannot be audited: {reason}") from error
 
 
 def _of_one(loss, x):
@@ -114,7 +117,7 @@ def _run(file):
     before = sys.argv, sys.path
     sys.argv, sys.path = [str(file)], [str(file.resolve().parent), *sys.path]
     try:
-        with audited(f"{file} does not run", str(file)):
+        with audited(file=str(file)):
             return runpy.run_path(str(file), run_name=file.stem)
     finally:
         sys.argv, sys.path = before
@@ -161,7 +164,7 @@ def write_report(source, folder, force=False):
         If a file cannot be written.
     """
     claim(folder, PAGES, force)
-    with audited(f"{source.name} cannot be audited"):
+    with audited(source.name):
         results = [_attempt(chapter, source) for chapter in CHAPTERS]
     words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
     verdict = next(word for word in MEANING if word in words)
