@@ -387,7 +387,7 @@ def lorenz(u, p, dt=0.02):
     "step, start, p, n, exponent",
     [
         (logistic, np.array([0.3]), 4.0, 500, np.log(2.0)),
-        (lorenz, np.array([1.0, 2.0, 20.0]), None, 1300, 0.01811),
+        pytest.param(lorenz, np.array([1.0, 2.0, 20.0]), None, 1300, 0.01811, marks=pytest.mark.whole),
     ],
     ids=["logistic", "lorenz"],
 )

@@ -32,6 +32,7 @@ def scene(name):
     return (lambda u, v: move(u, v, 0.15, inflow)), u, v, RNG.standard_normal(u.shape)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("wanted", ["u and v", "u", "v"])
 def test_steps_of_transport_in_a_rollout_have_the_bits_of_a_budget_and_the_values_of_a_loop(name, wanted):

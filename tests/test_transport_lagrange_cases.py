@@ -41,6 +41,7 @@ def test_burgers_forward():
     assert frames(step, start, 32)[-1, :5] == pytest.approx(published, abs=1e-7)
 
 
+@pytest.mark.whole
 def test_burgers_inverse():
     """A8: gradient descent at rate 5 from zero, mean error over frames 0 to 31 after 50 and 200 steps."""
     step, start = burgers()

@@ -58,6 +58,7 @@ def test_it_is_the_twin(scheme, of, velocity, form, dim):
                 np.testing.assert_allclose(one, other, rtol=0, atol=2e-13)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("dim", SHAPES)
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
 def test_forward_and_reverse_mode_agree(scheme, dim):
