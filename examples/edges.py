@@ -65,7 +65,7 @@ hidden = blocks(grid)
 # The usual price is half the integral of :math:`|\nabla m|^2`. To go up by 1 within a width :math:`w` costs
 # :math:`\frac12 \, w \, (1 / w)^2 = 1 / (2 w)`: a jump is dear, and it is cheaper to spread it. **Total variation** is
 # the integral of :math:`|\nabla m|`. It costs :math:`w \cdot 1 / w = 1` for any width, so that an edge is as cheap as a
-# slope. At :math:`\nabla m = 0` the length of a vector has a kink, which :math:`\sqrt{|\nabla m|^2 + \epsilon^2}` rounds
+# slope. At :math:`\nabla m = 0` the length of a vector has a kink; :math:`\sqrt{|\nabla m|^2 + \epsilon^2}` rounds it
 # off.
 
 
@@ -111,8 +111,8 @@ for name, (term, weight) in terms.items():
 # %%
 # The picture
 # -----------
-# The smooth regularizer leaves waves in the blocks and around them, total variation leaves both flat. The tight block is
-# the harder one: little water flows through it, so that the readings tell little of it.
+# The smooth regularizer leaves waves in the blocks and around them, total variation leaves both flat. The tight block
+# is the harder one: little water flows through it, so that the readings tell little of it.
 #
 # Exercises
 # ---------
