@@ -152,18 +152,23 @@ def check_takes(name, fun, count, example):
         raise TypeError(f"{name} calls a function with {count} arguments, got one that takes {most}; write {example}")
 
 
+RANGES = {
+    "": lambda value: True,
+    "> 0": lambda value: value > 0,
+    ">= 0": lambda value: value >= 0,
+    "from 0 to 1": lambda value: 0 <= value <= 1,
+    "from 0 to below 1": lambda value: 0 <= value < 1,
+}
+
+
 def check_number(name, value, needs="", advice=""):
     """One finite real number -> a float. Refuse all else, and what is not in the range that is needed, in words."""
     if not is_number(value):
         given = f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
         raise TypeError(f"{name} must be one real number, got {given}{advice}")
-    if not np.isfinite(value):
+    if not isfinite(value):
         raise NonFiniteError(f"{name} must be finite, got {value}{advice}")
-    ranges = {
-        "": True, "> 0": value > 0, ">= 0": value >= 0, "from 0 to 1": 0 <= value <= 1,
-        "from 0 to below 1": 0 <= value < 1,
-    }  # fmt: skip
-    if not ranges[needs]:
+    if not RANGES[needs](value):
         raise ValueError(f"{name} must be {needs}, got {value:g}{advice}")
     return float(value)
 
@@ -187,6 +192,8 @@ def leaves_by_name(what, tree, wanted, other):
 
 def is_number(value):
     """Whether a value is one real number, NaN and infinity included; a flag is none."""
+    if type(value) is float:
+        return True
     array = np.asarray(value)
     return array.ndim == 0 and array.dtype.kind in "iuf"
 
