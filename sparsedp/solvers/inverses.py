@@ -288,8 +288,9 @@ class Solution(Structure):
         if x.dtype.kind == "c" and not self.solver.system.complex:
             for part in ("imag", "real"):  # the record of the last solve is that of the real part
                 start = None if self.start is None else getattr(self.start, part)
-                one = Solution(self.solver, self.transposed, self.checked, start)
-                getattr(out, part)[...] = one.product(getattr(x, part).copy())
+                half = np.empty_like(out.real)
+                Solution(self.solver, self.transposed, self.checked, start).apply(getattr(x, part).copy(), half)
+                getattr(out, part)[...] = half
             return
         wide = np.result_type(x, float, self.dtype)
         start = None if self.start is None else self.start.astype(wide)
