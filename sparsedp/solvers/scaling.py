@@ -10,7 +10,6 @@ from sparsedp.fields import BLOCK
 
 __all__ = [
     "dot",
-    "far_exponent",
     "in_range",
     "inverted",
     "largest",
@@ -50,8 +49,10 @@ def norm(x):
 def length(x):
     """2-norm of a flat real array of any magnitude."""
     size = norm(x)
-    exponent = far_exponent(x, size)
-    return float(np.ldexp(norm(shifted(x, -exponent)), exponent)) if exponent else size
+    if in_range(size):
+        return size
+    exponent = int(np.frexp(largest(x))[1])
+    return float(np.ldexp(norm(shifted(x, -exponent)), exponent))
 
 
 def remainder(b, out, x):
@@ -67,11 +68,6 @@ def remainder(b, out, x):
 def in_range(size):
     """Whether a norm is finite, not 0, and far from both ends of the range of floats."""
     return SMALL < size < LARGE
-
-
-def far_exponent(x, size):
-    """The power of two by which x of this norm leaves the middle of the range of floats; 0 inside."""
-    return 0 if in_range(size) else int(np.frexp(largest(x))[1])
 
 
 def largest(x):
