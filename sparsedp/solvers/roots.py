@@ -23,6 +23,7 @@ from sparsedp.solvers.adjoint import solve_rule, vary
 from sparsedp.solvers.inverses import check_settings
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation, Layout, Newton
+from sparsedp.solvers.scaling import length
 from sparsedp.solvers.solve import Run, SolveLog
 from sparsedp.tape import Rule, plain
 from sparsedp.tree import mapped
@@ -242,7 +243,7 @@ class Root(Remade):
             return newton.solve(guess, (series or {}).get(equation.size))
         finally:
             if newton.F is not None:
-                equation.left = float(np.linalg.norm(newton.F))
+                equation.left = length(newton.F)
             if run.status:  # else it is an error of the residual
                 self.info.note(run.info(), False)
             if newton.J is not None:
@@ -271,15 +272,15 @@ class Root(Remade):
         if equation.left is None:  # somebody else gave the root, and answers for it
             return
         changed = max(CHANGED, LOOSE * self.rtol)
-        if np.linalg.norm(F) <= MORE * equation.left:  # as it was left, at a loose tolerance too
+        if length(F) <= MORE * equation.left:  # as it was left, at a loose tolerance too
             return
         if not np.abs(y) @ np.abs(F) > changed * (np.abs(g) @ np.abs(x)):
             return
-        terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1] if leaves else 0.0
-        if np.linalg.norm(F) <= CANCELS * np.linalg.norm(terms):  # a root near 0, where what it is made of cancels
+        terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1] if leaves else np.zeros(0)
+        if length(F) <= CANCELS * length(terms):  # a root near 0, where what it is made of cancels
             return
         step = self._solve(False, False, F, equation, x, *leaves)
-        if np.linalg.norm(step) > changed * np.linalg.norm(x):
+        if length(step) > changed * length(x):
             raise DerivativeError(
                 f"{self.name} is not solved any more by what it was: its residual uses something that has changed "
                 "since, such as an array that was written into; make what changes a parameter"
