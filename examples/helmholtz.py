@@ -110,9 +110,9 @@ def shift(c):
 
 
 # %%
-# Two solvers. LU factors the matrix and then solves without iterations. GMRES needs a preconditioner. Multigrid fails on
-# this equation itself: smoothing makes smooth waves grow, and on coarse grids they have the wrong length. But it works
-# on the same equation with strong damping, the *shifted Laplacian*, and that is near enough to precondition with.
+# Two solvers. LU factors the matrix and then solves without iterations. GMRES needs a preconditioner. Multigrid fails
+# on this equation itself: smoothing makes smooth waves grow, and on coarse grids they have the wrong length. But it
+# works on the same equation with strong damping, the *shifted Laplacian*, and that is near enough to precondition with.
 
 solvers = {
     "LU": dp.elliptic_solver(D, G),
@@ -173,8 +173,8 @@ print(f"gradient in {slope.size} speeds: {dp.check.gradient(misfit, even).verdic
 # %%
 # The picture
 # -----------
-# Left: the waves; in the denser layer they are shorter. Middle: the gradient in every speed, largest on the way from the
-# source to the microphones. Right: circular waves along a line above the source.
+# Left: the waves; in the denser layer they are shorter. Middle: the gradient in every speed, largest on the way from
+# the source to the microphones. Right: circular waves along a line above the source.
 #
 # Exercises
 # ---------
