@@ -202,8 +202,8 @@ print(f"feed found from what is seen after 25 steps: {best.x:.6f} (0.034), {len(
 # Exercises
 # ---------
 # 1. Look for other patterns: feed 0.029 with kill 0.057, or 0.026 with 0.051.
-# 2. Give Cahn-Hilliard the equation as it is, ``linear=(-1.0 * C - C @ C, ...)``. What does
-#    `dp.stepper` say, and why?
+# 2. Give Cahn-Hilliard the equation as it is, ``-1.0 * C - C @ C`` as the linear part and ``m * C(u**3)`` as the rate.
+#    For which steps does the energy still fall? And for which as it stands above?
 # 3. After how many steps can the feed rate of Gray-Scott no longer be found? And the :math:`c` of the flame, which is
 #    chaotic?
 

@@ -77,7 +77,7 @@ sizes = (3, 20), (20, 20), (20, 20), (20, 1)
 weights = [network.dense_weights(rng, *size, gain=5 / 3) for size in sizes]
 
 angles = np.tile(np.pi * x, 32)
-times = np.repeat(np.arange(32) / 16 - 1, n)  # from -1 to 1, as networks like it
+times = np.repeat(np.arange(32) / 16 - 1, n)  # from -1 to 1, a range that suits tanh
 points = np.stack([np.sin(angles), np.cos(angles), times], axis=1)
 
 
@@ -187,9 +187,9 @@ if options.out:
     style.use("tableau-colorblind10")
     picture, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
     left.plot(x, truth[0], color="black", linewidth=4, alpha=0.3, label="true")
-    for label, u in histories.items():
-        left.plot(x, u[0], label=label)
-        right.semilogy(dt * np.arange(32), np.mean(np.abs(u - truth), axis=1), label=label)
+    for (label, u), line in zip(histories.items(), ("-", "--", "-", "-")):
+        left.plot(x, u[0], line, label=label)
+        right.semilogy(dt * np.arange(32), np.mean(np.abs(u - truth), axis=1), line)
     left.set(title="the start", xlabel="x", ylabel="u")
     left.legend(frameon=False, fontsize="small", loc="upper right")
     right.set(title="mean error", xlabel="t")

@@ -209,6 +209,6 @@ if options.out:
         right.semilogy(counts, errors, ".-", label=label)
     right.axvline(iterations, color="black", linestyle=":")
     right.set(title="error in the norm of A", xlabel="iterations of CG")
-    right.legend(frameon=False, loc="lower left")
+    right.legend(frameon=False, loc="center right")
     options.out.mkdir(parents=True, exist_ok=True)
     picture.savefig(options.out / "warm_start_learned.png", dpi=120)
