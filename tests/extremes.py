@@ -7,7 +7,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp import kernels
-from sparsedp.solvers.inverses import METHODS as WORDS
+from sparsedp.solvers.choose_method import METHODS as WORDS
 
 METHODS = ("auto", *WORDS)
 OPTIONS = {"krylov": {"preconditioner": "jacobi", "maxiter": 5000}}  # where coefficients or cells differ in size

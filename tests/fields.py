@@ -5,7 +5,7 @@ from functools import reduce
 import numpy as np
 
 import sparsedp as dp
-from sparsedp.conditions import resolve
+from sparsedp.boundary_conditions import resolve
 
 
 def smooth_map(n, extent=1.0):

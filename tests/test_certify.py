@@ -9,7 +9,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.ledger import recording, thread
-from sparsedp.solvers.inverses import Inverse, Solution
+from sparsedp.solvers.choose_method import Inverse, Solution
 from sparsedp.solvers.solve import Engine, SolveLog, Solver
 from sparsedp.solvers.system import System
 

@@ -8,7 +8,7 @@ from test_elliptic import dense, stretched
 import sparsedp as dp
 from sparsedp.derivative import pullback, pushforward, value_and_grad
 from sparsedp.ledger import recording
-from sparsedp.solvers.inverses import COMPLEX_UP_TO
+from sparsedp.solvers.choose_method import COMPLEX_UP_TO
 from sparsedp.solvers.preconditioners import shifted_laplace
 from sparsedp.solvers.system import System
 from sparsedp.tape import plain

@@ -13,7 +13,7 @@ from sparsedp.derivative import pullback, value_and_grad
 from sparsedp.errors import NonFiniteError
 from sparsedp.integrators.functions import Function
 from sparsedp.ledger import recording
-from sparsedp.solvers.inverses import build_dense
+from sparsedp.solvers.choose_method import build_dense
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Newton
 

@@ -55,7 +55,7 @@ def dense(level, extras=True):
 
 def prolongation(level):
     """The weights of black-box interpolation as a matrix."""
-    from sparsedp.solvers.multigrid.levels import Transfer, interpolated
+    from sparsedp.solvers.multigrid.cycle import Transfer, interpolated
 
     layout, coarse = level.layout, level.layout.coarse()
     transfer = Transfer(layout, coarse, interpolated(level))

@@ -281,7 +281,7 @@ BUGS = {
         "tests/test_grid.py",
     ),
     "the lower wall for the upper one": Bug(
-        "conditions.py",
+        "boundary_conditions.py",
         "    return tuple(sides)\n",
         "    return tuple(sides[::-1])\n",
         "tests/test_thin_axes.py::test_what_acts_on_a_velocity",

@@ -9,7 +9,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.derivative import pullback, pushforward
-from sparsedp.trajectory.schedule import advances, stride
+from sparsedp.trajectory.memory_budget import advances, stride
 from sparsedp.tree import flatten, leaves
 
 N = 9

@@ -10,7 +10,7 @@ import sparsedp as dp
 from sparsedp.errors import BudgetWarning
 from sparsedp.ledger import recording
 from sparsedp.tape import Rule
-from sparsedp.trajectory.schedule import advances, budget_within_reach, plan, recomputed, stride
+from sparsedp.trajectory.memory_budget import advances, budget_within_reach, plan, recomputed, stride
 
 
 def shift(wrong=None):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.solvers.inverses import Inverse, Solution
+from sparsedp.solvers.choose_method import Inverse, Solution
 from sparsedp.solvers.solve import Engine, SolveLog, Solver
 from sparsedp.solvers.system import System
 

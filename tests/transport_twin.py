@@ -3,7 +3,7 @@
 import autograd.numpy as np
 
 import sparsedp as dp
-from sparsedp.conditions import resolve
+from sparsedp.boundary_conditions import resolve
 
 
 def cut(x, axis, start, stop):

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sparsedp import kernels
-from sparsedp.conditions import neumann
+from sparsedp.boundary_conditions import neumann
 from sparsedp.fields import place
 from sparsedp.kernels.fluxes import ITSELF, ROUND, TILE, UNEVEN
 

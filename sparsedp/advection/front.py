@@ -9,12 +9,12 @@ from sparsedp.advection.no_cells import NoCells
 from sparsedp.advection.rule import rule_of
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.advection.values import check_step, flat_numbers
-from sparsedp.conditions import dirichlet, neumann, resolve
+from sparsedp.boundary_conditions import dirichlet, neumann, resolve
 from sparsedp.errors import DerivativeError
 from sparsedp.grid import check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import check_solid
+from sparsedp.operators.masks_and_lift import check_solid
 from sparsedp.recipe import Frozen, Remade
 from sparsedp.structure.base import Matrix
 from sparsedp.tape import Rule, isbox

@@ -10,8 +10,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.advection.law import wall_space
-from sparsedp.conditions import dirichlet
-from sparsedp.kernels.departure import PAD
+from sparsedp.boundary_conditions import dirichlet
+from sparsedp.kernels.gather import PAD
 from sparsedp.operators.stencils import cell_beside
 
 __all__ = ["filling", "ghost_origins"]

@@ -12,7 +12,7 @@ import numpy as np
 
 from sparsedp.advection.velocities import interpolation
 from sparsedp.fields import place
-from sparsedp.operators.boundary import solid_faces
+from sparsedp.operators.masks_and_lift import solid_faces
 from sparsedp.space import Space
 
 __all__ = ["FIELD", "INFLOW", "STEP", "VELOCITY", "Law", "Setting"]

@@ -7,7 +7,7 @@ With E the field with ghost cells, m the velocity with which point i looks back 
     g_m      = -s g_i (gradient of the interpolant at i - s m_i)
     tangent  = W dE + g_m(g = 1) . dm,
 
-then on to the velocity v as it is given, see `back_trajectory`. A step depends on v dt alone: g_dt = g_v . v / dt, and
+then on to the velocity v as it is given, see `departure_points`. A step depends on v dt alone: g_dt = g_v . v / dt, and
 ddt counts as the tangent v ddt / dt of v. Linear weights have kinks at the points: there the
 slope is the mean of both sides. Cubic ones are those of Catmull and Rom (cubic convolution, Keys 1981): order 3
 a step, so order 2 and more at a fixed ratio of dt to spacing, exact for quadratics away from walls.
@@ -21,7 +21,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp import results
-from sparsedp.advection.back_trajectory import Trajectory
+from sparsedp.advection.departure_points import Trajectory
 from sparsedp.advection.interpolant import Interpolant, Pass
 from sparsedp.advection.law import FIELD, INFLOW, VELOCITY, Law
 from sparsedp.advection.stability import check_numbers

@@ -8,7 +8,7 @@ widths: then constants are kept by a flow without divergence, on stretched grids
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.conditions import neumann
+from sparsedp.boundary_conditions import neumann
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import cell_beside, mean_of_faces, means, with_ends
 from sparsedp.space import Space

@@ -15,7 +15,7 @@ from sparsedp.derivative import grad, pullback
 from sparsedp.errors import DerivativeError
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
-from sparsedp.solvers.inverses import Inverse
+from sparsedp.solvers.choose_method import Inverse
 
 __all__ = ["culprit_of"]
 

@@ -25,8 +25,8 @@ the user's flux, speed and source. The limiter is one rule, with the derivatives
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.conditions import free_slip, outflow, resolve
-from sparsedp.conditions import inflow as inflow_side
+from sparsedp.boundary_conditions import free_slip, outflow, resolve
+from sparsedp.boundary_conditions import inflow as inflow_side
 from sparsedp.constants import constant, frozen
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import (

@@ -2,7 +2,7 @@
 
 Every component lives on its own faces. Along its own axis it is a field on nodes, and the wall faces
 hold the wall values; along the other axes it is a field between walls half a cell away, with the
-condition that what the fluid does there implies (`along` of conditions.py).
+condition that what the fluid does there implies (`along` of boundary_conditions.py).
 """
 
 from itertools import product
@@ -10,12 +10,12 @@ from itertools import product
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.conditions import dirichlet, free_slip, no_slip, outflow, resolve
-from sparsedp.flow.setup import faces_that
+from sparsedp.boundary_conditions import dirichlet, free_slip, no_slip, outflow, resolve
+from sparsedp.flow.projection_setup import faces_that
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import check_solid, solid_faces
 from sparsedp.operators.difference import divergence, gradient
+from sparsedp.operators.masks_and_lift import check_solid, solid_faces
 from sparsedp.operators.stencils import (
     along,
     differences,

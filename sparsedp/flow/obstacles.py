@@ -22,14 +22,14 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.conditions import no_slip, resolve
+from sparsedp.boundary_conditions import no_slip, resolve
 from sparsedp.fields import check_finite, check_number, field_array
 from sparsedp.flow.momentum import face_laplacian, momentum_fluxes, stresses
-from sparsedp.flow.setup import pressure_conditions
+from sparsedp.flow.projection_setup import pressure_conditions
 from sparsedp.grid import check_grid, numbers_per_axis
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import check_solid, mask, region_of, solid_faces
 from sparsedp.operators.difference import gradient
+from sparsedp.operators.masks_and_lift import check_solid, mask, region_of, solid_faces
 from sparsedp.operators.stencils import along, kronecker_operator
 from sparsedp.recipe import Made, Remade
 from sparsedp.space import Space

@@ -1,6 +1,6 @@
 """projection: the divergence-free part of a face field, as one Operator.
 
-With K, D, G and A = -D G as in setup.py,
+With K, D, G and A = -D G as in projection_setup.py,
 
     P v = K v + G p,          A p = D K v,          so that D P v = D K v - A p = 0,
     P^T g = K (g + D^T q),    A^T q = G^T g,        so that G^T P^T g = 0.
@@ -14,11 +14,11 @@ from functools import cached_property
 
 import numpy as np
 
-from sparsedp.conditions import no_slip
-from sparsedp.flow.setup import Setup
+from sparsedp.boundary_conditions import no_slip
+from sparsedp.flow.projection_setup import Setup
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
-from sparsedp.solvers.inverses import check_settings
+from sparsedp.solvers.choose_method import check_settings
 from sparsedp.structure.base import Structure
 
 __all__ = ["Projection", "projection"]

@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.conditions import neumann, no_slip
+from sparsedp.boundary_conditions import neumann, no_slip
 from sparsedp.constants import frozen
 from sparsedp.errors import DerivativeError, ShapeError, UnstableStepError
 from sparsedp.fields import check_choice, check_finite, check_function, check_number, check_takes, rounded_down
@@ -43,11 +43,11 @@ from sparsedp.flow.momentum import convection, face_laplacian, free_faces
 from sparsedp.flow.pressure import projection
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import identity, lift, mask
 from sparsedp.operators.difference import divergence, gradient, laplacian
+from sparsedp.operators.masks_and_lift import identity, lift, mask
 from sparsedp.operators.transfer import average
 from sparsedp.recipe import Remade
-from sparsedp.solvers.inverses import inverse
+from sparsedp.solvers.choose_method import inverse
 from sparsedp.tape import dtype_of, isbox, plain
 from sparsedp.tree import copied, mapped
 

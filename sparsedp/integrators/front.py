@@ -17,7 +17,7 @@ from sparsedp.integrators.runge_kutta import (
     Scheme,
 )
 from sparsedp.recipe import Remade
-from sparsedp.solvers.inverses import check_settings
+from sparsedp.solvers.choose_method import check_settings
 from sparsedp.solvers.separable import spectrum
 from sparsedp.tape import is_variable, plain
 from sparsedp.tree import copied, labels, leaves

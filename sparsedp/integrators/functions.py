@@ -26,7 +26,7 @@ from scipy.special import hyp1f1
 from sparsedp.derivative import of_argument
 from sparsedp.errors import NonFiniteError
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import identity
+from sparsedp.operators.masks_and_lift import identity
 from sparsedp.shortcuts import refuse_elsewhere
 from sparsedp.solvers.separable import SpectralFunction, diagonalised
 from sparsedp.space import Space

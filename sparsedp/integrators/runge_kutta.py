@@ -58,10 +58,10 @@ from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import identity
 from sparsedp.operators.given import from_matrix
+from sparsedp.operators.masks_and_lift import identity
 from sparsedp.solvers.adjoint import solve_rule
-from sparsedp.solvers.inverses import build
+from sparsedp.solvers.choose_method import build
 from sparsedp.solvers.nullspace import Projector
 from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog

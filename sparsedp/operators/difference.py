@@ -5,10 +5,10 @@ from functools import reduce
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.conditions import check_condition, neumann, resolve
+from sparsedp.boundary_conditions import check_condition, neumann, resolve
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import check_solid, region_of, solid_faces
+from sparsedp.operators.masks_and_lift import check_solid, region_of, solid_faces
 from sparsedp.operators.stencils import along, differences, kronecker_operator, one_sided, pick, slopes, to_faces
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix

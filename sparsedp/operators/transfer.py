@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.conditions import neumann, resolve
+from sparsedp.boundary_conditions import neumann, resolve
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_choice, check_finite, is_whole
 from sparsedp.grid import Grid, check_grid, per_axis, real_numbers

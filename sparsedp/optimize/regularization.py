@@ -7,9 +7,9 @@ import scipy.sparse as sp
 from sparsedp.constants import constant
 from sparsedp.fields import check_finite, check_native, is_number
 from sparsedp.grid import check_grid
-from sparsedp.operators.boundary import interior
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.given import from_matrix
+from sparsedp.operators.masks_and_lift import interior
 from sparsedp.recipe import Made
 from sparsedp.tape import dtype_of, plain
 

@@ -16,7 +16,7 @@ import scipy.sparse as sp
 
 from sparsedp.parallel.exchange import of_boxes, of_entries
 from sparsedp.parallel.partition import lengths, slices
-from sparsedp.solvers.inverses import Solution
+from sparsedp.solvers.choose_method import Solution
 from sparsedp.solvers.nullspace import Projector
 from sparsedp.space import components
 from sparsedp.structure.base import Matrix, Structure, rows_of

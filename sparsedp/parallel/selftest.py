@@ -10,12 +10,12 @@ from sysconfig import get_path
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.conditions import dirichlet
+from sparsedp.boundary_conditions import dirichlet
 from sparsedp.derivative import value_and_grad
 from sparsedp.grid import Grid
 from sparsedp.operators.difference import laplacian
 from sparsedp.parallel.front import distribute
-from sparsedp.solvers.inverses import inverse
+from sparsedp.solvers.choose_method import inverse
 
 __all__ = ["report"]
 

@@ -19,7 +19,7 @@ from sparsedp.advection.front import Transport
 from sparsedp.advection.law import wall_space
 from sparsedp.advection.stability import check_numbers, check_weights
 from sparsedp.advection.values import check_given, check_step
-from sparsedp.conditions import neumann
+from sparsedp.boundary_conditions import neumann
 from sparsedp.derivative import forward, linearised, zero_like
 from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.grid import Grid

@@ -17,8 +17,8 @@ from sparsedp.ledger import count, recording
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_functions, from_matrix
 from sparsedp.solvers.cache import Cache
+from sparsedp.solvers.choose_method import Inverse, Solution, build, build_dense
 from sparsedp.solvers.direct import DENSE_UP_TO
-from sparsedp.solvers.inverses import Inverse, Solution, build, build_dense
 from sparsedp.solvers.solve import failure
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
 from sparsedp.space import Space

@@ -19,14 +19,14 @@ from sparsedp.derivative import of_argument
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.operator import Operator
-from sparsedp.operators.boundary import identity
 from sparsedp.operators.given import from_matrix
+from sparsedp.operators.masks_and_lift import identity
 from sparsedp.operators.tensor import check_tensor, corners
 from sparsedp.recipe import Remade
 from sparsedp.shortcuts import array, in_dtype, whole
 from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.cache import Cache
-from sparsedp.solvers.inverses import build, check_settings
+from sparsedp.solvers.choose_method import build, check_settings
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.sparsity import pattern_like
 from sparsedp.space import Space, fits

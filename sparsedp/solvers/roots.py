@@ -20,7 +20,7 @@ from sparsedp.ledger import note, thread
 from sparsedp.recipe import Remade
 from sparsedp.shortcuts import on_every_rank, together
 from sparsedp.solvers.adjoint import solve_rule, vary
-from sparsedp.solvers.inverses import check_settings
+from sparsedp.solvers.choose_method import check_settings
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation, Layout, Newton
 from sparsedp.solvers.scaling import length

@@ -46,6 +46,7 @@ from sparsedp.fields import check_finite, place
 from sparsedp.ledger import count, thread, timed
 from sparsedp.markup import facts, table
 from sparsedp.recipe import Remade
+from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import in_range, norm, shifted
 from sparsedp.tape import plain
 
@@ -76,6 +77,13 @@ class EmptySystem(Engine):
 
     method = "none"
     hierarchy = "no unknowns"
+
+
+def accepted(residual, goal, terms):
+    """Whether norms meet the tolerance ("converged"), the attainable accuracy, or neither ("")."""
+    if residual <= goal:
+        return "converged"
+    return "converged_at_roundoff" if residual <= ROUNDING * terms else ""
 
 
 class Solver(Remade):
@@ -146,7 +154,7 @@ class Solver(Remade):
         run = Run(adjoint)
         x = self.engine.solve(b, 0.0, transposed)[0]
         left = residual(x)
-        run.status = self.system.accepts(left, self.system.rtol * data, terms)
+        run.status = accepted(left, self.system.rtol * data, terms)
         if not run.status:
             return None
         run.measure(left, data, max(terms - data, 0.0))
@@ -309,7 +317,7 @@ class Solver(Remade):
         """The status word of a solution of this length, "" while it is none."""
         if goal < residual and residual > FAR_OFF * data:  # huge along an unknown null vector: any size of rounding
             return ""
-        return self.system.accepts(residual, goal, self.system.norm(run.transposed) * length + data)
+        return accepted(residual, goal, self.system.norm(run.transposed) * length + data)
 
     def _correction(self, r, goal, transposed):
         """One call of the engine."""

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from sparsedp.errors import NonFiniteError
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
-from sparsedp.solvers.nullspace import ROUNDING, NullSpace, find_null_space
+from sparsedp.solvers.nullspace import NullSpace, find_null_space
 from sparsedp.solvers.scaling import largest, norm, remainder
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.kronecker import Kronecker
@@ -321,12 +321,6 @@ class System:
         return _pinned(self.matrix, flags)
 
     # ------------------------------------------------------------ the test of a solution
-
-    def accepts(self, residual, goal, terms):
-        """Whether norms meet the tolerance ("converged"), the attainable accuracy, or neither ("")."""
-        if residual <= goal:
-            return "converged"
-        return "converged_at_roundoff" if residual <= ROUNDING * terms else ""
 
     def rounding(self, x, data, transposed=False):
         """The residual that rounding leaves, row by row: well below the bound with |A|_inf on stretched grids."""

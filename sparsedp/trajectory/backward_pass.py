@@ -5,8 +5,8 @@ from sparsedp.ledger import active, count
 from sparsedp.progress import shown_steps
 from sparsedp.tape import backward, fit
 from sparsedp.trajectory.layout import refuse_lost, stacked
+from sparsedp.trajectory.memory_budget import stride
 from sparsedp.trajectory.record import growth, largest
-from sparsedp.trajectory.schedule import stride
 from sparsedp.trajectory.steps import State
 
 __all__ = ["go_back"]

@@ -11,10 +11,10 @@ from sparsedp.fields import check_function, check_takes, is_whole
 from sparsedp.ledger import thread
 from sparsedp.shortcuts import together
 from sparsedp.tape import dtype_of, innermost, is_variable, isbox, plain, through
-from sparsedp.trajectory.keep import All, Each, Last, Some
 from sparsedp.trajectory.layout import Layout
+from sparsedp.trajectory.memory_budget import budget_within_reach, plan, room_within, slots_within
+from sparsedp.trajectory.outputs import All, Each, Last, Some
 from sparsedp.trajectory.run import Loop
-from sparsedp.trajectory.schedule import budget_within_reach, plan, room_within, slots_within
 from sparsedp.tree import leaves
 
 __all__ = ["rollout"]

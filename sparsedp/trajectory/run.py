@@ -16,8 +16,8 @@ from sparsedp.progress import shown_steps
 from sparsedp.tape import Rule
 from sparsedp.trajectory.backward_pass import go_back
 from sparsedp.trajectory.layout import is_finite
+from sparsedp.trajectory.memory_budget import checkpoints
 from sparsedp.trajectory.record import APART, SAMPLES, Record
-from sparsedp.trajectory.schedule import checkpoints
 from sparsedp.trajectory.steps import Steps
 
 __all__ = ["Loop"]

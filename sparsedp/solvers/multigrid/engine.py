@@ -124,7 +124,7 @@ class Structured(Engine):
 
     def __init__(self, stencil, free, maxiter=None, dtype=np.float32):
         from sparsedp.solvers.multigrid import loops
-        from sparsedp.solvers.multigrid.levels import Level, hierarchy
+        from sparsedp.solvers.multigrid.cycle import Level, hierarchy
         from sparsedp.solvers.multigrid.loops import Layout
 
         grid, self.scale, self.maxiter, self.loops = stencil.grid, stencil.scale, maxiter or MAXITER, loops

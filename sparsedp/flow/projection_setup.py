@@ -13,15 +13,15 @@ from functools import cached_property
 
 import numpy as np
 
-from sparsedp.conditions import inflow, no_slip, resolve
+from sparsedp.boundary_conditions import inflow, no_slip, resolve
 from sparsedp.errors import NonFiniteError
 from sparsedp.fields import check_finite, place
 from sparsedp.flow.passes import Products, compiled
 from sparsedp.grid import Grid
-from sparsedp.operators.boundary import check_solid, diagonal, solid_faces
 from sparsedp.operators.difference import divergence, gradient
+from sparsedp.operators.masks_and_lift import check_solid, diagonal, solid_faces
 from sparsedp.recipe import Remade
-from sparsedp.solvers.inverses import build
+from sparsedp.solvers.choose_method import build
 from sparsedp.solvers.scaling import in_range, largest, shifted
 
 __all__ = ["Setup", "faces_that", "pressure_conditions"]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.conditions import resolve
+from sparsedp.boundary_conditions import resolve
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, check_plain
 from sparsedp.grid import check_grid
