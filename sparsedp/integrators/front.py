@@ -201,7 +201,8 @@ def _scheme(method, given, settings):
         raise TypeError(f"{method} needs the stiff linear term: write linear=L or linear=(L, coefficient)")
     scheme: Scheme
     if method in EXPLICIT:
-        scheme = (Polynomial if problem.linear and problem.source is None else Explicit)(problem, method)
+        plain = problem.linear and problem.source is None and all(term.op.layout is None for term in problem.stiff)
+        scheme = (Polynomial if plain else Explicit)(problem, method)
     elif method == "etdrk4":
         scheme = Exponential(problem)
     elif method == "imex" or problem.linear:
