@@ -68,7 +68,7 @@ print("published :  0.0057228 0.0171672 0.0286103 0.0400520 0.0514921   (128 cel
 # ----------------------
 # Now only the state after 16 steps is seen. The loss of a start is the mean squared difference there,
 #
-# .. math:: J(u_0) = \frac1n \, | \Phi_{16}(u_0) - u_{\text{seen}} |^2 ,
+# .. math:: J(u_0) = \frac{1}{n} \, | \Phi_{16}(u_0) - u_{\text{seen}} |^2 ,
 #
 # where :math:`\Phi_{16}` stands for 16 steps. Its gradient comes from one run backwards through the steps, each of
 # which hands the cotangent of its result to its argument.

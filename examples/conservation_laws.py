@@ -36,7 +36,7 @@ grid = dp.Grid(n, size=1.0)
 #
 # .. math:: u = \begin{pmatrix} \rho \\ \rho v \\ E \end{pmatrix}, \quad
 #           F(u) = \begin{pmatrix} \rho v \\ \rho v^2 + p \\ v \, (E + p) \end{pmatrix}, \quad
-#           p = (\gamma - 1) \left( E - \tfrac12 \rho v^2 \right) .
+#           p = (\gamma - 1) \left( E - \tfrac{1}{2} \rho v^2 \right) .
 #
 # Sound travels at :math:`c = \sqrt{\gamma p / \rho}` relative to the gas, so that the slowest and the fastest wave have
 # the speeds :math:`v - c` and :math:`v + c`.
@@ -94,7 +94,7 @@ burst = dp.stepper("ssprk3", gas, 0.2 / steps)
 # Of shallow water we follow the depth :math:`h` and the discharge :math:`h v`,
 #
 # .. math:: u = \begin{pmatrix} h \\ h v \end{pmatrix}, \quad
-#           F(u) = \begin{pmatrix} h v \\ h v^2 + \tfrac12 g h^2 \end{pmatrix}, \quad c = \sqrt{g h} .
+#           F(u) = \begin{pmatrix} h v \\ h v^2 + \tfrac{1}{2} g h^2 \end{pmatrix}, \quad c = \sqrt{g h} .
 #
 # It is the same call with another flux. The channel has walls, where the discharge changes its sign.
 

@@ -123,7 +123,7 @@ class Flow:
 # What the fluid pushes the cylinder with is the momentum that enters a region around it and does not leave, by
 # pressure, viscosity and convection. Any region will do; ours has a radius of 0.8 diameters. The coefficients are
 #
-# .. math:: C_D = \frac{2 F_x}{\bar u^2 D}, \qquad C_L = \frac{2 F_y}{\bar u^2 D} .
+# .. math:: C_D = \frac{2 F_x}{\bar{u}^2 D}, \qquad C_L = \frac{2 F_y}{\bar{u}^2 D} .
 #
 # Pressure goes on inside the friction, where it means nothing. On the surface it is taken from outside, by a straight
 # line through points one and two cells away.

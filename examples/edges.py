@@ -58,13 +58,14 @@ hidden = blocks(grid)
 # %%
 # Two regularizers
 # ----------------
-# The loss is half the mean squared misfit, in units of the noise, and a price for a rough :math:`m`:
+# The loss is half the mean squared misfit of all :math:`N` readings :math:`d_i`, in units of their noise, and a price
+# for a rough :math:`m`:
 #
-# .. math:: J(m) = \frac12 \, \overline{\left( \frac{r(m) - d}{\sigma} \right)^2} + \beta \, R(m) .
+# .. math:: J(m) = \frac{1}{2 N} \sum_i \left( \frac{r_i(m) - d_i}{\sigma_i} \right)^2 + \beta \, R(m) .
 #
 # The usual price is half the integral of :math:`|\nabla m|^2`. To go up by 1 within a width :math:`w` costs
-# :math:`\frac12 \, w \, (1 / w)^2 = 1 / (2 w)`: a jump is dear, and it is cheaper to spread it. **Total variation** is
-# the integral of :math:`|\nabla m|`. It costs :math:`w \cdot 1 / w = 1` for any width, so that an edge is as cheap as a
+# :math:`w \, (1 / w)^2 / 2 = 1 / (2 w)`: a jump is dear, and it is cheaper to spread it. **Total variation** is the
+# integral of :math:`|\nabla m|`. It costs :math:`w \cdot 1 / w = 1` for any width, so that an edge is as cheap as a
 # slope. At :math:`\nabla m = 0` the length of a vector has a kink; :math:`\sqrt{|\nabla m|^2 + \epsilon^2}` rounds it
 # off.
 

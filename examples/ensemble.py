@@ -79,7 +79,7 @@ def network(weights, u):
 # Three hot spots at random places. The loss of one experiment is the mean squared miss at the end; all of them together
 # have the mean of these,
 #
-# .. math:: J(w) = \sum_{i=1}^{12} \frac{1}{12} \, \overline{\left( u_i(w) - d_i \right)^2} .
+# .. math:: J(w) = \sum_{i=1}^{12} \frac{1}{12} \, \operatorname{mean} \left( u_i(w) - d_i \right)^2 .
 
 
 def experiment(seed):

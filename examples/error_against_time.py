@@ -29,7 +29,7 @@ options = parser.parse_args()
 # -------------------------------
 # On :math:`(-1, 1)`, from a sine,
 #
-# .. math:: u_t + \left( \tfrac12 u^2 \right)_x = \nu \, u_{xx}, \qquad u(x, 0) = -p_0 \, \sin \pi (x + p_1) .
+# .. math:: u_t + \left( \tfrac{1}{2} u^2 \right)_x = \nu \, u_{xx}, \qquad u(x, 0) = -p_0 \, \sin \pi (x + p_1) .
 #
 # At :math:`t = 0.5` a front has formed. We look at three places, and ask for the sum of the squares there, with its
 # slopes in the amplitude :math:`p_0` and the phase :math:`p_1`.

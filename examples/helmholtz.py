@@ -35,7 +35,7 @@ omega = 2 * np.pi / (cells * h)  # for a speed of 1
 # A wave of the frequency :math:`\omega` is the real part of :math:`u \, e^{-i \omega t}`. With the density :math:`\rho`
 # and the source :math:`s`,
 #
-# .. math:: -\nabla \cdot \left( \frac1\rho \, \nabla u \right) - \frac{\omega^2}{c^2} \, (1 + i \sigma) \, u = s .
+# .. math:: -\nabla \cdot \left( \frac{1}{\rho} \, \nabla u \right) - \frac{\omega^2}{c^2} \, (1 + i \sigma) \, u = s .
 #
 # Here :math:`c` is the speed where :math:`\rho = 1`; elsewhere waves run at :math:`c / \sqrt \rho`. The term with
 # :math:`\sigma` damps. `dp.elliptic_solver` takes all of it: as :math:`k` one over the density, as *shift* minus
@@ -150,7 +150,7 @@ print(f"off Hankel's function: {off:.1%}")
 # Microphones stand along a line above the lens. We do not know the lens: how should each speed change, starting from 1,
 # so that they hear what they do? With :math:`A u = s` for the equation, and :math:`L` for listening,
 #
-# .. math:: J(c) = | L u - d |^2, \qquad A^T w = 2 \, L^T \, \overline{(L u - d)}, \qquad
+# .. math:: J(c) = | L u - d |^2, \qquad A^T w = 2 \, L^T \, (L u - d)^*, \qquad
 #           \frac{\partial J}{\partial c} = -\operatorname{Re} \left( \frac{2 \omega^2}{c^3} \, (1 + i \sigma) \,
 #           w \, u \right) .
 #

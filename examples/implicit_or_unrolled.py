@@ -32,7 +32,7 @@ options = parser.parse_args()
 # How far is the solution of :math:`A x = b`, with :math:`A = -\Delta`, from the wanted one, and how does that change
 # with the source :math:`b`?
 #
-# .. math:: J(b) = \frac1N \, | A^{-1} b - x_d |^2 .
+# .. math:: J(b) = \frac{1}{N} \, | A^{-1} b - x_d |^2 .
 
 
 class Problem:

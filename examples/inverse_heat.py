@@ -79,8 +79,8 @@ print(f"{options.samples} samples with heat {warmth:.0f}, noise of the data (sin
 # %%
 # First way: gradient descent
 # ---------------------------
-# The gradient of :math:`\frac12 |\text{heat}(x) - y|^2` damps each wave once more. A step of rate 1 from zero leaves of
-# a wave's error the share :math:`1 - \varphi_k^2`; after :math:`n` steps the sum of the geometric series is
+# The gradient of :math:`|\text{heat}(x) - y|^2 / 2` damps each wave once more. A step of rate 1 from zero leaves of a
+# wave's error the share :math:`1 - \varphi_k^2`; after :math:`n` steps the sum of the geometric series is
 #
 # .. math:: \hat x_k = \frac{1 - (1 - \varphi_k^2)^n}{\varphi_k} \, \hat y_k .
 #
@@ -121,7 +121,7 @@ def physical(y):
 # Temperatures are not negative, and rectangles have few edges. Of all starts that fit we want the one with the least
 # sum of jumps between neighbours:
 #
-# .. math:: \min_{x \ge 0} \; \frac12 |\text{heat}(x) - y|^2 + \lambda \sum_i |x_{i+1} - x_i| .
+# .. math:: \min_{x \ge 0} \; \frac{1}{2} |\text{heat}(x) - y|^2 + \lambda \sum_i |x_{i+1} - x_i| .
 #
 # ADMM splits this in two: a quadratic problem, diagonal in waves, and a step that shrinks jumps and cuts off what is
 # negative, cell by cell. Both are a line of code; a third array keeps them together.

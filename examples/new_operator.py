@@ -43,7 +43,7 @@ print(dp.check.operator(scanner))
 # Without a matrix, an operator is the map and its transpose. Here a wind blows half of each value one cell along x, and
 # round the end. In the transpose the wind blows the other way:
 #
-# .. math:: (W u)_i = \tfrac12 u_i + \tfrac12 u_{i-1}, \qquad (W^T g)_i = \tfrac12 g_i + \tfrac12 g_{i+1} .
+# .. math:: (W u)_i = \tfrac{1}{2} (u_i + u_{i-1}), \qquad (W^T g)_i = \tfrac{1}{2} (g_i + g_{i+1}) .
 
 
 def smear(u):

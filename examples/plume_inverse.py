@@ -74,7 +74,7 @@ def run(wind, source, keep="last"):
 # --------
 # The three winds :math:`w_1, w_2, w_3` are the unknowns, and all three plumes count:
 #
-# .. math:: J(w_1, w_2, w_3) = \sum_{k=1}^{3} \frac12 \, | \Phi_k(w_k) - s_{\text{goal}} |^2 .
+# .. math:: J(w_1, w_2, w_3) = \sum_{k=1}^{3} \frac{1}{2} \, | \Phi_k(w_k) - s_{\text{goal}} |^2 .
 
 calm = np.zeros(grid.faces.size)
 goal = run(calm, wanted)

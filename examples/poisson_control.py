@@ -30,7 +30,7 @@ options = parser.parse_args()
 # -----------
 # Find the source :math:`u` that makes the temperature :math:`y` as :math:`y_d` wants it:
 #
-# .. math:: \min_u \; \frac12 \, | y - y_d |^2 + \frac{\alpha}{2} \, | u |^2
+# .. math:: \min_u \; \frac{1}{2} \, | y - y_d |^2 + \frac{\alpha}{2} \, | u |^2
 #           \quad \text{with} \quad -\Delta y = u, \; y = 0 \text{ on the walls} .
 #
 # The norms are those of functions: sums over cells, times :math:`h^2`.
@@ -75,7 +75,7 @@ class Problem:
 # -----------------
 # For a sine wave, :math:`-\Delta` is a number :math:`\mu`. Each wave :math:`k` of the wanted field then leaves
 #
-# .. math:: J_k = \frac12 \, \frac{\alpha \, \mu_k^2}{1 + \alpha \, \mu_k^2} \, y_{d,k}^2 .
+# .. math:: J_k = \frac{1}{2} \, \frac{\alpha \, \mu_k^2}{1 + \alpha \, \mu_k^2} \, y_{d,k}^2 .
 
 print("cells   alpha  J found          J exact          gap     iterations  gradients")
 finest = {}

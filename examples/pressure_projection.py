@@ -65,7 +65,7 @@ target = right(grid.join(np.zeros_like(x_faces), upwards))
 # %%
 # Operators are composed with `@`. This one takes our half of the wind, makes it incompressible, and looks at the right.
 #
-# .. math:: J(v) = \frac12 \, | R \, P \, M \, v - w |^2
+# .. math:: J(v) = \frac{1}{2} \, | R \, P \, M \, v - w |^2
 
 reach = right @ project @ left
 

@@ -47,7 +47,8 @@ measured = heat(blocks) + 0.005 * rng.standard_normal(grid.shape)
 # %%
 # Edges are sharp, so the regularizer counts jumps: PyLops has split Bregman for it,
 #
-# .. math:: \min_u \; \frac12 \, | e^{t \Delta} u - d |^2 + \epsilon \left(|\partial_x u|_1 + |\partial_y u|_1\right) .
+# .. math:: \min_u \; \frac{1}{2} \, | e^{t \Delta} u - d |^2
+#           + \epsilon \left(|\partial_x u|_1 + |\partial_y u|_1\right) .
 
 jumps = [pylops.FirstDerivative(grid.shape, axis=axis, edge=True, kind="backward") for axis in (0, 1)]
 start = pylops.optimization.sparsity.splitbregman(

@@ -47,6 +47,12 @@ def test_every_public_name_is_on_the_page_of_the_api():
     assert sorted(listed) == sorted([*public, *(f"{room}.{name}" for room in rooms for name in rooms[room])])
 
 
+def test_fractions_have_braces():
+    r"""Sphinx's MathML takes \frac12 x for twelve over x."""
+    for path in [*DOCS.glob("*.md"), *DOCS.glob("*.rst"), *(ROOT / "examples").glob("*.py")]:
+        assert not re.search(r"\\[dt]?frac[^{]", path.read_text(encoding="utf-8")), path.name
+
+
 def test_commands_of_the_pages():
     found = [words for name in PAGES for block in blocks((DOCS / name).read_text(encoding="utf-8"))
              if block.language in SHELL for words in commands(block.text)]  # fmt: skip
