@@ -181,8 +181,12 @@ for label, loss, before, rate in (
 # The picture
 # -----------
 # An unseen pressure, and the guess of it; then what CG makes of each start. The loss through CG looks at one place of
-# these curves, where the dotted line is. A guess saves most of the iterations of CG, and next to none of multigrid,
-# which has few to begin with.
+# these curves, where the dotted line is.
+#
+# There a learned guess is some ten times closer than zero. To a residual of 1e-3 CG saves no more than an eighth to a
+# quarter of its iterations, since each further digit takes as many as before. Multigrid takes three, from zero or from
+# any of the guesses. Training through CG pays on 32 x 32 cells, at four times the seconds; on 16 x 16, with only 4
+# iterations in the loss, it does not.
 #
 # Exercises
 # ---------
