@@ -167,9 +167,13 @@ for label, (loss, begin, frames_of) in searches.items():
 # %%
 # What to make of it
 # ------------------
+# Ten iterations are too few for any network. With 200 of them those with a residual are still off by 0.15 and 0.05 on
+# average, the two behind a solver by less than 0.01.
+#
 # A residual needs no solver, and the network gives :math:`u` at any place and time, nearly. What it gives obeys the
 # equation nearly, too: the loss weighs the misfit against the physics, and the sum of both can be small with a shock
-# that is off. Behind a solver there is nothing to weigh. Every answer is a run, and a gradient costs no more.
+# that is off. Behind a solver there is nothing to weigh. Every answer is a run, and a gradient costs no more. Where a
+# search tries a start so steep that the cotangent grows out of bounds, the rollout warns, and the search goes back.
 #
 # The picture
 # -----------
