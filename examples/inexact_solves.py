@@ -56,7 +56,7 @@ seen = solve(2 * source)
 # As the inner solver we take the slowest there is, sweeps of Jacobi. A sweep adds the residual, divided by the diagonal
 # :math:`2 / h^2` of :math:`A`:
 #
-# .. math:: u \leftarrow u + \tfrac12 h^2 \, (\theta f - A u) .
+# .. math:: u \leftarrow u + \tfrac{1}{2} h^2 \, (\theta f - A u) .
 
 START = 5.0
 RATE = 275.0  # of gradient descent, as published

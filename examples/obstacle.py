@@ -93,7 +93,7 @@ measured = exact + 0.01 * np.random.default_rng(0).standard_normal(exact.size)
 # The readings have to fit. Differences from cell to cell of the profile cost a little, so that noise is not taken for a
 # detail of the wind:
 #
-# .. math:: J(q) = \frac12 \, |\text{readings}(q) - m|^2 + 10^{-3} \sum_j (q_{j+1} - q_j)^2 .
+# .. math:: J(q) = \frac{1}{2} \, |\text{readings}(q) - m|^2 + 10^{-3} \sum_j (q_{j+1} - q_j)^2 .
 
 
 def loss(profile):

@@ -108,7 +108,8 @@ print(f"{spots(end)} spots (1 drop at the start; with more kill {spots(gone)}, k
 #
 # .. math:: u_t = m \, \Delta \left( u^3 - u - \Delta u \right) .
 #
-# What is below the Laplacian is the derivative of the energy :math:`\int \frac14 (u^2 - 1)^2 + \frac12 |\nabla u|^2`.
+# What is below the Laplacian is the derivative of the energy
+# :math:`\int \frac{1}{4} (u^2 - 1)^2 + \frac{1}{2} |\nabla u|^2`.
 # So the energy falls, and the mean of :math:`u` stays. For the energy to fall in long steps too, the linear part gets
 # :math:`2 u` more than it needs, and the other one :math:`2 u` less (after D. Eyre, 1998):
 #
@@ -139,7 +140,7 @@ print(f"drift of the mean {drift:.0e} (0), largest rise of energy {rise:.0e} (be
 # .. math:: u_t = r u - (1 + \Delta)^2 u - u^3 .
 #
 # Waves of length :math:`2 \pi` grow, all others die out or lag behind. A single wave :math:`a \cos x` is steady when
-# :math:`r a = \frac34 a^3`, so the root mean square of :math:`u` is :math:`\sqrt{2 r / 3}`.
+# :math:`r a = \frac{3}{4} a^3`, so the root mean square of :math:`u` is :math:`\sqrt{2 r / 3}`.
 #
 # `dp.function` makes an operator of a function of the eigenvalues of another one.
 
@@ -161,7 +162,7 @@ print(f"wavelength {length:.2f} ({2 * np.pi:.2f}), size {size:.3f} (one wave: {n
 # -----------------------------------
 # Long waves grow, short ones are damped, and the last term hands energy from the ones to the others, for ever:
 #
-# .. math:: u_t = -\Delta u - \Delta^2 u - \tfrac12 \, c \, |\nabla u|^2 .
+# .. math:: u_t = -\Delta u - \Delta^2 u - \tfrac{1}{2} \, c \, |\nabla u|^2 .
 #
 # A small wave of wavenumber :math:`k` grows like :math:`e^{(k^2 - k^4) t}`. The gradient lives on faces; the transpose
 # of `dp.average` takes the squares of both components to the cells.

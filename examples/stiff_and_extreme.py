@@ -83,7 +83,7 @@ def ink(p):
 # Explicit diffusion multiplies a mode by :math:`1 - \Delta t \, \nu \lambda`. The largest eigenvalue in a plane is
 # about :math:`8 / h^2`, so the step is stable for
 #
-# .. math:: \frac{\Delta t \, \nu}{h^2} \le \frac14 .
+# .. math:: \frac{\Delta t \, \nu}{h^2} \le \frac{1}{4} .
 #
 # Here the number is 0.6, written by hand and checked by nobody: the shortest waves change their sign and become 3.8
 # times as large in a step. After 20 steps the loss is still a finite number.

@@ -148,7 +148,7 @@ print(f"from the Laplacian on 25 cells alone: {np.exp(2 * VISCOSITY * END * (1 -
 # ---------------
 # Start with :math:`\alpha` times the vortices. The end is known, and so is half of its square:
 #
-# .. math:: J(\alpha, \nu) = \tfrac12 \, |v(T)|^2 = \tfrac12 \, \alpha^2 \, |v(0)|^2 \, e^{-4 \nu T},
+# .. math:: J(\alpha, \nu) = \tfrac{1}{2} \, |v(T)|^2 = \tfrac{1}{2} \, \alpha^2 \, |v(0)|^2 \, e^{-4 \nu T},
 #
 # .. math:: \frac{\partial J}{\partial \alpha} = \frac{2 J}{\alpha}, \qquad
 #           \frac{\partial J}{\partial \nu} = -4 \, T J .

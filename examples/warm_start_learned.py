@@ -96,7 +96,7 @@ def guess(w, b):
 # --------
 # The solution of :math:`A x = b` is where the energy is least, and CG is the method that makes it small:
 #
-# .. math:: E(x) = \tfrac12 \, x^T A x - b^T x = E(x^*) + \tfrac12 \, (x - x^*)^T A \, (x - x^*) .
+# .. math:: E(x) = \tfrac{1}{2} \, x^T A x - b^T x = E(x^*) + \tfrac{1}{2} \, (x - x^*)^T A \, (x - x^*) .
 #
 # So the energy can be the loss, and nobody has to solve anything in order to train. It is taken before the iterations
 # of CG or after them.
@@ -136,7 +136,7 @@ def train(loss, w, rate, steps=10 * n):
 # How good are they?
 # ------------------
 # After a fixed number of iterations, the residual and the error in the norm of :math:`A`, both relative: :math:`E(x^*)
-# = -\frac12 x^{*T} A x^*`, so the squared error is :math:`1 - E(x) / E(x^*)`. Then the iterations of CG and of
+# = -\frac{1}{2} x^{*T} A x^*`, so the squared error is :math:`1 - E(x) / E(x^*)`. Then the iterations of CG and of
 # multigrid from the guess to a residual of 1e-3.
 
 solutions = [direct(b) for b in unseen]

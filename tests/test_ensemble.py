@@ -46,12 +46,11 @@ class Reversed:
     """An executor that does its tasks when they are asked for, the last one first; what it unpacks is its own."""
 
     def __init__(self, forgets=False):
-        self.tasks, self.sizes, self.forgets = [], [], forgets
+        self.tasks, self.forgets = [], forgets
 
     def submit(self, *task):
         future = Future()
         self.tasks.append((future, pickle.dumps(task)))
-        self.sizes.append(len(self.tasks[-1][1]))
         future.result = lambda: self.all_done() or Future.result(future)
         return future
 
@@ -60,7 +59,7 @@ class Reversed:
             future, task = self.tasks.pop()
             act, *args = pickle.loads(task)
             if self.forgets:
-                scenes._kept.cache_clear()
+                scenes._unpacked.cache_clear()
             try:
                 future.set_result(act(*args))
             except Exception as error:
@@ -143,30 +142,9 @@ def test_a_worker_keeps_what_it_has_unpacked():
     assert [total(2.0), *dp.value_and_grad(total)(3.0)] == [12.0, 18.0, 6.0] and len(SET_UP) == 1
 
 
-def large(x, scene):
-    return np.sum(x * scene)
-
-
-def test_what_a_worker_knows_is_not_sent_again():
-    """The unknown goes with the first task; the last one is done first here, and asks for everything."""
-    total, x = dp.ensemble(large, onp.ones((3, 1000)), Reversed()), onp.ones(1000)
-    assert [total(k * x) for k in range(4)] == [0.0, 3000.0, 6000.0, 9000.0]
-    sizes = onp.array(total._executor.sizes) // 8000
-    assert sizes.tolist() == [2, 2, 2, *[1, 0, 0, 2, 2], *[1, 0, 0, 2, 2], *[1, 0, 0, 2, 2]]
-
-
-def test_a_worker_that_forgets_asks_again():
-    wanted, forgetful = dp.ensemble(loss, SCENES, weights=WEIGHTS, chunk=2), Reversed(forgets=True)
-    total = dp.ensemble(loss, SCENES, forgetful, WEIGHTS, 2)
+def test_a_worker_that_forgets_unpacks_again():
+    wanted, total = (dp.ensemble(loss, SCENES, some, WEIGHTS, 2) for some in (None, Reversed(forgets=True)))
     assert [bits(total) for _ in range(2)] == [bits(wanted)] * 2
-    assert len(forgetful.sizes) > 3 * 2 * 3  # tasks of two evaluations, were nothing forgotten
-
-
-def test_an_error_beside_a_worker_that_asks():
-    total = dp.ensemble(Raising("typed"), range(4), Reversed(forgets=True))
-    for _ in range(3):
-        with pytest.raises(dp.errors.NonFiniteError, match="^scene 2 of 4: planted$"):
-            total(1.0)
 
 
 def test_batches_of_scenes():

@@ -90,7 +90,7 @@ class Agreement:
         if found == mark * self.comm.size:
             self._log.clear()
         elif FAILED in (found[k : k + 8] for k in range(0, len(found), 8)):
-            self._raise_together(None)
+            self._raise_together()
         else:
             self._refuse()
         return self._all[:, 8 : 8 + len(content)].tobytes()
@@ -140,17 +140,21 @@ class Agreement:
 
     # ------------------------------------------------------------ errors
 
-    def agreed(self, label, act, *args):
-        """act(*args), which may fail on one rank only: then it fails on all. Inside of `together`, that tells them."""
+    def agreed(self, label, act, *args, at_once=False):
+        """act(*args), which may fail on one rank only: then it fails on all.
+
+        Inside of `together`, that tells them; `at_once`: they are told here, for the caller goes on in another way.
+        """
+        alone = at_once or course.begun is None
         try:
             result = act(*args)
         except Exception as error:
-            if course.begun is None:
+            if alone:
                 self.fail(error)
             if not hasattr(error, "on_all_ranks"):
                 self.tell(f"an error in {label}", b"failed")  # if it is caught on the way, the ranks differ
             raise
-        if course.begun is None:
+        if alone:
             self.meet(label)
         return result
 
@@ -161,21 +165,19 @@ class Agreement:
         watch = Timer(PATIENCE, end_all, (type(error), error, error.__traceback__))
         watch.daemon = True
         watch.start()
-        self._sent(FAILED, crc32(f"{type(error)}{error}".encode()).to_bytes(8, "little"))
+        self._sent(FAILED, b"")
         self._raise_together(error, watch)
 
-    def _raise_together(self, error, watch=None):
-        heads = self._all[:, :16].tobytes()
-        alike = heads == heads[:16] * self.comm.size  # all have failed in the same way
-        rank = next(rank for rank in range(self.comm.size) if heads[16 * rank :].startswith(FAILED))
-        mine = _packed(error, f" (on rank {rank}{self.where})") if rank == self.comm.rank and not alike else None
-        told = error if alike else self.comm.bcast(mine, rank)
+    def _raise_together(self, error=None, watch=None):
+        where = f" (on rank {self.comm.rank}{self.where})"
+        mine = None if error is None else (f"{type(error)}{error}", _packed(error, where))
+        told = self.comm.allgather(mine)
         if watch:
             watch.cancel()
         self._forget()
-        if alike:
+        if len({one and one[0] for one in told}) == 1:  # all have failed in the same way
             raise _marked(error)
-        raise _marked(told) from error
+        raise _marked(next(filter(None, told))[1]) from error
 
 
 def _marked(error):

@@ -9,8 +9,9 @@ from petsc4py import PETSc
 from sparsedp import results
 from sparsedp.ledger import active, count
 from sparsedp.parallel.partition import lengths, slices
+from sparsedp.structure.kronecker import components
 
-__all__ = ["Exchange", "hold", "of_boxes", "of_entries"]
+__all__ = ["Exchange", "hold", "of_boxes"]
 
 KINDS = {"f": MPI.FLOAT, "d": MPI.DOUBLE, "D": MPI.C_DOUBLE_COMPLEX}  # PETSc adds up no floats
 
@@ -33,24 +34,28 @@ class Exchange:
     Parameters
     ----------
     layout : Partition
-    roots, size : int
-        Count of numbers in the block, and of those that are read.
-    copies : list of pairs of (slice, its shape, window of that)
-        What this rank holds itself: where it goes in the result, and where it is in the block.
-    leaves, ranks, places : int arrays
-        Of what others hold: where it goes in the result, who holds it, and where in the flat block there.
+    parts : list of shapes
+        Of the components of the whole field.
+    size : int
+        Count of numbers that are read.
+    leaves, entries : int arrays
+        Of what is not copied: where it goes in the result, and its number in the whole flat field.
+    shapes, windows : lists
+        Of what is copied, for each component: the shape of what is read, and where the copy is in it and in the block.
     """
 
-    def __init__(self, layout, roots, size, copies, leaves, ranks, places):
-        self.roots, self.size, self.copies = roots, size, copies
-        leaves, ranks, places = (numbers.astype(PETSc.IntType) for numbers in (leaves, ranks, places))
-        self.agreement = layout.agreement
+    def __init__(self, layout, parts, size, leaves, entries, shapes=(), windows=()):
+        ranks, places = layout.owners(parts, entries)
         counts = np.array([leaves.size, np.count_nonzero(ranks != layout.comm.rank)])
+        self.agreement = layout.agreement
         self.busy, self.crossing = map(int, layout.sum(counts))  # of all ranks
+        self.read = size, shapes, [there for there, _ in windows]
+        self.block = layout.size(parts), layout.shapes(parts), [here for _, here in windows]
         if self.busy:
             PETSc.garbage_cleanup(layout.comm)  # what Python has dropped is freed here, on all ranks together
             self._forest = PETSc.SF().create(layout.comm)
-            self._forest.setGraph(roots, leaves, np.stack([ranks, places], axis=1))
+            remote = np.stack([ranks, places], axis=1).astype(PETSc.IntType)
+            self._forest.setGraph(self.block[0], leaves.astype(PETSc.IntType), remote)
             self._forest.setUp()
 
     def forward(self, flat):
@@ -63,11 +68,11 @@ class Exchange:
 
     def placed(self, flat):
         """Flat block -> what is read of it on this rank, zeros elsewhere."""
-        return _copied([(_window(flat, *here), there) for there, here in self.copies], self.size, flat.dtype)
+        return _copied(flat, self.block, self.read)
 
     def taken(self, read):
         """The transpose of that."""
-        return _copied([(_window(read, *there), here) for there, here in self.copies], self.roots, read.dtype)
+        return _copied(read, self.read, self.block)
 
     def _sent(self, word, act, given, out):
         """What comes from others, or goes to them, added to what stays here."""
@@ -82,49 +87,33 @@ class Exchange:
         return out
 
 
-def _window(flat, part, shape, window):
-    return flat[part].reshape(shape)[window]
-
-
-def _copied(pieces, size, dtype):
-    """Arrays, and where they go in a flat one of this size, with zeros in between; an array that fills it is it."""
-    if len(pieces) == 1 and pieces[0][0].size == size and pieces[0][0].flags.c_contiguous:
-        return pieces[0][0].reshape(-1)
-    out = results.empty((size,), dtype)
-    if sum(values.size for values, _ in pieces) < size:
+def _copied(flat, given, made):
+    """Windows of a flat array -> those of another one, with zeros in between; an array that fills it is it."""
+    (_, shapes, windows), (size, others, places) = given, made
+    pieces = [part[window] for part, window in zip(components(flat, shapes), windows)]
+    if len(pieces) == 1 and pieces[0].size == size and pieces[0].flags.c_contiguous:
+        return pieces[0].reshape(-1)
+    out = results.empty((size,), flat.dtype)
+    if sum(piece.size for piece in pieces) < size:
         out[:] = 0
-    for values, place in pieces:
-        _window(out, *place)[...] = values
+    for piece, part, place in zip(pieces, components(out, others), places):
+        part[place] = piece
     return out
 
 
 def of_boxes(layout, parts, boxes):
     """The Exchange for a box of each component, which may reach into other blocks."""
-    copies: list[tuple] = []
-    found: list = [np.zeros((3, 0), np.int64)]
+    leaves, entries, windows = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], []
     start = first = 0
-    for number, (part, box) in enumerate(zip(parts, boxes)):
-        here, shape = layout.box(part), lengths(box)
-        inner = tuple((max(a, c), max(min(b, d), max(a, c))) for (a, b), (c, d) in zip(box, here))
-        result, block = slice(start, start + prod(shape)), slice(first, first + prod(lengths(here)))
-        if prod(lengths(inner)):
-            there, place = (result, shape, slices(inner, box)), (block, lengths(here), slices(inner, here))
-            copies.append((there, place))
-        away = np.ones(shape, dtype=bool)
-        away[slices(inner, box)] = not prod(lengths(inner))
+    for part, box in zip(parts, boxes):
+        here = layout.box(part)
+        inner = [(max(a, c), max(min(b, d), a, c)) for (a, b), (c, d) in zip(box, here)]
+        windows.append((slices(inner, box), slices(inner, here)))
+        away = np.ones(lengths(box), dtype=bool)
+        away[windows[-1][0]] = False
         index = [line + a for line, (a, _) in zip(np.nonzero(away), box)]
-        ranks, places = layout.owners(parts, number, index)
-        found.append((start + np.flatnonzero(away), ranks, places))
-        start, first = result.stop, block.stop
-    return Exchange(layout, first, start, copies, *map(np.concatenate, zip(*found)))
-
-
-def of_entries(layout, parts, entries):
-    """The Exchange for entries of the whole flat field, by number."""
-    ends = np.cumsum([prod(part) for part in parts])
-    ranks, places = np.zeros((2, entries.size), np.int64)
-    for number, (part, end) in enumerate(zip(parts, ends)):
-        here = (entries >= end - prod(part)) & (entries < end)
-        index = np.unravel_index(entries[here] - (end - prod(part)), part)
-        ranks[here], places[here] = layout.owners(parts, number, index)
-    return Exchange(layout, layout.size(parts), entries.size, [], np.arange(entries.size), ranks, places)
+        leaves.append(start + np.flatnonzero(away))
+        entries.append(first + np.ravel_multi_index(index, part, mode="wrap"))
+        start, first = start + away.size, first + prod(part)
+    shapes = list(map(lengths, boxes))
+    return Exchange(layout, parts, start, np.concatenate(leaves), np.concatenate(entries), shapes, windows)

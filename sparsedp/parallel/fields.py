@@ -76,8 +76,8 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc, method, *inputs, **options):
         if any(map(isbox, inputs)):
             return NotImplemented  # autograd's turn
-        if method == "reduce" and options == {"axis": None} and ufunc in OVER_ALL:
-            return OVER_ALL[ufunc](self)
+        if method == "reduce" and options == {"axis": None} and ufunc in REDUCED:
+            return REDUCED[ufunc](self)
         if method != "__call__" or ufunc.nout != 1 or ufunc.signature or not options.keys() <= {"dtype", "casting"}:
             self.refuse(f"{ufunc.__name__} with {method if method != '__call__' else 'out= or where='}")
         act = pow if ufunc is np.power and not options else ufunc  # the operator of arrays is quick for whole powers
@@ -123,27 +123,18 @@ def _first(*values):
     return next(value for value in values if isinstance(value, DistributedField))
 
 
-def _over_all(act, name):
-    """A function of a field and no further choice -> the same, which refuses an axis."""
-
-    def function(x, axis=None, dtype=None, out=None, keepdims=False, **options):
-        if keepdims and axis is not None and not dtype and out is None and x.shape[axis] == 1:
-            return x  # along an axis of one entry
-        if axis is not None or keepdims or dtype is not None or out is not None or options:
-            x.refuse(f"{name} with a choice such as an axis")
-        return act(x)
-
-    return function
+def _over_all(function, act, x, axis=None, *others, **options):
+    """A function of a whole field; what asks for more, such as an axis, is refused."""
+    if axis is not None and options == {"keepdims": True} and x.shape[axis] == 1:
+        return x  # along an axis of one entry
+    if any(value is not None and value is not False for value in (axis, *others, *options.values())):
+        x.refuse(f"{function.__name__} with a choice such as an axis")
+    return act(x)
 
 
 def _sum(x):
     """Sum of all entries."""
     return x.layout.sum(x.flat.sum())
-
-
-def _mean(x):
-    """Mean of all entries."""
-    return np.divide(_sum(x), x.size, dtype=np.result_type(x.dtype, float if x.dtype.kind in "biu" else x.dtype))
 
 
 def _extreme(act, end, x):
@@ -155,7 +146,7 @@ _max, _min = partial(_extreme, np.maximum, 0), partial(_extreme, np.minimum, 1)
 
 
 def _max_from(x, *axis, initial=None, **options):
-    top = _over_all(_max, "max")(x, *axis, **options)
+    top = _over_all(np.max, _max, x, *axis, **options)
     return top if initial is None else np.maximum(top, initial)
 
 
@@ -221,17 +212,12 @@ FUNCTIONS = {
     np.result_type: _result_type,
     np.real: lambda x: x.real,
     np.imag: lambda x: x.imag,
-    np.sum: _over_all(_sum, "sum"),
-    np.mean: _over_all(_mean, "mean"),
     np.max: _max_from,
-    np.min: _over_all(_min, "min"),
-    np.any: _over_all(lambda x: bool(_max(x.astype(bool))), "any"),
-    np.all: _over_all(lambda x: bool(_min(x.astype(bool))), "all"),
+    np.amax: _max_from,  # in new versions of NumPy the same, in old ones a function of its own
     np.count_nonzero: lambda x: int(x.layout.sum(np.count_nonzero(x.flat))),
     np.argmin: partial(_place, _min),
     np.argmax: partial(_place, _max),
     np.vdot: _vdot,
-    np.linalg.norm: _over_all(_norm, "norm"),
     np.array_equal: _equal,
     np.where: lambda condition, x, y: _by_entry(np.where, condition, x, y),
     np.clip: lambda x, low=None, high=None: _by_entry(np.clip, x, low, high),
@@ -241,39 +227,47 @@ FUNCTIONS = {
     np.zeros_like: _filled(0),
     np.ones_like: _filled(1),
     np.full_like: lambda x, number: x.like(np.full(x.flat.shape, number, x.dtype)),
-}  # in new versions of NumPy amax is max, in old ones a function of its own
-FUNCTIONS.update({np.amax: FUNCTIONS[np.max], np.amin: FUNCTIONS[np.min]})
-
-
-OVER_ALL: dict = {np.add: _sum, np.maximum: _max, np.minimum: _min}  # as ``np.add.reduce(u, axis=None)``
+}
+OVER_ALL = {
+    np.sum: _sum,
+    np.mean: lambda x: (_sum(x)[None] / x.size)[0],  # beside an array a number has no dtype
+    np.min: _min,
+    np.amin: _min,
+    np.any: lambda x: bool(_max(x.astype(bool))),
+    np.all: lambda x: bool(_min(x.astype(bool))),
+    np.linalg.norm: _norm,
+}
+FUNCTIONS.update((function, partial(_over_all, function, act)) for function, act in OVER_ALL.items())
+REDUCED: dict = {np.add: _sum, np.maximum: _max, np.minimum: _min}  # as ``np.add.reduce(u, axis=None)``
 
 
 # ---- derivatives ----
+
+
+def _spread(shape, space):
+    """The rules from numbers, or whole arrays, of a shape to fields on ranks, and back: transposes of each other."""
+    back = DistributedField.gather if shape else _sum
+    return linear("block", lambda x: block(x, space), back)
 
 
 def everywhere(x, space):
     """A number, or what every rank has whole -> a field on ranks; on the tape too."""
     if not isbox(x):
         return block(x, space)
-    if isinstance(plain(x), DistributedField):
+    value = plain(x)
+    if isinstance(value, DistributedField):
         return x
-    shape = np.shape(plain(x))
-    if shape not in ((), space.shape):
+    if np.shape(value) not in ((), space.shape):
         x = x * np.ones(space.shape)  # autograd adds up what is spread
-    back = DistributedField.gather if shape else _sum
-    return linear("block", lambda x: block(x, space), back)[0](x)
+    return _spread(np.shape(value), space)[0](x)
 
 
 def alike(back, value):
     """A cotangent or tangent in the form of what it belongs to: a number, a whole array, or a field on ranks."""
-    here, wanted = isinstance(plain(back), DistributedField), plain(value)
+    field, wanted = plain(back), plain(value)
     if isinstance(wanted, DistributedField):
         return everywhere(back, wanted.space)
-    if not here:
-        return back
-    space = plain(back).space
-    act = _sum if np.ndim(wanted) == 0 else DistributedField.gather
-    return linear("whole", act, lambda g: block(g, space))[0](back)
+    return _spread(np.shape(wanted), field.space)[1](back) if isinstance(field, DistributedField) else back
 
 
 def total(x):
@@ -371,9 +365,8 @@ def together(what, given, act, *args):
 
 def _agreement(given):
     """That of the fields among some values, or of the last message since the outermost call began; else None."""
-    layouts = [getattr(plain(leaf), "layout", None) for leaf in leaves(given)]
-    found = next((layout.agreement for layout in layouts if layout is not None), None)
-    return found or (course.last if course.met > course.begun else None)
+    layouts = filter(None, (getattr(plain(leaf), "layout", None) for leaf in leaves(given)))
+    return next((layout.agreement for layout in layouts), course.last if course.met > course.begun else None)
 
 
 BOX.register(DistributedField)

@@ -55,7 +55,7 @@ def distribute(grid, comm=None):
         if comm is None and told == MPI.COMM_WORLD.size == 1:
             return grid
         from sparsedp.parallel.agreement import end_all
-        from sparsedp.parallel.layout import Layout, laid
+        from sparsedp.parallel.layout import laid
     except ImportError as error:
         raise ImportError(
             f"distribute on several processes needs mpi4py and petsc4py ({error}); install them, or start one process"
@@ -68,7 +68,7 @@ def distribute(grid, comm=None):
         )
     if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
         sys.excepthook = end_all
-    return laid(grid, Layout(grid.shape, grid.periodic, MPI.COMM_WORLD if comm is None else comm))
+    return laid(grid, MPI.COMM_WORLD if comm is None else comm)
 
 
 def gather(u):

@@ -1,22 +1,22 @@
 """Layout: what the core asks of a grid whose fields lie on ranks. It calls the methods, and imports nothing here."""
 
-from functools import reduce
-from itertools import accumulate
-from math import prod
-from weakref import WeakKeyDictionary
+from functools import cache, reduce
+from operator import add
 
 import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import field_array
-from sparsedp.parallel.cut import OnBlocks, localized
+from sparsedp.operator import Operator
+from sparsedp.parallel.cut import localized
 from sparsedp.parallel.exchange import hold
 from sparsedp.parallel.fields import DistributedField, block, everywhere
 from sparsedp.parallel.partition import Partition
 from sparsedp.parallel.solve import RanksSystem
 from sparsedp.parallel.transport import Carry
-from sparsedp.structure.base import result_dtype
-from sparsedp.tape import Rule, linear, plain
+from sparsedp.space import Space
+from sparsedp.structure.kronecker import Kronecker, Term
+from sparsedp.tape import plain
 
 __all__ = ["Layout"]
 
@@ -36,7 +36,7 @@ class Layout(Partition):
     def __init__(self, shape, periodic, comm):
         super().__init__(shape, periodic, comm)
         hold(comm)
-        self._cuts: WeakKeyDictionary = WeakKeyDictionary()  # structure of whole fields -> that of blocks
+        self._components = cache(_components)
 
     def __repr__(self):
         return f"on {self.comm.size} ranks"
@@ -48,7 +48,7 @@ class Layout(Partition):
 
     def laid(self, grid):
         """Another grid on the same ranks."""
-        return laid(grid, type(self)(grid.shape, grid.periodic, self.comm))
+        return laid(grid, self.comm)
 
     # ------------------------------------------------------------ operators
 
@@ -59,21 +59,18 @@ class Layout(Partition):
         return self.agreement.agreed(op.name, self._applied, op, u)
 
     def _applied(self, op, u):
-        x, side = self._given(op, u), _side(op.codomain)
-        act = self._cuts.get(op.structure) or localized(op.structure, _side(op.domain), side)
-        if not isinstance(act, OnBlocks):  # which holds what it is made of, and would keep it for ever
-            self._cuts[op.structure] = act
-        y = np.empty(act.shape[0], result_dtype(op.structure, x.dtype))
-        act.apply(x, y)
-        return DistributedField(y, op.codomain) if side else y.reshape(op.codomain.shape)
+        if "_cut" not in vars(op):
+            vars(op)["_cut"] = localized(op.structure, _side(op.domain), _side(op.codomain))
+        y = vars(op)["_cut"].product(self._given(op, u))
+        return DistributedField(y, op.codomain) if op.codomain.layout else y.reshape(op.codomain.shape)
 
     def _given(self, op, u):
-        if isinstance(u, DistributedField):
-            if _side(op.domain) != _side(u.space):
-                raise ShapeError(f"{op.name} takes a field on {op.domain.described}, got one on {u.space.described}")
-            return u.flat if u.dtype.kind in "fc" else u.flat.astype(float)
-        u = field_array(op, u)
-        return block(u, op.domain).flat if op.domain.layout else u.reshape(-1)
+        if not isinstance(u, DistributedField):
+            u = field_array(op, u)
+            return block(u, op.domain).flat if op.domain.layout else u.reshape(-1)
+        if _side(op.domain) != _side(u.space):
+            raise ShapeError(f"{op.name} takes a field on {op.domain.described}, got one on {u.space.described}")
+        return u.flat if u.dtype.kind in "fc" else u.flat.astype(float)
 
     def system(self, op, rtol, maxiter, method="auto", options=None):
         """The system of an operator on ranks, for `inverse`."""
@@ -127,53 +124,28 @@ class Layout(Partition):
 
     def split(self, space, v):
         """Field -> its components, each a field on ranks; differentiable."""
-        if len(space.parts) == 1:
-            return (v,)
-        ends = [0, *accumulate(map(prod, self.shapes(space.parts)))]
-
-        def component(axis, own):
-            def put(g):
-                flat = np.zeros(ends[-1], g.dtype)
-                flat[ends[axis] : ends[axis + 1]] = g.flat
-                return DistributedField(flat, space)
-
-            return linear(
-                f"component of {space.kind}",
-                lambda v: DistributedField(v.flat[ends[axis] : ends[axis + 1]].copy(), own),
-                put,
-            )[0]
-
-        return tuple(component(axis, own)(v) for axis, own in enumerate(_components(space)))
+        return tuple(part(v) for part in self._components(space))
 
     def join(self, space, parts):
         """Components, on ranks or known to all -> one field; differentiable."""
-        own = _components(space)
-        parts = [everywhere(part, one) for part, one in zip(parts, own)]
-
-        def joined(*parts):
-            return DistributedField(np.concatenate([part.flat for part in parts]), space)
-
-        def vjp(nums, ans, *parts):
-            return lambda g: tuple(self.split(space, g)[num] for num in nums)
-
-        def jvp(nums, tangents, ans, *parts):
-            moved = dict(zip(nums, tangents))
-            return rule(*(everywhere(moved.get(num, 0.0), one) for num, one in enumerate(own)))
-
-        rule = Rule("join", joined, vjp, jvp)
-        return rule(*parts)
+        pairs = zip(self._components(space), parts)
+        return reduce(add, (op.T(everywhere(part, op.codomain)) for op, part in pairs))
 
 
-def laid(grid, layout):
-    """Grid -> the same with its fields on ranks."""
+def laid(grid, comm):
+    """Grid -> the same with its fields on the ranks of a communicator."""
     made = object.__new__(type(grid))
-    vars(made).update(grid.__getstate__(), layout=layout)
+    vars(made).update(grid.__getstate__(), layout=Layout(grid.shape, grid.periodic, comm))
     return made
 
 
 def _components(space):
-    """The space of each component of a field."""
-    return [space.component(axis) for axis in range(len(space.parts))]
+    """The operators from a field to each component of it."""
+    same, grid, made = (Term(1.0, (None,) * space.grid.dim),), space.grid, []
+    for number, part in enumerate(space.parts):
+        blocks = Kronecker((part,), space.parts, {(0, number): same})
+        made.append(Operator(blocks, space, Space(part, f"components of {space.kind}", grid), "component"))
+    return made
 
 
 def _side(space):

@@ -7,11 +7,13 @@ beyond 0 and n.
 """
 
 from functools import cached_property
+from itertools import product
 from math import prod
 
 import numpy as np
 
 from sparsedp.parallel.agreement import Agreement
+from sparsedp.structure.kronecker import components
 
 __all__ = ["Partition"]
 
@@ -51,9 +53,7 @@ class Partition:
 
     def lines(self, axis, length):
         """Cuts along one axis of a component with so many entries: cells, nodes, or any other count."""
-        cuts, n, more = self.cuts[axis], self.shape[axis], length - self.shape[axis]
-        inner = cuts[1:-1] + more // 2 if more in (0, 1, 2) else cuts[1:-1] * length // max(n, 1)
-        return np.concatenate([[0], inner, [length]])
+        return np.append(self.cuts[axis][:-1] * length // max(self.shape[axis], 1), length)
 
     @cached_property
     def places(self):
@@ -74,34 +74,37 @@ class Partition:
         """Count of numbers in the blocks of a rank."""
         return sum(map(prod, self.shapes(parts, rank)))
 
+    def blocks(self, whole, parts, rank=None):
+        """What a rank holds of a whole flat field, as views, one for each component."""
+        return [field[slices(self.box(part, rank))] for field, part in zip(components(whole, parts), parts)]
+
     def take(self, values, parts):
         """A whole flat field -> the flat block of this rank, a copy."""
-        found, start = [values[:0]], 0  # where nothing is bounded there are no walls
-        for part in parts:
-            found.append(values[start : start + prod(part)].reshape(part)[slices(self.box(part))].reshape(-1))
-            start += prod(part)
-        return np.concatenate(found)
+        return np.concatenate([values[:0], *(block.reshape(-1) for block in self.blocks(values, parts))])
 
     def gather(self, flat, parts):
         """The flat block of this rank -> the whole flat field, on every rank."""
-        whole = [np.empty(part, flat.dtype) for part in parts]
-        for rank, block in enumerate(self.agreement.gathered(flat)):
-            start = 0
-            for target, part, shape in zip(whole, parts, self.shapes(parts, rank)):
-                target[slices(self.box(part, rank))] = block[start : start + prod(shape)].reshape(shape)
-                start += prod(shape)
-        return np.concatenate([flat[:0], *(target.reshape(-1) for target in whole)])
+        whole = np.empty(sum(map(prod, parts)), flat.dtype)
+        for rank, given in enumerate(self.agreement.gathered(flat)):
+            for block, values in zip(self.blocks(whole, parts, rank), components(given, self.shapes(parts, rank))):
+                block[...] = values
+        return whole
 
-    def owners(self, parts, number, index):
-        """Indices on one component, an array for each axis -> the rank that holds each, and where in its flat block."""
-        starts = np.array([self.size(parts[:number], rank) for rank in range(self.comm.size)])
-        ranks = places = np.zeros((), np.int64)
-        for axis, (i, length) in enumerate(zip(index, parts[number])):
-            cuts, i = self.lines(axis, length), i % max(length, 1)
-            owner = np.searchsorted(cuts, i, side="right") - 1
-            ranks = ranks * self.ranks[axis] + owner
-            places = places * np.diff(cuts)[owner] + (i - cuts[owner])
-        return ranks, places + starts[ranks]
+    def owners(self, parts, entries):
+        """Numbers of entries of a whole flat field -> the rank that holds each, and where in its flat block."""
+        ranks, places = np.zeros((2, entries.size), np.int64)
+        first, starts = 0, np.zeros(self.comm.size, np.int64)
+        for part in parts:
+            here = np.flatnonzero((entries >= first) & (entries < first + prod(part)))
+            rank = place = np.zeros(here.size, np.int64)
+            for axis, i in enumerate(np.unravel_index(entries[here] - first, part)):
+                cuts = self.lines(axis, part[axis])
+                owner = np.searchsorted(cuts, i, side="right") - 1
+                rank = rank * self.ranks[axis] + owner
+                place = place * np.diff(cuts)[owner] + (i - cuts[owner])
+            ranks[here], places[here] = rank, place + starts[rank]
+            first, starts = first + prod(part), starts + [self.size([part], r) for r in range(self.comm.size)]
+        return ranks, places
 
     # ------------------------------------------------------------ numbers that all ranks agree on
 
@@ -131,9 +134,6 @@ def slices(box, origin=None):
 
 def _arrangement(shape, count):
     """So many ranks -> how many along each axis: that which cuts through the fewest cells, the first axes first."""
-    found: list[tuple] = [()]
-    for _ in shape[1:]:
-        found = [(*some, p) for some in found for p in range(1, count + 1) if count % prod((*some, p)) == 0]
-    found = [(*some, count // prod(some)) for some in found]
-    area = lambda ranks: sum((p - 1) * prod(shape) / max(n, 1) for p, n in zip(ranks, shape))
-    return min(sorted(found, reverse=True), key=area)
+    divisors = [p for p in range(count, 0, -1) if count % p == 0]
+    found = [ranks for ranks in product(divisors, repeat=len(shape)) if prod(ranks) == count]
+    return min(found, key=lambda ranks: sum((p - 1) * prod(shape) / max(n, 1) for p, n in zip(ranks, shape)))

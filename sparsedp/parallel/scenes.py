@@ -1,11 +1,7 @@
 """One loss over many scenes: its weighted sum and the derivatives of it, computed by the workers of any executor."""
 
-import os
 import pickle
-from dataclasses import dataclass, field
 from functools import lru_cache
-from hashlib import sha256
-from math import inf
 from typing import Any
 
 import autograd.numpy as anp
@@ -23,7 +19,6 @@ from sparsedp.tree import copied, flatten, leaves, mapped
 __all__ = ["Ensemble", "ensemble"]
 
 KEPT = 128  # scenes and losses that a worker keeps as they were unpacked, with all that they have set up since
-LATEST = 2  # unknowns that a worker keeps: those of this evaluation, and of one that runs at the same time
 
 
 def ensemble(loss, scenes, executor=None, weights=None, chunk=None, progress=False):
@@ -65,9 +60,8 @@ def ensemble(loss, scenes, executor=None, weights=None, chunk=None, progress=Fal
     -----
     Sums are taken in the order of the scenes, within a chunk and over chunks: the bits do not depend on the executor,
     nor on how many workers it has. Loss and scenes are pickled once (by cloudpickle, where that is installed and
-    functions have no name); a worker keeps what it has unpacked, so each sets up a solver once. Bytes are sent as often
-    as there are workers, later only their name; a worker that does not know it asks again. An error has the type that
-    it has here, and names its scene; tasks that have not begun are cancelled.
+    functions have no name), and the bytes go with every task; a worker keeps what it has unpacked, so each sets up a
+    solver once. An error has the type that it has here, and names its scene; tasks that have not begun are cancelled.
 
     Derivatives of second order are right, too; of third order there are none. Only the leaves of x that are traced
     are differentiated. `explain` counts what this process does.
@@ -118,9 +112,7 @@ class Ensemble(Remade):
         self._weights = self._weights.tolist()
         self._given = loss, scenes, executor, self._weights, chunk, progress
         self._chunk, self._executor, self._progress = int(chunk or 1), executor, progress
-        self._pack = _packed if executor is not None else lambda thing: mapped(frozen, thing)
-        self._loss, self._scenes = self._pack(loss), [*map(self._pack, scenes)]
-        self._workers: set[int] = set()  # those that have answered
+        self._loss, *self._scenes = (_packed(x) if executor is not None else mapped(frozen, x) for x in (loss, *scenes))
 
     def recipe(self):
         """The call that makes it again: see recipe.py."""
@@ -142,12 +134,10 @@ class Ensemble(Remade):
         slopes: Any = []
 
         def total(task, values, tangents=None):
-            return self._sum(task, _placed(x, moving, values), moving, tangents, numbers)
+            return self._sum(task, (_placed(x, moving, values), moving, tangents), numbers)
 
         def value(*values):
-            if not values:
-                return total(_value, values)[0]
-            result, *slopes[:] = total(_slopes, values)
+            result, *slopes[:] = total(_slopes if values else _value, values)
             return result
 
         def slopes_at(values):
@@ -176,34 +166,18 @@ class Ensemble(Remade):
         gradient = Rule("ensemble", lambda *values: tuple(total(_slopes, values)[1:]), curved_back, curved)
         return Rule("ensemble", value, back, along)(*(entries[place] for place in moving))
 
-    def _sum(self, task, x, moving, tangents, numbers):
+    def _sum(self, task, point, numbers):
         """What a task returns, added up over scenes in their order."""
-        chunks = [numbers[begin : begin + self._chunk] for begin in range(0, len(numbers), self._chunk)]
-        point, total = self._pack((x, moving, tangents)), None
-
-        def given(chunk, sent=lambda thing: thing):
-            scenes = [(number, self._weights[number], sent(self._scenes[number])) for number in chunk]
-            return task, sent(self._loss), sent(point), scenes, self.count
-
-        def submit(chunk, copies=inf):
-            return self._executor.submit(_answer, *given(chunk, lambda parcel: parcel.sent(copies)))
-
-        futures: list = []
+        chunks = []
+        for begin in range(0, len(numbers), self._chunk):
+            scenes = [(n, self._weights[n], self._scenes[n]) for n in numbers[begin : begin + self._chunk]]
+            chunks.append((task, self._loss, point, scenes, self.count))
+        futures, total = [], None
         try:
             if self._executor is not None:
-                futures += [submit(chunk, len(self._workers) or inf) for chunk in chunks]
+                futures += [self._executor.submit(_of_bytes, *chunk) for chunk in chunks]
             for number in shown_steps(self._progress, range(len(chunks)), "scenes"):
-                if not futures:
-                    part = _sum(*given(chunks[number]))
-                else:
-                    worker, part = futures[number].result()
-                    if part is None:  # it asks for the bytes, as others may by now
-                        for later, future in enumerate(futures[number:], number):
-                            if future.done() and not future.exception() and future.result()[1] is None:
-                                futures[later] = submit(chunks[later])
-                        worker, part = futures[number].result()
-                    self._workers.add(worker)
-                total = _added(total, part)
+                total = _added(total, futures[number].result() if futures else _sum(*chunks[number]))
         finally:
             for future in futures:
                 future.cancel()
@@ -213,19 +187,21 @@ class Ensemble(Remade):
 # ---- in a worker -----------------------------------------------------------------------------------------------------
 
 
-def _answer(task, loss, point, scenes, count):
-    """What `_sum` returns, and who says so; None where this worker lacks bytes."""
-    try:
-        loss, point = _kept(loss), _latest(point)
-        scenes = [(number, weight, _kept(scene)) for number, weight, scene in scenes]
-    except Unknown:
-        return os.getpid(), None
-    return os.getpid(), _sum(task, loss, point, scenes, count)
+@lru_cache(KEPT)
+def _unpacked(data):
+    """What was pickled, read-only; a second time the same, with what it has set up."""
+    return mapped(frozen, pickle.loads(data))
+
+
+def _of_bytes(task, loss, point, scenes, count):
+    """What `_sum` returns of what was packed."""
+    return _sum(task, _unpacked(loss), point, [(n, weight, _unpacked(scene)) for n, weight, scene in scenes], count)
 
 
 def _sum(task, loss, point, scenes, count):
     """What a task returns over some scenes (number, weight, scene), added up in their order."""
     (x, moving, tangents), total = point, None
+    x = mapped(frozen, x)
     values = [leaves(x)[place] for place in moving]
     for number, weight, scene in scenes:
         try:
@@ -267,31 +243,10 @@ def _added(total, parts):
     return parts if total is None else [a + b for a, b in zip(total, parts, strict=True)]
 
 
-# ---- what travels ----------------------------------------------------------------------------------------------------
-
-
-@dataclass(unsafe_hash=True)
-class Parcel:
-    """Something pickled, under a name by which a worker that has it finds it without the bytes."""
-
-    name: str
-    data: bytes | None = field(compare=False)
-    times: int = field(default=0, compare=False)  # it was sent
-
-    def sent(self, copies):
-        """The parcel for one task: so many of them have the bytes in them."""
-        self.times += 1
-        return Parcel(self.name, self.data if self.times <= copies else None)
-
-
-class Unknown(Exception):
-    """A name that this worker has not seen, or has forgotten."""
-
-
 def _packed(thing):
-    """Anything -> its Parcel."""
+    """Anything -> its bytes."""
     try:
-        data = pickle.dumps(thing, 5)
+        return pickle.dumps(thing, 5)
     except Exception as error:
         try:
             import cloudpickle
@@ -300,16 +255,4 @@ def _packed(thing):
                 f"ensemble cannot send {type(thing).__name__} to another process ({error}); write functions as a def "
                 "at the top level of a module, or install cloudpickle"
             ) from error
-        data = cloudpickle.dumps(thing, 5)
-    return Parcel(sha256(data).hexdigest(), data)
-
-
-def _unpacked(parcel):
-    """The thing again, read-only; a second time the same one, with what it has set up."""
-    data, parcel.data = parcel.data, None  # the cache holds the parcel: as a name
-    if data is None:
-        raise Unknown
-    return mapped(frozen, pickle.loads(data))
-
-
-_kept, _latest = lru_cache(KEPT)(_unpacked), lru_cache(LATEST)(_unpacked)
+        return cloudpickle.dumps(thing, 5)

@@ -13,13 +13,12 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 from scipy.sparse.csgraph import connected_components
 
-from sparsedp.parallel.cut import Entries, Rows, between, localized
-from sparsedp.parallel.exchange import Exchange
+from sparsedp.parallel.cut import Rows, localized
 from sparsedp.parallel.fields import DistributedField
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.solve import Engine
 from sparsedp.solvers.system import System
-from sparsedp.structure.lazy import Chain, Diagonal, Sum
+from sparsedp.structure.lazy import Chain, Diagonal, Mask, Sum
 
 __all__ = ["PetscEngine", "RanksSystem"]
 
@@ -31,6 +30,7 @@ HYPRE_3D = {
     "pc_hypre_boomeramg_agg_nl": 1,
     "pc_hypre_boomeramg_strong_threshold": 0.5,
 }
+GAMG = {"ksp_type": "gmres", "pc_type": "gamg", "ksp_pc_side": "right"}
 # On the coarsest level BoomerAMG eliminates, which a singular matrix may end by a pivot of 0.
 HYPRE_SINGULAR = {"pc_hypre_boomeramg_relax_type_coarse": "symmetric-SOR/Jacobi"}
 MOST = 500  # iterations of one call
@@ -40,46 +40,27 @@ TIGHT = 1e-14  # least relative residual that PETSc is asked for; the contract r
 # ---- matrices ----
 
 
-def assembled(structure, given, made):
-    """Structure of whole fields -> PETSc's matrix of it: products are PETSc's own. Sides as for `localized`."""
-    if isinstance(structure, Chain):
-        sides = between(structure.members, given, made)
-        members = zip(structure.members, sides, sides[1:])
-        return reduce(PETSc.Mat.matMult, [assembled(member, right, left) for member, left, right in members])
-    if isinstance(structure, Sum):
-        total = None
-        for member in structure.members:
-            matrix = assembled(member, given, made)
-            if total is not None:
-                matrix.axpy(1.0, total, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-            total = matrix
+def assembled(block, layout):
+    """Structure of blocks -> PETSc's matrix of it: products are PETSc's own."""
+    if isinstance(block, Chain):
+        return reduce(PETSc.Mat.matMult, [assembled(member, layout) for member in block.members])
+    if isinstance(block, Sum):
+        total, *matrices = (assembled(member, layout) for member in block.members)
+        for matrix in matrices:
+            total.axpy(1.0, matrix, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         return total
-    shape = tuple((side[0].size(side[1]), _whole(side)) for side in (made, given))
-    block, numbers = localized(structure, given, made), _numbers(given)
-    if isinstance(block, Diagonal):
-        entries, columns_of = sp.diags_array(block.values, format="csr"), numbers
-    elif isinstance(block, Rows):
-        entries, columns_of = block.entries(), block.exchange.forward(numbers)
-    elif isinstance(block, Entries):
-        entries, columns_of = block.matrix, block.read(numbers)
-    else:
-        raise TypeError(f"{type(structure).__name__} has no matrix on ranks; invert a sum or product of operators")
-    held = (entries.indptr, columns_of[entries.indices], entries.data)
-    indptr, indices = (part.astype(PETSc.IntType) for part in held[:2])
-    return PETSc.Mat().createAIJ(shape, csr=(indptr, indices, held[2]), comm=given[0].comm)
+    entries, rank = block.explicit(), layout.comm.rank
+    # PETSc numbers the entries rank by rank. They are exchanged as floats, exact up to 2^53.
+    columns = sum(layout.agreement.gathered(block.shape[1])[:rank]) + np.arange(block.shape[1], dtype=float)
+    if isinstance(block, Rows):
+        columns = block.read(columns)
+    return _matrix(block.shape, entries.indptr, columns[entries.indices], entries.data, layout)
 
 
-def _whole(side):
-    """Count of numbers of a side, over all ranks."""
-    layout, parts = side
-    return sum(layout.size(parts, rank) for rank in range(layout.comm.size))
-
-
-def _numbers(side):
-    """PETSc's numbers of the entries that this rank holds: rank by rank. As floats, exact up to 2^53."""
-    layout, parts = side
-    sizes = [layout.size(parts, rank) for rank in range(layout.comm.size)]
-    return sum(sizes[: layout.comm.rank]) + np.arange(sizes[layout.comm.rank], dtype=float)
+def _matrix(shape, indptr, columns, data, layout):
+    """PETSc's matrix of the rows of each rank; `shape`: of blocks."""
+    held = indptr.astype(PETSc.IntType), columns.astype(PETSc.IntType), data
+    return PETSc.Mat().createAIJ([(n, None) for n in shape], csr=held, comm=layout.comm)
 
 
 # ---- what the contract asks ----
@@ -111,16 +92,12 @@ class RanksSystem(System):
 
     def total(self, numbers):
         """Sums over all ranks."""
-        return self.layout.sum(numbers)
+        return self.layout.sum(np.asarray(numbers, float))  # of an empty block bincount gives whole numbers
 
     def extremes(self, x):
         """The least and the largest entry."""
         low, high = super().extremes(x)
         return self.layout.min(low), self.layout.max(high)
-
-    def counts(self, labels, weights, count):
-        """Sums of weights over each label."""
-        return self.layout.sum(np.bincount(labels, weights, count).astype(float))
 
     def shaped(self, x, space):
         """The field of a flat block."""
@@ -130,10 +107,6 @@ class RanksSystem(System):
         """The flat array of all entries, on every rank."""
         return self.layout.gather(x, self.parts)
 
-    def number_of_largest(self, x):
-        """Flat number, in the whole field, of the entry of largest magnitude."""
-        return int(np.argmax(abs(self.shaped(x, self.op.domain))))
-
     # products
 
     @cached_property
@@ -141,10 +114,13 @@ class RanksSystem(System):
         """The operator and its transpose on blocks."""
         return tuple(localized(op.structure, self.side, self.side) for op in (self.op, self.op.T))
 
+    @cached_property
+    def _magnitudes(self):
+        return tuple(act.magnitude() for act in self.acts)
+
     def product(self, x, transposed=False):
         """A x or A^T x for the unknowns."""
-        y = self.acts[transposed].product(x)
-        return self.masked(y)
+        return self.masked(self.acts[transposed].product(x))
 
     def residual(self, x, b, transposed=False):
         """(b - A x, its norm; that of x)."""
@@ -154,20 +130,7 @@ class RanksSystem(System):
     @cached_property
     def assembled(self):
         """The operator as PETSc's matrix."""
-        return assembled(self.op.structure, self.side, self.side)
-
-    @cached_property
-    def absolute(self):
-        """Magnitudes of its entries."""
-        indptr, indices, data = self.assembled.getValuesCSR()
-        held = indptr, indices, np.abs(data)
-        return PETSc.Mat().createAIJ(self.assembled.getSizes(), csr=held, comm=self.layout.comm)
-
-    def magnitude(self, x, transposed=False):
-        """|A| x."""
-        y = np.zeros(x.size)
-        (self.absolute.multTranspose if transposed else self.absolute.mult)(self.vector(x), self.vector(y))
-        return y
+        return assembled(self.acts[False], self.layout)
 
     def vector(self, x):
         """A flat block as PETSc's vector, on the same memory."""
@@ -177,29 +140,20 @@ class RanksSystem(System):
     def components(self):
         """(labels, count) of the connected components of the unknowns: those of the blocks, joined across ranks."""
         indptr, indices, data = self.matrix.getValuesCSR()
-        here, first = self.here, int(_numbers(self.side)[0]) if self.here else 0
-        indices = indices.astype(np.int64)
-        mine = (indices >= first) & (indices < first + here)
-        row = np.repeat(np.arange(here), np.diff(indptr))
-        links = mine & (data != 0)
-        graph = sp.coo_array((np.ones(links.sum()), (row[links], indices[links] - first)), shape=(here, here))
-        many, labels = connected_components(graph, directed=False)
+        links = _matrix((self.here,) * 2, indptr, indices, (data != 0).astype(float), self.layout)
+        starts, columns, ones = links.getDiagonalBlock().getValuesCSR()
+        block = sp.csr_array((ones, columns, starts), shape=(self.here,) * 2)
+        block.eliminate_zeros()
+        many, labels = connected_components(block, directed=False)
         counts = self.layout.agreement.gathered(many)
         labels = labels + sum(counts[: self.layout.comm.rank])
-        away, place = np.unique(indices[~mine & (data != 0)], return_inverse=True)
-        whole = self._at_numbers(labels.astype(float), away)[place.reshape(-1)].astype(np.int64)
-        pairs = np.unique(np.stack([labels[row[~mine & (data != 0)]], whole]), axis=1)
-        pairs = np.concatenate(self.layout.agreement.gathered(pairs), axis=1)
+        links.diagonalScale(R=self.vector(labels + 1.0))  # each link by the label of its column: 0 where there is none
+        others = links.getValuesCSR()[2].astype(np.int64)
+        pairs = np.stack([np.repeat(labels, np.diff(indptr)), others - 1])[:, others > 0]
+        pairs = np.concatenate(self.layout.agreement.gathered(np.unique(pairs, axis=1)), axis=1)
         graph = sp.coo_array((np.ones(pairs.shape[1]), tuple(pairs)), shape=(sum(counts),) * 2)
         count, joined = connected_components(graph, directed=False)
         return joined[labels], count
-
-    def _at_numbers(self, x, numbers):
-        """Entries of a flat block field at PETSc's numbers, of any rank."""
-        sizes = np.cumsum([0, *(self.layout.size(self.parts, rank) for rank in range(self.layout.comm.size))])
-        ranks = np.searchsorted(sizes, numbers, side="right") - 1
-        places = numbers - sizes[ranks]
-        return Exchange(self.layout, x.size, ranks.size, [], np.arange(ranks.size), ranks, places).forward(x)
 
     @property
     def entries(self):
@@ -228,39 +182,17 @@ class RanksSystem(System):
         """PETSc's matrix, with a row and a column of the identity, scaled, for what is no unknown."""
         if self.active is None:
             return self.assembled
-        matrix = self.assembled.copy()
-        keep = self.vector(np.where(self.active, 1.0, 0.0))
-        matrix.diagonalScale(keep, keep)
-        matrix.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
-        size = self.largest(self.diagonal) * (self.sign or 1)
-        matrix.setDiagonal(self.vector(np.where(self.active, self.diagonal, size)))
-        return matrix
+        keep, size = Mask(self.active), self.largest(self.diagonal) * (self.sign or 1)
+        rest = Diagonal(np.where(self.active, 0.0, size))
+        return assembled(Sum([Chain([keep, self.acts[False], keep]), rest]), self.layout)
 
 
 class RanksNullSpace(NullSpace):
-    """Null vectors whose blocks lie on ranks; sums are those of the whole."""
+    """Null vectors whose blocks lie on ranks: sums and sizes are those of the system."""
 
-    def __init__(self, system, labels, right, left, count):
-        self.layout, self.size_of, self.side = system.layout, system.size_of, system.side
-        super().__init__(labels, right, left, count)
-
-    def _dots(self, side, values):
-        return self._sums(side * values)
-
-    def _sums(self, values):
-        sums = np.bincount(self.labels + 1, values, self.count + 1)[1:]
-        return self.layout.sum(sums.astype(float))  # of an empty block they are whole numbers
-
-    def projected(self, b, transposed=False, into=None, sums=None):
-        """As in `NullSpace`."""
-        b, _ = super().projected(b, transposed, into, sums)
-        return b, self.size_of(b)
-
-    def cells(self, number):
-        """Numbers, in the whole field, of the unknowns of one component."""
-        layout, parts = self.side
-        mine = layout.take(np.arange(sum(map(np.prod, parts))), parts)[self.labels == number]
-        return np.sort(np.concatenate(layout.agreement.gathered(mine)))
+    def __init__(self, system, *given):
+        self.total, self.whole, self.size_of = system.total, system.whole, system.size_of
+        super().__init__(*given)
 
 
 # ---- the engine ----
@@ -277,32 +209,27 @@ class PetscEngine(Engine):
     def __init__(self, system):
         comm, w = system.layout.comm, system.weights
         PETSc.garbage_cleanup(comm)  # what Python has dropped is freed here, on all ranks together
-        self.system, self.sign = system, -1.0 if system.sign < 0 else 1.0
-        self.rows = None if w is None or np.isscalar(w) else w
+        self.system, sign = system, -1.0 if system.sign < 0 else 1.0
+        self.rows = np.full(system.here, sign) * (1.0 if w is None else w)  # by these the matrix is positive
         matrix = system.matrix.copy()
-        if self.rows is not None:
-            matrix.diagonalScale(L=system.vector(self.rows.copy()))
-        matrix.scale(self.sign)
-        space = system.null_space
+        matrix.diagonalScale(L=system.vector(self.rows))
+        space, symmetric = system.null_space, w is not None
         if space.count:
-            sides = [space.right, space.right if w is not None else space.left]
+            sides = [space.right, space.right if symmetric else space.left]
             for vectors, attach in zip(sides, (matrix.setNullSpace, matrix.setTransposeNullSpace)):
                 found = [np.where(space.labels == k, vectors, 0.0) for k in range(space.count)]
                 found = [system.vector(v / system.size_of(v)) for v in found]
                 attach(PETSc.NullSpace().create(vectors=found, comm=comm))
-        self.ksp = ksp = PETSc.KSP().create(comm)
-        ksp.setOptionsPrefix("sparsedp_")
-        ksp.setOperators(matrix)
-        ksp.setType("cg" if w is not None else "gmres")
-        ksp.getPC().setType("hypre" if w is not None else "gamg")
-        if w is None:
-            ksp.setPCSide(PETSc.PC.Side.RIGHT)
-        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-        chosen = HYPRE_3D if w is not None and len(system.parts[0]) == 3 else {}
-        chosen = chosen | HYPRE_SINGULAR if space.count else chosen
+        chosen: dict = {"ksp_type": "cg", "pc_type": "hypre"} if symmetric else GAMG
+        chosen = chosen | (HYPRE_3D if symmetric and len(system.parts[0]) == 3 else {})
+        chosen = chosen | (HYPRE_SINGULAR if space.count else {})
         options = PETSc.Options("sparsedp_")
         for name, value in chosen.items():
             options[name] = value
+        self.ksp = ksp = PETSc.KSP().create(comm)
+        ksp.setOptionsPrefix("sparsedp_")
+        ksp.setOperators(matrix)
+        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         ksp.setFromOptions()
         for name in chosen:  # there is one table of options for the whole process
             options.delValue(name)
@@ -314,11 +241,12 @@ class PetscEngine(Engine):
         system, reasons = self.system, PETSc.KSP.ConvergedReason
         rtol = max(0.5 * goal / (system.size_of(b) or 1.0), TIGHT)
         self.ksp.setTolerances(rtol=rtol, atol=0.0, divtol=1e8, max_it=system.maxiter or MOST)
-        weighed = self.sign * (b if self.rows is None or transposed else self.rows * b)
-        x, turned = np.zeros(b.size), transposed and system.weights is None
+        x, act = np.zeros(b.size), self.ksp.solve
+        if transposed and system.weights is None:
+            act = self.ksp.solveTranspose
         system.layout.agreement.meet("solve by PETSc")
-        (self.ksp.solveTranspose if turned else self.ksp.solve)(system.vector(weighed), system.vector(x))
-        if self.rows is not None and transposed:
+        act(system.vector(b.copy() if transposed else self.rows * b), system.vector(x))
+        if transposed:
             x *= self.rows
         reason = self.ksp.getConvergedReason()
         words = {reasons.DIVERGED_MAX_IT: "max_iterations", reasons.DIVERGED_DTOL: "diverged"}

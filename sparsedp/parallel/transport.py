@@ -3,14 +3,13 @@
     u' = C s(H u, H v, dt, inflow),     H: widen the blocks,     s: the step, unchanged,     C: keep the own block.
 
 C^T puts zeros around a block. H^T sends what stands beyond it back to whom it belongs, where it is added. A number goes
-to all ranks as it is, and what comes back is the sum over them. So every derivative of a step, of whatever order, is
-one of s between these maps: the tape of a program sees fields on ranks alone, the same on every rank. Where a
-block ends at another one the widened grid has a wall that is not there; what that changes C leaves out.
+to all ranks as it is, and what comes back is the sum over them. These maps are rules, and so is s: derivatives of every
+order follow. A step is one node of the tape, which sees fields on ranks alone, the same on every rank. Where a block
+ends at another one the widened grid has a wall that is not there; what that changes C leaves out.
 """
 
 from functools import cache, partial
-from math import floor, isfinite
-from typing import Any, NamedTuple
+from math import floor, isfinite, prod
 
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
@@ -20,14 +19,13 @@ from sparsedp.advection.law import wall_space
 from sparsedp.advection.stability import check_numbers, check_weights
 from sparsedp.advection.values import check_given, check_step
 from sparsedp.boundary_conditions import neumann
-from sparsedp.derivative import forward, linearised, zero_like
 from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.grid import Grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.parallel.exchange import of_boxes
 from sparsedp.parallel.fields import DistributedField, block
 from sparsedp.space import Space, components
-from sparsedp.tape import Rule, isbox, plain
+from sparsedp.tape import Rule, isbox, linear, plain
 
 __all__ = ["Carry"]
 
@@ -84,8 +82,9 @@ class Carry:
         setting, law = self.setting, wide.move.law
         check_numbers(setting, block(u, setting.space), block(v, wide.velocity), block(inflow, self.walls))
         if setting.scheme in SCHEMES:
-            rate = self.layout.agreement.agreed("transport", law.reference.rate, wide.ins[1].into(v).reshape(-1))
-            check_weights(setting, dt, wide.outs.out(rate), law.scheme.most)
+            v = wide.ins[1][0].forward(v).reshape(-1)
+            rate = self.layout.agreement.agreed("transport", law.reference.rate, v)
+            check_weights(setting, dt, wide.crop[0].forward(rate), law.scheme.most)
 
 
 def velocity_space(setting, shape):
@@ -99,36 +98,40 @@ class Block:
 
     def __init__(self, setting, width, shape, inflows, unstable):
         grid, layout = setting.grid, setting.grid.layout
-        spans, around, sides = [], [], []
+        spans, sides = [], []
         for (a, b), n, pair in zip(layout.box(grid.shape), grid.shape, setting.sides, strict=True):
-            whole = pair is None and b - a + 2 * width >= n  # a whole period
-            span = (a - width, b + width) if pair is None else (max(a - width, 0), min(b + width, n))
-            spans.append((0, n) if whole else span)
-            around.append(whole)
-            ends = zip(pair or (neumann, neumann), (span[0] == 0, span[1] == n))
-            sides.append(None if whole else tuple(condition if at else neumann for condition, at in ends))
+            low, high = a - width, b + width
+            if pair is None:
+                whole = high - low >= n  # a period
+                spans.append((0, n) if whole else (low, high))
+                sides.append(None if whole else (neumann, neumann))
+            else:
+                spans.append((max(low, 0), min(high, n)))
+                sides.append((pair[0] if low <= 0 else neumann, pair[1] if high >= n else neumann))
         index = [np.arange(*span) % max(n, 1) for span, n in zip(spans, grid.shape)]
-        local = Grid([i.size for i in index], spacing=[h[i] for h, i in zip(grid.widths, index)], periodic=around)
+        widths, around = [h[i] for h, i in zip(grid.widths, index)], [side is None for side in sides]
+        local = Grid([i.size for i in index], spacing=widths, periodic=around)
         solid = None if setting.solid is None else setting.solid[np.ix_(*index)]
         here = setting._replace(grid=local, sides=tuple(sides), solid=solid, unstable=unstable)
         self.move, self.velocity = layout.agreement.agreed("transport", Transport, here), velocity_space(setting, shape)
 
-        def way(space, wide):
+        def wider(space, wide):
             return widened(space, [[(a, a + n) for (a, _), n in zip(spans, part)] for part in wide.parts], wide.shape)
 
-        number = Way(lambda x: x, layout.sum)
-        carried, exchange = way(setting.space, here.space)
-        speed, _ = way(self.velocity, velocity_space(here, shape[: -grid.dim] + local.shape))
-        self.ins = [carried, speed, number, _inflow(setting, self.move, spans) if inflows else number]
-        self.outs = Way(
-            lambda g: exchange.placed(block(g, setting.space).flat).reshape(here.space.shape),
+        number = linear("number", lambda x: x, layout.sum)
+        field, exchange = wider(setting.space, here.space)
+        speed, _ = wider(self.velocity, velocity_space(here, shape[: -grid.dim] + local.shape))
+        self.ins = [field, speed, number, _inflow(setting, self.move, spans) if inflows else number]
+        self.crop = linear(
+            "block",
             lambda x: DistributedField(exchange.taken(x.reshape(-1)), setting.space),
+            lambda g: exchange.placed(block(g, setting.space).flat).reshape(here.space.shape),
         )
-        self.rule = on_blocks(layout, self.move._rule, self.ins, self.outs)
+        self.rule = on_blocks(layout.agreement, self.move._rule, self.ins, self.crop)
 
 
 def _inflow(setting, move, spans):
-    """The Way of inflow values: a wall of the widened grid gets what is given there, zeros where there is none."""
+    """The rules of inflow values: a wall of the widened grid gets what is given there, zeros where there is none."""
     boxes, places = [], [np.zeros(0, int)]
     numbers = iter(components(np.arange(move.walls.size), move.walls.parts))
     for part in move.space.parts:
@@ -145,31 +148,27 @@ def _inflow(setting, move, spans):
 # ---- between fields and what a rank works on ----
 
 
-class Way(NamedTuple):
-    """A linear map from what the user has to what a rank works on, and its transpose, which leads back."""
-
-    into: Any
-    out: Any
-
-
 def widened(space, boxes, shape, places=None):
-    """(Way, Exchange) from the blocks of a field to boxes around them, at some places of an array of this shape."""
+    """The rules from the blocks of a field to boxes around them, at some places of an array of this shape; an Exchange.
+
+    Those that lead there and back.
+    """
     exchange = of_boxes(space.layout, space.parts, boxes)
 
-    def into(x):
+    def wide(x):
         flat = block(x, space).flat
-        wide = exchange.forward(flat if flat.dtype.kind == "f" else flat.astype(float))
+        read = exchange.forward(flat if flat.dtype.kind == "f" else flat.astype(float))
         if places is not None:
-            read, wide = wide, np.zeros(shape, wide.dtype)
-            wide[places] = read
-        wide.flags.writeable = False
-        return wide.reshape(shape)
+            read, inner = np.zeros(prod(shape), read.dtype), read
+            read[places] = inner
+        read.flags.writeable = False
+        return read.reshape(shape)
 
-    def out(g):
+    def back(g):
         read = np.ascontiguousarray(g, dtype=float).reshape(-1)
         return DistributedField(exchange.backward(read if places is None else read[places]), space)
 
-    return Way(last(into), out), exchange
+    return linear("widened", last(wide), back), exchange
 
 
 def last(act):
@@ -184,57 +183,39 @@ def last(act):
     return known
 
 
-# ---- derivatives ----
-
-
-def on_blocks(layout, act, ins, outs):
-    """A Rule, or a function, of what a rank works on -> the Rule of what the user has.
+def on_blocks(agreement, local, ins, crop):
+    """The Rule of what a rank works on -> that of fields on ranks. Its derivatives are made of rules, to any order.
 
     Parameters
     ----------
-    act : callable
-        Of as many arguments as `ins`.
-    ins : list of Way
-    outs : Way, or list of Way where `act` gives a list
+    local : Rule
+    ins : list of pairs of Rules
+        What leads to each argument of it, and back; linear.
+    crop : pair of Rules
+        What leads from its result, and back.
     """
-    many = isinstance(outs, list)
 
-    def run(*args):
-        wide = [way.into(arg) for way, arg in zip(ins, args, strict=True)]
-        found = layout.agreement.agreed("transport", getattr(act, "forward", act), *wide)
-        return tuple(way.out(x) for way, x in zip(outs, found)) if many else outs.out(found)
+    def run(rule, x):
+        return rule(x) if isbox(x) else rule.forward(x)
+
+    def wide(numbers, values):
+        return [run(ins[num][0], value) for num, value in zip(numbers, values, strict=True)]
+
+    def forward(*args):
+        given = wide(range(len(ins)), args)
+        return crop[0].forward(agreement.agreed(local.name, local.forward, *given, at_once=True))
 
     def vjp(nums, ans, *args):
-        ways = outs if many else [outs]
-        rule = on_blocks(layout, partial(_back, act, nums, len(ways)), [*ways, *ins], [ins[num] for num in nums])
-
         def pull(g):
-            both = *((g[k] for k in range(len(ways))) if many else [g]), *args
-            backs = rule(*both) if any(map(isbox, both)) else rule.forward(*both)
-            return [backs[k] for k in range(len(nums))]
+            given, g = wide(range(len(ins)), args), run(crop[1], g)
+            backs = agreement.agreed(local.name, lambda: local.vjp(nums, None, *given)(g))
+            return [run(ins[num][1], back) for num, back in zip(nums, backs, strict=True)]
 
         return pull
 
     def jvp(nums, tangents, ans, *args):
-        rule = on_blocks(layout, partial(_ahead, act, nums), [*(ins[num] for num in nums), *ins], outs)
-        return rule(*tangents, *args)
+        given = wide(range(len(ins)), args)
+        tangent = agreement.agreed(local.name, local.jvp, nums, wide(nums, tangents), given[0], *given)
+        return run(crop[0], tangent)
 
-    return Rule(getattr(act, "name", "a derivative of transport"), run, vjp, jvp)
-
-
-def _back(act, nums, count, *both):
-    """Cotangents of the results of a function, so many, and its arguments -> cotangents of the arguments `nums`."""
-    g, args = both[:count], both[count:]
-    if isinstance(act, Rule):
-        return act.vjp(nums, None, *args)(*g)
-    backs = linearised(lambda args: act(*args), args, [num in nums for num in range(len(args))])[2](g)
-    return [zero_like(args[num]) if backs[num] is None else backs[num] for num in nums]
-
-
-def _ahead(act, nums, *both):
-    """Tangents of the arguments `nums` of a function, and its arguments -> the tangent of its result."""
-    tangents, args = both[: len(nums)], both[len(nums) :]
-    if isinstance(act, Rule):
-        return act.jvp(nums, tangents, args[0], *args)
-    along = dict(zip(nums, tangents, strict=True))
-    return forward(lambda args: act(*args), args, [along.get(num) for num in range(len(args))])[1]
+    return Rule(local.name, forward, vjp, jvp)

@@ -33,6 +33,9 @@ class NullSpace:
     count : int
     """
 
+    total = whole = staticmethod(lambda numbers: numbers)  # on ranks, these are of all of them
+    size_of = staticmethod(norm)
+
     def __init__(self, labels, right, left, count):
         self.labels, self.count = labels, count
         self.right, self.left = right, left
@@ -44,14 +47,14 @@ class NullSpace:
         if self.count != 1:
             return self._sums(side * values)
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
-            return np.array([dot(side, values) if np.ndim(side) else side * values.sum()])
+            return self.total(np.array([dot(side, values) if np.ndim(side) else side * values.sum()]))
 
     def _sums(self, values):
         if self.labels is None:
             return np.array([values.sum()])
         if values.dtype.kind == "c":  # bincount is real
             return self._sums(values.real) + 1j * self._sums(values.imag)
-        return np.bincount(self.labels + 1, values, self.count + 1)[1:]
+        return self.total(np.bincount(self.labels + 1, values, self.count + 1)[1:])
 
     def sums(self, b, transposed=False):
         """l.b on each component."""
@@ -70,7 +73,7 @@ class NullSpace:
         part = self._sides[transposed] * (shares[0] if self.count == 1 else np.append(shares, 0.0)[self.labels])
         with np.errstate(over="ignore", invalid="ignore"):
             b = np.subtract(b, part, out=into)
-        return b, norm(b)
+        return b, self.size_of(b)
 
     def defect(self, b, sums, size, floor, transposed=False):
         """The largest |l.b| / (|l| |b|) over the components, and the number of that component.
@@ -91,7 +94,7 @@ class NullSpace:
 
     def cells(self, number):
         """Indices of the unknowns of one component."""
-        return np.arange(self.right.size) if self.labels is None else np.flatnonzero(self.labels == number)
+        return np.arange(self.right.size) if self.labels is None else np.flatnonzero(self.whole(self.labels) == number)
 
     def anchors(self):
         """One unknown for each component, where it can be pinned: the largest |l r|."""

@@ -56,7 +56,7 @@ class System:
             self.exponent = int(np.clip(exponent, -1000, 1000))
             self.op = op * 2.0**-self.exponent
             _check_underflow(op, self.op)
-            for name in ("_magnitudes", "sums", "norms", "faces", "assembled", "absolute"):
+            for name in ("_magnitudes", "sums", "norms", "faces", "acts"):
                 self.__dict__.pop(name, None)
 
     # ------------------------------------------------------------ products
@@ -119,11 +119,11 @@ class System:
 
     def number_of_largest(self, x):
         """Flat number of the entry of largest magnitude."""
-        return int(np.argmax(np.abs(x)))
+        return int(np.argmax(np.abs(self.shaped(x, self.op.domain))))
 
     def counts(self, labels, weights, count):
         """Sums of weights over each label; None: how often it is there."""
-        return np.bincount(labels, weights, count)
+        return self.total(np.bincount(labels, weights, count))
 
     @cached_property
     def _magnitudes(self):

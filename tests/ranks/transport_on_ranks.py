@@ -172,9 +172,16 @@ def refusals_are_those_of_one_process():
     ]:
         one, move = (dp.transport(some, scheme, dp.dirichlet) for some in (road, dp.distribute(road, COMM)))
         assert told_by(lambda args=args, move=move: move(*args)) == told_by(lambda args=args, one=one: one(*args))
+    acts = [lambda act=act: dp.rollout(lambda u, v: act(u, v, 0.4), u, fast, 3) for act in (move, one)]
+    assert told_by(acts[0]) == told_by(acts[1])  # within a call that ranks make together
     grid, v = dp.distribute(LINE, COMM), v[1:]
     one, move = (dp.transport(some, "upwind", of="faces") for some in (LINE, grid))
     close(move(u, v, 0.45), one(u, v, 0.45), 1e-15)  # half a cell at the end of a block would be too small
+    for fast in range(13):  # at the end of one block alone
+        v = np.where(np.arange(13) == fast, 1.0, 0.05)
+        end = lambda u, move, v=v: dp.rollout(lambda u, v: move(u, v, 0.45), u, v, 3)
+        slopes = [dp.grad(lambda u, act=act: anp.sum(end(u, act) ** 2))(u) for act in (move, one)]
+        close(*slopes, 1e-14)
     one, move = (dp.transport(some, "van_leer") for some in (LINE, grid))
     twice = [lambda f=f: dp.hvp(lambda u: anp.sum(f(u, v, 0.1) ** 3), u, u) for f in (one, move)]
     assert told_by(twice[0]) == told_by(twice[1])
