@@ -8,7 +8,7 @@ import sparsedp as dp
 from sparsedp import kernels
 from sparsedp.derivative import pullback, pushforward
 from sparsedp.errors import DerivativeError
-from sparsedp.kernels import gather, team
+from sparsedp.kernels import departure_samples, team
 
 NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
 SCHEMES = [
@@ -147,7 +147,7 @@ def test_second_derivatives(without_numba):
 def test_loops_against_the_matrix_and_nothing_is_read_beside_the_samples(shape, interpolation):
     """Departure points far out on all sides and at the points; what lies around the samples is NaN."""
     periodic = (False, True, False)[: len(shape)]
-    points, rng = gather.Points.of(shape, periodic, interpolation), np.random.default_rng(1)
+    points, rng = departure_samples.Points.of(shape, periodic, interpolation), np.random.default_rng(1)
     n, scale = points.size, np.array([1.0, 0.5, 2.0])[: len(shape)]
     samples = np.full(points.samples + 200, np.nan)[100:-100]
     samples[:] = rng.standard_normal(points.samples)
@@ -158,17 +158,17 @@ def test_loops_against_the_matrix_and_nothing_is_read_beside_the_samples(shape, 
     ]:
         value, slope = _dense(points, w, scale), [_dense(points, w, scale, axis) for axis in axes]
         close = dict(rtol=1e-13, atol=1e-13)
-        found = gather.interpolate(points, samples, w, scale, np.empty(n))
+        found = departure_samples.interpolate(points, samples, w, scale, np.empty(n))
         np.testing.assert_allclose(found, value @ samples, **close)
-        back = gather.scatter(points, w, scale, g, np.zeros(points.samples))
+        back = departure_samples.scatter(points, w, scale, g, np.zeros(points.samples))
         np.testing.assert_allclose(back, value.T @ g, **close)
-        steep = gather.interpolate(points, samples, w, scale, np.empty(w.shape), g)
+        steep = departure_samples.interpolate(points, samples, w, scale, np.empty(w.shape), g)
         for axis in axes:
             np.testing.assert_allclose(steep[axis], -scale[axis] * g * (slope[axis] @ samples), **close)
         low, high = bounds = np.empty((2, n))
-        gather.interpolate(points, samples, w, scale, np.empty(n), bounds=bounds)
+        departure_samples.interpolate(points, samples, w, scale, np.empty(n), bounds=bounds)
         assert np.isfinite([low, high]).all() and (low <= high).all()
-        corners, *shares = gather.bound_shares(points, samples, w, scale, np.arange(n))
+        corners, *shares = departure_samples.bound_shares(points, samples, w, scale, np.arange(n))
         for share, bound in zip(shares, (low, high)):
             np.testing.assert_array_equal(np.sum(share * samples[corners], axis=0), bound)
 
@@ -176,7 +176,7 @@ def test_loops_against_the_matrix_and_nothing_is_read_beside_the_samples(shape, 
 def _dense(points, w, scale, along=None):
     """The matrix of the interpolation, or of its slope."""
     found = np.zeros((points.size, points.samples))
-    for index, weight in gather.entries(points, w, scale, along):
+    for index, weight in departure_samples.entries(points, w, scale, along):
         np.add.at(found, (np.arange(points.size), index), weight)
     return found
 

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 
 from sparsedp.advection.law import wall_space
 from sparsedp.boundary_conditions import dirichlet
-from sparsedp.kernels.gather import PAD
+from sparsedp.kernels.departure_samples import PAD
 from sparsedp.operators.stencils import cell_beside
 
 __all__ = ["filling", "ghost_origins"]

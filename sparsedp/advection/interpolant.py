@@ -8,8 +8,8 @@ import scipy.sparse as sp
 from sparsedp import results
 from sparsedp.advection.ghost_cells import filling, ghost_origins
 from sparsedp.advection.index_coordinates import Coordinates
-from sparsedp.kernels import gather
-from sparsedp.kernels.gather import PAD
+from sparsedp.kernels import departure_samples
+from sparsedp.kernels.departure_samples import PAD
 
 __all__ = ["Interpolant", "Pass"]
 
@@ -28,7 +28,7 @@ class Interpolant:
     def __init__(self, setting, number, closed=False):
         interpolation = "linear" if closed else setting.interpolation
         self.setting, self.span = setting, slice(*setting.space.offsets[number : number + 2])
-        self.points = gather.Points.of(setting.space.parts[number], setting.grid.periodic, interpolation)
+        self.points = departure_samples.Points.of(setting.space.parts[number], setting.grid.periodic, interpolation)
         self.inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
         self.ghosts, self.origins = ghost_origins(setting, number, self.points, closed)
         self.coordinates = Coordinates(setting, number, interpolation)
@@ -69,10 +69,10 @@ class Pass:
         fill = self.component.fill
         return self.component.pad(self.u if fill is None else fill[0] @ self.u, self.inflow)
 
-    def value(self, out=None, bounds=gather.NO_BOUNDS):
+    def value(self, out=None, bounds=departure_samples.NO_BOUNDS):
         """Values at the departure points; least and greatest sample of the cells around them -> bounds."""
         out = results.empty((self.points.size,), float) if out is None else out
-        return gather.interpolate(self.points, self.samples, *self.departure, out, bounds=bounds)
+        return departure_samples.interpolate(self.points, self.samples, *self.departure, out, bounds=bounds)
 
     def vjp(self, g, into, of_w, clamped=None):
         """Cotangent of the values -> that of u is written, that of inflow added to the pair `into`.
@@ -84,7 +84,7 @@ class Pass:
             samples[:] = 0.0
             if clamped is not None:
                 np.add.at(samples, *clamped)
-            self.component.pad_vjp(gather.scatter(self.points, *self.departure, g, samples), *into)
+            self.component.pad_vjp(departure_samples.scatter(self.points, *self.departure, g, samples), *into)
             if self.component.fill is not None:
                 into[0][:] = self.component.fill[1] @ into[0]
         if of_w is not None:
@@ -94,12 +94,14 @@ class Pass:
         """g times the derivative of the values in the velocity all along the trajectory -> out (axis, point)."""
         (displacement, scale), sides = self.departure, self.trajectory.sides
         if not len(sides):
-            return gather.interpolate(self.points, self.samples, displacement, scale, out, g)
+            return departure_samples.interpolate(self.points, self.samples, displacement, scale, out, g)
         nudge = 32 * np.finfo(float).eps * max(self.points.shape) * (sides[0] != sides[-1])  # to the side that is meant
         total = 0.0
         for slope, shift in zip(sides, (-nudge, nudge)):
             found = results.empty(out.shape, float)
-            total += slope * gather.interpolate(self.points, self.samples, displacement + shift, scale, found, g)
+            total += slope * departure_samples.interpolate(
+                self.points, self.samples, displacement + shift, scale, found, g
+            )
         return np.divide(total, len(sides), out=out)
 
     def jvp(self, du, dinflow, dw):
@@ -113,7 +115,7 @@ class Pass:
         """The values as a csr_array in u, without what flows in."""
         n, fill = self.points.size, self.component.fill
         sources = self.component.pad(np.arange(n), np.full(self.inflow.size, n)).astype(int)  # n: inflow
-        entries = gather.entries(self.points, *self.departure)
+        entries = departure_samples.entries(self.points, *self.departure)
         columns = (sp.csr_array((weight, sources[index], np.arange(n + 1)), (n, n + 1)) for index, weight in entries)
         moved = sum(columns)[:, :n]
         return moved if fill is None else moved @ fill[0]

@@ -17,7 +17,7 @@ import numpy as np
 from sparsedp import results
 from sparsedp.advection.interpolant import Pass
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
-from sparsedp.kernels import gather
+from sparsedp.kernels import departure_samples
 
 __all__ = ["MacCormack"]
 
@@ -27,7 +27,7 @@ class Corrected:
 
     def __init__(self, back, ahead, u, inflow):
         self.first, self.clamp = Pass(back, u, inflow), back.component.setting.clamp
-        self.bounds = results.empty((2, u.size), float) if self.clamp else gather.NO_BOUNDS
+        self.bounds = results.empty((2, u.size), float) if self.clamp else departure_samples.NO_BOUNDS
         f = self.first.value(bounds=self.bounds)
         self.second = Pass(ahead, f, inflow)
         self.new = self.second.value()  # what comes back, and then the new value before it is clamped
@@ -41,7 +41,7 @@ class Corrected:
         some = np.flatnonzero((new <= self.bounds[0]) | (new >= self.bounds[1]))
         (low, high), value = self.bounds[:, some], new[some]
         below, above = np.heaviside(low - value, 0.5), np.heaviside(value - high, 0.5)
-        index, least, greatest = gather.bound_shares(first.points, first.samples, *first.departure, some)
+        index, least, greatest = departure_samples.bound_shares(first.points, first.samples, *first.departure, some)
         return some, 1.0 - below - above, index, least * below + greatest * above
 
     def value(self, out):

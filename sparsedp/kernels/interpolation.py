@@ -1,7 +1,7 @@
 """Compiled loops of semi-Lagrangian transport: interpolation at departure points, its slope and its transpose.
 
 The departure point of the point (i, j, k) is (i, j, k) - scale w, in index coordinates. A field is known with ghost
-cells around it, as the flat array `samples`; `axes` and `tables` are those of `gather.Points`.
+cells around it, as the flat array `samples`; `axes` and `tables` are those of `departure_samples.Points`.
 
 The loops work on TILE points at a time, counted by `start` and `stop`: what belongs to a tile stays in the L1 cache,
 and every inner loop runs over it, for one axis or one sample of the stencil. So the same loops serve 1-D to 3-D, linear
@@ -11,7 +11,7 @@ and cubic interpolation. Indices are unsigned, for a signed one would be tested 
 import numpy as np
 from numba import njit
 
-from sparsedp.kernels.gather import PAD, TILE
+from sparsedp.kernels.departure_samples import PAD, TILE
 from sparsedp.kernels.team import INNER, kernel
 
 __all__ = ["interpolate", "scatter"]
