@@ -528,6 +528,12 @@ BUGS = {
         "",
         "tests/test_report_tables.py",
     ),
+    "rates that go to fields by their place": Bug(
+        "integrators", "[found[place] for place in wanted]", "[*found.values()]", "tests/test_integrators_fields.py"
+    ),
+    "lengths of complex vectors without a conjugate": Bug(
+        "solvers", "return np.vdot(x, x).real", "return abs(x @ x)", "tests/test_elliptic_complex.py"
+    ),
     **{name: Bug("parallel", *lines, on_ranks=True) for name, lines in BUGS_ON_RANKS.items()},
 }
 
