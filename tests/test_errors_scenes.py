@@ -359,6 +359,11 @@ TABLE = [
         TYPE,
         "admm with a function as inner does not use bounds; leave them out, or keep to them in inner",
     ),
+    (
+        lambda: dp.vjp(dp.projection(BOX).pressure, np.zeros(40))[1](np.where(np.eye(4) > 0, np.nan, 1.0)),
+        dp.errors.NonFiniteError,
+        "pressure solve takes finite numbers, got 4 that are NaN or infinite, the first at (0, 0)",
+    ),
 ]
 
 

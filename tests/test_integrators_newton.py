@@ -184,6 +184,8 @@ def test_dense_factors_solve_and_know_when_they_cannot():
     beyond = (2.0**900 * A, 2.0**-900 * A)  # for these the general path scales
     for matrix in (np.zeros((3, 3)), np.ones((3, 3)), np.diag([1.0, 1e-14]), *beyond):
         assert dense(matrix) is None
+    with pytest.raises(NonFiniteError, match=r"^matrix needs finite entries, got 1 .* the first at \(1, 1\)"):
+        dense(np.diag([1.0, np.nan]))
 
 
 # ---- grids ----------------------------------------------------------------------------------------------------------
