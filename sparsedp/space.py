@@ -88,7 +88,34 @@ class Space(Value, Uncached):
         return volumes
 
     def component(self, axis):
-        """The space of one component of faces or edges, such as x-faces: see node_axes in grid.py."""
+        """The space of one component of faces or edges, such as x-faces.
+
+        Parameters
+        ----------
+        axis : int or "x", "y", "z"
+
+        Returns
+        -------
+        Space
+            Its fields have the shape `parts[axis]`, as those that `split` gives.
+
+        Raises
+        ------
+        TypeError
+            If the space is not that of faces or edges of a grid.
+        ValueError
+            If the grid has no such axis.
+
+        Examples
+        --------
+        >>> from sparsedp import Grid
+        >>> space = Grid((4, 3)).faces.component("x")
+        >>> space.kind, space.shape
+        ('x-faces', (5, 3))
+        """
+        if self.kind not in ("faces", "edges"):
+            raise TypeError(f"component takes faces or edges of a grid, got {self}; write grid.faces.component(0)")
+        axis = self.grid.axis(axis)
         return Space(self.parts[axis], f"{self.grid.axes[axis]}-{self.kind}", self.grid)
 
     def split(self, v):

@@ -104,6 +104,21 @@ TABLE = [
         SHAPE,
         "join on faces(2, 2) needs components ((3, 2), (2, 3)), got one of shape (7,)",
     ),
+    (
+        lambda: dp.Space(7).component(0),
+        TYPE,
+        "component takes faces or edges of a grid, got space(7); write grid.faces.component(0)",
+    ),
+    (
+        lambda: BOX.cells.component(0),
+        TYPE,
+        "component takes faces or edges of a grid, got cells(2, 2); write grid.faces.component(0)",
+    ),
+    (
+        lambda: BOX.faces.component(2),
+        VALUE,
+        "Grid(2 x 2 cells, size 2 x 2) has axes 0 to 1, got 2; write a number or a name of x, y",
+    ),
     (lambda: dp.Space(-1), SHAPE, "a space needs whole lengths >= 0, got -1; write Space(7) or Space((2, 3))"),
     (
         lambda: dp.Space(2.5),
