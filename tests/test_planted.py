@@ -522,17 +522,15 @@ BUGS = {
         'return PASSED, 0.0, "the gradient is 0"',
         "tests/test_stress.py::test_a_wrong_gradient_and_a_swallowed_nan_fail",
     ),
-    "a table that leaves a bar in a cell": Bug(
-        "check",
-        '.replace("|", "\\\\|")',
-        "",
-        "tests/test_report_tables.py",
-    ),
+    "a table that leaves a bar in a cell": Bug("check", '.replace("|", "\\\\|")', "", "tests/test_report_tables.py"),
     "rates that go to fields by their place": Bug(
         "integrators", "[found[place] for place in wanted]", "[*found.values()]", "tests/test_integrators_fields.py"
     ),
     "lengths of complex vectors without a conjugate": Bug(
         "solvers", "return np.vdot(x, x).real", "return abs(x @ x)", "tests/test_elliptic_complex.py"
+    ),
+    "conjugate gradients in an inner product without volumes": Bug(
+        "solvers", "x if uniform else measure * x", "x", "tests/test_solvers_methods.py"
     ),
     **{name: Bug("parallel", *lines, on_ranks=True) for name, lines in BUGS_ON_RANKS.items()},
 }
