@@ -316,7 +316,7 @@ class Operator(Frozen, Remade):
             "acts": self.form,
             "dtype": self.dtype,
             "entries": None if matrix is None else f"{matrix.nnz} of {self.shape[0]} x {self.shape[1]}",
-            "where": matrix if matrix is None or not matrix.nnz else spy(matrix),
+            "where": None if matrix is None or not matrix.nnz else spy(matrix),
         }
         return facts(self.name, entries)
 

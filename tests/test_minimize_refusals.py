@@ -84,6 +84,12 @@ def test_methods_and_options():
         dp.minimize(bowl, np.ones(2), tolerance="a")
 
 
+def test_a_tolerance_of_infinity_takes_any_gradient():
+    best = dp.minimize(bowl, np.ones(2), tolerance=np.inf)
+    assert best.converged and len(best.history) == 1 and np.array_equal(best.x, np.ones(2))
+    assert dp.minimize(bowl, np.ones(2), "gd", rate=0.1, tolerance=np.float32(np.inf)).converged
+
+
 def test_ranges_of_options():
     with pytest.raises(ValueError, match="memory of lbfgs must be a whole number >= 1, got 0; the default is 10"):
         dp.minimize(bowl, np.ones(2), memory=0)

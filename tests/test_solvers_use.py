@@ -2,6 +2,7 @@
 
 import gc
 import pickle
+import re
 import weakref
 
 import autograd.numpy as anp
@@ -80,6 +81,38 @@ def test_complex_data(method, rng):
     assert inv(b + 0j).imag.any() == 0 and inv.info.forward.status == "converged"
 
 
+@pytest.mark.parametrize("adjoint", [False, True])
+def test_complex_data_leave_one_record_of_both_solves(adjoint, rng):
+    op = PROBLEMS["dirichlet"]()
+    inv = dp.inverse(op, "krylov")
+    solve, record = (inv.T if adjoint else inv), lambda: inv.info.adjoint if adjoint else inv.info.forward
+    b, c, none = rng.standard_normal(op.domain.shape), np.ones(op.domain.shape), np.zeros(op.domain.shape)
+    solve(b)
+    one = record()
+    solve(c)
+    other = record()
+    for data in (1j * b, b + 0j):
+        solve(data)
+        assert (record().status, record().iterations) == ("converged", one.iterations) and one.iterations > 0
+        assert (record().residual, record().backward_error) == (one.residual, one.backward_error)
+    solve(b + 1j * c)
+    both = record()
+    assert both.status == "converged" and both.iterations == one.iterations + other.iterations
+    assert both.residual == max(one.residual, other.residual) and both.seconds > 0
+    assert both.backward_error == max(one.backward_error, other.backward_error)
+    solve(none + 0j)
+    assert (record().status, record().iterations, record().residual) == ("exact_zero_rhs", 0, 0.0)
+    assert (inv.info.forward if adjoint else inv.info.adjoint) is None
+
+
+@pytest.mark.parametrize("part", [1.0, 1j])
+def test_complex_data_leave_the_record_of_the_half_that_failed(part, rng):
+    inv = dp.inverse(PROBLEMS["dirichlet"](), "krylov", maxiter=1)
+    with pytest.raises(dp.errors.ConvergenceError):
+        inv(part * rng.standard_normal((26, 22)) + 0j)
+    assert (inv.info.forward.status, inv.info.forward.iterations) == ("max_iterations", 1)
+
+
 def test_complex_operators_take_the_direct_method_or_gmres(rng):
     matrix = rng.standard_normal((80, 80)) + 1j * rng.standard_normal((80, 80))
     op = dp.from_matrix(matrix + 20 * np.eye(80))
@@ -95,6 +128,20 @@ def test_complex_operators_take_the_direct_method_or_gmres(rng):
     assert bare.method == "krylov" and bare(b) == pytest.approx(inv(b), rel=1e-8)
     with pytest.raises(ValueError, match=r"structured takes real operators, <.*> is complex; write method='direct' or"):
         dp.inverse(op, "structured")
+
+
+@pytest.mark.parametrize("options", [{}, {"diff": "unrolled"}])
+def test_a_start_is_checked_by_name(options):
+    inv = dp.inverse(PROBLEMS["dirichlet"](), "krylov", **options)
+    b, start = np.ones((26, 22)), np.zeros((26, 22))
+    start[3, 4] = np.nan
+    name = re.escape(f"the start of {inv.name} must be finite, got 1 that are NaN or infinite, the first at (3, 4)")
+    with pytest.raises(dp.errors.NonFiniteError, match=f"^{name}$"):
+        inv(b, start=start)
+    name = re.escape(f"{inv.name} takes a start on {inv.codomain}, got an array of shape (22,)")
+    with pytest.raises(dp.errors.ShapeError, match=f"^{name}$"):
+        inv(b, start=np.zeros(22))
+    assert inv(b, start=np.zeros((26, 22))) == pytest.approx(inv(b))
 
 
 def test_wrong_shapes():

@@ -1,9 +1,10 @@
 """minimize(): the loop around every method."""
 
 import inspect
+from math import inf
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_choice, check_function, check_number, check_whole
+from sparsedp.fields import check_choice, check_function, check_number, check_whole, is_number
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.checkpoint import Checkpoint
@@ -141,7 +142,7 @@ def minimize(
         check_function("callback of minimize", callback, "lambda record, x: False")
     stepper = _stepper(method, options) if method != "admm" else None
     maxiter = check_whole("maxiter of minimize", maxiter, 0, "; the default is 100")
-    if not callable(tolerance):
+    if not callable(tolerance) and not (is_number(tolerance) and tolerance == inf):  # inf: any gradient will do
         check_number("tolerance of minimize", tolerance, ">= 0", "; the default is 1e-8")
     unused = dict(progress=progress, gradient=gradient, project=project, batches=batches, checkpoint=checkpoint)
     for leaf in leaves(start):

@@ -18,7 +18,7 @@ from sparsedp.solvers.direct import DenseSystem, dense_engine, direct_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
 from sparsedp.solvers.preconditioners import Near, krylov_engine
 from sparsedp.solvers.separable import eigenbasis, separable_engine, transforming
-from sparsedp.solvers.solve import EmptySystem, SolveLog, Solver, failure
+from sparsedp.solvers.solve import EmptySystem, SolveLog, Solver, failure, merged
 from sparsedp.solvers.system import System
 from sparsedp.space import fits
 from sparsedp.structure.base import Structure
@@ -286,11 +286,7 @@ class Solution(Structure):
     def apply(self, x, out):
         """A^-1 x: solved in double precision, rounded once; of a real operator real and imaginary part apart."""
         if x.dtype.kind == "c" and not self.solver.system.complex:
-            for part in ("imag", "real"):  # the record of the last solve is that of the real part
-                start = None if self.start is None else getattr(self.start, part)
-                half = np.empty_like(out.real)
-                Solution(self.solver, self.transposed, self.checked, start).apply(getattr(x, part).copy(), half)
-                getattr(out, part)[...] = half
+            self._by_halves(x, out)
             return
         wide = np.result_type(x, float, self.dtype)
         start = None if self.start is None else self.start.astype(wide)
@@ -299,6 +295,18 @@ class Solution(Structure):
             np.copyto(out, solution, casting="same_kind")
         if out.dtype != solution.dtype and not np.isfinite(self.solver.system.largest(np.abs(out))):
             raise NonFiniteError(f"the solution of {self.solver.name} is beyond {out.dtype}; give it double precision")
+
+    def _by_halves(self, x, out):
+        """Two solves of a real operator with complex data, and one record of both."""
+        log, before, records = self.solver.log, self.solver.log.last(self.transposed), []
+        for part in ("real", "imag"):
+            start = None if self.start is None else getattr(self.start, part)
+            half = np.empty_like(out.real)
+            Solution(self.solver, self.transposed, self.checked, start).apply(getattr(x, part).copy(), half)
+            getattr(out, part)[...] = half
+            records.append(log.last(self.transposed))
+        if records[0] is not before:  # an approximate solve leaves no record
+            log.note(merged(*records), self.transposed)
 
     def transpose(self):
         return Solution(self.solver, not self.transposed, checked=False)
@@ -339,7 +347,8 @@ class Inverse(Operator):
     def info(self):
         """SolveLog, shared with the transpose: .forward, .adjoint, .setup_seconds, .hierarchy.
 
-        Real and imaginary part of data are two solves for a real operator; the real one is the last.
+        Complex data are two solves for a real operator, with one record: the sum of their iterations and seconds, and
+        the worse of the rest.
         """
         return self.solver.log
 
@@ -361,16 +370,19 @@ class Inverse(Operator):
         Implicit derivatives do not depend on `start`: the derivative in it is 0. With the option
         diff="unrolled" of krylov, the iterations themselves are differentiated, in b and in `start`.
         """
+        if start is not None:
+            check_native(self.name, start)
+            check_finite(f"the start of {self.name}", plain(start))
+            if np.shape(start) != self.codomain.shape:
+                raise ShapeError(
+                    f"{self.name} takes a start on {self.codomain}, got an array of shape {np.shape(start)}"
+                )
         if self.solver.engine.unrolled:
             if np.ndim(b) > len(self.domain.shape):  # a batch: each solve has steps of its own
                 return anp.array([self(field, start) for field in b])
             return self.solver.unroll(b, start, self.structure.transposed)
         if start is None:
             return super().__call__(b)
-        check_native(self.name, start)
-        check_finite(f"the start of {self.name}", plain(start))
-        if np.shape(start) != self.codomain.shape:
-            raise ShapeError(f"{self.name} takes a start on {self.codomain}, got an array of shape {np.shape(start)}")
         field_array(self, plain(b))  # a start is for one field
         structure, start = self.structure, np.asarray(plain(start)).reshape(-1)
         return Inverse(Solution(self.solver, structure.transposed, structure.checked, start))(b)

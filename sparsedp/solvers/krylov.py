@@ -173,9 +173,6 @@ def _probed_sign(system):
     return int(signs.pop()) if len(signs) == 1 else 0
 
 
-# ---------------------------------------------------------------- the iterations
-
-
 def _without_descent(inner, pq, rz, p, q, r, z):
     """Why p.Ap or r.z is not positive: rounding, or an operator that is not definite."""
     if not np.isfinite(pq) or not np.isfinite(rz):

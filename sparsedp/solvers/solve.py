@@ -43,6 +43,7 @@ import numpy as np
 
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
 from sparsedp.fields import check_finite, place
+from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, thread, timed
 from sparsedp.markup import facts, table
 from sparsedp.recipe import Remade
@@ -50,7 +51,7 @@ from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import in_range, norm, shifted
 from sparsedp.tape import plain
 
-__all__ = ["STATUS_WORDS", "Engine", "Run", "SolveInfo", "SolveLog", "Solver", "failure"]
+__all__ = ["STATUS_WORDS", "Engine", "Run", "SolveInfo", "SolveLog", "Solver", "failure", "merged"]
 
 EPS = np.finfo(float).eps
 COMPATIBLE = 1e-6  # largest relative defect of primal data that is taken for rounding
@@ -121,7 +122,8 @@ class Solver(Remade):
 
     def solved(self, b, transposed=False, checked=True, start=None, rtol=None):
         """The solve itself, counted and recorded. One to a tolerance of its own, `rtol`, is not in the log."""
-        count(self.name, "reused", self.served)
+        if recordings:
+            count(self.name, "reused", self.served)
         self.served = True
         return timed(self.name, "adjoint" if transposed else "solve", self._solved, b, transposed, checked, start, rtol)
 
@@ -142,8 +144,9 @@ class Solver(Remade):
         finally:
             if rtol is None:
                 self.log.note(run.info(), transposed)
-            count(self.name, "iterations", run.iterations)
-            count(self.name, "skipped", run.status == "exact_zero_rhs")
+            if recordings:
+                count(self.name, "iterations", run.iterations)
+                count(self.name, "skipped", run.status == "exact_zero_rhs")
 
     def judged(self, b, data, terms, residual, adjoint, transposed):
         """Flat x by one call of the engine, where ``residual(x)``, its true residual, is known to the caller.
@@ -159,7 +162,8 @@ class Solver(Remade):
             return None
         run.measure(left, data, max(terms - data, 0.0))
         thread.solves += 1
-        count(self.name, "adjoint" if adjoint else "solve")
+        if recordings:
+            count(self.name, "adjoint" if adjoint else "solve")
         self.log.note(run.info(), adjoint)
         return x
 
@@ -343,7 +347,7 @@ def _remade(build, arguments):
 
 # ---------------------------------------------------------------- what a solve leaves behind
 
-STATUS_WORDS = (
+STATUS_WORDS = (  # from good to bad: of two solves that share a record, the later word counts
     "exact_zero_rhs",
     "converged",
     "converged_at_roundoff",
@@ -415,6 +419,10 @@ class SolveLog:
         """Record a solve."""
         setattr(self, "adjoint" if transposed else "forward", info)
 
+    def last(self, transposed):
+        """The record of the last adjoint or forward solve, None before the first one."""
+        return self.adjoint if transposed else self.forward
+
     def _repr_html_(self):
         """For a notebook: the two solves side by side."""
         runs = {"forward": self.forward, "adjoint": self.adjoint}
@@ -452,3 +460,15 @@ class Run:
 def failure(status):
     """The record of a set-up that failed."""
     return Run(status=status).info()
+
+
+def merged(one, other):
+    """The record of two solves that belong together."""
+    return SolveInfo(
+        max(one.status, other.status, key=STATUS_WORDS.index),
+        one.iterations + other.iterations,
+        max(one.residual, other.residual),
+        max(one.backward_error, other.backward_error),
+        max(one.defect, other.defect),
+        one.seconds + other.seconds,
+    )
