@@ -83,7 +83,7 @@ def robin(a, b):
     >>> robin(1, 0)
     dirichlet
     """
-    a, b = (check_number(f"{name} of robin", weight, ">= 0", EXAMPLE) for name, weight in (("a", a), ("b", b)))
+    a, b = (check_number(f"{name} of robin", weight, ">= 0", EXAMPLE, EXAMPLE) for name, weight in (("a", a), ("b", b)))
     if a == b == 0:
         raise ValueError(f"a and b of robin must not both be 0{EXAMPLE}")
     return Condition(a, b)

@@ -161,13 +161,16 @@ RANGES = {
 }
 
 
-def check_number(name, value, needs="", advice=""):
-    """One finite real number -> a float. Refuse all else, and what is not in the range that is needed, in words."""
+def check_number(name, value, needs="", advice="", kind=""):
+    """One finite real number -> a float. Refuse all else, and what is not in the range that is needed, in words.
+
+    `advice`: what to write where the number is out of range; `kind`: where it is no number.
+    """
     if not is_number(value):
         given = f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
-        raise TypeError(f"{name} must be one real number, got {given}{advice}")
+        raise TypeError(f"{name} must be one real number, got {given}{kind}")
     if not isfinite(value):
-        raise NonFiniteError(f"{name} must be finite, got {value}{advice}")
+        raise NonFiniteError(f"{name} must be finite, got {value}")
     if not RANGES[needs](value):
         raise ValueError(f"{name} must be {needs}, got {value:g}{advice}")
     return float(value)

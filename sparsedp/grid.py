@@ -352,8 +352,8 @@ def real_numbers(entry, name, example):
 
 def numbers_per_axis(value, shape, name, needs=""):
     """One finite float for each axis, in the range that is needed; a number serves all of them."""
-    advice = "; write one number for each axis, or one for all"
-    return tuple(check_number(name, entry, needs, advice) for entry in per_axis(value, shape, name))
+    kind = "; write one number for each axis, or one for all"
+    return tuple(check_number(name, entry, needs, kind=kind) for entry in per_axis(value, shape, name))
 
 
 def flag(entry, shape):

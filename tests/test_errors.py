@@ -50,13 +50,13 @@ TABLE = [
     (
         lambda: dp.Grid(4, size=np.inf),
         VALUE,
-        "size must be finite, got inf; write one number for each axis, or one for all",
+        "size must be finite, got inf",
     ),
-    (lambda: dp.Grid(4, size=-2.0), VALUE, "size must be > 0, got -2; write one number for each axis, or one for all"),
+    (lambda: dp.Grid(4, size=-2.0), VALUE, "size must be > 0, got -2"),
     (
         lambda: dp.Grid(4, origin=np.nan),
         VALUE,
-        "origin must be finite, got nan; write one number for each axis, or one for all",
+        "origin must be finite, got nan",
     ),
     (lambda: dp.Grid((4, 4), size=(1.0,)), SHAPE, "size needs one entry for each of 2 axes, got 1"),
     (lambda: dp.Grid((4, 4), periodic=[True]), SHAPE, "periodic needs one entry for each of 2 axes, got 1"),
@@ -136,7 +136,7 @@ TABLE = [
     # boundary conditions
     (lambda: dp.robin(-1, 1), VALUE, "a of robin must be >= 0, got -1; write for example robin(1.0, 0.5)"),
     (lambda: dp.robin(0, 0), VALUE, "a and b of robin must not both be 0; write for example robin(1.0, 0.5)"),
-    (lambda: dp.robin(np.nan, 1), VALUE, "a of robin must be finite, got nan; write for example robin(1.0, 0.5)"),
+    (lambda: dp.robin(np.nan, 1), VALUE, "a of robin must be finite, got nan"),
     (lambda: dp.robin("a", 1), TYPE, "a of robin must be one real number, got 'a'; write for example robin(1.0, 0.5)"),
     (
         lambda: dp.gradient(LINE, solid_boundary="dirichlet"),

@@ -183,7 +183,7 @@ TABLE = [
     (
         lambda: dp.forces(BOX, cells=np.s_[:, :], about=np.nan),
         VALUE,
-        "about must be finite, got nan; write one number for each axis, or one for all",
+        "about must be finite, got nan",
     ),
     (lambda: dp.sample(BOX, np.ones(3)), SHAPE, "sample needs points of shape (m, 2), got an array of shape (3,)"),
     (lambda: dp.sample(dp.Grid(0), [0.0]), SHAPE, "sample needs a grid with cells, got Grid(0 cells, size 0)"),

@@ -57,12 +57,12 @@ CASES = [
     (
         call(dt="soon"),
         TypeError,
-        "dt of transport upwind must be one real number, got 'soon'; write dt=0.01, or turn the velocity round",
+        "dt of transport upwind must be one real number, got 'soon'",
     ),
     (
         call(dt=np.nan),
         NonFiniteError,
-        "dt of transport upwind must be finite, got nan; write dt=0.01, or turn the velocity round",
+        "dt of transport upwind must be finite, got nan",
     ),
     (call(u=U[0]), ShapeError, "transport upwind takes u of shape (3, 2), got an array of shape (2,)"),
     (

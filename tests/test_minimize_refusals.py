@@ -76,11 +76,11 @@ def test_methods_and_options():
         ValueError, match="maxiter of minimize must be a whole number >= 0, got None; the default is 100"
     ):
         dp.minimize(bowl, np.ones(2), maxiter=None)
-    with pytest.raises(ValueError, match="tolerance of minimize must be finite, got nan; the default is 1e-8"):
+    with pytest.raises(ValueError, match="tolerance of minimize must be finite, got nan$"):
         dp.minimize(bowl, np.ones(2), tolerance=np.nan)
     with pytest.raises(ValueError, match="tolerance of minimize must be >= 0, got -1; the default is 1e-8"):
         dp.minimize(bowl, np.ones(2), tolerance=-1)
-    with pytest.raises(TypeError, match="tolerance of minimize must be one real number, got 'a'; the default is 1e-8"):
+    with pytest.raises(TypeError, match="tolerance of minimize must be one real number, got 'a'$"):
         dp.minimize(bowl, np.ones(2), tolerance="a")
 
 
@@ -105,7 +105,7 @@ def test_ranges_of_options():
         dp.minimize(bowl, np.ones(2), "gd", line_search="wolfe")
     with pytest.raises(ValueError, match="rate of adam must be > 0, got 0; the default is 1e-3"):
         dp.minimize(bowl, np.ones(2), "adam", rate=0)
-    with pytest.raises(TypeError, match="rate of adam must be one real number, got None; the default is 1e-3"):
+    with pytest.raises(TypeError, match="rate of adam must be one real number, got None$"):
         dp.minimize(bowl, np.ones(2), "adam", rate=None)
     with pytest.raises(ValueError, match="epsilon of adam must be > 0, got 0; the default is 1e-8"):
         dp.minimize(bowl, np.ones(2), "adam", epsilon=0)
