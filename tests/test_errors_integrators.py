@@ -203,6 +203,16 @@ TABLE = [
         "a rate must have the fields of the state, u[0], u[1]['u'], u[1]['v'], got u[0], u[1][0], u[1][1]",
     ),
     (
+        lambda: dp.stepper("rk4", lambda x, p: {0: x[0], 1: x[1]}, 0.6)((U, U)),
+        SHAPE,
+        "a rate must have the names of the state, tuple, got [0, 1]",
+    ),
+    (
+        lambda: dp.stepper("rk4", lambda x, p: (x[0], [x[1][0]]), 0.6)((U, {0: U})),
+        SHAPE,
+        "a rate must have the names of the state, [0], got list",
+    ),
+    (
         lambda: dp.stepper("tr_bdf2", dp.laplacian(dp.Grid(3)), 0.6)(U),
         SHAPE,
         "stepper(tr_bdf2) takes a field on cells(3), got an array of shape (4,)",

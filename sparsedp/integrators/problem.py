@@ -52,11 +52,21 @@ def of_fields(tree, u):
     if found.keys() != wanted.keys():
         names = (", ".join(labels(x, "u")) or "nothing" for x in (u, tree))
         raise ShapeError("a rate must have the fields of the state, {}, got {}".format(*names))
+    _check_kinds(tree, u)
     shapes = [[np.shape(fields[place]) for place in wanted] for fields in (wanted, found)]
     if shapes[0] != shapes[1]:
         words = (", ".join(map(str, row)) for row in shapes)
         raise ShapeError("a rate must have the shape of the state, {}, got {}".format(*words))
     return [found[place] for place in wanted]
+
+
+def _check_kinds(tree, u):
+    """Refuse a dict whose keys are the numbers of a tuple's fields, and a tuple for such a dict: that is a mistake."""
+    if isinstance(tree, dict) != isinstance(u, dict):
+        names = ([*x] if isinstance(x, dict) else type(x).__name__ for x in (u, tree))
+        raise ShapeError("a rate must have the names of the state, {}, got {}".format(*names))
+    for name in keys(u) or ():
+        _check_kinds(tree[name], u[name])
 
 
 def _by_place(tree):
