@@ -8,8 +8,8 @@ import math
 import pytest
 
 import sparsedp as dp
-from sparsedp.check.summary import Result
-from sparsedp.check.table import table_of
+from sparsedp.check.summary import Result, Row, Summary
+from sparsedp.check.table import Table, table_of
 from sparsedp.report.certificate import Certificate
 from sparsedp.report.plan import Plan
 from sparsedp.report.plots import write_result
@@ -36,6 +36,31 @@ def test_markdown_keeps_its_columns_whatever_the_cells_hold():
     assert lines[2] == "| a\\|b | 1.2e-05 | 12 | two lines |"
     assert {line.replace("\\|", "").count("|") for line in lines} == {5}
     assert table_of([], NAMES).markdown().splitlines()[0] == "| name | error | count | note | absent |"
+
+
+def test_a_table_without_an_entry_keeps_its_first_column():
+    table = Table(("a", "b"), [(math.nan, None)])
+    assert table.markdown().splitlines() == ["| a |", "|---|", "|  |"]
+    assert "<th>a</th>" in table.html() and "<th>b</th>" not in table.html()
+    assert str(table) == "  a\n"
+
+
+def test_rows_with_other_keys_lose_nothing():
+    assert table_of([{"a": 1}, {"b": 2, "a": 3}, {"c": 4}]).csv() == "a,b,c\n1,,\n3,2,\n,,4\n"
+    assert table_of([{}]).csv().splitlines()[0] == "nothing"
+
+
+def test_a_limit_of_zero_is_a_limit():
+    table = Summary("title", [Row("exact", 0.0, 0.0, True), Row("left out")]).parts()[1]
+    assert [cells[2] for cells in table.rows] == ["<= 0", ""]
+
+
+def test_a_failure_is_one_line_of_what_is_there():
+    names = ("group", "parameter", "case", "outcome", "figure", "note")
+    case = ("", "value and gradient", "FAILED", 1.0, "")
+    rows = [dict(zip(names, ("as given", *case))), dict(zip(names, ("x", "dt", "low", "FAILED", 1.0, "grows")))]
+    found = Stress(rows=rows, counts={"FAILED": 2}, failures=rows, map=None, left_out=[], summary="two")
+    assert found.parts()[-3:] == ["FAILED: value and gradient", "FAILED: dt low: grows", "two"]
 
 
 def test_csv_reads_back_whole():

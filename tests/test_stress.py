@@ -246,6 +246,8 @@ def test_an_absolute_tolerance_does_not_scale():
 def test_refusals():
     with pytest.raises(ValueError, match="stress knows the parameters dt, nu, got 'k'; write one of them"):
         dp.stress(explicit, number(0.4), ranges={"k": (0, 1)})
+    with pytest.raises(ValueError, match="stress knows the parameters dt, nu, got 'k'; write one of them"):
+        dp.stress(explicit, number(0.4), ranges={"k": (0, 1), "j": (0, 1)}, time_step="i", viscosity="h")
     with pytest.raises(ValueError, match=r"stress needs ranges of two finite numbers, low < high, got \(1, 0\) for nu"):
         dp.stress(explicit, number(0.4), ranges={"nu": (1, 0)})
     with pytest.raises(ValueError, match="stress has no cases 'all'; write some of as given, scaling"):

@@ -130,7 +130,10 @@ class Summary(Result):
     def parts(self):
         """The verdict, and the rows."""
         words = {True: "ok", False: "FAILS", None: "-"}
-        cells = [(*row[:2], row.limit and f"<= {row.limit:g}", words[row.ok], row.note) for row in self.rows]
+        cells = [
+            (row.name, row.figure, "" if row.limit is None else f"<= {row.limit:g}", words[row.ok], row.note)
+            for row in self.rows
+        ]
         return [f"{self.title}: {self.verdict}", Table(("property", "figure", "limit", "", ""), cells)]
 
 

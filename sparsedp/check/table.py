@@ -21,9 +21,10 @@ class Table(NamedTuple):
     rows: Sequence[Sequence[Any]]
 
     def texts(self):
-        """The cells in words, below the names; without the columns that are empty."""
-        columns = zip(*([text_of(cell) for cell in row] for row in (self.names, *self.rows)), strict=True)
-        return list(zip(*(column for column in columns if any(column[1:]) or not self.rows)))
+        """The cells in words, below the names; without the columns that are empty, except the first one."""
+        columns = list(zip(*([text_of(cell) for cell in row] for row in (self.names, *self.rows)), strict=True))
+        kept = [column for column in columns[1:] if any(column[1:]) or not self.rows]
+        return list(zip(*columns[:1], *kept))
 
     def __str__(self):
         columns = []
@@ -51,8 +52,8 @@ class Table(NamedTuple):
 
 
 def table_of(rows, names=()):
-    """Dicts -> Table of the entries of these names; default: all that the first one has."""
-    names = names or list(rows[0] if rows else ["nothing"])
+    """Dicts -> Table of the entries of these names; default: all that they have, in the order of first use."""
+    names = names or list(dict.fromkeys(name for row in rows for name in row)) or ["nothing"]
     return Table(names, [[row.get(name) for name in names] for row in rows])
 
 

@@ -59,8 +59,9 @@ class Scene:
         names = [re.sub(r"^x\['?([^\[\]']*)'?\]$", r"\1", name) for name in self.point.names]  # x['dt'] is called dt
         self.leaves = dict(zip(names, self.point.values))
         self.ranges = ranges if isinstance(ranges, dict) else {"x": ranges} if ranges else {}
-        for name in {*self.ranges, time_step, viscosity} - {None, *names}:
-            raise ValueError(f"stress knows the parameters {', '.join(names)}, got {name!r}; write one of them")
+        for name in (*self.ranges, time_step, viscosity):
+            if name is not None and name not in names:
+                raise ValueError(f"stress knows the parameters {', '.join(names)}, got {name!r}; write one of them")
         for name, limits in self.ranges.items():
             if np.size(limits) != 2 or not -inf < limits[0] < limits[1] < inf:
                 raise ValueError(f"stress needs ranges of two finite numbers, low < high, got {limits!r} for {name}")

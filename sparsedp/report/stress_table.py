@@ -98,6 +98,12 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     )  # fmt: skip
 
 
+def _failure(row):
+    """A row that FAILED as one line, of what is there: parameter and case, and the note."""
+    case = " ".join(filter(None, (row["parameter"], row["case"])))
+    return ": ".join(filter(None, (FAILED, case, row["note"])))
+
+
 class Stress(Result):
     """The result of `stress`.
 
@@ -122,7 +128,7 @@ class Stress(Result):
     def parts(self):
         """All cases, what was left out, the map, the failures, and the counts."""
         growth = self.map.parts() if self.map else []
-        failed = (f"{FAILED}: {row['parameter']} {row['case']}: {row['note']}" for row in self.failures)
+        failed = [_failure(row) for row in self.failures]
         return ["stress", table_of(self.rows, COLUMNS), *self.omissions(), *growth, *failed, self.summary]
 
     def plot(self, ax=None):
