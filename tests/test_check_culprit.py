@@ -177,6 +177,23 @@ def test_a_ripple_is_inconclusive(frequency):
     assert smooth.verdict == "disagrees"
 
 
+def test_a_call_that_refuses_other_cotangents_is_passed_over():
+    """As a step with error control may: it ends no search, the call at fault comes after it."""
+
+    def pull(nums, ans, u):
+        def back(g):
+            if np.any(g != 2.1):
+                raise dp.errors.DerivativeError("shy takes 2.1 only")
+            return (g,)
+
+        return back
+
+    shy = dp.differentiable("shy", lambda u: 1.0 * u, pull)
+    double = dp.differentiable("double", lambda u: 2.0 * u, lambda nums, ans, u: lambda g: (2.1 * g,))
+    found = AUDIT(lambda u: anp.sum(double(shy(u))), np.ones(3), directions=1)
+    assert found.verdict == "disagrees" and found.culprit == "double"
+
+
 # ---- the result as data, in pytest, as a picture --------------------------------------------------------------------
 
 

@@ -196,7 +196,7 @@ def test_runs_that_meet_in_a_jump(tolerance):
 
 @pytest.mark.parametrize("at_fault", ["double", pytest.param(None, marks=pytest.mark.whole)])
 def test_an_audit_of_a_wrong_loss_blames_no_step(at_fault):
-    """Random cotangents, which a step with error control refuses, end no search for the culprit."""
+    """Its gradient is right, and the search for the culprit goes on after it."""
     step = dp.stepper("radau", robertson, 0.5, tolerance=1e-3, floor=SMALL["Robertson"])
     bypass = dp.differentiable("double", lambda u: 2.0 * u, lambda nums, ans, u: lambda g: (2.1 * g,))
     ends = lambda p: step(np.array([1.0, 0, 0]), RATES * p)[2]

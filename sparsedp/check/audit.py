@@ -297,7 +297,7 @@ class Audit(Result):
             f"verdict: {self.verdict}{proved}{': ' if self.reason else ''}{self.reason}",
         ]
 
-    def picture(self):
+    def curves(self):
         """|difference - gradient| of the derivative over the step, a curve for each direction."""
         lines: dict = {one.direction: [] for one in self.lines}
         for row in self.rows:

@@ -48,7 +48,7 @@ def culprit_of(loss, point):
         for node in _examined(nodes):
             try:
                 fault = _fault(node, cleared, rng)
-            except DerivativeError:  # of a step with error control: right, or refused
+            except DerivativeError:  # a call that refuses the cotangents tried: not to be judged
                 continue
             if fault:
                 return fault[0], ", ".join(fault)

@@ -53,11 +53,9 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
     errors = tuple(float(error_at(n)) for n in sizes)
     rise = np.log([error if 0 < error < inf else nan for error in errors])
     run = -np.log(sizes)
-    slope, verdict, reason = (
-        float(linear_regression(run[-3:], rise[-3:]).slope),
-        "inconclusive",
-        "no order was expected",
-    )
+    slope = float(linear_regression(run[-3:], rise[-3:]).slope)
+    verdict = "inconclusive"
+    reason = "no order was expected"
     if isnan(slope):
         reason = "an error is 0 or not finite: no slope"
     elif expected is not None:

@@ -50,7 +50,13 @@ class Result(Frozen):
         return "\n".join([f"### {title}", "", *blocks, ""])
 
     def html(self):
-        """The text as HTML: a title, tables, the other lines; what was left out is folded away."""
+        """The text as HTML: a title, tables, the other lines; what was left out is folded away.
+
+        Returns
+        -------
+        Markup
+            A str that notebooks show as HTML.
+        """
         title, *parts = self.parts()
         left_out = self.omissions()
         blocks = (
@@ -58,13 +64,19 @@ class Result(Frozen):
         )
         return Markup("\n".join([paragraphs([title], "h4"), *blocks, folded("What was left out", self.left_out)]))
 
-    def picture(self):
-        """Curves {name: points}, and what is across and up, on logarithmic axes; no curve: no picture."""
+    def curves(self):
+        """What is drawn on logarithmic axes; nothing unless a kind of result says so.
+
+        Returns
+        -------
+        (dict, str, str)
+            Name -> points (x, y) of each curve, and what is across and up. Without curves there is no picture.
+        """
         return {}, "", ""
 
     def _repr_html_(self):
         """For a notebook: with its picture, if it has one."""
-        return Markup(self.html() + curves(*self.picture(), log=(True, True)))
+        return Markup(self.html() + curves(*self.curves(), log=(True, True)))
 
     def csv(self):
         """The rows as CSV."""

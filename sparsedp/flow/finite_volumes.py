@@ -215,7 +215,8 @@ class ConservationLaw(Remade):
         if len(fields) > 1:
             wanted = ", ".join(map(str, ("fields", *shape)))
             raise ShapeError(f"conservation_law takes u of shape ({wanted}), got {values.shape}")
-        if momentum and max(momentum) >= (*fields, 1)[0]:
+        count = fields[0] if fields else 1
+        if momentum and max(momentum) >= count:
             raise ShapeError(
                 f"conservation_law needs a field for each number in momentum={momentum}, got u of shape "
                 f"{values.shape}; give a state that holds them all"

@@ -142,7 +142,7 @@ def brinkman(grid):
     check_grid("brinkman", grid)
     face_laplacian(grid)  # refuses cells whose squares leave the range of floats
     steps = [tuple(_differences(grid, axis, back) for back in (0, 1)) for axis in range(grid.dim)]
-    meshes = [np.ix_(*grid.control_lengths("faces", c)) for c in range(grid.dim)]
+    meshes = [np.meshgrid(*grid.control_lengths("faces", c), indexing="ij", sparse=True) for c in range(grid.dim)]
     widths = [grid.join(*(mesh[axis] for mesh in meshes)) for axis in range(grid.dim)]
     rates = [np.divide(1, h, out=np.zeros_like(h), where=h > 0) ** 2 for h in widths]  # 0: an axis without cells
     within = 2 * (np.cosh(SHARP) - 1) * reduce(add, rates)  # where the level may be flat

@@ -325,7 +325,7 @@ class Diffusion:
         Of nu in messages.
     number : number or callable
         nu.
-    laplacian : callable
+    make_operator : callable
         Makes L.
     held : array or None
         What walls add to L u.
@@ -341,9 +341,10 @@ class Diffusion:
         dt nu |L|; 0 where nu is a function.
     """
 
-    def __init__(self, name, number, laplacian, held, flow):
+    def __init__(self, name, number, make_operator, held, flow):
         self.name, self.number, self.held, self.flow = name, number, held, flow
-        self.op, self.damping = laplacian() if number else None, 0.0  # type: Any, float
+        self.op: Any = make_operator() if number else None
+        self.damping = 0.0
         self.relax: Any = None
         if self.op is None:
             return

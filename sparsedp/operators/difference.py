@@ -64,9 +64,10 @@ def gradient(grid, boundary=neumann, solid=None, solid_boundary=neumann):
     # The faces of solid cells are closed; there a slope from one side unless the condition is neumann.
     below, above = solid_faces(grid, check_solid(grid, solid))
     structure = compose(Mask(~(below | above)), slope.structure)
-    for upper, faces in ((True, below & ~above), (False, above & ~below)) if solid_boundary.a else ():
-        side = to_faces(grid, "gradient", one_sided, upper, solid_boundary)
-        structure = total(structure, compose(Mask(faces), side.structure))
+    if solid_boundary.a:
+        for upper, faces in ((True, below & ~above), (False, above & ~below)):
+            side = to_faces(grid, "gradient", one_sided, upper, solid_boundary)
+            structure = total(structure, compose(Mask(faces), side.structure))
     return Operator(structure, grid.cells, grid.faces, "gradient")
 
 
@@ -209,13 +210,15 @@ def curl(grid):
     check_grid("curl", grid)
     if grid.dim == 1:
         raise ValueError(f"curl needs a 2-D or 3-D grid, got {grid}; a 1-D slope is gradient(grid)")
-    flat, blocks = grid.dim == 2, {}  # in 2-D nodes are edges along z, the only ones
-    for a in range(grid.dim):
-        for along_edge, across, sign in ((a + 2, a + 1, 1.0), (a + 1, a + 2, -1.0)):
-            edge, axis = along_edge % 3, across % 3
-            if axis < grid.dim:
-                blocks[a, 0 if flat else edge] = along(axis, grid.dim, differences(grid, axis), sign)
-    return kronecker_operator(grid.nodes if flat else grid.edges, grid.faces, blocks, "curl")
+    slope = [differences(grid, axis) for axis in range(grid.dim)]
+    if grid.dim == 2:
+        blocks = {(0, 0): along(1, 2, slope[1]), (1, 0): along(0, 2, slope[0], -1.0)}
+        return kronecker_operator(grid.nodes, grid.faces, blocks, "curl")
+    blocks = {}
+    for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # v_a = d psi_c / d b - d psi_b / d c
+        blocks[a, c] = along(b, 3, slope[b])
+        blocks[a, b] = along(c, 3, slope[c], -1.0)
+    return kronecker_operator(grid.edges, grid.faces, blocks, "curl")
 
 
 def upwind(grid, axis=0, direction=1, boundary=neumann):

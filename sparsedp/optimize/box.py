@@ -43,7 +43,8 @@ class Box:
                 f"got {bounds!r}; write (0.0, None) for x >= 0"
             )
         lower, upper = bounds
-        self.lower, self.upper = (_side(*side, packing) for side in ((lower, -np.inf), (upper, np.inf)))
+        self.lower = _side(lower, -np.inf, packing)
+        self.upper = _side(upper, np.inf, packing)
         if not np.all((self.lower <= self.upper) & (self.lower < np.inf) & (self.upper > -np.inf)):  # nor NaN
             raise ValueError("bounds must be numbers with lower <= upper; write None for a side without a bound")
 

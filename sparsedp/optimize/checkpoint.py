@@ -63,7 +63,13 @@ class Checkpoint:
             self._check(name, setting == content["settings"].get(name))
         history, start = [_record(row) for row in content["history"]], template.trial
         value, size, others = history[0].value, history[0].gradient_norm, content["ranks"] != ranks()
-        same = lambda now, then, size: np.array_equal(now, then) or others and norm(now - then) <= NEAR * abs(size)
+
+        def same(now, then, size):
+            """Whether two numbers or vectors agree: bit for bit, on other ranks up to rounding of a size."""
+            if np.array_equal(now, then):
+                return True
+            return others and norm(now - then) <= NEAR * abs(size)
+
         same_norm = same(norm(trials.downhill(start)), size, size)
         self._check("loss at the start", same_norm and same(start.value, value, value))
         state = flatten(template)[1](content["state"])

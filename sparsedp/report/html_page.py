@@ -50,7 +50,7 @@ def section(title, result, files, caption):
     """A result with its picture: the PNG among its files, or a plainer one, and how to read it."""
     pictures = [base64.b64encode(path.read_bytes()).decode() for path in files if path.suffix == ".png"]
     drawn = [f'<img alt="{cell(title)}" src="data:image/png;base64,{one}">' for one in pictures]
-    picture = "".join(drawn) or curves(*result.picture(), log=(True, True))
+    picture = "".join(drawn) or curves(*result.curves(), log=(True, True))
     figure = f"<figure>{picture}<figcaption>{cell(caption)}</figcaption></figure>" if picture else ""
     return f'<section><h2>{cell(title)}</h2>{figure}<div class="wide">{result.html()}</div></section>'
 

@@ -169,13 +169,13 @@ def _rows(calls):
 
 def _how(calls, name):
     """Form or method, and why."""
-    words = dict(calls.notes.get((name, "method"), ()))
+    words = list(calls.notes.get((name, "method"), ()))
     for actor in calls.actors.get(name, {}).values():
         if hasattr(actor, "engine"):
-            words[f"{actor.engine.method}: {actor.reason}"] = 1
+            words.append(f"{actor.engine.method}: {actor.reason}")
         elif _applied(actor):
-            words[actor.form] = 1
-    return "; ".join(words) or "rule"
+            words.append(actor.form)
+    return "; ".join(dict.fromkeys(words)) or "rule"
 
 
 def _applied(actor):

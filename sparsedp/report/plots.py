@@ -284,7 +284,7 @@ def v_curve(audit, ax=None):
     >>> v_curve(result, figure().add_subplot()).get_xlabel()
     'step'
     """
-    lines, across, up = audit.picture()
+    lines, across, up = audit.curves()
     title = f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}"
     return _dressed(lines, current(ax), across, up, title)
 

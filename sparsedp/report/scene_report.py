@@ -179,7 +179,7 @@ def write_report(source, folder, force=False):
         else:
             missing += sentences
         links = [f"{'!' if path.suffix == '.png' else ''}[{path.name}]({path.name})" for path in files]
-        caption = ["", chapter.caption] if "!" in "".join(links) else []
+        caption = ["", chapter.caption] if any(path.suffix == ".png" for path in files) else []
         text += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in sentences), "", *links, *caption]
         lines += sentences
     write_file(folder / PAGES[0], "\n".join([*text, ""]))

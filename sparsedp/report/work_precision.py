@@ -366,13 +366,13 @@ class Rows(Result):
         -------
         matplotlib Axes
         """
-        ax, (lines, across, up) = plots.current(ax), self.picture(error)
+        ax, (lines, across, up) = plots.current(ax), self.curves(error)
         if lines:  # nothing has no logarithm
             plots.curves(lines, ax, across, up)
         ax.set_title(self.scene)
         return ax
 
-    def picture(self, error=None):
+    def curves(self, error=None):
         """The error over the run time, a curve for each method."""
         lines: dict = {}
         error = error or self.judged
