@@ -43,25 +43,33 @@ def write_file(path, content):
     """
     target = Path(os.path.realpath(path))
     part = target.parent / f"{target.name[:40]}.{uuid4().hex[:8]}{UNFINISHED}"  # whoever else writes has another
+    with _errors_name(path):
+        try:
+            there = target.exists()
+            if there and not target.is_file():
+                _write(target, "wb", content)
+                return
+            if there:
+                open(target, "rb+").close()  # a file that may not be changed is not replaced either
+            _write(part, "xb", content)
+            if there:
+                shutil.copymode(target, part)
+            os.replace(part, target)
+            _sync(target.parent)
+        finally:
+            with contextlib.suppress(OSError):  # it is gone when all went well
+                part.unlink()
+
+
+@contextlib.contextmanager
+def _errors_name(path):
+    """An OSError inside names `path`, and not the unfinished file beside it."""
     try:
-        there = target.exists()
-        if there and not target.is_file():
-            _write(target, "wb", content)
-            return
-        if there:
-            open(target, "rb+").close()  # a file that may not be changed is not replaced either
-        _write(part, "xb", content)
-        if there:
-            shutil.copymode(target, part)
-        os.replace(part, target)
-        _sync(target.parent)
+        yield
     except OSError as error:
         error.filename = str(path)
         del error.filename2
         raise
-    finally:
-        with contextlib.suppress(OSError):  # it is gone when all went well
-            part.unlink()
 
 
 def _write(path, mode, content):
@@ -100,21 +108,21 @@ def write_through(path, write):
         If it cannot be written. It names `path`, and what stood there stands there still.
     """
     target = Path(os.path.realpath(path))
-    try:
-        with TemporaryDirectory(suffix=UNFINISHED, dir=target.parent) as folder:
-            part = Path(folder, f"new{target.suffix.lower()}")
-            write(part)
-            if part.is_file():
-                with open(part, "rb") as whole:
-                    write_file(target, lambda stream: shutil.copyfileobj(whole, stream))
-                return
+    with _errors_name(path), TemporaryDirectory(suffix=UNFINISHED, dir=target.parent) as folder:
+        part, old = Path(folder, f"new{target.suffix.lower()}"), Path(folder, "old")
+        write(part)
+        if part.is_file():
+            with open(part, "rb") as whole:
+                write_file(target, lambda stream: shutil.copyfileobj(whole, stream))
+            return
+        try:
             if target.exists():
-                os.replace(target, Path(folder, "old"))
+                os.replace(target, old)
             os.replace(part, target)
-    except OSError as error:
-        error.filename = str(path)
-        del error.filename2
-        raise
+        except BaseException:
+            if old.exists() and not target.exists():  # what is in this folder is deleted with it
+                os.replace(old, target)
+            raise
 
 
 def save_tree(path, tree, kind):

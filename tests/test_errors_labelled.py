@@ -34,6 +34,17 @@ REFUSED = {
         "save takes attrs as a dict with keys from ['u', 'x', 'y', 'times'], got ['p', 'z']; leave them out",
         lambda path: dp.save(path, LINE, u=np.ones(LINE.shape), attrs={"p": {}, "z": {}}),
     ),
+    "units that are a number": (
+        TypeError,
+        "save takes units as a str, or a dict of str, numbers and arrays, in attrs, got 3 for u; write {'u': 'm'}",
+        lambda path: dp.save(path, LINE, u=np.ones(LINE.shape), attrs={"u": 3}),
+    ),
+    "an attribute that is none": (
+        TypeError,
+        "save takes units as a str, or a dict of str, numbers and arrays, in attrs, got {'a': None} for u; "
+        "write {'u': 'm'}",
+        lambda path: dp.save(path, LINE, u=np.ones(LINE.shape), attrs={"u": {"a": None}}),
+    ),
     "half precision": (
         TypeError,
         "u has dtype float16, which such a file does not hold; write u.astype(float)",
@@ -104,3 +115,18 @@ def test_a_time_that_is_not_on_the_grid():
         dp.interop.from_xarray(FIELD, LINE)
     with pytest.raises(ValueError, match="^to_xarray takes attrs as a dict with keys from"):
         dp.interop.to_xarray(LINE, attrs={"v": {}}, u=np.ones(LINE.shape))
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
+@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), MemoryError("no room")])
+def test_a_reader_that_may_not_or_cannot_read_says_so(suffix, error, tmp_path, monkeypatch):
+    path = tmp_path / f"a{suffix}"
+    dp.save(path, LINE, u=np.ones(LINE.shape))
+
+    def refuse(*arguments, **options):
+        raise error
+
+    monkeypatch.setattr("xarray.open_dataset", refuse)
+    with pytest.raises(type(error)) as caught:
+        dp.load(path)
+    assert caught.value is error

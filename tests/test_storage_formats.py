@@ -1,6 +1,7 @@
 """Files of xarray: what comes back, what other programs see, what is refused; and arrays of xarray as fields."""
 
 import json
+import os
 import shutil
 
 import numpy as np
@@ -95,6 +96,36 @@ def test_what_was_there_is_replaced_by_the_whole_or_stays(suffix, tmp_path, monk
         with pytest.raises(OSError, match=f"No space left on device: '{path}'"):
             dp.save(path, GRID, u=np.ones(GRID.shape))
     assert list(dp.load(path)[1]) == ["v"] and sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("kind", [OSError, KeyboardInterrupt])
+@pytest.mark.parametrize("moment", ["before", "after"])
+def test_a_folder_that_cannot_take_its_name_leaves_the_old_one_or_is_whole(kind, moment, tmp_path, monkeypatch):
+    """An error or Ctrl-C at each rename: of the old folder out of the way, and of the new one onto its name."""
+    path, rename = tmp_path / "a.zarr", os.replace
+    for failing in (1, 2):
+        dp.save(path, GRID, v=np.ones(GRID.shape))
+        calls = []
+
+        def fail(source, target, failing=failing, calls=calls):
+            if path not in (source, target):  # one of the library's own, in another thread
+                return rename(source, target)
+            calls.append(target)
+            if moment == "after" or len(calls) != failing:
+                rename(source, target)
+            if len(calls) == failing:
+                raise kind(5, "Input/output error", str(source))
+            return None
+
+        with monkeypatch.context() as disk:
+            disk.setattr("os.replace", fail)
+            with pytest.raises(kind) as caught:
+                dp.save(path, GRID, u=np.ones(GRID.shape))
+        if kind is OSError:
+            assert str(caught.value) == f"[Errno 5] Input/output error: '{path}'"
+        assert len(calls) >= failing and (failing == 1 or calls[1] == path)
+        assert list(dp.load(path)[1]) == (["u"] if (failing, moment) == (2, "after") else ["v"])
+        assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("suffix", [*SUFFIXES, ".vtr"])

@@ -102,6 +102,18 @@ def test_a_series(tmp_path):
     assert sorted(one.name for one in (tmp_path / "a & b").iterdir()) == ["0000.vtr", "0001.vtr", "0002.vtr"]
 
 
+def test_a_shorter_series_leaves_no_file_of_the_longer_one(tmp_path):
+    path, u = tmp_path / "a.pvd", sample(FLAT, "cells", float, 3)
+    dp.save(path, FLAT, times=[0.0, 0.1, 0.2], u=u)
+    (tmp_path / "a" / "mine.vtr").write_text("mine")
+    dp.save(path, FLAT, times=[0.0], u=u[:1])
+    assert sorted(one.name for one in (tmp_path / "a").iterdir()) == ["0000.vtr", "mine.vtr"]
+    path = tmp_path / "missing" / "a.pvd"
+    with pytest.raises(FileNotFoundError) as caught:
+        dp.save(path, FLAT, times=[0.0], u=u[:1])
+    assert str(caught.value) == f"[Errno 2] No such file or directory: '{path}'"
+
+
 @pytest.mark.parametrize("suffix", [".vti", ".vtr"])
 @pytest.mark.parametrize("grid", [dp.Grid(5), FLAT, dp.Grid((2, 3, 4), size=1 / 7, periodic=(False, False, True))])
 def test_vtk_reads_the_same(grid, suffix, tmp_path):

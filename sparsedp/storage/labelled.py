@@ -117,6 +117,12 @@ def from_xarray(grid, array, /):
 def dataset_of(name, grid, attrs, times, content):
     """What `check_fields` let through -> Dataset."""
     check_names(name, "attrs", attrs, [*content, *grid.axes, "times"])
+    for key, one in (attrs or {}).items():
+        if not isinstance(one, str) and not (isinstance(one, dict) and all(map(_is_attribute, one, one.values()))):
+            raise TypeError(
+                f"{name} takes units as a str, or a dict of str, numbers and arrays, in attrs, got {one!r} for {key}; "
+                f"write {{{key!r}: 'm'}}"
+            )
     given = {key: {"units": one} if isinstance(one, str) else one for key, one in (attrs or {}).items()}
     coords, variables = {}, {}
     for number, axis in enumerate(grid.axes):
@@ -142,6 +148,10 @@ def dataset_of(name, grid, attrs, times, content):
     return xarray.Dataset(variables, coords, {"sparsedp": json.dumps(notes)})
 
 
+def _is_attribute(key, value):
+    return isinstance(key, str) and (isinstance(value, str) or np.asarray(value).dtype.kind in "iuf")
+
+
 def write_dataset(path, dataset):
     """Dataset -> a .nc file or a .zarr folder that is whole, with a checksum of all it holds."""
     dataset.attrs["sparsedp_crc32"] = _checksum(dataset)
@@ -163,7 +173,10 @@ def _is_zarr(path):
 
 def read_dataset(path):
     """File that `write_dataset` wrote -> (what `save` puts into .npz,); None when it is another file, or changed."""
-    os.stat(path)
+    if _is_zarr(path):  # what is not there or may not be read is not damaged
+        os.scandir(path).close()
+    else:
+        open(path, "rb").close()
     try:
         engine = "zarr" if _is_zarr(path) else "h5netcdf"
         with xarray.open_dataset(path, engine=engine, mask_and_scale=False, decode_times=False) as stored:
@@ -171,13 +184,15 @@ def read_dataset(path):
         notes = json.loads(dataset.attrs["sparsedp"])
         if notes.pop("format") != KIND or dataset.attrs["sparsedp_crc32"] != _checksum(dataset):
             return None
-        fields = {field: _joined(dataset, *stored) for field, stored in notes.pop("fields").items()}
-        widths = [dataset[f"{axis}_widths"].values for axis, _ in zip(AXES, notes["origin"])]
-        times = dataset["time"].values if "time" in dataset.dims else None
-        grid = {"shape": tuple(map(len, widths)), "spacing": widths, **notes}
-        return ({"grid": grid, "times": times, "fields": fields},)
+    except (MemoryError, PermissionError):
+        raise
     except Exception:  # there is no end to what the readers raise on damage
         return None
+    fields = {field: _joined(dataset, *stored) for field, stored in notes.pop("fields").items()}
+    widths = [dataset[f"{axis}_widths"].values for axis, _ in zip(AXES, notes["origin"])]
+    times = dataset["time"].values if "time" in dataset.dims else None
+    grid = {"shape": tuple(map(len, widths)), "spacing": widths, **notes}
+    return ({"grid": grid, "times": times, "fields": fields},)
 
 
 def _joined(dataset, kind, labels):

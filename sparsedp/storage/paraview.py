@@ -1,5 +1,6 @@
 """Fields as .vti, .vtr and .pvd files for ParaView. The only file that imports pyevtk (extra `files`)."""
 
+import re
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -15,7 +16,11 @@ __all__ = ["write_grid", "write_series"]
 def write_series(path, grid, times, content):
     """Fields at each time -> a file in the folder that is called as `path` without .pvd, and then `path` itself."""
     folder = Path(path).with_suffix("")
-    folder.mkdir(exist_ok=True)
+    try:
+        folder.mkdir(exist_ok=True)
+    except FileNotFoundError as error:
+        error.filename = str(path)
+        raise
     entries = []
     for number, time in enumerate(times):
         place = f"{folder.name}/{number:04}.vtr"
@@ -24,6 +29,9 @@ def write_series(path, grid, times, content):
         )
         entries.append(f'<DataSet timestep="{time}" file={quoteattr(place)}/>\n')
     write_file(path, f'<VTKFile type="Collection"><Collection>\n{"".join(entries)}</Collection></VTKFile>\n')
+    for old in folder.glob("*.vtr"):  # of a longer series that was there
+        if re.fullmatch("[0-9]{4,}", old.stem) and int(old.stem) >= len(entries):
+            old.unlink()
 
 
 def write_grid(path, grid, content):
