@@ -14,6 +14,7 @@ __all__ = ["Markup", "cell", "curves", "facts", "folded", "paragraphs", "spy", "
 # Of Okabe and Ito: safe for all eyes.
 COLOURS = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999"
 WIDTH, HEIGHT, LEFT, BELOW = 420, 260, 60, 40  # of a picture, and of what is left for its labels [pixels]
+SHORT = 20  # letters of a cell that stay on one line
 SPOTS = 48  # a matrix is drawn as at most so many squares a side
 
 
@@ -40,8 +41,14 @@ def table(rows, head=(), title=""):
     lines = [f"<caption>{cell(title)}</caption>"] if title else []
     if head:
         lines.append(f"<thead><tr>{''.join(f'<th>{cell(name)}</th>' for name in head)}</tr></thead>")
-    body = (f"<tr>{''.join(f'<td>{cell(value)}</td>' for value in row)}</tr>" for row in rows)
+    body = (f"<tr>{''.join(map(_in_table, row))}</tr>" for row in rows)
     return Markup("\n".join(["<table>", *lines, "<tbody>", *body, "</tbody>", "</table>"]))
+
+
+def _in_table(value):
+    """A cell of a table; a number or a word is not broken."""
+    text = cell(value)
+    return f'<td nowrap="nowrap">{text}</td>' if len(text) <= SHORT else f"<td>{text}</td>"
 
 
 def facts(title, entries):
@@ -111,7 +118,7 @@ def curves(lines, across, up, *, log=(False, True)):
     wide = WIDTH + 150 * (len(lines) > 1)
     return Markup(
         f'<svg viewBox="0 0 {wide} {HEIGHT}" width="{wide}" height="{HEIGHT}" font-size="12" role="img" '
-        f'stroke-width="1.5" style="max-width: 100%">{"".join(parts)}</svg>'
+        f'stroke-width="1.5" style="max-width: 100%; height: auto">{"".join(parts)}</svg>'
     )
 
 

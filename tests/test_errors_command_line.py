@@ -142,6 +142,19 @@ def test_the_report(scene, tmp_path, capsys):
     assert page.startswith("# poisson-wrong: disagrees") and "culprit: cube" in page
 
 
+def test_what_a_report_leaves_out_and_what_is_degraded(tmp_path, capsys):
+    (tmp_path / "cool.py").write_text(
+        "import autograd.numpy as np\n\nloss, x = lambda nu: np.exp(-3.0 * nu), 0.5\n", encoding="utf-8"
+    )
+    main(["report", str(tmp_path / "cool.py"), "--out", str(tmp_path / "out")])
+    printed = capsys.readouterr().out
+    line = "error against run time: not measured, the file gives no workprec_options (problem, methods, over)"
+    assert line in printed.splitlines()
+    degraded = int(re.search(r"(\d+) degraded", printed)[1])
+    page = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
+    assert (f"{degraded} stiff or extreme cases are degraded, see below." in page) == (degraded > 0)
+
+
 def test_a_report_of_a_loss_that_does_not_run(scene, tmp_path, capsys):
     assert main(["report", f"{scene}:broken", "--out", str(tmp_path / "out")]) == 3
     assert "gradient: not audited, LookupError: no such well" in capsys.readouterr().out

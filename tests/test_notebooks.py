@@ -68,6 +68,18 @@ def test_operator_of_zeros_and_of_no_cells():
         assert op.name in text and "Sparse" not in op._repr_html_() and "where" not in text
 
 
+def test_inverse_tells_how_it_solves():
+    inverse = dp.inverse(-dp.laplacian(GRID, dp.dirichlet))
+    entries = dict(cells(shown(inverse)))
+    assert entries["method"].startswith(f"{inverse.method}: ") and entries["unknowns"] == "24 of 24"
+    assert all(words in str(inverse) for name, words in entries.items() if name not in ("from", "to"))
+
+
+def test_numbers_are_not_broken():
+    table = markup.table([[2.4e-11, "a sentence that may be broken at its spaces"]])
+    assert '<td nowrap="nowrap">2.4e-11</td>' in table and "<td>a sentence" in table
+
+
 def test_solves():
     inverse = dp.inverse(-dp.laplacian(GRID, dp.dirichlet))
     assert "set-up" in inverse.info._repr_html_() and not any(cells(shown(inverse.info)))  # no solve so far
@@ -141,4 +153,4 @@ def test_curves_of_nothing():
 
 def test_words_of_the_user_are_no_markup():
     assert "<script>" not in markup.table([["<script>", markup.Markup("<b>bold</b>")]], ["<script>"], "<script>")
-    assert re.search("<td><b>bold</b></td>", markup.table([[markup.Markup("<b>bold</b>")]]))
+    assert re.search("<td[^>]*><b>bold</b></td>", markup.table([[markup.Markup("<b>bold</b>")]]))

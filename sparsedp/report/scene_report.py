@@ -30,7 +30,7 @@ __all__ = ["Source", "audited", "claim", "load", "write_report"]
 STARTS = ("start", "x")  # names of the point, the first that is there
 OPTIONS = "workprec", "stress"  # instruments whose arguments the file may hold, as dicts of the name NAME_options
 PAGES = "report.md", "report.html"
-NO_PROBLEM = "error against run time: not measured, the file gives no workprec_options (problem, methods, over)"
+NO_PROBLEM = "the file gives no workprec_options (problem, methods, over)"
 MEANING = {  # the worst first: one that is wrong beats one that is open
     "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
     "inconclusive": "Nothing is proved: the reason stands below. This is no pass.",
@@ -168,7 +168,9 @@ def write_report(source, folder, force=False):
         results = [_attempt(chapter, source) for chapter in CHAPTERS]
     words = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
     verdict = next(word for word in MEANING if word in words)
-    text, lines, sections, missing = [f"# {source.name}: {verdict}", "", MEANING[verdict]], [], [], []
+    degraded = getattr(results[-1], "counts", {}).get("degraded")
+    meaning = MEANING[verdict] + (f" {degraded} stiff or extreme cases are degraded, see below." if degraded else "")
+    text, lines, sections, missing = [f"# {source.name}: {verdict}", "", meaning], [], [], []
     for chapter, result in zip(CHAPTERS, results):
         sentences, files = [f"{chapter.failed}, {result}"], []
         if isinstance(result, Result):
@@ -183,7 +185,7 @@ def write_report(source, folder, force=False):
         text += ["", f"## {chapter.title}", "", *(f"- {sentence}" for sentence in sentences), "", *links, *caption]
         lines += sentences
     write_file(folder / PAGES[0], "\n".join([*text, ""]))
-    write_file(folder / PAGES[1], page(source.name, verdict, MEANING[verdict], sections, missing))
+    write_file(folder / PAGES[1], page(source.name, verdict, meaning, sections, missing))
     return verdict, lines
 
 

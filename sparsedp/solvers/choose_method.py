@@ -10,6 +10,7 @@ from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite, check_native, field_array, is_number, is_whole
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, spent
+from sparsedp.markup import facts
 from sparsedp.operator import Operator
 from sparsedp.operators.given import check_operator
 from sparsedp.shortcuts import together
@@ -392,15 +393,21 @@ class Inverse(Operator):
     def __repr__(self):
         return f"<{self.name}: {self.domain} -> {self.codomain}, {self.method}>"
 
+    def _facts(self):
+        """How it solves, in words."""
+        system, space = self.solver.system, self.solver.system.null_space
+        return {
+            "method": f"{self.method}: {self.reason}",
+            "unknowns": f"{system.unknowns} of {system.size}",
+            "tolerance": f"relative residual {system.rtol:g}",
+            "null space": f"{space.count} singular component{'s' * (space.count != 1)}, {self.solver.nullspace!r}",
+            "set-up": f"{self.info.setup_seconds:.2g} s; {self.info.hierarchy}",
+        }
+
     def __str__(self):
-        system, log = self.solver.system, self.info
-        space = system.null_space
-        lines = [
-            f"{self.name}: {self.domain} -> {self.codomain}",
-            f"  method      {self.method}: {self.reason}",
-            f"  unknowns    {system.unknowns} of {system.size}",
-            f"  tolerance   relative residual {system.rtol:g}",
-            f"  null space  {space.count} singular component{'s' * (space.count != 1)}, {self.solver.nullspace!r}",
-            f"  set-up      {log.setup_seconds:.2g} s; {log.hierarchy}",
-        ]
-        return "\n".join(lines)
+        lines = (f"  {name:10}  {words}" for name, words in self._facts().items())
+        return "\n".join([f"{self.name}: {self.domain} -> {self.codomain}", *lines])
+
+    def _repr_html_(self):
+        """For a notebook: how it solves."""
+        return facts(self.name, {"from": self.domain, "to": self.codomain, **self._facts()})
