@@ -284,3 +284,11 @@ def test_a_field_of_none_stays(method):
     step = lambda linear: dp.stepper(method, None, 0.01, linear=linear)
     found = step({"u": L, "v": L, "w": None})({"u": U, "v": None, "w": None})
     assert found["v"] is found["w"] is None and np.array_equal(found["u"], step(L)(U))
+
+
+def test_the_way_back_of_a_linear_step_has_a_name_of_its_own():
+    step, u = dp.stepper("heun", dp.laplacian(dp.Grid(5)), 0.1), np.arange(5.0)
+    with recording() as calls:
+        dp.grad(lambda u: anp.sum(step(u) ** 2))(u)
+    assert calls["stepper(heun)", "forward"] == calls["stepper(heun)", "vjp"] == 1
+    assert calls["stepper(heun).T", "forward"] == 1

@@ -150,18 +150,20 @@ class Polynomial(Scheme):
 
     def __init__(self, problem, name):
         super().__init__(problem, name, EXPLICIT[name].order)
-        self._rule = lru_cache(None)(taylor)  # made once, for every step
+        self._rule = lru_cache(None)(taylor)  # made once for each operator
 
     def __call__(self, u, params, t, h):
         name = f"stepper({self.name})"
         return self.problem.on_fields(
-            lambda L, z, leaf: self._rule(L, name, self.order)(z, leaf) if L else leaf, h, params, u
+            lambda L, z, leaf: leaf if L is None else self._rule(L, name, self.order)(z, leaf), h, params, u
         )
 
 
 def taylor(op, name, order, power=0):
     """The rule (z, u) -> L^power T_order(z L) u; its derivative in z is the same with order - 1 and power + 1."""
-    turned, slope = (partial(taylor, *line) for line in ((op.T, name, order, power), (op, name, order - 1, power + 1)))
+    other = name.removesuffix(".T") if name.endswith(".T") else f"{name}.T"
+    transposed = partial(taylor, op.T, other, order, power)
+    slope = partial(taylor, op, name, order - 1, power + 1)
 
     def forward(z, u):
         z = float(z)  # a NumPy scalar would round float32
@@ -175,11 +177,22 @@ def taylor(op, name, order, power=0):
         return total
 
     def vjp(nums, ans, z, u):
-        backs = lambda g: (anp.sum(g * slope()(z, u)) if num == 0 else turned()(z, g) for num in nums)
-        return lambda g: tuple(of_argument(back, (z, u)[num]) for num, back in zip(nums, backs(g), strict=True))
+        def pull(g):
+            found = []
+            for num in nums:
+                if num == 0:
+                    found.append(of_argument(anp.sum(g * slope()(z, u)), z))
+                else:
+                    found.append(of_argument(transposed()(z, g), u))
+            return tuple(found)
+
+        return pull
 
     def jvp(nums, tangents, ans, z, u):
-        return reduce(add, (t * slope()(z, u) if num == 0 else rule(z, t) for num, t in zip(nums, tangents)))
+        terms = []
+        for num, tangent in zip(nums, tangents, strict=True):
+            terms.append(tangent * slope()(z, u) if num == 0 else rule(z, tangent))
+        return reduce(add, terms)
 
     rule = Rule(name, forward, vjp, jvp)
     return rule
@@ -331,7 +344,9 @@ class Linear(Stages):
         """(1 - h c L)^-1 (b + the sum of factor * s(t) over pairs (factor, t)), field by field."""
         if self.problem.source is not None:
             b = combine(b, *((factor, self.problem.given(params, t)) for factor, t in shares))
-        return self.problem.on_fields(lambda L, z, leaf: self.resolvents[L](z, leaf) if L else leaf, h, params, b)
+        return self.problem.on_fields(
+            lambda L, z, leaf: leaf if L is None else self.resolvents[L](z, leaf), h, params, b
+        )
 
     def solve(self, guess, b, params, t, h):
         """x of x = b + h (c L x + s(t))."""
