@@ -84,6 +84,12 @@ def test_an_audit_is_a_table_in_markdown_too():
     assert "\n- verdict: agrees to" in text
 
 
+def test_what_a_result_draws():
+    lines, across, up = dp.check.gradient(lambda x: x**2, 1.5).curves()
+    assert list(lines)[0] == "random 1" and (across, up) == ("step", "|difference - gradient| / |derivative|")
+    assert dp.explain(lambda x: x**2, 1.5).curves() == ({}, "", "")
+
+
 def test_results_are_frozen_and_print_themselves():
     assert all(issubclass(kind, Result) for kind in (Plan, Certificate, Stress, Rows))
     found = dp.stress(lambda x: x**2, 1.5, only=["as given"])

@@ -15,7 +15,8 @@ class Result(Frozen):
     """What an instrument gives: frozen, as plain data, as text; true unless it has a verdict other than "agrees".
 
     The attributes are the values it is made with; the docstring of each kind lists them, and nothing else does.
-    ``parts()`` of each kind is its text from top to bottom: lines, the first one a title, and Tables.
+    ``parts()`` of each kind returns its text from top to bottom, a list of str and Table: lines, the first one a title,
+    and tables.
     """
 
     _plain: tuple = ()  # names of the attributes that are plain data; default: all that were given

@@ -138,9 +138,10 @@ def conservation_law(
             raise TypeError(f"{name} must be a function, got {type(function).__name__}; write {_example(name, count)}")
         check_takes(f"conservation_law, as {name},", function, count, _example(name, count))
     sides = resolve(grid, boundary, outflow)
-    conditions = {side for pair in sides for side in pair or ()}
-    for side in conditions - {*REPEATED}:
-        raise ValueError(f"conservation_law takes outflow, free_slip or inflow, got {side}; write one of them")
+    conditions = [side for pair in sides for side in pair or ()]
+    for side in conditions:
+        if side not in REPEATED:
+            raise ValueError(f"conservation_law takes outflow, free_slip or inflow, got {side}; write one of them")
     if (inflow_side in conditions) != (inflow is not None):
         raise ValueError(
             "conservation_law got a side of dp.inflow without inflow=, or inflow= without such a side; "
