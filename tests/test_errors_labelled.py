@@ -34,6 +34,11 @@ REFUSED = {
         "save takes attrs as a dict with keys from ['u', 'x', 'y', 'times'], got ['p', 'z']; leave them out",
         lambda path: dp.save(path, LINE, u=np.ones(LINE.shape), attrs={"p": {}, "z": {}}),
     ),
+    "attributes that are no dict": (
+        ValueError,
+        "save takes attrs as a dict with keys from ['u', 'x', 'y', 'times'], got ['u']; leave them out",
+        lambda path: dp.save(path, LINE, u=np.ones(LINE.shape), attrs=["u"]),
+    ),
     "units that are a number": (
         TypeError,
         "save takes units as a str, or a dict of str, numbers and arrays, in attrs, got 3 for u; write {'u': 'm'}",
@@ -130,3 +135,19 @@ def test_a_reader_that_may_not_or_cannot_read_says_so(suffix, error, tmp_path, m
     with pytest.raises(type(error)) as caught:
         dp.load(path)
     assert caught.value is error
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
+def test_a_file_that_may_not_be_read_is_not_damaged(suffix, tmp_path, monkeypatch):
+    """Root may read everything: the right is taken from the functions that open."""
+    path = tmp_path / f"a{suffix}"
+    dp.save(path, LINE, u=np.ones(LINE.shape))
+
+    def refuse(*arguments):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    with monkeypatch.context() as rights:
+        rights.setattr("builtins.open" if suffix == ".nc" else "os.scandir", refuse)
+        with pytest.raises(PermissionError) as caught:
+            dp.load(path)
+    assert str(caught.value) == f"[Errno 13] Permission denied: '{path}'"

@@ -31,8 +31,8 @@ def check_fields(name, grid, times, at, fields, dtypes=None):
 
 
 def check_names(name, argument, given, known):
-    """Refuse a dict with other keys than some names."""
-    unknown = sorted(set(given or ()) - set(known))
+    """Refuse what is no dict, or one with other keys than some names."""
+    unknown = sorted(set(given or ()) - set(known), key=str) if isinstance(given or {}, dict) else given
     if unknown:
         raise ValueError(f"{name} takes {argument} as a dict with keys from {[*known]}, got {unknown}; leave them out")
 
