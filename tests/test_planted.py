@@ -276,8 +276,8 @@ BUGS = {
     ),
     "components of a face field in the wrong order": Bug(
         "space.py",
-        "accumulate(map(prod, self.parts))",
-        "accumulate(map(prod, self.parts[::-1]))",
+        "ends = accumulate(map(prod, parts))",
+        "ends = accumulate(map(prod, parts[::-1]))",
         "tests/test_grid.py",
     ),
     "the lower wall for the upper one": Bug(
