@@ -9,7 +9,7 @@ from math import isnan
 
 import numpy as np
 
-__all__ = ["Markup", "cell", "curves", "facts", "folded", "paragraphs", "spy", "table"]
+__all__ = ["Markup", "cell", "curves", "facts", "folded", "paragraphs", "spy", "table", "text_of"]
 
 # Of Okabe and Ito: safe for all eyes.
 COLOURS = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999"
@@ -27,13 +27,16 @@ class Markup(str):
         return self
 
 
+def text_of(value, digits):
+    """A value in words: so many digits of a float, nothing for NaN and None."""
+    if isinstance(value, (float, np.floating)):
+        return "" if isnan(value) else f"{value:.{digits}g}"
+    return "" if value is None else str(value)
+
+
 def cell(value):
     """A value as HTML: three digits of a float, nothing for NaN and None."""
-    if isinstance(value, Markup):
-        return value
-    if isinstance(value, (float, np.floating)):
-        return "" if isnan(value) else f"{value:.3g}"
-    return "" if value is None else escape(str(value))
+    return value if isinstance(value, Markup) else escape(text_of(value, 3))
 
 
 def table(rows, head=(), title=""):

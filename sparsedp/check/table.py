@@ -2,7 +2,6 @@
 
 import csv
 import io
-import math
 import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,6 +10,7 @@ from sparsedp import markup
 
 __all__ = ["Table", "table_of"]
 
+DIGITS = 2  # of a float in a cell
 NUMBER = re.compile(r"[-+]?(\d[\d.]*(e[-+]\d+)?|nan|inf|exact)?").fullmatch  # what is set to the right of a column
 
 
@@ -22,7 +22,8 @@ class Table(NamedTuple):
 
     def texts(self):
         """The cells in words, below the names; without the columns that are empty, except the first one."""
-        columns = list(zip(*([text_of(cell) for cell in row] for row in (self.names, *self.rows)), strict=True))
+        texts = ([markup.text_of(cell, DIGITS) for cell in row] for row in (self.names, *self.rows))
+        columns = list(zip(*texts, strict=True))
         kept = [column for column in columns[1:] if any(column[1:]) or not self.rows]
         return list(zip(*columns[:1], *kept))
 
@@ -55,10 +56,3 @@ def table_of(rows, names=()):
     """Dicts -> Table of the entries of these names; default: all that they have, in the order of first use."""
     names = names or list(dict.fromkeys(name for row in rows for name in row)) or ["nothing"]
     return Table(names, [[row.get(name) for name in names] for row in rows])
-
-
-def text_of(value):
-    """A cell: two digits of a float, nothing for NaN and None."""
-    if isinstance(value, float):
-        return "" if math.isnan(value) else f"{value:.2g}"
-    return "" if value is None else str(value)
