@@ -106,7 +106,7 @@ def pullback(fun, x):
     if not any(moving):
         kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in entries})
         raise DerivativeError(
-            f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write x.astype(float)"
+            f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write np.asarray(x, float)"
         )
     entries = [_apart_from_caller(leaf) if moves else leaf for leaf, moves in zip(entries, moving, strict=True)]
 

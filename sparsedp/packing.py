@@ -129,7 +129,7 @@ class Packing:
         self._floating = list(map(is_variable, self._leaves))
         self.values = [np.asarray(leaf) for leaf in compress(self._leaves, self._floating)]
         if not self.values:
-            raise DerivativeError(f"floating values are needed, and {root} holds none; write {root}.astype(float)")
+            raise DerivativeError(f"floating values are needed, and {root} holds none; write np.asarray({root}, float)")
         self.complex = any(map(np.iscomplexobj, self.values))
         self.eps = max(float(np.finfo(x.dtype).eps) for x in self.values)
         ends = [0, *accumulate(joined([x]).size for x in self.values)]

@@ -120,7 +120,7 @@ def test_own_steps_and_bad_arguments():
         AUDIT(smooth, X, steps=[0.1])
     with pytest.raises(
         dp.errors.DerivativeError,
-        match=r"floating values are needed, and x holds none; write x.astype\(float\)",
+        match=r"floating values are needed, and x holds none; write np.asarray\(x, float\)",
     ):
         AUDIT(smooth, np.arange(3))
     with pytest.raises(

@@ -98,7 +98,7 @@ TABLE = [
     (
         lambda: value_and_grad(lambda x: 1.0)(np.ones(2, dtype=int)),
         DERIVATIVE,
-        "a gradient needs floating values, got int64; write x.astype(float)",
+        "a gradient needs floating values, got int64; write np.asarray(x, float)",
     ),
     (
         lambda: value_and_grad(lambda x: x)(np.ones(2)),

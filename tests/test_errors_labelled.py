@@ -50,6 +50,18 @@ REFUSED = {
         "write {'u': 'm'}",
         lambda path: dp.save(path, LINE, u=np.ones(LINE.shape), attrs={"u": {"a": None}}),
     ),
+    "an attribute of ragged lists": (
+        TypeError,
+        "save takes units as a str, or a dict of str, numbers and arrays, in attrs, got {'a': [[1], [2, 3]]} for u; "
+        "write {'u': 'm'}",
+        lambda path: dp.save(path, LINE, u=np.ones(LINE.shape), attrs={"u": {"a": [[1], [2, 3]]}}),
+    ),
+    "an attribute without a name": (
+        TypeError,
+        "save takes units as a str, or a dict of str, numbers and arrays, in attrs, got {'': 1} for u; "
+        "write {'u': 'm'}",
+        lambda path: dp.save(path, LINE, u=np.ones(LINE.shape), attrs={"u": {"": 1}}),
+    ),
     "half precision": (
         TypeError,
         "u has dtype float16, which such a file does not hold; write u.astype(float)",

@@ -162,7 +162,7 @@ TABLE = [
     (
         slope(state=np.arange(3)),
         NONE,
-        "a gradient through rollout needs a state of floating numbers, got int64; write state.astype(float)",
+        "a gradient through rollout needs a state of floating numbers, got int64; write np.asarray(state, float)",
     ),
     (
         grad(traced_whole_numbers),

@@ -72,7 +72,7 @@ CASES = {
     ),
     "ParaView and back": (
         ValueError,
-        "load takes a path that ends in .npz, .nc or .zarr, got 'u.vti'; write 'fields.npz'",
+        "load takes a path that ends in .npz, .nc or .zarr, got 'u.vti'; save the fields as .npz too",
         lambda: dp.load("u.vti"),
     ),
     "ParaView, complex": (
@@ -100,6 +100,11 @@ CASES = {
         ValueError,
         "save puts one state into .vti or .vtr, and a series with times into .pvd, got .vti",
         lambda: dp.save("u.vti", GRID, times=[0.0], u=np.zeros((1, 3, 2))),
+    ),
+    "ParaView, a time that is none": (
+        dp.errors.NonFiniteError,
+        "times of save must be finite, got 1 that are NaN or infinite, the first at 1",
+        lambda: dp.save("u.pvd", GRID, times=[0.0, np.nan], u=np.zeros((2, 3, 2))),
     ),
     "ParaView, one state in a series": (
         ValueError,

@@ -117,7 +117,7 @@ def test_ranges_of_options():
 
 def test_losses_and_gradients():
     with pytest.raises(
-        DerivativeError, match=r"floating values are needed, and start holds none; write start.astype\(float\)"
+        DerivativeError, match=r"floating values are needed, and start holds none; write np.asarray\(start, float\)"
     ):
         dp.minimize(bowl, np.arange(3))
     with pytest.raises(ShapeError, match=r"the loss must be a scalar, got an array of shape \(2,\); sum it"):

@@ -155,7 +155,7 @@ class Polynomial(Scheme):
     def __call__(self, u, params, t, h):
         name = f"stepper({self.name})"
         return self.problem.on_fields(
-            lambda L, z, leaf: leaf if L is None else self._rule(L, name, self.order)(z, leaf), h, params, u
+            lambda L, z, leaf: 1.0 * leaf if L is None else self._rule(L, name, self.order)(z, leaf), h, params, u
         )
 
 

@@ -304,10 +304,17 @@ def stability_chart(growth, ax):
     ylabel, xlabel = growth.names
     ax.set(xlabel=xlabel, ylabel=ylabel, title="stable: blue; grows: red; refused: grey", facecolor="0.75")
     factors = np.clip(growth.factors, 0.0, 2.0)
-    image = ax.pcolormesh(growth.viscosities, growth.time_steps, factors, cmap="coolwarm", vmin=0, vmax=2)
+    ends = map(_ends_between, (growth.viscosities, growth.time_steps))
+    image = ax.pcolormesh(*ends, factors, cmap="coolwarm", vmin=0, vmax=2)
     ax.figure.colorbar(image, ax=ax, label="growth factor of a step (2 and more: red)")
     ax.loglog(*growth.here[::-1], marker="*", color="black", markersize=12)
     return ax
+
+
+def _ends_between(values):
+    """Rising numbers > 0 -> the ends of cells around them, as wide on both sides on a logarithmic axis."""
+    ends = np.sqrt(values[1:] * values[:-1])
+    return np.concatenate([values[:1] ** 2 / ends[:1], ends, values[-1:] ** 2 / ends[-1:]])
 
 
 # ---------------------------------------------------------------- figures and files

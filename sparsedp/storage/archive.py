@@ -3,6 +3,7 @@
 from importlib.util import find_spec
 from pathlib import Path
 
+from sparsedp.fields import check_finite
 from sparsedp.files import load_tree, save_tree
 from sparsedp.grid import Grid, check_grid
 from sparsedp.storage.contents import KIND, OTHERS, REAL, check_fields
@@ -56,7 +57,8 @@ def save(path, grid, /, *, times=None, attrs=None, at=None, **fields):
         If an array is no field on the grid, or has not one entry for each time.
     TypeError
         If a field is no plain array of numbers: a value on a tape, a tensor, a field on ranks; or has a dtype that the
-        file has not: half precision; for ParaView complex numbers and truth values.
+        file has not: half precision; for ParaView complex numbers and truth values. Or if attributes are neither text
+        nor numbers.
     ValueError
         If the name ends otherwise, or the file cannot hold this grid, a series, or attributes.
     ImportError
@@ -102,6 +104,8 @@ def _check_for_paraview(suffix, grid, times, content):
     """Refuse what its files cannot hold."""
     if (times is None) == (suffix == ".pvd"):
         raise ValueError(f"save puts one state into .vti or .vtr, and a series with times into .pvd, got {suffix}")
+    if times is not None:
+        check_finite("times of save", times)
     if suffix == ".vti" and not (content and grid.cells.size and all(grid.uniform)):
         raise ValueError(
             f"save puts fields on uniform grids into .vti, got {len(content)} on {grid}; write 'fields.vtr'"
@@ -164,9 +168,9 @@ def _suffix(name, path, allowed):
     suffix = Path(path).suffix.lower()
     if suffix not in allowed:
         *others, last = allowed
+        instead = "save the fields as .npz too" if suffix in PARAVIEW else "write 'fields.npz'"
         raise ValueError(
-            f"{name} takes a path that ends in {', '.join(others)} or {last}, got {Path(path).name!r}; "
-            "write 'fields.npz'"
+            f"{name} takes a path that ends in {', '.join(others)} or {last}, got {Path(path).name!r}; {instead}"
         )
     return suffix
 

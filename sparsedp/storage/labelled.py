@@ -149,7 +149,14 @@ def dataset_of(name, grid, attrs, times, content):
 
 
 def _is_attribute(key, value):
-    return isinstance(key, str) and (isinstance(value, str) or np.asarray(value).dtype.kind in "iuf")
+    entries = value if isinstance(value, (list, tuple)) else [value]
+    numbers = all(
+        isinstance(x, (np.ndarray, np.generic, int, float))
+        and np.asarray(x).dtype.kind in "iuf"
+        and (x is value or np.ndim(x) == 0)
+        for x in entries
+    )
+    return isinstance(key, str) and key != "" and (isinstance(value, str) or numbers)
 
 
 def write_dataset(path, dataset):

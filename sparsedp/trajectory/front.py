@@ -211,5 +211,5 @@ def _check_values(loop, args, traced):
         kinds = ", ".join(sorted({str(dtype_of(leaf)) for leaf in loop.state.statics if leaf is not None}))
         raise DerivativeError(
             f"a gradient through rollout needs a state of floating numbers, got {kinds or 'nothing'}; "
-            "write state.astype(float)"
+            "write np.asarray(state, float)"
         )
