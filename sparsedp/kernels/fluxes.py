@@ -168,10 +168,42 @@ def weigh(lines, line, x, start, table, row, axes, a, side, free, c):
         lines[line + j] *= free[2 * a + row % 2, c + j]
 
 
+def to_velocity(w, gw, fresh, u, inflow, slopes, given, ratio, flux, a, on_sides, c, sides, places):
+    """The cotangent of w for the sides of a piece; `given` holds that of the cells and of those beyond, at `places`.
+
+    The value at a side is that of the cell it comes from, at rest the mean.
+    """
+    (below, above), rest, many = sides, 1.0 - flux, slopes.shape[1]
+    m, q = below.speed, above.beyond
+    for j in range(below.begin, below.begin if on_sides else below.end):  # in a cell w is that of both its sides
+        near = share(w[m + j])
+        low = (below.shown * u[below.beyond + j] - u[c + j]) * given[places[0] + j]
+        high = (above.shown * u[q + j] - u[c + j]) * given[places[1] + j]
+        total = ratio * (near * low - (1.0 - near) * high)
+        gw[m + j] = total if fresh else total + gw[m + j]
+    for upper in range(2):
+        (b, e, z, m, wall, _, inner, shown), x, i = sides[upper], places[upper], places[2 + upper]
+        if upper and on_sides and inner:
+            continue  # the velocity on an upper side is that on the lower side of the cell beyond
+        sign, back = 1.0 - 2.0 * upper, on_sides * inner
+        for j in range(b, e if on_sides else b):
+            near = share(sign * w[m + j])
+            value = near * (shown * u[z + j]) + (1.0 - near) * u[c + j]
+            mine, theirs = value - rest * u[c + j], value - rest * u[z + j]
+            total = sign * ratio * (mine * given[x + j] - back * given[i + j] * theirs)
+            gw[m + j] = total if fresh else total + gw[m + j]
+        for j in range(b, b if shown else e):
+            gw[m + j] += sign * ratio * given[x + j] * (share(sign * w[m + j]) * inflow[wall + j])
+        for j in range(b, e if slopes.size else b):
+            near = share(sign * w[m + j])
+            slope = near * inner * slopes[a, (1 - upper) % many, z + j] - (1.0 - near) * slopes[a, upper % many, c + j]
+            gw[m + j] += ratio * (given[x + j] - back * given[i + j]) * slope
+
+
 limiter = van_leer  # in the loop over slopes: stands for the function of the scheme it is compiled for
 # A product and a sum are one instruction: the same bits everywhere.
 OPTIONS: dict[str, Any] = {
-    "uses": (tile_of, side_of, weigh, share),
+    "uses": (tile_of, side_of, weigh, share, to_velocity),
     "fastmath": {"contract"},
 }
 
@@ -243,7 +275,7 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
 
     gu, gw: empty where they are not wanted. The cotangents of a and b are left in the last slopes of `partials`.
     """
-    memory, lines, uneven, rest = np.empty((3, LINE)), np.empty(4 * LINE), axes[0, UNEVEN], 1.0 - flux
+    memory, lines, uneven = np.empty((3, LINE)), np.empty(4 * LINE), axes[0, UNEVEN]
     field, asked, given, many = memory[0], memory[1:], lines if uneven else g, slopes.shape[1]
     for part in range(start, stop):
         tile = _, _, _, c, size = tile_of(axes, part)
@@ -255,7 +287,7 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
             for number in range(3 if a == len(axes) - 1 else 1):
                 below = side_of(axes, a, number, int64(0), tile)
                 above = side_of(axes, a, number, int64(1), tile)
-                b, e, m, h = below.begin, below.end, below.speed, above.speed
+                b, e, m, h, sides = below.begin, below.end, below.speed, above.speed, (below, above)
                 if b == e:
                     continue
                 x, y, i, k = c, c, below.beyond, above.beyond  # what cells and those beyond want of a flow of 1
@@ -266,6 +298,7 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
                     weigh(lines, TWO, g, i, table, THEIRS, axes, a, below, free, c)
                     weigh(lines, THREE, g, k, table, THEIRS + 1, axes, a, above, free, c)
                     x, y, i, k = NONE, ONE, TWO, THREE
+                places = x, y, i, k
                 for j in range(b, e if gu.size else b):
                     low, high = ratio * w[m + j], -ratio * w[h + j]  # into the cells
                     more = below.inner * max(-ratio * w[o + j], 0.0) * given[i + j]
@@ -273,7 +306,7 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
                     less = (max(low, 0.0) - flux * low) * given[x + j] + (max(high, 0.0) - flux * high) * given[y + j]
                     field[j] += more - less
                 for upper in range(2):
-                    (_, _, z, m, wall, _, inner, shown), sign = (above, -1.0) if upper else (below, 1.0)
+                    (_, _, _, m, wall, _, inner, shown), sign = (above, -1.0) if upper else (below, 1.0)
                     x, i, o, into = (y, k, p, -ratio) if upper else (x, i, o, ratio)
                     target, at = (field, NONE) if shown else (ginflow, wall)
                     for j in range(b, b if inner or not gu.size else e):
@@ -281,22 +314,8 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
                     for j in range(b, e if partials.size else b):
                         more = inner * max(-into * w[o + j], 0.0) * given[i + j]
                         asked[upper, j] = sign * (max(-into * w[m + j], 0.0) * given[x + j] - more)
-                    if not gw.size or upper and on_sides and inner:
-                        continue  # the velocity on an upper side is that on the lower side of the cell beyond
-                    back, added = on_sides * inner, not fresh or upper > on_sides
-                    for j in range(b, e):  # the value at the side is that of the cell it comes from, at rest the mean
-                        near = share(sign * w[m + j])
-                        value = near * (shown * u[z + j]) + (1.0 - near) * u[c + j]
-                        mine, theirs = value - rest * u[c + j], value - rest * u[z + j]
-                        total = into * (mine * given[x + j] - back * given[i + j] * theirs)
-                        gw[m + j] = total + gw[m + j] if added else total
-                    for j in range(b, b if shown else e):
-                        gw[m + j] += into * given[x + j] * (share(sign * w[m + j]) * inflow[wall + j])
-                    for j in range(b, e if slopes.size else b):
-                        near = share(sign * w[m + j])
-                        slope = near * inner * slopes[a, (1 - upper) % many, z + j]
-                        slope -= (1.0 - near) * slopes[a, upper % many, c + j]
-                        gw[m + j] += ratio * (given[x + j] - back * given[i + j]) * slope
+                if gw.size:
+                    to_velocity(w, gw, fresh, u, inflow, slopes, given, ratio, flux, a, on_sides, c, sides, places)
             for by in range(2 if partials.size else 0):  # what is asked of behind and ahead -> cotangents of a and b
                 for j in range(size):
                     total = partials[a, 0, by, c + j] * asked[0, j]
