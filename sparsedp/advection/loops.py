@@ -23,18 +23,20 @@ class Loops:
         self.limiter = fluxes.slopes.get(reference.setting.scheme)
         self.many = 1 if self.scheme.symmetric else 2  # arrays of slopes for each axis
         self.least = 1.0 - self.scheme.most - ROUNDING
+        self.none = [self._empty(part, 0, 0) for part in self.components]  # the slopes of a scheme of first order
 
     def slopes(self, u, inflow, partials):
         """For each component the slopes and (partials) their derivatives in a and b; empty for a first-order scheme."""
         found = []
-        for part in self.components:
-            axes, cells = len(part.axes), part.field.stop - part.field.start if self.limiter else 0
-            shapes = (axes, self.many, cells), (axes, self.many, 2, cells * partials)
-            arrays = [results.empty(shape, float) for shape in shapes]
-            if self.limiter:
-                part.run(self.limiter, u[part.field], inflow[part.inflow], part.free, part.table, part.axes, *arrays)
+        for part in self.components if self.limiter else ():
+            arrays = self._empty(part, part.field.stop - part.field.start, partials)
+            part.run(self.limiter, u[part.field], inflow[part.inflow], part.free, part.table, part.axes, *arrays)
             found.append(arrays)
-        return found
+        return found or self.none
+
+    def _empty(self, part, cells, partials):
+        shapes = (len(part.axes), self.many, cells), (len(part.axes), self.many, 2, cells * partials)
+        return [results.empty(shape, float) for shape in shapes]
 
     def _given(self, part, u, inflow, w, slopes, dt):
         """What the loops over fields and velocities begin with."""

@@ -10,7 +10,7 @@ from sparsedp.tape import cast, dtype_of, isbox, plain
 
 __all__ = ["LETTERS", "check_given", "check_step", "flat_numbers", "prepare", "raised", "result_like", "unflatten"]
 
-FLOAT = np.dtype(float)
+FLOAT, NOTHING = np.dtype(float), np.zeros(0)
 LETTERS = "u", "v", "dt", "inflow"
 
 
@@ -67,7 +67,7 @@ def _shape(name, letter, value):
 
 def _inflow(name, inflow, walls):
     if type(inflow) is float:
-        return np.full(walls.size, inflow)
+        return np.full(walls.size, inflow) if walls.size else NOTHING
     if np.shape(inflow) == ():
         return flat_numbers(name, "inflow", inflow, ((),)) * np.ones(walls.size)
     return flat_numbers(name, "inflow", inflow, (walls.shape,))
