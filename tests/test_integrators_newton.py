@@ -11,7 +11,7 @@ import sparsedp as dp
 from sparsedp import kernels
 from sparsedp.derivative import pullback, value_and_grad
 from sparsedp.errors import NonFiniteError
-from sparsedp.integrators.functions import Function
+from sparsedp.integrators.exponential import Function
 from sparsedp.ledger import recording
 from sparsedp.solvers.choose_method import build_dense
 from sparsedp.solvers.jacobian import Jacobians

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 
 import sparsedp as dp
 from sparsedp.derivative import pullback, value_and_grad
-from sparsedp.integrators.functions import Function, PhiFunctions, phi
+from sparsedp.integrators.exponential import Function, PhiFunctions, phi
 from sparsedp.ledger import recording
 
 GRID = dp.Grid(16, size=1.0)

@@ -10,7 +10,6 @@ from sparsedp.integrators.runge_kutta import (
     EXPLICIT,
     IMPLICIT,
     Explicit,
-    Exponential,
     Linear,
     Nonlinear,
     Polynomial,
@@ -204,6 +203,8 @@ def _scheme(method, given, settings):
         plain = problem.linear and problem.source is None and all(term.op.layout is None for term in problem.stiff)
         scheme = (Polynomial if plain else Explicit)(problem, method)
     elif method == "etdrk4":
+        from sparsedp.integrators.exponential import Exponential
+
         scheme = Exponential(problem)
     elif method == "imex" or problem.linear:
         scheme = Linear(problem, method, settings, KEPT[tolerance is not None])

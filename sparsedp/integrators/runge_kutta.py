@@ -33,27 +33,18 @@ serves all stages, steps and adjoint solves of one z. For z = 0, x is b, and not
 
 What L leaves as it is (the mean, where nothing flows through the walls) is split off before the solve and added
 after it: 1 - z L has the eigenvalue 1 there beside those of size z |L|, and would lose it to rounding.
-
-etdrk4, exponential time differencing, is made of functions of z L. Order 4, and exact where N is constant and s a
-polynomial of degree 3. A source counts in every stage by the integral of exp((h - x) c L) s(t + x), with s through four
-points.
-Source: Cox and Matthews, J. Comput. Phys. 176 (2002), formulas 26 to 29; Hochbruck and Ostermann,
-Acta Numerica 19 (2010), section 2.2, exponential quadrature.
 """
 
 from functools import cached_property, lru_cache, partial, reduce
-from math import factorial, sqrt
+from math import sqrt
 from operator import add
 from typing import Any, NamedTuple
 
 import autograd.numpy as anp
-import numpy as np
 import scipy.sparse as sp
-from numpy.polynomial import Polynomial as Line
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import ConvergenceError
-from sparsedp.integrators.functions import Function, PhiFunctions
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
@@ -67,13 +58,11 @@ from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
 from sparsedp.tape import Rule
-from sparsedp.tree import mapped
 
 __all__ = [
     "EXPLICIT",
     "IMPLICIT",
     "Explicit",
-    "Exponential",
     "Linear",
     "Nonlinear",
     "Polynomial",
@@ -176,23 +165,27 @@ def taylor(op, name, order, power=0):
             total = op.apply(total)
         return total
 
-    def vjp(nums, ans, z, u):
+    return family(name, forward, slope, transposed)
+
+
+def family(name, forward, slope, transposed):
+    """The Rule of (z, b), forward(z, b) = F(z) b: a linear map that depends on a number.
+
+    `slope`, `transposed`: functions that give the Rules of F'(z) b and of F(z)^T b, of the same form. With y = F(z) b
+
+        dy = F(z) db + F'(z) b dz,     b_bar = F(z)^T g,     z_bar = g . F'(z) b.
+    """
+
+    def vjp(nums, ans, *given):
         def pull(g):
-            found = []
-            for num in nums:
-                if num == 0:
-                    found.append(of_argument(anp.sum(g * slope()(z, u)), z))
-                else:
-                    found.append(of_argument(transposed()(z, g), u))
-            return tuple(found)
+            backs = (transposed()(given[0], g) if num else anp.sum(g * slope()(*given)) for num in nums)
+            return tuple(of_argument(back, given[num]) for num, back in zip(nums, backs, strict=True))
 
         return pull
 
-    def jvp(nums, tangents, ans, z, u):
-        terms = []
-        for num, tangent in zip(nums, tangents, strict=True):
-            terms.append(tangent * slope()(z, u) if num == 0 else rule(z, tangent))
-        return reduce(add, terms)
+    def jvp(nums, tangents, ans, *given):
+        pairs = zip(nums, tangents, strict=True)
+        return reduce(add, (rule(given[0], tangent) if num else tangent * slope()(*given) for num, tangent in pairs))
 
     rule = Rule(name, forward, vjp, jvp)
     return rule
@@ -416,69 +409,3 @@ def shifted(jacobian, timed):
 def as_matrix(J):
     """A jacobian that was given, as a sparse matrix."""
     return (J if isinstance(J, Operator) else from_matrix(J)).matrix
-
-
-# ---- exponential -----------------------------------------------------------------------------------------------------
-
-WHOLE, HALF, MEAN = Function((1.0,)), Function((1.0,), 0.5), Function((0.0, 0.5), 0.5)
-BEGIN, MIDDLE, END = (
-    Function((0.0, 1.0, -3.0, 4.0)),
-    Function((0.0, 0.0, 2.0, -4.0)),
-    Function((0.0, 0.0, -1.0, 4.0)),
-)
-NODES = (0.0, 0.5 - 0.1 * 5**0.5, 0.5 + 0.1 * 5**0.5, 1.0)  # of Lobatto, as shares of a step
-
-
-def quadrature(nodes, start, stop):
-    """Weights of s(t + node h) in h times the integral of exp((stop - x) z L) s(t + x h) over start < x < stop.
-
-    Of the Lagrange polynomials of the nodes; that of x^k over 0 < x < 1 is k! phi_{k+1}(z L).
-    """
-    found = []
-    for values in np.eye(len(nodes)):
-        line = Line.fit(nodes, values, len(nodes) - 1, domain=(start, stop), window=(0.0, 1.0))
-        weights = (float((stop - start) * factorial(k) * a) for k, a in enumerate(line.coef))
-        found.append(Function((0.0, *weights), stop - start))
-    return tuple(found)
-
-
-class Exponential(Scheme):
-    """Exponential time differencing, Runge-Kutta of order 4."""
-
-    dyadic = True
-
-    def __init__(self, problem):
-        super().__init__(problem, "etdrk4", 4)
-        self.functions = {op: PhiFunctions(op, "stepper(etdrk4)") for op in problem.operators} | {None: _free}
-        self.nodes = () if problem.source is None else NODES if problem.moving else NODES[:1]
-        self.parts = [quadrature(self.nodes, *ends) for ends in ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0))]
-
-    def __call__(self, u, params, t, h):
-        def f(functions, *trees):
-            def of_field(L, z, *row):
-                return reduce(add, (self.functions[L](f, z, leaf) for f, leaf in zip(functions, row, strict=True)))
-
-            return self.problem.on_fields(of_field, h, params, *trees)
-
-        def scaled(rate):
-            return mapped(lambda leaf: leaf if leaf is None else h * leaf, rate)
-
-        s = [scaled(self.problem.given(params, later(t, node * h))) for node in self.nodes]
-        whole, first, second = self.parts
-        if self.problem.rate is None:
-            return f((WHOLE, *whole), u, *s)
-
-        def n(v, share):
-            return scaled(self.problem.explicit(v, params, later(t, share * h)))
-
-        n0, half = n(u, 0.0), f((HALF, *first), u, *s)
-        a = combine(half, (1.0, f((MEAN,), n0)))
-        n1 = n(a, 0.5)
-        n2 = n(combine(half, (1.0, f((MEAN,), n1))), 0.5)
-        n3 = n(f((HALF, MEAN, *second), a, combine(n2, (1.0, n2), (-1.0, n0)), *s), 1.0)
-        return f((WHOLE, BEGIN, MIDDLE, END, *whole), u, n0, combine(n1, (1.0, n2)), n3, *s)
-
-
-def _free(function, z, b):
-    """The same where L is 0."""
-    return function.start * b
