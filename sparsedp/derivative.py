@@ -11,7 +11,7 @@ import numpy as np
 
 from sparsedp.constants import is_fixed
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
-from sparsedp.fields import check_function, check_native, is_whole
+from sparsedp.fields import check_function, check_native, check_whole
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
 from sparsedp.shortcuts import ELSEWHERE, Part, alike, held_for_many, together
@@ -507,7 +507,9 @@ def grad(loss, argnum=0):
     Raises
     ------
     TypeError
-        If `loss` is not a function, or `argnum` no whole number.
+        If `loss` is not a function.
+    ValueError
+        If `argnum` is no whole number >= 0.
     ShapeError, DerivativeError
         On use, as `value_and_grad`.
 
@@ -540,7 +542,9 @@ def value_and_grad(loss, argnum=0):
     Raises
     ------
     TypeError
-        If `loss` is not a function, or `argnum` no whole number; on use, if there is no such argument.
+        If `loss` is not a function; on use, if there is no such argument.
+    ValueError
+        If `argnum` is no whole number >= 0.
     ShapeError
         If the loss is not a scalar.
     DerivativeError
@@ -559,8 +563,7 @@ def value_and_grad(loss, argnum=0):
     (18.0, {'a': 12.0, 'n': None})
     """
     check_function("value_and_grad", loss, "lambda x: np.sum(x**2)")
-    if not is_whole(argnum, 0):
-        raise TypeError(f"value_and_grad takes the number of an argument as argnum, got {argnum!r}; write 0, 1, ...")
+    argnum = check_whole("argnum of value_and_grad", argnum, 0, ", the number of an argument")
 
     def evaluate(*args):
         if len(args) <= argnum:

@@ -137,10 +137,11 @@ def check_function(name, thing, example):
         raise TypeError(f"{name} takes a function, got {type(thing).__name__}; write {example}")
 
 
-def check_choice(name, word, choices):
-    """Refuse what is none of some words."""
-    if word not in tuple(choices):
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {word!r}")
+def check_choice(name, word, choices, advice=""):
+    """Refuse what is none of some words; where these are True and False, 1 is none of them."""
+    if not any(isinstance(word, type(one)) and word == one for one in choices):
+        words = ", ".join(str(one) for one in choices if one is not None)
+        raise ValueError(f"{name} must be one of {words}, got {word!r}{advice}")
 
 
 def check_takes(name, fun, count, example):
@@ -156,6 +157,7 @@ RANGES = {
     "": lambda value: True,
     "> 0": lambda value: value > 0,
     ">= 0": lambda value: value >= 0,
+    "between 0 and 1": lambda value: 0 < value < 1,
     "from 0 to 1": lambda value: 0 <= value <= 1,
     "from 0 to below 1": lambda value: 0 <= value < 1,
 }

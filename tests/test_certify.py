@@ -120,7 +120,7 @@ def test_text_data_and_state():
     with pytest.raises(AttributeError, match="Certificate is frozen; make a new one instead of setting value"):
         found.value = 0.0
     with pytest.raises(
-        ValueError, match="certify needs a target between 0 and 1, got 2; write for example target=0.01"
+        ValueError, match="target of certify must be between 0 and 1, got 2; write for example target=0.01"
     ):
         dp.certify(lambda u: anp.sum(u), B, target=2)
     with pytest.raises(ZeroDivisionError):
@@ -190,7 +190,7 @@ def test_direct_solves_and_refusals():
     assert loose.passes == loose.evaluations and loose.iterations == 0
     with pytest.raises(
         ValueError,
-        match=r"certified needs 0 < fraction < 1 and a tolerance >= 0, got 2 and 0; write for example certified\(0.1\)",
+        match=r"fraction of certified must be between 0 and 1, got 2; write for example certified\(0.1\)",
     ):
         dp.certified(2, 0)
     with pytest.raises(

@@ -304,7 +304,9 @@ def test_refused_settings(given, message):
 
 
 def test_refused_functions():
-    with pytest.raises(TypeError, match="flux must be a function, got ndarray; write lambda u, params, axis: ..."):
+    with pytest.raises(
+        TypeError, match="conservation_law, as flux, takes a function, got ndarray; write lambda u, params, axis: ..."
+    ):
         dp.conservation_law(LINE, np.ones(4), carry)
     with pytest.raises(TypeError, match="conservation_law, as speed, calls a function with 3 arguments, got one that"):
         dp.conservation_law(LINE, carry, lambda u: u)

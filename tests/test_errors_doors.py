@@ -89,11 +89,11 @@ TABLE = [
         TYPE,
         "matrix_solver takes plain arrays, got a masked array; fill it first",
     ),
-    (lambda: dp.implicit(None), TYPE, "implicit takes a function as residual, got NoneType; write lambda x: ..."),
+    (lambda: dp.implicit(None), TYPE, "implicit, as residual, takes a function, got NoneType; write lambda x: ..."),
     (
         lambda: dp.implicit(lambda x: x, LAP.matrix),
         TYPE,
-        "implicit takes a function as jacobian, got csr_array; write lambda x: ...",
+        "implicit, as jacobian, takes a function, got csr_array; write lambda x: ...",
     ),
     (
         lambda: dp.implicit(lambda x: x)(MASKED),

@@ -64,7 +64,7 @@ WRONG = [
     ),
     (
         lambda: dp.check.gradient(lambda x: anp.sum(x**2), np.ones(3), directions=-1), ValueError,
-        "a sweep needs directions >= 0, a whole number, got -1; the default is 3",
+        "directions of check.gradient must be a whole number >= 0, got -1; the default is 3",
     ),
 ]  # fmt: skip
 

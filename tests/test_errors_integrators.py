@@ -28,7 +28,7 @@ TABLE = [
     (
         lambda: dp.stepper("euler", decay, 0.1, tolerance=0),
         VALUE,
-        "tolerance must be between 0 and 1 or None, got 0; write for example 1e-6",
+        "tolerance of stepper must be between 0 and 1, got 0; write for example 1e-6",
     ),
     (
         lambda: dp.stepper("rk4", decay, 0.1, tolerance=1e-3, floor=(1e-3, -1.0)),

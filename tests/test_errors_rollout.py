@@ -117,9 +117,9 @@ def grad(loss):
 
 TABLE = [
     # what is given
-    (roll(n=-1), VALUE, "rollout needs n >= 0, a whole number of steps, got -1"),
-    (roll(n=2.5), VALUE, "rollout needs n >= 0, a whole number of steps, got 2.5"),
-    (roll(n=True), VALUE, "rollout needs n >= 0, a whole number of steps, got True"),
+    (roll(n=-1), VALUE, "n of rollout must be a whole number >= 0, got -1, the number of steps"),
+    (roll(n=2.5), VALUE, "n of rollout must be a whole number >= 0, got 2.5, the number of steps"),
+    (roll(n=True), VALUE, "n of rollout must be a whole number >= 0, got True, the number of steps"),
     (
         grad(traced_number),
         NONE,
@@ -148,7 +148,11 @@ TABLE = [
     (roll(keep=[-1, 2]), VALUE, "keep needs at least one state, numbers from 0 on, got [-1, 2]"),
     (roll(keep=[1, 4]), VALUE, "keep needs rising numbers of states from 0 to n = 3, got [1, 4]"),
     (roll(keep=[2, 1]), VALUE, "keep needs rising numbers of states from 0 to n = 3, got [2, 1]"),
-    (roll(truncate=0), VALUE, "rollout needs truncate >= 1, a whole number of steps, or None, got 0"),
+    (
+        roll(truncate=0),
+        VALUE,
+        "truncate of rollout must be a whole number >= 1, got 0; leave it out and nothing is cut",
+    ),
     (
         roll(state={"a": U, "b": np.array([[1.0, np.nan], [np.inf, 2.0]])}),
         FINITE,

@@ -42,7 +42,11 @@ def not_linear():
 SOLVE = dp.matrix_solver(np.eye(3))
 
 TABLE = [
-    (lambda: dp.implicit(square, maxiter=None), VALUE, "maxiter must be a whole number >= 1, got None"),
+    (
+        lambda: dp.implicit(square, maxiter=None),
+        VALUE,
+        "maxiter must be a whole number >= 1, got None; the default is 50",
+    ),
     (
         lambda: dp.implicit(square)(1j, 4.0),
         TYPE,

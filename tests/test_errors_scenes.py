@@ -136,7 +136,7 @@ TABLE = [
     (
         lambda: dp.conservation_law(LINE, np.ones(4), carry),
         TYPE,
-        "flux must be a function, got ndarray; write lambda u, params, axis: ...",
+        "conservation_law, as flux, takes a function, got ndarray; write lambda u, params, axis: ...",
     ),
     (
         lambda: flow(scalars={"heat": 0.1}),
@@ -239,7 +239,7 @@ TABLE = [
     (
         lambda: dp.sponge(LINE, 2, 0),
         VALUE,
-        "sponge needs a speed > 0 and an echo between 0 and 1, got 0 and 0.001",
+        "speed of sponge must be > 0, got 0, that of the fastest waves",
     ),
     (
         lambda: dp.total_variation(LINE, 0.0),

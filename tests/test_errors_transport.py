@@ -41,7 +41,7 @@ CASES = [
     (
         lambda: dp.transport(GRID, of="nodes"),
         ValueError,
-        "transport takes of from 'cells', 'faces', got 'nodes'; write one of them",
+        "of= of transport must be one of cells, faces, got 'nodes'",
     ),
     (
         lambda: dp.transport(GRID, boundary=dp.robin(1, 1)),
@@ -174,12 +174,12 @@ def test_an_option_that_a_scheme_does_not_use_is_refused(scheme):
 
 @pytest.mark.parametrize("word", ["midpoint", "clamped", "unclamped midpoint"])
 def test_the_words_of_form_in_the_first_edition(word):
-    message = f"transport takes form from 'flux', 'advective', got '{word}'; write backtrace= or clamp="
+    message = f"form= of transport must be one of flux, advective, got '{word}'; write backtrace= or clamp="
     with pytest.raises(ValueError, match=message):
         dp.transport(GRID, "maccormack", form=word)
 
 
 @pytest.mark.parametrize("options", [{"clamp": 1}, {"clamp": None}, {"backtrace": np.array(["euler"])}, {"form": True}])
 def test_words_of_another_kind_are_refused(options):
-    with pytest.raises(ValueError, match="transport takes .* write"):
+    with pytest.raises(ValueError, match="of transport must be one of"):
         dp.transport(GRID, "maccormack", **options)

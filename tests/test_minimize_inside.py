@@ -147,6 +147,6 @@ def test_convergence_is_drawn():
     assert list(ax.lines[1].get_ydata()) == [record.gradient_norm for record in best.history]
     assert ax.get_yscale() == "log" and ax.get_xlabel() == "evaluations"
     with pytest.raises(
-        ValueError, match="convergence is drawn against iteration, seconds, evaluations or solves, got 'time'"
+        ValueError, match="against of convergence must be one of iteration, seconds, evaluations, solves, got 'time'"
     ):
         dp.convergence(best, against="time")

@@ -250,7 +250,7 @@ def test_refusals():
         dp.stress(explicit, number(0.4), ranges={"k": (0, 1), "j": (0, 1)}, time_step="i", viscosity="h")
     with pytest.raises(ValueError, match=r"stress needs ranges of two finite numbers, low < high, got \(1, 0\) for nu"):
         dp.stress(explicit, number(0.4), ranges={"nu": (1, 0)})
-    with pytest.raises(ValueError, match="stress has no cases 'all'; write some of as given, scaling"):
+    with pytest.raises(ValueError, match="a group of stress cases must be one of as given, scaling"):
         dp.stress(explicit, number(0.4), only=["all"])
     with pytest.raises(
         ValueError, match="this scene has no stability map; it needs a rollout, a time step and a viscosity by name"

@@ -220,7 +220,7 @@ def test_the_whole_message_of_a_refusal():
 
 
 def test_an_unknown_precision():
-    with pytest.raises(ValueError, match="^precision must be 'auto', 'single' or 'double', got 'half'$"):
+    with pytest.raises(ValueError, match="^precision must be one of auto, single, double, got 'half'$"):
         dp.inverse(PLUS, "structured", precision="half")
 
 

@@ -220,7 +220,7 @@ def test_words_pictures_and_refusals(tmp_path):
     labels = [line.get_label() for line in ax.lines]
     assert "best so far" in labels and "direct" in labels
 
-    with pytest.raises(ValueError, match="workprec needs repeats >= 1, a whole number, got 0; the default is 3"):
+    with pytest.raises(ValueError, match="repeats of workprec must be a whole number >= 1, got 0; the default is 3"):
         table(repeats=0)
     with pytest.raises(ValueError, match="workprec needs at least one method; write {'name': {settings}}"):
         dp.workprec(poisson, {})

@@ -11,6 +11,7 @@ from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.advection.values import check_step, flat_numbers
 from sparsedp.boundary_conditions import dirichlet, neumann, resolve
 from sparsedp.errors import DerivativeError
+from sparsedp.fields import check_choice
 from sparsedp.grid import check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.operator import Operator
@@ -124,24 +125,18 @@ def transport(
     array([0.  , 0.75, 0.25, 0.  ])
     """
     check_grid("transport", grid)
-    _check_word("scheme", scheme, tuple(LAWS))
+    check_choice("scheme= of transport", scheme, LAWS)
     words = dict(velocity=velocity, of=of, interpolation=interpolation, form=form, backtrace=backtrace, clamp=clamp)
     words["unstable"] = unstable
     for name, word in words.items():
-        _check_word(name, word, CHOICES[name])
+        advice = "; write backtrace= or clamp=" if name == "form" else ""  # words of form in the first edition
+        check_choice(f"{name}= of transport", word, CHOICES[name], advice)
         if word != CHOICES[name][0] and name not in ("velocity", "of", *LAWS[scheme].options):
             raise ValueError(f"transport {scheme} does not use {name}; leave it out")
     if "form" in LAWS[scheme].options and form is None:
         words["form"] = "flux" if velocity == "faces" else "advective"
     solid = None if solid is None else check_solid(grid, solid).copy()
     return Transport(Setting(grid, scheme, _sides(grid, boundary), solid=solid, **words))
-
-
-def _check_word(name, word, known):
-    if type(word) not in {type(one) for one in known} or word not in known:
-        words = ", ".join(repr(w) for w in known if w is not None)
-        advice = "backtrace= or clamp=" if name == "form" else "one of them"  # words of form in the first edition
-        raise ValueError(f"transport takes {name} from {words}, got {word!r}; write {advice}")
 
 
 def _sides(grid, boundary):

@@ -20,7 +20,7 @@ from sparsedp.check.summary import Result
 from sparsedp.check.sweep import POINTS, QUICK, REFUSALS, Point, Trials, generator
 from sparsedp.check.table import Table, table_of
 from sparsedp.derivative import grad, hvp
-from sparsedp.fields import check_function, is_whole
+from sparsedp.fields import check_function, check_whole
 from sparsedp.progress import bar
 
 __all__ = ["Audit", "gradient"]
@@ -114,8 +114,7 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
     'disagrees'
     """
     check_function("check.gradient", loss, "lambda x: np.sum(x**2)")
-    if not is_whole(directions, 0):
-        raise ValueError(f"a sweep needs directions >= 0, a whole number, got {directions!r}; the default is 3")
+    directions = check_whole("directions of check.gradient", directions, 0, "; the default is 3")
     chosen = tuple(map(float, () if steps is None else steps))
     if steps is not None and (len(set(chosen)) < FEWEST_STEPS or not all(0 < step < inf for step in chosen)):
         raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {chosen}")

@@ -32,6 +32,7 @@ from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.fields import (
     check_choice,
     check_finite,
+    check_function,
     check_number,
     check_takes,
     field_array,
@@ -134,9 +135,9 @@ def conservation_law(
     check_grid("conservation_law", grid)
     check_choice("scheme of conservation_law", scheme, SCHEMES)
     for name, function, count in (("flux", flux, 3), ("speed", speed, 3), ("source", source, 2)):
-        if not callable(function) and (function is not None or name != "source"):
-            raise TypeError(f"{name} must be a function, got {type(function).__name__}; write {_example(name, count)}")
-        check_takes(f"conservation_law, as {name},", function, count, _example(name, count))
+        if function is not None or name != "source":
+            check_function(f"conservation_law, as {name},", function, _example(name, count))
+            check_takes(f"conservation_law, as {name},", function, count, _example(name, count))
     sides = resolve(grid, boundary, outflow)
     conditions = [side for pair in sides for side in pair or ()]
     for side in conditions:

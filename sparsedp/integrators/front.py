@@ -4,7 +4,7 @@ import numpy as np
 from scipy.sparse.linalg import ArpackError, eigsh
 
 from sparsedp.errors import NonFiniteError, UnstableStepError
-from sparsedp.fields import check_choice, check_finite, is_number, rounded_down, surely_finite
+from sparsedp.fields import check_choice, check_finite, check_number, rounded_down, surely_finite
 from sparsedp.integrators.problem import Problem, like, number, pair
 from sparsedp.integrators.runge_kutta import (
     EXPLICIT,
@@ -161,8 +161,8 @@ def stepper(
         unused.append("solver")  # full systems are solved by LU
     if unused:
         raise TypeError(f"{method} does not use {', '.join(unused)}; leave it out")
-    if tolerance is not None and not (is_number(tolerance) and 0 < tolerance < 1):
-        raise ValueError(f"tolerance must be between 0 and 1 or None, got {tolerance!r}; write for example 1e-6")
+    if tolerance is not None:
+        check_number("tolerance of stepper", tolerance, "between 0 and 1", "; write for example 1e-6")
     if not all(map(_is_floor, leaves(floor))):
         raise ValueError(f"floor must hold finite numbers >= 0, in the units of u, got {floor!r}; write 1e-3")
     dt = dt if callable(dt) else number(dt, "dt", "> 0")

@@ -27,7 +27,7 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
 from sparsedp.derivative import push
 from sparsedp.errors import ShapeError, UnstableStepError
-from sparsedp.fields import check_function, check_takes, is_number, is_whole, rounded_down
+from sparsedp.fields import check_function, check_number, check_takes, is_whole, rounded_down
 from sparsedp.grid import AXES, check_grid
 from sparsedp.integrators.adaptive import Moving
 from sparsedp.integrators.problem import combine, of_fields, pair, untraced
@@ -190,8 +190,8 @@ def sponge(grid, cells, speed, echo=1e-3):
     array([0.   , 0.   , 0.   , 0.   , 0.216, 1.943])
     """
     check_grid("sponge", grid)
-    if not (is_number(speed) and 0 < speed < np.inf and is_number(echo) and 0 < echo < 1):
-        raise ValueError(f"sponge needs a speed > 0 and an echo between 0 and 1, got {speed!r} and {echo!r}")
+    check_number("speed of sponge", speed, "> 0", ", that of the fastest waves")
+    check_number("echo of sponge", echo, "between 0 and 1", "; the default is 1e-3")
     bounded = [name for name, periodic in zip(grid.axes, grid.periodic, strict=True) if not periodic]
     depths = cells if isinstance(cells, dict) else dict.fromkeys(bounded, cells)
     if set(depths) - set(bounded) or any(np.shape(deep) not in ((), (2,)) for deep in depths.values()):

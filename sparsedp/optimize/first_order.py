@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.fields import check_number, is_number
+from sparsedp.fields import check_choice, check_number, is_number
 from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.solvers.scaling import largest
 from sparsedp.tree import norm, power_of_two
@@ -45,8 +45,7 @@ class Descent:
         if rate is not None:
             check_number("rate of gd", rate, "> 0", "; leave it out and it is searched for")
         check_number("momentum of gd", momentum, "from 0 to below 1", "; leave it out for none")
-        if line_search not in (None, "backtracking"):
-            raise ValueError(f"gd has no line search {line_search!r}; write line_search='backtracking' or leave it out")
+        check_choice("line_search of gd", line_search, (None, "backtracking"), "; leave it out for none")
         self.rate, self.momentum = rate, momentum
         self.searches = line_search is not None or rate is None
 

@@ -10,7 +10,7 @@ import numpy as np
 from sparsedp.constants import frozen
 from sparsedp.derivative import check_loss, grad, jvp, value_and_grad, zero_like
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_finite, check_function, is_whole
+from sparsedp.fields import check_finite, check_function, check_whole, is_whole
 from sparsedp.progress import shown_steps
 from sparsedp.recipe import Remade
 from sparsedp.tape import Rule, isbox
@@ -101,8 +101,8 @@ class Ensemble(Remade):
                 f"ensemble takes an executor, got {type(executor).__name__}; write "
                 "concurrent.futures.ProcessPoolExecutor(2)"
             )
-        if chunk is not None and not is_whole(chunk, 1):
-            raise ValueError(f"chunk must be a number of scenes, got {chunk!r}; write 1, 2, ...")
+        if chunk is not None:
+            check_whole("chunk of ensemble", chunk, 1, "; the default is 1")
         self._weights = np.ones(self.count) if weights is None else np.array(weights, float)
         if self._weights.shape != (self.count,):
             raise ShapeError(

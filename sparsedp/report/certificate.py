@@ -21,7 +21,7 @@ import numpy as np
 from sparsedp.check.summary import Result
 from sparsedp.check.table import table_of
 from sparsedp.derivative import value_and_grad
-from sparsedp.fields import is_number
+from sparsedp.fields import check_number
 from sparsedp.ledger import recording, thread
 from sparsedp.report.plan import total
 from sparsedp.tree import leaves, norm
@@ -191,8 +191,7 @@ def certify(loss, x, target=TARGET):
     >>> bool(1e-6 < certificate.gradient_error < 1e-2), list(certificate.causes)
     (True, ['forward solves', 'adjoint solves'])
     """
-    if not (is_number(target) and 0 < target < 1):
-        raise ValueError(f"certify needs a target between 0 and 1, got {target!r}; write for example target=0.01")
+    check_number("target of certify", target, "between 0 and 1", "; write for example target=0.01")
     gradient_of, solves = value_and_grad(loss), RecordedSolves()
     value, gradient = solves.run(gradient_of, x)
 
@@ -316,12 +315,8 @@ def certified(fraction=0.1, tolerance=1e-8):
     >>> best.converged, loose.evaluations == best.evaluations
     (True, True)
     """
-    if not (is_number(fraction) and 0 < fraction < 1 and is_number(tolerance) and tolerance >= 0):
-        raise ValueError(
-            f"certified needs 0 < fraction < 1 and a tolerance >= 0, got {fraction!r} and {tolerance!r}; "
-            "write for example certified(0.1)"
-        )
-    return Certified(float(fraction), float(tolerance))
+    fraction = check_number("fraction of certified", fraction, "between 0 and 1", "; write for example certified(0.1)")
+    return Certified(fraction, check_number("tolerance of certified", tolerance, ">= 0", "; the default is 1e-8"))
 
 
 class Certified:

@@ -8,6 +8,7 @@ from importlib import import_module
 import numpy as np
 
 from sparsedp.errors import ShapeError
+from sparsedp.fields import check_choice
 from sparsedp.files import write_file
 from sparsedp.grid import check_grid
 from sparsedp.tape import plain
@@ -244,8 +245,7 @@ def convergence(best, ax=None, against="iteration"):
     >>> convergence(best, figure().add_subplot()).get_xlabel()
     'iteration'
     """
-    if against not in ("iteration", "seconds", "evaluations", "solves"):
-        raise ValueError(f"convergence is drawn against iteration, seconds, evaluations or solves, got {against!r}")
+    check_choice("against of convergence", against, ("iteration", "seconds", "evaluations", "solves"))
     ax = current(ax)
     records = [(getattr(record, against), record.value, record.gradient_norm) for record in best.history]
     numbers = np.array(records, float)

@@ -6,7 +6,7 @@ import numpy as np
 
 from sparsedp.check.summary import Result
 from sparsedp.check.table import table_of
-from sparsedp.fields import check_function
+from sparsedp.fields import check_choice, check_function
 from sparsedp.report import plots
 from sparsedp.report.stability import stability_map
 from sparsedp.report.stress_cases import FAILED, GROUPS, WORDS, Scene, cases
@@ -76,8 +76,7 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     """
     check_function("stress", loss, "lambda x: np.sum(x**2)")
     for group in only or ():
-        if group not in GROUPS:
-            raise ValueError(f"stress has no cases {group!r}; write some of {', '.join(GROUPS)}")
+        check_choice("a group of stress cases", group, GROUPS)
     chosen = [name for name in GROUPS if only is None or name in only]
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the rows say what became of a case

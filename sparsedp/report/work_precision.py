@@ -19,7 +19,7 @@ from sparsedp.check.summary import Result
 from sparsedp.check.table import table_of
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
-from sparsedp.fields import check_function, is_whole
+from sparsedp.fields import check_function, check_whole
 from sparsedp.files import write_file
 from sparsedp.ledger import recording
 from sparsedp.report import plots
@@ -112,8 +112,7 @@ def workprec(
     check_function("workprec", problem, "lambda cells: (loss, x)")
     if ranks() > 1:
         raise TypeError("workprec repeats runs by the clock, which no two ranks share; run it on one process")
-    if not is_whole(repeats, 1):
-        raise ValueError(f"workprec needs repeats >= 1, a whole number, got {repeats!r}; the default is 3")
+    repeats = check_whole("repeats of workprec", repeats, 1, "; the default is 3")
     if not methods or not isinstance(methods, dict):
         raise ValueError("workprec needs at least one method; write {'name': {settings}}")
     scene, over, now, rows = scene or getattr(problem, "__name__", "scene"), over or {}, _versions(), []
@@ -196,7 +195,7 @@ def _measured(problem, settings, repeats):
         runs, facts, answers = _prepared(problem, settings)
         seconds = perf_counter() - clock
         status, first, last = _warm(runs[-1])
-        times = _times(runs, int(repeats)) if status == "ok" else {}
+        times = _times(runs, repeats) if status == "ok" else {}
         peak, result = _peak(runs[-1])
         answer, gradient = answers(result)
     except FAILURES as error:

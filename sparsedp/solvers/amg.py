@@ -14,7 +14,7 @@ import scipy.linalg as la
 from scipy.sparse import csr_array, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from sparsedp.fields import is_number, is_whole
+from sparsedp.fields import check_choice, check_number, check_whole
 from sparsedp.solvers.krylov import Krylov
 
 __all__ = ["Hierarchy", "Level", "Multigrid", "coarse_solver", "coloured_graph", "multigrid_engine", "ruge_stueben"]
@@ -57,17 +57,14 @@ def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), 
     Set-up: deterministic. Source: Ruge and Stueben, Algebraic Multigrid, in Multigrid Methods, SIAM, 1987;
     PyAMG, Bell, Olson and Schroder, J. Open Source Software 7, 2022.
     """
-    if cycle not in tuple(CYCLES):
-        raise ValueError(f"cycle must be 'V' or 'W', got {cycle!r}; the F cycle has no transpose of its own kind")
-    if not (is_number(strength) and 0 <= strength < 1):
-        raise ValueError(f"strength must be in [0, 1), got {strength!r}; the default is 0.25")
+    check_choice("cycle", cycle, CYCLES, "; the F cycle has no transpose of its own kind")
+    strength = check_number("strength", strength, "from 0 to below 1", "; the default is 0.25")
     if not _are_sweeps(sweeps):
         raise ValueError(
             f"sweeps must be two tuples of 'forward' and 'backward', got {sweeps!r}; "
             "write for example (('forward',), ('backward',))"
         )
-    if not is_whole(levels, 1):
-        raise ValueError(f"levels must be a whole number >= 1, got {levels!r}; the default is 25")
+    levels = check_whole("levels", levels, 1, "; the default is 25")
     if not system.op.structure.has_entries:
         raise ValueError(f"multigrid needs the entries, {system.given} only knows its products; write method='krylov'")
     if not system.sign:
@@ -76,7 +73,7 @@ def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), 
             f"multigrid needs a diagonal of one sign; {system.given} has {ends.min():.1e} and {ends.max():.1e}; "
             "write method='direct'"
         )
-    return Multigrid(system, CYCLES[cycle], float(strength), tuple(map(tuple, sweeps)), int(levels))
+    return Multigrid(system, CYCLES[cycle], strength, tuple(map(tuple, sweeps)), levels)
 
 
 def _are_sweeps(given):

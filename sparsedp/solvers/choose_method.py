@@ -7,7 +7,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
-from sparsedp.fields import check_finite, check_native, field_array, is_number, is_whole
+from sparsedp.fields import check_choice, check_finite, check_native, check_number, check_whole, field_array
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, spent
 from sparsedp.markup import facts
@@ -172,17 +172,13 @@ def _set_up(solver, clock):
 
 def check_settings(method, rtol, maxiter, nullspace, options):
     """Refuse settings that the method, or with "auto" every method, cannot take -> them, as keywords of `build`."""
-    if method not in ("auto", *METHODS):
-        raise ValueError(f"method must be auto, {', '.join(METHODS)}, got {method!r}")
-    if not (is_number(rtol) and 0 < rtol < 1):
-        raise ValueError(f"rtol must be between 0 and 1, got {rtol!r}; the default is 1e-10")
-    if maxiter is not None and not is_whole(maxiter, 1):
-        raise ValueError(f"maxiter must be a whole number >= 1 or None, got {maxiter!r}")
-    if nullspace not in ("raise", "project"):
-        raise ValueError(f"nullspace must be 'raise' or 'project', got {nullspace!r}")
+    check_choice("method", method, ("auto", *METHODS))
+    rtol = check_number("rtol", rtol, "between 0 and 1", "; the default is 1e-10")
+    if maxiter is not None:
+        maxiter = check_whole("maxiter", maxiter, 1, "; None leaves it to the method")
+    check_choice("nullspace", nullspace, ("raise", "project"))
     _check_options(method, options)
-    maxiter = None if maxiter is None else int(maxiter)
-    return dict(method=method, rtol=float(rtol), maxiter=maxiter, nullspace=nullspace, options=copied(options))
+    return dict(method=method, rtol=rtol, maxiter=maxiter, nullspace=nullspace, options=copied(options))
 
 
 def _check_options(word, options):

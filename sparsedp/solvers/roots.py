@@ -14,7 +14,7 @@ import numpy as np
 
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError
-from sparsedp.fields import check_function
+from sparsedp.fields import check_function, check_whole
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note, thread
 from sparsedp.recipe import Remade
@@ -108,12 +108,11 @@ def implicit(
     >>> value_and_grad(lambda p: root(1.0, p))(9.0)[1]
     0.16666666666666666
     """
-    if not (callable(residual) and (jacobian is None or callable(jacobian))):
-        given = [("residual", residual), ("jacobian", jacobian)][callable(residual)]
-        raise TypeError(f"implicit takes a function as {given[0]}, got {type(given[1]).__name__}; write lambda x: ...")
+    check_function("implicit, as residual,", residual, "lambda x: ...")
+    if jacobian is not None:
+        check_function("implicit, as jacobian,", jacobian, "lambda x: ...")
     settings = check_settings(method, rtol, maxiter, nullspace, options)
-    if maxiter is None:
-        raise ValueError("maxiter must be a whole number >= 1, got None")
+    check_whole("maxiter", maxiter, 1, "; the default is 50")
     return Root(residual, jacobian, sparsity, settings.pop("maxiter"), settings)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from sparsedp.constants import constant_args
 from sparsedp.errors import BudgetWarning, DerivativeError, ShapeError
-from sparsedp.fields import check_function, check_takes, is_whole
+from sparsedp.fields import check_function, check_takes, check_whole, is_whole
 from sparsedp.ledger import thread
 from sparsedp.shortcuts import together
 from sparsedp.tape import dtype_of, innermost, is_variable, isbox, plain, through
@@ -132,8 +132,8 @@ def rollout(
     if memory == "reverse":
         _check_reversible(step)
     slots = None if memory is None else 0 if memory == "reverse" else slots_within(memory, *sizes)
-    if truncate is not None and not is_whole(truncate, 1):
-        raise ValueError(f"rollout needs truncate >= 1, a whole number of steps, or None, got {truncate!r}")
+    if truncate is not None:
+        check_whole("truncate of rollout", truncate, 1, "; leave it out and nothing is cut")
     room = ROOM if memory is None else room_within(memory, *sizes) if slots else 0
     loop = Loop(step, forms, n, truncate, innermost(args), _kind(keep, forms[0], n), slots, room, progress, record)
     _check_values(loop, args, traced)
@@ -158,9 +158,7 @@ def _check_reversible(step):
 def _number_of_steps(n):
     if isbox(n):
         raise DerivativeError("rollout needs n as a plain whole number, got a traced value; it has no derivative")
-    if isinstance(n, bool) or not is_whole(n, 0):
-        raise ValueError(f"rollout needs n >= 0, a whole number of steps, got {n!r}")
-    return int(n)
+    return check_whole("n of rollout", n, 0, ", the number of steps")
 
 
 def _check_inputs(inputs, n):

@@ -11,6 +11,7 @@ import threading
 import numpy as np
 
 from sparsedp import kernels
+from sparsedp.fields import check_choice
 from sparsedp.solvers.multigrid.stencil import Unfit, components, stencil_of
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.solve import Engine, norm
@@ -55,8 +56,7 @@ def structured_engine(system, *, precision="auto"):
     -----
     Source: J. E. Dendy, Black box multigrid, J. Comput. Phys. 48 (1982) 366-386.
     """
-    if precision not in tuple(PRECISIONS):
-        raise ValueError(f"precision must be 'auto', 'single' or 'double', got {precision!r}")
+    check_choice("precision", precision, PRECISIONS)
     if not kernels.compiled():
         raise ValueError("structured needs numba, which is not installed; write method='multigrid'")
     try:
