@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_choice, check_finite, check_function
+from sparsedp.fields import check_choice, check_finite, check_function, check_shape
 from sparsedp.ledger import active, count
 from sparsedp.operators.given import from_matrix
 from sparsedp.recipe import Remade
@@ -224,8 +224,7 @@ class Adopted(Remade):
             yield self._coloured
             earlier = self._coloured.pattern
         elif earlier is not None:
-            if earlier.shape != (rows, columns):
-                raise ShapeError(f"the sparsity of {self.name} must have shape {(rows, columns)}, got {earlier.shape}")
+            check_shape(f"the sparsity of {self.name}", earlier, (rows, columns))
             yield Coloured(earlier, shapes)
         elif not np.array_equal(self._flat(x), y):
             raise DerivativeError(f"{self.name} gives two results for one argument; fix its random state first")

@@ -11,7 +11,7 @@ What a fluid does at a wall implies conditions of its velocity along the wall an
 
 from dataclasses import dataclass
 
-from sparsedp.fields import check_number
+from sparsedp.fields import check_number, check_type
 from sparsedp.grid import AXES, Grid
 from sparsedp.recipe import Value
 
@@ -156,8 +156,7 @@ def resolve(grid, boundary, default=neumann):
     >>> resolve(Grid((2, 2), periodic=(True, False)), {"y": (dirichlet, neumann)})
     (None, (dirichlet, neumann))
     """
-    if not isinstance(grid, Grid):
-        raise TypeError(f"an operator needs a grid first, got {grid!r}; write dp.Grid((8, 6), size=1.0)")
+    check_type("an operator, as its first argument,", grid, Grid, "a Grid", "dp.Grid((8, 6), size=1.0)")
     if isinstance(boundary, dict):
         _check_names(grid, boundary)
     else:

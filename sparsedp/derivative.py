@@ -11,7 +11,7 @@ import numpy as np
 
 from sparsedp.constants import is_fixed
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
-from sparsedp.fields import check_function, check_native, check_whole
+from sparsedp.fields import check_function, check_native, check_shape, check_whole
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
 from sparsedp.shortcuts import ELSEWHERE, Part, alike, held_for_many, together
@@ -42,6 +42,7 @@ __all__ = [
 ]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
+SPREAD = ": autograd's np.where does not add up what it spreads; multiply by the condition instead, a * c + b * (1 - c)"
 NO_JVP = (DerivativeError, NotImplementedError)
 
 LARGE = 1e100  # a cotangent that makes others overflow, through derivatives that do not
@@ -121,8 +122,7 @@ def pullback(fun, x):
     (value,), _, back = linearised(one_array, rebuild(entries), moving)
 
     def pull(g):
-        if np.shape(g) != np.shape(value):
-            raise ShapeError(f"the cotangent must have the shape {np.shape(value)} of the value, got {np.shape(g)}")
+        check_shape("the cotangent", g, np.shape(value), "; give one like the value")
         slopes = zip(entries, moving, back([g]), strict=True)
         return rebuild(_apart([gradient_of(leaf, slope) if moves else None for leaf, moves, slope in slopes], g))
 
@@ -284,12 +284,7 @@ def gradient_of(leaf, cotangent):
     """The gradient in a leaf: of its shape and dtype, zero where no cotangent arrived."""
     if cotangent is None:
         return 0.0 if isinstance(leaf, float) else anp.zeros_like(plain(leaf))
-    shape, wanted = np.shape(plain(cotangent)), np.shape(plain(leaf))
-    if shape != wanted:
-        raise ShapeError(
-            f"the gradient has shape {shape} where {wanted} is needed: autograd's np.where does not add up what it "
-            "spreads; multiply by the condition instead, a * c + b * (1 - c)"
-        )
+    check_shape("the gradient", cotangent, np.shape(leaf), SPREAD)
     return _as_given(fit("the gradient", leaf, cotangent, cotangent), leaf)
 
 

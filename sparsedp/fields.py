@@ -15,11 +15,15 @@ __all__ = [
     "check_choice",
     "check_finite",
     "check_function",
+    "check_kind",
     "check_native",
     "check_number",
+    "check_on",
     "check_out",
     "check_plain",
+    "check_shape",
     "check_takes",
+    "check_type",
     "check_whole",
     "field_array",
     "is_number",
@@ -88,8 +92,7 @@ def check_native(name, *values):
 def check_out(op, out, u, dtype, shape):
     """Refuse a result array of another shape or dtype, or one that shares memory with `u`."""
     wanted = f"out=np.empty({shape}, {dtype.name!r})"
-    if not isinstance(out, np.ndarray):
-        raise TypeError(f"{op.name} needs an array as out, got {type(out).__name__}; write {wanted}")
+    check_type(f"{op.name}, as out,", out, np.ndarray, "an array", wanted)
     if out.shape != shape:
         raise ShapeError(f"{op.name} gives a field on {op.codomain}, got out of shape {out.shape}; write {wanted}")
     if out.dtype != dtype:
@@ -135,6 +138,33 @@ def check_function(name, thing, example):
     """Refuse what cannot be called."""
     if not callable(thing):
         raise TypeError(f"{name} takes a function, got {type(thing).__name__}; write {example}")
+
+
+def check_type(name, thing, kind, wanted, example):
+    """Refuse what is not of a type; `wanted`: the type with its article."""
+    if not isinstance(thing, kind):
+        raise TypeError(f"{name} takes {wanted}, got {type(thing).__name__}; write {example}")
+
+
+def check_shape(what, given, shape, advice=""):
+    """Refuse what has another shape."""
+    if np.shape(given) != shape:
+        raise ShapeError(f"{what} must have shape {shape}, got {np.shape(given)}{advice}")
+
+
+def check_on(name, given, space, advice=""):
+    """Refuse what is no field on a space."""
+    if np.shape(given) != space.shape:
+        raise ShapeError(f"{name} takes a field on {space.described}, got an array of shape {np.shape(given)}{advice}")
+
+
+KINDS = {"numbers": "biufc", "real numbers": "biuf", "integers": "iu", "True or False": "b"}
+
+
+def check_kind(what, dtype, needs, advice=""):
+    """Refuse arrays of a dtype that does not hold what is needed, in the words of `KINDS`."""
+    if dtype.kind not in KINDS[needs]:
+        raise TypeError(f"{what} must hold {needs}, got dtype {dtype}{advice}")
 
 
 def check_choice(name, word, choices, advice=""):

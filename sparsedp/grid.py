@@ -16,7 +16,7 @@ from itertools import compress
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_number
+from sparsedp.fields import check_number, check_type
 from sparsedp.markup import facts
 from sparsedp.recipe import Uncached, Value
 from sparsedp.space import Space, whole_lengths
@@ -302,8 +302,7 @@ class Grid(Value, Uncached):
 
 def check_grid(name, grid):
     """Refuse what is no Grid."""
-    if not isinstance(grid, Grid):
-        raise TypeError(f"{name} takes a Grid, got {type(grid).__name__}; write dp.Grid((64, 64), size=1.0)")
+    check_type(name, grid, Grid, "a Grid", "dp.Grid((64, 64), size=1.0)")
     if grid.layout is not None:
         grid.layout.check(name)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparsedp import kernels, results
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_native, check_out, field_array
+from sparsedp.fields import check_native, check_out, check_shape, field_array
 from sparsedp.ledger import active
 from sparsedp.markup import facts, spy
 from sparsedp.recipe import Frozen, Remade
@@ -176,10 +176,7 @@ class Operator(Frozen, Remade):
         if isinstance(other, Operator):
             return self._compose(other)
         if isbox(other) or isinstance(other, np.ndarray):
-            if np.shape(other) != (self.domain.size,):
-                raise ShapeError(
-                    f"{self.name} @ x takes a flat x of shape ({self.domain.size},); for a field write op(u)"
-                )
+            check_shape(f"x of {self.name} @ x", other, (self.domain.size,), "; for a field write op(u)")
             return self._flat(other)
         check_native(self.name, other)
         return NotImplemented

@@ -6,8 +6,8 @@ from itertools import accumulate, compress
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_native
+from sparsedp.errors import DerivativeError
+from sparsedp.fields import check_finite, check_native, check_shape
 from sparsedp.recipe import Made
 from sparsedp.tape import cast, is_variable, isbox
 from sparsedp.tree import copied, labels, leaves
@@ -62,11 +62,7 @@ def flatten(tree):
     packing = Packing(tree, "tree")
 
     def unflatten(vector):
-        if np.shape(vector) != (packing.size,):
-            raise ShapeError(
-                f"this tree has {packing.size} numbers, got a vector of shape {np.shape(vector)}; write one that came "
-                "from dp.flatten of a tree like it"
-            )
+        check_shape("the vector of this tree", vector, (packing.size,), "; write one from dp.flatten of a tree like it")
         if not isbox(vector):
             return packing.unpack(np.asarray(vector, dtype=float))
         return packing.tree(map(_traced, packing.split(vector), packing.values))

@@ -9,7 +9,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_plain
+from sparsedp.fields import check_on, check_plain
 from sparsedp.recipe import Uncached, Value
 from sparsedp.tape import dtype_of, isbox
 
@@ -134,8 +134,7 @@ class Space(Value, Uncached):
         ShapeError
             If `v` has another shape.
         """
-        if np.shape(v) != self.shape:
-            raise ShapeError(f"split takes a field on {self.described}, got an array of shape {np.shape(v)}")
+        check_on("split", v, self)
         if self.layout is not None and self.layout.holds(v):
             return self.layout.split(self, v)
         check_plain("split", v)

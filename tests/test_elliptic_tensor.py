@@ -209,7 +209,7 @@ def test_rotated_anisotropy_solves_or_raises(method, ratio):
 def test_what_is_no_tensor_is_refused():
     grid = dp.Grid((4, 3))
     solve, K, b = solver(grid), tensors(grid), np.ones((4, 3))
-    message = "k takes a tensor for each cell, an array of shape (2, 2, 4, 3), got shape (3, 3, 4, 3)"
+    message = "k, a tensor for each cell, must have shape (2, 2, 4, 3), got (3, 3, 4, 3)"
     with pytest.raises(dp.errors.ShapeError, match=f"^{re.escape(message)}$"):
         solve(np.ones((3, 3, 4, 3)), b)
     K[:, :, 2, 1] = [[1.0, 2.0], [2.0, 1.0]]

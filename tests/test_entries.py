@@ -1,6 +1,7 @@
 """matrix_solver: solves differentiable in the entries of a sparse matrix, on its pattern only."""
 
 import pickle
+import re
 import tracemalloc
 
 import autograd.numpy as anp
@@ -197,7 +198,7 @@ def test_what_is_refused(rng):
     wrong[3] = np.nan
     place = f"row {solve.rows[3]}, column {solve.columns[3]}"
     for arguments, error, message in (
-        ((data[1:], b), ShapeError, f"data takes one value for each of {data.size} entries, got shape"),
+        ((data[1:], b), ShapeError, f"data must have shape {re.escape(str(data.shape))}, got"),
         ((data, b[1:]), ShapeError, r"matrix_solver takes a field on space\(8\), got an array of shape \(7,\)"),
         ((wrong, b), NonFiniteError, f"data must be finite, got 1 that are NaN or infinite, the first at {place}"),
         ((data, b * np.inf), NonFiniteError, "takes finite numbers"),
@@ -205,7 +206,7 @@ def test_what_is_refused(rng):
     ):
         with pytest.raises(error, match=message):
             solve(*arguments)
-    with pytest.raises(ShapeError, match=r"^matrix_solver takes a square pattern of 2 rows, got shape \(2, 3\)$"):
+    with pytest.raises(ShapeError, match=r"^the pattern of matrix_solver must have shape \(2, 2\), got \(2, 3\)$"):
         matrix_solver(np.ones((2, 3)))
     with pytest.raises(ShapeError, match="^matrix_solver takes a 2-D pattern"):
         matrix_solver(np.ones(3))
@@ -250,7 +251,7 @@ def test_a_domain_of_a_grid_takes_flat_places(rng):
     ("rows", "columns", "options", "error", "message"),
     [
         ([0, 1], [0], {}, ShapeError, r"^from_coo takes flat rows and columns, got shapes \(2,\) and \(1,\)$"),
-        ([0.0], [0], {}, TypeError, "^rows and columns must be integers, got dtypes float64 and int64$"),
+        ([0.0], [0], {}, TypeError, "^rows and columns must hold integers, got dtype float64$"),
         ([-1], [0], {}, ShapeError, "^from_coo takes rows and columns from 0 to 0, one place at least; give others$"),
         ([3], [0], {"domain": 3}, ShapeError, "^from_coo takes rows and columns from 0 to 2, one place at least"),
         (np.zeros(0, int), np.zeros(0, int), {}, ShapeError, "one place at least; give others$"),

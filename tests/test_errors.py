@@ -187,7 +187,7 @@ TABLE = [
     (
         lambda: dp.gradient(LINE).apply(np.ones(3), out=[1]),
         TYPE,
-        "gradient needs an array as out, got list; write out=np.empty((4,), 'float64')",
+        "gradient, as out, takes an array, got list; write out=np.empty((4,), 'float64')",
     ),
     (
         lambda: dp.gradient(LINE).apply(np.ones(3), out=np.ones(3)),
@@ -207,7 +207,7 @@ TABLE = [
     (
         lambda: dp.laplacian(BOX) @ np.ones((2, 2)),
         SHAPE,
-        "laplacian @ x takes a flat x of shape (4,); for a field write op(u)",
+        "x of laplacian @ x must have shape (4,), got (2, 2); for a field write op(u)",
     ),
     (lambda: np.sin(dp.laplacian(LINE)), TYPE, "numpy.sin does not take an operator; write laplacian(u) for a field u"),
     (

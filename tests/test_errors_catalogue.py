@@ -40,7 +40,7 @@ TABLE = [
     (
         lambda: dp.from_matrix([["a"]]),
         TYPE,
-        "matrix needs a matrix of numbers, got dtype <U1; write matrix.astype(float)",
+        "matrix must hold numbers, got dtype <U1; write matrix.astype(float)",
     ),
     (
         lambda: dp.from_matrix([[1.0, 0.0], [2.0, np.nan], [np.inf, 0.0]]),
@@ -70,7 +70,7 @@ TABLE = [
     (
         lambda: dp.from_functions(lambda u: u[1:], None, 3, 3)(np.ones(3)),
         SHAPE,
-        "the function must return an array of shape (3,), got (2,)",
+        "what the function returns must have shape (3,), got (2,)",
     ),
     (
         lambda: dp.from_functions(lambda u: 1j * u, None, 3, 3)(np.ones(3)),
@@ -93,7 +93,7 @@ TABLE = [
     (
         lambda: dp.diagonal(LINE.cells, "a"),
         TYPE,
-        "diagonal on cells(3) needs numbers, got dtype <U1; write values.astype(float)",
+        "diagonal on cells(3) must hold numbers, got dtype <U1; write values.astype(float)",
     ),
     (lambda: dp.diagonal(LINE, 1.0), TYPE, "diagonal takes a Space, got Grid; write grid.cells or grid.faces"),
     (lambda: dp.identity(LINE), TYPE, "identity takes a Space, got Grid; write grid.cells or grid.faces"),
@@ -111,17 +111,17 @@ TABLE = [
     (
         lambda: dp.mask(LINE.cells, np.ones(3)),
         TYPE,
-        "keep needs a boolean array, got dtype float64; write keep.astype(bool)",
+        "keep must hold True or False, got dtype float64; write keep.astype(bool)",
     ),
     (
         lambda: dp.gradient(LINE, solid=np.zeros(3)),
         TYPE,
-        "solid needs a boolean array, got dtype float64; write solid.astype(bool)",
+        "solid must hold True or False, got dtype float64; write solid.astype(bool)",
     ),
     (
         lambda: dp.interior(LINE, np.zeros(4, bool)),
         SHAPE,
-        "solid needs one flag for each value on cells(3), got an array of shape (4,)",
+        "solid takes a field on cells(3), got an array of shape (4,)",
     ),
     (
         lambda: dp.flux(BOX, np.s_[0.5:1, :]),
@@ -138,7 +138,7 @@ TABLE = [
     (
         lambda: dp.flux(BOX, np.zeros(4, bool)),
         SHAPE,
-        "cells needs one flag for each value on cells(2, 2), got an array of shape (4,)",
+        "cells takes a field on cells(2, 2), got an array of shape (4,)",
     ),
     (
         lambda: dp.brinkman(LINE)(np.ones(3)),
@@ -158,7 +158,7 @@ TABLE = [
     (
         lambda: dp.brinkman(LINE)(np.ones(4, complex)),
         TYPE,
-        "brinkman takes real numbers, got dtype complex128; write level.real",
+        "the level of brinkman must hold real numbers, got dtype complex128; write level.real",
     ),
     (
         lambda: dp.brinkman(LINE)([1.0, np.nan, 1.0, 1.0]),
@@ -215,7 +215,7 @@ TABLE = [
     (
         lambda: dp.harmonic_average(LINE)(np.ones(3, complex)),
         TYPE,
-        "harmonic_average takes real numbers, got dtype complex128; write k.real",
+        "k of harmonic_average must hold real numbers, got dtype complex128; write k.real",
     ),
     (lambda: dp.harmonic_average(LINE)(-np.ones(3)), VALUE, "harmonic_average needs a coefficient >= 0, got -1"),
     (

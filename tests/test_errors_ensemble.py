@@ -17,7 +17,7 @@ import sparsedp as dp
     (lambda: dp.ensemble(np.add, [1], chunk=1.5), ValueError,
      "chunk of ensemble must be a whole number >= 1, got 1.5; the default is 1"),
     (lambda: dp.ensemble(np.add, [1], weights=[1, 2]), dp.errors.ShapeError,
-     r"weights must be one number for each of 1 scenes, got shape \(2,\)"),
+     r"weights of ensemble must have shape \(1,\), got \(2,\); give one number for each scene"),
     (lambda: dp.ensemble(np.add, [1, 2], weights=[1, np.nan]), dp.errors.NonFiniteError,
      r"weights must be finite, got 1 that are NaN or infinite, the first at 1"),
     (lambda: dp.ensemble(np.add, [1, 2])(1.0, [0, 2]), IndexError, "ensemble has scenes 0 to 1, got 2"),

@@ -60,7 +60,7 @@ WRONG = [
     ),
     (
         lambda: dp.gradient((4, 4)), TypeError,
-        "an operator needs a grid first, got (4, 4); write dp.Grid((8, 6), size=1.0)",
+        "an operator, as its first argument, takes a Grid, got tuple; write dp.Grid((8, 6), size=1.0)",
     ),
     (
         lambda: dp.check.gradient(lambda x: anp.sum(x**2), np.ones(3), directions=-1), ValueError,

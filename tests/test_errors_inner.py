@@ -123,7 +123,7 @@ TABLE = [
     (
         lambda: pullback(lambda x: 2 * x, np.ones(3))[1](np.ones(2)),
         SHAPE,
-        "the cotangent must have the shape (3,) of the value, got (2,)",
+        "the cotangent must have shape (3,), got (2,); give one like the value",
     ),
     (
         lambda: pushforward(lambda x: x[0] * x[1], (1.0, 2.0), (1.0,)),
@@ -167,14 +167,15 @@ def test_forces_and_walls_of_another_shape_are_refused():
         dp.flow_step(grid, 0.1, force="up")
     with pytest.raises(
         dp.errors.ShapeError,
-        match="flow_step takes "
-        r"a force on faces\(2, 2\), got an array of shape \(2, 2\); join its components with grid\.join",
+        match="flow_step, as force, takes a "
+        r"field on faces\(2, 2\) of shape \(12,\), got an array of shape \(2, 2\); join its components with grid\.join",
     ):
         dp.flow_step(grid, 0.1, force=lambda v, params: np.ones((2, 2))).start(rest)
     with pytest.raises(
         dp.errors.ShapeError,
-        match="flow_step takes "
-        r"walls on faces\(2, 2\), got an array of shape \(3,\); write face_lift\(grid, boundary\)\(values\)",
+        match="flow_step, as walls, takes a "
+        r"field on faces\(2, 2\) of shape \(12,\), got an array of shape \(3,\); "
+        r"write face_lift\(grid, boundary\)\(values\)",
     ):
         dp.flow_step(grid, 0.1, walls=np.zeros(3))
     by_number, by_field = (dp.flow_step(grid, 0.1, force=lambda v, g: g).start(rest, g) for g in (1.0, np.ones(12)))

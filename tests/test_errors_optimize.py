@@ -104,7 +104,7 @@ WRONG = [
     ),
     (
         direction(g=np.ones(3)), ShapeError,
-        "the cotangent must have the shape (2,) of the outputs, got (3,)",
+        "the cotangent must have shape (2,), got (3,); give one like the outputs",
     ),
     (direction(lambda u: u * np.nan), NonFiniteError, "an output must be finite, got 2 that are NaN or infinite"),
     (
@@ -123,7 +123,7 @@ WRONG = [
     ),
     (
         back(lambda y, x: y[:1]), ShapeError,
-        "the inverse of physical gradient must return an x of shape (3,), got (1,)",
+        "x from the inverse of physical gradient must have shape (3,), got (1,)",
     ),
 ]  # fmt: skip
 

@@ -94,7 +94,7 @@ TABLE = [
     (
         lambda: dp.implicit(square, lambda x, p: 1j * np.eye(2))(TWO, 4 * TWO),
         TYPE,
-        "the jacobian of implicit(square) must be real",
+        "the jacobian of implicit(square) must hold real numbers, got dtype complex128",
     ),
     (
         lambda: dp.implicit(square, sparsity=np.eye(3))(TWO, 4 * TWO),
@@ -117,10 +117,10 @@ TABLE = [
     (
         lambda: dp.matrix_solver(np.ones((2, 3))),
         SHAPE,
-        "matrix_solver takes a square pattern of 2 rows, got shape (2, 3)",
+        "the pattern of matrix_solver must have shape (2, 2), got (2, 3)",
     ),
     (lambda: dp.matrix_solver(np.ones(3)), SHAPE, "matrix_solver takes a 2-D pattern, got an array of shape (3,)"),
-    (lambda: SOLVE(TWO, np.ones(3)), SHAPE, "data takes one value for each of 3 entries, got shape (2,)"),
+    (lambda: SOLVE(TWO, np.ones(3)), SHAPE, "data must have shape (3,), got (2,); give one value for each entry"),
     (lambda: SOLVE(np.array(["a"] * 3), np.ones(3)), TYPE, "data must hold numbers, got dtype <U1"),
     (
         lambda: SOLVE(np.array([1, np.nan, 1]), np.ones(3)),

@@ -27,7 +27,7 @@ CASES = {
     ),
     "from_coo dtypes": (
         TypeError,
-        "rows and columns must be integers, got dtypes float64 and int64",
+        "rows and columns must hold integers, got dtype float64",
         lambda: from_coo([0.0], [0]),
     ),
     "from_coo places": (

@@ -118,7 +118,8 @@ def test_frictions_refused_by_name():
         (
             np.ones(4),
             dp.errors.ShapeError,
-            "flow_step takes a friction on faces(2, 2), got an array of shape (4,); write one number for each face",
+            "flow_step, as friction, takes a field on faces(2, 2) of shape (12,), got an array of "
+            "shape (4,); write one number for each face",
         ),
         (0.1, dp.errors.ShapeError, "got an array of shape (); write one number for each face"),
         (np.full(12, 1j), ValueError, "flow_step takes a friction >= 0, got 1j; write abs(friction)"),

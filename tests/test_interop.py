@@ -97,8 +97,7 @@ def test_flatten_and_back():
     assert pickle.loads(pickle.dumps(unflatten))(vector)["n"] == 3
     with pytest.raises(
         dp.errors.ShapeError,
-        match="^this tree has 11 numbers, got a vector of shape .*; write one that came from dp.flatten of a tree "
-        "like it$",
+        match="^the vector of this tree must have shape .11,., got .*; write one from dp.flatten of a tree like it$",
     ):
         unflatten(np.ones(3))
 

@@ -176,7 +176,8 @@ def test_wrong_shape(ax):
 
 def test_complex(ax):
     with pytest.raises(
-        TypeError, match="plot draws real fields, got dtype complex128; plot its real part or its absolute value"
+        TypeError,
+        match="u of plot must hold real numbers, got dtype complex128; plot its real part or its absolute value",
     ):
         dp.plot(dp.Grid(3), np.zeros(3, dtype=complex), ax=ax)
 

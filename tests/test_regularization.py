@@ -159,7 +159,9 @@ def test_refused_regularization():
         with pytest.raises(ValueError, match="total_variation needs eps > 0, a slope that counts as small"):
             dp.total_variation(GRIDS[0], eps)
     for term in (dp.total_variation(GRIDS[0], 1.0), dp.smoothness(GRIDS[0])):
-        with pytest.raises(TypeError, match="takes real fields, got complex numbers; add that of u.real and that of"):
+        with pytest.raises(
+            TypeError, match="must hold real numbers, got dtype complex128; add that of u.real and that of"
+        ):
             term(np.ones(7, complex))
 
 

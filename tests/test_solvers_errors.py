@@ -88,7 +88,7 @@ CONTRACT = [
     Case(
         lambda: dp.inverse(OP)(B, start=np.ones(3)),
         SHAPE,
-        match="inverse(-laplacian) takes a start on cells(3, 2), got an array of shape (3,)",
+        match="inverse(-laplacian), as start, takes a field on cells(3, 2), got an array of shape (3,)",
     ),
 ]
 
@@ -255,12 +255,12 @@ ELLIPTIC = [
     ),
     Case(
         lambda: SOLVE(np.full(17, "1"), B),
-        ValueError,
+        TypeError,
         match="k must hold numbers, got dtype <U1; write np.asarray(k, float)",
     ),
     Case(
         lambda: SOLVE(K, B, "1"),
-        ValueError,
+        TypeError,
         match="shift must hold numbers, got dtype <U1; write np.asarray(shift, float)",
     ),
     Case(
@@ -292,7 +292,7 @@ ELLIPTIC = [
     Case(
         lambda: dp.elliptic_solver(np.eye(3), G),
         TypeError,
-        match="elliptic_solver takes Operators, got ndarray for D; write dp.from_matrix first",
+        match="elliptic_solver, as D, takes an Operator, got ndarray; write dp.from_matrix(...) first",
     ),
     Case(
         lambda: dp.elliptic_solver(D, D),

@@ -138,7 +138,7 @@ def test_a_start_is_checked_by_name(options):
     name = re.escape(f"the start of {inv.name} must be finite, got 1 that are NaN or infinite, the first at (3, 4)")
     with pytest.raises(dp.errors.NonFiniteError, match=f"^{name}$"):
         inv(b, start=start)
-    name = re.escape(f"{inv.name} takes a start on {inv.codomain}, got an array of shape (22,)")
+    name = re.escape(f"{inv.name}, as start, takes a field on {inv.codomain}, got an array of shape (22,)")
     with pytest.raises(dp.errors.ShapeError, match=f"^{name}$"):
         inv(b, start=np.zeros(22))
     assert inv(b, start=np.zeros((26, 22))) == pytest.approx(inv(b))
@@ -150,7 +150,7 @@ def test_wrong_shapes():
         with pytest.raises(dp.errors.ShapeError, match="takes a field on cells"):
             inv(wrong)
     with pytest.raises(
-        dp.errors.ShapeError, match=r".* takes a start on cells\(26, 22\), got an array of shape \(3,\)"
+        dp.errors.ShapeError, match=r".*, as start, takes a field on cells\(26, 22\), got an array of shape \(3,\)"
     ):
         inv(np.ones((26, 22)), start=np.ones(3))
 

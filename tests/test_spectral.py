@@ -225,10 +225,11 @@ def test_functions_that_are_refused():
     with pytest.raises(ValueError, match="function needs a separable operator that can be diagonalised"):
         dp.function(dp.from_matrix(np.triu(np.ones((3, 3)))), np.exp)
     with pytest.raises(
-        dp.errors.ShapeError, match=r"function needs f to give shape \(4,\), a number an eigenvalue, got \(\)"
+        dp.errors.ShapeError,
+        match=r"f\(e\) of function must have shape \(4,\), got \(\); give a number for each eigenvalue",
     ):
         dp.function(L, lambda e: 1.0)
-    with pytest.raises(TypeError, match="function needs f to give real numbers, got dtype complex128"):
+    with pytest.raises(TypeError, match="f.e. of function must hold real numbers, got dtype complex128"):
         dp.function(L, lambda e: e * 1j)
     with pytest.raises(
         dp.errors.NonFiniteError, match=r"f\(laplacian\) holds NaN or infinity; check f at its eigenvalues"

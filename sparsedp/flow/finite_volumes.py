@@ -33,7 +33,9 @@ from sparsedp.fields import (
     check_choice,
     check_finite,
     check_function,
+    check_kind,
     check_number,
+    check_shape,
     check_takes,
     field_array,
     is_whole,
@@ -223,8 +225,7 @@ class ConservationLaw(Remade):
                 f"conservation_law needs a field for each number in momentum={momentum}, got u of shape "
                 f"{values.shape}; give a state that holds them all"
             )
-        if np.iscomplexobj(values):
-            raise TypeError(f"conservation_law takes real numbers as u, got dtype {values.dtype}; write u.real")
+        check_kind("u of conservation_law", values.dtype, "real numbers", "; write u.real")
         return frozen(u if isbox(u) else values)
 
     def _rate(self, u, e, params):
@@ -298,10 +299,8 @@ class ConservationLaw(Remade):
 
 def _shaped(name, value, u):
     """What a function of the user returned, of the shape of u."""
-    if np.shape(value) != np.shape(u):
-        raise ShapeError(f"the {name} of a conservation_law must have shape {np.shape(u)} here, got {np.shape(value)}")
-    if dtype_of(value).kind == "c":
-        raise TypeError(f"the {name} of a conservation_law must be real, got complex numbers; write its .real")
+    check_shape(f"the {name} of a conservation_law", value, np.shape(u))
+    check_kind(f"the {name} of a conservation_law", dtype_of(value), "real numbers", "; write its .real")
     return value
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.boundary_conditions import no_slip, resolve
-from sparsedp.fields import check_finite, check_number, field_array
+from sparsedp.fields import check_finite, check_kind, check_number, field_array
 from sparsedp.flow.momentum import face_laplacian, momentum_fluxes, stresses
 from sparsedp.flow.projection_setup import pressure_conditions
 from sparsedp.grid import check_grid, numbers_per_axis
@@ -149,8 +149,7 @@ def brinkman(grid):
 
     def friction(level):
         values = field_array(steps[0][0], plain(level), batch=True)
-        if np.iscomplexobj(values):
-            raise TypeError(f"brinkman takes real numbers, got dtype {values.dtype}; write level.real")
+        check_kind("the level of brinkman", values.dtype, "real numbers", "; write level.real")
         check_finite("brinkman", values, "takes a finite level")
         level = level / (np.max(np.abs(values), initial=0.0) or 1.0)
         changes = [(ahead(level), behind(level)) for ahead, behind in steps]

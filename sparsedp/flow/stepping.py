@@ -38,7 +38,16 @@ import numpy as np
 from sparsedp.boundary_conditions import neumann, no_slip
 from sparsedp.constants import frozen
 from sparsedp.errors import DerivativeError, ShapeError, UnstableStepError
-from sparsedp.fields import check_choice, check_finite, check_function, check_number, check_takes, rounded_down
+from sparsedp.fields import (
+    check_choice,
+    check_finite,
+    check_function,
+    check_number,
+    check_on,
+    check_takes,
+    check_type,
+    rounded_down,
+)
 from sparsedp.flow.momentum import convection, face_laplacian, free_faces
 from sparsedp.flow.pressure import projection
 from sparsedp.grid import check_grid
@@ -157,13 +166,11 @@ def flow_step(
         _check_constant("viscosity", viscosity, ">= 0")
     elif implicit:
         raise ValueError("implicit viscosity of flow_step is a number, got a function; write implicit=False")
-    if not isinstance(scalars, (dict, type(None))):
-        raise TypeError(
-            f'flow_step takes a dict of scalars, got {type(scalars).__name__}; write scalars={{"heat": {{...}}}}'
-        )
+    if scalars is not None:
+        check_type("flow_step", scalars, dict, "a dict of scalars", 'scalars={"heat": {...}}')
     _check_function(force, 3 if scalars else 2, f"force=lambda v, {'s, ' * bool(scalars)}params: ...")
     if walls is not None:
-        _check_faces("walls", grid, walls, "write face_lift(grid, boundary)(values)")
+        check_on("flow_step, as walls,", walls, grid.faces, "; write face_lift(grid, boundary)(values)")
     if friction is not None and implicit:
         raise ValueError("flow_step takes no friction beside implicit viscosity; write implicit=False")
     check_choice("unstable", unstable, ("raise", "allow"))
@@ -179,12 +186,6 @@ def _check_function(function, count, example):
     if function is not None:
         check_function("flow_step", function, example)
         check_takes("flow_step", function, count, example)
-
-
-def _check_faces(name, grid, values, write):
-    shape = np.shape(plain(values))
-    if shape != grid.faces.shape:
-        raise ShapeError(f"flow_step takes {name} on {grid.faces}, got an array of shape {shape}; {write}")
 
 
 def _check_constant(name, number, least):
@@ -275,7 +276,7 @@ class FlowStep(Remade):
         force = self.force(*mapped(frozen, (v, *scalars)), params)
         if np.shape(plain(force)) == ():
             return force * np.ones(v.shape, dtype_of(v))
-        _check_faces("a force", self.grid, force, "join its components with grid.join")
+        check_on("flow_step, as force,", force, self.grid.faces, "; join its components with grid.join")
         return force
 
     def _rub(self, params):
@@ -283,7 +284,7 @@ class FlowStep(Remade):
         if self.friction is None:
             return None
         rub = self.friction(params) if callable(self.friction) else self.friction
-        _check_faces("a friction", self.grid, rub, "write one number for each face")
+        check_on("flow_step, as friction,", rub, self.grid.faces, "; write one number for each face")
         values = plain(rub)
         check_finite("flow_step", values, "takes a finite friction")
         if np.any(values != np.abs(values)):  # complex numbers too

@@ -40,6 +40,7 @@ import numpy as np
 from sparsedp.constants import constant
 from sparsedp.derivative import backward_each, linearised
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
+from sparsedp.fields import check_shape
 from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Taken
 from sparsedp.integrators.problem import combine, like, untraced
 from sparsedp.integrators.runge_kutta import Scheme, as_matrix
@@ -267,8 +268,7 @@ class Radau(Adaptive):
             return self.problem.rows(v, self.params, t, [False] * len(self.moving))[:, :n]
         args = (self.problem.state(v), self.params, t)
         J = as_matrix(self.given(*args[: 2 + self.problem.timed])).toarray()
-        if J.shape != (n, n):
-            raise ShapeError(f"the jacobian of {self.name} must have shape {(n, n)}, got {J.shape}")
+        check_shape(f"the jacobian of {self.name}", J, (n, n))
         return J
 
     def _newton(self, v, t, h):

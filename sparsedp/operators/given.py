@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_plain
+from sparsedp.fields import check_finite, check_kind, check_plain, check_type
 from sparsedp.operator import Operator
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
@@ -17,8 +17,7 @@ __all__ = ["check_operator", "from_functions", "from_linear_operator", "from_mat
 
 def check_operator(name, op):
     """Refuse what is no Operator."""
-    if not isinstance(op, Operator):
-        raise TypeError(f"{name} takes an Operator, got {type(op).__name__}; write dp.from_matrix(...) first")
+    check_type(name, op, Operator, "an Operator", "dp.from_matrix(...) first")
     if op.layout is not None:
         op.layout.check(name)
 
@@ -61,8 +60,7 @@ def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
         raise ShapeError(
             f"{name} needs a 2-D matrix, got an array of shape {entries.shape}; write matrix[None] for a row"
         )
-    if entries.dtype.kind not in "biufc":
-        raise TypeError(f"{name} needs a matrix of numbers, got dtype {entries.dtype}; write matrix.astype(float)")
+    check_kind(name, entries.dtype, "numbers", "; write matrix.astype(float)")
     structure = Matrix(sp.csr_array(entries, copy=True))
     rows, columns = structure.matrix.indptr, structure.matrix.indices
     check_finite(

@@ -11,8 +11,7 @@ Fluid Flow, 1980). Where both are 0 the ratios are taken as 1, their value on k_
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import ShapeError
-from sparsedp.fields import check_finite, check_native
+from sparsedp.fields import check_finite, check_kind, check_native, check_on
 from sparsedp.grid import check_grid
 from sparsedp.operators.stencils import cell_beside, to_faces
 from sparsedp.recipe import Made
@@ -58,10 +57,8 @@ def harmonic_average(grid):
     def average(k):
         check_native("harmonic_average", k)
         values = array(plain(k))
-        if values.shape != grid.shape:
-            raise ShapeError(f"harmonic_average takes a field on {grid.cells}, got an array of shape {values.shape}")
-        if values.dtype.kind not in "biuf":
-            raise TypeError(f"harmonic_average takes real numbers, got dtype {values.dtype}; write k.real")
+        check_on("harmonic_average", values, grid.cells)
+        check_kind("k of harmonic_average", values.dtype, "real numbers", "; write k.real")
         check_finite("harmonic_average", values, "takes a finite coefficient")
         if np.any(np.less(values, 0)):
             raise ValueError(f"harmonic_average needs a coefficient >= 0, got {np.min(values):g}")

@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp.boundary_conditions import resolve
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_plain
+from sparsedp.fields import check_finite, check_kind, check_on, check_plain, check_type
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.stencils import along, kronecker_operator, wall_slopes
@@ -172,8 +172,7 @@ def diagonal(space, values):
     _check_space(space, "diagonal")
     check_plain("diagonal", values)
     values = np.asarray(values)
-    if values.dtype.kind not in "biufc":
-        raise TypeError(f"diagonal on {space} needs numbers, got dtype {values.dtype}; write values.astype(float)")
+    check_kind(f"diagonal on {space}", values.dtype, "numbers", "; write values.astype(float)")
     try:
         values = np.broadcast_to(values, space.shape)
     except ValueError:
@@ -183,8 +182,7 @@ def diagonal(space, values):
 
 
 def _check_space(space, name):
-    if not isinstance(space, Space):
-        raise TypeError(f"{name} takes a Space, got {type(space).__name__}; write grid.cells or grid.faces")
+    check_type(name, space, Space, "a Space", "grid.cells or grid.faces")
 
 
 def check_solid(grid, solid):
@@ -196,10 +194,8 @@ def _boolean(flags, space, name):
     if isbox(flags):
         raise DerivativeError(f"{name} needs a constant boolean array, got a traced one; take it from plain numbers")
     flags = np.asarray(flags)
-    if flags.dtype != bool:
-        raise TypeError(f"{name} needs a boolean array, got dtype {flags.dtype}; write {name}.astype(bool)")
-    if flags.shape != space.shape:
-        raise ShapeError(f"{name} needs one flag for each value on {space}, got an array of shape {flags.shape}")
+    check_kind(name, flags.dtype, "True or False", f"; write {name}.astype(bool)")
+    check_on(name, flags, space)
     return flags
 
 

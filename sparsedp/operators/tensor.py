@@ -17,8 +17,7 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.errors import ShapeError
-from sparsedp.fields import check_finite, place
+from sparsedp.fields import check_finite, check_shape, place
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.stencils import along, pick
 from sparsedp.space import Space
@@ -79,8 +78,7 @@ def _eliminated(K, closed):
 def check_tensor(name, K, grid):
     """Refuse what is not a positive definite matrix (its symmetric, real part) in every cell."""
     values, shape = np.asarray(plain(K)), (grid.dim, grid.dim, *grid.shape)
-    if values.shape != shape:
-        raise ShapeError(f"{name} takes a tensor for each cell, an array of shape {shape}, got shape {values.shape}")
+    check_shape(f"{name}, a tensor for each cell,", values, shape)
     check_finite(name, values)
     rest = 0.5 * (values + values.swapaxes(0, 1)).real
     for axis in range(grid.dim):  # the pivots of an elimination are positive where the matrix is

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.errors import ShapeError
-from sparsedp.fields import check_choice, check_finite, check_function, check_number, check_whole
+from sparsedp.fields import check_choice, check_finite, check_function, check_number, check_shape, check_whole
 from sparsedp.optimize.linearised import Linearised, singular
 from sparsedp.packing import Packing
 
@@ -201,9 +200,7 @@ def update_direction(outputs, x, g=None, method="auto", apart=False, **options):
     family, packing = Family(**options), Packing(x)
     linearised = Linearised(outputs, packing, packing.pack(x), apart=apart, dense=form_of(method))
     g = linearised.value if g is None else g
-    if np.shape(g) != linearised.value.shape:
-        shape = linearised.value.shape
-        raise ShapeError(f"the cotangent must have the shape {shape} of the outputs, got {np.shape(g)}")
+    check_shape("the cotangent", g, linearised.value.shape, "; give one like the outputs")
     check_finite("the cotangent", g)
     direction = family(linearised, np.asarray(g, dtype=float).reshape(-1))
     return direction._replace(step=packing.unpack(direction.step))

@@ -2,8 +2,7 @@
 
 import autograd.numpy as anp
 
-from sparsedp.errors import ShapeError
-from sparsedp.fields import check_number
+from sparsedp.fields import check_number, check_shape
 from sparsedp.optimize.first_order import Descent
 from sparsedp.tape import differentiable, plain
 
@@ -65,9 +64,7 @@ def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
         def pull(g):
             here = plain(x)
             start = inverse(plain(y) - rate * plain(g), here)
-            wanted, got = anp.shape(here), anp.shape(start)
-            if got != wanted:
-                raise ShapeError(f"the inverse of {name} must return an x of shape {wanted}, got {got}")
+            check_shape(f"x from the inverse of {name}", start, anp.shape(here))
             return (here - start,)
 
         return pull

@@ -5,7 +5,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.constants import constant
-from sparsedp.fields import check_finite, check_native, is_number
+from sparsedp.fields import check_finite, check_kind, check_native, is_number
 from sparsedp.grid import check_grid
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.given import from_matrix
@@ -118,8 +118,7 @@ def _square(grid, name, solid):
 
     def square(u):
         check_native(name, u)
-        if dtype_of(u).kind == "c":
-            raise TypeError(f"{name} takes real fields, got complex numbers; add that of u.real and that of u.imag")
+        check_kind(f"u of {name}", dtype_of(u), "real numbers", "; add that of u.real and that of u.imag")
         g = mean(inside(slope(u)) ** 2)
         check_finite(f"the squared slope in {name}", plain(g))
         return g

@@ -19,8 +19,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.derivative import vjp
-from sparsedp.errors import ShapeError
-from sparsedp.fields import check_function, check_number, check_whole
+from sparsedp.fields import check_function, check_number, check_shape, check_whole
 from sparsedp.ledger import thread
 from sparsedp.optimize.result import Minimum, Record
 from sparsedp.tree import norm
@@ -92,8 +91,7 @@ def _rounds(minimized, x, K, z, weight, rho, prox):
     for number in count():
         x, spent = minimized(z - w, rho, x)
         image, pull = vjp(K, x)
-        if np.shape(image) != z.shape:
-            raise ShapeError(f"the operator of admm gave shape {np.shape(image)} after {z.shape}; it must not change")
+        check_shape("what the operator of admm gives", image, z.shape, ", another one than at first")
         before, z = z, prox(image + w, weight / rho)
         w = w + image - z
         primal = norm(image - z) / (max(norm(image), norm(z)) or 1.0)

@@ -9,8 +9,7 @@ import numpy as np
 
 from sparsedp.constants import frozen
 from sparsedp.derivative import check_loss, grad, jvp, value_and_grad, zero_like
-from sparsedp.errors import ShapeError
-from sparsedp.fields import check_finite, check_function, check_whole, is_whole
+from sparsedp.fields import check_finite, check_function, check_shape, check_whole, is_whole
 from sparsedp.progress import shown_steps
 from sparsedp.recipe import Remade
 from sparsedp.tape import Rule, isbox
@@ -104,10 +103,7 @@ class Ensemble(Remade):
         if chunk is not None:
             check_whole("chunk of ensemble", chunk, 1, "; the default is 1")
         self._weights = np.ones(self.count) if weights is None else np.array(weights, float)
-        if self._weights.shape != (self.count,):
-            raise ShapeError(
-                f"weights must be one number for each of {self.count} scenes, got shape {self._weights.shape}"
-            )
+        check_shape("weights of ensemble", self._weights, (self.count,), "; give one number for each scene")
         check_finite("weights", self._weights)
         self._weights = self._weights.tolist()
         self._given = loss, scenes, executor, self._weights, chunk, progress

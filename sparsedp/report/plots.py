@@ -8,7 +8,7 @@ from importlib import import_module
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_choice
+from sparsedp.fields import check_choice, check_kind
 from sparsedp.files import write_file
 from sparsedp.grid import check_grid
 from sparsedp.tape import plain
@@ -62,8 +62,7 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, cmap="viridis", 
     """
     check_grid("plot", grid)
     u = np.asarray(plain(u))
-    if np.iscomplexobj(u):
-        raise TypeError(f"plot draws real fields, got dtype {u.dtype}; plot its real part or its absolute value")
+    check_kind("u of plot", u.dtype, "real numbers", "; plot its real part or its absolute value")
     u, kind, arrows = _scalar(grid, u, at)
     ax = current(ax)
     if title is not None:

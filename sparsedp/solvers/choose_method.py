@@ -7,7 +7,15 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
-from sparsedp.fields import check_choice, check_finite, check_native, check_number, check_whole, field_array
+from sparsedp.fields import (
+    check_choice,
+    check_finite,
+    check_native,
+    check_number,
+    check_on,
+    check_whole,
+    field_array,
+)
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, spent
 from sparsedp.markup import facts
@@ -370,10 +378,7 @@ class Inverse(Operator):
         if start is not None:
             check_native(self.name, start)
             check_finite(f"the start of {self.name}", plain(start))
-            if np.shape(start) != self.codomain.shape:
-                raise ShapeError(
-                    f"{self.name} takes a start on {self.codomain}, got an array of shape {np.shape(start)}"
-                )
+            check_on(f"{self.name}, as start,", start, self.codomain)
         if self.solver.engine.unrolled:
             if np.ndim(b) > len(self.domain.shape):  # a batch: each solve has steps of its own
                 return anp.array([self(field, start) for field in b])

@@ -11,7 +11,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.derivative import NO_JVP, pushforward
-from sparsedp.errors import ConvergenceError, DerivativeError, ShapeError
+from sparsedp.errors import ConvergenceError, DerivativeError
+from sparsedp.fields import check_kind, check_shape
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, recording
 from sparsedp.operator import Operator
@@ -222,10 +223,8 @@ class Jacobians:
             given = from_matrix(given if sp.issparse(given) or np.ndim(given) else [[given]], name=name)
         if given.layout is not None:  # every rank solves for all unknowns
             given = from_matrix(given.matrix, name=given.name)
-        if given.shape != (size, size):
-            raise ShapeError(f"the jacobian of {self.name} must have shape {(size, size)}, got {given.shape}")
-        if given.dtype.kind == "c":
-            raise TypeError(f"the jacobian of {self.name} must be real")
+        check_shape(f"the jacobian of {self.name}", given, (size, size))
+        check_kind(f"the jacobian of {self.name}", given.dtype, "real numbers")
         return given
 
     def _product(self, equation, x, leaves, transposed, purpose="jacobian"):
@@ -252,8 +251,7 @@ class Jacobians:
             self.ways = [False] * has_jvp + [True] * (has_vjp or not has_jvp)
         if pattern is not None:
             self.way = "assembled on the pattern given"
-            if pattern.shape != (size, size):
-                raise ShapeError(f"the sparsity of {self.name} must have shape {(size, size)}, got {pattern.shape}")
+            check_shape(f"the sparsity of {self.name}", pattern, (size, size))
         elif self.settings["method"] == "krylov":
             self.way = "products only, as asked"
         elif size <= FULL_UP_TO:

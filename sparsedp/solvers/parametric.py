@@ -17,7 +17,7 @@ import scipy.sparse as sp
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_plain
+from sparsedp.fields import check_finite, check_kind, check_plain, check_shape, check_type
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.masks_and_lift import identity
@@ -112,11 +112,11 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     Raises
     ------
     TypeError
-        If D or G is not an Operator, and on use, if k or b is a masked array.
+        If D or G is not an Operator, and on use, if k or b is a masked array, or k or shift holds no numbers.
     ShapeError
         If D and G do not fit, and on use, if k, b or shift has another shape.
     ValueError
-        On use, if k is real and negative, a tensor is not positive definite, or k or shift holds no numbers.
+        On use, if k is real and negative, or a tensor is not positive definite.
     NonFiniteError
         On use, if k, b or shift holds NaN or infinity.
     ConvergenceError
@@ -141,10 +141,7 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     (1.0, -1.0)
     """
     for name, op in (("D", D), ("G", G)):
-        if not isinstance(op, Operator):
-            raise TypeError(
-                f"elliptic_solver takes Operators, got {type(op).__name__} for {name}; write dp.from_matrix first"
-            )
+        check_type(f"elliptic_solver, as {name},", op, Operator, "an Operator", "dp.from_matrix(...) first")
     if not (fits(D.domain, G.codomain) and fits(D.codomain, G.domain)):
         raise ShapeError(
             f"elliptic_solver needs D @ G to be square: {D.name} maps {D.domain} to {D.codomain}, "
@@ -294,8 +291,7 @@ def _values(name, given, space, advice="", other=None):
         raise ShapeError(
             f"{name} takes a number or a field on {space.described}, got an array of shape {values.shape}{advice}"
         )
-    if values.dtype.kind not in "biufc":
-        raise ValueError(f"{name} must hold numbers, got dtype {values.dtype}; write np.asarray({name}, float)")
+    check_kind(name, values.dtype, "numbers", f"; write np.asarray({name}, float)")
     check_finite(name, values)
     return given if isbox(given) else values
 
@@ -384,8 +380,7 @@ def matrix_solver(pattern, method="auto", rtol=1e-10, maxiter=None, nullspace="r
         raise ShapeError(f"matrix_solver takes a 2-D pattern, got an array of shape {entries.shape}")
     pattern = pattern_like(entries)
     domain = domain if isinstance(domain, Space) else Space(pattern.shape[0] if domain is None else domain)
-    if pattern.shape != (domain.size, domain.size):
-        raise ShapeError(f"matrix_solver takes a square pattern of {domain.size} rows, got shape {pattern.shape}")
+    check_shape("the pattern of matrix_solver", pattern, (domain.size, domain.size))
     return MatrixSolver(pattern, domain, settings)
 
 
@@ -424,8 +419,8 @@ def from_coo(rows, columns, domain=None, **settings):
     places = np.asarray(rows), np.asarray(columns)
     if places[0].ndim != 1 or places[0].shape != places[1].shape:
         raise ShapeError(f"from_coo takes flat rows and columns, got shapes {places[0].shape} and {places[1].shape}")
-    if any(one.dtype.kind not in "iu" for one in places):
-        raise TypeError(f"rows and columns must be integers, got dtypes {places[0].dtype} and {places[1].dtype}")
+    for one in places:
+        check_kind("rows and columns", one.dtype, "integers")
     domain = domain if domain is None or isinstance(domain, Space) else Space(domain)
     size = 1 + max(int(one.max(initial=-1)) for one in places) if domain is None else domain.size
     if places[0].size == 0 or min(map(np.min, places)) < 0 or max(map(np.max, places)) >= size:
@@ -487,10 +482,8 @@ class MatrixSolver(ParametricSolver):
         if self.assembly is not None:
             data = self.assembly(data)
         values = np.asarray(plain(data))
-        if values.shape != self.rows.shape:
-            raise ShapeError(f"data takes one value for each of {self.rows.size} entries, got shape {values.shape}")
-        if values.dtype.kind not in "biufc":
-            raise TypeError(f"data must hold numbers, got dtype {values.dtype}")
+        check_shape("data", values, self.rows.shape, "; give one value for each entry")
+        check_kind("data", values.dtype, "numbers")
         check_finite("data", values, where=lambda entry: f"row {self.rows[entry]}, column {self.columns[entry]}")
         return self._solution(data if isbox(data) else values, b if isbox(b) else np.asarray(b), 0.0)
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_function, check_number
+from sparsedp.errors import NonFiniteError
+from sparsedp.fields import check_function, check_kind, check_number, check_shape
 from sparsedp.operator import Operator
 from sparsedp.solvers.separable import SpectralFunction, diagonalised
 
@@ -138,10 +138,8 @@ def function(op, f):
     axes, values = diagonalised(op, "function")
     with np.errstate(all="ignore"):  # NaN is refused below
         weights = np.asarray(f(values.copy()))
-    if weights.shape != values.shape:
-        raise ShapeError(f"function needs f to give shape {values.shape}, a number an eigenvalue, got {weights.shape}")
-    if weights.dtype.kind not in "fiu":
-        raise TypeError(f"function needs f to give real numbers, got dtype {weights.dtype}")
+    check_shape("f(e) of function", weights, values.shape, "; give a number for each eigenvalue")
+    check_kind("f(e) of function", weights.dtype, "real numbers")
     name = f"f({op.name})"
     return _function(op, axes, weights.astype(float), name, f"{name} holds NaN or infinity; check f at its eigenvalues")
 

@@ -11,6 +11,7 @@ import numpy as np
 import xarray
 
 from sparsedp.errors import ShapeError
+from sparsedp.fields import check_type
 from sparsedp.files import write_file, write_through
 from sparsedp.grid import AXES, check_grid, node_axes
 from sparsedp.storage.contents import KIND, check_fields, check_names
@@ -95,8 +96,7 @@ def from_xarray(grid, array, /):
            [3., 6.]])
     """
     check_grid("from_xarray", grid)
-    if not isinstance(array, xarray.DataArray):
-        raise TypeError(f"from_xarray takes a DataArray, got {type(array).__name__}; write dataset['u']")
+    check_type("from_xarray", array, xarray.DataArray, "a DataArray", "dataset['u']")
     others = sorted(set(array.coords) - set(grid.axes))
     if others or not set(grid.axes) <= set(array.dims):
         raise ValueError(

@@ -10,7 +10,8 @@ import scipy.sparse as sp
 
 from sparsedp import kernels
 from sparsedp.constants import frozen
-from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.errors import DerivativeError
+from sparsedp.fields import check_shape
 from sparsedp.recipe import Remade
 from sparsedp.space import components
 from sparsedp.structure.base import Structure, compact, rows_of
@@ -158,8 +159,7 @@ class Functions(Remade, Structure):
         if self.forward is None:
             raise DerivativeError("this operator has no transpose; give from_functions its second function")
         y = np.asarray(self.forward(frozen(x.reshape(self.domain))))  # the field is the caller's
-        if y.shape != self.codomain:
-            raise ShapeError(f"the function must return an array of shape {self.codomain}, got {y.shape}")
+        check_shape("what the function returns", y, self.codomain)
         if y.dtype.kind == "c" and out.dtype.kind != "c":
             raise DerivativeError(
                 "the function returned complex values for a real field; give its operator dtype=complex"
