@@ -11,8 +11,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_choice, check_finite, check_function, check_shape
-from sparsedp.ledger import active, count
+from sparsedp.fields import EPS, check_choice, check_finite, check_function, check_shape
+from sparsedp.ledger import count
 from sparsedp.operators.given import from_matrix
 from sparsedp.recipe import Remade
 from sparsedp.solvers.cache import Cache
@@ -24,7 +24,7 @@ __all__ = ["Adopted", "adopt"]
 STEP, DIFFERENCES = "complex step", "central differences"
 WAYS = {"auto": "", "complex": STEP, "difference": DIFFERENCES}
 COMPLEX = 1e-30  # step of the complex step: no difference is taken, so nothing cancels
-CENTRAL = np.finfo(float).eps ** (1 / 3)  # step of central differences, relative to x
+CENTRAL = EPS ** (1 / 3)  # step of central differences, relative to x
 SHARES = 1.0, 1e-2  # of the step of central differences: Jacobians and probes
 MOST = {STEP: (1e-9, 1e-12), DIFFERENCES: (1e-4, 1e-4)}  # what a row may lack of a probe: of itself, of the largest row
 GROWS = 1e-5  # what it may lack of a difference if that grows with the step: rounding does not
@@ -145,8 +145,7 @@ class Adopted(Remade):
 
     def _run(self, x):
         """One run on plain values; a copy, for foreign code may return the array that it will write into next."""
-        if active:
-            count(f"{self.name}.run", "forward")
+        count(f"{self.name}.run", "forward")
         with self._alone:
             self.runs += 1
             y = np.array(self._f(np.array(x)))

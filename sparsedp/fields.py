@@ -12,6 +12,7 @@ from sparsedp.tree import leaves_like
 
 __all__ = [
     "BLOCK",
+    "EPS",
     "check_choice",
     "check_finite",
     "check_function",
@@ -35,6 +36,7 @@ __all__ = [
 ]
 
 FLOAT = np.dtype(float)
+EPS = np.finfo(float).eps  # between 1 and the next number; what is `ROUNDING` to whom stands there
 WRAP = "{0}; wrap what is computed in dp.interop.to_{0}(f), which keeps gradients"
 # By the package that the type of an array comes from: which library that is, and what to write instead.
 LIBRARIES = {
@@ -240,5 +242,5 @@ def is_whole(value, least):
 
 def rounded_down(number):
     """A bound > 0 as a text of six digits that keeps it: rounded to nearest it would be refused when it is written."""
-    near = float(number) * (1 + 4 * np.finfo(float).eps)
+    near = float(number) * (1 + 4 * EPS)
     return f"{float(Context(prec=6, rounding=ROUND_FLOOR).create_decimal(near)):.6g}"

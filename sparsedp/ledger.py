@@ -88,13 +88,13 @@ def recording():
 
 
 def count(name, kind, times=1):
-    """Add a call of `name`, or several, to every open block. Callers test `active` first: it is on hot paths."""
+    """Add a call of `name`, or several, to every open block. The tape, a hot path, asks `active` first."""
     for calls in thread.calls if times else ():
         calls[name, kind] += times
 
 
 def note(name, what, value):
-    """Note a fact about `name`, such as the method that was chosen. Callers test `active` first."""
+    """Note a fact about `name`, such as the method that was chosen."""
     for calls in thread.calls:
         calls.notes.setdefault((name, what), Counter())[value] += 1
 

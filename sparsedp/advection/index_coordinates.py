@@ -15,6 +15,7 @@ Beyond a wall the points go on at the distance of the width of the last cell.
 import numpy as np
 
 from sparsedp import results
+from sparsedp.fields import EPS
 
 __all__ = ["Coordinates"]
 
@@ -22,7 +23,6 @@ LAYERS = 4  # points beyond each end
 STEEPEST = 5.0  # ratio of neighbouring distances up to which a Catmull-Rom curve is monotone
 NEWTON = 50  # steps at most; about five are needed
 BLOCK = 1 << 13  # points at a time: what is made on the way stays in the cache
-EPS = np.finfo(float).eps
 
 
 class Coordinates:

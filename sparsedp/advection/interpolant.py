@@ -8,6 +8,7 @@ import scipy.sparse as sp
 from sparsedp import results
 from sparsedp.advection.ghost_cells import filling, ghost_origins
 from sparsedp.advection.index_coordinates import Coordinates
+from sparsedp.fields import EPS
 from sparsedp.kernels import departure_samples
 from sparsedp.kernels.departure_samples import PAD
 
@@ -95,7 +96,7 @@ class Pass:
         (displacement, scale), sides = self.departure, self.trajectory.sides
         if not len(sides):
             return departure_samples.interpolate(self.points, self.samples, displacement, scale, out, g)
-        nudge = 32 * np.finfo(float).eps * max(self.points.shape) * (sides[0] != sides[-1])  # to the side that is meant
+        nudge = 32 * EPS * max(self.points.shape) * (sides[0] != sides[-1])  # to the side that is meant
         total = 0.0
         for slope, shift in zip(sides, (-nudge, nudge)):
             found = results.empty(out.shape, float)

@@ -4,11 +4,11 @@ import numpy as np
 
 from sparsedp.advection.control_volumes import place_words
 from sparsedp.errors import UnstableStepError
-from sparsedp.fields import check_finite, rounded_down
+from sparsedp.fields import EPS, check_finite, rounded_down
 
 __all__ = ["ROUNDING", "check_numbers", "check_weights"]
 
-ROUNDING = 8 * np.finfo(float).eps  # CFL exactly 1 leaves a weight of about -1e-16
+ROUNDING = 8 * EPS  # CFL exactly 1 leaves a weight of about -1e-16
 
 
 def check_numbers(setting, u, v, inflow):

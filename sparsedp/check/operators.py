@@ -15,6 +15,7 @@ from sparsedp.check.summary import Row, Summary, error_text
 from sparsedp.check.sweep import generator
 from sparsedp.derivative import hvp, pullback, pushforward
 from sparsedp.errors import DerivativeError
+from sparsedp.fields import EPS
 from sparsedp.operators.given import check_operator
 from sparsedp.structure.base import Matrix
 from sparsedp.tree import norm
@@ -315,7 +316,7 @@ def fault_of(op, rng):
     if not failed:
         return ""
     worst = max(failed, key=lambda one: one.figure)
-    how = worst.note or f"is off by about {worst.figure * max(probe.tolerance, np.finfo(float).eps):.0e}"
+    how = worst.note or f"is off by about {worst.figure * max(probe.tolerance, EPS):.0e}"
     return f"its {worst.name.split(',')[0]} {how}"
 
 

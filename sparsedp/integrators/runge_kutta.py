@@ -46,7 +46,6 @@ import scipy.sparse as sp
 from sparsedp.derivative import of_argument
 from sparsedp.errors import ConvergenceError
 from sparsedp.integrators.problem import combine, later, untraced
-from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_matrix
@@ -224,8 +223,7 @@ class Resolvent:
 
     def _solved(self, transposed, checked, b, z):
         if z == 0:
-            if recordings:
-                note(f"{self.name}.solve", "skipped", "dt or coefficient 0, no solve and no set-up")
+            note(f"{self.name}.solve", "skipped", "dt or coefficient 0, no solve and no set-up")
             return self._one.apply(b)  # whole numbers become floating ones
         inv = self._inverse(float(z))
         return (inv.T if transposed else inv if checked else inv.tangent).apply(b)

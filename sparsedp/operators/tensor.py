@@ -17,7 +17,7 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.fields import check_finite, check_shape, place
+from sparsedp.fields import EPS, check_finite, check_shape, place
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.stencils import along, pick
 from sparsedp.space import Space
@@ -26,7 +26,7 @@ from sparsedp.tape import plain
 
 __all__ = ["check_tensor", "corners"]
 
-NO_DIGITS = 64 * np.finfo(float).eps  # share of an entry below which a pivot is rounding
+NO_DIGITS = 64 * EPS  # share of an entry below which a pivot is rounding
 
 
 def corners(grid, closed):

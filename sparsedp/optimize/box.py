@@ -3,13 +3,13 @@
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import is_number
+from sparsedp.fields import EPS, is_number
 from sparsedp.packing import joined
 from sparsedp.tree import leaves
 
 __all__ = ["Box"]
 
-ULPS = 4 * float(np.finfo(float).eps)
+ULPS = 4 * float(EPS)
 
 
 class Box:

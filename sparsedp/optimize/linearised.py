@@ -8,7 +8,7 @@ import scipy.linalg
 
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_finite
+from sparsedp.fields import EPS, check_finite
 from sparsedp.solvers.scaling import largest
 from sparsedp.tape import is_variable
 from sparsedp.tree import leaves, mapped, power_of_two
@@ -126,7 +126,7 @@ class Linearised:
         jacobian = self.rows()
         sizes = np.linalg.norm(jacobian, axis=0)  # in units of its columns no unknown is small beside another
         vectors, s = singular((jacobian / np.where(sizes > 0, sizes, 1.0)).T)
-        if not s[-1] > rows * np.finfo(float).eps * s[0]:
+        if not s[-1] > rows * EPS * s[0]:
             return np.full((columns, columns), np.inf)
         inverse = vectors / s / sizes[:, None]
         return float(np.dot(self.flat, self.flat)) / (rows - columns) * (inverse @ inverse.T)

@@ -23,7 +23,7 @@ from zlib import crc32
 import numpy as np
 from mpi4py import MPI
 
-from sparsedp.ledger import active, count
+from sparsedp.ledger import count
 from sparsedp.tape import plain
 from sparsedp.trajectory.layout import folded
 from sparsedp.tree import labels, leaves
@@ -126,8 +126,7 @@ class Agreement:
 
     def reduced(self, number, act):
         """The numbers of all ranks in one, in the order of the ranks: the same bits on each, whatever MPI does."""
-        if active:
-            count("ranks", "reduction")
+        count("ranks", "reduction")
         number = np.asarray(number)
         content, label = number.tobytes(), f"{act.__name__} of shape {number.shape}, {number.dtype}"
         found = self.meet(label, content) if len(content) <= ROOM else b"".join(self.gathered(content, label))

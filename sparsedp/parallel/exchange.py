@@ -7,7 +7,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from sparsedp import results
-from sparsedp.ledger import active, count
+from sparsedp.ledger import count
 from sparsedp.parallel.partition import lengths, slices
 from sparsedp.structure.kronecker import components
 
@@ -81,7 +81,7 @@ class Exchange:
             out = out.copy() if np.may_share_memory(out, given) else out
             for part in ("Begin", "End"):
                 getattr(self._forest, word + part)(KINDS[given.dtype.char], given, out, act)
-        if self.crossing and active:
+        if self.crossing:
             count("ranks", "exchange")
             count("ranks", "sent", self.crossing * given.itemsize)
         return out

@@ -16,6 +16,7 @@ from sparsedp.check.summary import error_text
 from sparsedp.check.sweep import QUICK, Line, Point, Trials, generator, rms
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
+from sparsedp.fields import EPS
 from sparsedp.ledger import thread
 from sparsedp.report.certificate import distance
 from sparsedp.report.stability import SEED, STEADY, growth_of
@@ -25,7 +26,6 @@ __all__ = ["FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 
 WORDS = PASSED, REFUSED, DEGRADED, FAILED = "passed", "refused correctly", "degraded", "FAILED"
 TIME_STEPS, VISCOSITIES = ("dt", "time_step", "tau"), ("nu", "viscosity", "diffusivity", "kappa", "mu")
-EPS = np.finfo(float).eps
 DIFFERENCES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-2, 1e-7)  # their steps, in units of x; the one that mostly serves comes first
 GOOD, BAD = 1e-5, 1e-2  # gaps between gradient and differences
 UNSEEN = 100 * EPS  # changes of the value, relative, that no difference sees

@@ -16,7 +16,6 @@ from sparsedp.fields import (
     check_whole,
     field_array,
 )
-from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, spent
 from sparsedp.markup import facts
 from sparsedp.operator import Operator
@@ -171,10 +170,9 @@ def _set_up(solver, clock):
     """The Solver, its set-up noted, which began at this time."""
     log, name = solver.log, solver.name
     log.setup_seconds, log.hierarchy = perf_counter() - clock, solver.engine.hierarchy
-    if recordings:
-        count(name, "setup")
-        count(name, "hierarchy", int(solver.engine.hierarchical))
-        spent(name, "setup", log.setup_seconds, log.setup_seconds)
+    count(name, "setup")
+    count(name, "hierarchy", int(solver.engine.hierarchical))
+    spent(name, "setup", log.setup_seconds, log.setup_seconds)
     return solver
 
 

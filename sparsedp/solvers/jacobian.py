@@ -13,7 +13,6 @@ import scipy.sparse as sp
 from sparsedp.derivative import NO_JVP, pushforward
 from sparsedp.errors import ConvergenceError, DerivativeError
 from sparsedp.fields import check_kind, check_shape
-from sparsedp.ledger import active as recordings
 from sparsedp.ledger import count, recording
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_functions, from_matrix
@@ -233,8 +232,7 @@ class Jacobians:
         act = (equation.transposed if transposed else equation.tangent)(x, leaves)
 
         def product(v):
-            if recordings:
-                count(*key)
+            count(*key)
             with np.errstate(all="ignore"):
                 return act(v)
 

@@ -11,12 +11,12 @@ import numpy as np
 from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 
+from sparsedp.fields import EPS
 from sparsedp.solvers.scaling import dot, norm
 from sparsedp.structure.base import Structure
 
 __all__ = ["NullSpace", "Projector", "find_null_space"]
 
-EPS = np.finfo(float).eps
 ROUNDING = 8 * EPS  # a row whose entries sum to less than this share of their magnitudes sums to 0
 POWER_STEPS = 3
 

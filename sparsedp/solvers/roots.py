@@ -15,7 +15,6 @@ import numpy as np
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import check_function, check_whole
-from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note, thread
 from sparsedp.recipe import Remade
 from sparsedp.shortcuts import on_every_rank, together
@@ -223,10 +222,9 @@ class Root(Remade):
     # ------------------------------------------------------------ the root as a rule of the parameters
 
     def _newton(self, equation, guess, *leaves):
-        solved = thread.solve_hooks[-1].root if recordings and thread.solve_hooks else Root.solved
+        solved = thread.solve_hooks[-1].root if thread.solve_hooks else Root.solved
         x = solved(self, equation, guess, leaves)
-        if recordings:
-            note(self.name, "method", f"Newton's method, Jacobian {self._jacobians.way or 'not needed'}")
+        note(self.name, "method", f"Newton's method, Jacobian {self._jacobians.way or 'not needed'}")
         return x
 
     def corrected(self, equation, x, leaves, share, kept=0.0):

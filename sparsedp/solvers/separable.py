@@ -23,6 +23,7 @@ import scipy.fft as fft
 import scipy.linalg
 
 from sparsedp import kernels
+from sparsedp.fields import EPS
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import inverted
 from sparsedp.solvers.solve import Engine
@@ -43,7 +44,6 @@ __all__ = [
 
 WORTH_THREADS = 131072  # unknowns below which a second thread costs more than it brings
 WIDE_COMPILED, WIDE_PLAIN = 16, 1024  # modes from which elimination along the first axis beats transforms
-EPS = np.finfo(float).eps
 ZERO = 4 * EPS  # a sum of eigenvalues below this share of the largest one is 0
 ROUNDING = 16 * EPS  # entries that should be equal may differ by this share
 WIDEST = 1e4  # largest ratio of scalings that keeps the digits of the eigenvectors

@@ -42,8 +42,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
-from sparsedp.fields import check_finite, place
-from sparsedp.ledger import active as recordings
+from sparsedp.fields import EPS, check_finite, place
 from sparsedp.ledger import count, thread, timed
 from sparsedp.markup import facts, table
 from sparsedp.recipe import Remade
@@ -53,7 +52,6 @@ from sparsedp.tape import plain
 
 __all__ = ["STATUS_WORDS", "Engine", "Run", "SolveInfo", "SolveLog", "Solver", "failure", "merged"]
 
-EPS = np.finfo(float).eps
 COMPATIBLE = 1e-6  # largest relative defect of primal data that is taken for rounding
 FAR_OFF = 0.1  # a residual beyond this share of the data is no solution, whatever the size of x
 ADVICE = {"indefinite_operator": "; write method='direct'"}
@@ -122,8 +120,7 @@ class Solver(Remade):
 
     def solved(self, b, transposed=False, checked=True, start=None, rtol=None):
         """The solve itself, counted and recorded. One to a tolerance of its own, `rtol`, is not in the log."""
-        if recordings:
-            count(self.name, "reused", self.served)
+        count(self.name, "reused", self.served)
         self.served = True
         return timed(self.name, "adjoint" if transposed else "solve", self._solved, b, transposed, checked, start, rtol)
 
@@ -144,9 +141,8 @@ class Solver(Remade):
         finally:
             if rtol is None:
                 self.log.note(run.info(), transposed)
-            if recordings:
-                count(self.name, "iterations", run.iterations)
-                count(self.name, "skipped", run.status == "exact_zero_rhs")
+            count(self.name, "iterations", run.iterations)
+            count(self.name, "skipped", run.status == "exact_zero_rhs")
 
     def judged(self, b, data, terms, residual, adjoint, transposed):
         """Flat x by one call of the engine, where ``residual(x)``, its true residual, is known to the caller.
@@ -162,8 +158,7 @@ class Solver(Remade):
             return None
         run.measure(left, data, max(terms - data, 0.0))
         thread.solves += 1
-        if recordings:
-            count(self.name, "adjoint" if adjoint else "solve")
+        count(self.name, "adjoint" if adjoint else "solve")
         self.log.note(run.info(), adjoint)
         return x
 

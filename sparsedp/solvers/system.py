@@ -8,6 +8,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from sparsedp.errors import NonFiniteError
+from sparsedp.fields import EPS
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import NullSpace, find_null_space
@@ -324,7 +325,7 @@ class System:
 
     def rounding(self, x, data, transposed=False):
         """The residual that rounding leaves, row by row: well below the bound with |A|_inf on stretched grids."""
-        return np.finfo(float).eps * (self.size_of(self.magnitude(np.abs(x), transposed)) + data)
+        return EPS * (self.size_of(self.magnitude(np.abs(x), transposed)) + data)
 
 
 def _check_underflow(op, scaled):

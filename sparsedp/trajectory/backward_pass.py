@@ -1,7 +1,7 @@
 """The backward pass over all steps of a loop."""
 
 from sparsedp.derivative import zero_like
-from sparsedp.ledger import active, count
+from sparsedp.ledger import count
 from sparsedp.progress import shown_steps
 from sparsedp.tape import backward, fit
 from sparsedp.trajectory.layout import refuse_lost, stacked
@@ -59,9 +59,8 @@ def go_back(loop, steps, kept, g):
             total = _sum(total, source(state))
     if loop.reverse and state.i == 0:
         steps.check_start(state, last)
-    if active:
-        count("rollout.step", "vjp", n)
-        count("rollout.step", "recomputed", recomputed)
+    count("rollout.step", "vjp", n)
+    count("rollout.step", "recomputed", recomputed)
     record = growth(loop, norms, recomputed)
     if loop.record is not None:
         loop.record(record)

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparsedp.derivative import judged, zero_like
 from sparsedp.errors import DerivativeError, NonFiniteError
-from sparsedp.ledger import active, count
+from sparsedp.ledger import count
 from sparsedp.progress import shown_steps
 from sparsedp.tape import Rule
 from sparsedp.trajectory.backward_pass import go_back
@@ -102,9 +102,8 @@ class Loop(Rule):
         if self.wanted:
             self._end = state.marks()
             self._runs = [(steps, kept)]
-        if active:
-            count("rollout.step", "forward", self.n)
-            count("rollout", "bytes", self.kept * self.state.nbytes)
+        count("rollout.step", "forward", self.n)
+        count("rollout", "bytes", self.kept * self.state.nbytes)
         if self.record is not None:
             self.record(Record("forward", self.n, self.kept, 0))
         results = self.keep.finish(state)

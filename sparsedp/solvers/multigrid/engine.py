@@ -11,7 +11,7 @@ import threading
 import numpy as np
 
 from sparsedp import kernels
-from sparsedp.fields import check_choice
+from sparsedp.fields import EPS, check_choice
 from sparsedp.solvers.multigrid.stencil import Unfit, components, stencil_of
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.solve import Engine, norm
@@ -26,7 +26,7 @@ SLOW = 0.3  # a step that leaves more than this share of the residual may have m
 WEAK_SHARE = 0.1  # of cells: beyond it a cycle with point smoothing takes more than about 30 iterations
 SURE = 1 - 1e-6  # sizes are measured with weights in single precision
 PATIENCE = 20  # steps without a smaller residual before giving up
-ROUNDING = 4 * np.finfo(float).eps
+ROUNDING = 4 * EPS
 # Ratio of the coefficients times cells along the longest axis, up to which a cycle in single precision does:
 # a strong cluster of that width is held by so small a share of its links. Beyond, single precision takes 14 to
 # 100 iterations where double takes 9 (a million times stronger balls, 512^2), and fails from ratios of 1e8 on.

@@ -6,11 +6,12 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from sparsedp.fields import EPS
 from sparsedp.structure.base import Matrix
 
 __all__ = ["Stencil", "Unfit", "components", "faces_of", "stencil_of"]
 
-CLEAN = 16 * np.finfo(float).eps  # what is left of a diagonal is 0 below this share of the links at it
+CLEAN = 16 * EPS  # what is left of a diagonal is 0 below this share of the links at it
 AGREES = 1e-12  # relative difference to the operator on a random field that is taken for rounding
 
 
