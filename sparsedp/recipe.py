@@ -11,13 +11,17 @@ __all__ = ["Frozen", "Made", "Remade", "Uncached", "Value"]
 
 
 class Remade:
-    """An object that is pickled, and copied, as the call that makes it: a subclass has ``recipe()``.
+    """An object that is pickled, and copied, as the call that makes it: its attribute `made`, or ``recipe()``.
 
-    It returns that function or class of a module, and its arguments.
+    These are the function or class of a module, and its arguments.
     """
 
     __slots__ = ()
-    recipe: Any
+    made: Any
+
+    def recipe(self):
+        """The call that makes it again."""
+        return self.made
 
     def __reduce__(self):
         build, arguments = self.recipe()
@@ -73,14 +77,10 @@ class Made(Remade):
 
     def __init__(self, function, build, *arguments):
         update_wrapper(self, function)
-        self.name, self._function, self._made = build.__name__, function, (build, arguments)
+        self.name, self._function, self.made = build.__name__, function, (build, arguments)
 
     def __call__(self, *args, **options):
         return self._function(*args, **options)
-
-    def recipe(self):
-        """The call that makes it again: see recipe.py."""
-        return self._made
 
     def __repr__(self):
         return f"<function of {self.name}>"

@@ -393,10 +393,6 @@ class Rule(Remade):
         self.keywords = keywords
         self.made = made or (Rule, (name, forward, vjp, jvp, keywords))  # see recipe.py
 
-    def recipe(self):
-        """The call that makes it again: see recipe.py."""
-        return self.made
-
     def __call__(self, *args, **options):
         if self.keywords or options:
             args = self._positional(args, options)

@@ -18,6 +18,7 @@ __all__ = [
     "leaves_like",
     "mapped",
     "norm",
+    "placed",
     "power_of_two",
     "subscript",
 ]
@@ -46,6 +47,20 @@ def flatten(tree):
     {'a': (3.0, 4.0), 'b': 5.0}
     """
     return leaves(tree), lambda values: _build(tree, iter(values))
+
+
+def placed(entries, places, values):
+    """A sequence as a list with other values at some places.
+
+    Examples
+    --------
+    >>> placed((1.0, 2.0, 3.0), [0, 2], "ab")
+    ['a', 2.0, 'b']
+    """
+    entries = list(entries)
+    for place, value in zip(places, values, strict=True):
+        entries[place] = value
+    return entries
 
 
 def copied(tree):

@@ -22,6 +22,7 @@ from sparsedp.advection.control_volumes import components
 from sparsedp.derivative import pullback, pushforward
 from sparsedp.kernels.fluxes import OWN
 from sparsedp.tape import isbox, linear, plain
+from sparsedp.tree import placed
 
 __all__ = ["Reference"]
 
@@ -124,12 +125,12 @@ class Reference:
 
     def vjp(self, nums, g, *args):
         """Cotangent of the moved field -> those of the arguments `nums`."""
-        return pullback(lambda some: self.step(*_with(args, nums, some)), tuple(args[num] for num in nums))[1](g)
+        return pullback(lambda some: self.step(*placed(args, nums, some)), tuple(args[num] for num in nums))[1](g)
 
     def jvp(self, tangents, *args):
         """{number of an argument: tangent} -> tangent of the moved field."""
         given = tuple(args[num] for num in tangents)
-        return pushforward(lambda some: self.step(*_with(args, tangents, some)), given, tuple(tangents.values()))[1]
+        return pushforward(lambda some: self.step(*placed(args, tangents, some)), given, tuple(tangents.values()))[1]
 
     def rate(self, v):
         """What the weight 1 - dt * rate of each point is made of."""
@@ -147,11 +148,3 @@ class Reference:
 def _applied(matrix):
     rule = linear("transport", matrix.__matmul__, sp.csr_array(matrix.T).__matmul__)[0]
     return lambda x: rule(x) if isbox(x) else matrix @ x
-
-
-def _with(args, nums, some):
-    """The arguments with others in some places."""
-    found = list(args)
-    for num, value in zip(nums, some, strict=True):
-        found[num] = value
-    return found

@@ -177,17 +177,14 @@ class ConservationLaw(Remade):
 
     def __init__(self, grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium):
         inflow, equilibrium = constant(inflow), constant(equilibrium)
-        self.given = grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium
+        given = grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium
+        self.made, self.scheme, self.momentum = (ConservationLaw, given), scheme, momentum
         self.grid, self.domain, self.flux, self.speed = grid, grid.cells, flux, speed
         self.source, self.equilibrium = source, equilibrium
         self.axes = [
             Axis(grid, axis, sides[axis] or (None, None), momentum and momentum[axis], inflow, SCHEMES[scheme])
             for axis in range(grid.dim if grid.cells.size else 0)
         ]
-
-    def recipe(self):
-        """The call that makes it again: see recipe.py."""
-        return ConservationLaw, self.given
 
     def __call__(self, u, params=None):
         """State -> its rate of change.
@@ -214,7 +211,7 @@ class ConservationLaw(Remade):
 
     def _state(self, u):
         """The state, of floating numbers."""
-        values, momentum, shape = field_array(self, plain(u), batch=True), self.given[5], self.grid.shape
+        values, momentum, shape = field_array(self, plain(u), batch=True), self.momentum, self.grid.shape
         fields = values.shape[: -len(shape)]
         if len(fields) > 1:
             wanted = ", ".join(map(str, ("fields", *shape)))
@@ -294,7 +291,7 @@ class ConservationLaw(Remade):
         return float(cfl / most) if most else np.inf
 
     def __repr__(self):
-        return f"<conservation_law {self.given[3]}: {self.grid.cells}>"
+        return f"<conservation_law {self.scheme}: {self.grid.cells}>"
 
 
 def _shaped(name, value, u):

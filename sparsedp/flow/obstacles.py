@@ -181,21 +181,17 @@ class Forces(Remade):
     """What `forces` makes."""
 
     def __init__(self, grid, solid, boundary, solid_boundary, cells, about):
-        self.made = grid, solid, boundary, solid_boundary, cells, about
+        self.made = Forces, (grid, solid, boundary, solid_boundary, cells, about)
         sides = resolve(grid, boundary, no_slip)
         held = check_solid(grid, solid) if cells is None else region_of(grid, cells)
         chosen = np.logical_or(*solid_faces(grid, held))
         point = numbers_per_axis(about, grid.shape, "about")
         self.total = _total(grid, chosen, point)
         viscous = Operator(stresses(grid, sides, solid, solid_boundary), grid.faces, grid.faces, "stresses")
-        wet = np.ones(grid.shape, bool) if solid is None else ~check_solid(grid, solid)
+        wet = ~check_solid(grid, solid)
         slope = gradient(grid, pressure_conditions(grid, sides)) @ mask(grid.cells, wet)
         self.carried, self.carrier, gain = momentum_fluxes(grid, sides)
         self.viscous, self.pressure, self.gain = self.total @ viscous, -self.total @ slope, self.total @ gain
-
-    def recipe(self):
-        """The call that makes it again: see recipe.py."""
-        return Forces, self.made
 
     def __call__(self, v, p, viscosity):
         check_number("the viscosity of forces", plain(viscosity), ">= 0")  # an array would be spread over the torque

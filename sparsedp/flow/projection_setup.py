@@ -40,7 +40,7 @@ class Setup(Remade):
         self.grid, self.sides = grid, resolve(grid, boundary, no_slip)
         self.solid = None if solid is None else check_solid(grid, solid).copy()
         named = {axis: pair for axis, pair in zip(grid.axes, self.sides, strict=True) if pair}
-        self.made = grid, self.solid, named, settings  # nothing that the caller may change
+        self.made = Setup, (grid, self.solid, named, settings)  # nothing that the caller may change
         self.pressure_conditions = pressure_conditions(grid, self.sides)
         self.open = faces_that(grid, self.sides, self.solid, lambda condition: not condition.closed)
         self.exponent = int(np.frexp(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))[1])
@@ -63,10 +63,6 @@ class Setup(Remade):
     def info(self):
         """SolveLog of the pressure solves."""
         return self.inverse.info
-
-    def recipe(self):
-        """The call that makes it again: see recipe.py."""
-        return Setup, self.made
 
     def operators(self):
         """(P, its pressure) as products: so they act on ranks, where no pass sees the whole field."""

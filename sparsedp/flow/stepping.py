@@ -205,7 +205,7 @@ class FlowStep(Remade):
     """A step of incompressible flow, made by `flow_step` of what is given. What the scene does not need is None."""
 
     def __init__(self, given):
-        self.given = given
+        self.made = _remade, (given,)
         grid, boundary, solid = given["grid"], given["boundary"], given["solid"]
         self.grid, self.dt, self.force, self.friction = grid, float(given["dt"]), given["force"], given["friction"]
         self.strict, self.implicit = given["unstable"] == "raise", given["implicit"]
@@ -221,10 +221,6 @@ class FlowStep(Remade):
         viscous = partial(face_laplacian, grid, boundary, solid, given["solid_boundary"])
         self.viscous = Diffusion("viscosity", given["viscosity"], viscous, given["walls"], self)
         self.scalars = {name: Scalar(name, solid, self, **parts) for name, parts in (given["scalars"] or {}).items()}
-
-    def recipe(self):
-        """The call that makes it again: see recipe.py."""
-        return _remade, (self.given,)
 
     def start(self, v, params=None, s=None):
         """Velocity and scalars -> the first state: made incompressible, the pressure still unknown."""

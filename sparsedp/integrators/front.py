@@ -244,10 +244,7 @@ class Step(Remade):
     def __init__(self, method, dt, scheme, limits, given):
         self.method, self.problem, self.dt, self.scheme, self.limits = method, scheme.problem, dt, scheme, limits
         self.name, self.given, self.order, self.info = f"stepper({method})", given, scheme.order, scheme.info
-
-    def recipe(self):
-        """The call that makes it again: see recipe.py."""
-        return _remade, (self.given,)
+        self.made = _remade, (given,)
 
     @property
     def taken(self):

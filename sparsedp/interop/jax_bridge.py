@@ -11,9 +11,10 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from sparsedp.fields import check_function
-from sparsedp.interop.recording import owned, parts, placed, recorded
+from sparsedp.interop.recording import owned, parts, recorded
 from sparsedp.recipe import Made
 from sparsedp.tape import Rule, dtype_of, plain
+from sparsedp.tree import placed
 
 __all__ = ["from_jax", "to_jax"]
 

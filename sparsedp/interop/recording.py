@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp.derivative import gradient_of, growing, linearised
 
-__all__ = ["owned", "parts", "placed", "recorded"]
+__all__ = ["owned", "parts", "recorded"]
 
 
 def recorded(fun, arrays, moving):
@@ -20,14 +20,6 @@ def recorded(fun, arrays, moving):
         return [gradient_of(array, slope) for array, slope, moves in slopes if moves]
 
     return values, rebuild, gradients
-
-
-def placed(entries, places, values):
-    """A list with other values at some places."""
-    entries = list(entries)
-    for place, value in zip(places, values, strict=True):
-        entries[place] = value
-    return entries
 
 
 def owned(array):

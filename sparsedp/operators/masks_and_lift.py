@@ -112,7 +112,7 @@ def interior(grid, solid=None):
     array([0., 1., 1., 0.])
     """
     check_grid("interior", grid)
-    below, above = solid_faces(grid, np.ones(grid.shape, bool) if solid is None else ~check_solid(grid, solid))
+    below, above = solid_faces(grid, ~check_solid(grid, solid))
     return Operator(Mask(below & above), grid.faces, grid.faces, "interior")
 
 
@@ -186,8 +186,8 @@ def _check_space(space, name):
 
 
 def check_solid(grid, solid):
-    """Solid argument -> boolean array of the shape of the grid."""
-    return _boolean(solid, grid.cells, "solid")
+    """Solid argument -> boolean array of the shape of the grid, False everywhere for None."""
+    return np.zeros(grid.shape, bool) if solid is None else _boolean(solid, grid.cells, "solid")
 
 
 def _boolean(flags, space, name):

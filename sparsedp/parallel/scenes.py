@@ -13,7 +13,7 @@ from sparsedp.fields import check_finite, check_function, check_shape, check_who
 from sparsedp.progress import shown_steps
 from sparsedp.recipe import Remade
 from sparsedp.tape import Rule, isbox
-from sparsedp.tree import copied, flatten, leaves, mapped
+from sparsedp.tree import copied, flatten, leaves, mapped, placed
 
 __all__ = ["Ensemble", "ensemble"]
 
@@ -106,13 +106,9 @@ class Ensemble(Remade):
         check_shape("weights of ensemble", self._weights, (self.count,), "; give one number for each scene")
         check_finite("weights", self._weights)
         self._weights = self._weights.tolist()
-        self._given = loss, scenes, executor, self._weights, chunk, progress
+        self.made = ensemble, (loss, scenes, executor, self._weights, chunk, progress)
         self._chunk, self._executor, self._progress = int(chunk or 1), executor, progress
         self._loss, *self._scenes = (_packed(x) if executor is not None else mapped(frozen, x) for x in (loss, *scenes))
-
-    def recipe(self):
-        """The call that makes it again: see recipe.py."""
-        return ensemble, self._given
 
     def __repr__(self):
         return f"<ensemble of {self.count} scenes>"
@@ -230,9 +226,7 @@ def _curvature(of, values, tangents):
 def _placed(x, moving, values):
     """A tree -> the same one with other values at the leaves that move."""
     entries, rebuild = flatten(x)
-    for place, value in zip(moving, values, strict=True):
-        entries[place] = value
-    return rebuild(entries)
+    return rebuild(placed(entries, moving, values))
 
 
 def _added(total, parts):

@@ -15,6 +15,7 @@ import numpy as np
 from sparsedp.derivative import of_argument, push
 from sparsedp.errors import NonFiniteError
 from sparsedp.tape import Rule, plain
+from sparsedp.tree import placed
 
 __all__ = ["solve_rule", "vary"]
 
@@ -60,14 +61,7 @@ def solve_rule(name, solve, back, product, transposed=False, checked=False):
 
 def vary(fun, args, places):
     """fun(*args) -> (function of the list of the arguments at `places`, that list)."""
-
-    def varied(chosen):
-        values = list(args)
-        for place, value in zip(places, chosen, strict=True):
-            values[place] = value
-        return fun(*values)
-
-    return varied, [args[place] for place in places]
+    return lambda chosen: fun(*placed(args, places, chosen)), [args[place] for place in places]
 
 
 def _finite(name, cotangent):

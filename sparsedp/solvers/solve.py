@@ -102,15 +102,11 @@ class Solver(Remade):
     """
 
     def __init__(self, system, engine, nullspace, log, name, made, reason=""):
-        self.made, self.reason = made, reason
+        # Factors and hierarchies do not travel: what was asked for does, and is set up again.
+        self.made, self.reason = (_remade, made), reason
         self.served = not thread.calls  # whether this set-up served before, or was made where nobody counts
         self.system, self.engine = system, engine
         self.nullspace, self.log, self.name = nullspace, log, name
-
-    def recipe(self):
-        """The call that makes it again: see recipe.py."""
-        # Factors and hierarchies do not travel: what was asked for does, and is set up again.
-        return _remade, self.made
 
     def solve(self, b, transposed=False, checked=True, start=None):
         """Flat b, float64 or of a complex operator complex128 -> flat x. `checked`: primal data, to be compatible."""
