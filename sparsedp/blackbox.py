@@ -10,7 +10,7 @@ from zlib import crc32
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
+from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import EPS, check_choice, check_finite, check_function, check_shape
 from sparsedp.ledger import count
 from sparsedp.operators.given import from_matrix
@@ -259,8 +259,7 @@ class Adopted(Remade):
         along = self._product(x, way)
         matrix = coloured.matrix(lambda v: along(steps * v))
         matrix.data /= steps[matrix.indices]
-        if not np.all(np.isfinite(matrix.data)):
-            raise NonFiniteError(f"{self.name} is not finite close to x; its Jacobian cannot be taken there")
+        check_finite(f"what differences of {self.name} close to x give", matrix.data, advice="; move x a little")
         return matrix
 
     def _probed(self, coloured, x):

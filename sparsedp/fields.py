@@ -103,8 +103,8 @@ def check_out(op, out, u, dtype, shape):
         raise ValueError(f"{op.name} needs an out that is contiguous, writeable and apart from u; write {wanted}")
 
 
-def check_finite(name, values, needs="must be finite", where=None):
-    """Refuse NaN and infinity in plain numbers: say how many there are and where the first one is.
+def check_finite(name, values, needs="must be finite", where=None, advice=""):
+    """Refuse NaN and infinity in plain numbers: say how many there are, where the first one is, and what to do.
 
     `where` turns the number of a flat entry into words; default: its index in `values`.
     """
@@ -115,7 +115,7 @@ def check_finite(name, values, needs="must be finite", where=None):
         raise NonFiniteError(f"{name} {needs}, got {values}; write a finite number")
     index, many = int(np.argmin(finite)), finite.size - np.count_nonzero(finite)
     first = place(index, finite.shape) if where is None else where(index)
-    raise NonFiniteError(f"{name} {needs}, got {many} that are NaN or infinite, the first at {first}")
+    raise NonFiniteError(f"{name} {needs}, got {many} that are NaN or infinite, the first at {first}{advice}")
 
 
 def surely_finite(value):
@@ -136,10 +136,12 @@ def place(index, shape):
     return indices[0] if len(indices) == 1 else indices
 
 
-def check_function(name, thing, example):
-    """Refuse what cannot be called."""
+def check_function(name, thing, example, count=None):
+    """Refuse what cannot be called, or does not take this many arguments."""
     if not callable(thing):
         raise TypeError(f"{name} takes a function, got {type(thing).__name__}; write {example}")
+    if count is not None:
+        check_takes(name, thing, count, example)
 
 
 def check_type(name, thing, kind, wanted, example):

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparsedp import kernels, results
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_native, check_out, check_shape, field_array
+from sparsedp.fields import check_finite, check_native, check_out, check_shape, field_array
 from sparsedp.ledger import active
 from sparsedp.markup import facts, spy
 from sparsedp.recipe import Frozen, Remade
@@ -219,8 +219,7 @@ class Operator(Frozen, Remade):
         if not _is_scalar(factor):
             return NotImplemented
         number = complex(factor)
-        if not np.isfinite(number):
-            raise NonFiniteError(f"{self.name} can be scaled by a finite number only, got {factor}")
+        check_finite(f"a factor of {self.name}", factor)
         label = "-" if number == -1 else f"{factor:g} * "
         structure = times(self.structure, number if np.iscomplexobj(factor) else number.real)
         return Operator(structure, self.domain, self.codomain, f"{label}{_bracket(self.name)}")

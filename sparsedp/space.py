@@ -8,8 +8,8 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.fields import check_on, check_plain
+from sparsedp.errors import ShapeError
+from sparsedp.fields import check_finite, check_on, check_plain
 from sparsedp.recipe import Uncached, Value
 from sparsedp.tape import dtype_of, isbox
 
@@ -82,8 +82,7 @@ class Space(Value, Uncached):
             lengths = (self.grid.control_lengths(self.kind, axis) for axis in range(len(self.parts)))
             flat = [reduce(np.multiply.outer, lines).ravel() for lines in lengths]
         volumes = np.concatenate(flat).reshape(self.shape)
-        if not np.all(np.isfinite(volumes)):
-            raise NonFiniteError("volumes overflow: the spacing is too large; rescale the lengths of the grid")
+        check_finite("volumes of a grid", volumes, advice="; its spacing is too large, rescale its lengths")
         volumes.flags.writeable = False
         return volumes
 

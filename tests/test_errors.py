@@ -232,7 +232,11 @@ TABLE = [
         FINITE,
         "laplacian can be divided by a finite number other than 0 only, got 0.0",
     ),
-    (lambda: dp.laplacian(LINE) * np.nan, FINITE, "laplacian can be scaled by a finite number only, got nan"),
+    (
+        lambda: dp.laplacian(LINE) * np.nan,
+        FINITE,
+        "a factor of laplacian must be finite, got nan; write a finite number",
+    ),
     (
         lambda: dp.laplacian(LINE) / np.inf,
         FINITE,

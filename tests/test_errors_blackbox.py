@@ -48,7 +48,7 @@ WRONG = [
     (first(lambda x: x / 0.0, name="f"), NonFiniteError, "f near x must be finite to be differentiated, got 2"),
     (
         first(np.sqrt, (0.0, 1.0), derivative="difference"), NonFiniteError,
-        "sqrt is not finite close to x; its Jacobian cannot be taken there",
+        "what differences of sqrt close to x give must be finite, got .*; move x a little",
     ),
     (
         first(lambda x: x * 1j, name="turn"), TypeError,

@@ -226,7 +226,8 @@ TABLE = [
     (
         lambda: dp.laplacian(dp.Grid(3, spacing=1e-200)),
         FINITE,
-        "coefficients overflow: the spacing is too small; rescale the lengths of the grid",
+        "coefficients on a grid must be finite, got 7 that are NaN or infinite, the first at 0; its spacing "
+        "is too small, rescale its lengths",
     ),
     (
         lambda: dp.laplacian(dp.Grid(3, spacing=1e200)),

@@ -69,7 +69,8 @@ TABLE = [
     (
         lambda: dp.stepper("etdrk4", -1.0 * L, 1e6)(U),
         FINITE,
-        "stepper(etdrk4): exp(1e+06 * -laplacian) is beyond 1.8e308; take a smaller dt or the other sign",
+        "stepper(etdrk4): exp(1e+06 * -laplacian) must be finite, got 4 that are NaN or infinite, the first "
+        "at 0; take a smaller dt or the other sign",
     ),
     (
         lambda: dp.stepper("euler", L, 0.1, linear=L),

@@ -232,7 +232,7 @@ def test_functions_that_are_refused():
     with pytest.raises(TypeError, match="f.e. of function must hold real numbers, got dtype complex128"):
         dp.function(L, lambda e: e * 1j)
     with pytest.raises(
-        dp.errors.NonFiniteError, match=r"f\(laplacian\) holds NaN or infinity; check f at its eigenvalues"
+        dp.errors.NonFiniteError, match=r"f\(laplacian\) must be finite at the eigenvalues, got .*; check f there"
     ):
         dp.function(L, lambda e: np.log(e - 1))
     with pytest.raises(TypeError):

@@ -240,7 +240,7 @@ def test_gradients_that_overflow_are_refused():
         np.errstate(over="ignore"),
         pytest.raises(
             dp.errors.NonFiniteError,
-            match="a gradient of elliptic_solver is beyond 1.8e308; scale the loss or the right-hand side",
+            match="a gradient of elliptic_solver must be finite, got .*; scale the loss or the right-hand side",
         ),
     ):
         dp.value_and_grad(lambda k: 1e100 * anp.sum(solve(k, b)))(np.linspace(1.0, 2.0, grid.faces.size))

@@ -28,7 +28,7 @@ import numpy as np
 from sparsedp.boundary_conditions import free_slip, outflow, resolve
 from sparsedp.boundary_conditions import inflow as inflow_side
 from sparsedp.constants import constant, frozen
-from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.errors import ShapeError
 from sparsedp.fields import (
     check_choice,
     check_finite,
@@ -36,7 +36,6 @@ from sparsedp.fields import (
     check_kind,
     check_number,
     check_shape,
-    check_takes,
     field_array,
     is_whole,
 )
@@ -48,6 +47,7 @@ from sparsedp.tree import mapped
 
 __all__ = ["ConservationLaw", "conservation_law"]
 
+NO_WAVES = "; has the state left where it has waves (a density or a depth below 0)? Take a smaller dt"
 GHOSTS = 2  # cells beyond each end: the slope in the first of them needs the second
 # What a side is -> how np.pad repeats cells there; None: the axis is periodic.
 REPEATED: dict = {None: "wrap", free_slip: "symmetric", outflow: "edge", inflow_side: "edge"}
@@ -138,8 +138,7 @@ def conservation_law(
     check_choice("scheme of conservation_law", scheme, SCHEMES)
     for name, function, count in (("flux", flux, 3), ("speed", speed, 3), ("source", source, 2)):
         if function is not None or name != "source":
-            check_function(f"conservation_law, as {name},", function, _example(name, count))
-            check_takes(f"conservation_law, as {name},", function, count, _example(name, count))
+            check_function(f"conservation_law, as {name},", function, _example(name, count), count)
     sides = resolve(grid, boundary, outflow)
     conditions = [side for pair in sides for side in pair or ()]
     for side in conditions:
@@ -256,11 +255,7 @@ class ConservationLaw(Remade):
         given = given if isinstance(given, tuple) else (-given, given)
         for speed in map(plain, given):
             _shaped("speed", speed, u[(0,) * (u.ndim - self.grid.dim)])
-            if not np.all(np.isfinite(speed)):
-                raise NonFiniteError(
-                    f"the speed of a conservation_law is NaN or infinite along {AXES[axis]}: the state has left where "
-                    "it has waves (a density or a depth below 0?); take a smaller dt"
-                )
+            check_finite(f"the speed of a conservation_law along {AXES[axis]}", speed, advice=NO_WAVES)
         if np.any(plain(given[0]) > plain(given[1])):  # no flux would lean against the wind
             raise ValueError(
                 "the speed of a conservation_law must be >= 0, or a pair, the slowest before the fastest; write abs(u) "

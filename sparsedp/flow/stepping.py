@@ -44,7 +44,6 @@ from sparsedp.fields import (
     check_function,
     check_number,
     check_on,
-    check_takes,
     check_type,
     rounded_down,
 )
@@ -168,7 +167,9 @@ def flow_step(
         raise ValueError("implicit viscosity of flow_step is a number, got a function; write implicit=False")
     if scalars is not None:
         check_type("flow_step", scalars, dict, "a dict of scalars", 'scalars={"heat": {...}}')
-    _check_function(force, 3 if scalars else 2, f"force=lambda v, {'s, ' * bool(scalars)}params: ...")
+    if force is not None:
+        example = f"force=lambda v, {'s, ' * bool(scalars)}params: ..."
+        check_function("flow_step", force, example, 3 if scalars else 2)
     if walls is not None:
         check_on("flow_step, as walls,", walls, grid.faces, "; write face_lift(grid, boundary)(values)")
     if friction is not None and implicit:
@@ -178,14 +179,9 @@ def flow_step(
         if not isinstance(parts, dict) or not parts.keys() <= set(SCALAR):
             raise ValueError(f"scalar {name!r} of flow_step needs a dict of {', '.join(SCALAR)}, got {parts!r}")
         _check_constant(f"diffusivity of {name!r}", parts.get("diffusivity", 0.0), ">= 0")
-        _check_function(parts.get("source"), 2, "source=lambda s, params: ...")
+        if parts.get("source") is not None:
+            check_function("flow_step", parts["source"], "source=lambda s, params: ...", 2)
     return FlowStep(given)
-
-
-def _check_function(function, count, example):
-    if function is not None:
-        check_function("flow_step", function, example)
-        check_takes("flow_step", function, count, example)
 
 
 def _check_constant(name, number, least):

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.polynomial import Polynomial as Line
 from scipy.special import hyp1f1
 
-from sparsedp.errors import NonFiniteError
+from sparsedp.fields import check_finite
 from sparsedp.integrators.problem import combine, later
 from sparsedp.integrators.runge_kutta import Scheme, family
 from sparsedp.operator import Operator
@@ -131,10 +131,9 @@ class PhiFunctions:
             product = reduce(matmul, [self.op] * function.power, identity(self.op.domain))
             return self._named((function.start * product).structure)
         values = function.values(z, self.eigenvalues)
-        if not np.all(np.isfinite(values)):
-            raise NonFiniteError(
-                f"{self.name}: exp({z:g} * {self.op.name}) is beyond 1.8e308; take a smaller dt or the other sign"
-            )
+        check_finite(
+            f"{self.name}: exp({z:g} * {self.op.name})", values, advice="; take a smaller dt or the other sign"
+        )
         return self._named(SpectralFunction(self.spectrum, values))
 
     def _named(self, structure):

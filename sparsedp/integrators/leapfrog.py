@@ -27,7 +27,7 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
 from sparsedp.derivative import push
 from sparsedp.errors import ShapeError, UnstableStepError
-from sparsedp.fields import check_function, check_number, check_takes, is_whole, rounded_down
+from sparsedp.fields import check_function, check_number, is_whole, rounded_down
 from sparsedp.grid import AXES, check_grid
 from sparsedp.integrators.adaptive import Moving
 from sparsedp.integrators.problem import combine, of_fields, pair, untraced
@@ -62,8 +62,7 @@ class Leapfrog(Scheme):
         super().__init__(self, "leapfrog", 2)
         example = "(lambda v, c: ..., lambda p, c: ...) for the state (p, v)"
         for rate in pair("the rates of leapfrog", rates, example):
-            check_function("a rate of leapfrog", rate, "lambda field, params: ...")
-            check_takes("leapfrog", rate, 2, "lambda field, params: ...")
+            check_function("a rate of leapfrog", rate, "lambda field, params: ...", 2)
         if damping is not None:
             pair("damping, for both fields of the state,", damping, "(s, None)")
         for rate in map(plain, leaves(damping)):

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from sparsedp.derivative import pullback, push
-from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
+from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import EPS, check_finite
 from sparsedp.solvers.scaling import largest
 from sparsedp.tape import is_variable
@@ -171,8 +171,7 @@ def singular(matrix):
     rows = matrix / scale
     with np.errstate(invalid="ignore"):
         gram = rows @ rows.T
-    if not np.all(np.isfinite(gram)):
-        raise NonFiniteError("the Jacobian is not finite; start where every output has a finite derivative")
+    check_finite("products of the Jacobian", gram, advice="; start where every output has a finite derivative")
     squares, vectors = scipy.linalg.eigh(gram.T, driver="evd", overwrite_a=True, check_finite=False)
     few = int(np.count_nonzero(squares <= GRADE**2 * np.max(squares, initial=0.0)))  # for later; they come first
     few = 0 if few == len(squares) else few

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from sparsedp.derivative import of_argument, push
-from sparsedp.errors import NonFiniteError
+from sparsedp.fields import check_finite
 from sparsedp.tape import Rule, plain
 from sparsedp.tree import placed
 
@@ -66,6 +66,5 @@ def vary(fun, args, places):
 
 def _finite(name, cotangent):
     """Refuse products of two solutions that overflow."""
-    if not np.all(np.isfinite(plain(cotangent))):
-        raise NonFiniteError(f"a gradient of {name} is beyond 1.8e308; scale the loss or the right-hand side")
+    check_finite(f"a gradient of {name}", plain(cotangent), advice="; scale the loss or the right-hand side")
     return cotangent

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from sparsedp.errors import NonFiniteError
-from sparsedp.fields import check_function, check_kind, check_number, check_shape
+from sparsedp.fields import check_finite, check_function, check_kind, check_number, check_shape
 from sparsedp.operator import Operator
 from sparsedp.solvers.separable import SpectralFunction, diagonalised
 
@@ -50,7 +49,7 @@ def exponential(op, time=1.0):
     with np.errstate(over="ignore"):
         weights = np.exp(time * values)
     name = f"exp({time:g} * {op.name})"
-    return _function(op, axes, weights, name, f"{name} is beyond 1.8e308; take a shorter time or the other sign")
+    return _function(op, axes, weights, name, "; take a shorter time or the other sign")
 
 
 def power(op, exponent):
@@ -91,8 +90,7 @@ def power(op, exponent):
     zero = values == 0
     with np.errstate(over="ignore"):
         weights = np.where(zero, float(exponent == 0), np.where(zero, 1.0, values) ** float(exponent))
-    refusal = f"{op.name} to the power {exponent:g} is beyond 1.8e308; rescale the operator"
-    return _function(op, axes, weights, f"({op.name})^{exponent:g}", refusal)
+    return _function(op, axes, weights, f"({op.name})^{exponent:g}", "; rescale the operator")
 
 
 def function(op, f):
@@ -140,12 +138,10 @@ def function(op, f):
         weights = np.asarray(f(values.copy()))
     check_shape("f(e) of function", weights, values.shape, "; give a number for each eigenvalue")
     check_kind("f(e) of function", weights.dtype, "real numbers")
-    name = f"f({op.name})"
-    return _function(op, axes, weights.astype(float), name, f"{name} holds NaN or infinity; check f at its eigenvalues")
+    return _function(op, axes, weights.astype(float), f"f({op.name})", "; check f there")
 
 
-def _function(op, axes, weights, name, refusal):
+def _function(op, axes, weights, name, advice):
     """The Operator with these weights in place of the eigenvalues; refused when they are beyond the range of floats."""
-    if not np.all(np.isfinite(weights)):
-        raise NonFiniteError(refusal)
+    check_finite(name, weights, "must be finite at the eigenvalues", advice=advice)
     return Operator(SpectralFunction(axes, weights), op.domain, op.codomain, name)

@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import NonFiniteError
+from sparsedp.fields import check_finite
 from sparsedp.kernels.reference import Rows, Tridiagonal
 from sparsedp.recipe import Uncached
 from sparsedp.structure.base import rows_of
@@ -30,8 +31,7 @@ class Factor(Uncached):
         matrix.sum_duplicates()
         matrix.eliminate_zeros()
         matrix.sort_indices()
-        if not np.all(np.isfinite(matrix.data)):
-            raise NonFiniteError("coefficients overflow: the spacing is too small; rescale the lengths of the grid")
+        check_finite("coefficients on a grid", matrix.data, advice="; its spacing is too small, rescale its lengths")
         self.matrix = matrix
 
     @classmethod
