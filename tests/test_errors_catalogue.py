@@ -55,7 +55,7 @@ TABLE = [
     (
         lambda: dp.from_functions(lambda u: u, "T", 3, 3),
         TYPE,
-        "from_functions takes two functions, got function and str; write None for a missing transpose",
+        "from_functions, as transpose, takes a function, got str; write None for a missing one",
     ),
     (
         lambda: dp.from_linear_operator(Broken()).T(np.ones(3)),

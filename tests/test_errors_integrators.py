@@ -80,7 +80,7 @@ TABLE = [
     (
         lambda: dp.stepper("euler", 3.0, 0.1),
         TYPE,
-        "rate must be a function or an Operator, got float",
+        "stepper, as rate, takes a function, got float; write rate=lambda u, params: ...",
     ),
     (
         lambda: dp.stepper("rk4", lambda u: -u, 0.1),

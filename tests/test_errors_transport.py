@@ -91,7 +91,7 @@ CASES = [
     (
         call(u=np.ma.masked_array(U)),
         TypeError,
-        "transport upwind takes plain arrays, got a masked array as u; fill it first",
+        "transport upwind, as u, takes plain arrays, got a masked array; fill it first",
     ),
     (
         call(u=bad(U, (1, 1))),

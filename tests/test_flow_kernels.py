@@ -21,7 +21,7 @@ def projections(shape):
             for boundary in ({}, dict.fromkeys(bounded[-1:], (dp.inflow, dp.outflow))):
                 P = dp.projection(grid, boundary=boundary, method="auto")
                 if P.method == "separable":
-                    yield grid, P.structure.setup
+                    yield grid, P.setup
 
 
 @pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")

@@ -111,7 +111,7 @@ def test_pressure_is_the_potential():
         P = dp.projection(grid, None, boundary)
         v = velocity(grid)
         G = dp.gradient(grid, {"x": (dp.neumann, dp.dirichlet)} if boundary is OPEN else dp.neumann)
-        kept = dp.mask(grid.faces, P.structure.setup.open)
+        kept = dp.mask(grid.faces, P.setup.open)
         np.testing.assert_allclose(P(v), kept(v) + G(P.pressure(v)), atol=1e-10)
         g = np.random.default_rng(1).standard_normal(grid.shape)
         assert abs(np.sum(g * P.pressure(v)) - P.pressure.T(g) @ v) < 1e-9

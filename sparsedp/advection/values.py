@@ -5,7 +5,7 @@ import numpy as np
 
 from sparsedp.advection.law import INFLOW, STEP
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_native, check_number
+from sparsedp.fields import check_number, check_plain
 from sparsedp.tape import cast, dtype_of, isbox, plain
 
 __all__ = ["LETTERS", "check_given", "check_step", "flat_numbers", "prepare", "raised", "result_like", "unflatten"]
@@ -47,9 +47,7 @@ def check_given(name, letter, value, shapes):
         hint = "; write grid.join(...) for the components on faces" if parts else ""
         hint += ", or velocity='cells'" if parts and letter == "v" else ""
         raise ShapeError(f"{name} takes {letter} of shape {shapes[0]}, got an array of shape {shape}{hint}")
-    if isinstance(value, np.ma.MaskedArray):
-        raise TypeError(f"{name} takes plain arrays, got a masked array as {letter}; fill it first")
-    check_native(name, value)
+    check_plain(f"{name}, as {letter},", value)
     kind = dtype_of(value)
     if kind.kind not in "biu" and kind.char not in "df":
         raise TypeError(

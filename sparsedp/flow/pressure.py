@@ -19,7 +19,7 @@ from sparsedp.flow.projection_setup import Setup
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.solvers.choose_method import check_settings
-from sparsedp.structure.base import Structure
+from sparsedp.structure.base import Turning
 
 __all__ = ["Projection", "projection"]
 
@@ -77,41 +77,23 @@ def projection(grid, solid=None, boundary=no_slip, method="auto", rtol=1e-10, ma
     return Projection(Setup(grid, solid, boundary, settings))
 
 
-class Projected(Structure):
-    """P or P^T on flat face fields. It solves in double precision, and rounds once."""
-
-    has_entries = takes_complex = False
-
-    def __init__(self, setup, transposed=False):
-        self.setup, self.transposed = setup, transposed
-        self.shape = self.sizes[::-1] if transposed else self.sizes
-
-    @property
-    def sizes(self):
-        """Of the result and of the argument of the map, not transposed."""
-        return (self.setup.grid.faces.size,) * 2
-
-    def transpose(self):
-        return type(self)(self.setup, not self.transposed)
+class Projected(Turning):
+    """P or P^T on flat face fields, of a Setup. It solves in double precision, and rounds once."""
 
     def act(self, x, out):
-        self.setup.split(x, out, self.transposed)
+        self.inner.split(x, out, self.transposed)
 
 
-class Potential(Projected):
+class Potential(Turning):
     """Face field -> the p with P v = v + G p, one of average 0 where only its slope is known; or the transpose."""
 
-    @property
-    def sizes(self):
-        return self.setup.grid.cells.size, self.setup.grid.faces.size
-
     def act(self, x, out):
-        scale = 2.0**self.setup.exponent
+        setup, scale = self.inner, 2.0**self.inner.exponent
         if self.transposed:
-            self.setup.pressed(scale * x, out)
+            setup.pressed(scale * x, out)
         else:
-            p = self.setup.split(x, np.empty(x.size))
-            np.multiply(scale, self.setup.inverse.solver.system.null_space.project(p), out=out)
+            p = setup.split(x, np.empty(x.size))
+            np.multiply(scale, setup.inverse.solver.system.null_space.project(p), out=out)
 
 
 class Projection(Operator):
@@ -121,7 +103,7 @@ class Projection(Operator):
 
     def __init__(self, setup):
         faces = setup.grid.faces
-        structure = Projected(setup) if faces.layout is None else setup.operators()[0].structure
+        structure = Projected(setup, (faces.size,) * 2) if faces.layout is None else setup.operators()[0].structure
         super().__init__(structure, faces, faces, "projection", "matrix-free")
         vars(self)["setup"] = setup
 
@@ -142,9 +124,10 @@ class Projection(Operator):
     @cached_property
     def pressure(self):
         """Operator faces -> cells: the p with P(v) = v + G(p) on the faces where the flow is free [velocity length]."""
-        grid = self.setup.grid
-        structure = Potential(self.setup) if grid.layout is None else self.setup.operators()[1].structure
-        return Operator(structure, grid.faces, grid.cells, "pressure")
+        setup, cells = self.setup, self.setup.grid.cells
+        shape = cells.size, self.domain.size
+        structure = Potential(setup, shape) if cells.layout is None else setup.operators()[1].structure
+        return Operator(structure, self.domain, cells, "pressure")
 
     def __str__(self):
         return str(self.setup.inverse)

@@ -8,7 +8,7 @@ import numpy as np
 
 from sparsedp.constants import frozen
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_number, check_takes
+from sparsedp.fields import check_function, check_number, check_takes
 from sparsedp.operator import Operator
 from sparsedp.space import fits
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
@@ -203,10 +203,8 @@ class Problem:
 
     def _check_functions(self):
         for name, fun in (("rate", self.rate), ("source", self.source)):
-            if fun is not None and not callable(fun):
-                raise TypeError(
-                    f"{name} must be a function{' or an Operator' * (name == 'rate')}, got {type(fun).__name__}"
-                )
+            if fun is not None:
+                check_function(f"stepper, as {name},", fun, f"{name}=lambda {'u, ' * (name == 'rate')}params: ...")
         if self.rate is None and not self.stiff:
             raise TypeError("stepper needs a rate, a function rate(u, params) or an Operator, or the option linear")
 

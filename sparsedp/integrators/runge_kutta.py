@@ -250,7 +250,7 @@ class Resolvent:
         if not self.op.structure.has_entries or system.complex or system.weights is None:
             return None
         null = system.null_space
-        return self._named(Projector(null, self.op.domain.size)) if null.count else None
+        return self._named(Projector(null, self.op.shape)) if null.count else None
 
 
 # ---- implicit: steps made of stages ----------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_kind, check_plain, check_type
+from sparsedp.fields import check_finite, check_function, check_kind, check_plain, check_type
 from sparsedp.operator import Operator
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
@@ -168,9 +168,9 @@ def from_functions(forward, transpose, domain, codomain, name="operator", dtype=
     """
     if domain is None or codomain is None:
         raise TypeError("from_functions needs a domain and a codomain, got None; write from_functions(f, t, 3, 2)")
-    if not callable(forward) or not (transpose is None or callable(transpose)):
-        given = f"{type(forward).__name__} and {type(transpose).__name__}"
-        raise TypeError(f"from_functions takes two functions, got {given}; write None for a missing transpose")
+    check_function("from_functions", forward, "from_functions(f, t, 3, 2)")
+    if transpose is not None:
+        check_function("from_functions, as transpose,", transpose, "None for a missing one")
     domain, codomain = _space(domain, None), _space(codomain, None)
     structure = Functions(forward, transpose, domain.shape, codomain.shape, _kind(dtype))
     return Operator(structure, domain, codomain, name)

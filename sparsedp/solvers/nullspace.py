@@ -13,7 +13,7 @@ from scipy.sparse.linalg import splu
 
 from sparsedp.fields import EPS
 from sparsedp.solvers.scaling import dot, norm
-from sparsedp.structure.base import Structure
+from sparsedp.structure.base import Turning
 
 __all__ = ["NullSpace", "Projector", "find_null_space"]
 
@@ -107,19 +107,11 @@ class NullSpace:
         return found[labels[found] >= 0]
 
 
-class Projector(Structure):
-    """x without its part along a null space, as a linear map."""
-
-    has_entries = takes_complex = False
-
-    def __init__(self, space, size, transposed=False):
-        self.space, self.transposed, self.shape = space, transposed, (size, size)
+class Projector(Turning):
+    """x without its part along a null space, `inner`, as a linear map."""
 
     def act(self, x, out):
-        self.space.project(x, self.transposed, into=out)
-
-    def transpose(self):
-        return Projector(self.space, self.shape[0], not self.transposed)
+        self.inner.project(x, self.transposed, into=out)
 
 
 def _plainest(side):

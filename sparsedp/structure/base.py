@@ -12,6 +12,7 @@ __all__ = [
     "INT32_LIMIT",
     "Matrix",
     "Structure",
+    "Turning",
     "assembled",
     "compact",
     "probes",
@@ -131,6 +132,18 @@ class Matrix(Structure):
 
     def scaled(self, factor):
         return Matrix(self.matrix * factor)
+
+
+class Turning(Structure):
+    """A map that one thing, `inner`, does both ways: a subclass acts as `transposed` says."""
+
+    has_entries = takes_complex = False
+
+    def __init__(self, inner, shape, transposed=False):
+        self.inner, self.shape, self.transposed = inner, shape, transposed
+
+    def transpose(self):
+        return type(self)(self.inner, self.shape[::-1], not self.transposed)
 
 
 def result_dtype(structure, dtype):
