@@ -109,7 +109,7 @@ BUDGETS = {
     "interop": 3_540,  # bridges to torch and JAX, both ways, to every order, for trees, some arguments, all dtypes
     "solvers/multigrid": 9_730,
     "storage": 3_860,  # .npz 700; .nc and .zarr through xarray, for every dtype, with a checksum: 1 400; ParaView: 720
-    "structure": 6_430,  # products of Kronecker sums: 15, for 360 of solvers; maps that turn round: 40, for 140 elsewhere
+    "structure": 6_430,  # products of Kronecker sums: 15, for 360 of solvers; maps that turn round: 40
     "trajectory": 9_800,  # states on ranks: 250; reversed steps: 400; what a step stores is refused: 150
 }
 CLOSURES = {"integrators.front": 45, "solvers.choose_method": 35, "operators.difference": 24}  # files an import loads
