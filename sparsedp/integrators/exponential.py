@@ -134,7 +134,7 @@ class PhiFunctions:
         check_finite(
             f"{self.name}: exp({z:g} * {self.op.name})", values, advice="; take a smaller dt or the other sign"
         )
-        return self._named(SpectralFunction(self.spectrum, values))
+        return self._named(SpectralFunction((self.spectrum, values), self.op.shape))
 
     def _named(self, structure):
         return Operator(structure, self.space, self.space, self.name)

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from sparsedp.fields import EPS
+
 __all__ = ["linear_weights"]
 
 
@@ -24,7 +26,7 @@ def linear_weights(grid, axis, x):
         If a coordinate lies outside a bounded axis.
     """
     n, start, extent, periodic = grid.shape[axis], grid.origin[axis], grid.size[axis], grid.periodic[axis]
-    slack = 8 * np.finfo(float).eps * (abs(start) + extent)
+    slack = 8 * EPS * (abs(start) + extent)
     outside = (x < start - slack) | (x > start + extent + slack)
     if not periodic and np.any(outside):
         name = grid.axes[axis]

@@ -27,7 +27,7 @@ from sparsedp.fields import EPS
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import inverted
 from sparsedp.solvers.solve import Engine
-from sparsedp.structure.base import Structure
+from sparsedp.structure.base import Turning
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Chain, Diagonal, Sum
 
@@ -383,24 +383,17 @@ def separable_engine(system):
 # ---------------------------------------------------------------- functions of a Kronecker sum
 
 
-class SpectralFunction(Structure):
-    """f(A) for a Kronecker sum A, as a structure: one pair of transforms."""
-
-    has_entries = takes_complex = False
-
-    def __init__(self, spectrum, weights, transposed=False):
-        self.spectrum, self.weights, self.transposed = spectrum, weights, transposed
-        self.shape = (prod(spectrum.shape),) * 2
+class SpectralFunction(Turning):
+    """f(A) for a Kronecker sum A, as a structure: one pair of transforms. `inner`: (Spectrum, f on the eigenvalues)."""
 
     def act(self, x, out):
-        out[...] = self.spectrum.apply(self.weights, x, self.transposed)
-
-    def transpose(self):
-        return SpectralFunction(self.spectrum, self.weights, not self.transposed)
+        spectrum, weights = self.inner
+        out[...] = spectrum.apply(weights, x, self.transposed)
 
     def scaled(self, factor):
+        spectrum, weights = self.inner
         real = not np.iscomplexobj(factor)
-        return SpectralFunction(self.spectrum, self.weights * factor, self.transposed) if real else None
+        return SpectralFunction((spectrum, weights * factor), self.shape, self.transposed) if real else None
 
 
 def eigenbasis(structure):
@@ -412,7 +405,7 @@ def eigenbasis(structure):
         size = structure.shape[0]
         return Spectrum((size,), (Axis("identity", np.zeros(size)),), 0.0), structure.values
     if isinstance(structure, SpectralFunction) and not structure.transposed:
-        return structure.spectrum, structure.weights
+        return structure.inner
     if isinstance(structure, (Sum, Chain)):
         return _together(structure.members, np.add if isinstance(structure, Sum) else np.multiply)
     found = spectrum(structure) if isinstance(structure, Kronecker) and structure.separable else None

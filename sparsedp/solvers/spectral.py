@@ -144,4 +144,4 @@ def function(op, f):
 def _function(op, axes, weights, name, advice):
     """The Operator with these weights in place of the eigenvalues; refused when they are beyond the range of floats."""
     check_finite(name, weights, "must be finite at the eigenvalues", advice=advice)
-    return Operator(SpectralFunction(axes, weights), op.domain, op.codomain, name)
+    return Operator(SpectralFunction((axes, weights), op.shape), op.domain, op.codomain, name)
