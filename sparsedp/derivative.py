@@ -4,7 +4,7 @@ import gc
 import threading
 from contextlib import contextmanager
 from numbers import Number
-from typing import Any
+from typing import Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
@@ -14,11 +14,9 @@ from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, Sparsed
 from sparsedp.fields import check_function, check_native, check_shape, check_whole
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
-from sparsedp.shortcuts import ELSEWHERE, Part, alike, held_for_many, together
+from sparsedp.shortcuts import ELSEWHERE, alike, together
 from sparsedp.tape import (
     Recorder,
-    ReverseNode,
-    added,
     backward,
     boxed,
     called,
@@ -31,14 +29,13 @@ from sparsedp.tape import (
     new_trace,
     plain,
     split_boxes,
-    untraced,
 )  # fmt: skip
 from sparsedp.tree import copied, flatten, keys, leaves, mapped
 
 __all__ = [
-    "NO_JVP", "backward_each", "check_loss", "described", "grad", "gradient_of", "growing", "hvp", "judged", "jvp",
-    "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "traced", "value_and_grad", "vjp",
-    "witnessed", "zero_like",
+    "NO_JVP", "check_loss", "described", "grad", "gradient_of", "growing", "hvp", "judged", "jvp",
+    "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "taped", "traced", "value_and_grad",
+    "vjp", "witnessed", "zero_like",
 ]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
@@ -132,54 +129,37 @@ def pullback(fun, x):
 def linearised(fun, tree, moving):
     """A function at a tree, of whose leaves some move -> (leaves of its result, how to build it, pull).
 
-    ``pull(cotangents)``: of the leaves of the result -> of the leaves of the tree; None where there is none. With
-    `backward_each` as `back` many at once, side by side along a last axis.
+    ``pull(cotangents)``: of the leaves of the result -> of the leaves of the tree; None where there is none.
     """
-    recorder = Recorder()
+    tape = taped(fun, tree, moving)
+
+    def pull(cotangents):
+        sums: dict = {}
+        backward(tape.nodes, tape.ends, cotangents, sums)
+        return [sums.get(root, (None,))[0] for root in tape.roots]
+
+    return tape.values, tape.rebuild, pull
+
+
+class Tape(NamedTuple):
+    """A function at a tree: leaves of its result, how to build it, their nodes; all calls; roots of leaves."""
+
+    values: list
+    rebuild: Any
+    ends: list
+    nodes: list
+    roots: list
+
+
+def taped(fun, tree, moving, *witnesses):
+    """A function at a tree, of whose leaves some move -> Tape, whose calls the witnesses see."""
+    recorder = Recorder(*witnesses)
     roots = [recorder.root() if moves else None for moves in moving]
     try:
         values, ends, rebuild = traced(fun, tree, roots)
-    finally:
-        nodes, recorder.ended = recorder.taken(), True
-
-    def pull(cotangents, back=backward):
-        sums: dict = {}
-        back(nodes, ends, cotangents, sums)
-        return [sums.get(root, (None,))[0] for root in roots]
-
-    return values, rebuild, pull
-
-
-def backward_each(nodes, ends, cotangents, sums):
-    """`backward` for many cotangents, side by side along a last axis: of them and of the sums; plain values alone."""
-
-    def add(parent, g):
-        total, ours = sums.get(parent, (None, False))
-        if type(g) is Part:
-            part, index, shape = g
-            if not ours:  # a sum that was made here is written into
-                total = np.zeros((*shape, part.shape[-1])) if total is None else np.array(total)
-                sums[parent] = total, True
-            total[index] += part
-        else:
-            sums[parent] = (g, False) if total is None else (total + g, True)
-
-    for end, g in zip(ends, cotangents, strict=True):
-        if end is not None:
-            add(end, g)
-    for node in reversed(nodes):
-        g, _ = sums.pop(node, (None, False))
-        if g is None:
-            continue
-        held = held_for_many(node.vjp, node.held)
-        if held is not None:
-            backs = node.vjp(g, *held)
-        else:
-            ones = np.ascontiguousarray(np.moveaxis(g, -1, 0))
-            columns = zip(*(node.vjp(one, *node.held) for one in ones), strict=True)
-            backs = [np.stack([added(None, back)[0] for back in column], -1) for column in columns]
-        for parent, back in zip(node.parents, backs, strict=True):
-            add(parent, back)
+    finally:  # a witness that keeps nodes would be a circle
+        nodes, recorder.ended, recorder.witnesses = recorder.taken(), True, ()
+    return Tape(values, rebuild, ends, nodes, roots)
 
 
 @contextmanager
@@ -189,22 +169,11 @@ def witnessed(see):
     Nodes of every reverse-mode trace, when they are made; `numbers`: those of the arguments that are differentiated.
     """
 
-    class Witness(ReverseNode):
-        """A node that reports itself."""
-
-        vjp: Any
-
-        def __init__(self, value, fun, args, options, nums, parents):
-            super().__init__(value, fun, args, options, nums, parents)
-            see(self, fun, value, args, options, nums)
-
-    untraced[Witness] = untraced[ReverseNode]  # comparisons, shapes, rounding: plain values for this kind too
-    thread.witnesses.append(Witness)
+    thread.witnesses.append(see)
     try:
         yield
     finally:
-        thread.witnesses.remove(Witness)
-        del untraced[Witness]
+        thread.witnesses.remove(see)
 
 
 @contextmanager

@@ -27,8 +27,8 @@ class Thread(local):
         Who takes part in every solve, the last one first; asked inside recordings only.
     loop_hooks : list of callables
         Called for every time loop before it runs, with (step, state, params, inputs, n).
-    witnesses : list of types
-        Kinds of nodes of a tape that see what they stand for; the last one is used.
+    witnesses : list of callables
+        Called for every node of a tape when it is made: see `Recorder`.
     solves : int
         Since the thread began, forward and adjoint: counted always, for one addition a solve.
     grown : int

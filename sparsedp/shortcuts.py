@@ -14,9 +14,8 @@ import numpy as np
 
 __all__ = [
     "ACTS", "ARRAY", "BOX", "COPY", "ELSEWHERE", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part",
-    "REAL", "alike", "array", "formulas_of", "held_for_many", "in_dtype", "on_every_rank", "ranks",
-    "refuse_elsewhere",
-    "together", "whole",
+    "REAL", "alike", "array", "by_entry", "formulas_of", "in_dtype", "on_every_rank", "ranks",
+    "refuse_elsewhere", "together", "whole",
 ]  # fmt: skip
 
 FLOAT = np.dtype(float)
@@ -48,7 +47,7 @@ HELD: dict[tuple, Any] = {
 }
 
 
-_by_entry: set = set()  # pullbacks that act entry by entry
+by_entry: set = set()  # pullbacks that act entry by entry
 
 
 class Part(tuple):
@@ -137,7 +136,7 @@ def _entrywise(*acts):
         pulls[1,] = lambda g, *args: (other(g, *args),), HELD[needs]
         pulls[0, 1] = lambda g, *args: (act(g, *args), other(g, *args)), HELD[need and (0, 1)]
 
-    _by_entry.update(pull for pull, _ in pulls.values())
+    by_entry.update(pull for pull, _ in pulls.values())
 
     def fits(value, nums, args):
         for num in nums:
@@ -163,16 +162,6 @@ def _part(g, place):
 
 def _entries(g, nums):
     return [g[num - 2] for num in nums]
-
-
-def held_for_many(pull, held):
-    """What a pullback is given beside many cotangents, side by side along a last axis; None: it takes one by one."""
-    if pull in _by_entry:
-        return [x if type(x) in SINGLE else np.expand_dims(x, -1) for x in held]
-    if pull is _part:
-        index = held[0][0]
-        return None if index is Ellipsis or type(index) is tuple and Ellipsis in index else held
-    return held if pull is _entries else None
 
 
 # A kind of arrays that do not lie in the memory of one process -> what stands for `formulas_of` where one takes part,

@@ -60,13 +60,13 @@ class Recorder:
     bytes: Any = None  # while it is a number: of the results, and of what stands beside traced values, is added
     ended = False  # whether the function has returned: nothing goes back through a later call
 
-    def __init__(self):
+    def __init__(self, *witnesses):
         self.nodes: list = []
-        self._kind = thread.witnesses[-1] if thread.witnesses else ReverseNode
+        self.witnesses = *thread.witnesses, *witnesses  # see(node, function, value, arguments, options, numbers)
 
     def root(self):
         """A fresh start of a reverse-mode trace, whose calls are taken down here."""
-        return self._kind.new_root(self)
+        return ReverseNode.new_root(self)
 
     def weigh(self, value, args, nums):
         """One call."""
@@ -119,6 +119,8 @@ class ReverseNode(VJPNode):
         self.recorder.nodes.append(self)
         if self.recorder.bytes is not None:
             self.recorder.weigh(value, args, nums)
+        for see in self.recorder.witnesses:
+            see(self, fun, value, args, options, nums)
 
     def _keep_real(self, args, nums):
         """Beside complex values autograd hands complex cotangents on to real ones; a tuple, or entries, are neither."""
@@ -148,8 +150,7 @@ class ForwardNode(JVPNode):
     g: Any
 
     def __init__(self, value, fun, args, options, nums, parents):
-        formulas = None if options else formulas_of(fun, value, args, nums)
-        if formulas:
+        if formulas := None if options else formulas_of(fun, value, args, nums):
             total: Any = None
             for num, parent in zip(nums, parents, strict=True):
                 g = formulas[1](parent.g, num, args, value.shape)
@@ -164,7 +165,6 @@ untraced[ReverseNode] = untraced[UntapedNode] = untraced[VJPNode]
 untraced[ForwardNode] = untraced[JVPNode]
 untaped_root = UntapedNode.new_root
 forward_root = ForwardNode.new_root  # a fresh start of a forward-mode trace, with its tangent
-
 
 _numbers = numbers_from(trace_stack.top + 1)
 

@@ -33,6 +33,7 @@ def angle(x, count=1, **options):
 
 
 X = np.array([1.0, 2.0, 1.5, 0.3])
+MATRIX, LINE = np.random.default_rng(1).standard_normal((3, 3)), dp.laplacian(dp.Grid(3), dp.dirichlet)
 
 
 def test_order_five():
@@ -157,15 +158,25 @@ def test_every_mode(count, options, near):
         lambda u, p: anp.array([1.0, 2.0, 3.0]) + 0.0 * u[0],
         lambda u, p: u,
         lambda u, p: anp.ones(3),
+        lambda u, p: anp.where(u > 1, anp.exp(-u), u**2) * p[0] + anp.maximum(u, p[1]) - anp.minimum(u, 1.0),
+        lambda u, p: anp.roll(u, 1) * anp.repeat(p[:1], 3) + anp.sum(u * u) * anp.sqrt(u) / p[1],
+        lambda u, p: anp.concatenate([u[u > 1], np.ones(int(np.sum(untraced(u) <= 1)))]) * p[0],
+        lambda u, p: u * p[0] if u[0] > u[1] else anp.sin(u) / p[1],
+        lambda u, p: (MATRIX + p[0]) @ anp.tanh(MATRIX @ u) + anp.dot(MATRIX, anp.concatenate([p, [1.0]])) * u,
+        lambda u, p: anp.reshape(anp.reshape(u, (3, 1)) * anp.array([p[0], 1.0]) + MATRIX[:, :2], -1)[::2] - u[-1:],
+        lambda u, p: LINE(u * p[0]) + dp.transport(LINE.domain.grid)(u, p[1] * np.ones(4), 0.01),
+        lambda u, p: anp.sum(anp.outer(u, p), axis=1) + anp.real(anp.exp(1j * u)) + u ** p[0],
     ],
 )
 def test_all_rows_at_once(rate):
-    """The derivatives of a rate from one pass back are those of one pass for each row, to the bit or to rounding."""
-    u, p = np.array([1.3, 0.4, 2.1]), np.array([0.7, 1.6])
+    """The derivatives of a rate at many points are those of one pass back for each row and point, to rounding."""
+    points, p = np.random.default_rng(0).uniform(0.3, 2.5, (9, 3)), np.array([0.7, 1.6])
     problem = dp.stepper("radau", rate, 1.0).problem
-    rows = Flat(problem, u, "radau").rows(u, p, None, [True])
-    _, pull = dp.vjp(lambda u, p: 1.0 * rate(u, p) + 0.0 * u * p[0], u, p)
-    assert rows == pytest.approx(np.array([[*np.concatenate(pull(e)), 0.0] for e in np.eye(3)]), rel=1e-15, abs=1e-15)
+    rates, rows = Flat(problem, points[0], "radau").rows([(u, 0.0) for u in points], p, [True])
+    for u, f, found in zip(points, rates, rows, strict=True):
+        _, pull = dp.vjp(lambda u, p: 1.0 * rate(u, p) + 0.0 * u * p[0], u, p)
+        wanted = np.array([[*np.concatenate(pull(e)), 0.0] for e in np.eye(3)])
+        assert np.array_equal(f, rate(u, p)) and found == pytest.approx(wanted, rel=1e-14, abs=1e-14)
 
 
 def test_second_derivatives_are_refused():

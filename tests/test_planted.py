@@ -487,14 +487,14 @@ BUGS = {
     ),
     "lengths of radau that are held where a jump moves": Bug(
         "integrators",
-        "M[:, :, :n] += length[:, :, None] * section",
-        "M[:, :, :n] += 0.0 * section",
+        "M[..., :n] += stretch[..., None] * section[:, None, None]",
+        "M[..., :n] += 0.0 * section[:, None, None]",
         "tests/test_integrators_radau.py::test_stiff_problems_with_their_gradients",
     ),
     "derivatives of radau at the wrong stage": Bug(
         "integrators",
-        "step.done + C[i] * step.length) for i in (0, 1)]",
-        "step.done + C[i] * step.length) for i in (1, 0)]",
+        "[(u + z[:, i], done + C[i] * length) for i in (0, 1)]",
+        "[(u + z[:, i], done + C[i] * length) for i in (1, 0)]",
         "tests/test_integrators_radau.py::test_one_step_against_a_root",
     ),
     # ---- check, report

@@ -234,9 +234,8 @@ class Adaptive(Scheme):
         runs = (self._again(path, slopes, less, *start.at(x)) for less, x in zip(LESS, entered, strict=True))
         return anp.array([*map(end.off, runs)])
 
-    def section(self, u, params, t, half):
+    def section(self, u, rates, half):
         """The derivative of d for each array of the state, and the speed, as a share of the state's size by time."""
-        rates = leaves(self.problem(u, params, t))
         sizes = [np.where(size > 0, size, np.inf) for size in self.sizes(u)]
         count = max(sum(size.size for size in sizes), 1)
         rows = [np.conj(rate / size) / size / count for rate, size in zip(rates, sizes, strict=True)]
@@ -249,8 +248,9 @@ class Adaptive(Scheme):
         rows, speeds = [], []
         for step in path:
             half, at = 0.5 * step.length * h, later(t, step.done * h)
-            first, speed = self.section(step.u, params, at, half)
-            rows.append((first, self.section(step.middle, params, later(at, half), half)[0]))
+            places = (step.u, at), (step.middle, later(at, half))
+            (first, speed), (second, _) = (self.section(u, leaves(self.problem(u, params, t)), half) for u, t in places)
+            rows.append((first, second))
             speeds.append(speed)
         rest = h * (1.0 - np.array([step.done for step in path]))
         turn = int(np.argmin(np.maximum.accumulate(speeds[::-1])[::-1] + 1 / rest))  # the fastest from each step on

@@ -30,7 +30,6 @@ stiff parts are large in it.
 
 from collections import deque
 from copy import copy
-from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -38,10 +37,10 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import constant
-from sparsedp.derivative import backward_each, linearised
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import check_shape
 from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Taken
+from sparsedp.integrators.jacobians import jacobians_of
 from sparsedp.integrators.problem import combine, like, untraced
 from sparsedp.integrators.runge_kutta import Scheme, as_matrix
 from sparsedp.shortcuts import refuse_elsewhere
@@ -71,6 +70,7 @@ ROUNDING = 1e-15  # relative correction that no iteration is asked to go below
 STALLED = 1e-11  # relative correction that is taken for rounding where it does not shrink
 ITERATIONS = 10  # of Newton's method in a step with error control
 REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError  # of a rate that is given a state too far away
+TOGETHER, ENTRIES = 32, 2**20  # steps whose derivatives are taken at once; entries of their matrices, at most
 FAST = 0.03  # share of a correction that is left after an iteration, up to which the Jacobian serves the next step
 
 
@@ -110,16 +110,10 @@ class Flat:
         rate = self.problem(self.state(v), params, t)
         return rate if self.whole else self.layout.flat(rate)
 
-    def rows(self, v, params, t, moving):
-        """The derivatives in the state, the params that move, and the time: one row for each unknown."""
-        tree, moving = (self.state(v), params, t), [True] * len(self.spans) + moving
-        values, _, pull = linearised(lambda tree: self.problem(*tree), tree, [*moving, self.timed])
-        n, units = self.size, np.eye(self.size)
-        pairs = zip(self.spans, values, strict=True)
-        backs = pull([units[span].reshape(*np.shape(value), n) for span, value in pairs], backward_each)
-        found = zip(leaves(tree), backs, [*moving, True], strict=True)
-        parts = [np.zeros((np.size(x), n)) if g is None else g.reshape(-1, n) for x, g, wanted in found if wanted]
-        return np.concatenate(parts).T
+    def rows(self, points, params, moving):
+        """At points (v, t) the rates, and their derivatives in the state, the params that move, and the time."""
+        trees = [(self.state(v), params, t) for v, t in points]
+        return jacobians_of(lambda tree: self.problem(*tree), trees, [*[True] * len(self.spans), *moving, True])
 
 
 class Radau(Adaptive):
@@ -235,7 +229,7 @@ class Radau(Adaptive):
         return z, v + z[2], ratio if np.isfinite(ratio) else np.inf
 
     def sizes(self, *states):
-        return [flat(super().sizes(*map(self.problem.state, states)))]
+        return [np.concatenate([*map(np.ravel, super().sizes(*map(self.problem.state, states)))])]
 
     def units(self, v, w):
         """|v| + floor, to which errors are compared, the larger of two states."""
@@ -265,7 +259,7 @@ class Radau(Adaptive):
         """df/du for Newton's method."""
         n = self.problem.size
         if self.given is None:
-            return self.problem.rows(v, self.params, t, [False] * len(self.moving))[:, :n]
+            return self.problem.rows([(v, t)], self.params, [False] * len(self.moving))[1][0, :, :n]
         args = (self.problem.state(v), self.params, t)
         J = as_matrix(self.given(*args[: 2 + self.problem.timed])).toarray()
         check_shape(f"the jacobian of {self.name}", J, (n, n))
@@ -316,7 +310,7 @@ class Radau(Adaptive):
             """Tangents of what goes in -> of the states at the end, both in units of their sizes."""
             y = np.insert(x * scales, n, 0.0, axis=1).T
             if x.any():  # else it is the value that goes on the tape
-                for step, shadow in self._matrices(path, range(len(path)), t, h):
+                for step, shadow in self._matrices([*path], t, h, 1):
                     y[: n + 1] = step @ y + less * (shadow @ y)
             return y[:n].T / size
 
@@ -324,7 +318,7 @@ class Radau(Adaptive):
             """The transpose."""
             y = np.zeros((scales.size + 1, len(g)))
             y[:n] = (g / size).T
-            for step, shadow in self._matrices(path, range(len(path) - 1, -1, -1), t, h):
+            for step, shadow in self._matrices([*path], t, h, -1):
                 head = y[: n + 1].copy()
                 y[: n + 1] = 0.0
                 y += step.T @ head + shadow.T @ (less * head)
@@ -332,39 +326,43 @@ class Radau(Adaptive):
 
         return linear(f"{self.name}.steps", tangent, cotangent)[0](entered)
 
-    def _matrices(self, path, numbers, t, h):
-        """For each step the derivatives of (u, all d) after it, and what the first shadow adds to them."""
-        places = [*((step.u, step.done) for step in path), (path[-1].new, 1.0)]
+    def _matrices(self, path, t, h, way):
+        """Of each step, forward or (-1) back, the derivatives of (u, all d) after it, and what the shadow adds."""
+        many = int(np.clip(ENTRIES / (3 * self.problem.size) ** 2, 1, TOGETHER))
+        for start in range(0, len(path), many)[::way]:
+            yield from self._linearised(path[start : start + many], path[-1], t, h)[::way]
 
-        def rows(v, share):
-            return self.problem.rows(v, self.params, t + share * h, self.moving)
-
-        at = lru_cache(3)(lambda number: rows(*places[number]))  # in either direction the one that is met twice
-        for number in numbers:
-            step, first = path[number], at(number)
-            inner = [rows(step.u + step.middle[i], step.done + C[i] * step.length) for i in (0, 1)]
-            section = np.zeros(self.problem.size)
-            if step is not path[-1]:
-                (section,), _ = self.section(step.u, self.params, t + step.done * h, step.length * h)
-            yield self._linearised(step, h, first, np.array([*inner, at(number + 1)]), section, step is path[-1])
-
-    def _linearised(self, step, h, first, rows, section, last):
-        """The derivatives at the start and at the stages of a step, and of d -> those of the step."""
-        n, h, z, one = len(section), step.length * h, step.middle, np.eye(len(section))
+    def _linearised(self, steps, end, t, h):
+        """The same for a few steps, side by side along the first axis; `end`: the last step of all."""
+        n, one = self.problem.size, np.eye(self.problem.size)
+        length, done, u, z, new = (np.array(part) for part in zip(*steps, strict=True))
+        places = [(u, done), (new[-1:], done[-1:] + length[-1:])]
+        places += [(u + z[:, i], done + C[i] * length) for i in (0, 1)]
+        states, shares = (np.concatenate(part) for part in zip(*places, strict=True))
+        rates, rows = self.problem.rows([*zip(states, t + shares * h, strict=True)], self.params, self.moving)
+        m, last = len(steps), np.array([step is end for step in steps])
+        first, rows = rows[:m], np.stack([rows[m + 1 : -m], rows[-m:], rows[1 : m + 1]], 1)
+        sections = [self.section(*row)[0][0] for row in zip(u, rates[:m, None], length * h)]
+        section = np.where(last[:, None], 0.0, sections)
+        length, done, last, h = (part[:, None, None] for part in (length, done, last, length * h))
         hA = h * A
-        K = np.eye(3 * n) - np.einsum("ab,bij->aibj", hA, rows[:, :, :n]).reshape(3 * n, 3 * n)
-        b = np.dstack([np.tensordot(hA, rows, 1), z / h + (hA * C) @ rows[:, :, -1]])
-        dz = dense_lu(K)[0](b.reshape(3 * n, -1), False).reshape(b.shape)
-        error = np.tensordot(E, dz, 1) / h + np.column_stack([first, -E @ z / h**2])
-        error = dense_lu(REAL / h * one - first[:, :n])[0](error, False)
-        M = np.array([dz[2] + np.eye(n, b.shape[2]), error])
-        t, length = M[:, :, -2], M[:, :, -1].copy()
-        M[:, :, -1] = step.done * t + step.length * length
-        M = np.insert(M, n, t - last * length, axis=2)  # the last step gives all d back
-        M[:, :, :n] += length[:, :, None] * section
-        shift = np.zeros((2, 1, M.shape[2]))
-        shift[0, 0, : n + 1] = 0.0 if last else [*section, 1.0]
-        return np.concatenate([M, shift], 1)
+        K = np.eye(3 * n) - np.einsum("sab,sbij->saibj", hA, rows[..., :n]).reshape(m, 3 * n, 3 * n)
+        b = np.concatenate([np.einsum("sab,sbij->saij", hA, rows), (z / h + (hA * C) @ rows[..., -1])[..., None]], -1)
+        dz = solved(K, b.reshape(m, 3 * n, -1)).reshape(b.shape)
+        error = np.concatenate([first, -np.swapaxes(E[None] @ z / h**2, 1, 2)], 2) + np.tensordot(E, dz, (0, 1)) / h
+        M = np.stack([dz[:, 2] + np.eye(n, b.shape[-1]), solved(REAL / h * one - first[..., :n], error)], 1)
+        stretch = M[..., -1].copy()  # of the new state with the length
+        M[..., -1] = done * M[..., -2] + length * stretch
+        M = np.insert(M, n, M[..., -2] - last * stretch, axis=3)  # the last step gives all d back
+        M[..., :n] += stretch[..., None] * section[:, None, None]
+        shift = np.zeros((m, 2, 1, M.shape[3]))
+        shift[:, 0, 0, : n + 1] = np.insert(section, n, ~last[:, 0, 0], axis=1)
+        return np.concatenate([M, shift], 2)
+
+
+def solved(matrices, b):
+    """Of each matrix the solution for its right-hand sides."""
+    return np.array([dense_lu(matrix)[0](part, False) for matrix, part in zip(matrices, b, strict=True)])
 
 
 def norm(x):
