@@ -107,9 +107,13 @@ class Adaptive(Scheme):
     def __call__(self, *given):
         """(u, params, t, h) -> the state after the interval h."""
         self._check_tolerance(given[0])
+        return self._crossed(given, isbox)
+
+    def _crossed(self, given, moves):
+        """The state after the interval; `moves`: which leaves of what is given have a derivative."""
         traced = any(map(isbox, leaves(given)))
         path = deque(self._steps(*untraced(given)), None if traced else 1)
-        return self._followed(path, given) if traced else path[-1].new
+        return self._followed([*path], given, moves) if traced else path[-1].new
 
     def _check_tolerance(self, u):
         """Refuse a floor that does not fit the state, and digits that it cannot hold: steps would shrink to nothing."""
@@ -220,8 +224,8 @@ class Adaptive(Scheme):
             max(count, 1) ** 0.5 * self.tolerance * self.ratio
         )
 
-    def _followed(self, path, given, moves=isbox):
-        """The state at the end of the path, with a derivative that is judged; `moves`: which leaves have one."""
+    def _followed(self, path, given, moves):
+        """The state at the end of the path, with a derivative that is judged."""
         known = untraced(given)
         start = Moving(given, moves, [*self.sizes(path[0].u), *map(relative, leaves(known[1:]))])
         end = Moving(path[-1].new, is_variable, self.sizes(path[0].u, path[-1].new))

@@ -28,12 +28,9 @@ u + z_3 + EPSILON e, and the last step gives the sum of all d back: the rate at 
 stiff parts are large in it.
 """
 
-from collections import deque
 from copy import copy
-from itertools import pairwise
 from typing import Any
 
-import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.constants import constant
@@ -74,11 +71,6 @@ TOGETHER, ENTRIES = 32, 2**20  # steps whose derivatives are taken at once; entr
 FAST = 0.03  # share of a correction that is left after an iteration, up to which the Jacobian serves the next step
 
 
-def flat(parts):
-    """Arrays -> one flat array."""
-    return anp.concatenate([np.zeros(0), *map(anp.ravel, parts)])
-
-
 class Flat:
     """A problem on flat unknowns, and its derivatives.
 
@@ -99,7 +91,6 @@ class Flat:
                 f"{name} solves full systems of at most {UNKNOWNS} unknowns, got {self.size}; take tr_bdf2"
             )
         self.whole = self.layout.shapes == [(self.size,)]
-        self.spans = [slice(*pair) for pair in pairwise(self.layout.space.offsets)]
 
     def state(self, v):
         """Flat -> tree."""
@@ -113,7 +104,7 @@ class Flat:
     def rows(self, points, params, moving):
         """At points (v, t) the rates, and their derivatives in the state, the params that move, and the time."""
         trees = [(self.state(v), params, t) for v, t in points]
-        return jacobians_of(lambda tree: self.problem(*tree), trees, [*[True] * len(self.spans), *moving, True])
+        return jacobians_of(lambda tree: self.problem(*tree), trees, [*[True] * len(self.layout.shapes), *moving, True])
 
 
 class Radau(Adaptive):
@@ -162,11 +153,12 @@ class Radau(Adaptive):
         run = copy(self)
         run.problem, run.params = Flat(self.problem, u, self.name), constant(untraced(params))
         run.moving = [isbox(leaf) for leaf in leaves(params)]
-        v = flat([cast(leaf, float) for leaf in leaves(u)])
+        v = run.problem.layout.space.join(*(cast(leaf, float) for leaf in leaves(u)))
         if not v.size:
             return u
         run.check(u, params, t, h)
-        new = run.flat(v, [leaf for leaf in leaves(params) if isbox(leaf)], 0.0 if t is None else t + 0.0, h)
+        moving = [leaf for leaf in leaves(params) if isbox(leaf)]
+        new = run._crossed((v, moving, 0.0 if t is None else t + 0.0, h), is_variable)
         self.taken = run.taken
         return run.problem.layout.rounded(new)
 
@@ -190,16 +182,9 @@ class Radau(Adaptive):
         if self.tolerance is not None:
             self._check_tolerance(u)
 
-    def flat(self, *given):
-        """(flat state, params that are traced, time, length) -> the flat state at the end."""
-        v, _, t, h = untraced(given)
-        traced = any(map(isbox, leaves(given)))
-        path = deque(self._path(v, t, float(h)), None if traced else 1)
-        return self._followed(path, given, is_variable) if traced else path[-1].new
-
-    def _path(self, v, t, h):
+    def _steps(self, v, params, t, h):
         if self.tolerance is not None:
-            return self._steps(v, self.params, t, h)
+            return super()._steps(v, self.params, t, h)
         self._first(v, self.params, t, h)  # refuses what is not finite
         with np.errstate(all="ignore"):
             z = self.stages(v, t, h)
@@ -310,7 +295,7 @@ class Radau(Adaptive):
             """Tangents of what goes in -> of the states at the end, both in units of their sizes."""
             y = np.insert(x * scales, n, 0.0, axis=1).T
             if x.any():  # else it is the value that goes on the tape
-                for step, shadow in self._matrices([*path], t, h, 1):
+                for step, shadow in self._matrices(path, t, h, 1):
                     y[: n + 1] = step @ y + less * (shadow @ y)
             return y[:n].T / size
 
@@ -318,7 +303,7 @@ class Radau(Adaptive):
             """The transpose."""
             y = np.zeros((scales.size + 1, len(g)))
             y[:n] = (g / size).T
-            for step, shadow in self._matrices([*path], t, h, -1):
+            for step, shadow in self._matrices(path, t, h, -1):
                 head = y[: n + 1].copy()
                 y[: n + 1] = 0.0
                 y += step.T @ head + shadow.T @ (less * head)
