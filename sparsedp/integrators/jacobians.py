@@ -10,7 +10,7 @@ import numpy as np
 
 from sparsedp.derivative import taped
 from sparsedp.operator import Operator
-from sparsedp.shortcuts import ARRAY, FLOAT, ITEM, Part, by_entry
+from sparsedp.shortcuts import ARRAY, FLOAT, ITEM, REAL, Part, by_entry
 from sparsedp.tape import added, autograd_rules, called, dtype_of
 from sparsedp.tree import leaves
 
@@ -148,7 +148,7 @@ def many(node, fun, value, args, options, nums):
     """
     traced = [args[num] for num in nums]
     shapes = [np.shape(x) for x in traced]
-    if any(dtype_of(x) is not FLOAT for x in (value, *traced)):
+    if any(type(x) not in REAL or dtype_of(x) is not FLOAT for x in (value, *traced)):
         return None
     if fun in SELECTIONS:
         return _selection(fun, args, options, nums, *shapes)

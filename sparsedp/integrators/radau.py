@@ -67,7 +67,7 @@ ROUNDING = 1e-15  # relative correction that no iteration is asked to go below
 STALLED = 1e-11  # relative correction that is taken for rounding where it does not shrink
 ITERATIONS = 10  # of Newton's method in a step with error control
 REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError  # of a rate that is given a state too far away
-TOGETHER, ENTRIES = 32, 2**20  # steps whose derivatives are taken at once; entries of their matrices, at most
+TOGETHER, ENTRIES = 32, 2**20  # steps whose derivatives are taken at once; entries of an array of them
 FAST = 0.03  # share of a correction that is left after an iteration, up to which the Jacobian serves the next step
 
 
@@ -290,35 +290,36 @@ class Radau(Adaptive):
         *_, t, h = known
         n, less = self.problem.size, np.array(LESS[: len(entered)])
         (size,), scales = end.units, np.concatenate([*map(np.ravel, start.units)])
+        many = int(np.clip(ENTRIES / (9 * n * scales.size), 1, TOGETHER))
+        parts = [path[first : first + many] for first in range(0, len(path), many)]
 
         def tangent(x):
             """Tangents of what goes in -> of the states at the end, both in units of their sizes."""
             y = np.insert(x * scales, n, 0.0, axis=1).T
             if x.any():  # else it is the value that goes on the tape
-                for step, shadow in self._matrices(path, t, h, 1):
-                    y[: n + 1] = step @ y + less * (shadow @ y)
+                for part in parts:
+                    for step, shadow in self._linearised(part, path[-1], t, h):
+                        y[: n + 1] = step @ y + less * (shadow @ y)
             return y[:n].T / size
 
         def cotangent(g):
             """The transpose."""
             y = np.zeros((scales.size + 1, len(g)))
             y[:n] = (g / size).T
-            for step, shadow in self._matrices(path, t, h, -1):
-                head = y[: n + 1].copy()
-                y[: n + 1] = 0.0
-                y += step.T @ head + shadow.T @ (less * head)
+            for part in reversed(parts):
+                for step, shadow in self._linearised(part, path[-1], t, h)[::-1]:
+                    head = y[: n + 1].copy()
+                    y[: n + 1] = 0.0
+                    y += step.T @ head + shadow.T @ (less * head)
             return np.delete(y, n, 0).T * scales
 
         return linear(f"{self.name}.steps", tangent, cotangent)[0](entered)
 
-    def _matrices(self, path, t, h, way):
-        """Of each step, forward or (-1) back, the derivatives of (u, all d) after it, and what the shadow adds."""
-        many = int(np.clip(ENTRIES / (3 * self.problem.size) ** 2, 1, TOGETHER))
-        for start in range(0, len(path), many)[::way]:
-            yield from self._linearised(path[start : start + many], path[-1], t, h)[::way]
-
     def _linearised(self, steps, end, t, h):
-        """The same for a few steps, side by side along the first axis; `end`: the last step of all."""
+        """Of some steps the derivatives of (u, all d) after each, and what the shadow adds; `end`: the last one of all.
+
+        Array (steps, 2, n + 1, numbers that go in and all d).
+        """
         n, one = self.problem.size, np.eye(self.problem.size)
         length, done, u, z, new = (np.array(part) for part in zip(*steps, strict=True))
         places = [(u, done), (new[-1:], done[-1:] + length[-1:])]
