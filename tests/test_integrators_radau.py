@@ -10,6 +10,7 @@ from test_integrators_variation import KNOWN, oscillator
 import sparsedp as dp
 from sparsedp.derivative import pushforward, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
+from sparsedp.integrators import jacobians
 from sparsedp.integrators.problem import untraced
 from sparsedp.integrators.radau import A, C, Flat
 
@@ -177,6 +178,19 @@ def test_all_rows_at_once(rate):
         _, pull = dp.vjp(lambda u, p: 1.0 * rate(u, p) + 0.0 * u * p[0], u, p)
         wanted = np.array([[*np.concatenate(pull(e)), 0.0] for e in np.eye(3)])
         assert np.array_equal(f, rate(u, p)) and found == pytest.approx(wanted, rel=1e-14, abs=1e-14)
+
+
+def test_points_go_back_together(monkeypatch):
+    """Tapes of the same calls do, each branch by itself; what is not known goes back alone."""
+    groups, one_by_one = [], jacobians._rows
+    monkeypatch.setattr(jacobians, "_rows", lambda tapes, *rest: groups.append(len(tapes)) or one_by_one(tapes, *rest))
+    cube = dp.differentiable("cube", lambda x: x**3, lambda nums, ans, x: lambda g: (3 * x**2 * g,))
+    points = [np.array([x, 1.0]) for x in (0.5, 1.5, 2.5, 0.1)]
+    for fun, found in ((lambda u: u * u if u[0] > 1 else anp.sin(u), [2, 2]), (cube, [1, 1, 1, 1])):
+        groups.clear()
+        values, rows = jacobians.jacobians_of(fun, points, [True])
+        assert groups == found and np.array_equal(values, [fun(u) for u in points])
+        assert rows == pytest.approx(np.array([np.diag(dp.vjp(fun, u)[1](np.ones(2))) for u in points]), rel=1e-15)
 
 
 def test_second_derivatives_are_refused():

@@ -103,11 +103,10 @@ def _rows(tapes, size, calls):
             index = slice(None), slice(None), *(index if type(index) is tuple else (index,))
         total[index] += part
 
-    units, start = np.eye(size), 0
-    for end, value in zip(first.ends, first.values, strict=True):
-        start, stop = start + np.size(value), start
+    units = np.split(np.eye(size), np.cumsum([*map(np.size, first.values)])[:-1])
+    for end, value, unit in zip(first.ends, first.values, units, strict=True):
         if end is not None:
-            add(end, np.repeat(units[stop:start].reshape(*np.shape(value), 1, size), count, -2))
+            add(end, np.repeat(unit.reshape(*np.shape(value), 1, size), count, -2))
     for nodes in zip(*(reversed(tape.nodes) for tape in tapes), strict=True):
         node = nodes[0]
         if node not in sums:
