@@ -1,5 +1,7 @@
 """A shift for each cell, complex shifts and coefficients, waves: beside dense twins in autograd.numpy."""
 
+import re
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from test_elliptic import dense, stretched
 import sparsedp as dp
 from sparsedp.derivative import pullback, pushforward, value_and_grad
 from sparsedp.ledger import recording
+from sparsedp.solvers import direct
 from sparsedp.solvers.choose_method import COMPLEX_UP_TO
 from sparsedp.solvers.preconditioners import shifted_laplace
 from sparsedp.solvers.system import System
@@ -256,12 +259,67 @@ def test_waves_without_damping_have_a_real_solution():
     assert solve(1.0, b * (1 + 2j), -150.0) == pytest.approx((1 + 2j) * x)
 
 
+def entries(solve):
+    """Entries in the factors of the last set-up, in each precision."""
+    return {words: int(number) for words, number in re.findall(r"(LU.*?), (\d+) entries in", str(solve))}
+
+
+def test_factors_of_waves_have_few_entries():
+    """Pivots stay on the diagonal; columns ordered alone leave more than 1.6 times as many."""
+    solve, shift, b = waves(96, "direct")
+    solve(1.0, b, shift)
+    assert entries(solve)["LU"] <= 45 * b.size
+
+
+@pytest.mark.parametrize("damped", [1.0, 0.0], ids=["complex", "real"])
+def test_factors_in_single_precision_meet_the_same_tolerance(damped):
+    (solve, shift, b), double = waves(96, "direct", precision="single"), waves(96, "direct", precision="double")[0]
+    shift = shift if damped else shift.real - 1e3
+    for size in (1.0, 1e-300, 1e200):
+        close(solve(1.0, size * b, shift), double(1.0, size * b, shift), 1e-8)
+    assert solve.info.forward.residual <= 1e-10 and "LU in single precision" in entries(solve)
+    loss = lambda solve: lambda s: anp.sum(anp.abs(solve(1.0, b, s)[20:30]) ** 2)
+    close(value_and_grad(loss(solve))(shift)[1], value_and_grad(loss(double))(shift)[1], 1e-8)
+    assert solve.info.adjoint.residual <= 1e-10
+
+
+def test_single_precision_is_left_where_refinement_would_not_converge():
+    """Next to an eigenvalue, and where entries leave its range."""
+    grid, b = dp.Grid((12, 12)), np.cos(np.arange(144.0)).reshape(12, 12)
+    op = dp.laplacian(grid, dp.dirichlet)
+    lowest = -8 * np.sin(np.pi / 24) ** 2
+    tiny = dp.diagonal(grid.cells, np.where(np.arange(144).reshape(12, 12) % 2, 1.0, 1e-60))
+    for near in (op - (lowest + 1e-9) * dp.identity(grid.cells), tiny @ op):
+        inv = dp.inverse(near, "direct", precision="single")
+        assert "single" not in inv.info.hierarchy
+        assert np.array_equal(inv(near(b)), dp.inverse(near, "direct", precision="double")(near(b)))
+
+
+def test_auto_keeps_factors_of_many_complex_unknowns_in_single_precision(monkeypatch):
+    monkeypatch.setattr(direct, "SINGLE_FROM", 1600)
+    for n, words in ((39, "LU"), (40, "LU in single precision")):
+        solve, shift, b = waves(n, "auto")
+        solve(1.0, b, shift)
+        assert list(entries(solve)) == [words]
+
+
+def test_precision_is_one_of_three_words():
+    with pytest.raises(ValueError, match="precision must be 'auto', 'single' or 'double', got 'half'"):
+        dp.inverse(dp.identity(dp.Grid(3).cells), "direct", precision="half")
+
+
 @pytest.mark.slow
 def test_a_million_unknowns_at_ten_cells_a_wavelength():
-    """Where LU takes 4 GB: about 300 iterations to 1e-10."""
-    solve, shift, b = waves(1024)
-    solve(1.0, b, shift)
-    assert solve.info.forward.residual <= 1e-10 and solve.info.forward.iterations <= 400
+    """Value and gradient, in 2.2 GB."""
+    solve, shift, b = waves(1024, "auto")
+    part = (slice(500, 520), slice(600, 620))
+    loss = lambda s: anp.sum(anp.abs(solve(1.0, b, s)[part]) ** 2)
+    value, slope = value_and_grad(loss)(shift)
+    assert max(solve.info.forward.residual, solve.info.adjoint.residual) <= 1e-10
+    along = np.zeros(shift.shape)
+    along[400:600, 400:600] = -shift[0, 0].real
+    h = 1e-6
+    close((loss(shift + h * along) - loss(shift - h * along)) / (2 * h), np.sum(slope * along).real, 1e-5)
 
 
 # ---------------------------------------------------------------- extremes

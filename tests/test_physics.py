@@ -14,6 +14,7 @@ CLOSE = {  # by how much a scene with few cells is off
     "cavity, Re 1000": 0.3,
     "convection, Ra 1e5": 0.15,
     "Helmholtz, two speeds": 5e-3,
+    "Helmholtz, 2-D": 0.04,
     "diffusion by a tensor": 0.02,
     "waves in a box, 3-D": 2e-4,
     "waves into a sponge": 1e-4,

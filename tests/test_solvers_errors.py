@@ -181,7 +181,7 @@ SETTINGS = [
         ValueError,
         match="nullspace must be one of raise, project, got 'drop'",
     ),
-    Case(lambda: dp.inverse(OP, "direct", x=1), TypeError, match="method direct takes the options (none), got 'x'"),
+    Case(lambda: dp.inverse(OP, "direct", x=1), TypeError, match="method direct takes the options precision, got 'x'"),
     Case(
         lambda: dp.inverse(OP, "multigrid", cycle="F"),
         ValueError,
@@ -328,4 +328,6 @@ def test_factors_that_do_not_fit_into_memory(monkeypatch):
     monkeypatch.setattr(direct, "splu", full)
     with pytest.raises(FAILED, match=r"sparse LU of <.*> does not fit into memory; write method='multigrid'") as caught:
         dp.inverse(-dp.laplacian(BOX, dp.dirichlet), "direct")
+    with pytest.raises(FAILED, match=r"write method='krylov', preconditioner='shifted_laplace'"):
+        dp.inverse(1j * dp.laplacian(BOX, dp.dirichlet), "direct")
     assert caught.value.info.status == "setup_failed"
