@@ -14,7 +14,7 @@ import numpy as np
 
 __all__ = [
     "ACTS", "ARRAY", "BOX", "COPY", "ELSEWHERE", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part",
-    "REAL", "alike", "array", "by_entry", "formulas_of", "in_dtype", "on_every_rank", "ranks",
+    "REAL", "alike", "array", "by_entry", "elsewhere", "formulas_of", "in_dtype", "on_every_rank", "ranks",
     "refuse_elsewhere", "together", "whole",
 ]  # fmt: skip
 
@@ -113,11 +113,16 @@ def on_every_rank(value):
     return pair[1](value, np.broadcast_to(0.0, value.shape)) if pair else value
 
 
+def elsewhere(values):
+    """The first of some plain values that lies elsewhere, or None."""
+    return next((value for value in values if type(value) in ELSEWHERE), None)
+
+
 def refuse_elsewhere(name, values):
     """Refuse plain values that lie elsewhere."""
-    for value in values:
-        if type(value) in ELSEWHERE:
-            value.refuse(name)
+    value = elsewhere(values)
+    if value is not None:
+        value.refuse(name)
 
 
 def in_dtype(value, dtype):

@@ -37,6 +37,16 @@ BUGS_ON_RANKS = {
         "self.acts[False].product(x)",
         "tests/test_ranks.py::test_as_on_one_process[solves-2]",
     ),
+    "on ranks, J for the transpose of J": (
+        "return structure.turned() if structure.transposed else structure.rows",
+        "return structure.rows",
+        "tests/test_ranks.py::test_as_on_one_process[newton-2]",
+    ),
+    "on ranks, what one refuses at a trial point that only it knows": (
+        '"a trial", act, *args, at_once=True',
+        '"a trial", act, *args',
+        "tests/test_ranks.py::test_as_on_one_process[newton-2]",
+    ),
     "on ranks, a number that is not compared": (
         "        self.layout.tell(value)\n        return value",
         "        return value",

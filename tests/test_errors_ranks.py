@@ -109,6 +109,23 @@ REFUSED = [
     ),
     (
         TypeError,
+        "implicit(<lambda>) takes, for fields on ranks, residuals in which a number meets few others, all of them "
+        "near; write dp.gather(u) for what every rank solves alone",
+        lambda s: dp.implicit(lambda x, k: x - k + anp.sum(x) ** 2)(s.u, 1.0),
+    ),
+    (
+        TypeError,
+        "implicit(<lambda>) takes fields that all lie on the same ranks, or none; got float, too; write "
+        "dp.identity(grid.cells)(u) for the field of an array",
+        lambda s: dp.implicit(lambda x: x)({"a": s.u, "b": 1.0}),
+    ),
+    (
+        TypeError,
+        "implicit(<lambda>) takes no sparsity for fields on ranks; leave it away",
+        lambda s: dp.implicit(lambda x: x**2 - 2.0, sparsity=np.eye(20))(s.u),
+    ),
+    (
+        TypeError,
         "distribute takes a communicator, got int; write mpi4py.MPI.COMM_WORLD",
         lambda s: dp.distribute(dp.Grid(3), 2),
     ),

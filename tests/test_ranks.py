@@ -25,7 +25,7 @@ def test_one_process_keeps_its_grid_and_imports_nothing(monkeypatch):
 
 @on_ranks
 @pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize("what", ["fields", "solves", "flow", "steps", "transport", "explain", "ensemble"])
+@pytest.mark.parametrize("what", ["fields", "solves", "flow", "steps", "transport", "explain", "ensemble", "newton"])
 def test_as_on_one_process(what, count):
     assert printed(f"{what}_on_ranks.py", count).endswith("all agree\n")
 
@@ -35,6 +35,12 @@ def test_as_on_one_process(what, count):
 @pytest.mark.parametrize("part", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in range(2, PARTS))])
 def test_every_transport(part):
     assert printed("transport_on_ranks.py", 2 + part % 3, str(part), str(PARTS)).endswith("all agree\n")
+
+
+@on_ranks
+@pytest.mark.whole
+def test_products_with_jacobians_have_the_same_bits():
+    assert len({printed("newton_on_ranks.py", count).splitlines()[0] for count in (1, 2, 3, 4)}) == 1
 
 
 @on_ranks

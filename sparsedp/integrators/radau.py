@@ -43,7 +43,7 @@ from sparsedp.integrators.runge_kutta import Scheme, as_matrix
 from sparsedp.shortcuts import refuse_elsewhere
 from sparsedp.solvers.direct import dense_lu
 from sparsedp.solvers.newton import Layout
-from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, traces_of
+from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
 from sparsedp.tree import leaves
 
 __all__ = ["Radau"]
@@ -84,6 +84,7 @@ class Flat:
     """
 
     def __init__(self, problem, u, name):
+        refuse_elsewhere(name, map(plain, leaves(u)))
         self.problem, self.timed, self.layout = problem, problem.timed, Layout(u, name)
         self.size = self.layout.size
         if self.size > UNKNOWNS:

@@ -8,6 +8,7 @@ The transpose is the transposed map, cut in the same way: it gathers too, so not
 the bits of the result do not depend on how many there are.
 """
 
+from copy import copy
 from math import prod
 
 import numpy as np
@@ -23,7 +24,7 @@ from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker, Term
 from sparsedp.structure.lazy import Chain, Diagonal, Mask, Sum
 
-__all__ = ["Rows", "localized"]
+__all__ = ["OwnRows", "Rows", "localized", "reads"]
 
 
 NOTHING = np.iinfo(int).max  # as an end of a side: there is none
@@ -51,6 +52,8 @@ def localized(structure, given, made):
     if isinstance(structure, Diagonal):
         return _of_diagonal(structure, *given) if given else structure
     shape = tuple(side[0].size(side[1]) if side else n for side, n in zip((made, given), structure.shape))
+    if isinstance(structure, OwnRows):
+        return structure.turned() if structure.transposed else structure.rows
     if isinstance(structure, (Solution, Projector)):
         return OnBlocks(structure, shape)
     if isinstance(structure, Kronecker) and given and made:
@@ -149,14 +152,62 @@ def _of_diagonal(structure, layout, parts):
 def _of_matrix(matrix, shape, given, made):
     """The rows of a matrix that make the blocks of this rank, or all rows where every rank has the result."""
     (given or made)[0].tell(matrix.data)
-    matrix, read = matrix[made[0].take(np.arange(matrix.shape[0]), made[1])] if made else matrix, None
-    if given:
-        entries, place = np.unique(matrix.indices, return_inverse=True)
-        layout, parts = given
-        read = Exchange(layout, parts, entries.size, np.arange(entries.size), entries).forward
-        held = matrix.data, place.reshape(-1), matrix.indptr
-        matrix = sp.csr_array(held, shape=(matrix.shape[0], entries.size))
-    return Rows(Matrix(matrix), shape, read)
+    matrix = matrix[made[0].take(np.arange(matrix.shape[0]), made[1])] if made else matrix
+    if not given:
+        return Rows(Matrix(matrix), shape, None)
+    places, exchange = reads(matrix.indices, *given)
+    inner = sp.csr_array((matrix.data, places, matrix.indptr), shape=(matrix.shape[0], exchange.read[0]))
+    return Rows(Matrix(inner), shape, exchange.forward)
+
+
+def reads(entries, layout, parts):
+    """Numbers of entries of a whole field that a rank reads -> where each is in what is read, the Exchange."""
+    entries, places = np.unique(entries, return_inverse=True)
+    return places.reshape(-1), Exchange(layout, parts, entries.size, np.arange(entries.size), entries)
+
+
+class OwnRows(Structure):
+    """A square matrix of which each rank knows the rows that make its block, and no one the others.
+
+    Its transpose sends what its rows make to whom it belongs, where it is added.
+
+    Parameters
+    ----------
+    inner : Matrix
+        The rows; its columns are what `exchange` reads.
+    exchange : Exchange
+    stencil : Stencil
+    """
+
+    has_entries = False
+
+    def __init__(self, inner, exchange, stencil):
+        here, self.exchange, self.stencil = inner.shape[0], exchange, stencil
+        self.rows = Rows(inner, (here, here), exchange.forward)
+        self.shape, self.transposed = (stencil.space.size,) * 2, False
+
+    def transpose(self):
+        other = copy(self)
+        other.transposed = not self.transposed
+        return other
+
+    def turned(self):
+        """The transpose on blocks."""
+        return Columns(self.rows.inner.transpose(), self.rows.shape[::-1], self.exchange.backward)
+
+
+class Columns(Structure):
+    """The transpose of Rows: what a structure makes of a block is sent back to where they read it."""
+
+    def __init__(self, inner, shape, back):
+        self.inner, self.shape, self.back = inner, shape, back
+
+    def act(self, x, out):
+        out[...] = self.back(self.inner.product(x))
+
+    def magnitude(self):
+        entries = abs(self.inner.explicit())
+        return lambda x: self.back(entries @ x)
 
 
 # ---- products of 1-D factors ----

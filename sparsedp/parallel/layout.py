@@ -1,22 +1,21 @@
 """Layout: what the core asks of a grid whose fields lie on ranks. It calls the methods, and imports nothing here."""
 
-from functools import cache, reduce
+from functools import cache, cached_property, reduce
 from operator import add
 
 import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import field_array
-from sparsedp.operator import Operator
 from sparsedp.parallel.cut import localized
 from sparsedp.parallel.exchange import hold
 from sparsedp.parallel.fields import DistributedField, block, everywhere
 from sparsedp.parallel.partition import Partition
 from sparsedp.parallel.solve import RanksSystem
+from sparsedp.parallel.stencil import stencil_of
 from sparsedp.parallel.transport import Carry
 from sparsedp.space import Space
-from sparsedp.structure.kronecker import Kronecker, Term
-from sparsedp.tape import plain
+from sparsedp.tape import linear, plain
 
 __all__ = ["Layout"]
 
@@ -36,7 +35,7 @@ class Layout(Partition):
     def __init__(self, shape, periodic, comm):
         super().__init__(shape, periodic, comm)
         hold(comm)
-        self._components = cache(_components)
+        self._pieces = cache(_pieces)
 
     def __repr__(self):
         return f"on {self.comm.size} ranks"
@@ -82,6 +81,10 @@ class Layout(Partition):
             raise TypeError(f"inverse takes real operators on ranks, {op.name} is complex; solve it on one process")
         return RanksSystem(op, rtol, maxiter)
 
+    def stencil(self, *given):
+        """What the rows of a Jacobian on each rank need: see stencil.py."""
+        return stencil_of(*given)
+
     def transport(self, setting):
         """The setting of a transport -> its step, called with (u, v, dt, inflow)."""
         return Carry(setting)
@@ -91,6 +94,10 @@ class Layout(Partition):
         from sparsedp.parallel.search import minimized
 
         return minimized(self.comm, *given)
+
+    def tried(self, act, *args):
+        """act(*args), where the caller goes on in another way if it fails: then all ranks do."""
+        return self.agreement.agreed("a trial", act, *args, at_once=True)
 
     # ------------------------------------------------------------ fields
 
@@ -122,14 +129,28 @@ class Layout(Partition):
         """Arrays along the axes -> what lies beside the block of this rank."""
         return [line[start:stop] for line, (start, stop) in zip(lines, self.box(part))]
 
+    def field(self, space, value):
+        """What every rank has whole -> a field on ranks."""
+        return block(value, space)
+
+    def joined(self, name, fields):
+        """The space of some fields side by side."""
+        for field in fields:
+            if not isinstance(field, DistributedField) or field.layout != self:
+                raise TypeError(
+                    f"{name} takes fields that all lie on the same ranks, or none; got {type(field).__name__}, too; "
+                    "write dp.identity(grid.cells)(u) for the field of an array"
+                )
+        return Joint([field.space for field in fields])
+
     def split(self, space, v):
-        """Field -> its components, each a field on ranks; differentiable."""
-        return tuple(part(v) for part in self._components(space))
+        """Field -> its components, or the fields that a joint one holds, each on ranks; differentiable."""
+        return tuple(take(v) for _, take, _ in self._pieces(space))
 
     def join(self, space, parts):
-        """Components, on ranks or known to all -> one field; differentiable."""
-        pairs = zip(self._components(space), parts)
-        return reduce(add, (op.T(everywhere(part, op.codomain)) for op, part in pairs))
+        """Components, or fields, on ranks or known to all -> one field; differentiable."""
+        pairs = zip(self._pieces(space), parts)
+        return reduce(add, (back(everywhere(part, inner)) for (inner, _, back), part in pairs))
 
 
 def laid(grid, comm):
@@ -139,13 +160,44 @@ def laid(grid, comm):
     return made
 
 
-def _components(space):
-    """The operators from a field to each component of it."""
-    same, grid, made = (Term(1.0, (None,) * space.grid.dim),), space.grid, []
-    for number, part in enumerate(space.parts):
-        blocks = Kronecker((part,), space.parts, {(0, number): same})
-        made.append(Operator(blocks, space, Space(part, f"components of {space.kind}", grid), "component"))
+class Joint(Space):
+    """Where some fields lie side by side, as one flat field."""
+
+    spaces: list
+
+    def __init__(self, spaces):
+        parts = [part for space in spaces for part in space.parts]
+        super().__init__(None, " and ".join(map(str, spaces)), spaces[0].grid, parts)
+        vars(self).update(spaces=spaces)
+
+    @cached_property
+    def volumes(self):
+        """Control volume of each value."""
+        return self.layout.join(self, [space.volumes for space in self.spaces])
+
+
+def _pieces(space):
+    """Space -> for each component, or field that it holds: its space, and the rules from all to it and back."""
+    layout, made, start = space.layout, [], 0
+    for inner in getattr(space, "spaces", None) or [
+        Space(part, f"components of {space.kind}", space.grid) for part in space.parts
+    ]:
+        stop = start + layout.size(inner.parts)
+        made.append((inner, *_piece(space, inner, slice(start, stop))))
+        start = stop
     return made
+
+
+def _piece(space, inner, here):
+    size = space.layout.size(space.parts)
+
+    def back(g):
+        g = block(g, inner).flat
+        flat = np.zeros(size, g.dtype)
+        flat[here] = g
+        return DistributedField(flat, space)
+
+    return linear("piece", lambda x: DistributedField(block(x, space).flat[here], inner), back)
 
 
 def _side(space):

@@ -31,6 +31,9 @@ HYPRE_3D = {
     "pc_hypre_boomeramg_strong_threshold": 0.5,
 }
 GAMG = {"ksp_type": "gmres", "pc_type": "gamg", "ksp_pc_side": "right"}
+# Of fields on cells and on faces, as velocity and pressure: no multigrid of PETSc knows what to do with them.
+LU = {"ksp_type": "gmres", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps", "ksp_pc_side": "right"}
+SPARE = 14, 200  # of MUMPS: percent of memory beyond its estimate, which the pivots of saddle points exceed
 # On the coarsest level BoomerAMG eliminates, which a singular matrix may end by a pivot of 0.
 HYPRE_SINGULAR = {"pc_hypre_boomeramg_relax_type_coarse": "symmetric-SOR/Jacobi"}
 MOST = 500  # iterations of one call
@@ -103,6 +106,10 @@ class RanksSystem(System):
         """The field of a flat block."""
         return DistributedField(x.copy(), space)
 
+    def flat(self, field):
+        """The flat block of a field."""
+        return field.flat
+
     def whole(self, x):
         """The flat array of all entries, on every rank."""
         return self.layout.gather(x, self.parts)
@@ -121,6 +128,10 @@ class RanksSystem(System):
     def product(self, x, transposed=False):
         """A x or A^T x for the unknowns."""
         return self.masked(self.acts[transposed].product(x))
+
+    def applied(self, x):
+        """A x as it was given: not scaled, for all that is not an unknown too."""
+        return np.ldexp(self.acts[False].product(x), self.exponent)
 
     def residual(self, x, b, transposed=False):
         """(b - A x, its norm; that of x)."""
@@ -220,9 +231,10 @@ class PetscEngine(Engine):
                 found = [np.where(space.labels == k, vectors, 0.0) for k in range(space.count)]
                 found = [system.vector(v / system.size_of(v)) for v in found]
                 attach(PETSc.NullSpace().create(vectors=found, comm=comm))
-        chosen: dict = {"ksp_type": "cg", "pc_type": "hypre"} if symmetric else GAMG
-        chosen = chosen | (HYPRE_3D if symmetric and len(system.parts[0]) == 3 else {})
-        chosen = chosen | (HYPRE_SINGULAR if space.count else {})
+        mixed = len({inner.kind for inner in getattr(system.op.domain, "spaces", ())}) > 1
+        chosen: dict = LU if mixed else {"ksp_type": "cg", "pc_type": "hypre"} if symmetric else GAMG
+        chosen = chosen | (HYPRE_3D if symmetric and not mixed and len(system.parts[0]) == 3 else {})
+        chosen = chosen | (HYPRE_SINGULAR if space.count and not mixed else {})
         options = PETSc.Options("sparsedp_")
         for name, value in chosen.items():
             options[name] = value
@@ -233,6 +245,9 @@ class PetscEngine(Engine):
         ksp.setFromOptions()
         for name in chosen:  # there is one table of options for the whole process
             options.delValue(name)
+        if mixed:
+            ksp.getPC().setFactorSetUpSolverType()
+            ksp.getPC().getFactorMatrix().setMumpsIcntl(*SPARE)
         ksp.setUp()
         self.hierarchy = f"{ksp.getType()} with {ksp.getPC().getType()} on {comm.size} ranks"
 

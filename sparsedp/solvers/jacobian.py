@@ -49,15 +49,23 @@ class Linearisation:
 
     def __init__(self, solver, point, checked):
         self.solver, self.point, self.checked = solver, point, checked
-        self.product = solver.system.applied  # J x
 
     def __str__(self):
         return str(Inverse(Solution(self.solver)))
 
+    def _of(self, act, x, *given):
+        """What a method of the solver or its system, which know flat numbers, gives for a field."""
+        system = self.solver.system
+        return system.shaped(act(system.flat(x), *given), self.point[0].layout.space)
+
+    def product(self, x):
+        """J x."""
+        return self._of(self.solver.system.applied, x)
+
     def magnitude(self, x):
         """|J| x, row by row, for x >= 0."""
         system = self.solver.system
-        return np.ldexp(system.magnitude(x), system.exponent)
+        return self._of(lambda x: np.ldexp(system.magnitude(x), system.exponent), x)
 
     @property
     def singular(self):
@@ -67,7 +75,7 @@ class Linearisation:
 
     def step(self, F, forcing):
         """The Newton step -J^-1 F, up to the relative residual `forcing`. Never refused: the next residual judges."""
-        return self.solver.approximate(-F, max(forcing, self.solver.system.rtol))
+        return self._of(self.solver.approximate, -F, max(forcing, self.solver.system.rtol))
 
     def solve(self, b, transposed):
         """(J^-1 b or J^-T b to the full tolerance, its record). Refused when the root is not isolated."""
@@ -78,21 +86,20 @@ class Linearisation:
                 "derivative; add an equation that fixes it or write nullspace='project'",
                 info=failure("setup_failed"),
             )
-        x = solver.solve(b, transposed, checked=False)
+        x = self._of(solver.solve, b, transposed, False)
         return x, solver.log.adjoint if transposed else solver.log.forward
 
     def defect(self):
         """How far J is from the derivative of the residual along a random direction: (largest, its row)."""
         equation, x, leaves = self.point
         rng = np.random.default_rng(0)
-        v = rng.uniform(0.5, 1.5, x.size) * rng.choice([-1.0, 1.0], x.size)
+        v = equation.layout.laid(rng.uniform(0.5, 1.5, x.size) * rng.choice([-1.0, 1.0], x.size))
         with np.errstate(all="ignore"):
             wanted = equation.tangent(x, leaves)(v)
         size = np.maximum(self.magnitude(np.abs(v)), np.abs(wanted))
-        size += 1e-8 * np.max(size, initial=0.0)  # rounding of large rows is no difference in small ones
+        size = size + 1e-8 * np.max(size, initial=0.0)  # rounding of large rows is no difference in small ones
         share = np.abs(self.product(v) - wanted) / np.where(size > 0, size, 1.0)
-        row = int(np.argmax(share)) if share.size else 0
-        return (float(share[row]) if share.size else 0.0), row
+        return float(np.max(share, initial=0.0)), int(np.argmax(share)) if share.size else 0
 
 
 class Jacobians:
@@ -140,7 +147,7 @@ class Jacobians:
     def relaxed(self, equation, x, leaves, pace, near):
         """The Solver of J + D / pace, D the rates of its rows; None where its entries are not known."""
         op, _ = self._operator(equation, x, leaves)
-        if op.form != "explicit":
+        if op.form != "explicit" or op.layout is not None:
             return None
         matrix = op.matrix + sp.diags_array(_rates(op.matrix, equation.layout) / pace)
         return self._solver(from_matrix(matrix, op.domain, op.domain, op.name), near)
@@ -149,7 +156,7 @@ class Jacobians:
         """The Solver of a Jacobian: found again by its entries, or set up."""
         settings, solver = self.settings, None
         key: Any = None
-        if op.form == "explicit" and not near:
+        if op.form == "explicit" and op.layout is None and not near:
             key = op.matrix.indptr, op.matrix.indices, op.matrix.data
             solver = self._matrices.find(key)
             if not solver and op.shape[0] <= DENSE_UP_TO and settings["method"] in ("auto", "direct"):
@@ -193,7 +200,10 @@ class Jacobians:
             )
         equation, x, leaves = known.point
         with self._alone:
-            self._enlarge(equation, x, leaves, row)
+            if equation.layout.ranks:
+                self._stencil(equation, x, leaves, known.solver.system.given.structure.stencil)
+            else:
+                self._enlarge(equation, x, leaves, row)
         return True
 
     # ------------------------------------------------------------ three ways to a Jacobian
@@ -203,7 +213,12 @@ class Jacobians:
         size, name = equation.size, self.settings["name"]
         if self.given is not None:
             self.way = "given"
-            return self._as_operator(self.given(equation.layout.split(x), *equation.params(leaves)), size, name), False
+            given = self.given(equation.layout.split(x), *equation.params(leaves))
+            return self._as_operator(given, equation.layout, name), False
+        if equation.layout.ranks:
+            with self._alone:
+                stencil = self._stencil(equation, x, leaves)
+            return stencil.operator(self._product(equation, x, leaves, False), name), False
         with self._alone:
             coloured, space = self._patterns.get(size) or self._coloured(equation, x, leaves)
         if coloured is None:
@@ -215,14 +230,16 @@ class Jacobians:
             space = Space(size)
         return from_matrix(matrix, space, space, name), coloured.by_rows and coloured.pattern.nnz == size**2
 
-    def _as_operator(self, given, size, name):
+    def _as_operator(self, given, layout, name):
         if isbox(given):
             raise DerivativeError(f"the jacobian of {self.name} uses a traced value that is not an argument")
         if not isinstance(given, Operator):
             given = from_matrix(given if sp.issparse(given) or np.ndim(given) else [[given]], name=name)
-        if given.layout is not None:  # every rank solves for all unknowns
-            given = from_matrix(given.matrix, name=given.name)
-        check_shape(f"the jacobian of {self.name}", given, (size, size))
+        check_shape(f"the jacobian of {self.name}", given, (layout.size,) * 2)
+        sides = [(space.layout, space.parts) for space in (given.domain, given.codomain)]
+        if (given.layout or layout.ranks) and sides != 2 * [(layout.ranks, layout.space.parts)]:  # it lies elsewhere
+            space = layout.space if layout.ranks else None
+            given = from_matrix(given.matrix, space, space, given.name)
         check_kind(f"the jacobian of {self.name}", given.dtype, "real numbers")
         return given
 
@@ -273,6 +290,18 @@ class Jacobians:
         known = self._patterns[equation.size] = coloured, cells
         return known
 
+    def _stencil(self, equation, x, leaves, lacking=None):
+        """What the ranks know of the pattern: found once, and where it is `lacking` with the entries at x."""
+        size, space, ranks = equation.size, equation.layout.space, equation.layout.ranks
+        known, self.way = self._patterns.get(size, (None, None))[0], f"the rows of each rank, {ranks}"
+        if self.sparsity is not None:
+            raise TypeError(f"{self.name} takes no sparsity for fields on ranks; leave it away")
+        if lacking or known is None or known.space != space:
+            points = [x] if lacking else _points(equation, x, leaves)
+            known = ranks.stencil(self.name, space, self._products(equation, points, leaves, False), lacking)
+            self._patterns[size] = known, None
+        return known
+
     def _guessed(self, equation, points, leaves):
         """Whether J has entries on a stencil only: what its products with colours give acts as it does. It is kept."""
         by_rows, shapes = self.ways[0], fields_met(equation, points[0], leaves)[1]
@@ -311,8 +340,9 @@ def _points(equation, x, leaves):
     """Points to probe at: near x and at two opposite random ones."""
     rng = np.random.default_rng(0)
     scale = np.sqrt(np.mean(x**2)) or 1.0
-    far = scale * rng.standard_normal(x.size)
-    points = x * (1 + 0.1 * rng.uniform(-1, 1, x.size)), far, -far  # opposite: each side of a switch is met
+    far = equation.layout.laid(scale * rng.standard_normal(x.size))
+    near = x * (1 + 0.1 * equation.layout.laid(rng.uniform(-1, 1, x.size)))
+    points = near, far, -far  # opposite: each side of a switch is met
     return [point for point in points if _is_valid(equation, point, leaves)] or [x]
 
 
@@ -320,7 +350,7 @@ def _is_valid(equation, x, leaves):
     """A probed point is ours, not the user's: where the residual refuses it, it is left out."""
     try:
         with np.errstate(all="ignore"):
-            return bool(np.all(np.isfinite(equation(x, *leaves))))
+            return bool(np.all(np.isfinite(equation.layout.tried(equation, x, *leaves))))
     except (ValueError, ArithmeticError, ConvergenceError):
         return False
 

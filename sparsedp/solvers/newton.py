@@ -28,6 +28,7 @@ steps on it is Newton's method again.
 Source: Kelley and Keyes, SIAM J. Numer. Anal. 35 (1998); Coffey, Kelley and Keyes, SIAM J. Sci. Comput. 25 (2003).
 """
 
+from itertools import pairwise
 from typing import Any
 
 import autograd.numpy as anp
@@ -39,7 +40,7 @@ from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, S
 from sparsedp.fields import check_finite, check_plain, leaves_by_name
 from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
-from sparsedp.shortcuts import on_every_rank, refuse_elsewhere
+from sparsedp.shortcuts import array, elsewhere, on_every_rank
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import length
@@ -69,7 +70,7 @@ TINY = 1e-8  # an iterate that is smaller than the last one by this share may be
 
 
 class Layout:
-    """How the unknowns, an array or a tree of arrays, lie in one flat float64 array.
+    """How the unknowns, an array or a tree of arrays, lie in one flat float64 array, or field on ranks.
 
     Parameters
     ----------
@@ -77,45 +78,75 @@ class Layout:
         Its shapes and dtypes count, and where it is traced, nothing else of the trace.
     name : str
         For messages.
+
+    Attributes
+    ----------
+    ranks : layout or None
+        Of a grid whose ranks hold the unknowns in blocks.
     """
 
     def __init__(self, guess, name):
         found, rebuild = flatten(guess)
         found = [plain(leaf) for leaf in found]
-        refuse_elsewhere(name, found)
         for leaf in found:
             _check_unknown(leaf, name)
         # Rebuilt without values: a kept layout must not hold a trace or a large array.
         self.tree = rebuild([None] * len(found))
         _, self.rebuild = flatten(self.tree)
         self.shapes = [np.shape(leaf) for leaf in found]
-        kinds = [np.asarray(leaf).dtype for leaf in found]
+        kinds = [dtype_of(leaf) for leaf in found]
         self.dtypes = [kind if kind.kind == "f" else np.dtype(float) for kind in kinds]
         self.scalar = isinstance(guess, (int, float)) and not isinstance(guess, np.generic)
-        self.space = Space(None, "unknowns", None, self.shapes)
-        self.size = self.space.size
+        field = elsewhere(found)
+        self.space = Space(None, "unknowns", None, self.shapes) if field is None else field.layout.joined(name, found)
+        self.ranks, self.size = self.space.layout, self.space.size
 
     def flat(self, guess):
         """The numbers of the guess, without a trace, as one fresh float64 array."""
-        parts = [np.asarray(plain(leaf), float).reshape(-1) for leaf in leaves(guess)]
-        return np.concatenate([np.zeros(0), *parts])
+        found = [plain(leaf) for leaf in leaves(guess)]
+        if self.ranks:
+            return self.ranks.join(self.space, found).astype(float)
+        return np.concatenate([np.zeros(0), *(np.asarray(leaf, float).reshape(-1) for leaf in found)])
 
     def split(self, x):
         """Flat unknowns, traced or not -> the tree of unknowns."""
-        whole = len(self.shapes) == 1
-        return self.rebuild([anp.reshape(x, self.shapes[0])] if whole else self.space.split(x))
+        if len(self.shapes) == 1 and not self.ranks:
+            return self.rebuild([anp.reshape(x, self.shapes[0])])
+        return self.rebuild(self._fields(x))
+
+    def _fields(self, x):
+        return self.ranks.split(self.space, x) if self.ranks else self.space.split(x)
+
+    def norms(self, x):
+        """The norm of each field of plain flat unknowns."""
+        fields = self._fields(x) if self.ranks else (x[a:b] for a, b in pairwise(self.space.offsets))
+        return np.array([length(field) for field in fields])
+
+    def spread(self, numbers):
+        """A number for each field -> the same for all of its unknowns."""
+        if self.ranks:
+            return self.ranks.join(self.space, numbers)
+        return np.repeat(numbers, np.diff(self.space.offsets))
+
+    def laid(self, x):
+        """A flat array that every rank has -> as the unknowns lie."""
+        return self.ranks.field(self.space, x) if self.ranks else x
+
+    def tried(self, act, *args):
+        """act(*args), where the caller goes on in another way if it fails: then all ranks do."""
+        return self.ranks.tried(act, *args) if self.ranks else act(*args)
 
     def rounded(self, x):
         """The tree of unknowns in the dtypes of the guess; copies, for the rules go on using x."""
         if self.scalar and not isbox(x):
             return float(x[0])
-        take = cast if isbox(x) else np.array
-        return self.rebuild(map(take, self.space.split(x), self.dtypes))
+        take = cast if isbox(x) or self.ranks else np.array
+        return self.rebuild(map(take, self._fields(x), self.dtypes))
 
 
 def _check_unknown(leaf, name):
     check_plain(name, leaf)
-    kind = np.asarray(leaf).dtype.kind
+    kind = dtype_of(leaf).kind
     if kind == "c":
         raise TypeError(f"{name} solves for real unknowns; give real and imaginary part as two fields")
     if kind not in KINDS:
@@ -166,7 +197,7 @@ class Equation:
         for number, param in enumerate(self.params(values)):
             for leaf in leaves(param):
                 if is_variable(leaf):
-                    check_finite(f"parameter {number + 1} of {self.name}", np.asarray(leaf))
+                    check_finite(f"parameter {number + 1} of {self.name}", array(leaf))
 
     def params(self, values):
         """Floating leaves -> the tuple of parameters."""
@@ -197,6 +228,8 @@ class Equation:
             raise ShapeError(f"the residual of {self.name} must hold {self.size} numbers, as many as x, got {size}")
         if any(dtype_of(part).kind not in KINDS for part in parts):
             raise TypeError(f"the residual of {self.name} must be real; give real and imaginary part as two fields")
+        if self.layout.ranks:
+            return cast(self.layout.ranks.join(self.layout.space, parts), np.float64)
         lines = [anp.reshape(on_every_rank(part), (-1,)) for part in parts]
         flat = lines[0] if len(lines) == 1 else anp.concatenate(lines) if lines else np.zeros(0)
         return flat if dtype_of(flat) == np.float64 else flat + np.zeros(self.size)
@@ -239,7 +272,6 @@ class Newton:
         self.x: np.ndarray
         self.F: Any = None
         self.size = 0.0  # |F|, of several fields each in units of the terms that it is the sum of
-        self.cuts = np.array(equation.layout.space.offsets[1:-1], int)  # between fields
         self.units: Any = 1.0  # of each number of F
         self.steps, self.keeps = steps, steps or equation.size > DENSE_UP_TO
         self.J: Any = None
@@ -247,7 +279,8 @@ class Newton:
         self.largest: Any = 0.0  # residual met, of each field
         self.stalls = 0  # Newton steps on end that left nearly all of the residual
         self.near: Any = None  # the engine of the last Jacobian, where its LU is worth another try
-        self.evolves = not steps  # whether pseudo-time may be tried: once
+        # Whether pseudo-time may be tried: once, and where one process knows all rows of the Jacobian.
+        self.evolves = not (steps or equation.layout.ranks)
 
     def solve(self, guess, known=None):
         """From a guess to a root, the first steps with the Jacobian `known` where there is one.
@@ -256,7 +289,7 @@ class Newton:
         """
         self.x, self.F = self.start = guess, self._first(guess)
         self.size = self._measure(self.F)
-        word, forcing = "" if self.F.any() else "converged", LOOSEST
+        word, forcing = "" if np.any(self.F) else "converged", LOOSEST
         if not word:
             if known is None:
                 self._linearise()
@@ -307,7 +340,7 @@ class Newton:
         try:
             check_finite(f"the guess of {name}", guess)
             self.equation.check_finite(self.leaves)
-            F = self.equation.value(guess, self.leaves)
+            F = self.equation.layout.tried(self.equation.value, guess, self.leaves)
             check_finite(f"the residual of {name} at the guess", F)
         except NonFiniteError:
             self.run.status = "nonfinite_input"
@@ -335,18 +368,14 @@ class Newton:
 
     def _weigh(self):
         """Units for the residual of several fields: the sizes of the terms of each, at this Jacobian."""
-        if self.cuts.size:
+        if len(self.equation.layout.shapes) > 1:
             sizes = self._sizes()[2]
             sizes[sizes == 0] = np.max(sizes) or 1.0  # a field that is 0 and solved: in the units of the others
-            self.units = 1 / np.repeat(sizes, np.diff(self.cuts, prepend=0, append=self.x.size))
+            self.units = self.equation.layout.spread(1 / sizes)
             self.size = self._measure(self.F)
 
     def _measure(self, F):
         return length(F * self.units)
-
-    def _norms(self, values):
-        """The norm of each field."""
-        return np.array([length(part) for part in (np.split(values, self.cuts) if self.cuts.size else [values])])
 
     def _step(self, forcing):
         try:
@@ -373,14 +402,14 @@ class Newton:
         """Iterates that shrink to 0 have no scale of their own: 0 itself is tried."""
         if size and length(x) <= TINY * length(self.x):
             at_zero = self._value(np.zeros_like(x))
-            if at_zero is not None and not at_zero.any():
+            if at_zero is not None and not np.any(at_zero):
                 return np.zeros_like(x), at_zero, 0.0
         return x, F, size
 
     def _value(self, x):
         """The residual at a trial point, or None where there is none."""
         try:
-            F = self.equation.value(x, self.leaves)
+            F = self.equation.layout.tried(self.equation.value, x, self.leaves)
         except (UnstableStepError, NonFiniteError, ConvergenceError):
             return None
         return F if np.all(np.isfinite(F)) else None
@@ -443,13 +472,14 @@ class Newton:
     def _sizes(self):
         """|F|, |b| and |J| |x| + |b| of each field."""
         with np.errstate(over="ignore", invalid="ignore"):
-            data = self._norms(self.J.product(self.x) - self.F)
-            return self._norms(self.F), data, self._norms(self.J.magnitude(np.abs(self.x))) + data
+            norms, J = self.equation.layout.norms, self.J
+            data = norms(J.product(self.x) - self.F)
+            return norms(self.F), data, norms(J.magnitude(np.abs(self.x))) + data
 
     def _rounding(self, step):
         """The status word when what is left of F is rounding, else ""."""
         residual, _, size = self._sizes()
-        size = size + self.largest + self._norms(self._terms())
+        size = size + self.largest + self.equation.layout.norms(self._terms())
         far = self._value(self.x + FAR * step)
         if far is None or not np.all(residual <= 8 * ROUNDING * size):
             return ""

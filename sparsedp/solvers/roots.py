@@ -214,7 +214,8 @@ class Root(Remade):
         -------
         x, like the guess
         """
-        layout, params = Layout(guess, self.name), mapped(on_every_rank, params)
+        layout = Layout(guess, self.name)
+        params = params if layout.ranks else mapped(on_every_rank, params)
         equation = Equation(self.residual, layout, params, self.name)
         given = layout.flat(guess), *equation.variables(params)
         return layout.rounded(together(self.name, (guess, *params), self._solution, equation, *given))
@@ -230,7 +231,7 @@ class Root(Remade):
     def corrected(self, equation, x, leaves, share, kept=0.0):
         """One more Newton step from x, to the residual `kept`; its linear solve to the relative residual `share`."""
         F = equation.value(x, leaves) - kept
-        return x + self._jacobians.fresh(equation, x, leaves).step(F, share) if F.any() else x
+        return x + self._jacobians.fresh(equation, x, leaves).step(F, share) if np.any(F) else x
 
     def solved(self, equation, guess, leaves):
         """Newton's method on flat arrays, recorded in the log."""
@@ -271,7 +272,7 @@ class Root(Remade):
         changed = max(CHANGED, LOOSE * self.rtol)
         if length(F) <= MORE * equation.left:  # as it was left, at a loose tolerance too
             return
-        if not np.abs(y) @ np.abs(F) > changed * (np.abs(g) @ np.abs(x)):
+        if not np.vdot(np.abs(y), np.abs(F)) > changed * np.vdot(np.abs(g), np.abs(x)):
             return
         terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1] if leaves else np.zeros(0)
         if length(F) <= CANCELS * length(terms):  # a root near 0, where what it is made of cancels

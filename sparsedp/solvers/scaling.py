@@ -7,6 +7,7 @@ does not wake its threads for so few numbers: they would stall those of compiled
 import numpy as np
 
 from sparsedp.fields import BLOCK
+from sparsedp.shortcuts import ELSEWHERE
 
 __all__ = [
     "dot",
@@ -25,7 +26,11 @@ SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve comput
 def _blocks(*arrays):
     """The parts of flat arrays of the same size that belong together; small arrays are one part themselves."""
     size = arrays[0].size
-    return (arrays,) if size <= BLOCK else ([x[i : i + BLOCK] for x in arrays] for i in range(0, size, BLOCK))
+    return (
+        (arrays,)
+        if size <= BLOCK or type(arrays[0]) in ELSEWHERE
+        else ([x[i : i + BLOCK] for x in arrays] for i in range(0, size, BLOCK))
+    )
 
 
 def dot(x, y):
@@ -47,11 +52,11 @@ def norm(x):
 
 
 def length(x):
-    """2-norm of a flat real array of any magnitude."""
+    """2-norm of a flat real array of any magnitude; of a field on ranks, that of all of it."""
     size = norm(x)
     if in_range(size):
         return size
-    exponent = int(np.frexp(largest(x))[1])
+    exponent = int(np.frexp(np.max(np.abs(x), initial=0.0))[1])
     return float(np.ldexp(norm(shifted(x, -exponent)), exponent))
 
 

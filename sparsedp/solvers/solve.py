@@ -127,7 +127,7 @@ class Solver(Remade):
         except ConvergenceError as error:
             if error.best is None:
                 raise
-            return error.best.reshape(-1)
+            return self.system.flat(error.best)
 
     def _solved(self, b, transposed, checked, start, rtol):
         run = Run(transposed, checked and not transposed, rtol or self.system.rtol)

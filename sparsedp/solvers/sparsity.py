@@ -34,7 +34,10 @@ import scipy.sparse as sp
 from sparsedp.solvers.amg import coloured_graph
 from sparsedp.structure.base import rows_of
 
-__all__ = ["Coloured", "colour", "dense_pattern", "find_pattern", "pattern_like", "pattern_of", "stencil_pattern"]
+__all__ = [
+    "WIDEST", "Coloured", "colour", "dense_pattern", "find_pattern", "lattice", "pattern_like", "pattern_of",
+    "stencil_pattern",
+]  # fmt: skip
 
 FIRST = 8  # blocks of the first level
 SAMPLE = 3  # columns that are looked at first
@@ -262,14 +265,21 @@ def _lattice(links, index, least):
     """(a . i) mod c with the smallest c that works, or a colour for each column; `index`: one row for each axis."""
     index = index[np.any(index, axis=1)]  # without axes of one place
     differences = _differences(links, index)
-    for count in range(least, 3 * least + 8) if differences is not None else ():
-        many = min(count ** (len(index) - 1), MOST_TRIALS // max(differences.shape[1], 1))
-        tried = islice(combinations(range(count), repeat=len(index) - 1), many)
+    found = None if differences is None else lattice(differences, least, 3 * least + 8)
+    return np.arange(links.shape[0]) if found is None else (found[0] @ index) % found[1]
+
+
+def lattice(differences, least, most):
+    """Differences of the indices of columns in one row, an axis in each row -> (a, c) of the smallest c, or None."""
+    axes = len(differences)
+    for count in range(least, most):
+        many = min(count ** (axes - 1), MOST_TRIALS // max(differences.shape[1], 1))
+        tried = islice(combinations(range(count), repeat=axes - 1), many)
         vectors = np.array([(*a[::-1], 1) for a in tried])
         valid = np.all((vectors @ differences) % count != 0, axis=1)
         if valid.any():
-            return (vectors[np.argmax(valid)] @ index) % count
-    return np.arange(links.shape[0])
+            return vectors[np.argmax(valid)], count
+    return None
 
 
 def _differences(links, index):

@@ -114,6 +114,10 @@ class System:
         """The field of a flat array."""
         return x.reshape(space.shape)
 
+    def flat(self, field):
+        """The flat array of a field."""
+        return field.reshape(-1)
+
     def whole(self, x):
         """The flat array of all entries."""
         return x

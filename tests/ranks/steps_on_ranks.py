@@ -1,4 +1,4 @@
-"""Steps in time on ranks, beside one process: every method of stepper, and roots of unknowns that every rank knows.
+"""Steps in time on ranks, beside one process: every method of stepper.
 
 mpirun -n 2 python -m mpi4py tests/ranks/steps_on_ranks.py
 """
@@ -83,12 +83,11 @@ EVERYWHERE = {
     "imex of a tree": tree,
     "leapfrog": leapfrog,
     "implicit": root,
+    **{f"{method}, by Newton": rates(method, rtol=1e-13) for method in ("backward_euler", "crank_nicolson", "tr_bdf2")},
 }
 # Of states that every rank knows; those that lie on ranks are refused by name.
 KNOWN_TO_ALL = {
-    **{method: rates(method) for method in ("backward_euler", "crank_nicolson", "tr_bdf2")},
     "etdrk4": lambda grid: dp.stepper("etdrk4", lambda u, k: k * anp.tanh(u), 1e-2, linear=dp.laplacian(grid)),
-    "steady": lambda grid: lambda u, k: dp.steady(lambda x, k: x - k - 1e-2 * dp.laplacian(grid)(x**3), u, k * u),
 }
 
 
@@ -105,12 +104,15 @@ def looked_at(name, make, grid, field):
     return value, *slopes, tangent, *bent
 
 
-BENT = "rk4", "rk4, linear", "tr_bdf2, linear", "imex", "leapfrog", "implicit"
+BENT = "rk4", "rk4, linear", "tr_bdf2, linear", "tr_bdf2, by Newton", "imex", "leapfrog", "implicit"
 RNG_FIELDS = {grid.shape: RNG.standard_normal((2, *grid.shape)) for grid in (PLAIN, UNEVEN)}
 
 
 def steps():
-    """All methods, of states on ranks, some of whole states too; on the second grid solves weigh rows."""
+    """All methods, of states on ranks, some of whole states too; on the second grid solves weigh rows.
+
+    A root whose residual has a sum in it is found of whole states alone.
+    """
     for number, (name, make) in enumerate(EVERYWHERE.items()):
         fields = (whole,) if make is root else (whole, lying) if make is tree else (lying,)
         plain = UNEVEN if number % 2 else PLAIN
@@ -124,7 +126,7 @@ def steps_of_what_all_know():
         grid = dp.distribute(PLAIN, COMM)
         u = lying(grid.cells, RNG_FIELDS[PLAIN.shape][0])
         words = f"{name}) does not work on a field that lies on ranks; write dp.gather(u) for the whole array"
-        refused(TypeError, words.removeprefix("steady)"), lambda make=make, u=u, grid=grid: make(grid)(u, 0.7))
+        refused(TypeError, words, lambda make=make, u=u, grid=grid: make(grid)(u, 0.7))
     grid = dp.distribute(PLAIN, COMM)
     words = "stepper(radau) does not work on a field that lies on ranks"
     refused(TypeError, words, lambda: rates("radau")(grid)(np.ones(PLAIN.shape), 0.7))
