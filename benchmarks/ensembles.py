@@ -18,7 +18,7 @@ import sparsedp as dp
 from benchmarks.triad import best_times
 
 CELLS = int(sys.argv[1]) if sys.argv[1:] and sys.argv[1].isdigit() else 256
-LAPS = 15  # the least time of each row counts: on a busy machine few laps have two processors for themselves
+LAPS = 40  # the least time of each row counts: on a busy machine few laps have two processors for themselves
 GRID = dp.Grid((CELLS, CELLS), size=1.0)
 SOLVE = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
 

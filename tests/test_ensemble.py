@@ -46,11 +46,12 @@ class Reversed:
     """An executor that does its tasks when they are asked for, the last one first; what it unpacks is its own."""
 
     def __init__(self, forgets=False):
-        self.tasks, self.forgets = [], forgets
+        self.tasks, self.forgets, self.sizes = [], forgets, []
 
     def submit(self, *task):
         future = Future()
         self.tasks.append((future, pickle.dumps(task)))
+        self.sizes.append(len(self.tasks[-1][1]))
         future.result = lambda: self.all_done() or Future.result(future)
         return future
 
@@ -59,7 +60,7 @@ class Reversed:
             future, task = self.tasks.pop()
             act, *args = pickle.loads(task)
             if self.forgets:
-                scenes._unpacked.cache_clear()
+                scenes._kept.clear()
             try:
                 future.set_result(act(*args))
             except Exception as error:
@@ -145,6 +146,19 @@ def test_a_worker_keeps_what_it_has_unpacked():
 def test_a_worker_that_forgets_unpacks_again():
     wanted, total = (dp.ensemble(loss, SCENES, some, WEIGHTS, 2) for some in (None, Reversed(forgets=True)))
     assert [bits(total) for _ in range(2)] == [bits(wanted)] * 2
+
+
+def summed(x, scene):
+    return x * np.sum(scene)
+
+
+def test_what_every_worker_has_is_not_sent_again():
+    large, executor = [onp.full(10_000, float(number)) for number in range(3)], Reversed()
+    total = dp.ensemble(summed, large, executor)
+    assert [total(2.0), total(2.0)] == [60_000.0] * 2
+    assert min(executor.sizes[:3]) > 80_000 and max(executor.sizes[3:]) < 2_000
+    scenes._kept.clear()  # as in a worker that was started anew: it gets all that it lacks
+    assert total(2.0) == 60_000.0 and sum(size > 80_000 for size in executor.sizes[6:]) == 3
 
 
 def test_batches_of_scenes():

@@ -59,8 +59,8 @@ BUGS = {
     ),
     "a scene that a worker takes for another": Bug(
         "parallel",
-        "(n, weight, _unpacked(scene))",
-        "(n, weight, _unpacked(scenes[0][2]))",
+        "(n, weight, found[key])",
+        "(n, weight, found[scenes[0][2]])",
         "tests/test_ensemble.py",
     ),
     "momentum that passes through a wall": Bug(

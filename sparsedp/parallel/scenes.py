@@ -1,7 +1,11 @@
 """One loss over many scenes: its weighted sum and the derivatives of it, computed by the workers of any executor."""
 
+import os
 import pickle
-from functools import lru_cache
+from collections import OrderedDict
+from hashlib import sha256
+from platform import node
+from threading import RLock
 from typing import Any
 
 import autograd.numpy as anp
@@ -59,8 +63,9 @@ def ensemble(loss, scenes, executor=None, weights=None, chunk=None, progress=Fal
     -----
     Sums are taken in the order of the scenes, within a chunk and over chunks: the bits do not depend on the executor,
     nor on how many workers it has. Loss and scenes are pickled once (by cloudpickle, where that is installed and
-    functions have no name), and the bytes go with every task; a worker keeps what it has unpacked, so each sets up a
-    solver once. An error has the type that it has here, and names its scene; tasks that have not begun are cancelled.
+    functions have no name). A worker keeps what it has unpacked, so each sets up a solver once; the bytes go with a
+    task until every worker has them, and again to one that has not. With each task goes x, and back comes a gradient
+    of its size. An error has the type that it has here, and names its scene; tasks that have not begun are cancelled.
 
     Derivatives of second order are right, too; of third order there are none. Only the leaves of x that are traced
     are differentiated. `explain` counts what this process does.
@@ -109,6 +114,7 @@ class Ensemble(Remade):
         self.made = ensemble, (loss, scenes, executor, self._weights, chunk, progress)
         self._chunk, self._executor, self._progress = int(chunk or 1), executor, progress
         self._loss, *self._scenes = (_packed(x) if executor is not None else mapped(frozen, x) for x in (loss, *scenes))
+        self._holders: dict = {}  # worker that has answered -> the keys of what it has
 
     def __repr__(self):
         return f"<ensemble of {self.count} scenes>"
@@ -164,30 +170,59 @@ class Ensemble(Remade):
         for begin in range(0, len(numbers), self._chunk):
             scenes = [(n, self._weights[n], self._scenes[n]) for n in numbers[begin : begin + self._chunk]]
             chunks.append((task, self._loss, point, scenes, self.count))
-        futures, total = [], None
+        futures: list = []
+        total = None
         try:
             if self._executor is not None:
-                futures += [self._executor.submit(_of_bytes, *chunk) for chunk in chunks]
+                futures += map(self._submitted, chunks)
             for number in shown_steps(self._progress, range(len(chunks)), "scenes"):
-                total = _added(total, futures[number].result() if futures else _sum(*chunks[number]))
+                parts = self._answer(chunks[number], futures[number]) if futures else _sum(*chunks[number])
+                total = _added(total, parts)
         finally:
             for future in futures:
                 future.cancel()
         return total
 
+    def _submitted(self, chunk):
+        """A task, with the bytes of what some worker may not have."""
+        task, loss, point, scenes, count = chunk
+        parcels = dict([loss, *(parcel for _, _, parcel in scenes)])
+        held = [*self._holders.values()]
+        bodies = {key: data for key, data in parcels.items() if not held or any(key not in keys for keys in held)}
+        keys = [(n, weight, parcel[0]) for n, weight, parcel in scenes]
+        return self._executor.submit(_of_parcels, [*parcels], bodies, task, loss[0], point, keys, count)
+
+    def _answer(self, chunk, future):
+        """What a task returns; where its worker has lost what it had, or is a new one, it is sent again with all."""
+        keys, worker, parts = future.result()
+        if parts is None:
+            self._holders[worker] = set()
+            return self._answer(chunk, self._submitted(chunk))
+        self._holders.setdefault(worker, set()).update(keys)
+        return parts
+
 
 # ---- in a worker -----------------------------------------------------------------------------------------------------
 
 
-@lru_cache(KEPT)
-def _unpacked(data):
-    """What was pickled, read-only; a second time the same, with what it has set up."""
-    return mapped(frozen, pickle.loads(data))
+_kept: OrderedDict = OrderedDict()  # key -> what was pickled, read-only, with what it has set up since; last used last
+_alone = RLock()  # held by the thread of a worker that looks there
 
 
-def _of_bytes(task, loss, point, scenes, count):
-    """What `_sum` returns of what was packed."""
-    return _sum(task, _unpacked(loss), point, [(n, weight, _unpacked(scene)) for n, weight, scene in scenes], count)
+def _of_parcels(keys, bodies, task, loss, point, scenes, count):
+    """(keys, this worker, what `_sum` returns of what they stand for; None where it has not all of them)."""
+    worker, found = f"{node()} {os.getpid()}", {}
+    with _alone:
+        for key in keys:
+            if key not in _kept:
+                if key not in bodies:
+                    return keys, worker, None
+                _kept[key] = mapped(frozen, pickle.loads(bodies[key]))
+            _kept.move_to_end(key)
+            found[key] = _kept[key]
+        while len(_kept) > KEPT:
+            _kept.popitem(last=False)
+    return keys, worker, _sum(task, found[loss], point, [(n, weight, found[key]) for n, weight, key in scenes], count)
 
 
 def _sum(task, loss, point, scenes, count):
@@ -234,7 +269,12 @@ def _added(total, parts):
 
 
 def _packed(thing):
-    """Anything -> its bytes."""
+    """Anything -> (a key for its bytes, these)."""
+    data = _pickled(thing)
+    return sha256(data).hexdigest(), data
+
+
+def _pickled(thing):
     try:
         return pickle.dumps(thing, 5)
     except Exception as error:
