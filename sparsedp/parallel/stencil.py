@@ -3,7 +3,8 @@
 Residuals made of operators on a grid meet the same few neighbours everywhere. Which, a few probes tell: products with
 one entry, in the middle of each component and at its ends. From these steps every rank knows where the entries of its
 rows are, and a colour for each column, without looking at the rest of the grid (see solvers/sparsity.py); a product for
-each colour gives the entries. The matrix is compared with a product along a random direction.
+each colour gives the entries. Before a derivative is taken, and where a Newton step does not do well, the matrix is
+compared with a product along a random direction (solvers/jacobian.py): what it lacks is looked for again, or refused.
 """
 
 from functools import cached_property
@@ -16,7 +17,7 @@ import scipy.sparse as sp
 
 from sparsedp.operator import Operator
 from sparsedp.parallel.cut import OwnRows, reads
-from sparsedp.parallel.fields import DistributedField, block
+from sparsedp.parallel.fields import DistributedField
 from sparsedp.parallel.partition import lengths
 from sparsedp.solvers.sparsity import WIDEST, lattice
 from sparsedp.structure.base import Matrix
@@ -24,7 +25,6 @@ from sparsedp.structure.base import Matrix
 __all__ = ["Stencil", "stencil_of"]
 
 COLOURS = 8  # times the entries of the fullest row: more are no stencil's
-AGREES = 1e-8  # relative difference up to which the assembled matrix is taken for the Jacobian
 
 
 def stencil_of(name, space, products, lacking=None):
@@ -43,7 +43,7 @@ def stencil_of(name, space, products, lacking=None):
                 at = [{"first": 0, "middle": n // 2, "last": n - 1}[place] for n in part]
                 steps.update(_met(space, act, number, at))
     stencil = Stencil(space, sorted(steps))
-    if lacking and stencil.steps == lacking.steps or stencil.vector is None or not stencil.acts_as(products[0]):
+    if lacking and stencil.steps == lacking.steps or stencil.vector is None:
         raise TypeError(
             f"{name} takes, for fields on ranks, residuals in which a number meets few others, all of them near; "
             "write dp.gather(u) for what every rank solves alone"
@@ -56,15 +56,16 @@ def _met(space, act, number, at):
     layout, (part, index) = space.layout, _own(space)
     here = (part == number) & np.all(index == np.reshape(at, (-1, 1)), axis=0)
     rows = np.flatnonzero(act(DistributedField(here.astype(float), space)).flat)
-    steps = _shortest(index[:, rows] - np.reshape(at, (-1, 1)), space)
+    n, around = _lengths(space)
+    steps = index[:, rows] - np.reshape(at, (-1, 1))
+    steps = np.where(around, (steps + n // 2) % n - n // 2, steps)  # round a periodic axis the short way
     here = np.vstack([part[rows], steps]).T[: WIDEST + 1]
     return [(number, *step) for step in np.concatenate(layout.agreement.gathered(here)).tolist()]
 
 
-def _shortest(steps, space):
-    """Steps of which those round a periodic axis go the short way."""
-    n, around = (np.reshape(line, (-1, 1)) for line in (space.grid.shape, space.grid.periodic))
-    return np.where(around, (steps + n // 2) % n - n // 2, steps)
+def _lengths(space):
+    """Of each axis the number of cells, and whether it is periodic."""
+    return (np.reshape(line, (-1, 1)) for line in (space.grid.shape, space.grid.periodic))
 
 
 def _own(space):
@@ -118,7 +119,7 @@ class Stencil:
     def _places(self):
         """Of each entry in the rows of this rank: row, number of the column in the whole field, and its colour."""
         space, (part, index), found = self.space, _own(self.space), []
-        n, around = (np.reshape(line, (-1, 1)) for line in (space.grid.shape, space.grid.periodic))
+        n, around = _lengths(space)
         for one, other, *step in self.steps:
             row = np.flatnonzero(part == other)
             column = index[:, row] - np.reshape(step, (-1, 1))
@@ -153,9 +154,3 @@ class Stencil:
     def operator(self, act, name):
         """The matrix that acts as ``act(v)``, as an Operator."""
         return Operator(self._rows(act), self.space, self.space, name, "matrix-free")
-
-    def acts_as(self, act):
-        """Whether that matrix gives the product along a random direction, too."""
-        v, rows = block(np.random.default_rng(1).uniform(0.5, 1.5, self.space.size), self.space), self._rows(act).rows
-        off, size = np.abs(rows.product(v.flat) - act(v).flat), rows.magnitude()(v.flat)
-        return not self.space.layout.sum(np.count_nonzero(~(off <= AGREES * size)))
