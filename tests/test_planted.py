@@ -375,7 +375,7 @@ BUGS = {
     ),
     "fields of a tree judged together": Bug(
         "solvers",
-        "data, self._norms(self.J.magnitude(np.abs(self.x))) + data",
+        "data, norms(J.magnitude(np.abs(self.x))) + data",
         "data, length(self.J.magnitude(np.abs(self.x))) + data",
         "tests/test_steady.py::test_a_fold_is_met_with_true_derivatives_or_an_error",
     ),
