@@ -16,6 +16,7 @@ import autograd.numpy as np
 
 import sparsedp as dp
 from benchmarks import stiff
+from benchmarks.waves import FRESNEL, echo, slanted
 
 
 def hires(tolerance):
@@ -108,45 +109,6 @@ def convection(n):
         return np.mean(grid.split(heat_flow(x))[0])
 
     return nusselt, 1e5
-
-
-def echo(n):
-    """Echo of a jump of the speed from 1 to c in Helmholtz's equation: (c - 1) / (c + 1), forty cells a wavelength."""
-    grid = dp.Grid(n)
-    (x,), (faces,), omega = grid.centres(), grid.face_centres(0), 2 * np.pi / 40
-    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
-    layer = lambda x: 1 - 2j * np.maximum(1 - np.minimum(x, n - x) / (n / 8), 0) ** 3
-    source = np.eye(n)[n // 4]
-
-    def reflected(c):
-        far = 1.0 * (x > n / 2)
-        u = solve(1 / layer(faces), source, -layer(x) * (omega * (far / c + 1 - far)) ** 2)
-        w = solve(1 / layer(faces), source, -layer(x) * omega**2)
-        part = slice(n // 4 + 20, n // 2 - 20)
-        return np.mean(np.abs(u - w)[part]) / np.mean(np.abs(w[part]))
-
-    return reflected, 2.0
-
-
-def slanted(n):
-    """Echo of a wave at 30 degrees from a jump of the speed to c, ten cells a wavelength (Fresnel); n a multiple of 20.
-
-    So few cells make it 3.5 % too strong: sin((a - b) / 2) / sin((a + b) / 2) with the wave numbers a, b on the grid.
-    """
-    grid = dp.Grid((n, n), periodic=(False, True))
-    (x, y), (faces, _), omega = grid.centres(), grid.face_centres(0), 2 * np.pi / 10
-    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
-    layer = lambda x: 1 - 2j * np.maximum(1 - np.minimum(x, n - x) / (n / 8), 0) ** 3
-    k = grid.join(1 / layer(faces), layer(grid.face_centres(1)[0]))
-    source = np.where(x == n // 4 + 0.5, np.exp(0.5j * omega * y), 0)
-
-    def reflected(c):
-        far = 1.0 * (x > n / 2)
-        u, w = (solve(k, source, -layer(x) * (omega * (far / c + 1 - far)) ** 2) for c in (c, 1.0))
-        part = slice(3 * n // 10, 9 * n // 20)
-        return np.mean(np.abs(u - w)[part]) / np.mean(np.abs(w[part]))
-
-    return reflected, 1.5
 
 
 def tensor(n):
@@ -265,7 +227,6 @@ def vortex(n):
     return least, 1.4
 
 
-FRESNEL = (np.sqrt(27) - np.sqrt(7)) / (np.sqrt(27) + np.sqrt(7))  # cos 30 degrees and sqrt(1 / 1.5^2 - 1 / 4)
 CASES = {  # name: scene, number that is looked at, what is published or exact, cells (or tolerance), few cells
     "HIRES": (hires, "u6", 0.006238968252742796, 1e-8, 1e-9),
     "Robertson, 1e11": (robertson, "u1", 2.083340149701255e-8, 1e-8, 1e-9),

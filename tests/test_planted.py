@@ -52,16 +52,10 @@ BUGS = {
         "fields.py", "if kind is not np.ndarray and (library", "if False and (library", "tests/test_interop.py"
     ),
     "an ensemble whose gradient has no weights": Bug(
-        "parallel",
-        "[weight * part for part in parts]",
-        "[weight * parts[0], *parts[1:]]",
-        "tests/test_ensemble.py",
+        "parallel", "[weight * part for part in parts]", "[weight * parts[0], *parts[1:]]", "tests/test_ensemble.py"
     ),
     "a scene that a worker takes for another": Bug(
-        "parallel",
-        "(n, weight, found[key])",
-        "(n, weight, found[scenes[0][2]])",
-        "tests/test_ensemble.py",
+        "parallel", "(n, weight, found[key])", "(n, weight, found[scenes[0][2]])", "tests/test_ensemble.py"
     ),
     "momentum that passes through a wall": Bug(
         "flow",
