@@ -339,8 +339,8 @@ BUGS = {
     ),
     "a function of an operator that is not transposed": Bug(
         "solvers",
-        "self.spectrum.apply(self.weights, x, self.transposed)",
-        "self.spectrum.apply(self.weights, x, False)",
+        "spectrum.apply(weights, x, self.transposed)",
+        "spectrum.apply(weights, x, False)",
         "tests/test_spectral.py",
     ),
     "the wrong sign in the derivative of a shift": Bug(
