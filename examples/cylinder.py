@@ -113,7 +113,10 @@ class Flow:
     def coefficients(self, state):
         """Drag and lift coefficients, and the difference of pressure between front and back."""
         drag, lift, _ = 2 / (MEAN**2 * D) * self.forces(state["v"], state["p"], NU)
-        front, before, back, behind = self.near_ends(state["p"])
+        u = self.grid.split(state["v"])[0]  # across the left and the right side of each cell
+        strain = (u[1:] - u[:-1]) / self.grid.widths[0][:, None]
+        total = state["p"] + (u[1:] + u[:-1]) ** 2 / 8 - NU * strain
+        front, before, back, behind = self.near_ends(total)
         return {"C_D": drag, "C_L": lift, "dp": (2 * front - before) - (2 * back - behind)}
 
 
@@ -126,9 +129,18 @@ class Flow:
 # .. math:: C_D = \frac{2 F_x}{\bar{u}^2 D}, \qquad C_L = \frac{2 F_y}{\bar{u}^2 D} .
 #
 # Pressure goes on inside the friction, where it means nothing. On the surface it is taken from outside, by a straight
-# line through points one and two cells away.
+# line through points one and two cells away. But within a layer of two cells it falls by a tenth: there the fluid is
+# held up. On the line through both ends of the cylinder the equation across :math:`y` is
 #
-# The lift is 500 times smaller than the drag: it is a difference of large numbers, and needs finer grids.
+# .. math:: \frac{\partial}{\partial x} \left( p + \frac{u^2}{2} - \nu \, \frac{\partial u}{\partial x} \right)
+#           = \nu \, \frac{\partial^2 u}{\partial y^2} - v \, \frac{\partial u}{\partial y} ,
+#
+# and its right-hand side is small. What stands in brackets is :math:`p` on the surface, where :math:`u` and its slope
+# are 0, and hardly changes before it: with 20 cells the pressure is 0.4 % off, and 2.2 % by a line through :math:`p`.
+#
+# The lift is 500 times smaller than the drag: it is a difference of large numbers, and needs finer grids. Here the
+# middle of the circle stands at faces, and the errors of its two halves cancel in part. A quarter of a cell higher the
+# lift on 20 cells is a third off that on 40, where the drag differs by 0.2 %.
 
 circle = {"r": D / 2, "s": 0.0, "y": CENTRE}
 print("cells  " + "".join(f"{name:>9} {'off by':>8}" for name in KNOWN) + "  seconds")

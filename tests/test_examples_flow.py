@@ -57,7 +57,7 @@ def test_cylinder():
     """DFG 2D-1 at 10 cells a diameter; 20 are within 0.3 % of the drag."""
     printed = run("cylinder.py")
     found = rows(printed, r"^ +(\d+) +(\S+) +(\S+)% +(\S+) +\S+% +(\S+) +(\S+)%")
-    assert found[1][0] == 10 and found[1][2] <= 0.9 < found[0][2] and abs(found[1][5]) <= 4.5 and "agrees" in printed
+    assert found[1][0] == 10 and found[1][2] <= 0.9 < found[0][2] and abs(found[1][5]) <= 2.2 and "agrees" in printed
     assert rows(printed, r"d/dr (\S+)  d/ds (\S+)")[0] == pytest.approx((130.88, -5.956), rel=1e-3)
 
 

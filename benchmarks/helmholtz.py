@@ -1,31 +1,10 @@
-"""Scenes of waves for `benchmarks.physics`: echoes of a jump of the speed, in 1-D and 2-D, with layers that absorb.
-
-Run ``python -m benchmarks.physics Helmholtz`` in the root of the repository.
-"""
+"""Waves of one frequency in the plane: a scene of benchmarks.physics."""
 
 import autograd.numpy as np
 
 import sparsedp as dp
 
 FRESNEL = (np.sqrt(27) - np.sqrt(7)) / (np.sqrt(27) + np.sqrt(7))  # cos 30 degrees and sqrt(1 / 1.5^2 - 1 / 4)
-
-
-def echo(n):
-    """Echo of a jump of the speed from 1 to c in Helmholtz's equation: (c - 1) / (c + 1), forty cells a wavelength."""
-    grid = dp.Grid(n)
-    (x,), (faces,), omega = grid.centres(), grid.face_centres(0), 2 * np.pi / 40
-    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
-    layer = lambda x: 1 - 2j * np.maximum(1 - np.minimum(x, n - x) / (n / 8), 0) ** 3
-    source = np.eye(n)[n // 4]
-
-    def reflected(c):
-        far = 1.0 * (x > n / 2)
-        u = solve(1 / layer(faces), source, -layer(x) * (omega * (far / c + 1 - far)) ** 2)
-        w = solve(1 / layer(faces), source, -layer(x) * omega**2)
-        part = slice(n // 4 + 20, n // 2 - 20)
-        return np.mean(np.abs(u - w)[part]) / np.mean(np.abs(w[part]))
-
-    return reflected, 2.0
 
 
 def slanted(n):
