@@ -35,8 +35,8 @@ from sparsedp.solvers.amg import coloured_graph
 from sparsedp.structure.base import rows_of
 
 __all__ = [
-    "WIDEST", "Coloured", "colour", "dense_pattern", "find_pattern", "lattice", "pattern_like", "pattern_of",
-    "stencil_pattern",
+    "WIDEST", "Coloured", "colour", "dense_pattern", "entries_at", "find_pattern", "lattice", "pattern_like",
+    "pattern_of", "places", "probes", "stencil_pattern", "steps_to",
 ]  # fmt: skip
 
 FIRST = 8  # blocks of the first level
@@ -139,7 +139,7 @@ def stencil_pattern(products, shapes):
     csr_array or None
         None when the fields are small, or a cell touches too many.
     """
-    index = _places(shapes)
+    index = places(shapes)
     lengths = np.max(index, axis=1, initial=0) + 1
     far = lengths > SHORT  # axes that count places; the others, and the fields, count kinds of values
     far[0] = False
@@ -147,29 +147,50 @@ def stencil_pattern(products, shapes):
     at, lengths, kinds = index[far], lengths[far, None], np.max(kind, initial=0) + 1
     if not far.any() or not products or kind.size < SMALLEST or kinds > SHORT:
         return None
-    number = np.full((kinds, *lengths[:, 0]), -1)
+    number = np.zeros((kinds, *lengths[:, 0]), int)
     number[(kind, *at)] = np.arange(kind.size)
-    moves, wraps, rng = set(), np.zeros(lengths.shape, dtype=bool), np.random.default_rng(0)
-    for one, product, place in combinations(range(kinds), products, (0 * lengths, lengths // 2, lengths - 1)):
-        cell, v = np.minimum(place, np.max(at[:, kind == one], axis=1, keepdims=True)), np.zeros(kind.size)
+    ends = [np.max(at[:, kind == one], axis=1, keepdims=True) + 1 for one in range(kinds)]
+    steps, wraps, rng = set(), np.zeros(lengths.shape, dtype=bool), np.random.default_rng(0)
+    for one, product, cell in probes(ends, products):
+        v = np.zeros(kind.size)
         v[number[(one, *cell)]] = rng.uniform(0.5, 1.5) * rng.choice((-1.0, 1.0))
         row = np.flatnonzero(product(v))
         if row.size > WIDEST:
             return None
-        ways = at[:, row] - cell
-        steps = (ways + lengths // 2) % lengths - lengths // 2  # the short way
-        wraps |= np.any(steps != ways, axis=1, keepdims=True)
-        moves |= {(one, *move) for move in np.vstack([kind[row], steps]).T.tolist()}
-    places = [np.empty((2, 0), dtype=int)]
-    for one, other, *step in sorted(moves):
-        column = np.flatnonzero(kind == one)
-        to = at[:, column] + np.reshape(step, (-1, 1))
-        to = np.where(wraps, to % lengths, to)  # steps over an edge count where the field goes round
-        inside = np.all((to >= 0) & (to < lengths), axis=0)
-        row = number[(other, *to[:, inside])]
-        places.append(np.stack([row, column[inside]])[:, row >= 0])
-    row, column = np.hstack(places)
+        found, round_ends = steps_to(one, cell, kind[row], at[:, row], lengths, True)
+        wraps |= round_ends  # steps over an edge count where the field goes round
+        steps |= found
+    found = [(row, number[(one, *there)]) for row, one, there in entries_at(steps, kind, at, ends, wraps)]
+    row, column = np.hstack([np.empty((2, 0), int), *found])
     return pattern_of(row, column, (kind.size,) * 2)
+
+
+def probes(ends, products):
+    """(kind, product, index) of the entries that tell of a stencil: the first, the middle and the last of each kind."""
+    for (one, end), product, place in combinations(enumerate(ends), products, (0, 1, 2)):
+        if np.all(end):
+            yield one, product, (0 * end, end // 2, end - 1)[place]
+
+
+def steps_to(one, cell, kind, at, lengths, around):
+    """From an entry to those that it meets: (its kind, theirs, cells along each axis), and which axes they go round."""
+    ways = at - cell
+    steps = np.where(around, (ways + lengths // 2) % lengths - lengths // 2, ways)  # the short way
+    found = {(one, *step) for step in np.vstack([kind, steps]).T.tolist()}
+    return found, np.any(steps != ways, axis=1, keepdims=True)
+
+
+def entries_at(steps, kind, at, ends, around):
+    """Steps, kinds and indices of rows -> for each step the rows that have such an entry, kind and index of its column.
+
+    `ends`: of the indices of each kind; `around`: whether an axis is periodic.
+    """
+    for one, other, *step in sorted(steps):
+        row = np.flatnonzero(kind == other)
+        there = at[:, row] - np.reshape(step, (-1, 1))
+        there = np.where(around, there % np.maximum(ends[one], 1), there)
+        inside = np.all((there >= 0) & (there < ends[one]), axis=0)
+        yield row[inside], one, there[:, inside]
 
 
 # ---------------------------------------------------------------- colours
@@ -191,6 +212,9 @@ class Coloured:
     ----------
     by_rows : bool
     count : int
+        Of colours: products that one matrix takes.
+    seeds : int array
+        The colour of each number that a product takes.
 
     Examples
     --------
@@ -205,23 +229,23 @@ class Coloured:
     def __init__(self, pattern, shapes=None, by_rows=False):
         if by_rows is None:  # there are as many colours as entries in the fullest row, or, by rows, column
             by_rows = np.bincount(pattern.indices).max(initial=0) <= 2 * np.diff(pattern.indptr).max(initial=0)
-        self.pattern, self.by_rows = pattern, bool(by_rows)
-        self.colours = colour(pattern.T.tocsr() if by_rows else pattern, shapes)
+        self.by_rows = bool(by_rows)
+        self.seeds = colour(pattern.T.tocsr() if by_rows else pattern, shapes)
+        self.count = int(self.seeds.max(initial=-1)) + 1
+        self._paint(pattern, self.seeds)
+
+    def _paint(self, pattern, colours):
+        self.pattern = pattern
         # Where each entry stands in the table of products: (colour of the column, row), or mirrored.
         row = rows_of(pattern)
         one, other = (row, pattern.indices) if self.by_rows else (pattern.indices, row)
-        self._place = self.colours[one], other
-
-    @property
-    def count(self):
-        """Number of colours: of products that one matrix takes."""
-        return int(self.colours.max(initial=-1)) + 1
+        self._place = colours[one], other
 
     def matrix(self, product):
         """product(v) -> A v (A^T v when `by_rows`)  to  csr_array of A on the pattern."""
         table = np.empty((self.count, self.pattern.shape[int(self.by_rows)]))
         for number in range(self.count):
-            table[number] = product((self.colours == number).astype(float))
+            table[number] = product((self.seeds == number).astype(float))
         return sp.csr_array((table[self._place], self.pattern.indices, self.pattern.indptr), shape=self.pattern.shape)
 
     def acts_as(self, product, share):
@@ -250,20 +274,25 @@ def colour(pattern, shapes=None):
         return np.arange(size)
     links = sp.csr_array(pattern.astype(np.int32))
     links = sp.csr_array(links.T @ links + sp.eye_array(size, dtype=np.int32))  # every column is linked to itself
-    found = _lattice(links, _places(shapes or [(size,)]), least)
+    found = _lattice(links, places(shapes or [(size,)]), least)
     return found if found.max() < 2 * least else min(found, coloured_graph(links), key=np.max)
 
 
-def _places(shapes):
-    """Fields of these shapes, one after the other -> the number of its field and its index there, of each unknown."""
-    sizes = [prod(shape) for shape in shapes]
-    inside = [np.indices(shape).reshape(len(shape), size) for shape, size in zip(shapes, sizes, strict=True)]
-    return np.vstack([np.repeat(np.arange(len(sizes)), sizes), np.hstack(inside)])
+def places(shapes, starts=None):
+    """Fields one after the other -> of each unknown the number of its field and its index there.
+
+    `shapes`: of the fields, or of blocks that start at these indices.
+    """
+    starts = [(0,) * len(shape) for shape in shapes] if starts is None else starts
+    lines = [
+        np.indices(shape).reshape(len(shape), prod(shape)) + np.reshape(start, (-1, 1))
+        for shape, start in zip(shapes, starts, strict=True)
+    ]
+    return np.vstack([np.repeat(np.arange(len(lines)), [line.shape[1] for line in lines]), np.hstack(lines)])
 
 
 def _lattice(links, index, least):
     """(a . i) mod c with the smallest c that works, or a colour for each column; `index`: one row for each axis."""
-    index = index[np.any(index, axis=1)]  # without axes of one place
     differences = _differences(links, index)
     found = None if differences is None else lattice(differences, least, 3 * least + 8)
     return np.arange(links.shape[0]) if found is None else (found[0] @ index) % found[1]
@@ -271,14 +300,18 @@ def _lattice(links, index, least):
 
 def lattice(differences, least, most):
     """Differences of the indices of columns in one row, an axis in each row -> (a, c) of the smallest c, or None."""
-    axes = len(differences)
+    apart = np.any(differences, axis=1)  # not axes of one place
+    apart[-1], vector = True, np.zeros(len(differences), int)
+    differences = differences[apart]
+    free = len(differences) - 1
     for count in range(least, most):
-        many = min(count ** (axes - 1), MOST_TRIALS // max(differences.shape[1], 1))
-        tried = islice(combinations(range(count), repeat=axes - 1), many)
+        many = min(count**free, MOST_TRIALS // max(differences.shape[1], 1))
+        tried = islice(combinations(range(count), repeat=free), many)
         vectors = np.array([(*a[::-1], 1) for a in tried])
         valid = np.all((vectors @ differences) % count != 0, axis=1)
         if valid.any():
-            return vectors[np.argmax(valid)], count
+            vector[apart] = vectors[np.argmax(valid)]
+            return vector, count
     return None
 
 
