@@ -38,8 +38,8 @@ BUGS_ON_RANKS = {
         "tests/test_ranks.py::test_as_on_one_process[solves-2]",
     ),
     "on ranks, J for the transpose of J": (
-        "return structure.turned() if structure.transposed else structure.rows",
-        "return structure.rows",
+        "return structure.inner[structure.transposed]",
+        "return structure.inner[0]",
         "tests/test_ranks.py::test_as_on_one_process[newton-2]",
     ),
     "on ranks, what one refuses at a trial point that only it knows": (

@@ -8,7 +8,6 @@ The transpose is the transposed map, cut in the same way: it gathers too, so not
 the bits of the result do not depend on how many there are.
 """
 
-from copy import copy
 from math import prod
 
 import numpy as np
@@ -19,12 +18,12 @@ from sparsedp.parallel.partition import lengths, slices
 from sparsedp.solvers.choose_method import Solution
 from sparsedp.solvers.nullspace import Projector
 from sparsedp.space import components
-from sparsedp.structure.base import Matrix, Structure, rows_of
+from sparsedp.structure.base import Matrix, Structure, Turning, rows_of
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker, Term
 from sparsedp.structure.lazy import Chain, Diagonal, Mask, Sum
 
-__all__ = ["OwnRows", "Rows", "localized", "reads"]
+__all__ = ["Columns", "OwnRows", "Rows", "localized", "reads"]
 
 
 NOTHING = np.iinfo(int).max  # as an end of a side: there is none
@@ -53,7 +52,7 @@ def localized(structure, given, made):
         return _of_diagonal(structure, *given) if given else structure
     shape = tuple(side[0].size(side[1]) if side else n for side, n in zip((made, given), structure.shape))
     if isinstance(structure, OwnRows):
-        return structure.turned() if structure.transposed else structure.rows
+        return structure.inner[structure.transposed]
     if isinstance(structure, (Solution, Projector)):
         return OnBlocks(structure, shape)
     if isinstance(structure, Kronecker) and given and made:
@@ -166,34 +165,13 @@ def reads(entries, layout, parts):
     return places.reshape(-1), Exchange(layout, parts, entries.size, np.arange(entries.size), entries)
 
 
-class OwnRows(Structure):
+class OwnRows(Turning):
     """A square matrix of which each rank knows the rows that make its block, and no one the others.
 
-    Its transpose sends what its rows make to whom it belongs, where it is added.
-
-    Parameters
-    ----------
-    inner : Matrix
-        The rows; its columns are what `exchange` reads.
-    exchange : Exchange
-    stencil : Stencil
+    `inner`: Rows; Columns, which send what the rows make to whom it belongs, where it is added; and the Stencil.
     """
 
-    has_entries = False
-
-    def __init__(self, inner, exchange, stencil):
-        here, self.exchange, self.stencil = inner.shape[0], exchange, stencil
-        self.rows = Rows(inner, (here, here), exchange.forward)
-        self.shape, self.transposed = (stencil.space.size,) * 2, False
-
-    def transpose(self):
-        other = copy(self)
-        other.transposed = not self.transposed
-        return other
-
-    def turned(self):
-        """The transpose on blocks."""
-        return Columns(self.rows.inner.transpose(), self.rows.shape[::-1], self.exchange.backward)
+    stencil = property(lambda self: self.inner[2])
 
 
 class Columns(Structure):

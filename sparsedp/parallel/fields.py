@@ -7,6 +7,7 @@ whole shape is a field that every rank knows: beside a field on ranks, each take
 """
 
 from functools import partial, partialmethod
+from operator import attrgetter
 
 import autograd.numpy as anp
 import numpy as np
@@ -204,14 +205,10 @@ def _result_type(*values):
 
 
 FUNCTIONS = {
-    np.shape: lambda x: x.shape,
-    np.ndim: lambda x: x.ndim,
-    np.size: lambda x: x.size,
+    **{getattr(np, name): attrgetter(name) for name in ("shape", "ndim", "size", "real", "imag")},
     np.iscomplexobj: lambda x: x.dtype.kind == "c",
     np.isrealobj: lambda x: x.dtype.kind != "c",
     np.result_type: _result_type,
-    np.real: lambda x: x.real,
-    np.imag: lambda x: x.imag,
     np.max: _max_from,
     np.amax: _max_from,  # in new versions of NumPy the same, in old ones a function of its own
     np.count_nonzero: lambda x: int(x.layout.sum(np.count_nonzero(x.flat))),
@@ -223,7 +220,7 @@ FUNCTIONS = {
     np.clip: lambda x, low=None, high=None: _by_entry(np.clip, x, low, high),
     np.reshape: _shaped,
     np.repeat: _repeat,
-    np.copy: lambda x: x,
+    np.copy: DistributedField.copy,
     np.zeros_like: _filled(0),
     np.ones_like: _filled(1),
     np.full_like: lambda x, number: x.like(np.full(x.flat.shape, number, x.dtype)),

@@ -81,13 +81,8 @@ class Layout(Partition):
             raise TypeError(f"inverse takes real operators on ranks, {op.name} is complex; solve it on one process")
         return RanksSystem(op, rtol, maxiter)
 
-    def stencil(self, *given):
-        """What the rows of a Jacobian on each rank need: see stencil.py."""
-        return stencil_of(*given)
-
-    def transport(self, setting):
-        """The setting of a transport -> its step, called with (u, v, dt, inflow)."""
-        return Carry(setting)
+    stencil = staticmethod(stencil_of)  # what the rows of a Jacobian on each rank need
+    transport = staticmethod(Carry)  # the setting of a transport -> its step, called with (u, v, dt, inflow)
 
     def minimize(self, *given):
         """`minimize` of unknowns on ranks."""

@@ -13,7 +13,7 @@ from itertools import product as combinations
 import numpy as np
 
 from sparsedp.operator import Operator
-from sparsedp.parallel.cut import OwnRows, reads
+from sparsedp.parallel.cut import Columns, OwnRows, Rows, reads
 from sparsedp.parallel.fields import DistributedField
 from sparsedp.parallel.partition import lengths
 from sparsedp.solvers.sparsity import WIDEST, Coloured, entries_at, lattice, pattern_of, places, probes, steps_to
@@ -103,5 +103,7 @@ class Stencil(Coloured):
 
     def operator(self, act, name):
         """The matrix that acts as ``act(v)``, as an Operator."""
-        matrix = self.matrix(lambda v: act(DistributedField(v, self.space)).flat)
-        return Operator(OwnRows(Matrix(matrix), self.exchange, self), self.space, self.space, name, "matrix-free")
+        space, own = self.space, Matrix(self.matrix(lambda v: act(DistributedField(v, self.space)).flat))
+        shape, exchange = (self.seeds.size,) * 2, self.exchange
+        both = Rows(own, shape, exchange.forward), Columns(own.transpose(), shape, exchange.backward)
+        return Operator(OwnRows((*both, self), (space.size,) * 2), space, space, name, "matrix-free")

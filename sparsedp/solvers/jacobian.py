@@ -119,15 +119,15 @@ class Jacobians:
         self.sparsity: Any = None if sparsity is None else pattern_like(sparsity)
         self.ways: list = []  # whether rows are coloured, for VJPs, or columns, for JVPs: what the residual has
         self.way = ""
-        # size -> (Coloured, or None when only products will do; the cells that the unknowns were found to lie on)
+        # space -> (Coloured, or None when only products will do; the cells that the unknowns were found to lie on)
         self._patterns: dict = {}
         self._points, self._matrices = Cache(), Cache()
         self._alone = RLock()  # held by the thread that looks for a pattern
 
     def __str__(self):
         lines = [
-            f"  {size} unknowns" + ("" if coloured is None else f", {coloured.count} products")
-            for size, (coloured, _) in self._patterns.items()
+            f"  {space.size} unknowns" + ("" if coloured is None else f", {coloured.count} products")
+            for space, (coloured, _) in self._patterns.items()
         ]
         return "\n".join([*lines, str(self._points.last) if len(self._points) else "  not set up yet"])
 
@@ -201,7 +201,7 @@ class Jacobians:
         equation, x, leaves = known.point
         with self._alone:
             if equation.layout.ranks:
-                self._stencil(equation, x, leaves, known.solver.system.given.structure.stencil)
+                self._stencil(equation, [x], leaves, known.solver.system.given.structure.stencil)
             else:
                 self._enlarge(equation, x, leaves, row)
         return True
@@ -215,16 +215,15 @@ class Jacobians:
             self.way = "given"
             given = self.given(equation.layout.split(x), *equation.params(leaves))
             return self._as_operator(given, equation.layout, name), False
-        if equation.layout.ranks:
-            with self._alone:
-                stencil = self._stencil(equation, x, leaves)
-            return stencil.operator(self._product(equation, x, leaves, False), name), False
         with self._alone:
-            coloured, space = self._patterns.get(size) or self._coloured(equation, x, leaves)
+            coloured, space = self._patterns.get(equation.layout.space) or self._coloured(equation, x, leaves)
         if coloured is None:
             forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
             return from_functions(forward, backward, size, size, name), True
-        matrix = coloured.matrix(self._product(equation, x, leaves, coloured.by_rows))
+        product = self._product(equation, x, leaves, coloured.by_rows)
+        if equation.layout.ranks:
+            return coloured.operator(product, name), False
+        matrix = coloured.matrix(product)
         # A field of another shape may have as many unknowns.
         if space is None or equation.layout.shapes[0] != space.shape or not _is_symmetric(matrix, space):
             space = Space(size)
@@ -260,6 +259,8 @@ class Jacobians:
     def _coloured(self, equation, x, leaves):
         """The coloured pattern for this many unknowns (None: only products will do), and the cells that they lie on."""
         size, pattern = equation.size, self.sparsity
+        if equation.layout.ranks:
+            return self._stencil(equation, _points(equation, x, leaves), leaves)
         if not self.ways:
             has_jvp = _can(pushforward, lambda y: equation(y, *leaves), x, np.ones_like(x))
             has_vjp = _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
@@ -274,7 +275,7 @@ class Jacobians:
         else:
             points, self.way = _points(equation, x, leaves), "assembled on a pattern found by probing"
             if self._guessed(equation, points, leaves):
-                return self._patterns[size]
+                return self._patterns[equation.layout.space]
             pattern = self._probed(equation, points, leaves)
             if pattern is None and self.settings["method"] == "auto" and size > FULL_AT_MOST:
                 self.way = f"products only: {size} unknowns and a Jacobian that is not sparse"
@@ -282,24 +283,22 @@ class Jacobians:
                 pattern, self.way = dense_pattern(size, size), "assembled, all entries: it is not sparse"
         if pattern is not None:
             return self._colour(pattern, equation, x, leaves)
-        return self._patterns.setdefault(size, (None, None))
+        return self._patterns.setdefault(equation.layout.space, (None, None))
 
     def _colour(self, pattern, equation, x, leaves):
         cells, shapes = fields_met(equation, x, leaves)
         coloured = Coloured(pattern, shapes, None if len(self.ways) > 1 else self.ways[0])
-        known = self._patterns[equation.size] = coloured, cells
+        known = self._patterns[equation.layout.space] = coloured, cells
         return known
 
-    def _stencil(self, equation, x, leaves, lacking=None):
-        """What the ranks know of the pattern: found once, and where it is `lacking` with the entries at x."""
-        size, space, ranks = equation.size, equation.layout.space, equation.layout.ranks
-        known, self.way = self._patterns.get(size, (None, None))[0], f"the rows of each rank, {ranks}"
+    def _stencil(self, equation, points, leaves, lacking=None):
+        """What the ranks know of the pattern, from some points; of one that is `lacking` entries, with those."""
+        space, ranks = equation.layout.space, equation.layout.ranks
+        self.way = f"the rows of each rank, {ranks}"
         if self.sparsity is not None:
             raise TypeError(f"{self.name} takes no sparsity for fields on ranks; leave it away")
-        if lacking or known is None or known.space != space:
-            points = [x] if lacking else _points(equation, x, leaves)
-            known = ranks.stencil(self.name, space, self._products(equation, points, leaves, False), lacking)
-            self._patterns[size] = known, None
+        products = self._products(equation, points, leaves, False)
+        known = self._patterns[space] = ranks.stencil(self.name, space, products, lacking), None
         return known
 
     def _guessed(self, equation, points, leaves):
@@ -325,7 +324,7 @@ class Jacobians:
 
     def _enlarge(self, equation, x, leaves, row):
         """Add the entries that J has at x. When there are none, its products are not linear."""
-        coloured, found = self._patterns[equation.size][0], self._probed(equation, [x], leaves)
+        coloured, found = self._patterns[equation.layout.space][0], self._probed(equation, [x], leaves)
         total = pattern_like(coloured.pattern + (dense_pattern(x.size, x.size) if found is None else found))
         if total.nnz == coloured.pattern.nnz:
             raise DerivativeError(f"the derivative of {self.name} is not linear in its direction in row {row}")
