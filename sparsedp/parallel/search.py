@@ -54,18 +54,15 @@ class Spread(Trials):
     """The loss on what the ranks hold; its gradient comes with it, and is judged by all of them together."""
 
     def __init__(self, loss, blocks, packing, box):
-        super().__init__(self._value, self._slope, packing, box, Batches(None))
-        self.whole, self.blocks, self.slopes = value_and_grad(loss), blocks, None
+        super().__init__(loss, None, packing, box, Batches(None))
+        self.blocks = blocks
 
-    def _value(self, tree):
-        value, self.slopes = self.whole(self.blocks.tree(tree))
-        for name, g, x in zip(labels(self.blocks.start, "start"), leaves(self.slopes), leaves(self.blocks.start)):
+    def _both(self, vector):
+        value, slopes = value_and_grad(self._loss)(self.blocks.tree(self._packing.unpack(vector)))
+        for name, g, x in zip(labels(self.blocks.start, "start"), leaves(slopes), leaves(self.blocks.start)):
             if is_variable(x):
                 check_finite(f"the gradient of {name}", g, FINITE)
-        return value
-
-    def _slope(self, tree):
-        return self.blocks.of(self.slopes)
+        return float(value), self._packing.pack_gradient(self.blocks.of(slopes))
 
     def downhill(self, trial):
         """The gradient as fields, 0 where the bounds hold an unknown."""
