@@ -33,8 +33,8 @@ BUGS_ON_RANKS = {
         "tests/test_ranks.py::test_as_on_one_process[transport-2]",
     ),
     "on ranks, A for the transpose of A": (
-        "self.acts[transposed].product(x)",
-        "self.acts[False].product(x)",
+        "self.structure_of(self.op.T if transposed else self.op).product(x)",
+        "self.structure_of(self.op).product(x)",
         "tests/test_ranks.py::test_as_on_one_process[solves-2]",
     ),
     "on ranks, J for the transpose of J": (

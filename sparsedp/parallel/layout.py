@@ -57,10 +57,14 @@ class Layout(Partition):
             raise TypeError(f"{op.name} takes no out on ranks; leave it away")
         return self.agreement.agreed(op.name, self._applied, op, u)
 
-    def _applied(self, op, u):
+    def cut(self, op):
+        """What an operator does to the blocks of this rank, as a Structure; it is kept with the operator."""
         if "_cut" not in vars(op):
             vars(op)["_cut"] = localized(op.structure, _side(op.domain), _side(op.codomain))
-        y = vars(op)["_cut"].product(self._given(op, u))
+        return vars(op)["_cut"]
+
+    def _applied(self, op, u):
+        y = self.cut(op).product(self._given(op, u))
         return DistributedField(y, op.codomain) if op.codomain.layout else y.reshape(op.codomain.shape)
 
     def _given(self, op, u):

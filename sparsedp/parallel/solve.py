@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 from scipy.sparse.csgraph import connected_components
 
-from sparsedp.parallel.cut import Rows, localized
+from sparsedp.parallel.cut import Rows
 from sparsedp.parallel.fields import DistributedField
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.solve import Engine
@@ -116,22 +116,17 @@ class RanksSystem(System):
 
     # products
 
-    @cached_property
-    def acts(self):
-        """The operator and its transpose on blocks."""
-        return tuple(localized(op.structure, self.side, self.side) for op in (self.op, self.op.T))
-
-    @cached_property
-    def _magnitudes(self):
-        return tuple(act.magnitude() for act in self.acts)
+    def structure_of(self, op):
+        """What an operator does to blocks."""
+        return self.layout.cut(op)
 
     def product(self, x, transposed=False):
         """A x or A^T x for the unknowns."""
-        return self.masked(self.acts[transposed].product(x))
+        return self.masked(self.structure_of(self.op.T if transposed else self.op).product(x))
 
     def applied(self, x):
         """A x as it was given: not scaled, for all that is not an unknown too."""
-        return np.ldexp(self.acts[False].product(x), self.exponent)
+        return self.structure_of(self.given).product(x)
 
     def residual(self, x, b, transposed=False):
         """(b - A x, its norm; that of x)."""
@@ -141,7 +136,7 @@ class RanksSystem(System):
     @cached_property
     def assembled(self):
         """The operator as PETSc's matrix."""
-        return assembled(self.acts[False], self.layout)
+        return assembled(self.structure_of(self.op), self.layout)
 
     def vector(self, x):
         """A flat block as PETSc's vector, on the same memory."""
@@ -195,7 +190,7 @@ class RanksSystem(System):
             return self.assembled
         keep, size = Mask(self.active), self.largest(self.diagonal) * (self.sign or 1)
         rest = Diagonal(np.where(self.active, 0.0, size))
-        return assembled(Sum([Chain([keep, self.acts[False], keep]), rest]), self.layout)
+        return assembled(Sum([Chain([keep, self.structure_of(self.op), keep]), rest]), self.layout)
 
 
 class RanksNullSpace(NullSpace):

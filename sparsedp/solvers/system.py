@@ -57,7 +57,7 @@ class System:
             self.exponent = int(np.clip(exponent, -1000, 1000))
             self.op = op * 2.0**-self.exponent
             _check_underflow(op, self.op)
-            for name in ("_magnitudes", "sums", "norms", "faces", "acts"):
+            for name in ("_magnitudes", "sums", "norms", "faces"):
                 self.__dict__.pop(name, None)
 
     # ------------------------------------------------------------ products
@@ -70,6 +70,10 @@ class System:
         if self.active is not None:
             y[~self.active] = 0.0
         return y
+
+    def structure_of(self, op):
+        """The Structure of an operator on what this process holds."""
+        return op.structure
 
     def applied(self, x):
         """A x as it was given: not scaled, for all that is not an unknown too."""
@@ -132,8 +136,7 @@ class System:
 
     @cached_property
     def _magnitudes(self):
-        structure = self.op.structure
-        return structure.magnitude(), structure.transpose().magnitude()
+        return tuple(self.structure_of(op).magnitude() for op in (self.op, self.op.T))
 
     @cached_property
     def sums(self):
