@@ -51,7 +51,7 @@ REFUSED = [
     ),
     (
         TypeError,
-        "gradient takes no out on ranks; leave it away",
+        "gradient takes no out on ranks; leave it out",
         lambda s: s.G.apply(s.u, out=np.ones(s.grid.faces.size)),
     ),
     (ShapeError, "gradient takes a field on cells(5, 4), got one on cells(3, 2)", lambda s: s.G(s.other)),
@@ -115,13 +115,13 @@ REFUSED = [
     ),
     (
         TypeError,
-        "implicit(<lambda>) takes fields that all lie on the same ranks, or none; got float, too; write "
+        "implicit(<lambda>) takes fields that all lie on the same ranks, or none, got float among them; write "
         "dp.identity(grid.cells)(u) for the field of an array",
         lambda s: dp.implicit(lambda x: x)({"a": s.u, "b": 1.0}),
     ),
     (
         TypeError,
-        "implicit(<lambda>) takes no sparsity for fields on ranks; leave it away",
+        "implicit(<lambda>) takes no sparsity for fields on ranks; leave it out",
         lambda s: dp.implicit(lambda x: x**2 - 2.0, sparsity=np.eye(20))(s.u),
     ),
     (

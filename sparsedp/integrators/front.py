@@ -141,7 +141,9 @@ def stepper(
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
     takes about six times the steps of its value: three times as long as without the judgement. radau takes three
     Jacobians for the derivative of a step, those of many steps together, and one rule on the tape for an interval: a
-    gradient takes 1.5 to 3 times the time of its value, and 3 to 5 times where the rate is written for vectors.
+    gradient takes 1.5 to 3.2 times the time of its value, and 3 to 5 times where the rate is written for vectors.
+    Ranks: fields in blocks too (`distribute`), not by radau and etdrk4; nonlinear implicit steps within the limits of
+    `implicit`: no `sparsity`.
     Source: runge_kutta.py and radau.py name the papers.
 
     Examples

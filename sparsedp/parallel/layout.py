@@ -54,7 +54,7 @@ class Layout(Partition):
     def applied(self, op, u, out=None):
         """Operator, field on ranks or known to all -> the result, on ranks where its space is."""
         if out is not None:
-            raise TypeError(f"{op.name} takes no out on ranks; leave it away")
+            raise TypeError(f"{op.name} takes no out on ranks; leave it out")
         return self.agreement.agreed(op.name, self._applied, op, u)
 
     def cut(self, op):
@@ -137,8 +137,8 @@ class Layout(Partition):
         for field in fields:
             if not isinstance(field, DistributedField) or field.layout != self:
                 raise TypeError(
-                    f"{name} takes fields that all lie on the same ranks, or none; got {type(field).__name__}, too; "
-                    "write dp.identity(grid.cells)(u) for the field of an array"
+                    f"{name} takes fields that all lie on the same ranks, or none, got {type(field).__name__} among "
+                    "them; write dp.identity(grid.cells)(u) for the field of an array"
                 )
         return Joint([field.space for field in fields])
 

@@ -296,7 +296,7 @@ class Jacobians:
         space, ranks = equation.layout.space, equation.layout.ranks
         self.way = f"the rows of each rank, {ranks}"
         if self.sparsity is not None:
-            raise TypeError(f"{self.name} takes no sparsity for fields on ranks; leave it away")
+            raise TypeError(f"{self.name} takes no sparsity for fields on ranks; leave it out")
         products = self._products(equation, points, leaves, False)
         known = self._patterns[space] = ranks.stencil(self.name, space, products, lacking), None
         return known

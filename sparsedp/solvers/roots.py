@@ -97,6 +97,7 @@ def implicit(
     for each Newton step, or for several while they contract (more than 64 unknowns, steps of `stepper`); one for
     each adjoint solve. Products with J^T share one tape. The first call also searches the pattern. J is set up on
     the grid of the Operators in the residual where it is symmetric there; up to 64 unknowns by dense LU.
+    Ranks: fields in blocks too (`distribute`), where each number meets few, near ones; no pseudo-time, no `sparsity`.
 
     Examples
     --------
@@ -155,6 +156,7 @@ def steady(residual, guess, *params, **options):
     (`check.gradient`) see the tolerance: write rtol=1e-13.
     Cost: sparse LU of the Jacobian; from 10 000 unknowns on one for several steps: GMRES with the LU of a step before
     does for the next. For a gradient one LU more, kept for each further one.
+    Ranks: fields in blocks too (`distribute`), within the limits of `implicit`: no pseudo-time, no `sparsity`.
     Source: Kelley and Keyes, SIAM J. Numer. Anal. 35 (1998).
 
     Examples
