@@ -304,7 +304,7 @@ def test_auto_keeps_factors_of_many_complex_unknowns_in_single_precision(monkeyp
 
 
 def test_precision_is_one_of_three_words():
-    with pytest.raises(ValueError, match="precision must be 'auto', 'single' or 'double', got 'half'"):
+    with pytest.raises(ValueError, match="precision must be one of auto, single, double, got 'half'"):
         dp.inverse(dp.identity(dp.Grid(3).cells), "direct", precision="half")
 
 

@@ -217,12 +217,12 @@ SETTINGS = [
     Case(
         lambda: dp.inverse(OP, "krylov", diff="both"),
         ValueError,
-        match="diff must be 'implicit' or 'unrolled', got 'both'",
+        match="diff must be one of implicit, unrolled, got 'both'",
     ),
     Case(
         lambda: dp.inverse(OP, "krylov", iterations=0),
         ValueError,
-        match="iterations must be a whole number >= 1 or None, got 0",
+        match="iterations must be a whole number >= 1, got 0; None leaves it to the tolerance",
     ),
     Case(
         lambda: dp.inverse(OP, "krylov", preconditioner="ilu"),

@@ -16,6 +16,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from sparsedp.errors import ConvergenceError
+from sparsedp.fields import check_choice
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import in_range, largest, norm, shifted
 from sparsedp.solvers.solve import Engine, failure
@@ -81,8 +82,7 @@ def direct_engine(system, *, precision="auto"):
     ConvergenceError
         With status setup_failed, when the matrix cannot be inverted and its null space is not known.
     """
-    if precision not in ("auto", "single", "double"):
-        raise ValueError(f"precision must be 'auto', 'single' or 'double', got {precision!r}")
+    check_choice("precision", precision, ("auto", "single", "double"))
     single = precision == "single" or (precision == "auto" and system.complex and system.size >= SINGLE_FROM)
     matrix = system.regular_matrix
     if system.size <= DENSE_UP_TO:

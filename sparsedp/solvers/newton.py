@@ -38,7 +38,6 @@ from sparsedp.constants import constant
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import check_finite, check_plain, leaves_by_name
-from sparsedp.ledger import active as recordings
 from sparsedp.ledger import note
 from sparsedp.shortcuts import array, elsewhere, on_every_rank
 from sparsedp.solvers.direct import DENSE_UP_TO
@@ -46,7 +45,7 @@ from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import length
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
-from sparsedp.tree import flatten, leaves
+from sparsedp.tree import flatten, leaves, placed
 
 __all__ = ["Equation", "Layout", "Newton"]
 
@@ -201,10 +200,7 @@ class Equation:
 
     def params(self, values):
         """Floating leaves -> the tuple of parameters."""
-        found = list(self.statics)
-        for place, value in zip(self._places, values, strict=True):
-            found[place] = value
-        return self._rebuild(found)
+        return self._rebuild(placed(self.statics, self._places, values))
 
     def __call__(self, x, *values):
         """The flat residual; differentiable in x and the leaves."""
@@ -422,8 +418,7 @@ class Newton:
             return False
         before = self.x, self.F, self.size
         (self.x, self.F), self.evolves, pace = self.start, False, FIRST
-        if recordings:
-            note(self.equation.name, "method", "pseudo-time, as Newton steps stalled")
+        note(self.equation.name, "method", "pseudo-time, as Newton steps stalled")
         self.size = first = self._measure(self.F)
         while SHORTEST <= pace <= LONGEST and self.run.iterations < self.maxiter:
             self.run.iterations += 1

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from sparsedp.fields import is_whole
+from sparsedp.fields import check_choice, check_whole
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_matrix
 from sparsedp.solvers.amg import Hierarchy, Level, ruge_stueben
@@ -83,12 +83,11 @@ def krylov_engine(system, *, preconditioner=None, diff="implicit", iterations=No
     ValueError
         If an option is out of range, or an unrolled solve is asked of an operator that is not symmetric.
     """
-    if diff not in ("implicit", "unrolled"):
-        raise ValueError(f"diff must be 'implicit' or 'unrolled', got {diff!r}")
-    if iterations is not None and not is_whole(iterations, 1):
-        raise ValueError(f"iterations must be a whole number >= 1 or None, got {iterations!r}")
+    check_choice("diff", diff, ("implicit", "unrolled"))
+    if iterations is not None:
+        iterations = check_whole("iterations", iterations, 1, "; None leaves it to the tolerance")
     precondition, dtype, words = _preconditioner(system, preconditioner)
-    engine = Krylov(system, precondition, iterations=iterations and int(iterations), dtype=dtype)
+    engine = Krylov(system, precondition, iterations=iterations, dtype=dtype)
     engine.hierarchy, engine.hierarchical = engine.hierarchy + words, bool(words)
     if diff == "unrolled":
         if system.complex or system.weights is None or preconditioner is not None:
