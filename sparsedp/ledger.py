@@ -88,14 +88,15 @@ def recording():
 
 
 def count(name, kind, times=1):
-    """Add a call of `name`, or several, to every open block. The tape, a hot path, asks `active` first."""
-    for calls in thread.calls if times else ():
-        calls[name, kind] += times
+    """Add a call of `name`, or several, to every open block. While none is open it takes a function call."""
+    if active and times:
+        for calls in thread.calls:
+            calls[name, kind] += times
 
 
 def note(name, what, value):
     """Note a fact about `name`, such as the method that was chosen."""
-    for calls in thread.calls:
+    for calls in thread.calls if active else ():
         calls.notes.setdefault((name, what), Counter())[value] += 1
 
 

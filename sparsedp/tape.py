@@ -481,8 +481,7 @@ def _call_jvp(argnums, tangents, ans, args, kwargs):
         raise DerivativeError(f"{rule.name} has no JVP; give differentiable(...) a jvp")
     if any(map(isbox, (*tangents, *args))):  # inside a reverse-mode trace: its pullback runs later
         args = constant_args(args, argnums)
-    if active:
-        count(rule.name, "jvp")
+    count(rule.name, "jvp")
     tangent = rule.jvp(tuple(num - 1 for num in argnums), tangents, ans, *args[1:])
     # Several results come as a tuple, and the rule itself checks each.
     return tangent if isinstance(plain(ans), tuple) else fit(rule.name, ans, tangent, tangents[0])
@@ -573,8 +572,7 @@ def _operator_vjp(argnums, ans, args, kwargs):
 
 def _operator_jvp(argnums, tangents, ans, args, kwargs):
     op = args[0]
-    if active:
-        count(op.name, "jvp")
+    count(op.name, "jvp")
     tangent = tangents[0]
     return apply_operator(op.tangent, tangent) if isbox(tangent) else op.tangent.apply(tangent)
 
