@@ -60,7 +60,7 @@ class Reversed:
             future, task = self.tasks.pop()
             act, *args = pickle.loads(task)
             if self.forgets:
-                scenes._kept.clear()
+                scenes._cache.clear()
             try:
                 future.set_result(act(*args))
             except Exception as error:
@@ -157,7 +157,7 @@ def test_what_every_worker_has_is_not_sent_again():
     total = dp.ensemble(summed, large, executor)
     assert [total(2.0), total(2.0)] == [60_000.0] * 2
     assert min(executor.sizes[:3]) > 80_000 and max(executor.sizes[3:]) < 2_000
-    scenes._kept.clear()  # as in a worker that was started anew: it gets all that it lacks
+    scenes._cache.clear()  # as in a worker that was started anew: it gets all that it lacks
     assert total(2.0) == 60_000.0 and sum(size > 80_000 for size in executor.sizes[6:]) == 3
 
 

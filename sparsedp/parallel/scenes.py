@@ -21,7 +21,7 @@ from sparsedp.tree import copied, flatten, leaves, mapped, placed
 
 __all__ = ["Ensemble", "ensemble"]
 
-KEPT = 128  # scenes and losses that a worker keeps as they were unpacked, with all that they have set up since
+CACHED = 128  # scenes and losses that a worker keeps as they were unpacked, with all that they have set up since
 
 
 def ensemble(loss, scenes, executor=None, weights=None, chunk=None, progress=False):
@@ -205,8 +205,8 @@ class Ensemble(Remade):
 # ---- in a worker -----------------------------------------------------------------------------------------------------
 
 
-_kept: OrderedDict = OrderedDict()  # key -> what was pickled, read-only, with what it has set up since; last used last
-_alone = RLock()  # held by the thread of a worker that looks there
+_cache: OrderedDict = OrderedDict()  # key -> what was unpacked, read-only, with what it set up since; last used last
+_alone = RLock()  # a worker may have several threads
 
 
 def _of_parcels(keys, bodies, task, loss, point, scenes, count):
@@ -214,14 +214,14 @@ def _of_parcels(keys, bodies, task, loss, point, scenes, count):
     worker, found = f"{node()} {os.getpid()}", {}
     with _alone:
         for key in keys:
-            if key not in _kept:
+            if key not in _cache:
                 if key not in bodies:
                     return keys, worker, None
-                _kept[key] = mapped(frozen, pickle.loads(bodies[key]))
-            _kept.move_to_end(key)
-            found[key] = _kept[key]
-        while len(_kept) > KEPT:
-            _kept.popitem(last=False)
+                _cache[key] = mapped(frozen, pickle.loads(bodies[key]))
+            _cache.move_to_end(key)
+            found[key] = _cache[key]
+        while len(_cache) > CACHED:
+            _cache.popitem(last=False)
     return keys, worker, _sum(task, found[loss], point, [(n, weight, found[key]) for n, weight, key in scenes], count)
 
 
