@@ -39,8 +39,8 @@ __all__ = [
 ]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
-SPREAD = ": autograd's np.where does not add up what it spreads; multiply by the condition instead, a * c + b * (1 - c)"
 NO_JVP = (DerivativeError, NotImplementedError)
+SPREAD = ": autograd's np.where does not add up what it spreads; multiply by the condition instead, a * c + b * (1 - c)"
 
 LARGE = 1e100  # a cotangent that makes others overflow, through derivatives that do not
 SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
@@ -527,7 +527,7 @@ def value_and_grad(loss, argnum=0):
     (18.0, {'a': 12.0, 'n': None})
     """
     check_function("value_and_grad", loss, "lambda x: np.sum(x**2)")
-    argnum = check_whole("argnum of value_and_grad", argnum, 0, ", the number of an argument")
+    argnum = check_whole("argnum of value_and_grad", argnum, 0, "; write 0 for the first argument")
 
     def evaluate(*args):
         if len(args) <= argnum:

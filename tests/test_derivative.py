@@ -77,7 +77,7 @@ def test_messages():
     with pytest.raises(TypeError, match="takes a function, got ndarray"):
         dp.jvp(U, U, T)
     with pytest.raises(
-        ValueError, match="argnum of value_and_grad must be a whole number >= 0, got -1, the number of an argument"
+        ValueError, match="argnum of value_and_grad must be a whole number >= 0, got -1; write 0 for the first argument"
     ):
         dp.grad(energy, -1)
     with pytest.raises(TypeError, match="the gradient in argument 1 of the loss needs it, got 1 arguments"):

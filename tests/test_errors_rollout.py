@@ -117,9 +117,9 @@ def grad(loss):
 
 TABLE = [
     # what is given
-    (roll(n=-1), VALUE, "n of rollout must be a whole number >= 0, got -1, the number of steps"),
-    (roll(n=2.5), VALUE, "n of rollout must be a whole number >= 0, got 2.5, the number of steps"),
-    (roll(n=True), VALUE, "n of rollout must be a whole number >= 0, got True, the number of steps"),
+    (roll(n=-1), VALUE, "n of rollout must be a whole number >= 0, got -1; give the number of steps"),
+    (roll(n=2.5), VALUE, "n of rollout must be a whole number >= 0, got 2.5; give the number of steps"),
+    (roll(n=True), VALUE, "n of rollout must be a whole number >= 0, got True; give the number of steps"),
     (
         grad(traced_number),
         NONE,

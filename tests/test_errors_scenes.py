@@ -240,7 +240,7 @@ TABLE = [
     (
         lambda: dp.sponge(LINE, 2, 0),
         VALUE,
-        "speed of sponge must be > 0, got 0, that of the fastest waves",
+        "speed of sponge must be > 0, got 0; give that of the fastest waves",
     ),
     (
         lambda: dp.total_variation(LINE, 0.0),
@@ -250,7 +250,7 @@ TABLE = [
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, operator=Growing(), inner=stay),
         SHAPE,
-        "what the operator of admm gives must have shape (3,), got (6,), another one than at first",
+        "what the operator of admm gives must have shape (3,), got (6,); it must not change from call to call",
     ),
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=0.0),

@@ -189,7 +189,7 @@ def sponge(grid, cells, speed, echo=1e-3):
     array([0.   , 0.   , 0.   , 0.   , 0.216, 1.943])
     """
     check_grid("sponge", grid)
-    check_number("speed of sponge", speed, "> 0", ", that of the fastest waves")
+    check_number("speed of sponge", speed, "> 0", "; give that of the fastest waves")
     check_number("echo of sponge", echo, "between 0 and 1", "; the default is 1e-3")
     bounded = [name for name, periodic in zip(grid.axes, grid.periodic, strict=True) if not periodic]
     depths = cells if isinstance(cells, dict) else dict.fromkeys(bounded, cells)

@@ -91,7 +91,7 @@ def _rounds(minimized, x, K, z, weight, rho, prox):
     for number in count():
         x, spent = minimized(z - w, rho, x)
         image, pull = vjp(K, x)
-        check_shape("what the operator of admm gives", image, z.shape, ", another one than at first")
+        check_shape("what the operator of admm gives", image, z.shape, "; it must not change from call to call")
         before, z = z, prox(image + w, weight / rho)
         w = w + image - z
         primal = norm(image - z) / (max(norm(image), norm(z)) or 1.0)

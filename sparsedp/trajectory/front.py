@@ -158,7 +158,7 @@ def _check_reversible(step):
 def _number_of_steps(n):
     if isbox(n):
         raise DerivativeError("rollout needs n as a plain whole number, got a traced value; it has no derivative")
-    return check_whole("n of rollout", n, 0, ", the number of steps")
+    return check_whole("n of rollout", n, 0, "; give the number of steps")
 
 
 def _check_inputs(inputs, n):
