@@ -100,7 +100,7 @@ BUDGETS = {
     "flow": 11_070,  # conservation laws: 2 850; forces: 780; scalars, Courant limit, friction: 1 650; on ranks: 175
     # radau: 4 430; leapfrog and sponge: 1 250; a term for each field, batches of etdrk4: 850; c L u as one node: 350
     "integrators": 18_870,
-    "kernels": 14_340,
+    "kernels": 14_340,  # the gradient in velocities on cells in a loop of its own: 350
     "network": 2_310,
     "operators": 6_220,  # tensors: 800; flux: 300; coarse grids on ranks: 15
     "optimize": 13_180,  # resumed on other ranks: 180; admm: 500; total_variation, smoothness: 400

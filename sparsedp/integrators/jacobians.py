@@ -21,7 +21,7 @@ ENTRYWISE = {
     anp.add, anp.subtract, anp.multiply, anp.true_divide, anp.power, anp.negative, anp.abs, anp.sqrt, anp.square,
     anp.exp, anp.log, anp.sin, anp.cos, anp.tan, anp.sinh, anp.cosh, anp.tanh, anp.maximum, anp.minimum, anp.where,
 }  # fmt: skip
-PLACES = ITEM, ARRAY
+PLACES = ITEM, ARRAY  # their pullbacks hand on entries along the first axes: more axes at the end do not matter
 SELECTIONS = {ITEM, anp.reshape, anp.ravel, anp.roll, anp.repeat, anp.transpose}
 
 
@@ -47,11 +47,11 @@ def jacobians_of(fun, trees, moving):
     >>> rows.tolist()
     [[[5.0, 2.0], [1.0, 0.0]]]
     """
-    calls: dict = {}  # what `many` says of nodes whose own pullbacks do not take many cotangents
+    calls: dict = {}  # what `_batched` says of nodes whose own pullbacks do not take many cotangents
 
     def see(node, fun, *call):
         if not (node.vjp in by_entry or node.held and fun in PLACES):
-            calls[node] = many(node, fun, *call)
+            calls[node] = _batched(node, fun, *call)
 
     tapes, groups = [taped(fun, tree, moving, see) for tree in trees], []  # type: list, list
     for number, tape in enumerate(tapes):
@@ -140,7 +140,7 @@ def _beside(rows):
 # ---- calls that take many cotangents ---------------------------------------------------------------------------------
 
 
-def many(node, fun, value, args, options, nums):
+def _batched(node, fun, value, args, options, nums):
     """A call -> (what it has in common with calls it may go back with, what it holds, act), or None.
 
     ``act(g, rows)``: cotangents (*shape of the value, calls, many), what each call holds -> those of the arguments.

@@ -3,7 +3,8 @@
 Dense LU up to 64 unknowns, sparse LU (SuperLU) otherwise: on a 1-D chain of 1000 it solves in 20 us, LAPACK for bands
 in 30. A singular system
 is factored with one unknown of each component pinned. Rounding is left to the contract's refinement, that of factors
-in single precision too: they take half the memory, and each solve with them leaves a hundredth of the residual.
+in single precision too: they take half the memory, and a solve with them leaves a hundredth of the residual or less,
+next to an eigenvector more (see MOST_LEFT).
 A full matrix of up to 64 unknowns takes microseconds to factor; finding its components, signs and symmetries takes a
 thousand times longer. `DenseSystem` does without them; what needs them, a singular matrix say, is not for it.
 SciPy changes the pivots of LAPACK while a solve runs, and back: every solve gets pivots of its own, for another
