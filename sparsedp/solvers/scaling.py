@@ -24,13 +24,11 @@ SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve comput
 
 
 def _blocks(*arrays):
-    """The parts of flat arrays of the same size that belong together; small arrays are one part themselves."""
+    """Parts of flat arrays of one size that belong together; what is small, or lies on ranks, is one part itself."""
     size = arrays[0].size
-    return (
-        (arrays,)
-        if size <= BLOCK or type(arrays[0]) in ELSEWHERE
-        else ([x[i : i + BLOCK] for x in arrays] for i in range(0, size, BLOCK))
-    )
+    if size <= BLOCK or type(arrays[0]) in ELSEWHERE:
+        return (arrays,)
+    return ([x[i : i + BLOCK] for x in arrays] for i in range(0, size, BLOCK))
 
 
 def dot(x, y):
