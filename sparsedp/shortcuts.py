@@ -14,7 +14,7 @@ import numpy as np
 
 __all__ = [
     "ACTS", "ARRAY", "BOX", "COPY", "ELSEWHERE", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part",
-    "REAL", "alike", "array", "by_entry", "elsewhere", "formulas_of", "in_dtype", "on_every_rank", "ranks",
+    "REAL", "alike", "array", "by_entry", "elsewhere", "formulas_of", "in_dtype", "on_every_rank", "operand", "ranks",
     "refuse_elsewhere", "together", "whole",
 ]  # fmt: skip
 
@@ -151,9 +151,14 @@ def _entrywise(*acts):
 
     def back(nums, args):
         pull, hold = pulls[nums]
-        return pull, hold(args)
+        return pull, hold(args if len(nums) == len(args) else [*map(operand, args)])
 
-    return fits, back, lambda g, num, args, shape: acts[num][0](g, *args)
+    return fits, back, lambda g, num, args, shape: acts[num][0](g, *map(operand, args))
+
+
+def operand(x):
+    """An operand as NumPy takes it: one less than a list is no list, and it may hold traced values."""
+    return anp.array(x) if type(x) is list or type(x) is tuple else x
 
 
 def _is_basic(value, nums, args):

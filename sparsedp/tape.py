@@ -38,6 +38,7 @@ from sparsedp.shortcuts import (
     alike,
     formulas_of,
     in_dtype,
+    operand,
 )  # fmt: skip
 from sparsedp.tree import copied, leaves
 
@@ -114,7 +115,7 @@ class ReverseNode(VJPNode):
                 args = constant_args(args, nums)
             super().__init__(value, fun, args, constant(options), nums, parents)
             self.held = ()
-            if getattr(plain(value), "dtype", FLOAT).kind == "c":
+            if _kind(fun, value) == "c":
                 self._keep_real(args, nums)
         self.recorder.nodes.append(self)
         if self.recorder.bytes is not None:
@@ -157,7 +158,19 @@ class ForwardNode(JVPNode):
                 total = (g, False) if total is None and type(g) in NUMBERS else added(total, g)
             self.g = total[0]
         else:
+            _kind(fun, value)
             super().__init__(value, fun, args, options, nums, parents)
+
+
+def _kind(fun, value):
+    """The kind of dtype of a result. Traced values inside a list escape autograd: what they give is refused."""
+    kind = getattr(plain(value), "dtype", FLOAT).kind
+    if kind == "O":
+        raise DerivativeError(
+            f"{fun.__name__} got a list that holds traced values, and their derivatives would be lost; "
+            "write anp.array([...]) around it, with autograd.numpy as anp"
+        )
+    return kind
 
 
 untraced = notrace_primitives  # by kind of node, functions that leave the tape
@@ -284,20 +297,20 @@ def direct(function):
 
 def _of_two(function):
     """The same for two operands. One that is not PLAIN may act itself, as NumPy's operators ask: left to autograd."""
-    raw = function.fun
+    raw, kinds = function.fun, PLAIN if function is ITEM else PLAIN - {list, tuple}
     quick = ACTS.get(function, raw)
 
     @wraps(function)
     def call(x, y):
         left, right = type(x), type(y)
-        if left is BOX and right in PLAIN:
+        if left is BOX and right in kinds:
             a, b, trace, nums, parents = x._value, y, x._trace, (0,), (x._node,)  # type: Any, Any, Any, tuple, tuple
-        elif left in PLAIN:  # the other one is traced
+        elif left in kinds:  # the other one is traced
             a, b, trace, nums, parents = x, y._value, y._trace, (1,), (y._node,)
         elif left is right is BOX and x._trace == y._trace:
             a, b, trace, nums, parents = x._value, y._value, x._trace, (0, 1), (x._node, y._node)
         else:
-            return function(x, y)
+            return function(x, y) if function is ITEM else function(operand(x), operand(y))
         if type(a) is BOX or type(b) is BOX:
             return function(x, y)
         ans = quick(a, b) if type(a) in NUMBERS or type(b) in NUMBERS else raw(a, b)

@@ -33,6 +33,16 @@ def angle(x, count=1, **options):
     return dp.rollout(step, ({"a": x[0], "s": 0.0}, x[3]), {"g": x[1], "T": x[2]}, count)[0]["a"]
 
 
+def bends(pair):
+    """Both results of a call with two: their derivatives have two shapes."""
+    return anp.abs(pair[1][0]) + pair[0] * pair[1][1] ** 2
+
+
+split = dp.differentiable(
+    "split",
+    lambda u: (u[:1] * 2.0, u * u),
+    lambda nums, ans, u: lambda g: (2 * anp.concatenate([g[0], np.zeros(2)]) + 2 * u * g[1],),
+)
 X = np.array([1.0, 2.0, 1.5, 0.3])
 MATRIX, LINE = np.random.default_rng(1).standard_normal((3, 3)), dp.laplacian(dp.Grid(3), dp.dirichlet)
 
@@ -167,6 +177,9 @@ def test_every_mode(count, options, near):
         lambda u, p: anp.reshape(anp.reshape(u, (3, 1)) * anp.array([p[0], 1.0]) + MATRIX[:, :2], -1)[::2] - u[-1:],
         lambda u, p: LINE(u * p[0]) + dp.transport(LINE.domain.grid)(u, p[1] * np.ones(4), 0.01),
         lambda u, p: anp.sum(anp.outer(u, p), axis=1) + anp.real(anp.exp(1j * u)) + u ** p[0],
+        lambda u, p: anp.roll(u * [1.0, 2.0, 5.0], 1) * p[0] + anp.roll(u / (1.0, 2.0, 4.0), 2) ** [1.0, 2.0, 3.0],
+        lambda u, p: split(u)[0] * split(u)[1] + anp.roll(split(p[0] * u)[0], 1),
+        lambda u, p: bends(anp.linalg.eigh(p[0] * MATRIX @ MATRIX.T + anp.outer(u, u))),
     ],
 )
 def test_all_rows_at_once(rate):

@@ -11,6 +11,7 @@ from autograd.tracer import getval
 
 import sparsedp as dp
 from sparsedp.derivative import pushforward
+from sparsedp.errors import DerivativeError
 
 RNG = np.random.default_rng(3)
 X, Y = RNG.standard_normal((2, 3, 4))
@@ -50,6 +51,30 @@ def test_the_shortcuts_of_the_tape_have_the_bits_of_autograd(name):
     same, known = autograd.value_and_grad(loss)((X, Y))
     assert value == same and abs(value - loss((X, Y))) <= 1e-15 * X.size  # x**2 is not power(x, 2) in NumPy 1.26
     assert all(np.array_equal(a, b) for a, b in zip(g, known, strict=True))
+
+
+def test_a_list_of_exponents():
+    """autograd takes one from the list itself, which Python refuses."""
+    exponents = [1.0, 2.0, 0.0, -1.0]
+    found = [dp.hvp(lambda x, e=e: anp.sum(x**e * Y), X, Y) for e in (exponents, np.array(exponents))]
+    assert np.array_equal(*found) and np.array_equal(
+        dp.grad(lambda x: anp.sum(x ** (1, 2, 0, 3)))(X)[:, 1], 2 * X[:, 1]
+    )
+
+
+def test_lists_that_hold_traced_values():
+    """Beside an operator they are arrays; autograd's functions do not see what is inside, and lost its derivative."""
+    made = lambda x: x * [x[0], 1.0] + (x[1], 2.0) - [x[0] * x[1], 0.0] / x
+    known = lambda x: x * anp.array([x[0], 1.0]) + anp.array([x[1], 2.0]) - anp.array([x[0] * x[1], 0.0]) / x
+    x, g = np.array([2.0, 3.0]), np.array([1.0, 5.0])
+    assert np.array_equal(dp.vjp(made, x)[1](g), dp.vjp(known, x)[1](g))
+    assert np.array_equal(dp.jvp(made, x, g)[1], dp.jvp(known, x, g)[1])
+    for fun in (anp.add, anp.maximum, lambda x, y: anp.where(x > 2, x, y)):
+        for lost in (lambda x, f=fun: f(x, [x[0], 1.0]), lambda x, f=fun: anp.sum(f(x, [x[0], 1.0]))):
+            with pytest.raises(DerivativeError, match="got a list that holds traced values, .*write anp.array"):
+                dp.vjp(lost, x)
+            with pytest.raises(DerivativeError, match="got a list that holds traced values"):
+                dp.jvp(lost, x, g)
 
 
 @pytest.mark.parametrize("name", FORMULAS)

@@ -67,7 +67,7 @@ def jacobians_of(fun, trees, moving):
         found = _rows([tapes[number] for number in group], values.shape[1], calls)
         for g, size, stop in zip(found, sizes, np.cumsum(sizes), strict=True):
             if g is not None:
-                rows[group, :, stop - size : stop] = np.moveaxis(g.reshape(size, len(group), -1), 0, -1)
+                rows[group, :, stop - size : stop] = np.moveaxis(g.reshape(size, len(group), values.shape[1]), 0, -1)
     return values, rows
 
 
@@ -117,12 +117,24 @@ def _rows(tapes, size, calls):
         elif calls[node]:
             backs = calls[node][2](g, [calls[node][1] for node in nodes])
         else:  # of one tape, one cotangent after the other
-            ones = np.ascontiguousarray(np.moveaxis(g[..., 0, :], -1, 0))
+            ones = g if type(g) is Several else np.ascontiguousarray(np.moveaxis(g[..., 0, :], -1, 0))
             columns = zip(*(node.vjp(one, *node.held) for one in ones), strict=True)
-            backs = [np.stack([added(None, back)[0] for back in column], -1)[..., None, :] for column in columns]
+            backs = [_joined([added(None, back)[0] for back in column]) for column in columns]
         for parent, back in zip(node.parents, backs, strict=True):
             add(parent, back)
     return [sums.get(root, (None,))[0] for root in first.roots if root is not None]
+
+
+class Several(list):
+    """Cotangents of a call with several results: they have no common shape, and stand one after the other."""
+
+    def __add__(self, other):
+        return Several(added((one, False), two)[0] for one, two in zip(self, other, strict=True))
+
+
+def _joined(column):
+    """Cotangents of one tape, side by side."""
+    return Several(column) if isinstance(column[0], (tuple, list)) else np.stack(column, -1)[..., None, :]
 
 
 def _beside(rows):
@@ -146,9 +158,9 @@ def _batched(node, fun, value, args, options, nums):
     ``act(g, rows)``: cotangents (*shape of the value, calls, many), what each call holds -> those of the arguments.
     """
     traced = [args[num] for num in nums]
-    shapes = [np.shape(x) for x in traced]
     if any(type(x) not in REAL or dtype_of(x) is not FLOAT for x in (value, *traced)):
         return None
+    shapes = [np.shape(x) for x in traced]
     if fun in SELECTIONS:
         return _selection(fun, args, options, nums, *shapes)
     if options:
