@@ -5,10 +5,12 @@ import re
 import autograd.numpy as anp
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from test_elliptic import dense, stretched
 
 import sparsedp as dp
 from sparsedp.derivative import pullback, pushforward, value_and_grad
+from sparsedp.errors import ConvergenceError
 from sparsedp.ledger import recording
 from sparsedp.solvers import direct
 from sparsedp.solvers.choose_method import COMPLEX_UP_TO
@@ -301,6 +303,30 @@ def test_auto_keeps_factors_of_many_complex_unknowns_in_single_precision(monkeyp
         solve, shift, b = waves(n, "auto")
         solve(1.0, b, shift)
         assert list(entries(solve)) == [words]
+
+
+def test_single_precision_takes_as_many_rounds_as_an_eigenvalue_close_by_needs():
+    """Each leaves a third of the residual; and where rows of far different size leave it all, it says what to write."""
+    n = np.arange(108.0)
+    chain = sp.diags_array([np.ones(107), np.full(108, -2.0), np.ones(107)], offsets=[-1, 0, 1])
+    near = dp.from_matrix(sp.csr_array(chain + (2 - 2 * np.cos(np.pi * 2 / 109) + 3e-7) * sp.eye_array(108)))
+    inv = dp.inverse(near, "direct", precision="single")
+    assert "LU in single precision" in inv.info.hierarchy
+    x = np.sin(2 * np.pi * (n + 1) / 109)
+    for solve in (inv, inv.T):
+        assert np.linalg.norm(near(solve(x)) - x) <= 1e-8 * np.linalg.norm(x)  # what rounding leaves
+    uneven = dp.from_matrix(sp.csr_array(sp.diags_array(10.0 ** (4 * np.sin(3 * n))) @ chain))
+    with pytest.raises(ConvergenceError, match=r"\(stagnated\); write precision='double'"):
+        dp.inverse(uneven, "direct", precision="single")(np.cos(n))
+    dp.inverse(uneven, "direct", precision="double")(np.cos(n))
+
+
+def test_single_precision_lifts_faint_regions_of_complex_operators():
+    block = sp.diags_array([np.ones(39), np.full(40, 3.0 + 1j), np.ones(39)], offsets=[-1, 0, 1])
+    op = dp.from_matrix(sp.csr_array(sp.block_diag([block, block])))
+    b = np.cos(np.arange(80.0)) * np.repeat([1.0, 1e-30], 40) * (1 + 2j)
+    x = dp.inverse(op, "direct", precision="single")(b)
+    close(x[40:], np.linalg.solve(block.toarray(), b[40:]), 1e-9)
 
 
 def test_precision_is_one_of_three_words():

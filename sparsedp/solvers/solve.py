@@ -55,7 +55,6 @@ __all__ = ["STATUS_WORDS", "Engine", "Run", "SolveInfo", "SolveLog", "Solver", "
 COMPATIBLE = 1e-6  # largest relative defect of primal data that is taken for rounding
 FAR_OFF = 0.1  # a residual beyond this share of the data is no solution, whatever the size of x
 ADVICE = {"indefinite_operator": "; write method='direct'"}
-ROUNDS = 8  # refinements; each must halve the residual
 
 
 class Engine:
@@ -67,6 +66,8 @@ class Engine:
     iterative = False
     hierarchical = False
     refines = True
+    rounds = 8  # refinements at most; each must halve the residual
+    advice = ""  # for solves that do not meet the tolerance
     unrolled = False
     last: Any = None
 
@@ -227,11 +228,12 @@ class Solver(Remade):
         lift = self.system.lift(b, size) if self.engine.iterative else None
         if lift is None:
             return self._refined(b, size, run, start)
-        # A tolerance relative to the whole would leave no digits to a region whose data are faint.
+        # A tolerance relative to the whole would leave no digits to a region whose data are faint; the whole is judged
+        # by its own size, which is less than that of many regions lifted to it.
         run.exponent = run.exponent - lift
         b, start = (None if x is None else shifted(x, lift) for x in (b, start))
         b = space.project(b, run.transposed, into=b)
-        return shifted(self._refined(b, self.system.size_of(b), run, start), -lift)
+        return shifted(self._refined(b, size, run, start), -lift)
 
     def _on_unknowns(self, b, raw, run, refuses):
         outside = np.where(self.system.active, 0.0, b)
@@ -272,7 +274,7 @@ class Solver(Remade):
             if system.null_space.count:
                 r, residual = system.null_space.projected(r, transposed)
             word = self._word(run, residual, goal, length, data)
-        for _ in range(ROUNDS if not word else 0):
+        for _ in range(self.engine.rounds if not word else 0):
             # A correction need not go below what rounding leaves of the whole; an engine sees the correction alone.
             floor = 0.0 if x is None else system.rounding(x, data, transposed)
             step, used, trouble = self._correction(r, max(goal, floor), transposed)
@@ -296,7 +298,7 @@ class Solver(Remade):
         run.measure(residual, data, system.norm(transposed) * length)
         if word or not self.engine.refines:
             return x
-        self._refuse(run, x, why=f" ({run.status}){ADVICE.get(run.status, '')}")
+        self._refuse(run, x, why=f" ({run.status}){ADVICE.get(run.status, self.engine.advice)}")
 
     def _refuse(self, run, x, how="", why=""):
         """Raise: x does not meet the tolerance."""
