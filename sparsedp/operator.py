@@ -218,8 +218,8 @@ class Operator(Frozen, Remade):
             raise TypeError(f"{self.name} * {factor.name} is not defined; write A @ B to compose operators")
         if not _is_scalar(factor):
             return NotImplemented
-        number = complex(factor)
-        check_finite(f"a factor of {self.name}", factor)
+        number = complex(factor)  # NumPy takes no whole number beyond 64 bits
+        check_finite(f"a factor of {self.name}", number if np.iscomplexobj(factor) else number.real)
         label = "-" if number == -1 else f"{factor:g} * "
         structure = times(self.structure, number if np.iscomplexobj(factor) else number.real)
         return Operator(structure, self.domain, self.codomain, f"{label}{_bracket(self.name)}")

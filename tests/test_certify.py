@@ -193,6 +193,7 @@ def test_direct_solves_and_refusals():
         match=r"fraction of certified must be between 0 and 1, got 2; write for example certified\(0.1\)",
     ):
         dp.certified(2, 0)
+    assert dp.minimize(control("direct"), 0 * X, tolerance=dp.certified(0.1, np.inf)).converged
     with pytest.raises(
         ValueError, match="certified sees the solves of the loss, not of a gradient that is given; leave it out"
     ):

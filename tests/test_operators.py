@@ -232,3 +232,9 @@ def test_products_and_sums_stay_factor_defined(builder):
     assert dp.laplacian(grid, dp.dirichlet).T.separable
     turned = builder(grid).T.T
     np.testing.assert_array_equal(turned(np.ones(grid.shape)), builder(grid)(np.ones(grid.shape)))
+
+
+def test_whole_numbers_of_any_size_scale_an_operator():
+    """NumPy holds none beyond 64 bits."""
+    op, u = dp.laplacian(dp.Grid(3)), np.array([1.0, 2.0, 4.0])
+    assert np.array_equal((2**70 * op)(u), 2.0**70 * op(u))

@@ -21,7 +21,7 @@ import numpy as np
 from sparsedp.check.summary import Result
 from sparsedp.check.table import table_of
 from sparsedp.derivative import value_and_grad
-from sparsedp.fields import check_number
+from sparsedp.fields import check_number, is_number
 from sparsedp.ledger import recording, thread
 from sparsedp.report.plan import total
 from sparsedp.tree import leaves, norm
@@ -316,7 +316,9 @@ def certified(fraction=0.1, tolerance=1e-8):
     (True, True)
     """
     fraction = check_number("fraction of certified", fraction, "between 0 and 1", "; write for example certified(0.1)")
-    return Certified(fraction, check_number("tolerance of certified", tolerance, ">= 0", "; the default is 1e-8"))
+    if not (is_number(tolerance) and tolerance == np.inf):  # as minimize: any gradient will do
+        check_number("tolerance of certified", tolerance, ">= 0", "; the default is 1e-8")
+    return Certified(fraction, float(tolerance))
 
 
 class Certified:
