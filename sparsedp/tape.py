@@ -22,24 +22,14 @@ from sparsedp.constants import constant, constant_args, frozen, sparing
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, note, thread, timed
 from sparsedp.recipe import Remade
+
+# isort: off
 from sparsedp.shortcuts import (
-    ACTS,
-    ARRAY,
-    BOX,
-    COPY,
-    FLOAT,
-    ITEM,
-    MAKERS,
-    NUMBERS,
-    OPERATORS,
-    PLAIN,
-    REAL,
-    Part,
-    alike,
-    formulas_of,
-    in_dtype,
+    ACTS, ARRAY, BOX, COPY, FLOAT, ITEM, MAKERS, NUMBERS, OPERATORS, PLAIN, REAL, Part, alike, formulas_of, in_dtype,
     operand,
 )  # fmt: skip
+
+# isort: on
 from sparsedp.tree import copied, leaves
 
 __all__ = [
