@@ -1,6 +1,7 @@
 """Fields on ranks: what a user is told in one process, and, where PETSc is installed, the scripts of tests/ranks/."""
 
 import sys
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import sparsedp as dp
 
 PARTS = 6  # of the table of transport
 pytestmark = pytest.mark.xdist_group("ranks")  # several processes at a time are enough
+run = cache(printed)  # what one test has run, another one need not run again
 FUNCTIONS = "cannot be cut for ranks, for no rank knows its rows; make it of operators of the grid or of a matrix"
 
 
@@ -27,7 +29,7 @@ def test_one_process_keeps_its_grid_and_imports_nothing(monkeypatch):
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("what", ["fields", "solves", "flow", "steps", "transport", "explain", "ensemble", "newton"])
 def test_as_on_one_process(what, count):
-    assert printed(f"{what}_on_ranks.py", count).endswith("all agree\n")
+    assert run(f"{what}_on_ranks.py", count).endswith("all agree\n")
 
 
 @on_ranks
@@ -40,7 +42,7 @@ def test_every_transport(part):
 @on_ranks
 @pytest.mark.whole
 def test_products_with_jacobians_have_the_same_bits():
-    assert len({printed("newton_on_ranks.py", count).splitlines()[0] for count in (1, 2, 3, 4)}) == 1
+    assert len({run("newton_on_ranks.py", count).splitlines()[0] for count in (1, 2, 3, 4)}) == 1
 
 
 @on_ranks
