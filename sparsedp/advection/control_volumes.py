@@ -42,7 +42,8 @@ class Component(NamedTuple):
 
     def run(self, loop, *args):
         """A loop over the tiles."""
-        loop.run(self.tiles, self.field.stop - self.field.start, kernels.threads(), *args)
+        work = (self.field.stop - self.field.start) * len(self.axes)  # each axis is a pass: 512^2 pays for two threads
+        loop.run(self.tiles, work, kernels.threads(), *args)
 
     def sides(self, a):
         """Axis -> Sides."""

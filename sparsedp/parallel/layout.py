@@ -7,6 +7,7 @@ import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import field_array
+from sparsedp.grid import node_axes
 from sparsedp.parallel.cut import localized
 from sparsedp.parallel.exchange import hold
 from sparsedp.parallel.fields import DistributedField, block, everywhere
@@ -171,7 +172,9 @@ class Joint(Space):
 
     @cached_property
     def volumes(self):
-        """Control volume of each value."""
+        """Control volume of each value; ones where those of a field are not known, as on one process."""
+        if any(node_axes(space.kind, 0, space.grid.dim) is None for space in self.spaces):
+            return DistributedField(np.ones(self.layout.size(self.parts)), self)
         return self.layout.join(self, [space.volumes for space in self.spaces])
 
 

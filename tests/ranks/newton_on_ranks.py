@@ -138,7 +138,9 @@ def entries_that_come_late():
         loss = lambda k: anp.sum(solve(field(grid.cells, np.ones(grid.shape)), k) ** 2)
         cube = dp.implicit(lambda x, k: x**3 - k)
         both = [cube(field(space, np.ones(space.shape)), 2.0) for space in (grid.cells, A.codomain)]
-        return *dp.value_and_grad(loss)(6.0), *both
+        others = *grid.centres()[:1], *grid.face_centres(0)[:1], grid.split(both[1])[0]
+        places = [cube(1.0 + abs(x), 2.0) for x in others]
+        return *dp.value_and_grad(loss)(6.0), *both, *places
 
     on_both("late entries", PLAIN, look, fields=(lying,))
 
