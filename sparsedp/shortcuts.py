@@ -21,7 +21,6 @@ __all__ = [
 FLOAT = np.dtype(float)
 REAL = {np.ndarray, np.float64, float, int}
 NUMBERS = {np.ndarray, np.float64}  # that have a shape and a dtype
-SINGLE = {np.float64, float, int, type(None)}
 PLAIN = {*REAL, slice, tuple, list, bool, type(None), type(Ellipsis)}  # operands that leave all to the traced one
 BASIC = {int, slice, type(None), type(Ellipsis)}  # indices that meet no entry twice
 OPERATORS = {

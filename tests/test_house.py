@@ -95,8 +95,8 @@ BUDGETS = {
     # second edition 174 700; scenes of 15: 19 500; ranks and ensembles: 20 200; bridges, files: 4 300
     # Newton on ranks: 3 300; what workers of ensembles have: 420
     # lists as operands, and those that hold traced values: 155
-    "": 225_380,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
-    "advection": 13_810,
+    "": 225_360,  # scenes: said room by room; a NaN names its call: 300; Jacobians in one pass back through a tape: 460
+    "advection": 13_800,
     "check": 14_880,  # fields on ranks on a tape: 10; results as HTML for notebooks: 170; tables of all results: 500
     "flow": 11_070,  # conservation laws: 2 850; forces: 780; scalars, Courant limit, friction: 1 650; on ranks: 175
     # radau: 4 430; leapfrog and sponge: 1 250; a term for each field, batches of etdrk4: 850; c L u as one node: 350

@@ -27,13 +27,12 @@ from sparsedp.advection.law import FIELD, INFLOW, VELOCITY, Law
 from sparsedp.advection.loops import Loops, able
 from sparsedp.advection.reference import Reference
 from sparsedp.advection.stability import check_numbers, check_weights
+from sparsedp.advection.values import NOTHING
 from sparsedp.fields import check_finite
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.tape import isbox
 
 __all__ = ["Eulerian"]
-
-NOTHING = np.zeros(0)
 
 
 class Eulerian(Law):

@@ -8,7 +8,17 @@ from sparsedp.errors import ShapeError
 from sparsedp.fields import check_number, check_plain
 from sparsedp.tape import cast, dtype_of, isbox, plain
 
-__all__ = ["LETTERS", "check_given", "check_step", "flat_numbers", "prepare", "raised", "result_like", "unflatten"]
+__all__ = [
+    "LETTERS",
+    "NOTHING",
+    "check_given",
+    "check_step",
+    "flat_numbers",
+    "prepare",
+    "raised",
+    "result_like",
+    "unflatten",
+]
 
 FLOAT, NOTHING = np.dtype(float), np.zeros(0)
 LETTERS = "u", "v", "dt", "inflow"
