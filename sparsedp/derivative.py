@@ -17,6 +17,7 @@ from sparsedp.recipe import Made
 from sparsedp.shortcuts import ELSEWHERE, alike, together
 from sparsedp.tape import (
     Recorder,
+    Rule,
     backward,
     boxed,
     called,
@@ -33,7 +34,7 @@ from sparsedp.tape import (
 from sparsedp.tree import copied, flatten, keys, leaves, mapped
 
 __all__ = [
-    "NO_JVP", "check_loss", "described", "grad", "gradient_of", "growing", "hvp", "judged", "jvp",
+    "NO_JVP", "check_loss", "described", "entrywise", "grad", "gradient_of", "growing", "hvp", "judged", "jvp",
     "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "taped", "traced", "value_and_grad",
     "vjp", "witnessed", "zero_like",
 ]  # fmt: skip
@@ -558,3 +559,17 @@ def of_argument(cotangent, value):
     while np.ndim(cotangent) > np.ndim(value):
         cotangent = anp.sum(cotangent, axis=0)
     return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent
+
+
+def entrywise(name, value, slopes):
+    """Name, ``value(a, b)`` entry by entry, ``slopes(a, b)``: its derivatives in both, on the tape too -> a rule."""
+
+    def vjp(nums, ans, a, b):
+        pair = slopes(a, b)
+        return lambda g: tuple(g * pair[num] for num in nums)
+
+    def jvp(nums, tangents, ans, a, b):
+        pair = slopes(a, b)
+        return sum(pair[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
+
+    return Rule(name, value, vjp, jvp)

@@ -175,7 +175,7 @@ def check_choice(name, word, choices, advice=""):
     """Refuse what is none of some words; where these are True and False, 1 is none of them."""
     if not any(isinstance(word, type(one)) and word == one for one in choices):
         words = ", ".join(str(one) for one in choices if one is not None)
-        raise ValueError(f"{name} must be one of {words}, got {word!r}{advice}")
+        raise ValueError(f"{name} must be {'one of ' if ', ' in words else ''}{words}, got {word!r}{advice}")
 
 
 def check_takes(name, fun, count, example):

@@ -34,7 +34,7 @@ from sparsedp.tree import copied, leaves
 
 __all__ = [
     "Recorder", "ReverseNode", "Rule", "VSpace", "added", "apply_operator", "autograd_rules", "backward", "boxed",
-    "called", "cast", "differentiable", "dtype_of", "entrywise", "fit", "forward_root", "innermost", "is_variable",
+    "called", "cast", "differentiable", "dtype_of", "fit", "forward_root", "innermost", "is_variable",
     "isbox", "linear", "new_trace", "plain", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
 ]  # fmt: skip
 
@@ -105,7 +105,7 @@ class ReverseNode(VJPNode):
                 args = constant_args(args, nums)
             super().__init__(value, fun, args, constant(options), nums, parents)
             self.held = ()
-            if _kind(fun, value) == "c":
+            if _kind(fun, value, args, nums) == "c":
                 self._keep_real(args, nums)
         self.recorder.nodes.append(self)
         if self.recorder.bytes is not None:
@@ -148,14 +148,19 @@ class ForwardNode(JVPNode):
                 total = (g, False) if total is None and type(g) in NUMBERS else added(total, g)
             self.g = total[0]
         else:
-            _kind(fun, value)
+            _kind(fun, value, args, nums)
             super().__init__(value, fun, args, options, nums, parents)
 
 
-def _kind(fun, value):
-    """The kind of dtype of a result. Traced values inside a list escape autograd: what they give is refused."""
+def _kind(fun, value, args, nums):
+    """The kind of dtype of a result. Traced values inside a list escape autograd: what they give is refused.
+
+    They give an array of objects, or as in a product of two vectors one traced value.
+    """
     kind = getattr(plain(value), "dtype", FLOAT).kind
-    if kind == "O":
+    beside = [arg for num, arg in enumerate(args) if num not in nums and type(arg) in (list, tuple)]
+    lost = beside and isbox(value) and any(map(isbox, leaves(beside)))
+    if kind == "O" or lost:
         raise DerivativeError(
             f"{fun.__name__} got a list that holds traced values, and their derivatives would be lost; "
             "write anp.array([...]) around it, with autograd.numpy as anp"
@@ -538,20 +543,6 @@ def linear(name, forward, transpose):
         rule.vjp = lambda nums, ans, x, act=transposed: lambda g: (act(g),)
         rule.jvp = lambda nums, tangents, ans, x, act=rule: act(tangents[0])
     return there, back
-
-
-def entrywise(name, value, slopes):
-    """Name, ``value(a, b)`` entry by entry, ``slopes(a, b)``: its derivatives in both, on the tape too -> a rule."""
-
-    def vjp(nums, ans, a, b):
-        pair = slopes(a, b)
-        return lambda g: tuple(g * pair[num] for num in nums)
-
-    def jvp(nums, tangents, ans, a, b):
-        pair = slopes(a, b)
-        return sum(pair[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
-
-    return Rule(name, value, vjp, jvp)
 
 
 def _apply(op, u):

@@ -98,6 +98,23 @@ def test_sum_of_axes_is_the_sparse_matrix(side):
         assert close(many, expected) and many.tobytes() == one.tobytes(), (shape, axes)
 
 
+@NUMBA
+def test_even_rows_have_the_bits_of_any_rows():
+    """The same three numbers in every row, read once or read in each."""
+    rng = np.random.default_rng(4)
+    for shape in ((1, 1, 1), (1, 1, 2), (1, 5, 3), (1, 7, 40), (4, 1, 37), (3, 5, 40), (2, 3, 1)):
+        axes = tuple(line(rng, n, n > 1, n > 1) for n in shape)
+        for axis in axes:
+            for diagonal in axis:
+                diagonal[:] = np.where(diagonal, diagonal[len(diagonal) // 2], 0.0)
+        u, found = rng.standard_normal(shape), []
+        for uniform in (True, False):
+            out, bands = np.full_like(u, np.nan), [np.stack(axis) for axis in axes]
+            assert kernels.run("stencil", "kronecker_sum", shape[0] * shape[1], u.size, 1, u, out, *bands, uniform, 0.3)
+            found.append(out)
+        assert np.array_equal(*found) and np.array_equal(found[0], added(u, axes, 0.3))
+
+
 def test_a_missing_neighbour_is_not_read_from_the_far_end(side):
     rng = np.random.default_rng(3)
     shape = (6, 7, 40)

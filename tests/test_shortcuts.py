@@ -70,7 +70,8 @@ def test_lists_that_hold_traced_values():
     x, g = np.array([2.0, 3.0]), np.array([1.0, 5.0])
     assert np.array_equal(dp.vjp(made, x)[1](g), dp.vjp(known, x)[1](g))
     assert np.array_equal(dp.jvp(made, x, g)[1], dp.jvp(known, x, g)[1])
-    for fun in (anp.add, anp.maximum, lambda x, y: anp.where(x > 2, x, y)):
+    products = anp.inner, anp.matmul, lambda x, y: anp.einsum("i,i->", x, y), lambda x, y: anp.tensordot(x, y, 1)
+    for fun in (anp.add, anp.maximum, lambda x, y: anp.where(x > 2, x, y), *products):
         for lost in (lambda x, f=fun: f(x, [x[0], 1.0]), lambda x, f=fun: anp.sum(f(x, [x[0], 1.0]))):
             with pytest.raises(DerivativeError, match="got a list that holds traced values"):
                 dp.vjp(lost, x)

@@ -28,6 +28,7 @@ import numpy as np
 from sparsedp.boundary_conditions import free_slip, outflow, resolve
 from sparsedp.boundary_conditions import inflow as inflow_side
 from sparsedp.constants import constant, frozen
+from sparsedp.derivative import entrywise
 from sparsedp.errors import ShapeError
 from sparsedp.fields import (
     check_choice,
@@ -42,7 +43,7 @@ from sparsedp.fields import (
 from sparsedp.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.recipe import Remade
-from sparsedp.tape import cast, dtype_of, entrywise, isbox, plain
+from sparsedp.tape import cast, dtype_of, isbox, plain
 from sparsedp.tree import mapped
 
 __all__ = ["ConservationLaw", "conservation_law"]

@@ -32,9 +32,19 @@ def kronecker_sum(u, out, far, middle, along, uniform, shift, start, stop):
         after1 = cells[row + (k + 1) % n1 - k if b != 0.0 else row]
         before0 = cells[(row - n1) % rows if c != 0.0 else row]
         after0 = cells[(row + n1) % rows if d != 0.0 else row]
-        for j in range(1, last):  # the compiler makes four loops of it: in 2-D there is nothing to read along axis 0
-            p = 1 if uniform else j  # three numbers in place of three rows that would fill the cache
-            total = (weight + centre[p]) * here[j] + (lower[p] * here[j - 1] + upper[p] * here[j + 1])
+        # Of even cells three numbers stand for three rows that would fill the cache; in 2-D there is nothing to read
+        # along axis 0. The compiler fills the vector units of loops without a choice: three of them.
+        one = min(1, last)
+        low, mid, high = lower[one], weight + centre[one], upper[one]
+        for j in range(1, last if uniform and n0 == 1 else 1):
+            total = mid * here[j] + (low * here[j - 1] + high * here[j + 1])
+            result[j] = total + (a * before1[j] + b * after1[j])
+        for j in range(1, last if uniform and n0 > 1 else 1):
+            total = mid * here[j] + (low * here[j - 1] + high * here[j + 1])
+            total += c * before0[j] + d * after0[j]
+            result[j] = total + (a * before1[j] + b * after1[j])
+        for j in range(1, 1 if uniform else last):
+            total = (weight + centre[j]) * here[j] + (lower[j] * here[j - 1] + upper[j] * here[j + 1])
             if n0 > 1:
                 total += c * before0[j] + d * after0[j]
             result[j] = total + (a * before1[j] + b * after1[j])

@@ -66,7 +66,8 @@ class Engine:
     iterative = False
     hierarchical = False
     refines = True
-    rounds = 8  # refinements at most; each must halve the residual
+    rounds = 8  # refinements at most
+    shrink = 0.5  # what each must leave of the residual at most
     advice = ""  # for solves that do not meet the tolerance
     unrolled = False
     last: Any = None
@@ -282,7 +283,7 @@ class Solver(Remade):
             trial = step if x is None else np.add(x, step, out=step)
             trial = system.null_space.project(trial, transposed, into=trial)
             r_trial, reached, size = system.residual(trial, b, transposed)
-            fell = reached <= 0.5 * residual
+            fell = reached <= self.engine.shrink * residual
             if not np.isfinite(reached):
                 trouble = "nonfinite_output"
             elif reached <= residual or x is None:
