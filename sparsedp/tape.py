@@ -33,9 +33,9 @@ from sparsedp.shortcuts import (
 from sparsedp.tree import copied, leaves
 
 __all__ = [
-    "Recorder", "ReverseNode", "Rule", "VSpace", "added", "apply_operator", "autograd_rules", "backward", "boxed",
-    "called", "cast", "differentiable", "dtype_of", "fit", "forward_root", "innermost", "is_variable",
-    "isbox", "linear", "new_trace", "plain", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
+    "Recorder", "ReverseNode", "Rule", "VJPNode", "VSpace", "added", "apply_operator", "autograd_rules", "backward",
+    "boxed", "called", "cast", "differentiable", "dtype_of", "fit", "forward_root", "is_variable", "isbox", "linear",
+    "new_trace", "plain", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
@@ -104,7 +104,7 @@ class ReverseNode(VJPNode):
             if len(nums) < len(args) and fun not in sparing:
                 args = constant_args(args, nums)
             super().__init__(value, fun, args, constant(options), nums, parents)
-            self.held = ()
+            self.held = OPEN if fun is _primitive and args[0].adds else ()
             if _kind(fun, value, args, nums) == "c":
                 self._keep_real(args, nums)
         self.recorder.nodes.append(self)
@@ -230,9 +230,22 @@ def backward(nodes, ends, cotangents, sums):
     for node in reversed(nodes):
         total = sums.pop(node, None)
         if total is not None:
-            for parent, g in zip(node.parents, node.vjp(total[0], *node.held), strict=True):
+            adds = node.held is OPEN
+            held = [_open(sums.get(parent)) for parent in node.parents] if adds else node.held
+            for parent, g in zip(node.parents, node.vjp(total[0], *held), strict=True):
                 total = sums.get(parent)
-                sums[parent] = (g, False) if total is None and type(g) in NUMBERS else added(total, g)
+                if total is None and type(g) in NUMBERS:
+                    sums[parent] = g, adds and type(g) is np.ndarray
+                elif not (adds and total is not None and total[0] is g):  # else the rule has added it
+                    sums[parent] = added(total, g)
+
+
+OPEN: tuple = Part()  # held of a call whose pullback gets the sums so far instead
+
+
+def _open(total):
+    """(Sum so far, whether it may be written to) or None -> the array that may be written to, or None."""
+    return total[0] if total is not None and total[1] and type(total[0]) is np.ndarray else None
 
 
 def added(total, g):
@@ -391,7 +404,13 @@ def _apart(function):
 
 
 class Rule(Remade):
-    """A function with hand-written derivatives whose results are fresh arrays. Users make one with `differentiable`."""
+    """A function with hand-written derivatives whose results are fresh arrays. Users make one with `differentiable`.
+
+    `adds`: what `vjp` returns is called ``pull(g, *sums)``, for each cotangent with an array that holds the sum of
+    others so far, or None. It may add its own to that, and return it; all else that it returns is fresh.
+    """
+
+    adds = False
 
     def __init__(self, name, forward, vjp=None, jvp=None, keywords=(), made=None):
         self.name = name
@@ -453,13 +472,6 @@ def through(rule, nums, *args):
     return new_box(ans, args[nums[0]]._trace, node)
 
 
-def innermost(values):
-    """Numbers of the values that are on the innermost trace of all, if that is a reverse-mode one."""
-    number = max((value._trace for value in values if isbox(value)), default=None)
-    nums = [num for num, value in enumerate(values) if isbox(value) and value._trace == number]
-    return nums if any(isinstance(values[num]._node, VJPNode) for num in nums) else []
-
-
 def _call_vjp(argnums, ans, args, kwargs):
     rule, nums = args[0], tuple([num - 1 for num in argnums])
     if rule.vjp is None:
@@ -472,8 +484,8 @@ def _call_vjp(argnums, ans, args, kwargs):
                 note(rule.name, "not asked", names[min(num, len(names) - 1)])
     pull = rule.vjp(nums, ans, *values)
 
-    def checked_pull(g):
-        backs = timed(rule.name, "vjp", pull, g)
+    def checked_pull(g, *sums):
+        backs = timed(rule.name, "vjp", pull, g, *sums)
         if not isinstance(backs, (tuple, list)) or len(backs) != len(nums):  # autograd would accept it silently
             raise DerivativeError(
                 f"{rule.name} must return one derivative for each of the {len(nums)} values asked for"

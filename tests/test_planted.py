@@ -27,6 +27,13 @@ class Bug(NamedTuple):
 
 
 BUGS = {
+    "a cotangent added to an array that others hold": Bug(
+        "tape.py",
+        "return total[0] if total is not None and total[1] and type",
+        "return total[0] if total is not None and type",
+        "tests/test_transport_rules.py",
+        compiled=True,
+    ),
     "A for the transpose of A": Bug(
         "solvers",
         'factors.solve(b, trans="T" if transposed else "N")',

@@ -154,6 +154,53 @@ def test_the_same_bits_twice(scheme):
         np.testing.assert_array_equal(first[name], second[name])
 
 
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
+@pytest.mark.parametrize("velocity", ["faces", "cells"])
+def test_steps_share_a_velocity(scheme, velocity):
+    """They add its cotangent up in one array, that nothing else holds: as if each had a velocity of its own."""
+    move, args = scene(scheme, GRIDS["2-D"], velocity, "advective")[:2]
+    u, v, dt, inflow = args.values()
+    weight = RNG.normal(size=v.shape)
+
+    def loss(vs):
+        a, b, c, d, e = vs
+        first = move(move(u, a, dt, inflow), b, dt, inflow)
+        double = c + c  # autograd hands one array to both
+        second = move(move(first, double, dt, inflow), double, dt, inflow)
+        return anp.sum(move(second, d, dt, inflow) ** 2) + anp.sum(weight * e) + anp.sum(a * weight * d)
+
+    v = 0.5 * v
+    slopes = dp.grad(loss)((v,) * 5)
+    wanted = sum(slopes)
+    for single in (loss, lambda vs: dp.rollout(lambda s, p: s + loss(p), 0.0, vs, 1)):
+        found = dp.grad(lambda v, f=single: f((v,) * 5))
+        for _ in range(2):
+            np.testing.assert_allclose(found(v), wanted, rtol=1e-13, atol=1e-14 * np.max(np.abs(wanted)))
+    along = RNG.normal(size=v.shape)
+    assert np.isclose(dp.jvp(lambda v: loss((v,) * 5), v, along)[1], np.sum(wanted * along), rtol=1e-12)
+    if scheme == "upwind":
+        twice = dp.jvp(dp.grad(lambda v: loss((v,) * 5)), v, along)[1]
+        apart = dp.jvp(dp.grad(loss), (v,) * 5, (along,) * 5)[1]
+        np.testing.assert_allclose(twice, sum(apart), rtol=1e-12, atol=1e-13 * np.max(np.abs(twice)))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_field_that_carries_itself(dtype):
+    """Field and velocity are one array, whose two cotangents meet."""
+    grid = dp.Grid(12, periodic=True)
+    move, u = dp.transport(grid, "upwind", velocity="cells"), RNG.uniform(0.5, 1, 12).astype(dtype)
+
+    def run(u, w):
+        for _ in range(3):
+            u, w = move(u, w, 0.1), w
+        return anp.sum(move(u, u, 0.1) * anp.sin(u)) + anp.sum(w**3)
+
+    slopes = dp.grad(lambda pair: run(*pair))((u, u))
+    found = dp.grad(lambda u: run(u, u))(u)
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, sum(slopes), rtol=20 * np.finfo(dtype).eps, atol=20 * np.finfo(dtype).eps)
+
+
 def test_inflow_as_one_number_gets_the_sum():
     move, args, _ = scene("upwind", GRIDS["2-D"], "faces", "flux")
     f = lambda q: anp.sum(move(args["u"], args["v"], args["dt"], q) ** 2)

@@ -43,6 +43,7 @@ class Eulerian(Law):
         self.scheme = SCHEMES[setting.scheme]
         self.reference = Reference(self)
         self.linear = self.twice = self.scheme.limiter is None
+        self.adds = self.between is None and able()
 
     @cached_property
     def loops(self):
@@ -73,17 +74,19 @@ class Eulerian(Law):
         unseen = inflow.sum() if inflow.size else 0.0
         return unseen if self.setting.solid is None else unseen + v.sum()
 
-    def vjp(self, nums, g, u, v, dt, inflow):
+    def vjp(self, nums, g, u, v, dt, inflow, into=None):
         if not able() or any(map(isbox, (g, u, v, dt, inflow))):
             return self.reference.vjp(nums, g, u, v, dt, inflow)
         w, field = self.velocity(v), FIELD in nums or INFLOW in nums
-        gw = results.empty(w.shape, float) if VELOCITY in nums else NOTHING
-        of_field, of_inflow = self._stages_vjp(np.ascontiguousarray(g), u, w, dt, inflow, gw, field)
+        gw, fresh = NOTHING if VELOCITY not in nums else into, into is None
+        if gw is None:
+            gw = results.empty(w.shape, float)
+        of_field, of_inflow = self._stages_vjp(np.ascontiguousarray(g), u, w, dt, inflow, gw, field, fresh)
         found = {FIELD: of_field, INFLOW: of_inflow, VELOCITY: self.velocity_vjp(gw) if gw.size else None}
         return tuple(found[num] for num in nums)
 
-    def _stages_vjp(self, g, u, w, dt, inflow, gw, field):
-        """Cotangents of u (field: where it is wanted) and inflow; that of w goes into gw."""
+    def _stages_vjp(self, g, u, w, dt, inflow, gw, field, fresh):
+        """Cotangents of u (field: where it is wanted) and inflow; that of w goes into gw (fresh: nothing is there)."""
         known: list = []
         for keep in self.scheme.stages:
             x = u
@@ -91,7 +94,7 @@ class Eulerian(Law):
                 x = results.empty(u.shape, float)
                 self.loops.stage(*known[-1][:2], w, dt, inflow, u, known[-1][2], x)
             known.append((x, self.loops.slopes(x, inflow, True), keep))
-        ginflow, rest, fresh = np.zeros(inflow.size), None, True
+        ginflow, rest = np.zeros(inflow.size), None
         while known:
             x, slopes, keep = known.pop()
             if keep:  # a share of the cotangent goes to the first field

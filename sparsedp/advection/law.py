@@ -87,6 +87,8 @@ class Law:
         The options of `transport` that the scheme uses.
     linear : bool
         Whether the step is linear in (u, inflow).
+    adds : bool
+        Whether `vjp` takes one argument more: an array to which it adds the cotangent of the velocity, to return it.
     twice : bool
         Whether `vjp` and `jvp` take traced values too, so that derivatives of every order follow.
     """
@@ -94,6 +96,7 @@ class Law:
     options: tuple[str, ...] = ("form", "unstable")
     linear = False
     twice = False
+    adds = False
     forward: Any
     vjp: Any
     jvp: Any

@@ -4,10 +4,10 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY
-from sparsedp.advection.values import LETTERS, prepare, raised, result_like, unflatten
+from sparsedp.advection.values import FLOAT, LETTERS, prepare, raised, result_like, unflatten
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import check_finite, surely_finite
-from sparsedp.tape import Rule, isbox, linear, plain
+from sparsedp.tape import Rule, dtype_of, isbox, linear, plain
 
 __all__ = ["rule_of"]
 
@@ -19,17 +19,22 @@ def rule_of(law):
         return result_like(u, law.forward(*prepare(law, u, v, dt, inflow)), law.setting.space.shape)
 
     def vjp(nums, ans, *args):
-        def pull(g):
+        def pull(g, *sums):
             flat = prepare(law, *args)
             g = raised(FIELD, law, g)
             traced = type(g) is not np.ndarray or any(map(isbox, flat))
+            into = None if traced or STEP in nums or not sums else _sum_of(law, args, dict(zip(nums, sums)))
             if traced and not law.twice:
                 found = tuple(back(g) for back, _ in _turned(law, nums, flat))
             else:
-                found = _vjp(law, nums, g, flat)
+                found = _vjp(law, nums, g, flat, into)
+                if into is not None and not surely_finite(into):  # what was there may not have been
+                    _check_slope(law, "the gradient in v", law.vjp((VELOCITY,), g, *flat)[0], (g,))
             for num, back in zip(nums, found, strict=True):
-                _check_slope(law, "the gradient in " + LETTERS[num], back, (g,))
-            return tuple([unflatten(args[num], back) for num, back in zip(nums, found, strict=True)])
+                if back is not into:
+                    _check_slope(law, "the gradient in " + LETTERS[num], back, (g,))
+            shaped = [unflatten(args[num], back) for num, back in zip(nums, found, strict=True)]
+            return [sums[k] if found[k] is into is not None else back for k, back in enumerate(shaped)]
 
         return pull
 
@@ -46,13 +51,22 @@ def rule_of(law):
         _check_slope(law, "the tangent", found, tangents)
         return unflatten(ans, found)
 
-    return Rule(law.name, forward, vjp, jvp)
+    rule = Rule(law.name, forward, vjp, jvp)
+    rule.adds = law.adds
+    return rule
 
 
-def _vjp(law, nums, g, flat):
+def _sum_of(law, args, sums):
+    """The sum of the cotangents of the velocity so far, flat, where that of a step can be added to it; else None."""
+    total = sums.get(VELOCITY)
+    fits = total is not None and total.dtype == FLOAT == dtype_of(args[VELOCITY]) and total.flags.c_contiguous
+    return total.reshape(-1) if fits else None
+
+
+def _vjp(law, nums, g, flat, into=None):
     """Cotangents of the arguments `nums`. A step depends on the velocity times dt: that of dt follows from v's."""
     asked = tuple({VELOCITY if num == STEP else num for num in nums})
-    found = dict(zip(asked, law.vjp(asked, g, *flat), strict=True))
+    found = dict(zip(asked, law.vjp(asked, g, *flat, *(() if into is None else (into,))), strict=True))
     if STEP in nums:
         found[STEP] = anp.dot(flat[VELOCITY], found[VELOCITY]) / flat[STEP]
     return [found[num] for num in nums]

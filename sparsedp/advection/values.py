@@ -9,6 +9,7 @@ from sparsedp.fields import check_number, check_plain
 from sparsedp.tape import cast, dtype_of, isbox, plain
 
 __all__ = [
+    "FLOAT",
     "LETTERS",
     "NOTHING",
     "check_given",
