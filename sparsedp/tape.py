@@ -158,9 +158,8 @@ def _kind(fun, value, args, nums):
     They give an array of objects, or as in a product of two vectors one traced value.
     """
     kind = getattr(plain(value), "dtype", FLOAT).kind
-    beside = [arg for num, arg in enumerate(args) if num not in nums and type(arg) in (list, tuple)]
-    lost = beside and isbox(value) and any(map(isbox, leaves(beside)))
-    if kind == "O" or lost:
+    beside = (arg for num, arg in enumerate(args) if num not in nums and type(arg) in (list, tuple))
+    if kind == "O" or (isbox(value) and any(map(isbox, leaves([*beside])))):
         raise DerivativeError(
             f"{fun.__name__} got a list that holds traced values, and their derivatives would be lost; "
             "write anp.array([...]) around it, with autograd.numpy as anp"

@@ -29,7 +29,7 @@ __all__ = ["DENSE_UP_TO", "DenseSystem", "dense_engine", "dense_lu", "direct_eng
 DENSE_UP_TO = 64
 MOST_GROWTH = 2.0**49  # |A^-1| |A| beyond this leaves no digit
 # Share of the data next to an eigenvector that a solve in single precision may leave, each refinement in turn.
-# Measured on waves: 0.001 at 256^2, 0.07 at 1024^2, 0.6 with a slanted boundary; a source leaves 0.0003 and 0.005.
+# Measured on waves: 0.001 at 256^2, 0.07 at 1024^2, more for slanted ones; a source leaves 0.0003 and 0.005.
 MOST_LEFT = 0.8
 MOST_ROUNDS = 124  # that lead from 1 to 1e-12
 # From here on "auto" keeps the factors of complex matrices in single precision. Measured, value and gradient of waves
