@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-__all__ = ["constant", "constant_args", "frozen", "is_fixed", "sparing"]
+__all__ = ["FIXED", "constant", "constant_args", "frozen", "is_fixed", "sparing"]
 
 SMALL = 2**16  # bytes up to which a copy of its own takes less time than a comparison with an older one
 CHUNK = 2**15  # entries that are compared at once: two pieces of them stay in the cache of a core

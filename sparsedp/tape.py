@@ -18,7 +18,7 @@ from autograd.core import JVPNode, VJPNode, add_outgrads, primitive_jvps, primit
 from autograd.extend import VSpace, defjvp_argnums, defvjp_argnums, primitive
 from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_primitives, trace_stack
 
-from sparsedp.constants import constant, constant_args, frozen, sparing
+from sparsedp.constants import FIXED, constant, constant_args, frozen, sparing
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, note, thread, timed
 from sparsedp.recipe import Remade
@@ -61,8 +61,9 @@ class Recorder:
 
     def weigh(self, value, args, nums):
         """One call."""
-        held = leaves((value, [arg for num, arg in enumerate(args) if num not in nums]))
-        self.bytes += sum(getattr(leaf, "nbytes", 0) for leaf in held)
+        for num, held in enumerate((*args, value)):
+            if num not in nums and type(held) not in FIXED:
+                self.bytes += sum(getattr(leaf, "nbytes", 0) for leaf in leaves(held))
 
     def taken(self):
         """The calls since it was asked last: it forgets them, for they know it, and a circle is freed late."""
@@ -533,7 +534,8 @@ def fit(name, value, cotangent, g):
 
 
 def dtype_of(value):
-    return np.asarray(plain(value)).dtype if not hasattr(plain(value), "dtype") else plain(value).dtype
+    value = plain(value)
+    return value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
 
 
 def cast(g, dtype):
@@ -590,8 +592,7 @@ defjvp_argnums(_operator, _operator_jvp)
 
 def is_variable(leaf):
     """Whether a leaf can carry a derivative: a floating number or array, or a traced one."""
-    kind = getattr(getattr(leaf, "dtype", None), "kind", None)
-    return isbox(leaf) or isinstance(leaf, (float, complex)) or kind in ("f", "c")
+    return isbox(leaf) or isinstance(leaf, (float, complex)) or getattr(getattr(leaf, "dtype", 0), "kind", "-") in "fc"
 
 
 def called(fun, args):

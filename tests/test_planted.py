@@ -402,10 +402,7 @@ BUGS = {
         "tests/test_transport_lagrange.py",
     ),
     "a MacCormack step that adds all that it misses": Bug(
-        "advection",
-        "        self.new *= 0.5\n",
-        "        self.new *= 1.0\n",
-        "tests/test_transport_lagrange.py",
+        "advection", "        self.new *= 0.5\n", "        self.new *= 1.0\n", "tests/test_transport_lagrange.py"
     ),
     # ---- flow, integrators, trajectory
     "a flow step that forgets the acceleration before": Bug(
@@ -455,6 +452,9 @@ BUGS = {
         "block[self._rows[state.i]] for block in rows",
         "block[self._rows[state.i] - 1] for block in rows",
         "tests/test_rollout.py tests/test_rollout_kinds.py",
+    ),
+    "a field that counts as unused where it has a zero": Bug(
+        "trajectory", "not back.any()", "not back.all()", "tests/test_rollout.py tests/test_rollout_kinds.py"
     ),
     # ---- optimize, blackbox, network
     "a running mean without the correction of its start": Bug(

@@ -3,6 +3,7 @@
 import gc
 import weakref
 
+import autograd
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -362,6 +363,45 @@ def test_an_argument_changed_after_the_run_is_not_seen():
     wanted = dp.value_and_grad(lambda x: anp.sum(dp.rollout(step, *x[:2], 4, inputs=x[2])))((u.copy(), p + 0, f + 0))
     u[:], p[:], f[:] = 9.0, 9.0, 9.0
     close(pull(1.0), wanted[1], 0.0)
+
+
+KINDS = {
+    "mixed": lambda one, other, p: 0.7 * one + 0.2 * other * p,
+    "itself": lambda one, other, p: one,
+    "the other one": lambda one, other, p: other,
+    "params": lambda one, other, p: p,
+    "constant": lambda one, other, p: CONSTANT,
+    "seen backwards": lambda one, other, p: one[::-1],
+    "sum": lambda one, other, p: one * anp.sum(other) * 0.3,
+}
+CONSTANT, FEW = np.array([0.2, 0.1, -0.4]), np.array([1.0, 0.0, -0.6])
+
+
+@pytest.mark.filterwarnings("ignore:Output seems independent")
+@pytest.mark.parametrize("weight", [0.0, 1.0], ids=["one field is used", "both are used"])
+@pytest.mark.parametrize("second", [*KINDS, "as the first"])
+@pytest.mark.parametrize("first", KINDS)
+def test_variables_that_are_constant_swapped_given_on_or_the_same(first, second, weight):
+    """Each as the loop on autograd's tape; with a budget to the last bit as without."""
+
+    def step(state, p):
+        new = KINDS[first](*state, p)
+        return new, (new if second == "as the first" else KINDS[second](*state[::-1], p))
+
+    def by_loop(x):
+        state = x[0], x[1]
+        for _ in range(6):
+            state = step(state, x[2])
+        return anp.sum(FEW * state[0]) + weight * anp.sum(WEIGHTS[1] * state[1] ** 2)
+
+    def by_rollout(x, memory=None):
+        one, other = dp.rollout(step, (x[0], x[1]), x[2], 6, memory=memory)
+        return anp.sum(FEW * one) + weight * anp.sum(WEIGHTS[1] * other**2)
+
+    x = U, 0.5 - U, np.array([0.4, -0.7, 1.1])
+    ours = dp.value_and_grad(by_rollout)(x)
+    close(ours, autograd.value_and_grad(by_loop)(x))
+    close(dp.value_and_grad(lambda x: by_rollout(x, 480))(x), ours, 0.0)
 
 
 def logistic(x, r):

@@ -7,7 +7,6 @@ from sparsedp.tape import backward, fit
 from sparsedp.trajectory.layout import refuse_lost, stacked
 from sparsedp.trajectory.memory_budget import stride
 from sparsedp.trajectory.record import growth, largest
-from sparsedp.trajectory.steps import State
 
 __all__ = ["go_back"]
 
@@ -45,7 +44,7 @@ def go_back(loop, steps, kept, g):
             recomputed += again
         if total is not None:
             if not taped:
-                state = State(i, state.values, state.statics)  # the tape goes with it
+                state = state.moved(state.values)  # the tape goes with it
                 after = steps.after(state, True)
                 if not loop.reverse:
                     loop.compare(after.marks(), end)
@@ -70,17 +69,23 @@ def go_back(loop, steps, kept, g):
 
 
 def _pulled(g, steps, state, sums, inputs):
-    """Cotangents of the state after a taped one -> those of the state itself, None if those are not wanted."""
+    """Cotangents of the state after a taped one -> those of the state itself, None if there are none."""
     roots, nodes, ends = state.tape
     steps.last = state
     backward(nodes, ends, g, sums)
-    backs = [sums.pop(root, NONE)[0] for root in roots]
-    for rows, back in zip(inputs, backs[len(state.values) :], strict=True):
+    backs: list = []
+    found = None
+    for root, value in zip(roots, state.values):
+        back = sums.pop(root, NONE)[0]
         if back is not None:
-            rows[state.i] = back
+            back, found = fit("the step", value, back, back), backs
+        backs.append(back)
+    for rows, root in zip(inputs, roots[len(backs) :]):
+        if root in sums:
+            rows[state.i] = sums.pop(root)[0]
     if not sums.keys() <= steps.known:
         refuse_lost("the step")  # in a call of another step
-    return _fitted(backs, state.values) if roots[0] else None
+    return found
 
 
 def _state_at(i, loop, steps, kept):

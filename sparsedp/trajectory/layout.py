@@ -1,6 +1,7 @@
 """Where the numbers of a state lie in its tree, and whether another tree has the same form."""
 
 from functools import cached_property
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
@@ -38,8 +39,8 @@ class Layout:
         All leaves, None in place of the variables.
     labels, names : lists of str
         Of all leaves and of the variables, as one would write them: ``state["ink"][0]``.
-    bare : bool
-        The tree is one variable leaf and nothing else.
+    bare, flat : bool
+        The tree is one variable leaf and nothing else, or a tuple of such leaves.
     open : bool
         Some branch is a dict or a list, whose entries could be changed.
     shapes, dtypes, floats : list
@@ -54,11 +55,13 @@ class Layout:
     rounds = False
 
     def __init__(self, tree, root):
-        self.root, self.bare = root, is_variable(tree)
         entries, rebuild = flatten(tree)
-        self.places = [place for place, leaf in enumerate(entries) if is_variable(leaf)]
+        moving = list(map(is_variable, entries))
+        self.places = [place for place, moves in enumerate(moving) if moves]
+        self.root, self.bare = root, bool(self.places) and keys(tree) is None
+        self.flat = type(tree) is tuple and all(moving) and all(keys(branch) is None for branch in tree)
         # Without the variables: what is kept must not hold a trace or a large array.
-        self.statics = tuple(None if is_variable(leaf) else constant(leaf) for leaf in entries)
+        self.statics = tuple(None if moves else constant(leaf) for leaf, moves in zip(entries, moving, strict=True))
         self._template = rebuild(self.statics)
         for number, leaf in enumerate(entries):
             if isinstance(leaf, np.ma.MaskedArray):
@@ -90,6 +93,8 @@ class Layout:
         """Variables, of which there may be more, and the other leaves -> the tree."""
         if self.bare:
             return variables[0]
+        if self.flat:
+            return tuple(variables[: len(self.places)])
         entries = list(self.statics if statics is None else statics)
         for place, value in zip(self.places, variables):
             entries[place] = value
@@ -100,7 +105,7 @@ class Layout:
         return flatten(self._template)[1]
 
     def take(self, tree, when, number, outer):
-        """A tree of the same form -> its variables below the boxes of one trace, contiguous, their nodes; other leaves.
+        """A tree of the same form -> its variables; the same below the boxes of one trace, contiguous; nodes; others.
 
         Parameters
         ----------
@@ -118,7 +123,10 @@ class Layout:
             If the form, a shape or a dtype differs.
         """
         if self.bare and not isinstance(tree, (tuple, list, dict)):
-            variables, others = [tree], self.statics
+            variables: Any = [tree]
+            others = self.statics
+        elif self.flat and type(tree) is tuple and len(tree) == len(self.places):
+            variables, others = tree, self.statics
         else:
             variables, others = self._parted(tree, when)
         values, nodes = split_boxes(variables, number)
@@ -130,7 +138,9 @@ class Layout:
                 and value.flags.c_contiguous
             ):
                 values[k] = self._settled(k, value, when, outer)
-        return values, nodes, others
+                if values[k] is not value:
+                    variables = None  # other arrays than those that were returned
+        return variables, values, nodes, others
 
     def _parted(self, tree, when):
         """A tree of the same form -> its variables and its other leaves."""

@@ -14,7 +14,6 @@ from sparsedp.errors import DerivativeError
 from sparsedp.shortcuts import ELSEWHERE, array
 from sparsedp.tape import dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, stacked
-from sparsedp.trajectory.steps import State
 from sparsedp.tree import leaves, mapped
 
 __all__ = ["All", "Each", "Last", "Some"]
@@ -55,6 +54,8 @@ class Last:
 
     def source(self, n, g):
         """Cotangents of the outputs -> function from a state to cotangents of a state, or None."""
+        if len(g) > 1:  # nothing goes back from a field that nobody uses
+            g = [None if type(back) is np.ndarray and not back.any() else back for back in g]
         return lambda state: g if state.i == n else None
 
 
@@ -97,7 +98,7 @@ class Some(Last):
             block[row] = owned(values[number]) if isinstance(block, list) else values[number]
             if np.ndim(values[number]) and self.whole:
                 values[number] = block[row]
-        return State(state.i, values, state.statics)
+        return state.moved(values)
 
     def finish(self, last):
         """The blocks; where all are handed out, the way back uses these very arrays."""

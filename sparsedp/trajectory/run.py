@@ -132,7 +132,7 @@ class Loop(Rule):
                     weight = max(recorder.bytes + len(before.tape[1]) * CALL - self.state.nbytes, 0)
                 room -= weight
                 if i == 0 and room < 0:
-                    before.tape = None
+                    before.tape = state.boxes = None
             if along:
                 state = see(state)
             if i + 1 in self._stops:

@@ -1,6 +1,7 @@
 """The steps of a rollout, on plain values or on a tape, and in which of them an error arose."""
 
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -32,20 +33,31 @@ class State:
         Its variables.
     statics : tuple
         Its other leaves.
+    moves : list or None
+        True where a variable depends on something traced, None where not; None in place of the list: all do.
+    boxes : (variables, nodes) or None
+        Its variables as they were returned, and their nodes, where the step from it can go on from those; until it
+        begins.
     tape : (roots, nodes, ends) or None
         Of the step from it: the roots of the variables of state and inputs, None where a constant is; all calls, in
         order, so that the backward pass need not sort a graph; the nodes of the state after it, None where that does
         not depend on anything traced.
     """
 
-    __slots__ = ("i", "statics", "tape", "values")
+    __slots__ = ("boxes", "i", "moves", "statics", "tape", "values")
 
-    def __init__(self, i, values, statics):
-        self.i, self.values, self.statics, self.tape = i, values, statics, None  # type: int, list, tuple, Any
+    def __init__(self, i, values, statics, moves=None):
+        self.i, self.values, self.statics, self.moves = i, values, statics, moves
+        self.tape: Any = None
+        self.boxes: Any = None
+
+    def moved(self, values):
+        """The same in other memory."""
+        return State(self.i, values, self.statics, self.moves)
 
     def owned(self):
         """The same in memory of its own: a step may use the arrays again that it has returned."""
-        return State(self.i, list(map(owned, self.values)), self.statics)
+        return self.moved(list(map(owned, self.values)))
 
     def marks(self):
         """Fingerprints of all of it."""
@@ -79,35 +91,55 @@ class Steps:
     def __init__(self, loop, args):
         self.loop, self.recorder, self.number = loop, Recorder(), new_trace()
         self.outer, self.last = traces_of(args), None
+        self.goes_on = not (loop.cuts or loop.inputs)
         values, self.p, self.x = loop.split(args)
         self.first = State(0, values, loop.state.statics)
         roots = [self.recorder.root() if number in loop.wanted else None for number in range(len(args))]
         _, self.roots, self.input_roots = loop.split(roots)
-        self.known = set(self.roots)
-        # Without a tape the values are traced all the same: what a step stores away is no constant.
-        self._untaped = untaped_root(self.recorder)
-        self._taped_params = self._params(self.roots)
-        self._untaped_params = self._params([root and self._untaped for root in self.roots])
+        self.known = {None, *self.roots}
+
+    @cached_property
+    def _taped_params(self):
+        return self._params(self.roots)
+
+    @cached_property
+    def _untaped_params(self):
+        return self._params([root and self._untaped for root in self.roots])
+
+    @cached_property
+    def _untaped(self):
+        """The root of all values where there is no tape: what a step stores away is traced all the same."""
+        return untaped_root(self.recorder)
 
     def after(self, state, taped):
         """The step from a state -> the state after it. Where it is taped, the first one gets the tape."""
-        loop, i = self.loop, state.i
-        self.last = state
-        values, roots = self._given(state), ()  # type: list, Any
-        if loop.wanted:
-            wants, new = i >= loop.moving and i not in loop.cuts, self.recorder.root if taped else self._root
-            roots = [new() if wants else None for _ in state.values] + [root and new() for root in self.input_roots]
-            values = boxed(values, roots, self.number)
+        loop, number, boxes = self.loop, self.number, state.boxes
+        self.last, state.boxes = state, None
+        if taped and boxes:
+            values, roots = boxes
+        else:
+            values, roots = self._given(state), ()
+            if loop.wanted:
+                roots = self._new_roots(state, self.recorder.root if taped else self._root)
+                values = boxed(values, roots, number)
         parts = self._parts(state, values, self._taped_params if taped else self._untaped_params)
         given = [leaves(part) for part in parts] if loop.open else None
         result = loop.step(*parts)
         if given is not None:
             _check_entries(parts, given)
-        values, ends, statics = loop.state.take(result, "the step", self.number, self.outer)
-        after = State(i + 1, values, statics)
+        variables, values, nodes, statics = loop.state.take(result, "the step", number, self.outer)
+        after = State(state.i + 1, values, statics)
+        if None in nodes:
+            after.moves = [node and True for node in nodes]
         if taped:
-            state.tape = roots, self.recorder.taken(), ends
-        if self.copies or (taped and None in ends):  # what is on no tape may be an array that the step uses again
+            state.tape = roots, self.recorder.taken(), nodes
+            # Each variable has a sum of its own, and so has each of params.
+            if self.goes_on and variables and len({*nodes}) == len(nodes) and self.known.isdisjoint(nodes):
+                after.boxes = variables, nodes
+                for value in values:
+                    if type(value) is np.ndarray:
+                        value.flags.writeable = False
+        if self.copies or (taped and after.moves):  # what is on no tape may be an array that the step uses again
             return after.owned()
         return after
 
@@ -115,7 +147,7 @@ class Steps:
         """The state before this one, by the step turned round: the same to rounding."""
         self.last = earlier = State(state.i - 1, state.values, state.statics)
         result = self.loop.step.back(*self._plain_parts(earlier))
-        values, _, statics = self.loop.state.take(result, "the step turned round", self.number, self.outer)
+        _, values, _, statics = self.loop.state.take(result, "the step turned round", self.number, self.outer)
         return State(earlier.i, values, statics)
 
     def shown(self, state):
@@ -123,6 +155,13 @@ class Steps:
         root = self._untaped if state.i >= self.loop.moving else None
         values = boxed(map(frozen, state.values), [root] * len(state.values), self.number)
         return self.loop.state.build(values, state.statics)
+
+    def _new_roots(self, state, new):
+        """A new root for each variable of state and inputs, None of a constant."""
+        moves = state.moves or [True] * len(state.values)
+        if state.i < self.loop.moving or state.i in self.loop.cuts:
+            moves = [None] * len(state.values)
+        return [wanted and new() for wanted in (*moves, *self.input_roots)]
 
     def _root(self):
         return self._untaped
