@@ -1,12 +1,14 @@
 """The floors of the library in one table: what it must not fall below, and what it reaches on this machine.
 
 Every row is a ratio of times that were taken in turn, in one run; the error of the result, where there is one, stands
-beside it. Some rows take gigabytes and a minute; name those you want: ``--only upwind``.
+beside it. Each runs in a process of its own with one thread of BLAS: the memory and the threads that one row leaves
+behind change the next one by up to 20 %. Some rows take gigabytes and a minute; name those you want: ``--only upwind``.
 
 Run ``python -m benchmarks.floors [--only WORD]`` in the root of the repository.
 """
 
 import argparse
+import os
 import subprocess
 import sys
 from functools import partial
@@ -200,17 +202,27 @@ def imported():
     return min(float(run.stdout) for run in runs), None
 
 
+def show(words, sign, floor, aim, measured):
+    """Print one row."""
+    figure, error = measured()
+    fine = figure >= floor if sign == MORE else figure <= floor
+    shown, missed = "" if error is None else f"{error:9.1e}", "" if fine else "  MISSED"
+    print(f"{words:64} {figure:9.3g} {sign:>3}{floor:6g} {aim:6g} {shown:>9}{missed}", flush=True)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="", help="rows with this word in their name")
-    wanted = parser.parse_args().only
-    print(f"{'':64} {'figure':>9} {'floor':>9} {'aim':>6} {'error':>9}")
-    for words, sign, floor, aim, measured in ROWS[::-1]:
-        if wanted in words:
-            figure, error = measured()
-            fine = figure >= floor if sign == MORE else figure <= floor
-            shown, missed = "" if error is None else f"{error:9.1e}", "" if fine else "  MISSED"
-            print(f"{words:64} {figure:9.3g} {sign:>3}{floor:6g} {aim:6g} {shown:>9}{missed}", flush=True)
+    parser.add_argument("--here", action="store_true", help="in this process, with the threads of BLAS that it has")
+    given = parser.parse_args()
+    if not given.here:
+        print(f"{'':64} {'figure':>9} {'floor':>9} {'aim':>6} {'error':>9}", flush=True)
+    for row in ROWS[::-1]:
+        if given.here and given.only in row[0]:
+            show(*row)
+        elif given.only in row[0]:
+            command = [sys.executable, "-m", "benchmarks.floors", "--here", "--only", row[0]]
+            subprocess.run(command, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}, check=True)
 
 
 if __name__ == "__main__":

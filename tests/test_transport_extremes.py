@@ -95,7 +95,8 @@ def test_a_derivative_beyond_the_floats_is_an_error(scheme, velocity):
     move, u, v, q = scene(scheme, velocity=velocity)
     u, scale = 2.0**900 * u, 2.0**900
     through = lambda x, dt=0.01: scale * anp.sum(move(u, x, dt, q) * u / scale)
-    for loss, x, name in ((through, v, "v"), (lambda dt: through(v, dt), 0.01, "dt")):
+    shared = lambda x: through(x) + anp.sum(move(u / scale, x, 0.01, q))  # the second of two that are added up
+    for loss, x, name in ((through, v, "v"), (shared, v, "v"), (lambda dt: through(v, dt), 0.01, "dt")):
         with np.errstate(all="ignore"), pytest.raises(NonFiniteError, match=f"cannot represent the gradient in {name}"):
             value_and_grad(loss)(x)
     with np.errstate(all="ignore"), pytest.raises(NonFiniteError, match="cannot represent the tangent, got"):

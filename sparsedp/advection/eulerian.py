@@ -76,17 +76,21 @@ class Eulerian(Law):
 
     def vjp(self, nums, g, u, v, dt, inflow, into=None):
         if not able() or any(map(isbox, (g, u, v, dt, inflow))):
-            return self.reference.vjp(nums, g, u, v, dt, inflow)
+            return self.reference.vjp(nums, g, u, v, dt, inflow), False
         w, field = self.velocity(v), FIELD in nums or INFLOW in nums
         gw, fresh = NOTHING if VELOCITY not in nums else into, into is None
         if gw is None:
             gw = results.empty(w.shape, float)
-        of_field, of_inflow = self._stages_vjp(np.ascontiguousarray(g), u, w, dt, inflow, gw, field, fresh)
+        of_field, of_inflow, wrong = self._stages_vjp(np.ascontiguousarray(g), u, w, dt, inflow, gw, field, fresh)
         found = {FIELD: of_field, INFLOW: of_inflow, VELOCITY: self.velocity_vjp(gw) if gw.size else None}
-        return tuple(found[num] for num in nums)
+        seen = self.adds and not (self.scheme.limiter and field) and isfinite(of_inflow.sum())
+        return tuple(found[num] for num in nums), seen and not wrong
 
     def _stages_vjp(self, g, u, w, dt, inflow, gw, field, fresh):
-        """Cotangents of u (field: where it is wanted) and inflow; that of w goes into gw (fresh: nothing is there)."""
+        """Cotangents of u (field: where it is wanted) and inflow; that of w goes into gw (fresh: nothing is there).
+
+        Also how many of w in the end, and of u in each stage, are not finite.
+        """
         known: list = []
         for keep in self.scheme.stages:
             x = u
@@ -100,11 +104,11 @@ class Eulerian(Law):
             if keep:  # a share of the cotangent goes to the first field
                 rest, g = (keep * g if rest is None else rest + keep * g), (1.0 - keep) * g
             gu = results.empty(u.shape, float) if known or field else NOTHING
-            self.loops.vjp(g, x, slopes, w, dt, inflow, gu, ginflow, gw, fresh)
+            wrong = self.loops.vjp(g, x, slopes, w, dt, inflow, gu, ginflow, gw, fresh)
             g, fresh = gu, False
         if rest is not None and field:
             g += rest
-        return g, ginflow
+        return g, ginflow, wrong
 
     def jvp(self, tangents, u, v, dt, inflow):
         return self.reference.jvp(tangents, u, v, dt, inflow)

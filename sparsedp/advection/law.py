@@ -71,8 +71,8 @@ class Law:
     ``forward(u, v, dt, inflow)``
         The moved field.
     ``vjp(nums, g, u, v, dt, inflow)``
-        Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed. dt is not asked for:
-        a step depends on v dt alone, and `rule` derives it from v.
+        Cotangent of the result -> a tuple of those of the arguments `nums`, nothing else computed, and whether they are
+        known to be finite. dt is not asked for: a step depends on v dt alone, and `rule` derives it from v.
     ``jvp(tangents, u, v, dt, inflow)``
         {number of an argument: tangent} -> tangent of the result; dt as above.
     ``matrix(v, dt)``

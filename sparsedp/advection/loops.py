@@ -63,14 +63,17 @@ class Loops:
         return total
 
     def vjp(self, g, u, slopes, w, dt, inflow, gu, ginflow, gw, fresh):
-        """The cotangent of u + dt du/dt -> that of u into gu, those of the rest added to theirs.
+        """The cotangent of u + dt du/dt -> that of u into gu, those of the rest added to theirs; how many are infinite.
 
-        gu, gw: empty where they are not wanted; fresh: there is nothing in gw. The derivatives in `slopes` are
-        overwritten.
+        Not counted: what slopes add to that of u, and the inflow. gu, gw: empty where they are not wanted; fresh:
+        there is nothing in gw. The derivatives in `slopes` are overwritten.
         """
+        total = 0.0
         for part, (values, partials) in zip(self.components, slopes, strict=True):
-            given = self._given(part, u, inflow, w, values, dt)
+            given, wrong = self._given(part, u, inflow, w, values, dt), np.empty(part.tiles)
             targets = gu[part.field], ginflow[part.inflow], gw[part.speed]
-            part.run(fluxes.vjp, g[part.field], *given, *targets, fresh, partials)
+            part.run(fluxes.vjp, g[part.field], *given, *targets, fresh, partials, wrong)
+            total += wrong.sum()
             if partials.size and gu.size:
                 part.run(fluxes.jumps, partials, part.free, part.axes, *targets[:2])
+        return total

@@ -21,7 +21,7 @@ class NoCells(Law):
 
     def vjp(self, nums, g, u, v, dt, inflow):
         found = {FIELD: g + 0.0, VELOCITY: np.zeros(np.shape(v)), INFLOW: np.zeros(np.shape(inflow))}
-        return tuple(found[num] for num in nums)
+        return tuple(found[num] for num in nums), True
 
     def jvp(self, tangents, u, v, dt, inflow):
         return tangents.get(FIELD, np.zeros(np.shape(u))) + 0.0

@@ -25,13 +25,13 @@ def rule_of(law):
             traced = type(g) is not np.ndarray or any(map(isbox, flat))
             into = None if traced or STEP in nums or not sums else _sum_of(law, args, dict(zip(nums, sums)))
             if traced and not law.twice:
-                found = tuple(back(g) for back, _ in _turned(law, nums, flat))
+                found, fine = tuple(back(g) for back, _ in _turned(law, nums, flat)), False
             else:
-                found = _vjp(law, nums, g, flat, into)
-                if into is not None and not surely_finite(into):  # what was there may not have been
-                    _check_slope(law, "the gradient in v", law.vjp((VELOCITY,), g, *flat)[0], (g,))
+                found, fine = _vjp(law, nums, g, flat, into)
+                if not fine and into is not None and not surely_finite(into):  # what was there may not have been
+                    _check_slope(law, "the gradient in v", law.vjp((VELOCITY,), g, *flat)[0][0], (g,))
             for num, back in zip(nums, found, strict=True):
-                if back is not into:
+                if not fine and back is not into:
                     _check_slope(law, "the gradient in " + LETTERS[num], back, (g,))
             shaped = [unflatten(args[num], back) for num, back in zip(nums, found, strict=True)]
             return [sums[k] if found[k] is into is not None else back for k, back in enumerate(shaped)]
@@ -64,12 +64,16 @@ def _sum_of(law, args, sums):
 
 
 def _vjp(law, nums, g, flat, into=None):
-    """Cotangents of the arguments `nums`. A step depends on the velocity times dt: that of dt follows from v's."""
+    """Cotangents of the arguments `nums`, and whether all are finite for sure.
+
+    A step depends on the velocity times dt: the cotangent of dt follows from that of v.
+    """
     asked = tuple({VELOCITY if num == STEP else num for num in nums})
-    found = dict(zip(asked, law.vjp(asked, g, *flat, *(() if into is None else (into,))), strict=True))
+    cotangents, fine = law.vjp(asked, g, *flat, *(() if into is None else (into,)))
+    found = dict(zip(asked, cotangents, strict=True))
     if STEP in nums:
         found[STEP] = anp.dot(flat[VELOCITY], found[VELOCITY]) / flat[STEP]
-    return [found[num] for num in nums]
+    return [found[num] for num in nums], fine and STEP not in nums
 
 
 def _check_slope(law, what, slope, given):
@@ -90,7 +94,7 @@ def _turned(law, nums, flat):
         raise DerivativeError(f"{law.name} has first derivatives only; for second ones write scheme='upwind'")
 
     def rules(num):
-        pull = lambda g: law.vjp((num,), np.asarray(g), *plain_flat)[0]
+        pull = lambda g: law.vjp((num,), np.asarray(g), *plain_flat)[0][0]
         return linear(f"{law.name}.T", pull, lambda tangent: law.jvp({num: tangent}, *plain_flat))
 
     return map(rules, nums)

@@ -85,7 +85,7 @@ class SemiLagrangian(Law):
         found = {FIELD: of_u, INFLOW: of_inflow}
         if speed:
             found[VELOCITY] = self.velocity_vjp(of_w)
-        return tuple(found[num] for num in nums)
+        return tuple(found[num] for num in nums), False
 
     def jvp(self, tangents, u, v, dt, inflow):
         """{argument: tangent} -> tangent of the advected field."""

@@ -171,16 +171,18 @@ def weigh(lines, line, x, start, table, row, axes, a, side, free, c):
 def to_velocity(w, gw, fresh, u, inflow, slopes, given, ratio, flux, a, on_sides, c, sides, places):
     """The cotangent of w for the sides of a piece; `given` holds that of the cells and of those beyond, at `places`.
 
-    The value at a side is that of the cell it comes from, at rest the mean.
+    The value at a side is that of the cell it comes from, at rest the mean. Returns how many of them are not finite.
     """
-    (below, above), rest, many = sides, 1.0 - flux, slopes.shape[1]
+    (below, above), rest, many, bad = sides, 1.0 - flux, slopes.shape[1], 0
     m, q = below.speed, above.beyond
     for j in range(below.begin, below.begin if on_sides else below.end):  # in a cell w is that of both its sides
         near = share(w[m + j])
         low = (below.shown * u[below.beyond + j] - u[c + j]) * given[places[0] + j]
         high = (above.shown * u[q + j] - u[c + j]) * given[places[1] + j]
         total = ratio * (near * low - (1.0 - near) * high)
-        gw[m + j] = total if fresh else total + gw[m + j]
+        total = total if fresh else total + gw[m + j]
+        bad += not abs(total) < np.inf
+        gw[m + j] = total
     for upper in range(2):
         (b, e, z, m, wall, _, inner, shown), x, i = sides[upper], places[upper], places[2 + upper]
         if upper and on_sides and inner:
@@ -191,13 +193,18 @@ def to_velocity(w, gw, fresh, u, inflow, slopes, given, ratio, flux, a, on_sides
             value = near * (shown * u[z + j]) + (1.0 - near) * u[c + j]
             mine, theirs = value - rest * u[c + j], value - rest * u[z + j]
             total = sign * ratio * (mine * given[x + j] - back * given[i + j] * theirs)
-            gw[m + j] = total if fresh else total + gw[m + j]
+            total = total if fresh else total + gw[m + j]
+            bad += not abs(total) < np.inf
+            gw[m + j] = total
         for j in range(b, b if shown else e):
             gw[m + j] += sign * ratio * given[x + j] * (share(sign * w[m + j]) * inflow[wall + j])
+            bad += not abs(gw[m + j]) < np.inf
         for j in range(b, e if slopes.size else b):
             near = share(sign * w[m + j])
             slope = near * inner * slopes[a, (1 - upper) % many, z + j] - (1.0 - near) * slopes[a, upper % many, c + j]
             gw[m + j] += ratio * (given[x + j] - back * given[i + j]) * slope
+            bad += not abs(gw[m + j]) < np.inf
+    return bad
 
 
 limiter = van_leer  # in the loop over slopes: stands for the function of the scheme it is compiled for
@@ -267,18 +274,20 @@ def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, ou
 
 
 @kernel(
-    "read1 read1 read1 read1 mask2 read3 real read2 index2 real write1 write1 write1 flag write4",
+    "read1 read1 read1 read1 mask2 read3 real read2 index2 real write1 write1 write1 flag write4 write1",
     **OPTIONS,
 )
-def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, fresh, partials, start, stop):
+def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, fresh, partials, wrong, start, stop):
     """The cotangent of u' -> those of u with constant slopes, of the inflow (added) and of w (added or, fresh, set).
 
-    gu, gw: empty where they are not wanted. The cotangents of a and b are left in the last slopes of `partials`.
+    wrong: for each tile how many of u and w are not finite. gu, gw: empty where they are not wanted. The cotangents of
+    a and b are left in the last slopes of `partials`.
     """
     memory, lines, uneven = np.empty((3, LINE)), np.empty(4 * LINE), axes[0, UNEVEN]
     field, asked, given, many = memory[0], memory[1:], lines if uneven else g, slopes.shape[1]
     for part in range(start, stop):
         tile = _, _, _, c, size = tile_of(axes, part)
+        bad = 0
         for j in range(size):
             field[j] = g[c + j]
         for a in range(len(axes)):
@@ -315,13 +324,17 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
                         more = inner * max(-into * w[o + j], 0.0) * given[i + j]
                         asked[upper, j] = sign * (max(-into * w[m + j], 0.0) * given[x + j] - more)
                 if gw.size:
-                    to_velocity(w, gw, fresh, u, inflow, slopes, given, ratio, flux, a, on_sides, c, sides, places)
+                    bad += to_velocity(
+                        w, gw, fresh, u, inflow, slopes, given, ratio, flux, a, on_sides, c, sides, places
+                    )
             for by in range(2 if partials.size else 0):  # what is asked of behind and ahead -> cotangents of a and b
                 for j in range(size):
                     total = partials[a, 0, by, c + j] * asked[0, j]
                     partials[a, many - 1, by, c + j] = total + partials[a, many - 1, by, c + j] * asked[1, j]
         for j in range(size if gu.size else NONE):
+            bad += not abs(field[j]) < np.inf
             gu[c + j] = field[j]
+        wrong[part] = bad
 
 
 @kernel("read4 mask2 index2 write1 write1", **OPTIONS)
