@@ -121,7 +121,7 @@ class Jacobians:
         self.way = ""
         # space -> (Coloured, or None when only products will do; the cells that the unknowns were found to lie on)
         self._patterns: dict = {}
-        self._points, self._matrices = Cache(), Cache()
+        self._points, self._operators, self._matrices = Cache(), Cache(), Cache()
         self._alone = RLock()  # held by the thread that looks for a pattern
 
     def __str__(self):
@@ -157,7 +157,8 @@ class Jacobians:
         settings, solver = self.settings, None
         key: Any = None
         if op.form == "explicit" and op.layout is None and not near:
-            key = op.matrix.indptr, op.matrix.indices, op.matrix.data
+            entries = op.matrix.indptr, op.matrix.indices, op.matrix.data
+            key = (op,) if op is self._operators.last else entries
             solver = self._matrices.find(key)
             if not solver and op.shape[0] <= DENSE_UP_TO and settings["method"] in ("auto", "direct"):
                 solver = build_dense(op, settings["rtol"], settings["nullspace"], settings["name"])
@@ -224,10 +225,14 @@ class Jacobians:
         if equation.layout.ranks:
             return coloured.operator(product, name), False
         matrix = coloured.matrix(product)
-        # A field of another shape may have as many unknowns.
-        if space is None or equation.layout.shapes[0] != space.shape or not _is_symmetric(matrix, space):
-            space = Space(size)
-        return from_matrix(matrix, space, space, name), coloured.by_rows and coloured.pattern.nnz == size**2
+        if space is not None and equation.layout.shapes[0] != space.shape:
+            space = None  # a field of another shape that has as many unknowns
+        key = space, matrix.indptr, matrix.indices, matrix.data
+        op = self._operators.find(key)  # that of the step before, where the residual is linear
+        if op is None:
+            cells = space if space is not None and _is_symmetric(matrix, space) else Space(size)
+            op = self._operators.put(key, from_matrix(matrix, cells, cells, name))
+        return op, coloured.by_rows and coloured.pattern.nnz == size**2
 
     def _as_operator(self, given, layout, name):
         if isbox(given):
