@@ -2,6 +2,6 @@
 
 - `engine`: what the contract calls: conjugate gradients with the cycle as preconditioner.
 - `stencil`: an operator as a stencil, read off its products.
-- `interpolation`, `levels`: the set-up, and the cycle.
+- `cycle`: the levels, black-box interpolation between them, and the cycle.
 - `loops`: the compiled functions.
 """
