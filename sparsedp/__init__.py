@@ -85,7 +85,8 @@ def __getattr__(name):
         except metadata.PackageNotFoundError:
             value = "0+unknown"  # run from a tree that was never installed
     else:
-        hint = f"; write {_MEANT[name]}" if name in _MEANT else ""
+        near = _import_module(f"{__name__}.fields").advice_near
+        hint = f"; write {_MEANT[name]}" if name in _MEANT else near(name, __all__)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
     globals()[name] = value  # the next look-up does not come here
     return value

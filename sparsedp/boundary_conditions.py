@@ -49,6 +49,9 @@ class Condition(Value):
     def _key(self):
         return self.a, self.b
 
+    def __call__(self, value):
+        raise TypeError(f"{self} takes no value here; write G(u) + B(values), B = dp.lift(grid, dp.{self})")
+
     def __repr__(self):
         return {(1.0, 0.0): "dirichlet", (0.0, 1.0): "neumann"}.get(self._key, f"robin({self.a:g}, {self.b:g})")
 
@@ -135,7 +138,7 @@ def resolve(grid, boundary, default=neumann):
     grid : Grid
     boundary : condition or dict
         One condition for all bounded sides, or a dict with keys "x", "y", "z", each a condition
-        or a pair (lower, upper).
+        or a pair (lower, upper). On a grid of one axis a pair needs no dict.
     default : Condition or FlowCondition
         That of the axes that are not named; says which kind of conditions is meant.
 
@@ -148,7 +151,7 @@ def resolve(grid, boundary, default=neumann):
     ValueError
         If a periodic axis or an axis the grid does not have is named.
     TypeError
-        If an entry is not a condition of that kind, or the grid not a grid.
+        If an entry is not a condition of that kind, a pair of them has no axis, or the grid is not a grid.
 
     Examples
     --------
@@ -160,6 +163,8 @@ def resolve(grid, boundary, default=neumann):
     if isinstance(boundary, dict):
         _check_names(grid, boundary)
     else:
+        if isinstance(boundary, (tuple, list)) and grid.dim > 1:
+            raise TypeError(f"a pair of conditions belongs to one axis of {grid}; name it: {{'x': {boundary!r}}}")
         boundary = dict.fromkeys(AXES, boundary)
     return tuple(
         None if periodic else _sides(axis, boundary.get(axis, default), type(default))
@@ -185,6 +190,6 @@ def _sides(axis, entry, kind):
     sides = (entry, entry) if isinstance(entry, kind) else entry
     if not (isinstance(sides, (tuple, list)) and len(sides) == 2 and all(isinstance(s, kind) for s in sides)):
         names = [word for word in kind.choices.split(", ") if f"'{word}'" in repr(entry)]
-        advice = f"; write dp.{names[0]}" if names else ""
+        advice = f"; write dp.{names[0]}" if names else EXAMPLE if "function robin" in repr(entry) else ""
         raise TypeError(f"boundary on {axis} needs {kind.choices} or a pair of them, got {entry!r}{advice}")
     return tuple(sides)

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparsedp.constants import is_fixed
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
-from sparsedp.fields import check_function, check_native, check_shape, check_whole
+from sparsedp.fields import advise, check_function, check_native, check_shape, check_whole
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
 from sparsedp.shortcuts import ELSEWHERE, alike, together
@@ -223,6 +223,7 @@ def traced(fun, tree, roots):
     except (TypeError, ValueError, AttributeError) as error:
         said = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
         if isinstance(error, SparsedpError) or not any("ArrayBox" in words for words in said):
+            advise(error)
             raise
         raise DerivativeError(
             f"a traced value was refused ({error}); write the function with autograd.numpy, without float(), item() "
@@ -528,7 +529,8 @@ def value_and_grad(loss, argnum=0):
     (18.0, {'a': 12.0, 'n': None})
     """
     check_function("value_and_grad", loss, "lambda x: np.sum(x**2)")
-    argnum = check_whole("argnum of value_and_grad", argnum, 0, "; write 0 for the first argument")
+    advice = "; write 0 for the first argument, and value_and_grad(loss)(x) for the gradient at x"
+    argnum = check_whole("argnum of value_and_grad", argnum, 0, advice)
 
     def evaluate(*args):
         if len(args) <= argnum:
@@ -547,6 +549,8 @@ def value_and_grad(loss, argnum=0):
 
 def check_loss(value):
     """Refuse what a loss returned, traced or not, if it is not one real number."""
+    if isinstance(value, (tuple, list, dict)):
+        raise ShapeError(f"the loss must be a scalar, got a {type(value).__name__}; return one number")
     if np.shape(plain(value)) != ():
         raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(plain(value))}; sum it")
     if dtype_of(value).kind == "c":

@@ -30,7 +30,7 @@ class NonFiniteError(SparsedpError, ValueError):
 
 
 class UnstableStepError(SparsedpError, ValueError):
-    """An explicit time step is larger than the scheme allows."""
+    """A time step is larger than the scheme allows."""
 
 
 class DerivativeError(SparsedpError, TypeError):

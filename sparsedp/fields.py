@@ -1,6 +1,7 @@
 """What may be given: the checks of fields, of numbers and of reused result arrays."""
 
 from decimal import ROUND_FLOOR, Context
+from difflib import get_close_matches
 from inspect import CO_VARARGS
 from math import isfinite
 from types import FunctionType
@@ -13,6 +14,8 @@ from sparsedp.tree import leaves_like
 __all__ = [
     "BLOCK",
     "EPS",
+    "advice_near",
+    "advise",
     "check_choice",
     "check_finite",
     "check_function",
@@ -175,7 +178,25 @@ def check_choice(name, word, choices, advice=""):
     """Refuse what is none of some words; where these are True and False, 1 is none of them."""
     if not any(isinstance(word, type(one)) and word == one for one in choices):
         words = ", ".join(str(one) for one in choices if one is not None)
+        advice = advice or advice_near(word, words.split(", "))
         raise ValueError(f"{name} must be {'one of ' if ', ' in words else ''}{words}, got {word!r}{advice}")
+
+
+def advice_near(word, words):
+    """Advice to write the one of some words that is most like one which is none of them; empty if none is."""
+    word = str(word).lower()
+    near = [one for one in words if word and one.startswith(word)] or get_close_matches(word, words)
+    return f"; write {near[0]!r}" if near else ""
+
+
+def advise(error, params=()):
+    """Add to the words of an error what to write, where a list or the params None met arithmetic."""
+    said = str(error)
+    if isinstance(error, TypeError) and "; write" not in said:
+        if "'list'" in said or "multiply sequence" in said:
+            error.args = (f"{said}; write np.asarray(x) for an array: a list is a tree of numbers",)
+        elif params is None and "NoneType" in said:
+            error.args = (f"{said}; write rollout(step, start, params, n): the params given are None",)
 
 
 def check_takes(name, fun, count, example):

@@ -70,6 +70,7 @@ class Grid(Value, Uncached):
     periodic: tuple[bool, ...]
     origin: tuple[float, ...]
     widths: tuple[np.ndarray, ...]
+    meant = {"dx": "grid.widths", "h": "grid.widths", "n": "grid.shape", "ndim": "grid.dim", "x": "grid.centres()[0]"}
     layout = None  # of a grid whose fields lie on ranks: see parallel/layout.py
 
     def __init__(self, shape, *, size=None, spacing=None, origin=0.0, periodic=False):

@@ -62,6 +62,14 @@ class Operator(Frozen, Remade):
     name: str
     form: str
     layout: Any  # where its fields lie, when that is on ranks; else None
+    meant = {
+        "dot": "op(u), or A @ B",
+        "toarray": "op.matrix.toarray()",
+        "todense": "op.matrix.toarray()",
+        "nnz": "op.matrix.nnz",
+        "H": "op.T",
+        "solve": "inv(b), with inv = dp.inverse(op)",
+    }
     _transposed = None
     _origin = staticmethod(lambda: None)  # what it was turned from, while that is there
 

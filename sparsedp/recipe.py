@@ -97,10 +97,23 @@ class Uncached:
 
 
 class Frozen:
-    """An object whose attributes are the values it is made with."""
+    """An object whose attributes are the values it is made with.
+
+    Attributes
+    ----------
+    meant : dict
+        What people write, coming from elsewhere: what to write here.
+    """
+
+    meant: Any = {}
 
     def __init__(self, **values):
         vars(self).update(values)
+
+    def __getattr__(self, name):
+        if name in self.meant:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}; write {self.meant[name]}")
+        return object.__getattribute__(self, name)  # in Python's own words
 
     def __setattr__(self, name, value):
         raise AttributeError(f"{type(self).__name__} is frozen; make a new one instead of setting {name}")

@@ -12,6 +12,7 @@ from sparsedp.errors import ShapeError
 GRID = dp.Grid((3, 2))
 SIDES = {"x": dp.dirichlet, "y": dp.robin(1.0, 0.5)}
 LIFT, SOLVE = dp.lift(GRID, SIDES), dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
+MINIMUM = dp.minimize(lambda x: (x - 1.0) ** 2, 0.0)
 LAYERS = {"first": dp.network.dense_weights(np.random.default_rng(0), 2, 3)}
 RNG = np.random.default_rng(0)
 
@@ -66,7 +67,96 @@ WRONG = [
         lambda: dp.check.gradient(lambda x: anp.sum(x**2), np.ones(3), directions=-1), ValueError,
         "directions of check.gradient must be a whole number >= 0, got -1; the default is 3",
     ),
+    (
+        lambda: dp.laplacian(GRID, (dp.dirichlet, dp.neumann)), TypeError,
+        "a pair of conditions belongs to one axis of Grid(3 x 2 cells, size 3 x 2); name it: "
+        "{'x': (dirichlet, neumann)}",
+    ),
+    (
+        lambda: dp.dirichlet(1.0), TypeError,
+        "dirichlet takes no value here; write G(u) + B(values), B = dp.lift(grid, dp.dirichlet)",
+    ),
+    (
+        lambda: dp.lapacian, AttributeError, "module 'sparsedp' has no attribute 'lapacian'; write 'laplacian'",
+    ),
+    (lambda: dp.banana, AttributeError, "module 'sparsedp' has no attribute 'banana'"),
+    (lambda: MINIMUM.fun, AttributeError, "Minimum has no attribute 'fun'; write best.value"),
+    (lambda: MINIMUM.nit, AttributeError, "Minimum has no attribute 'nit'; write best.history[-1].iteration"),
+    (lambda: MINIMUM.gain, AttributeError, "'Minimum' object has no attribute 'gain'"),
+    (lambda: GRID.dx, AttributeError, "Grid has no attribute 'dx'; write grid.widths"),
+    (lambda: GRID.x, AttributeError, "Grid has no attribute 'x'; write grid.centres()[0]"),
+    (lambda: LIFT.dot, AttributeError, "Operator has no attribute 'dot'; write op(u), or A @ B"),
+    (lambda: LIFT.toarray(), AttributeError, "Operator has no attribute 'toarray'; write op.matrix.toarray()"),
+    (
+        lambda: dp.minimize(lambda x: x**2, 1.0, tol=1e-3), TypeError,
+        "lbfgs has no option 'tol'; it has memory, line_search; write 'tolerance'",
+    ),
+    (
+        lambda: dp.minimize(lambda x: x**2, 1.0, jac=True), TypeError,
+        "lbfgs has no option 'jac'; it has memory, line_search",
+    ),
+    (
+        lambda: dp.minimize(lambda x: x**2, 1.0, method="L-BFGS-B"), ValueError,
+        "method must be one of lbfgs, gd, adam, newton_cg, gauss_newton, levenberg_marquardt, half_inverse, "
+        "physical_gradient, admm, got 'L-BFGS-B'; write 'lbfgs'",
+    ),
+    (
+        lambda: dp.inverse(dp.laplacian(GRID), method="cg"), ValueError,
+        "method must be one of auto, separable, direct, structured, multigrid, krylov, got 'cg'; write 'krylov'",
+    ),
+    (
+        lambda: dp.inverse(dp.laplacian(GRID), tol=1e-3), TypeError,
+        "method auto takes the options precision, cycle, strength, sweeps, levels, preconditioner, diff, iterations, "
+        "got 'tol'; write 'rtol'",
+    ),
+    (
+        lambda: dp.value_and_grad(lambda x: anp.sum(x**2), np.ones(2)), ValueError,
+        "argnum of value_and_grad must be a whole number >= 0, got array([1., 1.]); write 0 for the first argument, "
+        "and value_and_grad(loss)(x) for the gradient at x",
+    ),
+    (
+        lambda: dp.check.gradient(dp.value_and_grad(lambda x: anp.sum(x**2)), np.ones(2)), ShapeError,
+        "the loss must be a scalar, got a tuple; return one number",
+    ),
+    (
+        lambda: dp.steady(lambda x: x, 1.0, 2.0), TypeError,
+        "implicit(<lambda>) calls a function with 2 arguments, got one that takes 1; "
+        "write lambda x, p: ..., and root(guess, p)",
+    ),
+    (
+        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(9), bounds=[(0, 1)] * 9), ValueError,
+        "bounds must be a pair (lower, upper), each a number, None or a tree like start, got [(0, 1), (0, 1), (0, 1), "
+        "(0, 1), (0, 1), (0, 1), ...]; write (0.0, None) for x >= 0",
+    ),
 ]  # fmt: skip
+
+NO_PARAMS = "; write rollout(step, start, params, n): the params given are None"
+NO_ARRAY = "; write np.asarray(x) for an array: a list is a tree of numbers"
+
+
+@pytest.mark.parametrize(
+    "call, advice",
+    [
+        (lambda: dp.rollout(lambda u, p: u * p, np.ones(2), None, 3), NO_PARAMS),
+        (lambda: dp.rollout(lambda u, p: u * p["k"], np.ones(2), None, 3), NO_PARAMS),
+        (lambda: dp.grad(lambda u: anp.sum(dp.rollout(lambda u, p: u * p[0], u, None, 3)))(np.ones(2)), NO_PARAMS),
+        (lambda: dp.rollout(lambda u, p: u * 0.5, [1.0, 2.0], None, 3), NO_ARRAY),
+        (lambda: dp.grad(lambda x: anp.sum(x**2))([1.0, 2.0]), NO_ARRAY),
+        (lambda: dp.minimize(lambda x: anp.sum(x**2), [1.0, 2.0]), NO_ARRAY),
+        (lambda: dp.check.gradient(lambda x: anp.sum(x**2), [[1.0, 2.0]]), NO_ARRAY),
+    ],
+)
+def test_an_error_of_arithmetic_says_what_was_given(call, advice):
+    """Python's words, and what to write; once, also through several loops."""
+    with pytest.raises(TypeError) as caught:
+        call()
+    assert str(caught.value).endswith(advice) and str(caught.value).count("; write") == 1
+
+
+def test_other_errors_of_a_step_are_left_alone():
+    """None that is no matter of the params."""
+    with pytest.raises(TypeError, match="^unsupported operand type.s. for .: 'float' and 'NoneType'$"):
+        dp.rollout(lambda u, p: u * 0.5 + (0.5 * None), np.ones(2), 2.0, 3)
 
 
 @pytest.mark.parametrize("call, error, message", WRONG, ids=[row[2][:40] for row in WRONG])

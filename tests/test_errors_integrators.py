@@ -22,7 +22,7 @@ TABLE = [
         lambda: dp.stepper("rk5", decay, 0.1),
         VALUE,
         "method must be one of euler, heun, ssprk3, rk4, backward_euler, crank_nicolson, tr_bdf2, imex, "
-        "radau, etdrk4, leapfrog, got 'rk5'",
+        "radau, etdrk4, leapfrog, got 'rk5'; write 'rk4'",
     ),
     (lambda: dp.stepper("euler", L, 0.1, unstable="warn"), VALUE, "unstable must be one of raise, allow, got 'warn'"),
     (
@@ -279,6 +279,46 @@ def test_a_rate_that_writes_into_the_state_is_named_when_only_params_are_traced(
     for last in (lambda p: sum(step(U, p)), lambda p: sum(dp.rollout(step, U, p, 2))):
         with pytest.raises(ValueError, match=re.escape(message)):
             dp.value_and_grad(last)(1.0)
+
+
+@pytest.mark.parametrize("method", ["backward_euler", "crank_nicolson", "tr_bdf2", "imex"])
+@pytest.mark.parametrize(
+    "grid",
+    [
+        dp.Grid((9, 8), size=1.0),
+        dp.Grid((9, 8), size=1.0, periodic=True),
+        dp.Grid((6, 5), spacing=[np.linspace(0.1, 0.3, 6), np.linspace(0.2, 0.1, 5)]),
+    ],
+    ids=["even", "around", "uneven"],
+)
+def test_an_operator_of_the_wrong_sign_is_refused(method, grid):
+    """Where steps with it would turn signs and grow; with L itself, and in steps that can follow, all is well."""
+    L, rate = dp.laplacian(grid), lambda u, p: 0.0 * u
+
+    def stepped(operator, h):
+        with_rate = dict(linear=operator) if method == "imex" else {}
+        step = dp.stepper(method, rate if with_rate else operator, h, **with_rate)
+        return dp.rollout(step, np.cos(np.arange(np.prod(grid.shape)) ** 2.0).reshape(grid.shape), None, 2)
+
+    with pytest.raises(
+        dp.errors.UnstableStepError,
+        match="the operator of .* makes fields grow faster than the step can follow, as -laplacian does; change its sign, or take a "
+        "smaller time step$",
+    ):
+        stepped(-L, 0.5)
+    assert np.all(np.isfinite(stepped(L, 0.5))) and np.all(np.isfinite(stepped(-L, 1e-5)))
+
+
+def test_growth_that_is_meant_is_taken():
+    """Swift and Hohenberg's operator, with waves that grow; a growth of its own; one that is not symmetric."""
+    grid = dp.Grid(32, size=20.0, periodic=True)
+    one, L = dp.identity(grid.cells), dp.laplacian(grid)
+    pattern = 0.3 * one - (one + L) @ (one + L)
+    turned = dp.from_matrix(np.array([[1.0, -10.0], [10.0, -3.0]]))
+    for op, h, u in ((pattern, 1.0, np.ones(32)), (0.5 * one, 1.0, np.ones(32)), (turned, 2.0, np.ones(2))):
+        assert np.all(np.isfinite(dp.stepper("backward_euler", op, h)(u, None)))
+    with pytest.raises(dp.errors.UnstableStepError):
+        dp.stepper("backward_euler", 2.0 * one, 1.0)(np.ones(32), None)
 
 
 def test_a_stage_without_a_root_says_what_to_change():

@@ -317,7 +317,7 @@ def test_message(case):
 def test_names_of_methods_are_listed():
     with pytest.raises(ValueError, match=r"^method must be one of auto, separable, .*, got 'magic'$"):
         dp.inverse(OP, "magic")
-    with pytest.raises(TypeError, match=r"^method multigrid takes the options cycle, .*, got 'cycles'$"):
+    with pytest.raises(TypeError, match=r"^method multigrid takes the options cycle, .*, got 'cycles'; write 'cycle'$"):
         dp.inverse(OP, "multigrid", cycles="V")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from sparsedp.check.summary import error_text
 from sparsedp.derivative import check_loss
 from sparsedp.errors import SparsedpError
-from sparsedp.fields import check_finite
+from sparsedp.fields import advise, check_finite
 from sparsedp.ledger import recording, thread
 from sparsedp.packing import Packing, joined
 from sparsedp.shortcuts import whole
@@ -181,8 +181,9 @@ class Trials:
         self.count += 1
         self.tick()
         with np.errstate(all="ignore"):
-            value = np.asarray(self.loss(tree))
+            value = self.loss(tree)
         check_loss(value)
+        value = np.asarray(value)
         if value.dtype.kind == "f":
             self.eps = max(self.eps, eps_of(value.dtype))
         return float(value)
@@ -194,7 +195,11 @@ class Trials:
     def start(self):
         """Find the loss at the point. Solves are seen in one more run: recording is no part of what is judged."""
         before = thread.solves
-        self.base = self.value(self.point.fresh())
+        try:
+            self.base = self.value(self.point.fresh())
+        except TypeError as error:
+            advise(error)
+            raise
         self.solved = thread.solves > before
         if self.solved:
             with recording() as calls, np.errstate(all="ignore"):

@@ -41,10 +41,11 @@ from operator import add
 from typing import Any, NamedTuple
 
 import autograd.numpy as anp
+import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.derivative import of_argument
-from sparsedp.errors import ConvergenceError
+from sparsedp.errors import ConvergenceError, UnstableStepError
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import note
 from sparsedp.operator import Operator
@@ -237,7 +238,19 @@ class Resolvent:
     def _set_up(self, z):
         """The inverse of 1 - z L."""
         inv, P = build(self._one - z * self.op, name=self.name, log=self.info, **self.settings), self._moving
+        self._check_sign(inv.structure.solver.system)
         return inv if P is None else self._named(((P @ inv - self._one) @ P + self._one).structure)
+
+    def _check_sign(self, system):
+        """Refuse an L under which something grows as fast as 1 / z or faster: a step would turn its sign."""
+        if system.complex or not system.symmetric:
+            return
+        x = system.masked(np.random.default_rng(system.seed).standard_normal(system.here))
+        if system.total(x @ (system.weights * system.product(x))) < 0:
+            raise UnstableStepError(
+                f"the operator of {self.name} makes fields grow faster than the step can follow, as -laplacian does; "
+                "change its sign, or take a smaller time step"
+            )
 
     def _named(self, structure):
         return Operator(structure, self.op.domain, self.op.domain, self.name)

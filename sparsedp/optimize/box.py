@@ -1,5 +1,7 @@
 """Bounds on the unknowns, as flat vectors."""
 
+from reprlib import repr as shortened
+
 import numpy as np
 
 from sparsedp.errors import ShapeError
@@ -40,7 +42,7 @@ class Box:
         if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
             raise ValueError(
                 "bounds must be a pair (lower, upper), each a number, None or a tree like start, "
-                f"got {bounds!r}; write (0.0, None) for x >= 0"
+                f"got {shortened(bounds)}; write (0.0, None) for x >= 0"
             )
         lower, upper = bounds
         self.lower = _side(lower, -np.inf, packing)

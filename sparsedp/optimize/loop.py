@@ -4,7 +4,7 @@ import inspect
 from math import inf
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_choice, check_function, check_number, check_whole, is_number
+from sparsedp.fields import advice_near, check_choice, check_function, check_number, check_whole, is_number
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.checkpoint import Checkpoint
@@ -230,4 +230,5 @@ def _stepper(method, options):
 def _check_options(method, options, names):
     for name in options:
         if name not in names:
-            raise TypeError(f"{method} has no option {name!r}; it has {', '.join(names)}")
+            near = advice_near(name, [*names, *inspect.signature(minimize).parameters])
+            raise TypeError(f"{method} has no option {name!r}; it has {', '.join(names)}{near}")

@@ -96,6 +96,14 @@ class Minimum(Frozen):
     evaluations: int
     resumed: str = ""
     covariance: Any = None
+    meant = {
+        "fun": "best.value",
+        "point": "best.x",
+        "nit": "best.history[-1].iteration",
+        "nfev": "best.evaluations",
+        "success": "best.converged",
+        "status": "best.message",
+    }
 
     def __str__(self):
         last = self.history[-1]

@@ -8,6 +8,7 @@ import numpy as np
 
 from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
 from sparsedp.fields import (
+    advice_near,
     check_choice,
     check_finite,
     check_native,
@@ -43,6 +44,7 @@ METHODS = {
     "multigrid": multigrid_engine,
     "krylov": krylov_engine,
 }
+MEANT = {"cg": "krylov", "gmres": "krylov", "amg": "multigrid", "mg": "structured", "lu": "direct", "fft": "separable"}
 
 # Transforms win from this number of unknowns on, in 2-D and 3-D, while the axes that need dense
 # eigenvectors are not longer than this.
@@ -179,7 +181,7 @@ def _set_up(solver, clock):
 
 def check_settings(method, rtol, maxiter, nullspace, options):
     """Refuse settings that the method, or with "auto" every method, cannot take -> them, as keywords of `build`."""
-    check_choice("method", method, ("auto", *METHODS))
+    check_choice("method", method, ("auto", *METHODS), f"; write {MEANT[method]!r}" if method in MEANT else "")
     rtol = check_number("rtol", rtol, "between 0 and 1", "; the default is 1e-10")
     if maxiter is not None:
         maxiter = check_whole("maxiter", maxiter, 1, "; None leaves it to the method")
@@ -194,7 +196,8 @@ def _check_options(word, options):
     known = list(dict.fromkeys(p.name for p in parameters if p.kind == p.KEYWORD_ONLY))
     for name in options:
         if name not in known:
-            raise TypeError(f"method {word} takes the options {', '.join(known) or '(none)'}, got {name!r}")
+            near = advice_near(name, [*known, "rtol", "maxiter", "method", "nullspace"])
+            raise TypeError(f"method {word} takes the options {', '.join(known) or '(none)'}, got {name!r}{near}")
 
 
 def _engine(system, word, options, suited=None):

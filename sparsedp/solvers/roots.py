@@ -14,7 +14,7 @@ import numpy as np
 
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError
-from sparsedp.fields import check_function, check_whole
+from sparsedp.fields import check_function, check_takes, check_whole
 from sparsedp.ledger import note, thread
 from sparsedp.recipe import Remade
 from sparsedp.shortcuts import on_every_rank, together
@@ -216,6 +216,7 @@ class Root(Remade):
         -------
         x, like the guess
         """
+        check_takes(self.name, self.residual, 1 + len(params), "lambda x, p: ..., and root(guess, p)")
         layout = Layout(guess, self.name)
         params = params if layout.ranks else mapped(on_every_rank, params)
         equation = Equation(self.residual, layout, params, self.name)

@@ -8,6 +8,7 @@ import numpy as np
 
 from sparsedp.constants import frozen
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
+from sparsedp.fields import advise
 from sparsedp.tape import Recorder, boxed, new_trace, plain, traces_of, untaped_root
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.trajectory.record import largest
@@ -212,6 +213,7 @@ class Steps:
             refused = _refuses_writing(error)
             changes = self._culprit() or ("keep changes the state" if refused else None)
             if changes is None:
+                advise(error, self.last and self._plain_parts(self.last)[1])
                 raise
             raise ValueError(f"{changes} in place; write u = u + du instead of u += du, or work on a copy") from (
                 error if refused else None
