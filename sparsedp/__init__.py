@@ -34,7 +34,7 @@ _WINDOW = {
     "advection.front": "transport",
     "flow.finite_volumes": "conservation_law",
     "flow.obstacles": "brinkman forces",
-    "flow.pressure": "projection",
+    "flow.pressure_projection": "projection",
     "flow.stepping": "flow_step",
     "integrators.front": "stepper",
     "integrators.leapfrog": "sponge",

@@ -23,7 +23,7 @@ from .flow.momentum import face_laplacian as face_laplacian
 from .flow.momentum import face_lift as face_lift
 from .flow.obstacles import brinkman as brinkman
 from .flow.obstacles import forces as forces
-from .flow.pressure import projection as projection
+from .flow.pressure_projection import projection as projection
 from .flow.stepping import flow_step as flow_step
 from .grid import Grid as Grid
 from .integrators.front import stepper as stepper

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.constants import is_fixed
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
 from sparsedp.fields import advise, check_function, check_native, check_shape, check_whole
 from sparsedp.ledger import thread
@@ -31,6 +30,7 @@ from sparsedp.tape import (
     plain,
     split_boxes,
 )  # fmt: skip
+from sparsedp.tape_constants import is_fixed
 from sparsedp.tree import copied, flatten, keys, leaves, mapped
 
 __all__ = [

@@ -18,10 +18,10 @@ from autograd.core import JVPNode, VJPNode, add_outgrads, primitive_jvps, primit
 from autograd.extend import VSpace, defjvp_argnums, defvjp_argnums, primitive
 from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_primitives, trace_stack
 
-from sparsedp.constants import FIXED, constant, constant_args, frozen, sparing
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.ledger import active, count, note, thread, timed
 from sparsedp.recipe import Remade
+from sparsedp.tape_constants import FIXED, constant, constant_args, frozen, sparing
 
 # isort: off
 from sparsedp.shortcuts import (

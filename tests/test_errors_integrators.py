@@ -302,8 +302,8 @@ def test_an_operator_of_the_wrong_sign_is_refused(method, grid):
 
     with pytest.raises(
         dp.errors.UnstableStepError,
-        match="the operator of .* makes fields grow faster than the step can follow, as -laplacian does; change its sign, or take a "
-        "smaller time step$",
+        match="the operator of .* makes fields grow faster than the step can follow, as -laplacian does; change "
+        "its sign, or take a smaller time step$",
     ):
         stepped(-L, 0.5)
     assert np.all(np.isfinite(stepped(L, 0.5))) and np.all(np.isfinite(stepped(-L, 1e-5)))

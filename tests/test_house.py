@@ -28,7 +28,7 @@ from sources import (
 import sparsedp
 
 FLOORS = [
-    ("constants", 0),
+    ("tape_constants", 0),
     ("errors", 0),
     ("shortcuts", 0),
     ("tree", 0),

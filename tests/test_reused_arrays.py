@@ -15,9 +15,9 @@ import scipy.sparse as sp
 from reused import CALLS, CASES, CONSTANT, LINE, PLACES, entries, field
 
 import sparsedp as dp
-from sparsedp.constants import constant
 from sparsedp.derivative import pullback, pushforward
 from sparsedp.errors import DerivativeError
+from sparsedp.tape_constants import constant
 from sparsedp.tree import flatten, leaves
 
 # One array and no other, so that nothing beside it is kept; or nothing to differentiate; or tested where it stands.
@@ -203,7 +203,7 @@ def test_what_cannot_change_is_not_copied():
 
 
 def test_copies_live_as_long_as_their_tape():
-    from sparsedp.constants import copies
+    from sparsedp.tape_constants import copies
 
     before, work = len(copies), field(20000, 1)
     value, pull = pullback(lambda x: work * x * work, np.ones(20000))

@@ -27,7 +27,6 @@ import numpy as np
 
 from sparsedp.boundary_conditions import free_slip, outflow, resolve
 from sparsedp.boundary_conditions import inflow as inflow_side
-from sparsedp.constants import constant, frozen
 from sparsedp.derivative import entrywise
 from sparsedp.errors import ShapeError
 from sparsedp.fields import (
@@ -44,6 +43,7 @@ from sparsedp.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.recipe import Remade
 from sparsedp.tape import cast, dtype_of, isbox, plain
+from sparsedp.tape_constants import constant, frozen
 from sparsedp.tree import mapped
 
 __all__ = ["ConservationLaw", "conservation_law"]

@@ -36,7 +36,6 @@ from typing import Any
 import numpy as np
 
 from sparsedp.boundary_conditions import neumann, no_slip
-from sparsedp.constants import frozen
 from sparsedp.errors import DerivativeError, ShapeError, UnstableStepError
 from sparsedp.fields import (
     check_choice,
@@ -48,7 +47,7 @@ from sparsedp.fields import (
     rounded_down,
 )
 from sparsedp.flow.momentum import convection, face_laplacian, free_faces
-from sparsedp.flow.pressure import projection
+from sparsedp.flow.pressure_projection import projection
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.difference import divergence, gradient, laplacian
@@ -57,6 +56,7 @@ from sparsedp.operators.transfer import average
 from sparsedp.recipe import Remade
 from sparsedp.solvers.choose_method import inverse
 from sparsedp.tape import dtype_of, isbox, plain
+from sparsedp.tape_constants import frozen
 from sparsedp.tree import copied, mapped
 
 __all__ = ["FlowStep", "flow_step"]

@@ -37,13 +37,13 @@ from typing import Any, NamedTuple
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.shortcuts import on_every_rank
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain
+from sparsedp.tape_constants import constant
 from sparsedp.tree import flatten, leaves, mapped
 
 __all__ = ["Adaptive", "Moving", "Taken", "relative"]

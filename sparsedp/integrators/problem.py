@@ -6,12 +6,12 @@ import inspect
 
 import numpy as np
 
-from sparsedp.constants import frozen
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_function, check_number, check_takes
 from sparsedp.operator import Operator
 from sparsedp.space import fits
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
+from sparsedp.tape_constants import frozen
 from sparsedp.tree import copied, flatten, keys, labels, leaves, mapped, subscript
 
 __all__ = ["Problem", "combine", "later", "like", "number", "of_fields", "pair", "untraced"]

@@ -33,7 +33,6 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import check_shape
 from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Taken
@@ -44,6 +43,7 @@ from sparsedp.shortcuts import refuse_elsewhere
 from sparsedp.solvers.direct import dense_lu
 from sparsedp.solvers.newton import Layout
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
+from sparsedp.tape_constants import constant
 from sparsedp.tree import leaves
 
 __all__ = ["Radau"]

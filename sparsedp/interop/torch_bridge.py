@@ -8,11 +8,11 @@ import autograd.numpy as anp
 import numpy as np
 import torch
 
-from sparsedp.constants import constant, frozen
 from sparsedp.fields import check_function
 from sparsedp.interop.recording import owned, parts, recorded
 from sparsedp.recipe import Made
 from sparsedp.tape import Rule, dtype_of, is_variable, isbox
+from sparsedp.tape_constants import constant, frozen
 from sparsedp.tree import flatten, leaves, placed
 
 __all__ = ["from_torch", "to_torch"]

@@ -4,7 +4,6 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.constants import constant
 from sparsedp.fields import check_finite, check_kind, check_native, is_number
 from sparsedp.grid import check_grid
 from sparsedp.operators.difference import divergence, gradient
@@ -12,6 +11,7 @@ from sparsedp.operators.given import from_matrix
 from sparsedp.operators.masks_and_lift import interior
 from sparsedp.recipe import Made
 from sparsedp.tape import dtype_of, plain
+from sparsedp.tape_constants import constant
 
 __all__ = ["smoothness", "total_variation"]
 

@@ -11,12 +11,12 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.constants import frozen
 from sparsedp.derivative import check_loss, grad, jvp, value_and_grad, zero_like
 from sparsedp.fields import check_finite, check_function, check_shape, check_whole, is_whole
 from sparsedp.progress import shown_steps
 from sparsedp.recipe import Remade
 from sparsedp.tape import Rule, isbox
+from sparsedp.tape_constants import frozen
 from sparsedp.tree import copied, flatten, leaves, mapped, placed
 
 __all__ = ["Ensemble", "ensemble"]

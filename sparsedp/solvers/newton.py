@@ -34,7 +34,6 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.constants import constant
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import check_finite, check_plain, leaves_by_name
@@ -45,6 +44,7 @@ from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import length
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
+from sparsedp.tape_constants import constant
 from sparsedp.tree import flatten, leaves, placed
 
 __all__ = ["Equation", "Layout", "Newton"]

@@ -9,13 +9,13 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp import kernels
-from sparsedp.constants import frozen
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import check_shape
 from sparsedp.recipe import Remade
 from sparsedp.space import components
 from sparsedp.structure.base import Structure, compact, rows_of
 from sparsedp.structure.kronecker import Kronecker
+from sparsedp.tape_constants import frozen
 
 __all__ = [
     "Chain",

@@ -1,19 +1,18 @@
 """rollout(): a time loop whose gradient costs one node on the tape."""
 
 import warnings
-from itertools import pairwise
 
 import numpy as np
 
-from sparsedp.constants import constant_args
 from sparsedp.errors import BudgetWarning, DerivativeError, ShapeError
-from sparsedp.fields import check_function, check_takes, check_whole, is_whole
+from sparsedp.fields import check_function, check_takes, check_whole
 from sparsedp.ledger import thread
 from sparsedp.shortcuts import together
 from sparsedp.tape import VJPNode, dtype_of, is_variable, isbox, plain, through
+from sparsedp.tape_constants import constant_args
+from sparsedp.trajectory.keep import kind
 from sparsedp.trajectory.layout import Layout
 from sparsedp.trajectory.memory_budget import budget_within_reach, plan, room_within, slots_within
-from sparsedp.trajectory.outputs import All, Each, Last, Some
 from sparsedp.trajectory.run import Loop
 from sparsedp.tree import leaves
 
@@ -135,7 +134,7 @@ def rollout(
     if truncate is not None:
         check_whole("truncate of rollout", truncate, 1, "; leave it out and nothing is cut")
     room = ROOM if memory is None else room_within(memory, *sizes) if slots else 0
-    loop = Loop(step, forms, n, truncate, _innermost(args), _kind(keep, forms[0], n), slots, room, progress, record)
+    loop = Loop(step, forms, n, truncate, _innermost(args), kind(keep, forms[0], n), slots, room, progress, record)
     _check_values(loop, args, traced)
     if loop.wanted and loop.slots:
         _warn_of_repeats(memory, *sizes)
@@ -187,21 +186,6 @@ def _warn_of_repeats(memory, size, n, beside):
             ),
             stacklevel=3,
         )
-
-
-def _kind(keep, layout, n):
-    if callable(keep):
-        return Each(layout, keep)
-    if isinstance(keep, (list, tuple, range, np.ndarray)):
-        numbers = list(keep)
-        if not numbers or not all(is_whole(number, 0) for number in numbers):
-            raise ValueError(f"keep needs at least one state, numbers from 0 on, got {keep!r}")
-        if numbers[-1] > n or any(later <= number for number, later in pairwise(numbers)):
-            raise ValueError(f"keep needs rising numbers of states from 0 to n = {n}, got {keep!r}")
-        return Some(layout, numbers)
-    if not isinstance(keep, str) or keep not in ("last", "all"):
-        raise ValueError(f'keep must be "last", "all", a list of states or a function of (index, state), got {keep!r}')
-    return All(layout, range(n + 1)) if keep == "all" else Last(layout)
 
 
 def _check_values(loop, args, traced):

@@ -6,12 +6,12 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.constants import constant
 from sparsedp.derivative import described
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, check_native, surely_finite
 from sparsedp.shortcuts import ELSEWHERE, array
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
+from sparsedp.tape_constants import constant
 from sparsedp.tree import flatten, keys, labels, leaves, subscript
 
 __all__ = [

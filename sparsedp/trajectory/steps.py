@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.constants import frozen
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.fields import advise
 from sparsedp.tape import Recorder, boxed, new_trace, plain, traces_of, untaped_root
+from sparsedp.tape_constants import frozen
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.trajectory.record import largest
 from sparsedp.tree import copied, flatten, leaves

@@ -4,19 +4,37 @@ Each kind takes the states of a run as they come (`start`, `see`, `finish`), bui
 the last run (`tree`), and going backward says which cotangent enters at which state (`source`).
 """
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from sparsedp.constants import constant
 from sparsedp.derivative import linearised
 from sparsedp.errors import DerivativeError
+from sparsedp.fields import is_whole
 from sparsedp.shortcuts import ELSEWHERE, array
 from sparsedp.tape import dtype_of, is_variable, isbox, plain, split_boxes, traces_of
+from sparsedp.tape_constants import constant
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, stacked
 from sparsedp.tree import leaves, mapped
 
-__all__ = ["All", "Each", "Last", "Some"]
+__all__ = ["All", "Each", "Last", "Some", "kind"]
+
+
+def kind(keep, layout, n):
+    """What `keep` of a rollout of n steps says -> one of these kinds; anything else is refused."""
+    if callable(keep):
+        return Each(layout, keep)
+    if isinstance(keep, (list, tuple, range, np.ndarray)):
+        numbers = list(keep)
+        if not numbers or not all(is_whole(number, 0) for number in numbers):
+            raise ValueError(f"keep needs at least one state, numbers from 0 on, got {keep!r}")
+        if numbers[-1] > n or any(later <= number for number, later in pairwise(numbers)):
+            raise ValueError(f"keep needs rising numbers of states from 0 to n = {n}, got {keep!r}")
+        return Some(layout, numbers)
+    if not isinstance(keep, str) or keep not in ("last", "all"):
+        raise ValueError(f'keep must be "last", "all", a list of states or a function of (index, state), got {keep!r}')
+    return All(layout, range(n + 1)) if keep == "all" else Last(layout)
 
 
 class Last:
