@@ -177,7 +177,7 @@ print("slopes of C_D:  " + "  ".join(f"d/d{name} {float(slope):.3f}" for name, s
 # The check solves for many shapes, and so it is made on few cells.
 
 coarse = Flow(4)
-audit = dp.check.gradient(lambda shape: drag(coarse, shape), circle)
+audit = dp.check.gradient(lambda shape: drag(coarse, shape), circle, quick=True)
 print("gradient against finite differences:", audit.verdict)
 
 # %%

@@ -128,7 +128,7 @@ def loss(m):
 
 start = np.zeros(grid.shape)
 print(f"{len(shots)} shots, {steps} steps, {grid.shape[0]} x {grid.shape[1]} cells")
-print("gradient against finite differences:", dp.check.gradient(loss, start, directions=1).verdict)
+print("gradient against finite differences:", dp.check.gradient(loss, start, quick=True).verdict)
 
 # %%
 # The search
