@@ -5,6 +5,7 @@ The first line that is printed is the same on any number of ranks: bits of produ
 mpirun -n 2 python -m mpi4py tests/ranks/newton_on_ranks.py
 """
 
+import sys
 from functools import partial
 from hashlib import sha256
 
@@ -189,8 +190,9 @@ def errors_are_the_same_on_all_ranks():
 
 if __name__ == "__main__":
     bits()
-    roots()
-    entries_that_come_late()
-    errors_are_the_same_on_all_ranks()
+    if sys.argv[1:] != ["bits"]:
+        roots()
+        entries_that_come_late()
+        errors_are_the_same_on_all_ranks()
     if COMM.rank == 0:
         print("all agree")
