@@ -122,7 +122,8 @@ def stepper(
     NonFiniteError
         If dt, state or params holds NaN or infinity, or the new state would.
     UnstableStepError
-        On use, if an explicit step is beyond the stable limit of the operator, or one of leapfrog beyond its own.
+        On use, if an explicit step is beyond the stable limit of the operator, or one of leapfrog beyond its own; or if
+        the operator of an implicit one makes fields grow faster than the step can follow, as -laplacian does.
     ConvergenceError
         On use, if a solve fails, or no step meets the tolerance.
     DerivativeError
