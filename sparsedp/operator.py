@@ -239,7 +239,7 @@ class Operator(Frozen, Remade):
             return self * number  # refused
         if not _is_scalar(number):
             return NotImplemented
-        if not (number != 0 and np.isfinite(number)):
+        if not 0 < abs(number) < np.inf:  # NumPy takes no whole number beyond 64 bits
             raise NonFiniteError(f"{self.name} can be divided by a finite number other than 0 only, got {number}")
         if np.iscomplexobj(number):
             return self * (1.0 / number)

@@ -238,3 +238,17 @@ def test_whole_numbers_of_any_size_scale_an_operator():
     """NumPy holds none beyond 64 bits."""
     op, u = dp.laplacian(dp.Grid(3)), np.array([1.0, 2.0, 4.0])
     assert np.array_equal((2**70 * op)(u), 2.0**70 * op(u))
+
+
+@pytest.mark.parametrize("number", [3, -0.7, 2**70, 1e308, np.float32(0.3), np.array(7.0), 2 - 3j, np.complex64(1j)])
+def test_divided_by_a_number(number):
+    """Of 1 / 1e308 digits are lost, of the quotient none."""
+    op, u = dp.laplacian(dp.Grid(4, spacing=0.3)), 1e300 * np.array([1.0, 2.0, 4.0, -3.0])
+    np.testing.assert_allclose((op / number)(u), op(u) / number, rtol=2e-15)
+    np.testing.assert_allclose((op / number).T(u), op.T(u) / number, rtol=2e-15)
+    assert (op / number).name == f"laplacian / {number:g}" or np.iscomplexobj(number)
+
+
+def test_divided_by_what_is_no_number():
+    op = dp.laplacian(dp.Grid(3))
+    assert op.__truediv__("2") is op.__truediv__(op) is NotImplemented

@@ -171,6 +171,8 @@ def test_no_cells(scheme):
     value, pull = pullback(lambda x: move(*x), (np.ones((0, 3)), np.ones(grid.faces.size), 0.5))
     assert value.shape == (0, 3)
     assert [np.shape(back) for back in pull(value)] == [(0, 3), (grid.faces.size,), ()]
+    point = np.ones((0, 3)), np.ones(grid.faces.size), 0.5
+    assert [np.shape(one) for one in dp.jvp(lambda x: move(*x), point, point)] == 2 * [(0, 3)]
     if scheme == "semi_lagrangian":
         assert move.operator(np.ones(grid.faces.size), 0.5).shape == (0, 0)
 

@@ -91,8 +91,6 @@ def _pulled(g, steps, state, sums, inputs):
 def _state_at(i, loop, steps, kept):
     """State i, from the nearest kept state, and how many steps that took; states on the way are kept by the rule."""
     state, again = kept.pop(), 0
-    while state.i > i:
-        state = kept.pop()
     while state.i < i:
         kept.append(state)
         stop = state.i + stride(i + 1 - state.i, max(loop.slots - len(kept) + 1, 1))
