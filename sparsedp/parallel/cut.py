@@ -231,7 +231,7 @@ def _boxes(structure, own, periodic):
             columns = [_entries(factor, own[r][axis], periodic[axis])[1] for factor in factors if factor]
             for read in filter(np.size, columns):
                 np.minimum(reach[c, axis], (read.min(), -read.max() - 1), out=reach[c, axis])
-        if len(terms) > 1 and not any(factors):
+        if len(terms) > 1:
             # One pass adds up the ends of a row in another order: no end but that of the grid may be in the block.
             low, high = own[r][-1][0] - 1, own[r][-1][1] + 1
             if not periodic[-1]:

@@ -1,4 +1,4 @@
-"""Every line of the catalogue on ranks: beside one process, its transpose, the hash of what it gives.
+"""Every line of the catalogue on ranks, and sums of them: beside one process, its transpose, the hash of what it gives.
 
     mpirun -n 4 python -m mpi4py tests/ranks/catalogue_scan.py
 
@@ -8,7 +8,7 @@ Rank 0 prints one line for each operator: its label, the largest error and dot t
 from hashlib import sha256
 
 import numpy as np
-from catalogue import CATALOGUE, LABELS
+from catalogue import CATALOGUE, LABELS, Entry
 from mpi4py import MPI
 
 import sparsedp as dp
@@ -22,6 +22,23 @@ GRIDS = [
     dp.Grid((6, 4, 8), size=1.0, periodic=(False, True, False)),
     dp.Grid((4, 6, 5), spacing=[RNG.uniform(0.5, 2.0, n) for n in (4, 6, 5)], periodic=(True, False, True)),
 ]
+
+
+def beside_the_identity(direction):
+    """One pass adds up the terms of a sum, in another order at the ends of a row: here one end needs no neighbour."""
+    return lambda grid, sides: 0.4 * dp.identity(grid.cells) - 1.7 * dp.upwind(grid, grid.dim - 1, direction, sides)
+
+
+def after_a_laplacian(grid, sides):
+    last = dp.upwind(grid, grid.dim - 1, 1, sides)
+    return dp.laplacian(grid, sides) @ dp.upwind(grid, 0, 1, sides) - 0.5 * dp.identity(grid.cells) + 0.7 * last
+
+
+SUMS = {
+    "sum-forward": Entry("sum", beside_the_identity(1)),
+    "sum-backward": Entry("sum", beside_the_identity(-1)),
+    "sum-laplacian": Entry("sum", after_a_laplacian),
+}
 
 
 def boundary(grid):
@@ -67,7 +84,7 @@ def main():
     comm = MPI.COMM_WORLD
     for number, plain in enumerate(GRIDS):
         grid = dp.distribute(plain, comm)
-        for label, entry in zip(LABELS, CATALOGUE):
+        for label, entry in [*zip(LABELS, CATALOGUE), *SUMS.items()]:
             if plain.dim < entry.least_dim:
                 continue
             found = looked_at(entry, plain, grid)
