@@ -165,6 +165,14 @@ TABLE = [
         TYPE,
         "inverse takes an Operator, got ndarray; write dp.from_matrix(...) first",
     ),
+    *(
+        (make, TYPE, f"{name} takes an Operator, got csr_array; write dp.from_matrix(...) first")
+        for name, make in {
+            "exponential": lambda: dp.exponential(dp.laplacian(GRID).matrix),
+            "power": lambda: dp.power(dp.laplacian(GRID).matrix, 2),
+            "function": lambda: dp.function(dp.laplacian(GRID).matrix, np.exp),
+        }.items()
+    ),
 ]
 
 

@@ -23,7 +23,8 @@ import scipy.fft as fft
 import scipy.linalg
 
 from sparsedp import kernels
-from sparsedp.fields import EPS
+from sparsedp.fields import EPS, check_type
+from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import inverted
 from sparsedp.solvers.solve import Engine
@@ -429,6 +430,7 @@ def _together(members, combined):
 
 def diagonalised(op, name, advice=""):
     """(Spectrum, eigenvalues) of an operator that is separable, or made of such ones; `name` needs them."""
+    check_type(name, op, Operator, "an Operator", "dp.from_matrix(...) first")
     found = eigenbasis(op.structure)
     if found is None:
         raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}{advice}")
