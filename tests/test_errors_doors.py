@@ -165,6 +165,16 @@ TABLE = [
         TYPE,
         "inverse takes an Operator, got ndarray; write dp.from_matrix(...) first",
     ),
+    (
+        lambda: dp.convergence([1.0, 0.5]),
+        TYPE,
+        "convergence takes what minimize returns, got list; write dp.convergence(dp.minimize(loss, start))",
+    ),
+    (
+        lambda: dp.v_curve(1.0),
+        TYPE,
+        "v_curve takes what check.gradient returns, got float; write dp.v_curve(dp.check.gradient(loss, x))",
+    ),
     *(
         (make, TYPE, f"{name} takes an Operator, got csr_array; write dp.from_matrix(...) first")
         for name, make in {

@@ -7,10 +7,12 @@ from importlib import import_module
 
 import numpy as np
 
+from sparsedp.check.audit import Audit
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_choice, check_kind
+from sparsedp.fields import check_choice, check_kind, check_type
 from sparsedp.files import write_file
 from sparsedp.grid import check_grid
+from sparsedp.optimize.result import Minimum
 from sparsedp.tape import plain
 
 __all__ = [
@@ -233,6 +235,8 @@ def convergence(best, ax=None, against="iteration"):
     ------
     ValueError
         If `against` is another word.
+    TypeError
+        If `best` is something else.
     ImportError
         If matplotlib is not installed.
 
@@ -244,6 +248,7 @@ def convergence(best, ax=None, against="iteration"):
     >>> convergence(best, figure().add_subplot()).get_xlabel()
     'iteration'
     """
+    check_type("convergence", best, Minimum, "what minimize returns", "dp.convergence(dp.minimize(loss, start))")
     check_choice("against of convergence", against, ("iteration", "seconds", "evaluations", "solves"))
     ax = current(ax)
     records = [(getattr(record, against), record.value, record.gradient_norm) for record in best.history]
@@ -273,6 +278,8 @@ def v_curve(audit, ax=None):
 
     Raises
     ------
+    TypeError
+        If it is something else.
     ImportError
         If matplotlib is not installed.
 
@@ -283,6 +290,7 @@ def v_curve(audit, ax=None):
     >>> v_curve(result, figure().add_subplot()).get_xlabel()
     'step'
     """
+    check_type("v_curve", audit, Audit, "what check.gradient returns", "dp.v_curve(dp.check.gradient(loss, x))")
     lines, across, up = audit.curves()
     title = f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}"
     return _dressed(lines, current(ax), across, up, title)
