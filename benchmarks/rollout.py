@@ -17,7 +17,7 @@ import numpy as np
 import sparsedp as dp
 from benchmarks.triad import best_times
 from sparsedp import kernels
-from sparsedp.trajectory.memory_budget import advances, plan
+from sparsedp.trajectory.memory_budget import advances, slots_within
 
 LIMITS = {1: 35.0, 2: 30.0}  # times faster than autograd over slices, by dimension
 
@@ -136,7 +136,7 @@ def memory(shape, n, budgets):
         back, most = runs[-1], peak(partial(gradient, n))
         short = b"".join(g.tobytes() for g in gradient(min(n, 1000)))
         exact = exact or short
-        least = (advances(n, plan(n, budget, u.nbytes, 2 * v.nbytes).kept) + 1) / n
+        least = (advances(n, slots_within(budget, u.nbytes, n, 2 * v.nbytes) if budget else n) + 1) / n
         print(
             f"{budget or 'all':>10} {back.kept:6} {back.factor:10.4f} {least:8.4f} {most / 1e6:8.1f} {seconds:7.2f}"
             f"  {'same' if short == exact else 'OTHER'}"

@@ -298,6 +298,11 @@ def zero_like(value):
     return np.zeros(np.shape(plain(value)), dtype_of(value))[()]
 
 
+def _random_like(value):
+    """Plain numbers of the shape and dtype of a value, the same in every run."""
+    return np.asarray(np.random.default_rng(0).uniform(0.5, 1.5, np.shape(plain(value))), dtype_of(value))[()]
+
+
 def _directions(x, tangent):
     """Tangent of each leaf of `x`, None where it is not floating; entries of dicts are paired by name."""
     names = keys(x)
@@ -402,7 +407,10 @@ def push(fun, tree, tangents):
 
 
 def _twice_reverse(fun, tree, tangents):
-    """The pullback z -> J^T z is linear, so the gradient in z of <J^T z, tangent> is J tangent."""
+    """The pullback z -> J^T z is linear, so the gradient in z of <J^T z, tangent> is J tangent.
+
+    It is taken at random z: a rule may branch on a cotangent of zero, and then has no derivative there.
+    """
     values, rebuild, pull = linearised(fun, tree, [tangent is not None for tangent in tangents])
     moving = list(map(is_variable, values))
 
@@ -410,8 +418,8 @@ def _twice_reverse(fun, tree, tangents):
         pairs = zip(pull(z), tangents, strict=True)
         return sum((anp.sum(back * tangent) for back, tangent in pairs if back is not None), 0.0)
 
-    zeros = [zero_like(value) if moves else None for value, moves in zip(values, moving, strict=True)]
-    slopes = linearised(paired, zeros, moving)[2]([1.0])
+    z = [_random_like(value) if moves else None for value, moves in zip(values, moving, strict=True)]
+    slopes = linearised(paired, z, moving)[2]([1.0])
     return rebuild(values), rebuild(map(tangent_of, values, slopes))
 
 

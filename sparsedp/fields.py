@@ -9,7 +9,6 @@ from types import FunctionType
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
-from sparsedp.tree import leaves_like
 
 __all__ = [
     "BLOCK",
@@ -32,7 +31,6 @@ __all__ = [
     "field_array",
     "is_number",
     "is_whole",
-    "leaves_by_name",
     "place",
     "rounded_down",
     "surely_finite",
@@ -238,16 +236,6 @@ def check_whole(name, value, least, advice=""):
     if not is_whole(value, least):
         raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}{advice}")
     return int(value)
-
-
-def leaves_by_name(what, tree, wanted, other):
-    """Leaves of a tree in the order of another one's: by name where both are dicts, and other names are refused.
-
-    `what`, `wanted`: what the trees are called in messages.
-    """
-    if isinstance(tree, dict) and isinstance(other, dict) and tree.keys() != other.keys():
-        raise ShapeError(f"{what} must have the names of {wanted}, {[*other]}, got {[*tree]}")
-    return leaves_like(tree, other)
 
 
 def is_number(value):

@@ -67,7 +67,7 @@ class Operator(Frozen, Remade):
         "toarray": "op.matrix.toarray()",
         "todense": "op.matrix.toarray()",
         "nnz": "op.matrix.nnz",
-        "H": "op.T",
+        "H": "op.T; of complex entries from_matrix(op.matrix.conj().T)",
         "solve": "inv(b), with inv = dp.inverse(op)",
     }
     _transposed = None

@@ -3,6 +3,8 @@
 autograd knows them all, and takes three to ten times as long: it is ready for all kinds of broadcasting, other dtypes
 and traces inside traces. What is here serves float64 alone, and traced operands of the shape of their result; without
 it a gradient of small steps takes twice the time (benchmarks/small.py, 200 steps of rk4).
+
+Two calls stand here because autograd's derivatives of them are wrong: `full_like`, and reductions with options.
 """
 
 import operator
@@ -12,10 +14,12 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.errors import DerivativeError
+
 __all__ = [
     "ACTS", "ARRAY", "BOX", "COPY", "ELSEWHERE", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part",
-    "REAL", "alike", "array", "by_entry", "elsewhere", "formulas_of", "in_dtype", "on_every_rank", "operand", "ranks",
-    "refuse_elsewhere", "together", "whole",
+    "REAL", "alike", "array", "by_entry", "elsewhere", "formulas_of", "in_dtype", "on_every_rank",
+    "operand", "ranks", "refuse_elsewhere", "refuse_options", "together", "whole",
 ]  # fmt: skip
 
 FLOAT = np.dtype(float)
@@ -35,6 +39,8 @@ ACTS = {
     anp.add: operator.add, anp.subtract: operator.sub, anp.multiply: operator.mul,
     anp.true_divide: operator.truediv, anp.power: operator.pow, ITEM: operator.getitem,
 }  # fmt: skip
+_constant_full_like = anp.full_like
+REDUCTIONS = "sum", "mean", "prod", "var", "std", "max", "min", "amax", "amin"
 COPY, ARRAY = (unwrap(getattr(anp.numpy_wrapper, name)) for name in MAKERS)
 
 # What of two operands a derivative needs -> what is held of them.
@@ -89,6 +95,23 @@ def together(what, given, act, *args):
     for entry in ELSEWHERE.values():
         return entry[2](what, given, act, *args)
     return act(*args)
+
+
+def _full_like(a, fill_value, *args, **options):
+    """As NumPy's; autograd's takes a traced value to fill with as a constant."""
+    ans = _constant_full_like(a, fill_value, *args, **options)
+    if type(fill_value) is BOX and ans.dtype.kind in "fc":
+        return (np.zeros_like(ans) + fill_value).astype(ans.dtype)
+    return ans
+
+
+def refuse_options(fun, options):
+    """Autograd's rules of reductions know neither the entries that are left out nor what is begun with."""
+    if fun.__name__ in REDUCTIONS and {"where", "initial"} & options.keys():
+        raise DerivativeError(
+            f"autograd's derivative of {fun.__name__} does not know where= and initial=; choose entries by x[mask] or "
+            "anp.where(mask, x, 0.0), and put what it begins with beside it"
+        )
 
 
 def ranks():
@@ -197,3 +220,5 @@ FORMULAS: dict[Any, Any] = {
         lambda g, num, args, shape: Part((g, num - 2, shape)),
     ),
 }
+
+anp.full_like = _full_like

@@ -25,8 +25,8 @@ from sparsedp.tape_constants import FIXED, constant, constant_args, frozen, spar
 
 # isort: off
 from sparsedp.shortcuts import (
-    ACTS, ARRAY, BOX, COPY, FLOAT, ITEM, MAKERS, NUMBERS, OPERATORS, PLAIN, REAL, Part, alike, formulas_of, in_dtype,
-    operand,
+    ACTS, ARRAY, BOX, COPY, FLOAT, ITEM, MAKERS, NUMBERS, OPERATORS, PLAIN, REAL, Part, alike, formulas_of,
+    in_dtype, operand, refuse_options,
 )  # fmt: skip
 
 # isort: on
@@ -97,7 +97,7 @@ class ReverseNode(VJPNode):
 
     def __init__(self, value, fun, args, options, nums, parents):
         self.parents, self.recorder = parents, parents[0].recorder.open()
-        formulas = None if options else formulas_of(fun, value, args, nums)
+        formulas = refuse_options(fun, options) if options else formulas_of(fun, value, args, nums)
         if formulas:
             self.vjp, held = formulas[0](nums, args)
             self.held = constant_args(held, nums) if len(nums) < len(held) else held
@@ -142,7 +142,7 @@ class ForwardNode(JVPNode):
     g: Any
 
     def __init__(self, value, fun, args, options, nums, parents):
-        if formulas := None if options else formulas_of(fun, value, args, nums):
+        if formulas := refuse_options(fun, options) if options else formulas_of(fun, value, args, nums):
             total: Any = None
             for num, parent in zip(nums, parents, strict=True):
                 g = formulas[1](parent.g, num, args, value.shape)

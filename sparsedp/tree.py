@@ -9,6 +9,8 @@ from math import hypot, isfinite
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.errors import ShapeError
+
 __all__ = [
     "copied",
     "flatten",
@@ -101,18 +103,26 @@ def leaves(tree):
     return [tree] if names is None else [leaf for name in names for leaf in leaves(tree[name])]
 
 
-def leaves_like(tree, other):
-    """Tree and another one -> its leaves in the order of the other's: by name, where both have the same names.
+def leaves_like(tree, other, what, wanted):
+    """Leaves of a tree in the order of another one's: by name where both are dicts, and other names are refused.
+
+    Parameters
+    ----------
+    tree, other : trees
+    what, wanted : str
+        What they are called in messages.
 
     Examples
     --------
-    >>> leaves_like({"v": 2.0, "u": 1.0}, {"u": None, "v": None})
+    >>> leaves_like({"v": 2.0, "u": 1.0}, {"u": None, "v": None}, "the rate", "the state")
     [1.0, 2.0]
     """
-    names, wanted = keys(tree), keys(other)
-    if names is None or wanted is None or set(names) != set(wanted):
+    names, others = keys(tree), keys(other)
+    if isinstance(tree, dict) and isinstance(other, dict) and names != others:
+        raise ShapeError(f"{what} must have the names of {wanted}, {[*others]}, got {[*names]}")
+    if names is None or others is None or set(names) != set(others):
         return leaves(tree)
-    return [leaf for name in wanted for leaf in leaves_like(tree[name], other[name])]
+    return [leaf for name in others for leaf in leaves_like(tree[name], other[name], what, wanted)]
 
 
 def labels(tree, root):

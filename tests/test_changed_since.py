@@ -63,6 +63,32 @@ def test_arrays_of_functions_that_change_before_the_way_back(make):
             value_and_grad(loss)(START, True)
 
 
+@pytest.mark.parametrize("method", ["backward_euler", "crank_nicolson", "tr_bdf2"])
+def test_a_number_at_a_fixed_point_sees_the_rate_of_today(method):
+    """Its root does not move, so that only its Jacobian tells one rate from the other."""
+    share = 1.0
+    rate = lambda u, p: share * (p - u)
+    step, root = dp.stepper(method, rate, 0.5), dp.implicit(rate)
+    slope = lambda step, u: dp.grad(lambda u: anp.sum(step(u, 2.0)))(u)
+    slope(step, 2.0)
+    assert dp.grad(lambda p: root(2.0, p))(2.0) == pytest.approx(1.0)
+    share = 10.0
+    wanted = pytest.approx(slope(dp.stepper(method, rate, 0.5), 2.0), rel=1e-12)
+    assert slope(step, 2.0) == wanted and slope(step, np.array([2.0]))[0] == wanted
+    assert dp.grad(lambda p: root(2.0, p))(2.0) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_adopted_code_that_changes_between_gradients_is_refused(kind):
+    share, x = [1.0], np.arange(1, 5).astype(kind)
+    act = dp.adopt(lambda x: share[0] * x**2)
+    loss = value_and_grad(lambda x: anp.sum(act(x)))
+    assert np.array_equal(loss(x)[1], 2 * x)
+    share[0] = 3.0
+    with pytest.raises(DerivativeError, match="another result for the same argument than before"):
+        loss(x)
+
+
 def test_adopted_code_with_a_counter_is_refused():
     runs = [0]
 

@@ -182,6 +182,15 @@ def test_hessians_that_are_not_known():
     assert found and found.hessian is None and "Hessian product: not available (TypeError)" in str(found)
 
 
+def test_a_hessian_product_that_is_no_number_does_not_agree():
+    back = lambda nums, ans, u: lambda g: (3 * u**2 * g + 0 * anp.sqrt(u - u) * g,)
+    cube = dp.differentiable("cube", lambda u: u**3, back)
+    with np.errstate(all="ignore"):
+        found = AUDIT(lambda u: anp.sum(cube(u) ** 2), X)
+    assert found and found.hessian == "disagrees"
+    assert "third Taylor remainder cannot be told: it is not finite" in str(found)
+
+
 @pytest.mark.slow
 def test_a_right_gradient_among_kinks_is_not_accused_and_a_wrong_one_is():
     """Clamped MacCormack on a field with ties: along one of the directions the kinks lie too close to be split."""

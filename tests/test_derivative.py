@@ -50,6 +50,73 @@ def test_jvp_of_trees_and_without_a_forward_derivative():
     np.testing.assert_allclose(dp.jvp(backward_only, U, T)[1], 3 * U**2 * T, rtol=1e-12)
 
 
+def skips(g, x, slope):
+    return (slope * g if np.any(g) else np.zeros_like(x),)
+
+
+def divides(g, x, slope):
+    return (slope * (g / anp.max(anp.abs(g))) * anp.max(anp.abs(g)),)
+
+
+def skips_what_carries_nothing(g, x, slope):
+    """Constants, which many a backward pass begins with, are removed first."""
+    return (slope * g if np.any(g - anp.mean(g)) else np.zeros_like(x),)
+
+
+@pytest.mark.parametrize("back", [skips, divides, skips_what_carries_nothing])
+def test_rules_that_branch_on_their_cotangent(back):
+    cube = dp.differentiable("cube", lambda u: u**3, lambda nums, ans, u: lambda g: back(g, u, 3 * u**2))
+    np.testing.assert_allclose(dp.jvp(cube, U, T)[1], 3 * U**2 * T, rtol=1e-12)
+    loss = lambda u: anp.sum(anp.sin(cube(u)) * T)
+    wanted = (6 * U * np.cos(U**3) - 9 * U**4 * np.sin(U**3)) * T * T
+    np.testing.assert_allclose(dp.hvp(loss, U, T), wanted, rtol=1e-10)
+
+
+def test_eigenvectors_forward():
+    """Autograd's rule of eigh skips cotangents of zero."""
+
+    def chain(k):
+        return anp.diag(k[:-1] + k[1:]) - anp.diag(k[1:-1], 1) - anp.diag(k[1:-1], -1)
+
+    k, t = np.linspace(1.0, 2.0, 7), np.arange(7.0)
+    shape, lowest = lambda k: anp.linalg.eigh(chain(k))[1][:, 0] ** 2, lambda k: anp.linalg.eigh(chain(k))[0][0]
+    np.testing.assert_allclose(dp.jvp(shape, k, t)[1], difference(shape, k, t), rtol=1e-6)
+    np.testing.assert_allclose(dp.hvp(lowest, k, t), difference(dp.grad(lowest), k, t), rtol=1e-6)
+    goal = shape(k[::-1])
+    for dense in (True, False):
+        found = dp.minimize(lambda k: shape(k) - goal, k, "levenberg_marquardt", dense=dense)
+        assert found.converged and found.value < 1e-15
+
+
+def test_full_like_of_a_traced_value():
+    for kind in (float, np.float32):
+        given = np.ones(3, kind)
+        assert dp.grad(lambda k: anp.sum(anp.full_like(given, k) ** 2))(2.0) == 12.0
+        assert np.array_equal(dp.jvp(lambda k: anp.full_like(given, k), 2.0, 1.0)[1], np.ones(3))
+        assert anp.full_like(given, 2.0).dtype == kind
+    assert np.array_equal(dp.grad(lambda k: anp.sum(anp.full_like(k, k[::-1]) ** 2))(np.array([2.0, 3.0])), [4.0, 6.0])
+    assert dp.grad(lambda k: k + anp.sum(anp.full_like(np.ones(3, int), k)))(2.5) == 1.0  # whole numbers: it jumps
+
+
+@pytest.mark.parametrize("name", ["sum", "mean", "prod", "var", "std", "max", "min", "amax", "amin"])
+@pytest.mark.parametrize("library", [np, anp])
+def test_reductions_of_some_entries_are_refused(name, library):
+    x, mask = np.array([1.0, 2.0, 4.0]), np.array([True, False, True])
+    told = name if library is anp else name.removeprefix("a")  # NumPy's asks the traced value for its `max`
+    options = [{"initial": 9.0}] if name not in ("mean", "var", "std") else []
+    options += [{"where": mask, **({"initial": 9.0} if name[-3:] in ("max", "min") else {})}]
+    for given in options:
+        some = lambda x: getattr(library, name)(x, **given)
+        assert some(x) == getattr(np, name)(x, **given)
+        for derive in (dp.grad(some), lambda x: dp.jvp(some, x, x)):
+            with pytest.raises(DerivativeError) as refused:
+                derive(x)
+            assert str(refused.value) == (
+                f"autograd's derivative of {told} does not know where= and initial=; choose entries by x[mask] or "
+                "anp.where(mask, x, 0.0), and put what it begins with beside it"
+            )
+
+
 def test_hvp_is_the_difference_of_gradients_and_symmetric():
     other = RNG.standard_normal(GRID.shape)
     product = dp.hvp(energy, U, T)

@@ -47,6 +47,12 @@ TABLE = [
         TYPE,
         "set_threads got 1.5; it needs an integer, for example 1, or None for the default",
     ),
+    (
+        lambda: value_and_grad(lambda x: np.sum(x, where=np.array([True, False])))(np.ones(2)),
+        DERIVATIVE,
+        "autograd's derivative of sum does not know where= and initial=; choose entries by x[mask] or "
+        "anp.where(mask, x, 0.0), and put what it begins with beside it",
+    ),
     # functions of separable operators
     (
         lambda: dp.inverse(dp.from_matrix(np.eye(3)), "separable"),

@@ -70,6 +70,11 @@ TABLE = [
         "the residual of implicit(<lambda>) must have the names of x, ['u', 'w'], got ['v', 'w']",
     ),
     (
+        lambda: dp.steady(lambda x: {"s": {"b": x["s"]["u"], "a": x["s"]["w"]}}, {"s": {"u": 1.0, "w": 2.0}}),
+        SHAPE,
+        "the residual of implicit(<lambda>) must have the names of x, ['u', 'w'], got ['b', 'a']",
+    ),
+    (
         lambda: dp.implicit(lambda x: 1j * x)(TWO),
         TYPE,
         "the residual of implicit(<lambda>) must be real; give real and imaginary part as two fields",

@@ -28,8 +28,8 @@ from sources import (
 import sparsedp
 
 FLOORS = [
+    ("errors", -1),
     ("tape_constants", 0),
-    ("errors", 0),
     ("shortcuts", 0),
     ("tree", 0),
     ("ledger", 0),
@@ -192,7 +192,7 @@ def test_the_floors_are_those_of_the_page():
     for page in ("CONTRIBUTING.md", "README.md"):
         text = (ROOT / page).read_text(encoding="utf-8")
         none(f"{page} does not name {name}" for name in FLOOR if not re.search(rf"\b{name}\b", text))
-    rows = re.findall(r"^\| (\d+) \| (.*?) \|$", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.MULTILINE)
+    rows = re.findall(r"^\| (-?\d+) \| (.*?) \|$", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.MULTILINE)
     told = {name: int(number) for number, names in rows for name in re.findall(r"`(\w+)/?`", names)}
     assert told == FLOOR
 
@@ -254,7 +254,7 @@ def test_no_private_names_of_foreign_libraries():
         f"{m.place}:{line} imports {target}"
         for m in modules()
         for target, line in imports(m)
-        if not within(target, "sparsedp") and not m.place != "tape.py"
+        if not within(target, "sparsedp") and m.place != "tape.py"
         if any(part.startswith("_") and not part.endswith("__") for part in target.split("."))
     )
 

@@ -48,7 +48,7 @@ from sparsedp.kernels.reference import Tridiagonal
 n = 200
 axis = Tridiagonal(np.r_[0, np.ones(n - 1)], -2 * np.ones(n), np.r_[np.ones(n - 1), 0])
 u, out = np.ones((1, n, n)), np.zeros((1, n, n))
-kernels.kronecker_sum(u, out, (None, axis, axis), 0.0)
+kernels.summed(u.shape, (None, axis, axis), 0.0)(u, out)
 assert out.sum() == -4 * n
 """
 
@@ -66,7 +66,7 @@ def test_the_environment_switches_numba_off():
 def test_a_forked_child_may_use_the_kernels():
     code = """
 child = os.fork()
-kernels.kronecker_sum(u, out, (None, axis, axis), 1.0)
+kernels.summed(u.shape, (None, axis, axis), 1.0)(u, out)
 if not child:
     os._exit(int(out.sum() != n * n - 4 * n))
 sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))

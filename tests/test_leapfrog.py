@@ -331,6 +331,16 @@ def test_damped_rates_go_to_the_fields_of_their_names():
         assert all(p[name] == pytest.approx(wanted[name], rel=1e-14) for name in "ab")
 
 
+def test_damping_of_other_names_is_refused():
+    x = {"a": np.array([1.0]), "b": np.array([2.0])}, np.array([1.0])
+    rates = lambda q, c: {"a": 3.0 * q, "b": 5.0 * q}, lambda p, c: 0.0 * p["a"]
+    step = dp.stepper("leapfrog", rates, 0.1, damping=({"b": 0.0, "c": 9.0}, None))
+    with pytest.raises(
+        dp.errors.ShapeError, match=r"damping must have the names of the state, \['a', 'b'\], got \['b', 'c'\]"
+    ):
+        step(x)
+
+
 @pytest.mark.parametrize("n", [0, 1, 20, 40])
 def test_frequencies_of_every_kind(n):
     """None at all, one alone, many, growth without a wave, and no finite slope at the state."""

@@ -437,7 +437,7 @@ BUGS = {
     ),
     "numbers that go to fields by their place": Bug(
         "tree.py",
-        "names is None or wanted is None or set(names) != set(wanted)",
+        "names is None or others is None or set(names) != set(others)",
         "True",
         "tests/test_leapfrog.py",
     ),

@@ -10,7 +10,7 @@ import sparsedp as dp
 from sparsedp.errors import BudgetWarning
 from sparsedp.ledger import recording
 from sparsedp.tape import Rule
-from sparsedp.trajectory.memory_budget import advances, budget_within_reach, plan, recomputed, stride
+from sparsedp.trajectory.memory_budget import advances, budget_within_reach, slots_within, stride
 
 
 def shift(wrong=None):
@@ -120,9 +120,9 @@ def test_steps_are_run_again_as_rarely_as_possible(step, slots, n):
     memory = CELLS * 8 * (slots + 6)
     with recording() as calls:
         dp.value_and_grad(lambda x: loss(step, x, n=n, memory=memory, record=runs.append))((U0, C0))
-    told = plan(n, memory, CELLS * 8, 2 * CELLS * 8)
-    assert runs[-1].recomputed == told.recomputed == recomputed(n, told.kept) == calls["rollout.step", "recomputed"]
-    assert runs[-1].factor == told.factor == pytest.approx((advances(n, told.kept) + 1) / n)
+    kept = slots_within(memory, CELLS * 8, n, 2 * CELLS * 8)
+    assert runs[-1].recomputed == advances(n, kept) - (n - 1) == calls["rollout.step", "recomputed"]
+    assert runs[-1].factor == pytest.approx((advances(n, kept) + 1) / n)
     assert calls["rollout.step", "forward"] == calls["rollout.step", "vjp"] == n
     assert calls["rollout", "forward"] == calls["rollout", "vjp"] == 1
 
@@ -130,8 +130,8 @@ def test_steps_are_run_again_as_rarely_as_possible(step, slots, n):
 def test_many_steps_without_recursion():
     """10^5 steps of 16^2 cells, 24 states kept."""
     u, c = np.random.default_rng(0).random((16, 16)), np.full((16, 16), 0.3)
-    told = plan(100_000, 31 * 2048, 2048, 2 * 2048)
-    assert told.kept == 24 and told.factor < 5
+    kept = slots_within(31 * 2048, 2048, 100_000, 2 * 2048)
+    assert kept == 24 and advances(100_000, kept) < 5 * 100_000 - 1
     runs: list = []
     step, n = RULE, 2_000  # the test itself is shorter; the benchmark runs all
     slope = dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, c, n, memory=31 * 2048, record=runs.append)))(u)[1]
@@ -229,8 +229,8 @@ def test_a_budget_that_a_little_more_would_help_says_so():
     for slots in range(1, 101):
         beside, memory = size, (slots + 5 + min(5, slots // 15)) * size
         told = budget_within_reach(memory, size, n, beside)
-        third = plan(n, memory, size, beside).factor / 3
-        found = [more for more in range(memory, 2 * memory + 1, size) if plan(n, more, size, beside).factor <= third]
+        runs_of = lambda memory: advances(n, slots_within(memory, size, n, beside)) + 1
+        found = [more for more in range(memory, 2 * memory + 1, size) if runs_of(more) <= runs_of(memory) / 3]
         assert told == (found[0] if found else None)
 
 

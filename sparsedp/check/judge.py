@@ -252,8 +252,7 @@ def _estimate(line, t, m, kinks, noise, jitter, scale, slope, curvature, **_):
             "passing": np.any((np.abs(m - gap) > bar + 6 * noise / t)[index + 1 :]),
         })  # fmt: skip
     # Away from kinks the first, with the smallest bar; of passing ones the last.
-    lasting = [one for one in estimates if not one["passing"]] or estimates[-1:]
-    return min(lasting, key=lambda one: one["doubtful"])
+    return min([one for one in estimates if not one["passing"]] or estimates[-1:], key=lambda one: one["doubtful"])
 
 
 def _estimates(t, values, power, noise):
@@ -271,8 +270,7 @@ def _compared(line, gap, bar, scale, split, jitter, agreed, curvature, **_):
     """How gap, bar, scale and noise compare."""
     size, base, trials = abs(gap), abs(line.base), line.trials
     far, resolved = bar * (FAR if jitter < ROUNDING else 3 * FAR), bar <= RESOLVED * scale
-    vanished = scale + bar <= max(VANISHED, agreed) * curvature
-    zero = not resolved and size <= NEAR * bar and vanished
+    zero = not resolved and size <= NEAR * bar and scale + bar <= max(VANISHED, agreed) * curvature
     return {
         "size": size, "share": size / scale, "beyond": (size - split / 2) * (split > 0), "resolved": resolved,
         "wrong": size > max(far, agreed * scale, agreed * 1e-4 * curvature),
@@ -485,6 +483,7 @@ def explained(result):
 def orders_of_hessians(e):
     """The same for a Hessian product."""
     return (
+        ("disagrees", not isfinite(e.bend), "cannot be told: it is not finite"),
         ("agrees", not e.used3, "is noise"),
         ("inconclusive", e.used3 < FEWEST, "stands out of the noise on {e.used3} steps, 3 are needed"),
         ("agrees", e.rate3 >= THIRD, "of order {e.rate3:.2f}"),

@@ -22,7 +22,7 @@ from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.masks_and_lift import check_solid, diagonal, solid_faces
 from sparsedp.recipe import Remade
 from sparsedp.solvers.choose_method import build
-from sparsedp.solvers.scaling import in_range, largest, shifted
+from sparsedp.solvers.scaling import exponent_of, in_range, largest, shifted
 
 __all__ = ["Setup", "faces_that", "pressure_conditions"]
 
@@ -43,7 +43,7 @@ class Setup(Remade):
         self.made = Setup, (grid, self.solid, named, settings)  # nothing that the caller may change
         self.pressure_conditions = pressure_conditions(grid, self.sides)
         self.open = faces_that(grid, self.sides, self.solid, lambda condition: not condition.closed)
-        self.exponent = int(np.frexp(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))[1])
+        self.exponent = exponent_of(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))
         near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
         near = near if grid.layout is None else grid.layout.laid(near)
         self._maps = D, G = divergence(near), gradient(near, self.pressure_conditions, self.solid)
@@ -99,7 +99,7 @@ class Setup(Remade):
                 return p
             passes.net_flow(x, b)
         elif 0 < (top := largest(x)) < np.inf and not in_range(top):  # beyond the middle of the range of floats
-            exponent = int(np.frexp(top)[1])
+            exponent = exponent_of(top)
             p = self._split(shifted(x, -exponent), out, transposed)
             out[:] = shifted(out, exponent)
             return shifted(p, exponent)

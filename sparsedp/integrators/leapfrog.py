@@ -139,7 +139,7 @@ def _advanced(x, rate, h, damping):
     if damping is None:
         return combine(x, (h, rate))
     found, rebuild = flatten(x)
-    rates, damped = of_fields(rate, x), leaves_like(damping, x)
+    rates, damped = of_fields(rate, x), leaves_like(damping, x, "damping", "the state")
     if len(damped) != len(found):
         raise ShapeError(f"damping has {len(damped)} parts for a field of {len(found)}; give one for each")
     rows = zip(found, rates, damped, strict=True)

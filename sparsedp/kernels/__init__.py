@@ -17,7 +17,6 @@ from sparsedp.kernels import reference
 __all__ = [
     "along_axis",
     "compiled",
-    "kronecker_sum",
     "run",
     "set_threads",
     "summed",
@@ -102,14 +101,15 @@ def run(module, name, rows, work, threads, *args):
     return True
 
 
-def kronecker_sum(u, out, axes, shift):
-    """Field, three tridiagonal matrices -> out = shift u + sum over a of T_a u, T_a along axis a, in one pass.
+def summed(shape, axes, shift):
+    """Three tridiagonal matrices T_a -> function (u, out): out = shift u + sum over a of T_a u, in one pass.
+
+    What its loop reads is made ready once.
 
     Parameters
     ----------
-    u : float64 array, shape (n0, n1, n2)
-    out : float64 array, shape (n0, n1, n2)
-        Must not overlap `u`.
+    shape : (n0, n1, n2)
+        Of `u` and `out`, float64 arrays that must not overlap.
     axes : tuple of three
         `Tridiagonal` of n_a rows, or None where nothing is done along the axis.
     shift : float
@@ -117,19 +117,13 @@ def kronecker_sum(u, out, axes, shift):
 
     Examples
     --------
-    >>> import numpy as np
     >>> from sparsedp.kernels.reference import Tridiagonal
     >>> line = Tridiagonal(np.array([0.0, 1, 1]), np.array([-2.0, -2, -2]), np.array([1.0, 1, 0]))
     >>> u, out = np.array([[[1.0, 2.0, 4.0]]]), np.zeros((1, 1, 3))
-    >>> kronecker_sum(u, out, (None, None, line), 0.0)
+    >>> summed((1, 1, 3), (None, None, line), 0.0)(u, out)
     >>> out
     array([[[ 0.,  1., -6.]]])
     """
-    summed(u.shape, axes, shift)(u, out)
-
-
-def summed(shape, axes, shift):
-    """Three tridiagonal matrices -> `kronecker_sum` as a function (u, out): what its loop reads is made ready once."""
     bands = [np.zeros((3, n)) if axis is None else np.stack(axis) for n, axis in zip(shape, axes, strict=True)]
     inner = bands[2][:, 1:-1]
     uniform, rows = (inner == inner[:, :1]).all(), shape[0] * shape[1]

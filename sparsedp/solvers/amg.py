@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sparsedp.fields import check_choice, check_number, check_whole
 from sparsedp.solvers.krylov import Krylov
+from sparsedp.solvers.scaling import exponent_of
 
 __all__ = ["Hierarchy", "Level", "Multigrid", "coarse_solver", "coloured_graph", "multigrid_engine", "ruge_stueben"]
 
@@ -94,7 +95,7 @@ class Multigrid(Krylov):
         mirrored = sweeps[0] == tuple(SWEEPS[sweep] for sweep in reversed(sweeps[1]))
         super().__init__(system, maxiter=MAXITER)
         self.symmetric = system.symmetric and mirrored
-        unit = 2.0 ** -int(np.frexp(system.norm(False))[1])  # PyAMG prints where entries are far from 1
+        unit = 2.0 ** -exponent_of(system.norm(False))  # PyAMG prints where entries are far from 1
         self._scale = unit * system.sign * (system.weights if self.symmetric else 1.0)
         matrix = csr_array(system.matrix * np.broadcast_to(self._scale, system.size)[:, None])
         self.forward = Hierarchy(ruge_stueben(matrix, strength, levels), visits, *sweeps)

@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu
 from sparsedp.errors import ConvergenceError
 from sparsedp.fields import check_choice
 from sparsedp.solvers.nullspace import NullSpace
-from sparsedp.solvers.scaling import in_range, largest, norm, shifted
+from sparsedp.solvers.scaling import exponent_of, in_range, largest, norm, shifted
 from sparsedp.solvers.solve import Engine, failure
 from sparsedp.solvers.system import System
 from sparsedp.structure.base import probes
@@ -133,7 +133,7 @@ class DenseSystem(System):
     rtol : float
     """
 
-    active, null_space = None, NullSpace(None, np.zeros(0), np.zeros(0), 0)
+    active, null_space = None, NullSpace.none()
     exponent = 0
 
     def __init__(self, op, rtol):
@@ -174,7 +174,7 @@ def _sparse(matrix, system, single):
     options = dict(permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.001, options=dict(SymmetricMode=True))
     given, exponent, low = csc_array(matrix), 0, np.complex64 if system.complex else np.float32
     if single:
-        exponent = int(np.frexp(largest(given.data))[1])
+        exponent = exponent_of(largest(given.data))
         given = csc_array((shifted(given.data, -exponent).astype(low), given.indices, given.indptr), given.shape)
     try:
         factors = splu(given, **(options if one_sided and system.symmetric else {}))
@@ -189,7 +189,7 @@ def _sparse(matrix, system, single):
         return solve, f"sparse LU, {factors.nnz} entries in the factors"
 
     def scaled(b, transposed):
-        size = int(np.frexp(largest(b))[1])
+        size = exponent_of(largest(b))
         x = solve(shifted(b, -size).astype(low), transposed)
         return shifted(x.astype(matrix.dtype), size - exponent)
 

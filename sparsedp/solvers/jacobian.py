@@ -337,7 +337,8 @@ class Jacobians:
 
 
 def _key(equation, x, leaves):
-    return (x, *leaves, *equation.statics, *equation.layout.shapes)
+    """Of one call alone: what a residual uses beside its arguments may have changed at the next."""
+    return (equation, x, *leaves)
 
 
 def _points(equation, x, leaves):

@@ -36,7 +36,7 @@ import numpy as np
 
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_finite, check_plain, leaves_by_name
+from sparsedp.fields import check_finite, check_plain
 from sparsedp.ledger import note
 from sparsedp.shortcuts import array, elsewhere, on_every_rank
 from sparsedp.solvers.direct import DENSE_UP_TO
@@ -45,7 +45,7 @@ from sparsedp.solvers.scaling import length
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tape_constants import constant
-from sparsedp.tree import flatten, leaves, placed
+from sparsedp.tree import flatten, leaves, leaves_like, placed
 
 __all__ = ["Equation", "Layout", "Newton"]
 
@@ -218,7 +218,7 @@ class Equation:
         return result
 
     def _flat(self, result):
-        parts = leaves_by_name(f"the residual of {self.name}", result, "x", self.layout.tree)
+        parts = leaves_like(result, self.layout.tree, f"the residual of {self.name}", "x")
         size = sum(int(np.size(plain(part))) for part in parts)
         if size != self.size:
             raise ShapeError(f"the residual of {self.name} must hold {self.size} numbers, as many as x, got {size}")

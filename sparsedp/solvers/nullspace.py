@@ -42,6 +42,11 @@ class NullSpace:
         self._sides = [_plainest(side) if labels is None else side for side in (right, left)]
         self._products = self._dots(self._sides[0], left)
 
+    @classmethod
+    def none(cls, size=0):
+        """That of a regular operator."""
+        return cls(None, np.zeros(size), np.zeros(size), 0)
+
     def _dots(self, side, values):
         """Sum of side * values over each component; `side` is 0 beside them."""
         if self.count != 1:

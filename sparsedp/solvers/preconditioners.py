@@ -16,7 +16,7 @@ from sparsedp.operators.given import from_matrix
 from sparsedp.solvers.amg import Hierarchy, Level, ruge_stueben
 from sparsedp.solvers.direct import direct_engine
 from sparsedp.solvers.krylov import Krylov
-from sparsedp.solvers.scaling import inverted
+from sparsedp.solvers.scaling import exponent_of, inverted
 from sparsedp.solvers.solve import Engine
 from sparsedp.solvers.system import System
 
@@ -135,7 +135,7 @@ def shifted_laplace(system):
     A = system.matrix
     size, rows = abs(A), A @ np.ones(system.size)
     sums = size @ np.ones(system.size)
-    unit = 2.0 ** -int(np.frexp(np.max(sums))[1])
+    unit = 2.0 ** -exponent_of(np.max(sums))
     links = csr_array(diags_array(sums + np.maximum(rows.real, 0.0)) - size)  # the matrix as if it had no waves
     turn = -1.0 if np.sum(rows.imag) > 0 else 1.0  # damped further to the side on which they are damped
     waves = (rows.real < 0) | (turn * rows.imag < 0)

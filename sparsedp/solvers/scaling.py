@@ -11,6 +11,7 @@ from sparsedp.shortcuts import ELSEWHERE
 
 __all__ = [
     "dot",
+    "exponent_of",
     "in_range",
     "inverted",
     "largest",
@@ -54,7 +55,7 @@ def length(x):
     size = norm(x)
     if in_range(size):
         return size
-    exponent = int(np.frexp(np.max(np.abs(x), initial=0.0))[1])
+    exponent = exponent_of(np.max(np.abs(x), initial=0.0))
     return float(np.ldexp(norm(shifted(x, -exponent)), exponent))
 
 
@@ -66,6 +67,11 @@ def remainder(b, out, x):
             np.subtract(given, part, out=part)
             rest, solution = rest + _square(part), solution + _square(values)
     return float(np.sqrt(rest)), float(np.sqrt(solution))
+
+
+def exponent_of(size):
+    """Exponent of the power of two next above a size."""
+    return int(np.frexp(size)[1])
 
 
 def in_range(size):

@@ -351,7 +351,7 @@ def transforming(system, found, eigenvalues):
     """System and its `eigenbasis` -> Separable, without transforms along the first axis unless they are as good."""
     structure, first, wide = system.op.structure, found.shape[0], WIDE_COMPILED if kernels.compiled() else WIDE_PLAIN
     if not structure.separable and np.all(eigenvalues):  # an eigenvalue 1 beside 1e16 would count as 0 in products
-        system.null_space = NullSpace(None, np.zeros(system.size), np.zeros(system.size), 0)
+        system.null_space = NullSpace.none(system.size)
     if structure.separable and 0 in structure.lines and first >= 3 and found.eigenvalues[0].size >= wide:
         rest = Spectrum(found.shape, (Axis("identity", np.zeros(first)), *found.axes[1:]), found.shift)
         sums = rest.eigenvalues[0].reshape(-1)

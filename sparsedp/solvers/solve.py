@@ -47,7 +47,7 @@ from sparsedp.ledger import count, thread, timed
 from sparsedp.markup import facts, table
 from sparsedp.recipe import Remade
 from sparsedp.solvers.nullspace import ROUNDING
-from sparsedp.solvers.scaling import in_range, norm, shifted
+from sparsedp.solvers.scaling import exponent_of, in_range, norm, shifted
 from sparsedp.tape import plain
 
 __all__ = ["STATUS_WORDS", "Engine", "Run", "SolveInfo", "SolveLog", "Solver", "failure", "merged"]
@@ -189,7 +189,7 @@ class Solver(Remade):
             if top == 0:
                 run.status = "exact_zero_rhs"
                 return np.zeros_like(b)
-            exponent = int(np.frexp(top)[1])
+            exponent = exponent_of(top)
             b = shifted(b, -exponent)
             size = self.system.size_of(b)
         exponent -= self.system.exponent
@@ -349,14 +349,12 @@ STATUS_WORDS = (  # from good to bad: of two solves that share a record, the lat
     "stagnated",
     "diverged",
     "indefinite_operator",
-    "nonsymmetric_operator",
     "incompatible_rhs",
     "empty_row",
     "nonfinite_input",
     "nonfinite_output",
     "not_representable",
     "setup_failed",
-    "unstable_step",
 )
 
 

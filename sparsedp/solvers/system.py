@@ -12,7 +12,7 @@ from sparsedp.fields import EPS
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
 from sparsedp.solvers.nullspace import NullSpace, find_null_space
-from sparsedp.solvers.scaling import largest, norm, remainder
+from sparsedp.solvers.scaling import exponent_of, largest, norm, remainder
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Mask
@@ -52,7 +52,7 @@ class System:
         self.rtol, self.maxiter = rtol, maxiter
         self.exponent = 0
         known = self.faces is not None and self.faces.within(FAR - 1)
-        exponent = 0 if known else int(np.frexp(self.norm(False))[1])
+        exponent = 0 if known else exponent_of(self.norm(False))
         if abs(exponent) > FAR:
             self.exponent = int(np.clip(exponent, -1000, 1000))
             self.op = op * 2.0**-self.exponent
@@ -344,7 +344,7 @@ def _check_underflow(op, scaled):
 
 def _rescaled(grid):
     """The grid with its lengths divided by powers of two, so that volumes are near 1, and so are their squares."""
-    widths = [np.ldexp(h, -int(np.frexp(np.max(h, initial=0.0))[1])) for h in grid.widths]
+    widths = [np.ldexp(h, -exponent_of(np.max(h, initial=0.0))) for h in grid.widths]
     return Grid(grid.shape, spacing=widths, periodic=grid.periodic)
 
 

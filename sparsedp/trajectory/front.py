@@ -12,7 +12,7 @@ from sparsedp.tape import VJPNode, dtype_of, is_variable, isbox, plain, through
 from sparsedp.tape_constants import constant_args
 from sparsedp.trajectory.keep import kind
 from sparsedp.trajectory.layout import Layout
-from sparsedp.trajectory.memory_budget import budget_within_reach, plan, room_within, slots_within
+from sparsedp.trajectory.memory_budget import advances, budget_within_reach, room_within, slots_within
 from sparsedp.trajectory.run import Loop
 from sparsedp.tree import leaves
 
@@ -178,7 +178,7 @@ def _check_inputs(inputs, n):
 def _warn_of_repeats(memory, size, n, beside):
     more = budget_within_reach(memory, size, n, beside)
     if more is not None:
-        few, many = (plan(n, bytes_, size, beside).factor for bytes_ in (more, memory))
+        few, many = ((advances(n, slots_within(b, size, n, beside)) + 1) / n for b in (more, memory))
         warnings.warn(
             BudgetWarning(
                 f"rollout runs {n} steps {many:.3g} times each within memory={memory!r}, and {few:.3g} times with "

@@ -18,14 +18,11 @@ from bisect import bisect_left
 from math import comb
 
 from sparsedp.fields import is_number
-from sparsedp.trajectory.record import Record
 
 __all__ = [
     "advances",
     "budget_within_reach",
     "checkpoints",
-    "plan",
-    "recomputed",
     "room_within",
     "slots_within",
     "stride",
@@ -59,11 +56,6 @@ def advances(n, s):
         return 0
     r = repetitions(n, s)
     return r * n - beta(s + 1, r - 1)
-
-
-def recomputed(n, s):
-    """Least number of steps that are run again."""
-    return advances(n, s) - max(n - 1, 0)
 
 
 def stride(n, s):
@@ -131,16 +123,3 @@ def _bytes(memory):
     if not is_number(memory) or not 0 < memory < float("inf"):
         raise ValueError(f'rollout needs memory as bytes > 0 or a text, got {memory!r}; write for example "200 MB"')
     return int(memory)
-
-
-def plan(n, memory, state_bytes, beside=0):
-    """Steps, memory and bytes of a state, and of what is there once -> the Record that a run will make.
-
-    Examples
-    --------
-    >>> schedule = plan(10_000, "100 MB", 256 * 256 * 8)
-    >>> schedule.kept, schedule.recomputed
-    (181, 9818)
-    """
-    slots = max(n, 1) if memory is None else slots_within(memory, state_bytes, n, beside)
-    return Record("backward", n, slots, recomputed(n, slots))

@@ -14,6 +14,7 @@ from sparsedp import kernels
 from sparsedp.fields import EPS, check_choice
 from sparsedp.solvers.multigrid.stencil import Unfit, components, stencil_of
 from sparsedp.solvers.nullspace import NullSpace
+from sparsedp.solvers.scaling import exponent_of
 from sparsedp.solvers.solve import Engine, norm
 
 __all__ = ["Structured", "structured_engine", "structured_if_suited"]
@@ -89,7 +90,7 @@ def _built(system, dtype=None):
     if faces is not None and faces.connected:  # what is known need not be found from the entries
         system.components = None, 1
         if faces.extra.any():
-            system.null_space = NullSpace(None, np.zeros(system.size), np.zeros(system.size), 0)
+            system.null_space = NullSpace.none(system.size)
     else:
         system.components = components(stencil)
     free = system.null_space.right != 0 if system.null_space.count else np.zeros(system.size, bool)
@@ -165,7 +166,7 @@ class _Run:
         self.engine, self.data, self.gauge = engine, norm(b), engine.gauges[int(transposed)]
         before, self.after = engine.factors[transposed], engine.factors[not transposed]
         top = engine.tops[transposed] / abs(engine.scale)
-        self.unit = 2.0 ** (np.frexp(self.data)[1] - np.frexp(top)[1])
+        self.unit = 2.0 ** (exponent_of(self.data) - exponent_of(top))
         self.measure = self.unit * top  # of a residual that is 1 by the gauge
         self.goal = SURE * goal / self.measure
         self.x, self.r, self.q = engine.vectors

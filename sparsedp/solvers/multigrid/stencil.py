@@ -7,6 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from sparsedp.fields import EPS
+from sparsedp.solvers.scaling import exponent_of
 from sparsedp.structure.base import Matrix
 
 __all__ = ["Stencil", "Unfit", "components", "faces_of", "stencil_of"]
@@ -63,7 +64,7 @@ class Stencil(NamedTuple):
         """The stencil times the number that makes it positive and near 1; refuses what multigrid cannot smooth."""
         values = np.array([array.flat[np.argmax(np.abs(array))] for array in (*self.links, self.extra) if array.size])
         sign = -1.0 if np.all(values <= 0) and np.any(values) else 1.0
-        factor = sign * 2.0 ** -int(np.frexp(np.max(np.abs(values), initial=0.0))[1])
+        factor = sign * 2.0 ** -exponent_of(np.max(np.abs(values), initial=0.0))
         links, extra = [factor * c for c in self.links], factor * self.extra
         if any(np.any(c < 0) for c in links):
             raise Unfit("a face has a coefficient of the wrong sign")
