@@ -10,7 +10,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
-from sparsedp.fields import advise, check_function, check_native, check_shape, check_whole
+from sparsedp.fields import advise, check_function, check_native, check_shape, check_whole, surely_finite
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
 from sparsedp.shortcuts import ELSEWHERE, alike, together
@@ -34,9 +34,9 @@ from sparsedp.tape_constants import is_fixed
 from sparsedp.tree import copied, flatten, keys, leaves, mapped
 
 __all__ = [
-    "NO_JVP", "check_loss", "described", "entrywise", "grad", "gradient_of", "growing", "hvp", "judged", "jvp",
-    "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "taped", "traced", "value_and_grad",
-    "vjp", "witnessed", "zero_like",
+    "NO_JVP", "check_loss", "described", "entrywise", "grad", "gradient_of", "growing", "hvp", "is_finite", "judged",
+    "jvp", "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "taped", "traced",
+    "value_and_grad", "vjp", "witnessed", "zero_like",
 ]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
@@ -291,6 +291,12 @@ def tangent_of(value, slope):
     if not is_variable(value):
         return None
     return zero_like(value) if slope is None else fit("a rule", value, slope, slope)
+
+
+def is_finite(value):
+    """Whether an array or number, plain or traced, holds neither NaN nor infinity."""
+    value = plain(value)
+    return surely_finite(value) or bool(np.all(np.isfinite(value)))
 
 
 def zero_like(value):

@@ -281,6 +281,10 @@ def test_a_rate_that_writes_into_the_state_is_named_when_only_params_are_traced(
             dp.value_and_grad(last)(1.0)
 
 
+def fastest(op):
+    return float(np.min(np.linalg.eigvals(op.matrix.toarray()).real))
+
+
 @pytest.mark.parametrize("method", ["backward_euler", "crank_nicolson", "tr_bdf2", "imex"])
 @pytest.mark.parametrize(
     "grid",
@@ -306,6 +310,8 @@ def test_an_operator_of_the_wrong_sign_is_refused(method, grid):
         "its sign, or take a smaller time step$",
     ):
         stepped(-L, 0.5)
+    with pytest.raises(dp.errors.UnstableStepError):  # the fastest alone is beyond it
+        stepped(-L, {"backward_euler": 1.3, "crank_nicolson": 2.6}.get(method, 4.4) / -fastest(L))
     assert np.all(np.isfinite(stepped(L, 0.5))) and np.all(np.isfinite(stepped(-L, 1e-5)))
 
 

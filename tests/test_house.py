@@ -79,6 +79,7 @@ DOORS = [
     ("tqdm", r"progress\.py", ()),
     ("mpi4py", r"parallel/.*", ()),
     ("petsc4py", r"parallel/.*", ()),
+    ("cloudpickle", r"parallel/.*", ()),
     ("torch", r"interop/torch_bridge\.py", ()),
     ("jax", r"interop/jax_bridge\.py", ()),
     ("PIL", r"storage/pictures\.py|report/plots\.py", ()),
@@ -256,6 +257,18 @@ def test_no_private_names_of_foreign_libraries():
         for target, line in imports(m)
         if not within(target, "sparsedp") and m.place != "tape.py"
         if any(part.startswith("_") and not part.endswith("__") for part in target.split("."))
+    )
+
+
+def test_traced_values_are_opened_in_few_places():
+    """What `tape.py` shows of autograd has names; these attributes have none."""
+    doors = "tape.py", "shortcuts.py", "trajectory/front.py", "check/nodes.py"
+    none(
+        f"{m.place}:{node.lineno} reads {ast.unparse(node)}"
+        for m in modules()
+        for node in m.nodes(ast.Attribute)
+        if node.attr in ("_value", "_trace", "_node") and ast.unparse(node.value) != "self"
+        if m.place not in doors
     )
 
 

@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.sparse.linalg import ArpackError, eigsh
 
+from sparsedp.derivative import is_finite
 from sparsedp.errors import NonFiniteError, UnstableStepError
-from sparsedp.fields import check_choice, check_finite, check_number, rounded_down, surely_finite
+from sparsedp.fields import check_choice, check_finite, check_number, rounded_down
 from sparsedp.integrators.problem import Problem, like, number, pair
 from sparsedp.integrators.runge_kutta import (
     EXPLICIT,
@@ -280,7 +281,7 @@ class Step(Remade):
         except NonFiniteError:  # a solver on the way may have met it: name the argument
             self._blame(state, params)
             raise
-        if not all(map(_finite, leaves(new))):
+        if not all(is_finite(leaf) for leaf in leaves(new) if is_variable(leaf)):
             self._blame(state, params)
             raise NonFiniteError(
                 f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
@@ -334,12 +335,6 @@ class Step(Remade):
     def __repr__(self):
         length = "given by the params" if callable(self.dt) else f"{float(plain(self.dt)):g}"
         return f"<{self.name}: order {self.order}, dt {length}>"
-
-
-def _finite(leaf):
-    """Whether all numbers are finite; their sum tells in one pass, unless it overflows."""
-    value = plain(leaf)
-    return not is_variable(value) or surely_finite(value) or bool(np.all(np.isfinite(value)))
 
 
 def largest_step(op, reach):

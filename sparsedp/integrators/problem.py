@@ -144,8 +144,7 @@ def _terms(linear, place):
         return Stiff(op, coefficient, place)
     names = keys(linear)
     if names is None:
-        given = type(linear).__name__
-        raise TypeError(f"{place} takes an Operator or a pair (Operator, coefficient), got {given}")
+        raise TypeError(f"{place} takes an Operator or a pair (Operator, coefficient), got {type(linear).__name__}")
     return {name: _terms(linear[name], place + subscript(linear, name)) for name in names}
 
 

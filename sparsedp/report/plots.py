@@ -292,8 +292,7 @@ def v_curve(audit, ax=None):
     """
     check_type("v_curve", audit, Audit, "what check.gradient returns", "dp.v_curve(dp.check.gradient(loss, x))")
     lines, across, up = audit.curves()
-    title = f"{audit.verdict}{f': {audit.culprit}' if audit.culprit else ''}"
-    return _dressed(lines, current(ax), across, up, title)
+    return _dressed(lines, current(ax), across, up, ": ".join(filter(None, (audit.verdict, audit.culprit))))
 
 
 def stability_chart(growth, ax):

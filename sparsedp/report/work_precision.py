@@ -327,7 +327,7 @@ class Rows(Result):
 
     def parts(self):
         """The figures, and the settings that tell those of a method apart; what was left out."""
-        best = [*self.pareto(), *self.pareto("forward_error")]
+        best = [row for row in self.pareto(self.judged) if row[self.judged] < 1]
         rows = [json.loads(row["settings"]) | row | {"best": "*" * (row in best)} for row in self.rows]
         apart = [name for name in self.over if name not in COLUMNS]
         errors = [row["reference_error"] for row in rows if row["reference_error"] >= 0]
@@ -336,7 +336,7 @@ class Rows(Result):
             table_of(rows, ["method", *apart, *SHOWN, "best"]),
             *self.omissions(),
             *self._recommended(),
-            "A star: no other row is both faster and more exact (the Pareto set, in gradient or value).",
+            "A star: an error below 1, and no other row is both faster and more exact (the Pareto set).",
             *([f"Error of the reference: {max(errors):.1e}."] if errors else []),
         ]
 

@@ -6,16 +6,16 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import described
+from sparsedp.derivative import described, is_finite
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_native, surely_finite
+from sparsedp.fields import check_finite, check_native
 from sparsedp.shortcuts import ELSEWHERE, array
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.tape_constants import constant
 from sparsedp.tree import flatten, keys, labels, leaves, subscript
 
 __all__ = [
-    "Layout", "dense", "fingerprint", "folded", "is_finite", "owned", "refuse_lost", "refuse_mask", "stacked",
+    "Layout", "dense", "fingerprint", "folded", "owned", "refuse_lost", "refuse_mask", "stacked",
 ]  # fmt: skip
 
 
@@ -197,12 +197,6 @@ class Layout:
         for number, value in enumerate(values):
             if not is_finite(value):
                 check_finite(f"{self.names[number]} of {owner}", plain(value), needs)
-
-
-def is_finite(value):
-    """Whether an array or number, plain or traced, holds neither NaN nor infinity."""
-    value = plain(value)
-    return surely_finite(value) or bool(np.all(np.isfinite(value)))
 
 
 def _is_open(tree):

@@ -9,13 +9,12 @@ from operator import is_
 
 import numpy as np
 
-from sparsedp.derivative import judged, zero_like
+from sparsedp.derivative import is_finite, judged, zero_like
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.ledger import count
 from sparsedp.progress import shown_steps
 from sparsedp.tape import Rule
 from sparsedp.trajectory.backward_pass import go_back
-from sparsedp.trajectory.layout import is_finite
 from sparsedp.trajectory.memory_budget import checkpoints
 from sparsedp.trajectory.record import APART, SAMPLES, Record
 from sparsedp.trajectory.steps import Steps

@@ -85,8 +85,7 @@ def survey(grid, logk):
     exact = Ground(grid, wells, sensors).readings(logk)
     noise = NOISE * np.sqrt(np.mean(exact**2, axis=1, keepdims=True))
     # Uniform numbers of standard deviation 1: their stream is the same with every version of NumPy.
-    spread = np.sqrt(12) * (default_rng(SEED).random(exact.shape) - 0.5)
-    return Survey(wells, sensors, exact + noise * spread, noise)
+    return Survey(wells, sensors, exact + noise * (np.sqrt(12) * (default_rng(SEED).random(exact.shape) - 0.5)), noise)
 
 
 def centres_of(grid):
