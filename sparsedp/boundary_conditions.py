@@ -181,7 +181,10 @@ def check_condition(name, given):
 def _check_names(grid, boundary):
     for name in boundary:
         if name not in grid.axes:
-            raise ValueError(f"boundary names axis {name!r}, but {grid} has {', '.join(grid.axes)}; leave it out")
+            raise ValueError(
+                f"boundary names axis {name!r}, but {grid} has {', '.join(grid.axes)}; give the two sides of an "
+                "axis as {'x': (lower, upper)}"
+            )
         if grid.periodic[AXES.index(name)]:
             raise ValueError(f"axis {name} is periodic and takes no boundary condition; leave it out")
 

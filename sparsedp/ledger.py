@@ -24,7 +24,7 @@ class Thread(local):
     calls : list of Calls
         The open `recording()` blocks.
     solve_hooks : list
-        Who takes part in every solve, the last one first; asked inside recordings only.
+        Who takes part in every solve, the last one first.
     loop_hooks : list of callables
         Called for every time loop before it runs, with (step, state, params, inputs, n).
     witnesses : list of callables

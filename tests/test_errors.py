@@ -151,7 +151,8 @@ TABLE = [
     (
         lambda: dp.gradient(LINE, {"y": dp.neumann}),
         VALUE,
-        "boundary names axis 'y', but Grid(3 cells, size 3) has x; leave it out",
+        "boundary names axis 'y', but Grid(3 cells, size 3) has x; give the two sides of an axis as "
+        "{'x': (lower, upper)}",
     ),
     (
         lambda: dp.gradient(RING, {"x": dp.neumann}),

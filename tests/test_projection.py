@@ -167,7 +167,7 @@ def test_nan_anywhere_is_refused():
 
 def test_what_is_refused():
     grid = dp.Grid((4, 3), periodic=(False, True))
-    with pytest.raises(ValueError, match="boundary names axis 'z', but .* has x, y; leave it out"):
+    with pytest.raises(ValueError, match="boundary names axis 'z', but .* has x, y; give the two sides of an axis"):
         dp.projection(grid, boundary={"z": dp.inflow})
     with pytest.raises(ValueError, match="axis y is periodic and takes no boundary condition; leave it out"):
         dp.projection(grid, boundary={"y": dp.inflow})

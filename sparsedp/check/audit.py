@@ -99,6 +99,12 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
 
     Cost: two evaluations of the loss for each step and direction (a hundred or two in all, about 60 of a quick
     audit), and a few gradients. A terminal shows how many are to come on standard error, with a bar if tqdm is there.
+    Where the verdict is "disagrees" the calls on the tape are looked at one by one for the culprit: seconds for most
+    losses, minutes where a loss takes a thousand implicit steps.
+
+    A `stepper` with a `tolerance` is differentiable to that tolerance, not to rounding: its gradient differs from that
+    of the value it returns by a few tolerances, and the verdict is "disagrees" with no culprit. Check such a loss with
+    a fixed dt, or with a tolerance of 1e-9.
 
     Everything is relative: a loss times 1e-200 or 1e200 is judged the same. A loss that refuses a trial
     point (unstable step, no convergence, not finite, a ValueError) makes that step unusable. At a kink

@@ -1,4 +1,4 @@
-"""The one writer of tables: as text, in Markdown, as HTML, as CSV."""
+"""Tables of results: as text, in Markdown, as HTML, as CSV."""
 
 import csv
 import io

@@ -40,7 +40,9 @@ def gradient(grid, boundary=neumann, solid=None, solid_boundary=neumann):
     ShapeError
         If `solid` has another shape than the grid.
     TypeError
-        If `solid` is not boolean, or `solid_boundary` not one condition.
+        If `grid` is no Grid, `solid` not boolean, or `solid_boundary` not one condition.
+    ValueError
+        If `boundary` names an axis that is periodic or that the grid lacks.
 
     Notes
     -----
@@ -82,6 +84,11 @@ def divergence(grid):
     -------
     Operator
         in: faces [unit]; out: cells [unit / length].
+
+    Raises
+    ------
+    TypeError
+        If `grid` is no Grid.
 
     Notes
     -----

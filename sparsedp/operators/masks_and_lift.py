@@ -127,6 +127,11 @@ def identity(space):
     -------
     Operator
 
+    Raises
+    ------
+    TypeError
+        If `space` is no Space.
+
     Examples
     --------
     >>> from sparsedp import Grid

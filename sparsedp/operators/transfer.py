@@ -34,6 +34,13 @@ def average(grid, boundary=neumann):
     Operator
         in: cells [unit]; out: faces [unit]. Linear fields are reproduced between cells.
 
+    Raises
+    ------
+    TypeError
+        If `grid` is no Grid, or a condition none that is known.
+    ValueError
+        If `boundary` names an axis that is periodic or that the grid lacks.
+
     Examples
     --------
     >>> average(Grid(3))(np.array([1.0, 2.0, 4.0]))

@@ -178,8 +178,8 @@ def certify(loss, x, target=TARGET):
     Cost: one gradient, two loose correction solves (relative residual 1e-2) for each pair of solves, one more
     forward correction for the value, one more adjoint correction for the split by cause, and for the split by solve
     as many again where there are several solvers. Norm: Euclidean over all leaves. Errors of discretisation and of
-    rounding are not seen; below 1e-13
-    the estimate is rounding. A solve that is unrolled on the tape is exact by its own definition.
+    rounding are not seen; below 1e-13 the estimate is rounding. A derivative or transpose that is wrong is not seen
+    either: `check.gradient` looks for those. A solve that is unrolled on the tape is exact by its own definition.
 
     Examples
     --------

@@ -76,6 +76,10 @@ def power(op, exponent):
     NonFiniteError
         If `exponent` is not finite, or the power leaves the range of floats.
 
+    Notes
+    -----
+    A product with known numbers, not a solve: no residual is looked at. For the solution of op x = b write `inverse`.
+
     Examples
     --------
     >>> from sparsedp import Grid, laplacian

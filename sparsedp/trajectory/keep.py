@@ -1,4 +1,4 @@
-"""What a rollout hands out: the last state, all states, or what a function makes of each.
+"""What a rollout hands out: the last state, some or all states, or what a function makes of each.
 
 Each kind takes the states of a run as they come (`start`, `see`, `finish`), builds the user's tree from the arrays of
 the last run (`tree`), and going backward says which cotangent enters at which state (`source`).

@@ -36,7 +36,7 @@ class Loop(Rule):
     truncate : int or None
     wanted : list of int
         The arguments that want a cotangent.
-    keep : Last, All or Each
+    keep : Last, Some, All or Each
     slots : int or None
         How many states may be kept for the way back; None: all; 0: the last one, steps are reversed.
     room : int
