@@ -327,7 +327,8 @@ class Rows(Result):
 
     def parts(self):
         """The figures, and the settings that tell those of a method apart; what was left out."""
-        best = [row for row in self.pareto(self.judged) if row[self.judged] < 1]
+        error = self.judged
+        best = [row for row in self.pareto(error) if row[error] < 1]
         rows = [json.loads(row["settings"]) | row | {"best": "*" * (row in best)} for row in self.rows]
         apart = [name for name in self.over if name not in COLUMNS]
         errors = [row["reference_error"] for row in rows if row["reference_error"] >= 0]
@@ -335,14 +336,13 @@ class Rows(Result):
             f"{self.scene}: error against run time",
             table_of(rows, ["method", *apart, *SHOWN, "best"]),
             *self.omissions(),
-            *self._recommended(),
+            *self._recommended(error),
             "A star: an error below 1, and no other row is both faster and more exact (the Pareto set).",
             *([f"Error of the reference: {max(errors):.1e}."] if errors else []),
         ]
 
-    def _recommended(self):
-        """The fastest method for each error of GOALS, in words."""
-        error = self.judged
+    def _recommended(self, error):
+        """The fastest method for each value of GOALS of this error, in words."""
         for goal in GOALS if self.pareto(error) else ():
             words, row = f"a {error.replace('_', ' ')} of {100 * goal:g} %", self.best(goal, error)
             if row is None:
