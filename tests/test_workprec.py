@@ -230,3 +230,19 @@ def test_words_pictures_and_refusals(tmp_path):
         TypeError, match=r"a problem gives \(loss, x\) or \(loss, x, facts\), got float; write return loss, x"
     ):
         dp.workprec(lambda: 1.0, {"it": {}})
+
+
+def test_a_star_needs_an_error_below_one():
+    """A value that is right by luck, beside a gradient that is not, is no good run."""
+
+    def scene(share, bend):
+        return lambda b: share * b**2 + bend * (b - 2.0), 2.0
+
+    methods = {
+        "lucky": {"share": 1.0, "bend": 40.0},
+        "off": {"share": 9.0, "bend": 0.0},
+        "fine": {"share": 1.01, "bend": 0.0},
+    }
+    lines = dp.workprec(scene, methods, reference=(4.0, 4.0), repeats=1).markdown().splitlines()
+    starred = [line for line in lines if line.startswith("|") and line.rstrip(" |").endswith("*")]
+    assert len(starred) == 1 and "fine" in starred[0]
