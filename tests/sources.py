@@ -135,15 +135,3 @@ def exported(module):
             if isinstance(node.value, (ast.List, ast.Tuple)):
                 return [ast.literal_eval(item) for item in node.value.elts]
     return [node.name for node in definitions(module)]
-
-
-def body_length(function):
-    """Lines from the first statement after the docstring to the last one."""
-    body = function.body[1:] if ast.get_docstring(function) is not None else function.body
-    return body[-1].end_lineno - body[0].lineno + 1 if body else 0
-
-
-def syntax_nodes(tree):
-    """How many nodes a tree has, docstrings left out."""
-    documented = [n for n in walked(tree) if isinstance(n, (*FUNCTION, ast.ClassDef, ast.Module)) and n.body]
-    return len(walked(tree)) - 2 * sum(ast.get_docstring(node) is not None for node in documented)
