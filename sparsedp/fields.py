@@ -56,7 +56,7 @@ def field_array(op, u, batch=False):
         check_plain(op.name, u)
         u = _array(op, u)
     shape = op.domain.shape
-    if u.shape != shape and not (batch and u.shape[-len(shape) :] == shape):
+    if u.shape != shape and not (batch and _is_batch(u.shape, shape)):
         raise ShapeError(f"{op.name} takes a field on {op.domain.described}, got an array of shape {u.shape}")
     if u.dtype.char not in "dfDF":
         if u.dtype.kind not in "biu":
@@ -65,6 +65,12 @@ def field_array(op, u, batch=False):
     if not u.flags.c_contiguous or not u.dtype.isnative:
         u = np.ascontiguousarray(u, dtype=u.dtype.newbyteorder("="))
     return u
+
+
+def _is_batch(shape, field_shape):
+    """Return whether the last axes are those of a field. A 0-d field has none, so every shape is a batch of it."""
+    lead = len(shape) - len(field_shape)
+    return lead >= 0 and shape[lead:] == field_shape
 
 
 def _array(op, u):

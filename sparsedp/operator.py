@@ -122,7 +122,7 @@ class Operator(Frozen, Remade):
             return self.layout.applied(self, u, out)
         u, shape = field_array(self, u, batch=True), self.codomain.shape
         dtype = result_dtype(self.structure, u.dtype)
-        lead = u.shape[: -len(self.domain.shape)]
+        lead = u.shape[: u.ndim - len(self.domain.shape)]
         if out is None:
             out = results.empty(lead + shape, dtype)
         else:

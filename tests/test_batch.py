@@ -20,12 +20,13 @@ OPERATORS = {
     "inverse": dp.inverse(-LAPLACIAN),
     "direct": dp.inverse(-LAPLACIAN, method="direct"),
     "projection": dp.projection(GRID),
+    "flux": dp.flux(GRID, (slice(1, 4), slice(1, 3))),
 }
 
 
 def one_by_one(function, batch, shape):
     flat = [function(u) for u in batch.reshape(-1, *shape)]
-    return np.array(flat).reshape(*batch.shape[: -len(shape)], *np.shape(flat[0]))
+    return np.array(flat).reshape(*batch.shape[: batch.ndim - len(shape)], *np.shape(flat[0]))
 
 
 @pytest.mark.parametrize("name", OPERATORS)
@@ -43,7 +44,7 @@ def test_a_batch_through_an_operator(name, lead, turned, rng):
     assert op(batch.astype("f")).dtype.itemsize == result.dtype.itemsize // 2
 
 
-@pytest.mark.parametrize("name", ["explicit", "matrix-free", "inverse", "projection"])
+@pytest.mark.parametrize("name", ["explicit", "matrix-free", "inverse", "projection", "flux"])
 def test_derivatives_of_a_batch(name, rng):
     op = OPERATORS[name]
     batch, direction = rng.normal(size=(2, 3, *op.domain.shape)), rng.normal(size=(2, 3, *op.domain.shape))
@@ -53,6 +54,24 @@ def test_derivatives_of_a_batch(name, rng):
     _, tangent = dp.jvp(op, batch, direction)
     assert np.array_equal(tangent, one_by_one(op, direction, op.domain.shape))
     assert dp.check.gradient(lambda u: anp.sum(weights * op(u) ** 2), batch, quick=True).verdict == "agrees"
+
+
+@pytest.mark.parametrize("lead", [(3,), (2, 3), (0,)])
+def test_second_order_of_a_batch_of_numbers(lead, rng):
+    """The codomain of `flux` is 0-d: each entry of its batch is one number."""
+    op = OPERATORS["flux"]
+    row = op.matrix.toarray()[0]
+    u, direction = rng.normal(size=(2, *lead, FACES.size))
+    twin = lambda u: anp.sum(anp.sum(row * u, -1) ** 4)
+    loss = lambda u: anp.sum(op(u) ** 4)
+    assert np.allclose(dp.grad(loss)(u), dp.grad(twin)(u), rtol=1e-12)
+    assert np.allclose(dp.hvp(loss, u, direction), dp.hvp(twin, u, direction), rtol=1e-12)
+    numbers = rng.normal(size=lead)
+    assert np.allclose(op.T(numbers), numbers[..., None] * row, rtol=1e-14)
+    back = lambda s: anp.sum((op.T(s)) ** 4)
+    assert np.allclose(dp.grad(back)(numbers), 4 * numbers**3 * np.sum(row**4), rtol=1e-12)
+    product = op @ op.T
+    assert np.allclose(dp.inverse(product)(product(numbers)), numbers, rtol=1e-12)
 
 
 @pytest.mark.parametrize("k", [0.7, np.linspace(0.5, 2.0, FACES.size)])

@@ -212,7 +212,7 @@ class ConservationLaw(Remade):
     def _state(self, u):
         """The state, of floating numbers."""
         values, momentum, shape = field_array(self, plain(u), batch=True), self.momentum, self.grid.shape
-        fields = values.shape[: -len(shape)]
+        fields = values.shape[: values.ndim - len(shape)]
         if len(fields) > 1:
             wanted = ", ".join(map(str, ("fields", *shape)))
             raise ShapeError(f"conservation_law takes u of shape ({wanted}), got {values.shape}")
