@@ -244,7 +244,9 @@ class Operator(Frozen, Remade):
         if np.iscomplexobj(number):
             return self * (1.0 / number)
         share, exponent = np.frexp(float(number))  # 1 / 1e308 has lost digits, 2^-1024 has not
-        structure = times(times(self.structure, 1.0 / float(share)), 2.0 ** -int(exponent))
+        half = int(exponent) // 2  # 2^-exponent of a subnormal number is infinite
+        structure = times(times(self.structure, 1.0 / float(share)), 2.0**-half)
+        structure = times(structure, 2.0 ** (half - int(exponent)))
         return Operator(structure, self.domain, self.codomain, f"{_bracket(self.name)} / {number:g}")
 
     def __array_ufunc__(self, ufunc, method, *inputs, **options):

@@ -292,3 +292,40 @@ def test_jumps_have_right_gradients():
     matrix = dense(solve, k, 0.0) + 1e-30j * (dense(solve, direction, 0.0))
     exact = np.sum(np.linalg.solve(matrix, b.ravel())).imag / 1e-30
     assert slope == pytest.approx(exact, rel=1e-8)
+
+
+@pytest.mark.parametrize("exponent", [-1030, -1000, 1000, 1015])
+@pytest.mark.parametrize("shape", [(7, 5), (4, 3, 5)])
+@pytest.mark.parametrize("kind", ["number", "faces", "tensor"])
+def test_coefficients_of_any_magnitude(kind, shape, exponent, rng):
+    """A coefficient, a shift and data times 2^e have the same solution, subnormal coefficients included."""
+    grid = dp.Grid(shape, size=(1.0,) * len(shape))
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
+    axes = np.eye(len(shape)).reshape(len(shape), len(shape), *[1] * len(shape))
+    coefficients = {
+        "number": 1.5,
+        "faces": rng.uniform(1.0, 2.0, grid.faces.size),
+        "tensor": axes * rng.uniform(1.0, 2.0, shape) + 0.25,
+    }
+    k, b = coefficients[kind], rng.standard_normal(shape)
+    shift = rng.uniform(0.0, 2.0, shape)
+    scaled = np.ldexp(k, exponent)
+
+    x = solve(float(scaled) if kind == "number" else scaled, np.ldexp(b, exponent), np.ldexp(shift, exponent))
+    assert np.allclose(x, solve(k, b, shift), rtol=1e-8, atol=1e-10)
+
+    def loss(k, b):
+        return anp.sum(solve(k, b) ** 2)
+
+    if abs(exponent) <= 1000:
+        gradient = dp.grad(loss)(scaled, np.ldexp(b, exponent))
+        assert np.allclose(np.ldexp(gradient, exponent), dp.grad(loss)(k, b), rtol=1e-7)
+
+
+def test_coefficients_whose_entries_would_overflow():
+    grid = dp.Grid((6, 5), size=1.0)
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
+    k, b = np.full(grid.faces.size, 1e308), np.ones(grid.shape)
+    assert np.allclose(solve(k, 1e300 * b), 1e-8 * solve(1.0, b), rtol=1e-10)
+    with pytest.raises(dp.errors.NonFiniteError, match="the solution of elliptic_solver is beyond 1.8e308"):
+        solve(np.full(grid.faces.size, 1e-309), b * 1e10)

@@ -249,6 +249,11 @@ def test_divided_by_a_number(number):
     assert (op / number).name == f"laplacian / {number:g}" or np.iscomplexobj(number)
 
 
+def test_divided_by_a_subnormal_number():
+    op, u = dp.laplacian(dp.Grid(4)), np.ldexp([1.0, 2.0, 4.0, -3.0], -500)
+    np.testing.assert_allclose((op / 2.0**-1030)(u), np.ldexp(op(u), 1030), rtol=2e-15)
+
+
 def test_divided_by_what_is_no_number():
     op = dp.laplacian(dp.Grid(3))
     assert op.__truediv__("2") is op.__truediv__(op) is NotImplemented

@@ -27,6 +27,7 @@ from sparsedp.shortcuts import array, in_dtype, whole
 from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose_method import build, check_settings
+from sparsedp.solvers.scaling import exponent_of, shifted
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.sparsity import pattern_like
 from sparsedp.space import Space, fits
@@ -35,6 +36,10 @@ from sparsedp.structure.lazy import Chain, Diagonal, Sum
 from sparsedp.tape import cast, dtype_of, isbox, plain
 
 __all__ = ["Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]
+
+
+FAR = 500  # exponent of coefficients beyond which they are scaled before the operator is built
+LEAST_EXPONENT = -1022  # of a float with all its digits
 
 
 class ParametricSolver(Remade):
@@ -77,13 +82,29 @@ class ParametricSolver(Remade):
         known = self._cache.find((k, shift))
         if known is not None:
             return known
-        op = self._operator(k.copy(), shift)
-        return self._cache.put((k, shift), build(op, name=self.name, log=self.info, solves="few", **self._settings))
+        exponent = _exponent_out_of_range(k, shift)
+        op = self._operator(shifted(k, -exponent) if exponent else k.copy(), shifted(shift, -exponent))
+        inverse = build(op, name=self.name, log=self.info, solves="few", **self._settings)
+        inverse.solver.system.exponent += exponent  # solutions are scaled back by it
+        return self._cache.put((k, shift), inverse)
 
     def __str__(self):
         if not len(self._cache):
             return f"{self!r}, not set up yet"
         return f"{self!r}, {len(self._cache)} of {self._cache.most} set-ups kept, the last one:\n{self._cache.last}"
+
+
+def _exponent_out_of_range(k, shift):
+    """Return the exponent of the largest coefficient where products with spacings could leave the range of floats.
+
+    0 where they cannot, and where coefficients differ so much that dividing by that power of two loses digits.
+    """
+    sizes = np.abs(np.concatenate([np.ravel(k), np.ravel(shift)]))
+    exponent = exponent_of(np.max(sizes, initial=0.0))
+    if abs(exponent) <= FAR:
+        return 0
+    smallest = np.min(sizes, where=sizes > 0, initial=np.inf)
+    return exponent if np.isinf(smallest) or exponent_of(smallest) - exponent > LEAST_EXPONENT else 0
 
 
 # ---------------------------------------------------------------- a coefficient on the faces

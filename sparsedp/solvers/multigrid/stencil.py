@@ -13,6 +13,7 @@ from sparsedp.structure.base import Matrix
 __all__ = ["Stencil", "Unfit", "components", "faces_of", "stencil_of"]
 
 CLEAN = 16 * EPS  # what is left of a diagonal is 0 below this share of the links at it
+MOST_EXPONENT = 1000  # of a power of two that scales: 2^1024 is infinite
 AGREES = 1e-12  # relative difference to the operator on a random field that is taken for rounding
 
 
@@ -64,7 +65,8 @@ class Stencil(NamedTuple):
         """The stencil times the number that makes it positive and near 1; refuses what multigrid cannot smooth."""
         values = np.array([array.flat[np.argmax(np.abs(array))] for array in (*self.links, self.extra) if array.size])
         sign = -1.0 if np.all(values <= 0) and np.any(values) else 1.0
-        factor = sign * 2.0 ** -exponent_of(np.max(np.abs(values), initial=0.0))
+        exponent = exponent_of(np.max(np.abs(values), initial=0.0))
+        factor = sign * 2.0 ** -np.clip(exponent, -MOST_EXPONENT, MOST_EXPONENT)  # of subnormals: as near as it gets
         links, extra = [factor * c for c in self.links], factor * self.extra
         if any(np.any(c < 0) for c in links):
             raise Unfit("a face has a coefficient of the wrong sign")
