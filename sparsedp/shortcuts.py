@@ -19,7 +19,7 @@ from sparsedp.errors import DerivativeError
 __all__ = [
     "ACTS", "ARRAY", "BOX", "COPY", "ELSEWHERE", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part",
     "REAL", "alike", "array", "by_entry", "elsewhere", "formulas_of", "in_dtype", "on_every_rank",
-    "operand", "ranks", "refuse_elsewhere", "refuse_options", "together", "whole",
+    "operand", "power_slope", "ranks", "refuse_elsewhere", "refuse_options", "together", "whole",
 ]  # fmt: skip
 
 FLOAT = np.dtype(float)
@@ -200,14 +200,26 @@ def _entries(g, nums):
 # ``alike(derivative, value)``, which gives a derivative the kind of the value it belongs to, `together` and `ranks`.
 ELSEWHERE: dict[type, Any] = {}
 
+
+def power_slope(g, x, y):
+    """Return g times the derivative of x**y in x, without the overflow of x**(y - 1) for a negative number y."""
+    if type(y) in (int, float) and y < 0:
+        return g / x * y * x**y
+    return g * y * x ** anp.where(y, y - 1, 1.0)
+
+
+# The square of a divisor below 1e-162 underflows to 0; the quotient x / y and its derivative may still be finite.
+_quotient = _entrywise((lambda g, x, y: g / y, (1,)), (lambda g, x, y: -g * (x / y) / y, (0, 1)))
+
 # Of a function of autograd: whether the formulas hold, from (value, nums, args); (pull, held), from (nums, args), with
 # ``pull(g, *held)`` the cotangents of args `nums`; what a tangent of one of them gives, from (g, num, args, shape).
 FORMULAS: dict[Any, Any] = {
     anp.add: _entrywise((lambda g, *args: g, ()), (lambda g, *args: g, ())),
     anp.subtract: _entrywise((lambda g, *args: g, ()), (lambda g, *args: -g, ())),
     anp.multiply: _entrywise((lambda g, x, y: y * g, (1,)), (lambda g, x, y: x * g, (0,))),
-    anp.true_divide: _entrywise((lambda g, x, y: g / y, (1,)), (lambda g, x, y: -g * x / y**2, (0, 1))),
-    anp.power: _entrywise((lambda g, x, y: g * y * x ** np.where(y, y - 1, 1.0), (0, 1))),
+    anp.true_divide: _quotient,
+    anp.divide: _quotient,
+    anp.power: _entrywise((power_slope, (0, 1))),
     anp.negative: _entrywise((lambda g, *args: -g, ())),
     ITEM: (
         _is_basic,

@@ -15,7 +15,8 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 from autograd.core import JVPNode, VJPNode, add_outgrads, primitive_jvps, primitive_vjps
-from autograd.extend import VSpace, defjvp_argnums, defvjp_argnums, primitive
+from autograd.extend import VSpace, defjvp, defjvp_argnums, defvjp, defvjp_argnums, primitive
+from autograd.numpy.numpy_vjps import match_complex, replace_zero, unbroadcast_f
 from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_primitives, trace_stack
 
 from sparsedp.errors import DerivativeError, ShapeError
@@ -26,7 +27,7 @@ from sparsedp.tape_constants import FIXED, constant, constant_args, frozen, spar
 # isort: off
 from sparsedp.shortcuts import (
     ACTS, ARRAY, BOX, COPY, FLOAT, ITEM, MAKERS, NUMBERS, OPERATORS, PLAIN, REAL, Part, alike, formulas_of,
-    in_dtype, operand, refuse_options,
+    in_dtype, operand, power_slope, refuse_options,
 )  # fmt: skip
 
 # isort: on
@@ -39,8 +40,69 @@ __all__ = [
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
-autograd_rules = primitive_vjps, primitive_jvps  # by function of autograd
+scaled_rules: dict = {}  # functions of autograd -> functions whose derivatives replace those of autograd on our traces
 
+
+def autograd_rules(fun):
+    """Return the VJP and the JVP maker of a function of autograd."""
+    fun = scaled_rules.get(fun, fun)
+    return primitive_vjps[fun], primitive_jvps[fun]
+
+
+def _scaled(*functions, slopes):
+    """Register ``slopes[k](g, value, *args)`` as the derivative of some functions in their argument k.
+
+    autograd divides by squares in the derivatives of these functions. Below 1e-162 such a square underflows, and the
+    derivative becomes NaN or infinite where it is finite. Other users of autograd keep its derivatives.
+    """
+
+    @primitive
+    def scaled(*args):
+        return functions[0](*args)
+
+    def in_argument(k, slope):
+        return lambda ans, *args: unbroadcast_f(args[k], lambda g: slope(g, ans, *args))
+
+    def forward(slope):
+        return lambda g, ans, *args: match_complex(ans, slope(g, ans, *args))
+
+    defvjp(scaled, *(in_argument(k, slope) for k, slope in enumerate(slopes)))
+    defjvp(scaled, *map(forward, slopes))
+    scaled_rules.update(dict.fromkeys(functions, scaled))
+
+
+def _angle_slope(g, ans, x):
+    size = anp.abs(x)
+    return g * (anp.conj(x * 1j) / size) / size
+
+
+def _along_hypotenuse(g, x, y, share):
+    """g times a share of x, y over x^2 + y^2."""
+    r = anp.hypot(x, y)
+    return g * (share / r) / r
+
+
+_scaled(
+    anp.true_divide,
+    anp.divide,
+    slopes=(lambda g, ans, x, y: g / y, lambda g, ans, x, y: -g * (x / y) / y),
+)
+_scaled(
+    anp.power,
+    slopes=(
+        lambda g, ans, x, y: power_slope(g, x, y),
+        lambda g, ans, x, y: g * anp.log(replace_zero(x, 1.0)) * ans,
+    ),
+)
+_scaled(anp.reciprocal, slopes=(lambda g, ans, x: -g / x / x,))
+_scaled(anp.angle, slopes=(_angle_slope,))
+_scaled(
+    anp.arctan2,
+    slopes=(
+        lambda g, ans, x, y: _along_hypotenuse(g, x, y, y),
+        lambda g, ans, x, y: _along_hypotenuse(g, x, y, -x),
+    ),
+)
 
 # ---- traces ----------------------------------------------------------------------------------------------------------
 
@@ -104,7 +166,7 @@ class ReverseNode(VJPNode):
         else:
             if len(nums) < len(args) and fun not in sparing:
                 args = constant_args(args, nums)
-            super().__init__(value, fun, args, constant(options), nums, parents)
+            super().__init__(value, scaled_rules.get(fun, fun), args, constant(options), nums, parents)
             self.held = OPEN if fun is _primitive and args[0].adds else ()
             if _kind(fun, value, args, nums) == "c":
                 self._keep_real(args, nums)
@@ -150,7 +212,7 @@ class ForwardNode(JVPNode):
             self.g = total[0]
         else:
             _kind(fun, value, args, nums)
-            super().__init__(value, fun, args, options, nums, parents)
+            super().__init__(value, scaled_rules.get(fun, fun), args, options, nums, parents)
 
 
 def _kind(fun, value, args, nums):

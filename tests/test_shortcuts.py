@@ -1,4 +1,4 @@
-"""The shortcuts of the tape, each against autograd, by bits."""
+"""The shortcuts of the tape, each against autograd, by bits; quotients of numbers whose squares underflow."""
 
 import re
 from time import process_time
@@ -13,6 +13,7 @@ from autograd.tracer import getval
 import sparsedp as dp
 from sparsedp.derivative import pushforward
 from sparsedp.errors import DerivativeError
+from sparsedp.tape import primitive_jvps, primitive_vjps, scaled_rules
 
 RNG = np.random.default_rng(3)
 X, Y = RNG.standard_normal((2, 3, 4))
@@ -43,6 +44,15 @@ FORMULAS = {
 }
 
 
+@pytest.fixture
+def scaled_quotients(monkeypatch):
+    """Give autograd the derivatives of quotients that do not divide by squares, as the tape has them."""
+    for fun, scaled in scaled_rules.items():
+        for rules in (primitive_vjps, primitive_jvps):
+            monkeypatch.setitem(rules, fun, rules[scaled])
+
+
+@pytest.mark.usefixtures("scaled_quotients")
 @pytest.mark.parametrize("name", FORMULAS)
 def test_the_shortcuts_of_the_tape_have_the_bits_of_autograd(name):
     def loss(z):
@@ -52,6 +62,38 @@ def test_the_shortcuts_of_the_tape_have_the_bits_of_autograd(name):
     same, known = autograd.value_and_grad(loss)((X, Y))
     assert value == same and abs(value - loss((X, Y))) <= 1e-15 * X.size  # x**2 is not power(x, 2) in NumPy 1.26
     assert all(np.array_equal(a, b) for a, b in zip(g, known, strict=True))
+
+
+SMALL = 2.0**-570  # its square underflows
+QUOTIENTS = {
+    "equal shapes": lambda x, y: x / (y * np.ones((3, 4))),
+    "broadcast": lambda x, y: x / y[0],
+    "number": lambda x, y: x[0, 1] / y,
+    "function": lambda x, y: anp.divide(x, y[:, :1]),
+    "reciprocal": lambda x, y: x * anp.reciprocal(y),
+    "power": lambda x, y: x * y**-1,
+    "power of a number": lambda x, y: x[0, 1] * y[1, 1] ** -1.0 * np.ones(4),
+    "arctan2": lambda x, y: anp.arctan2(x, y[:, :1]),
+    "angle": lambda x, y: anp.angle(x + 1j * y),
+    "complex": lambda x, y: anp.real(x / (x + 1j * y)),
+}
+
+
+@pytest.mark.parametrize("name", QUOTIENTS)
+def test_derivatives_of_quotients_of_small_numbers(name):
+    """A quotient does not change when both operands are scaled: its derivative scales with the inverse."""
+    loss = lambda z: anp.sum(anp.sin(QUOTIENTS[name](z[0], z[1])))
+    x, y, t = (X, Y), (SMALL * X, SMALL * Y), (Y, X**2)
+    known, found = autograd.grad(loss)(x), dp.grad(loss)(y)
+    assert all(np.allclose(SMALL * a, b, rtol=1e-13, atol=1e-13) for a, b in zip(found, known, strict=True))
+    along = sum(np.sum(a * b) for a, b in zip(known, t, strict=True))
+    assert dp.jvp(loss, y, tuple(SMALL * one for one in t))[1] == pytest.approx(along, rel=1e-12)
+    both = autograd.grad(lambda z: sum(anp.sum(a * b) for a, b in zip(autograd.grad(loss)(z), t)))(x)
+    assert all(np.allclose(a, b, rtol=1e-11, atol=1e-11) for a, b in zip(dp.hvp(loss, x, t), both, strict=True))
+
+
+def test_quotients_keep_their_derivatives_for_other_users_of_autograd():
+    assert not any(primitive_vjps[fun] is primitive_vjps[scaled] for fun, scaled in scaled_rules.items())
 
 
 def test_a_list_of_exponents():
@@ -108,6 +150,7 @@ FORWARD = {
 }
 
 
+@pytest.mark.usefixtures("scaled_quotients")
 @pytest.mark.parametrize("name", FORWARD)
 def test_forward_shortcuts_have_the_bits_of_autograd(name):
     def ends(z):

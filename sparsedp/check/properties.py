@@ -79,6 +79,6 @@ def _spectrum(op, symmetric):
         side = "positive" if np.all(kept > 0) else "negative" if np.all(kept < 0) else ""
         facts["definite"] = f"{side} {kind}" if side else "indefinite"
     if whole or symmetric:
-        step = float(np.min(-2 * np.minimum(kept.real, 0.0) / np.abs(kept) ** 2, initial=np.inf))
+        step = float(np.min(-2 * np.minimum(kept.real, 0.0) / np.abs(kept) / np.abs(kept), initial=np.inf))
         facts["stable step"] = 0.0 if step * radius <= ZERO else step
     return facts

@@ -186,7 +186,7 @@ def _entrywise(node, fun, value, args, nums, shapes):
         slopes = node.vjp(np.ones(shape), *node.held)
     else:
         spread = [np.broadcast_to(x, shape) if num in nums else x for num, x in enumerate(args)]
-        slopes = autograd_rules[0][fun](nums, value, spread, {})(np.ones(shape))
+        slopes = autograd_rules(fun)[0](nums, value, spread, {})(np.ones(shape))
 
     def act(g, rows):
         return [_summed(g * slope, known) for slope, known in zip(_beside(rows), shapes, strict=True)]

@@ -336,7 +336,7 @@ class Radau(Adaptive):
         K = np.eye(3 * n) - np.einsum("sab,sbij->saibj", hA, rows[..., :n]).reshape(m, 3 * n, 3 * n)
         b = np.concatenate([np.einsum("sab,sbij->saij", hA, rows), (z / h + (hA * C) @ rows[..., -1])[..., None]], -1)
         dz = solved(K, b.reshape(m, 3 * n, -1)).reshape(b.shape)
-        error = np.concatenate([first, -np.swapaxes(E[None] @ z / h**2, 1, 2)], 2) + np.tensordot(E, dz, (0, 1)) / h
+        error = np.concatenate([first, -np.swapaxes(E[None] @ z / h / h, 1, 2)], 2) + np.tensordot(E, dz, (0, 1)) / h
         M = np.stack([dz[:, 2] + np.eye(n, b.shape[-1]), solved(REAL / h * one - first[..., :n], error)], 1)
         stretch = M[..., -1].copy()  # of the new state with the length
         M[..., -1] = done * M[..., -2] + length * stretch
