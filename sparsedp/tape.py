@@ -35,7 +35,7 @@ from sparsedp.tree import copied, leaves
 
 __all__ = [
     "Recorder", "ReverseNode", "Rule", "VJPNode", "VSpace", "added", "apply_operator", "autograd_rules", "backward",
-    "boxed", "called", "cast", "differentiable", "dtype_of", "fit", "forward_root", "is_variable", "isbox", "linear",
+    "boxed", "called", "cast", "differentiable", "dtype_of", "fit", "forward_root", "innermost", "is_variable", "isbox", "linear",
     "new_trace", "plain", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
 ]  # fmt: skip
 
@@ -261,6 +261,13 @@ def traces_of(values):
             numbers.add(value._trace)
             value = value._value
     return numbers
+
+
+def innermost(values):
+    """Return the numbers of the values on the innermost trace of all, if that is a reverse-mode one."""
+    number = max((value._trace for value in values if isbox(value)), default=None)
+    nums = [num for num, value in enumerate(values) if isbox(value) and value._trace == number]
+    return nums if any(isinstance(values[num]._node, VJPNode) for num in nums) else []
 
 
 def boxed(values, roots, number):

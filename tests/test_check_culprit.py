@@ -120,6 +120,108 @@ def test_a_gradient_that_was_given():
     assert AUDIT(lambda u: np.sum(u**3), X, gradient=lambda u: 3.003 * u**2).verdict == "disagrees"
 
 
+# ---- a wrong rule behind every kind of call --------------------------------------------------------------------------
+
+
+WRONG_CUBE = dp.differentiable("cube", lambda u: u**3, lambda nums, ans, u: lambda g: (3.03 * u**2 * g,))
+LINE = np.linspace(1.0, 2.0, 5)
+ROWS = np.linspace(1.0, 2.0, 12).reshape(4, 3)
+
+
+def slow_down(u, p):
+    return 0.9 * u + 0.01 * u**2
+
+
+def run_of(u, step=slow_down, params=None, n=3, **options):
+    return dp.rollout(step, u, params, n, **options)
+
+
+def stepped(scheme, **options):
+    return lambda u: run_of(u, dp.stepper(scheme, lambda u, p: -p * u, 0.1, **options), 0.3)
+
+
+def swapped(state, params):
+    return {"a": 0.9 * state["a"] + 0.1 * state["b"], "b": 0.5 * state["b"]}
+
+
+def waves(u):
+    step = dp.stepper("leapfrog", (lambda v, c: v, lambda p, c: -p), 0.1)
+    return dp.rollout(step, (u, u), None, 5, memory="reverse")[0]
+
+
+def root_of_a_tree(u):
+    root = dp.implicit(
+        lambda x, p: {"a": x["a"] + 0.1 * x["b"] ** 3 - p["a"], "b": x["b"] + 0.1 * x["a"] - p["b"]}, method="direct"
+    )
+    return root({"a": u, "b": u}, {"a": u, "b": u})["a"]
+
+
+GRID_OF_ROWS = dp.Grid((4, 3))
+DECAY = dp.identity(GRID_OF_ROWS.cells) - 0.1 * dp.laplacian(GRID_OF_ROWS, dp.dirichlet)
+IN_FRONT = {  # what stands before the wrong rule, and where it is examined
+    "rollout": (run_of, LINE),
+    "rollout, all states": (lambda u: run_of(u, keep="all"), LINE),
+    "rollout, some states": (lambda u: run_of(u, keep=[1, 3]), LINE),
+    "rollout, a function of states": (lambda u: run_of(u, keep=lambda i, v: anp.sum(v**2))[2], LINE),
+    "rollout, memory": (lambda u: run_of(u, n=12, memory=300), LINE),
+    "rollout, params": (lambda u: run_of(u, lambda v, p: 0.9 * v + p, u), LINE),
+    "rollout, inputs": (lambda u: dp.rollout(lambda v, p, x: 0.9 * v + x, u[0], None, 5, inputs=u), LINE),
+    "rollout, dict": (lambda u: run_of({"a": u, "b": 2 * u}, swapped)["a"], LINE),
+    "rollout, number": (run_of, 1.3),
+    "rollout in rollout": (lambda u: run_of(u, lambda v, p: run_of(v, n=2)), LINE),
+    "leapfrog, reversed": (waves, LINE),
+    "euler": (stepped("euler"), LINE),
+    "rk4": (stepped("rk4"), LINE),
+    "adopt": (dp.adopt(np.sin), LINE),
+    "inverse": (dp.inverse(DECAY), ROWS),
+    "transport": (lambda u: dp.transport(GRID_OF_ROWS)(u, np.full(GRID_OF_ROWS.faces.size, 0.1), 0.1), ROWS),
+    "ensemble": (lambda u: dp.ensemble(lambda p, scale: anp.sum(p**2) * scale, [1.0, 2.0])(u), LINE),
+}
+SLOWER = {
+    "implicit": (lambda u: dp.implicit(lambda x, p: x + x**3 - p)(u, u), LINE),
+    "implicit, dict": (root_of_a_tree, LINE),
+    "steady": (lambda u: dp.steady(lambda x, p: p - x - x**3, LINE, u), LINE),
+    "krylov": (dp.inverse(DECAY, "krylov"), ROWS),
+    "backward_euler": (stepped("backward_euler"), LINE),
+    "radau, tolerance": (stepped("radau", tolerance=1e-6), LINE),
+    "rk4, tolerance": (stepped("rk4", tolerance=1e-6), LINE),
+}
+
+
+@pytest.mark.parametrize("name", [*IN_FRONT, *(pytest.param(name, marks=pytest.mark.whole) for name in SLOWER)])
+def test_a_wrong_rule_behind(name):
+    act, x = (IN_FRONT | SLOWER)[name]
+    found = AUDIT(lambda u: anp.sum(WRONG_CUBE(act(u))), x, directions=1, quick=True)
+    assert found.verdict == "disagrees" and found.culprit == "cube"
+    assert "was not examined" not in str(found)
+
+
+def test_a_rule_with_several_results_is_examined():
+    def wrong(nums, ans, u):
+        return lambda g: (2.02 * u * g[0] + anp.cos(u) * g[1],)
+
+    pair = dp.differentiable("pair", lambda u: (u**2, np.sin(u)), wrong)
+    assert AUDIT(lambda u: anp.sum(pair(u)[0]) + anp.sum(pair(u)[1]), LINE, quick=True).culprit == "pair"
+
+
+def test_a_rollout_whose_derivative_is_cut():
+    found = AUDIT(lambda u: anp.sum(run_of(u, n=4, truncate=2)), LINE, quick=True)
+    assert found.verdict == "disagrees" and found.culprit == "rollout"
+    assert "its derivative is cut by truncate=2" in str(found)
+
+
+def test_a_call_that_cannot_be_examined_ends_no_search():
+    def once(u):
+        if np.any(u != LINE):
+            raise KeyError("only there")
+        return 1.0 * u
+
+    shy = dp.differentiable("shy", once, lambda nums, ans, u: lambda g: (g,))
+    beside = lambda u: anp.sum(shy(LINE + 0.0 * u)) + anp.sum(u * np.sin(getattr(u, "_value", u)))
+    found = AUDIT(beside, LINE, quick=True)
+    assert found.verdict == "disagrees" and "shy was not examined (KeyError" in str(found)
+
+
 # ---- what others get wrong -----------------------------------------------------------------------------------------
 
 

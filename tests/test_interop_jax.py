@@ -220,6 +220,14 @@ def test_refusals_of_jax_functions():
         from_jax("net")
 
 
+def test_the_audit_examines_a_function_of_jax():
+    """A wrong rule behind it is named: the function is run again at other values."""
+    act = from_jax(lambda x: {"a": jnp.sin(x), "b": x})
+    cube = dp.differentiable("cube", lambda u: u**3, lambda nums, ans, u: lambda g: (3.03 * u**2 * g,))
+    found = dp.check.gradient(lambda u: anp.sum(cube(act(u)["a"])), np.linspace(1.0, 2.0, 5), quick=True)
+    assert found.culprit == "cube" and "was not examined" not in str(found)
+
+
 def test_there_and_back():
     """A function of this library as one of JAX, as one of this library."""
     solve, _ = SCENES["elliptic_solver"]

@@ -10,12 +10,14 @@ import numpy as np
 from sparsedp.check.judge import forward_mode, looked_at
 from sparsedp.check.nodes import calls_seen, in_order
 from sparsedp.check.operators import fault_of, field
+from sparsedp.check.summary import error_text
 from sparsedp.check.sweep import Point, Trials, generator
-from sparsedp.derivative import grad, pullback
+from sparsedp.derivative import grad
 from sparsedp.errors import DerivativeError
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
 from sparsedp.solvers.choose_method import Inverse
+from sparsedp.tape import is_variable
 
 __all__ = ["culprit_of"]
 
@@ -42,17 +44,21 @@ def culprit_of(loss, point):
     """
     rng = generator(None)
     cleared: set[int] = set()  # Operators that are right
+    refused: dict[str, str] = {}  # calls that cannot be examined alone, and the error
     with np.errstate(all="ignore"):
         with calls_seen() as nodes:
             grad(loss)(point.fresh())
         for node in _examined(nodes):
             try:
                 fault = _fault(node, cleared, rng)
-            except DerivativeError:  # a call that refuses the cotangents tried: not to be judged
+            except DerivativeError:  # the call refuses the cotangents that were tried
+                continue
+            except Exception as error:  # a function of the user may raise anything; the verdict does not need it
+                refused.setdefault(node.name, error_text(error))
                 continue
             if fault:
                 return fault[0], ", ".join(fault)
-    return None, NOBODY
+    return None, NOBODY + "".join(f"; {name} was not examined ({words})" for name, words in refused.items())
 
 
 def _examined(nodes):
@@ -62,7 +68,7 @@ def _examined(nodes):
     for node in nodes:
         groups.setdefault(id(node.subject), []).append(node)
     chosen = {id(node) for calls in groups.values() for node in calls[:: -(-len(calls) // MOST)]}
-    return [node for node in nodes if id(node) in chosen and node.plain and not isinstance(node.value, tuple)]
+    return [node for node in nodes if id(node) in chosen and node.plain]
 
 
 def _fault(node, cleared, rng):
@@ -72,8 +78,10 @@ def _fault(node, cleared, rng):
     reason = _wrong_rule(node, rng)
     if not reason:
         return None
+    if getattr(node.subject, "truncate", None):
+        reason += f"; its derivative is cut by truncate={node.subject.truncate}"
     with recording() as calls:
-        pullback(node.again, node.values)[1](np.ones_like(node.value))
+        grad(_functional(node, None))(node.values)
     actors = [actor for group in calls.actors.values() for actor in group.values() if isinstance(actor, Operator)]
     return next(filter(None, (_of_operator(op, cleared, rng) for op in actors)), (node.name, reason))
 
@@ -89,17 +97,31 @@ def _of_operator(op, cleared, rng):
     return (op.name.removesuffix(".T"), reason) if reason else None  # it and its transpose are one operator
 
 
+def _functional(node, rng):
+    """Return ``loss(values)``, the sum of random weights (ones without `rng`) times the results of a call."""
+    several = isinstance(node.value, tuple)
+    results = node.value if several else (node.value,)
+    weights = {
+        k: field(rng, np.shape(result), np.asarray(result).dtype) if rng else np.ones_like(result)
+        for k, result in enumerate(results)
+        if is_variable(result)
+    }
+
+    def loss(values):
+        again = node.again(values)
+        parts = [(weight, again[k] if several else again) for k, weight in weights.items()]
+        return sum(anp.sum(anp.real(weight * part)) for weight, part in parts)
+
+    return loss
+
+
 def _wrong_rule(node, rng):
     """What differences say against the VJP of a call, or its VJP against its JVP; "" if nothing."""
     try:
         point = Point(node.values)
     except Exception:  # no values that could be moved: nothing to be judged here
         return ""
-    g = field(rng, np.shape(node.value), np.asarray(node.value).dtype)
-
-    def loss(values):
-        return anp.sum(anp.real(g * node.again(values)))
-
+    loss = _functional(node, rng)
     # In each argument alone, and the largest entry: a loss of many entries hides single ones.
     trials = Trials(loss, point, grad(loss))
     judged, doubts = looked_at(trials, DIRECTIONS, rng, lambda name: name not in SKIPPED)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sparsedp.derivative import name_of, witnessed
 from sparsedp.shortcuts import ELSEWHERE
-from sparsedp.tape import called, isbox
+from sparsedp.tape import called, isbox, through
 
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
 
@@ -45,9 +45,18 @@ class Node:
 
         def again(values):
             given = dict(zip(nums, values, strict=True))
-            return fun(*(given.get(num, arg) for num, arg in enumerate(args)), **options)
+            everything = [given.get(num, _as_new(arg)) for num, arg in enumerate(args)]
+            if fun is through:  # the rule of a time loop knows which of its arguments have a derivative
+                loop, *everything = everything
+                return loop.again(*everything)
+            return fun(*everything, **options)
 
         self.again = again
+
+
+def _as_new(argument):
+    """An argument for another run of a call: one that holds the results of a run tells how it was before."""
+    return argument.as_new() if hasattr(argument, "as_new") else argument
 
 
 @contextmanager

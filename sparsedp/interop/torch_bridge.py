@@ -227,6 +227,7 @@ class _Graph:
 
     def __init__(self, act, moving, inputs=()):
         self._act, self._moving, self.inputs = act, moving, [*inputs]
+        self._continues = bool(self.inputs)
 
     def run(self, *entries):
         """Arguments as arrays -> results as a tuple of arrays."""
@@ -236,6 +237,10 @@ class _Graph:
         with torch.set_grad_enabled(any(self._moving)):
             self.outputs = self._act(self.inputs)
         return tuple(map(_owned, self.outputs))
+
+    def as_new(self):
+        """Return a graph of the same function that has not run; a graph of gradients belongs to one run."""
+        return self if self._continues else _Graph(self._act, self._moving)
 
     def pulled(self, places, moving):
         """The graph of the gradients of some arguments; its arguments are those here, and then the cotangents."""

@@ -8,7 +8,7 @@ from sparsedp.errors import BudgetWarning, DerivativeError, ShapeError
 from sparsedp.fields import check_function, check_takes, check_whole
 from sparsedp.ledger import thread
 from sparsedp.shortcuts import together
-from sparsedp.tape import VJPNode, dtype_of, is_variable, isbox, plain, through
+from sparsedp.tape import dtype_of, innermost, is_variable, isbox, plain, through
 from sparsedp.tape_constants import constant_args
 from sparsedp.trajectory.keep import kind
 from sparsedp.trajectory.layout import Layout
@@ -134,7 +134,7 @@ def rollout(
     if truncate is not None:
         check_whole("truncate of rollout", truncate, 1, "; leave it out and nothing is cut")
     room = ROOM if memory is None else room_within(memory, *sizes) if slots else 0
-    loop = Loop(step, forms, n, truncate, _innermost(args), kind(keep, forms[0], n), slots, room, progress, record)
+    loop = Loop(step, forms, n, truncate, innermost(args), kind(keep, forms[0], n), slots, room, progress, record)
     _check_values(loop, args, traced)
     if loop.wanted and loop.slots:
         _warn_of_repeats(memory, *sizes)
@@ -142,13 +142,6 @@ def rollout(
         hook(step, state, params, inputs, n)
     result = together("rollout", tuple(given.values()), through, loop, loop.wanted, *args)
     return loop.keep.tree(loop.parts(result))
-
-
-def _innermost(values):
-    """Numbers of the values that are on the innermost trace of all, if that is a reverse-mode one."""
-    number = max((value._trace for value in values if isbox(value)), default=None)
-    nums = [num for num, value in enumerate(values) if isbox(value) and value._trace == number]
-    return nums if any(isinstance(values[num]._node, VJPNode) for num in nums) else []
 
 
 def _check_reversible(step):

@@ -5,6 +5,7 @@ goes through the steps themselves, forward and back: a derivative forward is the
 higher order are those of the calls that the run makes.
 """
 
+from copy import copy
 from operator import is_
 
 import numpy as np
@@ -13,7 +14,7 @@ from sparsedp.derivative import is_finite, judged, zero_like
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.ledger import count
 from sparsedp.progress import shown_steps
-from sparsedp.tape import Rule
+from sparsedp.tape import Rule, innermost, through
 from sparsedp.trajectory.backward_pass import go_back
 from sparsedp.trajectory.memory_budget import checkpoints
 from sparsedp.trajectory.record import APART, SAMPLES, Record
@@ -60,6 +61,7 @@ class Loop(Rule):
 
     def __init__(self, step, layouts, n, truncate, wanted, keep, slots, room, progress, record):
         self.step, self.layouts, self.n, self.wanted = step, layouts, n, wanted
+        self.truncate = truncate
         self.state, self.params, self.inputs = [*layouts, None][:3]
         self.state.rounds = any(any(form.floats) for form in layouts)
         self.open = any(layout.open for layout in layouts)
@@ -108,6 +110,12 @@ class Loop(Rule):
         results = self.keep.finish(state)
         self.outputs = len(results)
         return results if self.outputs != 1 else results[0]
+
+    def again(self, *args):
+        """Run the same steps from other values, which may be on any trace, without `progress` and `record`."""
+        keep, wanted = copy(self.keep), innermost(args)
+        loop = Loop(self.step, self.layouts, self.n, self.truncate, wanted, keep, self.slots, self.room, False, None)
+        return through(loop, loop.wanted, *args)
 
     def parts(self, values):
         """The results of `forward`, or their cotangents, as a list."""
