@@ -35,8 +35,8 @@ from sparsedp.tree import copied, leaves
 
 __all__ = [
     "Recorder", "ReverseNode", "Rule", "VJPNode", "VSpace", "added", "apply_operator", "autograd_rules", "backward",
-    "boxed", "called", "cast", "differentiable", "dtype_of", "fit", "forward_root", "innermost", "is_variable", "isbox", "linear",
-    "new_trace", "plain", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
+    "boxed", "called", "cast", "differentiable", "dtype_of", "fit", "forward_root", "innermost", "is_variable", "isbox",
+    "linear", "new_trace", "plain", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
 ]  # fmt: skip
 
 plain = getval  # the value below all boxes
