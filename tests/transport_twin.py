@@ -1,43 +1,43 @@
 """The schemes of transport once more, with slices in autograd.numpy: slow, plain, and differentiated by the tape."""
 
-import autograd.numpy as np
+import autograd.numpy as anp
 
 import sparsedp as dp
 from sparsedp.boundary_conditions import resolve
 
 
 def cut(x, axis, start, stop):
-    return x[tuple(slice(start, stop) if a == axis else slice(None) for a in range(np.ndim(x)))]
+    return x[tuple(slice(start, stop) if a == axis else slice(None) for a in range(anp.ndim(x)))]
 
 
 def line(x, axis, dim):
-    return np.reshape(x, [-1 if a == axis else 1 for a in range(dim)])
+    return anp.reshape(x, [-1 if a == axis else 1 for a in range(dim)])
 
 
 def to_nodes(x, grid, axis, shared):
     """Cells -> nodes: linear between centres, or the mean weighted with the widths."""
     h = line(grid.widths[axis], axis, grid.dim)
     if grid.periodic[axis]:
-        x, h = (np.concatenate([cut(y, axis, -1, None), y], axis) for y in (x, h))
+        x, h = (anp.concatenate([cut(y, axis, -1, None), y], axis) for y in (x, h))
     low, high, hl, hh = cut(x, axis, 0, -1), cut(x, axis, 1, None), cut(h, axis, 0, -1), cut(h, axis, 1, None)
     inner = (low * hl + high * hh) / (hl + hh) if shared else (low * hh + high * hl) / (hl + hh)
-    return inner if grid.periodic[axis] else np.concatenate([cut(x, axis, 0, 1), inner, cut(x, axis, -1, None)], axis)
+    return inner if grid.periodic[axis] else anp.concatenate([cut(x, axis, 0, 1), inner, cut(x, axis, -1, None)], axis)
 
 
 def inside(x, grid, axis, nodes):
     """Nodes (or cells) -> interfaces between the nodes of an axis: the cell centres, and the walls."""
     if grid.periodic[axis]:
-        x = np.concatenate([x, cut(x, axis, 0, 1)], axis) if nodes else x
+        x = anp.concatenate([x, cut(x, axis, 0, 1)], axis) if nodes else x
         middle = 0.5 * (cut(x, axis, 0, -1) + cut(x, axis, 1, None)) if nodes else x
-        return np.concatenate([cut(middle, axis, -1, None), cut(middle, axis, 0, -1)], axis)
+        return anp.concatenate([cut(middle, axis, -1, None), cut(middle, axis, 0, -1)], axis)
     middle = 0.5 * (cut(x, axis, 0, -1) + cut(x, axis, 1, None)) if nodes else x
-    return np.concatenate([cut(x, axis, 0, 1), middle, cut(x, axis, -1, None)], axis)
+    return anp.concatenate([cut(x, axis, 0, 1), middle, cut(x, axis, -1, None)], axis)
 
 
 def speeds(grid, v, velocity, form, own):
     """The velocity along each axis where component `own` (None: cells) needs it."""
     parts = (
-        grid.split(v) if velocity == "faces" else [np.reshape(v, (grid.dim, *grid.shape))[a] for a in range(grid.dim)]
+        grid.split(v) if velocity == "faces" else [anp.reshape(v, (grid.dim, *grid.shape))[a] for a in range(grid.dim)]
     )
     found = []
     for axis, part in enumerate(parts):
@@ -59,11 +59,11 @@ class Line:
         cells, between = grid.widths[axis], grid.spacings(axis)
         h = between if own == axis else cells
         if self.periodic:
-            gaps = np.roll(cells, 1) if own == axis else between
-            gaps = np.append(gaps, gaps[:1])
+            gaps = anp.roll(cells, 1) if own == axis else between
+            gaps = anp.append(gaps, gaps[:1])
         else:
-            gaps = np.concatenate([h[:1], cells if own == axis else between[1:-1], h[-1:]])
-        self.half = gaps * np.where(np.arange(gaps.size) % (gaps.size - 1) == 0, 1.0 if self.periodic else 0.5, 1.0)
+            gaps = anp.concatenate([h[:1], cells if own == axis else between[1:-1], h[-1:]])
+        self.half = gaps * anp.where(anp.arange(gaps.size) % (gaps.size - 1) == 0, 1.0 if self.periodic else 0.5, 1.0)
         self.h, self.gaps, self.half = (line(x, axis, grid.dim) for x in (h, gaps, self.half))
 
     def around(self, u, low=None, high=None):
@@ -75,7 +75,7 @@ class Line:
             before, after = (
                 edge if side == dp.neumann else wall for edge, side, wall in zip((first, last), self.sides, self.walls)
             )
-        return np.concatenate([before, low], self.axis), np.concatenate([high, after], self.axis)
+        return anp.concatenate([before, low], self.axis), anp.concatenate([high, after], self.axis)
 
     def slope(self, u):
         """Van Leer's limited difference from the point to its face."""
@@ -83,20 +83,20 @@ class Line:
         a, b = u - cut(below, self.axis, 0, -1), cut(above, self.axis, 1, None) - u
         c, e = (2 * cut(self.half, self.axis, i, j) / self.h for i, j in ((0, -1), (1, None)))
         same = a * b > 0
-        a, b = np.where(same, a, 1.0), np.where(same, b, 1.0)
+        a, b = anp.where(same, a, 1.0), anp.where(same, b, 1.0)
         top = a * b * (a * e**2 + b * c**2)
-        return np.where(same, top / (a**2 * e**2 + (c + e - 2) * c * e * a * b + b**2 * c**2), 0.0)
+        return anp.where(same, top / (a**2 * e**2 + (c + e - 2) * c * e * a * b + b**2 * c**2), 0.0)
 
     def rate(self, u, w, form, points, limited):
         slope = self.slope(u) if limited else 0.0
         below, above = self.around(u, u + slope, u - slope)
         lower, upper = (lambda x: cut(x, self.axis, 0, -1)), (lambda x: cut(x, self.axis, 1, None))
         if points:
-            p, m = np.maximum(w, 0.0), np.minimum(w, 0.0)
+            p, m = anp.maximum(w, 0.0), anp.minimum(w, 0.0)
             back, ahead = (self.h, self.h) if limited else (lower(self.gaps), upper(self.gaps))
             return -p * (upper(below) - lower(below)) / back - m * (upper(above) - lower(above)) / ahead
-        w = np.concatenate([w, cut(w, self.axis, 0, 1)], self.axis) if self.periodic else w
-        flux = np.maximum(w, 0.0) * below + np.minimum(w, 0.0) * above
+        w = anp.concatenate([w, cut(w, self.axis, 0, 1)], self.axis) if self.periodic else w
+        flux = anp.maximum(w, 0.0) * below + anp.minimum(w, 0.0) * above
         rate = -(upper(flux) - lower(flux)) / self.h
         return rate + u * (upper(w) - lower(w)) / self.h if form == "advective" else rate
 
@@ -118,7 +118,7 @@ def twin(grid, scheme, boundary, velocity, of, form):
     walls = dp.transport(grid, scheme, boundary, velocity, of, form=form).walls
 
     def move(u, v, dt, inflow):
-        values = iter(walls.split(inflow * np.ones(walls.size)))
+        values = iter(walls.split(inflow * anp.ones(walls.size)))
         parts = [u] if of == "cells" else space.split(u)
         moved = []
         for number, part in enumerate(parts):

@@ -1,0 +1,357 @@
+"""A scene: a field, a chain of ingredients, a loss; by the library and by its twin, compared in every derivative."""
+
+import re
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import autograd
+import autograd.numpy as anp
+import numpy as np
+from campaign.boxes import Box, numbers
+
+import sparsedp as dp
+
+
+SMALLEST = 1e-3  # numbers of a scene are about 1: what is smaller than this may be what cancellation leaves
+
+
+class Mismatch(AssertionError):
+    """The library and the twin disagree."""
+
+
+class Discarded(Exception):
+    """The numbers of the scene leave the range in which a comparison says something."""
+
+
+class Pair(NamedTuple):
+    """A tree with fields that are no dict."""
+
+    first: Any
+    second: Any
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A program: the loss of a chain of ingredients, applied to a field with parameters.
+
+    Parameters
+    ----------
+    box : Box
+    chain : tuple of Ingredient
+    batch : tuple of int
+        Leading axes of the field.
+    dtype : str
+    loss : str
+        A key of `LOSSES`.
+    tree : str
+        How the field and the parameters are arranged, a key of `TREES`.
+    seed : int
+        Of the field, of the weights of the loss, and of the tangents.
+    """
+
+    box: Box
+    chain: tuple
+    batch: tuple = ()
+    dtype: str = "float64"
+    loss: str = "sine"
+    tree: str = "dict"
+    seed: int = 0
+    ensemble: int = 0
+
+    @property
+    def order(self):
+        orders = [part.order for part in self.chain]
+        return 1 if self.dtype == "complex128" else min([2, *orders])
+
+    @property
+    def tolerance(self):
+        if self.dtype == "float32":
+            return 3e-3
+        return 10 * max([1e-9, *(part.tolerance for part in self.chain)])
+
+    @property
+    def refusals(self):
+        return [refusal for part in self.chain for refusal in part.refusals]
+
+    def leaves(self):
+        """Return the values by name: the field, and the parameters of each ingredient."""
+        shape = (*self.batch, *self.box.field_shape(self.chain[0].source))
+        values = {"u": numbers(5000 + self.seed, shape, self.dtype)}
+        for number, part in enumerate(self.chain):
+            for name, value in part.parameters(self.box).items():
+                values[f"{number} {name}"] = in_precision(value, self.dtype)
+        return values
+
+    def tangents(self):
+        """Return a direction by name; its entries are in another order than those of `leaves`."""
+        names = list(self.leaves().items())
+        result = {}
+        for number, (name, value) in reversed(list(enumerate(names))):
+            tangent = numbers(7000 + self.seed + number, np.shape(value), np.asarray(value).dtype)
+            result[name] = float(tangent) if isinstance(value, float) else tangent
+        return result
+
+    def _composed(self, parts):
+        """Return loss(values by name)."""
+        measure, seed = LOSSES[self.loss], 6000 + self.seed
+
+        def loss(values):
+            u = values["u"]
+            for number, part in enumerate(parts):
+                mine = {}
+                for name, value in values.items():
+                    place, _, own_name = name.partition(" ")
+                    if place == str(number):
+                        mine[own_name] = value
+                u = part(u, mine)
+            return measure(u, in_precision(numbers(seed, anp.shape(u)), self.dtype))
+
+        return loss
+
+    def library(self):
+        """Return the loss of a tree of all values, made by the library."""
+        loss = self._composed([part.library(self.box) for part in self.chain])
+        entries = TREES[self.tree][1]
+        names = list(self.leaves())
+        if not self.ensemble:
+            return lambda x: loss(entries(x, names))
+
+        def of_member(x, share):
+            values = entries(x, names)
+            return loss({**values, "u": values["u"] * share})
+
+        return dp.ensemble(of_member, self.shares(), weights=self.shares())
+
+    def twin(self):
+        """Return the loss of a dict of all values, in plain autograd.numpy."""
+        loss = self._composed([part.twin(self.box) for part in self.chain])
+        if not self.ensemble:
+            return loss
+
+        def total(values):
+            result = 0.0
+            for share in self.shares():
+                result = result + share * loss({**values, "u": values["u"] * share})
+            return result
+
+        return total
+
+    def shares(self):
+        """Return the scale of the field in each member of an ensemble."""
+        return [1.0 - 0.25 * number for number in range(self.ensemble)]
+
+
+def in_precision(value, dtype):
+    """Return a value in the precision of a dtype; numbers of Python stay, parameters are real."""
+    if isinstance(value, float):
+        return value
+    return np.asarray(value, "float32" if dtype == "float32" else "float64")
+
+
+# ---- losses --------------------------------------------------------------------------------------------------------
+
+
+LOSSES = {
+    "sine": lambda u, w: anp.sum(w * anp.sin(u)) + 0.5 * anp.sum(u**2),
+    "linear": lambda u, w: anp.sum(w * u),
+    "logarithm": lambda u, w: anp.sum(anp.log(1 + u**2)) + anp.sum(w * u),
+    "mean": lambda u, w: anp.mean(u) ** 2 + anp.mean((u - w) ** 2),
+    "first": lambda u, w: anp.ravel(u)[0] ** 2 + anp.sum(u),
+    "squares": lambda u, w: anp.sum(w**2 * anp.real(u * anp.conj(u))),
+}
+
+
+# ---- trees ---------------------------------------------------------------------------------------------------------
+# Each is a pair: arrange(values by name) -> tree, entries(tree, names) -> values by name. Texts and whole numbers stand
+# beside the values in some.
+
+
+def arranged_in_list(values):
+    return ["ink", *values.values()]
+
+
+def entries_of_list(x, names):
+    return dict(zip(names, x[1:]))
+
+
+def arranged_in_pair(values):
+    rest = {name: value for name, value in values.items() if name != "u"}
+    return Pair((values["u"], None), {"b": last_name_first(rest), "a": [3, "ink"]})
+
+
+def entries_of_pair(x, names):
+    return {"u": x.first[0], **x.second["b"]}
+
+
+def last_name_first(values):
+    return {name: values[name] for name in sorted(values, reverse=True)}
+
+
+def entries_of_dict(x, names):
+    return dict(x)
+
+
+TREES = {
+    "dict": (dict, entries_of_dict),
+    "reversed": (last_name_first, entries_of_dict),
+    "list": (arranged_in_list, entries_of_list),
+    "pair": (arranged_in_pair, entries_of_pair),
+}
+
+
+# ---- comparison ----------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Outcome:
+    """What a comparison came to: how often each quantity was compared, and the refusals."""
+
+    compared: list = field(default_factory=list)
+    refused: list = field(default_factory=list)
+
+
+def compare(scene):
+    """Compare value, gradient, JVP and Hessian product of a scene with those of its twin.
+
+    Returns
+    -------
+    Outcome
+
+    Raises
+    ------
+    Discarded
+        If the numbers of the twin grow beyond 1e8.
+    Mismatch
+        If a quantity differs by more than the tolerance, has another dtype or shape, or changes when it is computed
+        twice; if an argument is modified; or if the library refuses what it should accept.
+    """
+    outcome = Outcome()
+    values, tangents = scene.leaves(), scene.tangents()
+    names = list(values)
+    arrange, entries = TREES[scene.tree]
+    x, direction = arrange(values), arrange(order_of(tangents, values, scene.tree))
+    before = {name: np.array(value) for name, value in values.items()}
+
+    with np.errstate(all="ignore"):
+        twin = Twin(scene, values, tangents)
+        wanted_product = twin.hessian_product() if scene.order > 1 else None
+    loss = attempt(scene, outcome, "set-up", scene.library)
+    if loss is None:
+        return outcome
+
+    result = attempt(scene, outcome, "gradient", lambda: dp.value_and_grad(loss)(x))
+    if result is not None:
+        value, gradient = result[0], entries(result[1], names)
+        check_close(scene, "value", value, twin.value, twin.value_scale)
+        outcome.compared.append("value")
+        check_gradient(scene, "gradient", gradient, twin.gradient, values)
+        outcome.compared.append("gradient")
+        plain = loss(x)
+        if scene.dtype != "float32" and plain != value:
+            raise Mismatch(f"value without derivative {plain!r}, with derivative {value!r}")
+
+    pushed = attempt(scene, outcome, "jvp", lambda: dp.jvp(loss, x, direction))
+    if pushed is not None:
+        check_close(scene, "value of jvp", pushed[0], twin.value, twin.value_scale)
+        check_close(scene, "jvp", pushed[1], twin.slope, twin.slope_scale)
+        outcome.compared.append("jvp")
+
+    if scene.order > 1:
+        product = attempt(scene, outcome, "hvp", lambda: dp.hvp(loss, x, direction))
+        if product is not None:
+            check_gradient(scene, "hvp", entries(product, names), wanted_product, values)
+            outcome.compared.append("hvp")
+
+    for name, value in values.items():
+        if not np.array_equal(before[name], value):
+            raise Mismatch(f"argument {name} was modified")
+    return outcome
+
+
+def order_of(tangents, values, tree):
+    """Dicts are paired by name, so their entries come in another order; lists by position."""
+    return tangents if tree in ("dict", "reversed") else {name: tangents[name] for name in values}
+
+
+class Twin:
+    """Value, gradient, slope along a direction, and Hessian product of the twin, in double precision."""
+
+    def __init__(self, scene, values, tangents):
+        self.names = list(values)
+        kind = "complex128" if scene.dtype == "complex128" else "float64"
+        wide = {}
+        for name, value in values.items():
+            wide[name] = np.asarray(value, kind if name == "u" else "float64")[()]
+        self.arguments = [wide[name] for name in self.names]
+        self.tangents = [np.asarray(tangents[name])[()] for name in self.names]
+        loss = scene.twin()
+        self.loss = lambda *arguments: loss(dict(zip(self.names, arguments)))
+        self.places = tuple(range(len(self.names)))
+        value, found = autograd.value_and_grad(self.loss, self.places)(*self.arguments)
+        self.value = value
+        self.gradient = dict(zip(self.names, found))
+        terms = [np.real(np.asarray(g) * t) for g, t in zip(found, self.tangents)]
+        self.slope = float(sum(np.sum(term) for term in terms))
+        self.slope_scale = float(sum(np.sum(np.abs(term)) for term in terms))
+        check_range(value, *found)
+        self.value_scale = abs(float(value)) + float(
+            sum(np.sum(np.abs(np.asarray(g) * a)) for g, a in zip(found, self.arguments))
+        )
+
+    def hessian_product(self):
+        """Return the derivative of the slope, by reverse mode over reverse mode."""
+        gradient = autograd.grad(self.loss, self.places)
+
+        def slope(*arguments):
+            return sum(anp.sum(g * t) for g, t in zip(gradient(*arguments), self.tangents))
+
+        found = autograd.grad(slope, self.places)(*self.arguments)
+        check_range(*found)
+        return dict(zip(self.names, found))
+
+
+def check_range(*values):
+    """Discard a scene whose numbers grow beyond 1e8."""
+    for value in values:
+        if not np.all(np.abs(value) < 1e8):
+            raise Discarded
+
+
+def attempt(scene, outcome, stage, act):
+    """Return act(), or None where the library refuses for a reason that an ingredient announces."""
+    try:
+        return act()
+    except Exception as error:
+        for kind, words in scene.refusals:
+            if isinstance(error, kind) and re.search(words, str(error)):
+                outcome.refused.append(f"{stage}: {type(error).__name__}: {words}")
+                return None
+        raise Mismatch(f"{stage}: {type(error).__name__}: {error}") from error
+
+
+def check_close(scene, what, found, wanted, scale):
+    error = abs(float(found) - float(wanted))
+    if not error <= scene.tolerance * (scale + SMALLEST):
+        raise Mismatch(f"{what}: library {float(found)!r}, twin {float(wanted)!r}, scale {scale:.3g}")
+
+
+def check_gradient(scene, what, found, wanted, values):
+    """Compare leaf by leaf, relative to the largest entry of the leaf and a little of that of all leaves."""
+    if set(found) != set(wanted):
+        raise Mismatch(f"{what}: leaves {sorted(found)} for {sorted(wanted)}")
+    largest = max(np.max(np.abs(leaf), initial=0.0) for leaf in wanted.values())
+    for name, leaf in wanted.items():
+        own = np.asarray(found[name])
+        if own.shape != np.shape(values[name]):
+            raise Mismatch(f"{what}: {name} has shape {own.shape} for {np.shape(values[name])}")
+        if own.dtype != np.asarray(values[name]).dtype:
+            raise Mismatch(f"{what}: {name} has dtype {own.dtype} for {np.asarray(values[name]).dtype}")
+        if not own.size:
+            continue
+        error = np.max(np.abs(own - leaf))
+        scale = np.max(np.abs(leaf)) + 1e-3 * largest + SMALLEST
+        if not error <= scene.tolerance * scale:
+            place = np.unravel_index(np.argmax(np.abs(own - leaf)), own.shape)
+            raise Mismatch(
+                f"{what}: {name}{list(map(int, place))} is {own[place]!r}, that of the twin {np.asarray(leaf)[place]!r}"
+            )
