@@ -611,10 +611,14 @@ def cast(g, dtype):
     """Array or traced array -> the same numbers in `dtype` (real part if `dtype` is real)."""
     if dtype_of(g).kind == "c" and np.dtype(dtype).kind == "f":
         g = anp.real(g)
-    given = dtype_of(g)
-    if given == dtype or not isbox(g):
-        return g if given == dtype else in_dtype(g, dtype)
-    return linear("cast", lambda x: in_dtype(x, dtype), lambda x: in_dtype(x, given))[0](g)
+    if dtype_of(g) == dtype:
+        return g
+    if not isbox(g):
+        return in_dtype(g, dtype)
+    rule = Rule("cast", lambda x: in_dtype(x, dtype))
+    rule.vjp = lambda nums, ans, x: lambda cotangent: (cast(cotangent, dtype_of(x)),)
+    rule.jvp = lambda nums, tangents, ans, x: cast(tangents[0], dtype)
+    return rule(g)
 
 
 def linear(name, forward, transpose):

@@ -11,11 +11,11 @@ from functools import lru_cache
 import autograd.numpy as anp
 import numpy as np
 from autograd.tracer import getval, isbox
-from campaign.boxes import boundary, condition, dense, numbers, obstacle
-from campaign.operators import bound, matrix, operator
 from transport_twin import twin as transport_twin
 
 import sparsedp as dp
+from campaign.boxes import boundary, dense, numbers, obstacle
+from campaign.operators import bound, matrix, operator
 
 
 class Ingredient:
@@ -96,7 +96,11 @@ class WallValues(OnCells):
 
     def library(self, box):
         grid, scale = box.grid(), self._scale(box)
-        D, G, B = dp.divergence(grid), dp.gradient(grid, boundary(box, self.sides)), dp.lift(grid, boundary(box, self.sides))
+        D, G, B = (
+            dp.divergence(grid),
+            dp.gradient(grid, boundary(box, self.sides)),
+            dp.lift(grid, boundary(box, self.sides)),
+        )
         return lambda u, p: u + D(G(u) + B(p["values"])) / scale
 
     def twin(self, box):

@@ -14,9 +14,9 @@ from functools import lru_cache, reduce
 from itertools import product
 
 import numpy as np
-from campaign.boxes import boundary, condition, dense, numbers, obstacle
 
 import sparsedp as dp
+from campaign.boxes import boundary, condition, dense, numbers, obstacle
 
 
 def operator(box, expression):

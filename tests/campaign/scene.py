@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 import autograd
 import autograd.numpy as anp
 import numpy as np
-from campaign.boxes import Box, numbers
 
 import sparsedp as dp
-
+from campaign.boxes import Box, numbers
 
 SMALLEST = 1e-3  # numbers of a scene are about 1: what is smaller than this may be what cancellation leaves
 

@@ -1,12 +1,12 @@
 """What Hypothesis draws: boxes, expressions of operators, ingredients, and whole scenes."""
 
+import numpy as np
+from hypothesis import strategies as st
+
 from campaign import ingredients as parts
 from campaign.boxes import Box
 from campaign.operators import matrix, total
 from campaign.scene import LOSSES, TREES, Scene
-from hypothesis import strategies as st
-
-import numpy as np
 
 SEEDS = st.integers(0, 999)
 SIDES = st.sampled_from(["neumann", "dirichlet", (2.0, 0.5), (1.0, 2.0)])
@@ -19,7 +19,7 @@ def boxes(draw, most=24, least_dim=1):
     """Small grids of one to three axes; axes of one cell, periodic and stretched ones among them."""
     dim = draw(st.integers(least_dim, 3))
     shape, left = [], most
-    for axis in range(dim):
+    for _ in range(dim):
         cells = draw(st.integers(1, max(1, min(6 if dim > 1 else 9, left))))
         shape.append(cells)
         left //= cells
@@ -216,9 +216,7 @@ def rollouts(draw, box, source, batched, complex_field):
     memory = draw(st.sampled_from([None, None, 3000, 6000, 12000, "1 MB"]))
     truncate = draw(st.sampled_from([None, None, None, 1, 2, 3]))
     inputs = draw(st.booleans()) and not complex_field
-    return parts.Rollout(
-        tuple(chain), n, memory, keep, truncate, inputs, draw(st.booleans()), draw(SEEDS)
-    )
+    return parts.Rollout(tuple(chain), n, memory, keep, truncate, inputs, draw(st.booleans()), draw(SEEDS))
 
 
 @st.composite
