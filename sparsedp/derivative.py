@@ -10,7 +10,16 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
-from sparsedp.fields import advise, check_function, check_native, check_shape, check_whole, surely_finite
+from sparsedp.fields import (
+    advise,
+    check_function,
+    check_leaves,
+    check_native,
+    check_precision,
+    check_shape,
+    check_whole,
+    surely_finite,
+)
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
 from sparsedp.shortcuts import ELSEWHERE, alike, together
@@ -31,10 +40,10 @@ from sparsedp.tape import (
     split_boxes,
 )  # fmt: skip
 from sparsedp.tape_constants import is_fixed
-from sparsedp.tree import copied, flatten, keys, leaves, mapped
+from sparsedp.tree import copied, described, flatten, labels, leaves, mapped, paired
 
 __all__ = [
-    "NO_JVP", "check_loss", "described", "entrywise", "grad", "gradient_of", "growing", "hvp", "is_finite", "judged",
+    "NO_JVP", "check_loss", "entrywise", "grad", "gradient_of", "growing", "hvp", "is_finite", "judged",
     "jvp", "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "taped", "traced",
     "value_and_grad", "vjp", "witnessed", "zero_like",
 ]  # fmt: skip
@@ -102,6 +111,7 @@ def pullback(fun, x):
     entries, rebuild = flatten(x)
     moving = list(map(is_variable, entries))
     check_native("a gradient", *entries)
+    check_leaves("x", x)
     if not any(moving):
         kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in entries})
         raise DerivativeError(
@@ -121,6 +131,7 @@ def pullback(fun, x):
 
     def pull(g):
         check_shape("the cotangent", g, np.shape(value), "; give one like the value")
+        check_precision("the cotangent", g)
         slopes = zip(entries, moving, back([g]), strict=True)
         return rebuild(_apart([gradient_of(leaf, slope) if moves else None for leaf, moves, slope in slopes], g))
 
@@ -310,28 +321,23 @@ def _random_like(value):
 
 
 def _directions(x, tangent):
-    """Tangent of each leaf of `x`, None where it is not floating; entries of dicts are paired by name."""
-    names = keys(x)
-    if names is None and not is_variable(x):
-        return [None]
-    if keys(tangent) != names or (names is None and not (_is_array(tangent) and np.shape(tangent) == np.shape(x))):
-        raise ShapeError(f"the tangent must have the structure of x: {described(x)}, got {described(tangent)}")
-    return [tangent] if names is None else [t for name in names for t in _directions(x[name], tangent[name])]
+    """The tangent of each leaf of `x`, None where it is not floating."""
+    entries = leaves(x)
+    tangents = paired(tangent, x, "tangent", advice="; give a tangent like x")
+    for number, leaf in enumerate(entries):
+        if not is_variable(leaf):
+            tangents[number] = None
+            continue
+        given = tangents[number]
+        if not (_is_array(given) and np.shape(given) == np.shape(leaf)):
+            place = labels(x, "tangent")[number]
+            raise ShapeError(f"{place}: expected {described(leaf)}, got {described(given)}; give a tangent like x")
+    return tangents
 
 
 def _is_array(value):
     """Whether a value is one array or number, traced or not."""
     return isbox(value) or isinstance(value, (np.ndarray, Number)) or type(value) in ELSEWHERE
-
-
-def described(tree):
-    """A tree in words: its kind, and how large it is."""
-    if isinstance(tree, dict):
-        return f"a dict of {', '.join(map(str, tree)) or 'nothing'}"
-    if isinstance(tree, (tuple, list)):
-        return f"a {type(tree).__name__} of length {len(tree)}"
-    array = is_variable(tree) or isinstance(tree, np.ndarray)
-    return f"an array of shape {np.shape(tree)}" if array else type(tree).__name__
 
 
 def jvp(fun, x, tangent):
@@ -367,6 +373,8 @@ def jvp(fun, x, tangent):
     """
     check_function("jvp", fun, "lambda u: ...")
     check_native("jvp", *leaves((x, tangent)))
+    check_leaves("x", x)
+    check_leaves("tangent", tangent)
     results = together("jvp", (x, tangent), push, fun, x, _directions(x, tangent))
     return copied(results)  # the caller may write into x, the tangent and the results
 

@@ -1,14 +1,18 @@
 """What may be given: the checks of fields, of numbers and of reused result arrays."""
 
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from decimal import ROUND_FLOOR, Context
 from difflib import get_close_matches
 from inspect import CO_VARARGS
 from math import isfinite
 from types import FunctionType
+from typing import Any
 
 import numpy as np
 
 from sparsedp.errors import NonFiniteError, ShapeError
+from sparsedp.tree import labels, leaves
 
 __all__ = [
     "BLOCK",
@@ -19,11 +23,13 @@ __all__ = [
     "check_finite",
     "check_function",
     "check_kind",
+    "check_leaves",
     "check_native",
     "check_number",
     "check_on",
     "check_out",
     "check_plain",
+    "check_precision",
     "check_shape",
     "check_takes",
     "check_type",
@@ -44,6 +50,8 @@ LIBRARIES = {
     "torch": WRAP.format("torch"), "jax": WRAP.format("jax"), "jaxlib": WRAP.format("jax"),
     "xarray": "xarray, whose coordinates would be lost; write dp.interop.from_xarray(grid, u)",
 }  # fmt: skip
+PRECISIONS = "fdFD"  # characters of the dtypes that fields and trees may have, see `check_precision`
+PLAIN_LEAVES = {float, complex, int, bool, str, type(None)}
 BLOCK = 8192  # numbers of which one product of BLAS is taken: it uses one thread up to 10000, and wakes no others
 
 
@@ -96,6 +104,59 @@ def check_native(name, *values):
         kind = type(value)
         if kind is not np.ndarray and (library := kind.__module__.partition(".")[0]) in LIBRARIES:
             raise TypeError(f"{name} needs arrays of NumPy, got a {kind.__name__} of {LIBRARIES[library]}")
+
+
+def check_precision(name, value):
+    """Refuse arrays of half and of extended precision.
+
+    The library computes with float32, float64, complex64 and complex128. Fields and trees of other precisions
+    (float16, longdouble, clongdouble) are refused by name, where they are given: a longdouble would lose its digits
+    silently, and its bytes cannot be viewed as doubles. Integers and booleans are not concerned. Numbers that are
+    settings, such as dt, and derivatives that a user's own function returns are rounded to double precision instead.
+    """
+    dtype: Any = getattr(value, "dtype", None)
+    if getattr(dtype, "kind", None) in ("f", "c") and dtype.char not in PRECISIONS:
+        kind = "complex" if dtype.kind == "c" else "float"
+        raise TypeError(
+            f"{name} must be float32, float64, complex64 or complex128, got {dtype}; write np.asarray(x, {kind})"
+        )
+
+
+def check_leaves(name, tree, containers=True):
+    """Refuse leaves that are arrays of another precision, or containers that are no trees and hold floating numbers.
+
+    containers: refuse the latter. A dataclass is one, and a Mapping that is not a dict; their numbers would silently
+    count as constants.
+    """
+    entries = leaves(tree)
+    for number, leaf in enumerate(entries):
+        dtype = getattr(leaf, "dtype", None)
+        if dtype is not None:
+            if getattr(dtype, "kind", None) in ("f", "c") and dtype.char not in PRECISIONS:
+                check_precision(labels(tree, name)[number], leaf)
+        elif containers and type(leaf) not in PLAIN_LEAVES and _hides_numbers(leaf):
+            raise TypeError(
+                f"{labels(tree, name)[number]} is a {type(leaf).__name__}, which is not a tree: its numbers would have "
+                "no derivative; write a dict or a NamedTuple"
+            )
+
+
+def _hides_numbers(value):
+    """Whether a value is a container that is not a tree and holds floating numbers."""
+    if isinstance(value, Mapping):
+        return any(map(_is_floating_or_hides, value.values()))
+    if is_dataclass(value) and not isinstance(value, type):
+        return any(_is_floating_or_hides(getattr(value, field.name, None)) for field in fields(value))
+    return False
+
+
+def _is_floating_or_hides(branch):
+    """Whether a branch of such a container is floating, or is one itself."""
+    for leaf in leaves(branch):
+        kind = getattr(getattr(leaf, "dtype", None), "kind", None)
+        if kind in ("f", "c") or isinstance(leaf, (float, complex)) or _hides_numbers(leaf):
+            return True
+    return False
 
 
 def check_out(op, out, u, dtype, shape):

@@ -7,10 +7,10 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import DerivativeError
-from sparsedp.fields import check_finite, check_native, check_shape
+from sparsedp.fields import check_finite, check_leaves, check_native, check_shape
 from sparsedp.recipe import Made
 from sparsedp.tape import cast, is_variable, isbox
-from sparsedp.tree import copied, labels, leaves
+from sparsedp.tree import copied, labels, paired
 from sparsedp.tree import flatten as taken_apart
 
 __all__ = ["FINITE", "Packing", "flatten", "joined"]
@@ -102,6 +102,8 @@ class Packing:
         Rounding of the coarsest dtype.
     count, size : int
         Of leaves, and of numbers in the vector.
+    form : tree
+        Of the same structure, the number of each leaf in its place; other trees are paired with it.
 
     Raises
     ------
@@ -122,6 +124,8 @@ class Packing:
         self._leaves, self._rebuild = taken_apart(tree)
         self.count = len(self._leaves)
         check_native(root, *self._leaves)
+        check_leaves(root, tree)
+        self.form = self._rebuild(range(self.count))
         self._floating = list(map(is_variable, self._leaves))
         self.values = [np.asarray(leaf) for leaf in compress(self._leaves, self._floating)]
         if not self.values:
@@ -134,14 +138,18 @@ class Packing:
     @cached_property
     def names(self):
         """Of the floating leaves, as one would write them: ``x['u'][0]``."""
-        return list(compress(labels(self._rebuild(self._leaves), self.root), self._floating))
+        return self.names_under(self.root)
 
-    def floating(self, tree):
-        """Tree of as many leaves -> those in the places of the floating ones."""
-        return list(compress(leaves(tree), self._floating))
+    def names_under(self, root):
+        """The same of a tree of the same structure with another name."""
+        return list(compress(labels(self.form, root), self._floating))
+
+    def floating(self, tree, name="tree", **options):
+        """Tree of the same structure -> its leaves in the places of the floating ones, paired as `paired` does."""
+        return list(compress(paired(tree, self.form, name, **options), self._floating))
 
     def pack(self, tree):
-        """Tree of as many leaves -> flat vector of doubles."""
+        """Tree of the same structure -> flat vector of doubles."""
         return joined(self.floating(tree))
 
     def slopes(self, gradient):
@@ -149,17 +157,13 @@ class Packing:
 
         The tape gives dL/dRe - i dL/dIm there. Joined, they are the gradient with respect to the packed vector.
         """
-        slopes = leaves(gradient)
-        if len(slopes) != self.count:
-            numbers = f"{len(slopes)} leaves where {self.root} has {self.count}"
-            raise DerivativeError(f"the gradient has {numbers}; return a tree like {self.root}")
-        given = list(map(np.asarray, self.floating(slopes)))
-        for place, (g, x) in enumerate(zip(given, self.values)):
+        advice = f"; return a tree like {self.root}"
+        given = list(map(np.asarray, self.floating(gradient, "gradient", advice=advice, error=DerivativeError)))
+        for name, g, x in zip(self.names_under("gradient"), given, self.values):
             if g.shape != x.shape:
-                shapes = f"shape {g.shape} where {x.shape} is needed"
-                raise DerivativeError(
-                    f"the gradient of {self.names[place]} has {shapes}; return a tree like {self.root}"
-                )
+                raise DerivativeError(f"{name}: expected shape {x.shape}, got {g.shape}{advice}")
+            if g.dtype.kind not in "biufc":
+                raise DerivativeError(f"{name}: expected numbers, got dtype {g.dtype}{advice}")
         return [np.conj(g).astype(complex) if np.iscomplexobj(x) else g.real for g, x in zip(given, self.values)]
 
     def pack_gradient(self, gradient):
@@ -195,7 +199,13 @@ class Packing:
 
 def joined(arrays):
     """Arrays -> one vector of doubles, complex numbers as pairs."""
-    return np.concatenate([np.ravel(x).astype(np.result_type(x, float)).view(float) for x in arrays])
+    return np.concatenate([_doubles(x) for x in arrays])
+
+
+def _doubles(array):
+    """An array of any precision as one vector of doubles."""
+    kind = complex if np.iscomplexobj(array) else float
+    return np.ravel(array).astype(kind).view(float)
 
 
 def _like(leaf, value):

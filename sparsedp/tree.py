@@ -1,9 +1,13 @@
-"""Nested containers of arrays: taken apart into leaves, put together again, and measured.
+"""Nested containers of arrays: taken apart into leaves, put together again, paired with each other, and measured.
 
-A tree is any nesting of tuples (named ones too), lists and dicts. Everything else is a leaf.
-Dict entries keep their order.
+A tree is any nesting of tuples (named ones too), lists and dicts (``defaultdict``, ``OrderedDict`` and other subclasses
+too). Everything else is a leaf. Entries of dicts keep their order.
+
+Two trees are always paired by `paired`: entries of dicts by key, those of named tuples by field, and only those of
+plain tuples and lists by position.
 """
 
+from copy import copy
 from math import hypot, isfinite
 
 import numpy as np
@@ -12,14 +16,17 @@ import scipy.sparse as sp
 from sparsedp.errors import ShapeError
 
 __all__ = [
+    "branches_mapped",
     "copied",
+    "described",
     "flatten",
+    "is_uniform",
     "keys",
     "labels",
     "leaves",
-    "leaves_like",
     "mapped",
     "norm",
+    "paired",
     "placed",
     "power_of_two",
     "subscript",
@@ -71,16 +78,16 @@ def copied(tree):
 
 
 def mapped(function, tree, *others):
-    """function(leaf) in the place of every leaf, or function(leaf, other, ...) over trees of as many leaves.
+    """Apply a function to every leaf of a tree, or to the leaves of several trees that are paired with the first one.
 
     Examples
     --------
-    >>> mapped(max, {"a": 1.0, "b": 5.0}, (2.0, 3.0))
+    >>> mapped(max, {"a": 1.0, "b": 5.0}, {"b": 3.0, "a": 2.0})
     {'a': 2.0, 'b': 5.0}
     """
     if not isinstance(tree, (tuple, list, dict)):
         return function(tree, *others)
-    return _build(tree, map(function, leaves(tree), *map(leaves, others)))
+    return _build(tree, map(function, leaves(tree), *(paired(other, tree, "tree") for other in others)))
 
 
 def leaves(tree):
@@ -103,26 +110,123 @@ def leaves(tree):
     return [tree] if names is None else [leaf for name in names for leaf in leaves(tree[name])]
 
 
-def leaves_like(tree, other, what, wanted):
-    """Leaves of a tree in the order of another one's: by name where both are dicts, and other names are refused.
+def paired(tree, reference, name, owner="", advice="", shapes=False, prefix=None, error=ShapeError):
+    """Return the leaves of a tree in the order of the leaves of a reference tree.
+
+    Entries of dicts are paired by key, whatever their order, those of named tuples by field, and those of plain tuples
+    and lists by position.
 
     Parameters
     ----------
-    tree, other : trees
-    what, wanted : str
-        What they are called in messages.
+    tree, reference : trees
+    name : str
+        Root of the paths in messages: ``name['u'][0]``.
+    owner : str
+        Follows a path in messages, such as " of stepper(heun)".
+    advice : str
+        Ends a message.
+    shapes : bool
+        Whether leaves must have the shapes of those of the reference.
+    prefix : callable, optional
+        ``prefix(leaf)``: whether this leaf may stand for a whole branch of the reference; it is then repeated for each
+        of its leaves. Default: none may.
+    error : type
+        What is raised.
+
+    Returns
+    -------
+    list
+
+    Raises
+    ------
+    ShapeError
+        Or `error`, if a key is missing or unknown, or a branch or the shape of a leaf differs. The message gives the
+        path.
 
     Examples
     --------
-    >>> leaves_like({"v": 2.0, "u": 1.0}, {"u": None, "v": None}, "the rate", "the state")
+    >>> paired({"v": 2.0, "u": 1.0}, {"u": None, "v": None}, "rate")
     [1.0, 2.0]
+    >>> paired({"v": 2.0, "u": 1.0}, {"u": None, "v": (None, None)}, "floor", prefix=is_uniform)
+    [1.0, 2.0, 2.0]
     """
-    names, others = keys(tree), keys(other)
-    if isinstance(tree, dict) and isinstance(other, dict) and names != others:
-        raise ShapeError(f"{what} must have the names of {wanted}, {[*others]}, got {[*names]}")
-    if names is None or others is None or set(names) != set(others):
-        return leaves(tree)
-    return [leaf for name in others for leaf in leaves_like(tree[name], other[name], what, wanted)]
+    try:
+        return _pair(tree, reference, shapes, prefix)
+    except _MismatchError as mismatch:
+        path = name + "".join(reversed(mismatch.subscripts))
+        raise error(f"{path}{owner}: {mismatch.words}{advice}") from None
+
+
+def is_uniform(leaf):
+    """Whether a leaf is one number or None, which may stand for a whole branch."""
+    return leaf is None or np.ndim(leaf) == 0
+
+
+class _MismatchError(Exception):
+    """Two branches cannot be paired: why, and the subscripts that lead to them, the innermost first."""
+
+    def __init__(self, words):
+        super().__init__(words)
+        self.words, self.subscripts = words, []
+
+
+def _pair(tree, reference, shapes, prefix):
+    """The recursion of `paired`."""
+    names = keys(reference)
+    if names is None:
+        if keys(tree) is not None:
+            raise _MismatchError(f"expected one array or number, got {described(tree)}")
+        if shapes and np.shape(tree) != np.shape(reference):
+            raise _MismatchError(f"expected shape {np.shape(reference)}, got {np.shape(tree)}")
+        return [tree]
+    if prefix and keys(tree) is None and prefix(tree):
+        return [tree] * len(leaves(reference))
+    if keys(tree) is None or isinstance(tree, dict) != isinstance(reference, dict):
+        raise _MismatchError(f"expected {described(reference)}, got {described(tree)}")
+    entries = []
+    for name, place in zip(names, _places(tree, reference)):
+        try:
+            entries += _pair(tree[place], reference[name], shapes, prefix)
+        except _MismatchError as mismatch:
+            mismatch.subscripts.append(subscript(reference, name))
+            raise
+    return entries
+
+
+def _places(tree, reference):
+    """Where a branch holds the entries of a reference branch, in the order of the reference."""
+    if isinstance(reference, dict):
+        _check_names("key", tree, reference)
+        return reference.keys()
+    fields, others = getattr(tree, "_fields", None), getattr(reference, "_fields", None)
+    if fields and others and fields != others:
+        _check_names("field", fields, others)
+        return [fields.index(field) for field in others]
+    if len(tree) != len(reference):
+        raise _MismatchError(f"expected {described(reference)}, got {described(tree)}")
+    return range(len(reference))
+
+
+def _check_names(kind, given, wanted):
+    """Refuse unknown and missing names."""
+    unknown = [repr(name) for name in given if name not in wanted]
+    missing = [repr(name) for name in wanted if name not in given]
+    if not (unknown or missing):
+        return
+    problem, names = ("unknown", unknown) if unknown else ("missing", missing)
+    plural = "s" if len(names) > 1 else ""
+    expected = ", ".join(map(repr, wanted)) or "none"
+    raise _MismatchError(f"{problem} {kind}{plural} {', '.join(names)}; expected {expected}")
+
+
+def described(tree):
+    """Say in words what a tree is: its kind, and how large it is."""
+    if isinstance(tree, dict):
+        return f"a dict of {', '.join(map(str, tree)) or 'nothing'}"
+    if isinstance(tree, (tuple, list)):
+        return f"a {type(tree).__name__} of length {len(tree)}"
+    is_array = hasattr(tree, "shape") or isinstance(tree, (float, complex))
+    return f"an array of shape {np.shape(tree)}" if is_array else getattr(tree, "described", type(tree).__name__)
 
 
 def labels(tree, root):
@@ -182,10 +286,21 @@ def keys(tree):
     return range(len(tree)) if isinstance(tree, (tuple, list)) else None
 
 
-def _build(tree, values):
+def branches_mapped(function, tree):
+    """A branch of the same type and keys, with ``function(key)`` in place of each entry."""
     if isinstance(tree, dict):
-        return type(tree)((key, _build(branch, values)) for key, branch in tree.items())
-    if isinstance(tree, (tuple, list)):
-        branches = [_build(branch, values) for branch in tree]
-        return type(tree)(*branches) if hasattr(tree, "_fields") else type(tree)(branches)
-    return next(values)
+        if type(tree) is dict:
+            return {key: function(key) for key in tree}
+        built = copy(tree)  # keeps what a subclass knows beside its entries, such as a default
+        for key in tree:
+            built[key] = function(key)
+        return built
+    entries = [function(place) for place in range(len(tree))]
+    return type(tree)(*entries) if hasattr(tree, "_fields") else type(tree)(entries)
+
+
+def _build(tree, values):
+    """A tree of the same structure and types, its leaves taken from an iterator."""
+    if keys(tree) is None:
+        return next(values)
+    return branches_mapped(lambda key: _build(tree[key], values), tree)

@@ -49,7 +49,7 @@ WRONG = [
     ),
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(4), bounds=(np.zeros(3), None)), ShapeError,
-        "a bound of shape (3,) does not fit start, of shape (4,)",
+        "bounds[0]: shape (3,) does not fit start, of shape (4,)",
     ),
     (
         lambda: dp.divergence(GRID) * dp.gradient(GRID), TypeError,

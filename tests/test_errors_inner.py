@@ -136,22 +136,22 @@ TABLE = [
     (
         lambda: pushforward(lambda x: x[0] * x[1], (1.0, 2.0), (1.0,)),
         SHAPE,
-        "the tangent must have the structure of x: a tuple of length 2, got a tuple of length 1",
+        "tangent: expected a tuple of length 2, got a tuple of length 1; give a tangent like x",
     ),
     (
         lambda: pushforward(lambda x: x["a"] * x["b"], {"a": 1.0, "b": 2.0}, [1.0, 2.0]),
         SHAPE,
-        "the tangent must have the structure of x: a dict of a, b, got a list of length 2",
+        "tangent: expected a dict of a, b, got a list of length 2; give a tangent like x",
     ),
     (
         lambda: pushforward(lambda x: 2 * x, np.ones(3), np.ones(2)),
         SHAPE,
-        "the tangent must have the structure of x: an array of shape (3,), got an array of shape (2,)",
+        "tangent: expected an array of shape (3,), got an array of shape (2,); give a tangent like x",
     ),
     (
         lambda: pushforward(lambda x: 2 * x, 1.0, None),
         SHAPE,
-        "the tangent must have the structure of x: an array of shape (), got NoneType",
+        "tangent: expected an array of shape (), got NoneType; give a tangent like x",
     ),
 ]
 

@@ -43,12 +43,12 @@ TABLE = [
     (
         lambda: dp.stepper("rk4", lambda u, p: -u, 0.1, tolerance=1e-3, floor=np.ones(2))(np.ones(3)),
         dp.errors.ShapeError,
-        "floor must be one number or fit the state, of shapes [(3,)], got [(2,)]; give one for each array",
+        "floor: shape (2,) does not fit the state there, of shape (3,); give one number, or a tree like the state",
     ),
     (
         lambda: dp.stepper("radau", lambda u, p: -u, 0.1, tolerance=1e-3, floor=(1.0, 2.0))(np.ones(3)),
         dp.errors.ShapeError,
-        "floor must be one number or fit the state, of shapes [(3,)], got [(), ()]; give one for each array",
+        "floor: expected one array or number, got a tuple of length 2; give one number, or a tree like the state",
     ),
     (
         lambda: dp.stepper("imex", decay, 0.1),
@@ -91,20 +91,17 @@ TABLE = [
     (
         lambda: dp.stepper("imex", decay, 0.1, linear=L)({"a": U}),
         TYPE,
-        "linear must be like the state, which has a tree of ['a'] there, got one for one field; "
-        "write None for a field without a stiff part",
+        "linear: expected a dict of a, got one operator; write None for a field without a stiff part",
     ),
     (
         lambda: dp.stepper("etdrk4", decay, 0.1, linear={"a": (L, 1.0)})(U),
         TYPE,
-        "linear must be like the state, which has one field there, got one for a tree of ['a']; "
-        "write None for a field without a stiff part",
+        "linear: expected one array or number, got a dict of a; write None for a field without a stiff part",
     ),
     (
         lambda: dp.stepper("imex", decay, 0.1, linear={"a": (L, {"b": L, "c": None})})({"a": (U, {"b": U, "d": U})}),
         TYPE,
-        "linear['a'][1] must be like the state, which has a tree of ['b', 'd'] there, got one for a tree of "
-        "['b', 'c']; write None for a field without a stiff part",
+        "linear['a'][1]: unknown key 'c'; expected 'b', 'd'; write None for a field without a stiff part",
     ),
     (
         lambda: dp.stepper("imex", decay, 0.1, linear=[L, {"b": 3.0}]),
@@ -186,32 +183,32 @@ TABLE = [
     (
         lambda: dp.stepper("euler", lambda u, p: u[:1], 0.6)(U),
         SHAPE,
-        "a rate must have the shape of the state, (4,), got (1,)",
+        "rate: expected shape (4,), got (1,); return a tree like the state",
     ),
     (
         lambda: dp.stepper("rk4", lambda x, p: {"w": x["v"], "u": x["u"]}, 0.6)({"u": U, "v": U}),
         SHAPE,
-        "a rate must have the fields of the state, u['u'], u['v'], got u['w'], u['u']",
+        "rate: unknown key 'w'; expected 'u', 'v'; return a tree like the state",
     ),
     (
         lambda: dp.stepper("rk4", lambda x, p: (x["v"], x["u"]), 0.6)({"u": U, "v": U}),
         SHAPE,
-        "a rate must have the fields of the state, u['u'], u['v'], got u[0], u[1]",
+        "rate: expected a dict of u, v, got a tuple of length 2; return a tree like the state",
     ),
     (
         lambda: dp.stepper("rk4", lambda x, p: (x[0], [*x[1].values()]), 0.6)((U, {"u": U, "v": U})),
         SHAPE,
-        "a rate must have the fields of the state, u[0], u[1]['u'], u[1]['v'], got u[0], u[1][0], u[1][1]",
+        "rate[1]: expected a dict of u, v, got a list of length 2; return a tree like the state",
     ),
     (
         lambda: dp.stepper("rk4", lambda x, p: {0: x[0], 1: x[1]}, 0.6)((U, U)),
         SHAPE,
-        "a rate must have the names of the state, tuple, got [0, 1]",
+        "rate: expected a tuple of length 2, got a dict of 0, 1; return a tree like the state",
     ),
     (
         lambda: dp.stepper("rk4", lambda x, p: (x[0], [x[1][0]]), 0.6)((U, {0: U})),
         SHAPE,
-        "a rate must have the names of the state, [0], got list",
+        "rate[1]: expected a dict of 0, got a list of length 1; return a tree like the state",
     ),
     (
         lambda: dp.stepper("tr_bdf2", dp.laplacian(dp.Grid(3)), 0.6)(U),

@@ -59,13 +59,12 @@ WRONG = [
     ),
     (
         run(bounds=((np.zeros(2), 1.0), None)), ValueError,
-        "a bound must be a number or have the structure of start, "
-        "got 2 leaves where start has 1; write one number, or a "
-        "tree like start",
+        "bounds[0]: expected one array or number, got a tuple of length 2; "
+        "write one number, None, or a tree like start",
     ),
     (
         run(project=lambda x: (x, x), loss=lambda x: anp.sum(x[0] ** 2)), ShapeError,
-        "project must return a tree like start; write project=lambda x: ...",
+        "project(x): expected one array or number, got a tuple of length 2; return a tree like start",
     ),
     (
         run(method="newton_cg", inner=0), ValueError,

@@ -187,23 +187,23 @@ TABLE = [
     (
         roll(shrinks_tree, {"a": U, "b": U}),
         SHAPE,
-        "state must keep its form: the step made a dict of a of a dict of a, b; return a state like the first one",
+        "state after the step: missing key 'b'; expected 'a', 'b'; return a state like the first one",
     ),
     (
         roll(lambda s, p: [s[0]], [U, U]),
         SHAPE,
-        "state must keep its form: the step made a list of length 1 of a list of length 2; "
-        "return a state like the first one",
+        "state after the step: expected a list of length 2, got a list of length 1; return a state like the first one",
     ),
     (
         roll(lambda u, p: (u, u)),
         SHAPE,
-        "state must keep its form: the step made a tuple of length 2 of one array; return a state like the first one",
+        "state after the step: expected one array or number, got a tuple of length 2; "
+        "return a state like the first one",
     ),
     (
         roll(lambda s, p: {"a": (s["a"], 1.0)}, {"a": U}),
         SHAPE,
-        "state['a'] must keep its form: the step made a tuple of length 2 of one leaf; "
+        "state['a'] after the step: expected one array or number, got a tuple of length 2; "
         "return a state like the first one",
     ),
     (
@@ -214,7 +214,7 @@ TABLE = [
     (
         roll(lambda s, p: (Pair(s[0].ink, (U, U)),), (Pair(U, U),)),
         SHAPE,
-        "state[0].wind must keep its form: the step made a tuple of length 2 of one leaf; "
+        "state[0].wind after the step: expected one array or number, got a tuple of length 2; "
         "return a state like the first one",
     ),
     (

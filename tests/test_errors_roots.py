@@ -67,12 +67,12 @@ TABLE = [
     (
         lambda: dp.steady(lambda x: {"v": x["u"] - x["w"], "w": x["w"]}, {"u": 1.0, "w": 2.0}),
         SHAPE,
-        "the residual of implicit(<lambda>) must have the names of x, ['u', 'w'], got ['v', 'w']",
+        "residual of implicit(<lambda>): unknown key 'v'; expected 'u', 'w'; return a tree like x",
     ),
     (
         lambda: dp.steady(lambda x: {"s": {"b": x["s"]["u"], "a": x["s"]["w"]}}, {"s": {"u": 1.0, "w": 2.0}}),
         SHAPE,
-        "the residual of implicit(<lambda>) must have the names of x, ['u', 'w'], got ['b', 'a']",
+        "residual['s'] of implicit(<lambda>): unknown keys 'b', 'a'; expected 'u', 'w'; return a tree like x",
     ),
     (
         lambda: dp.implicit(lambda x: 1j * x)(TWO),

@@ -225,7 +225,7 @@ TABLE = [
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=((1.0, 2.0), None))((1.0, 1.0)),
         SHAPE,
-        "damping has 2 parts for a field of 1; give one for each",
+        "damping[0]: expected one array or number, got a tuple of length 2; give one number, or a tree like the field",
     ),
     (
         lambda: dp.sponge(LINE, {"y": (2, 2)}, 1.0),

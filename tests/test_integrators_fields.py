@@ -231,7 +231,7 @@ def test_batches_of_trees():
     for name, u in step(STATE, PARAMS).items():
         assert np.array_equal(end[name][0], u)
     with pytest.raises(
-        dp.errors.ShapeError, match=r"a rate must have the shape of the state, \(2, 4, 3\), got \(4, 3\)"
+        dp.errors.ShapeError, match=r"rate: expected shape \(2, 4, 3\), got \(4, 3\); return a tree like the state"
     ):
         dp.stepper("etdrk4", lambda u, p: U, 0.01, linear=L)(np.stack([U, V]))
 

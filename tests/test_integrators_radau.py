@@ -348,7 +348,7 @@ REFUSED = [
     (lambda: dp.stepper("radau", DECAY, 1.0, jacobian=lambda u, p: np.eye(3))(ONES, 1.0), ShapeError,
      "the jacobian of stepper(radau) must have shape (2, 2), got (3, 3)"),
     (lambda: dp.stepper("radau", lambda u, p: u[:1], 1.0)(ONES, 1.0), ShapeError,
-     "a rate must have the shape of the state, (2,), got (1,)"),
+     "rate: expected shape (2,), got (1,); return a tree like the state"),
     (lambda: dp.stepper("radau", DECAY, 1.0)(np.array([1.0, np.nan]), 1.0), NonFiniteError,
      "state of stepper(radau) must be finite, got 1 that are NaN or infinite, the first at 1"),
     (lambda: dp.stepper("radau", lambda u, p: p * u**2, 2.0)(np.array([1.0]), 1.0), ConvergenceError,

@@ -219,10 +219,12 @@ def test_refusals():
     step = dp.stepper("leapfrog", rates, 0.1, damping=((1.0, 2.0), None))
     with pytest.raises(TypeError, match=r"the state of leapfrog must be a pair, got ndarray; write \(p, v\)"):
         step(np.ones(3))
-    with pytest.raises(dp.errors.ShapeError, match="damping has 2 parts for a field of 1; give one for each"):
+    with pytest.raises(
+        dp.errors.ShapeError, match=r"damping\[0\]: expected one array or number, got a tuple of length 2"
+    ):
         step((np.ones(3), np.ones(3)))
     step = dp.stepper("leapfrog", (rates[0], lambda p, c: (p, p)), 0.1, damping=(None, 1.0))
-    with pytest.raises(dp.errors.ShapeError, match=r"a rate must have the fields of the state, u, got u\[0\], u\[1\]"):
+    with pytest.raises(dp.errors.ShapeError, match="rate: expected one array or number, got a tuple of length 2"):
         step((np.ones(3), np.ones(3)))
     with pytest.raises(ValueError, match="sponge on x needs 0 to 4 cells, got 5"):
         dp.sponge(dp.Grid(4), 5, 1.0)
@@ -335,9 +337,7 @@ def test_damping_of_other_names_is_refused():
     x = {"a": np.array([1.0]), "b": np.array([2.0])}, np.array([1.0])
     rates = lambda q, c: {"a": 3.0 * q, "b": 5.0 * q}, lambda p, c: 0.0 * p["a"]
     step = dp.stepper("leapfrog", rates, 0.1, damping=({"b": 0.0, "c": 9.0}, None))
-    with pytest.raises(
-        dp.errors.ShapeError, match=r"damping must have the names of the state, \['a', 'b'\], got \['b', 'c'\]"
-    ):
+    with pytest.raises(dp.errors.ShapeError, match=r"damping\[0\]: unknown key 'c'; expected 'a', 'b'"):
         step(x)
 
 

@@ -44,10 +44,11 @@ from sparsedp.shortcuts import on_every_rank
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain
 from sparsedp.tape_constants import constant
-from sparsedp.tree import flatten, leaves, mapped
+from sparsedp.tree import flatten, is_uniform, labels, leaves, mapped, paired
 
 __all__ = ["Adaptive", "Moving", "Taken", "relative"]
 
+FITTING = "; give one number, or a tree like the state"  # advice about a floor
 SAFETY, SMALLEST, LARGEST = 0.9, 0.2, 5.0  # of one change of the length
 QUIET = 1e-2  # share of the tolerance below which an error shows no trend
 FLOOR = 0.1  # share of the largest entry of an array to which errors of small entries are compared
@@ -100,7 +101,7 @@ class Adaptive(Scheme):
 
     def __init__(self, scheme, tolerance, floor):
         super().__init__(scheme.problem, f"stepper({scheme.name})", scheme.order)
-        self.scheme, self.tolerance, self.floors, self.info = scheme, tolerance, leaves(constant(floor)), scheme.info
+        self.scheme, self.tolerance, self.floor, self.info = scheme, tolerance, constant(floor), scheme.info
         self.taken, self.ratio, self.compared, self.dyadic = [], 2**self.order - 1, self.order, scheme.dyadic
         self.weight = 0.0 if scheme.name == "crank_nicolson" else 1 / self.ratio
 
@@ -117,15 +118,14 @@ class Adaptive(Scheme):
 
     def _check_tolerance(self, u):
         """Refuse a floor that does not fit the state, and digits that it cannot hold: steps would shrink to nothing."""
-        shapes = [np.shape(plain(leaf)) for leaf in leaves(u)]
-        try:
-            for floor, shape in zip(self._floors(len(shapes)), shapes, strict=True):
-                np.broadcast_to(floor, shape)
-        except ValueError:
-            raise ShapeError(
-                f"floor must be one number or fit the state, of shapes {shapes}, got {[*map(np.shape, self.floors)]}; "
-                "give one for each array"
-            ) from None
+        for place, floor, leaf in zip(labels(u, "floor"), self._floors(u), leaves(u), strict=True):
+            try:
+                np.broadcast_to(floor, np.shape(plain(leaf)))
+            except ValueError:
+                raise ShapeError(
+                    f"{place}: shape {np.shape(floor)} does not fit the state there, of shape {np.shape(plain(leaf))}"
+                    f"{FITTING}"
+                ) from None
         for leaf in filter(is_variable, leaves(u)):
             rounding = np.finfo(dtype_of(leaf)).eps
             if self.tolerance < 4 * rounding:
@@ -205,15 +205,15 @@ class Adaptive(Scheme):
         """fine + weight (fine - whole)."""
         return combine(fine, (weight, fine), (-weight, whole)) if weight else fine
 
-    def _floors(self, count):
-        """A floor for each array of the state; a lone one serves all."""
-        return self.floors * count if len(self.floors) == 1 else self.floors
+    def _floors(self, u):
+        """A floor for each array of the state; a number or None may stand for a whole branch."""
+        return paired(self.floor, u, "floor", advice=FITTING, prefix=is_uniform)
 
     def sizes(self, *states):
         """For each array of the state |u| + floor, to which its errors are compared."""
         columns = list(zip(*map(leaves, states), strict=True))
         sizes = [reduce(np.maximum, map(np.abs, parts)) for parts in columns]
-        pairs = zip(sizes, self._floors(len(columns)), strict=True)
+        pairs = zip(sizes, self._floors(states[0]), strict=True)
         return [size + (FLOOR * np.max(size, initial=0.0) if floor is None else floor) for size, floor in pairs]
 
     def _error(self, u, new, whole):
@@ -317,6 +317,7 @@ class Moving:
 
     def __init__(self, tree, moves, sizes):
         self.found, self.rebuild = flatten(tree)
+        self.form = self.rebuild(range(len(self.found)))
         rows = enumerate(zip(self.found, sizes, strict=True))
         self.moving = [(n, plain(leaf), np.where(size > 0, size, 1.0)) for n, (leaf, size) in rows if moves(leaf)]
         self.units = [size for *_, size in self.moving]
@@ -325,7 +326,7 @@ class Moving:
 
     def off(self, tree):
         """Tree -> flat."""
-        found, parts = leaves(tree), []
+        found, parts = paired(tree, self.form, "rate"), []
         for place, leaf, size in self.moving:
             part = on_every_rank(_off(found[place], leaf) / size)
             parts += [anp.real(part), anp.imag(part)] if np.iscomplexobj(leaf) else [part]

@@ -96,7 +96,8 @@ def stepper(
     floor : number or tree like u, optional
         Errors are relative to |u| + floor. Default: a tenth of the largest entry of each array. What dies out with
         all of its array is then followed down to nothing, in many steps: give the size below which it no longer
-        matters. Where entries of very different size matter (species of 1 and 1e-5), give one for each.
+        matters. Where entries of very different size matter (species of 1 and 1e-5), give one for each. In a tree
+        entries of dicts are paired by key, and a number or None may stand for a whole branch.
     unstable : "raise" or "allow"
         Explicit steps of an Operator whose spectrum is known, and leapfrog, for which it is estimated once for each
         content of dt and params: refuse a dt beyond the stable limit, or take it.

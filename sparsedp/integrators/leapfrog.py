@@ -26,7 +26,7 @@ import numpy as np
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
 from sparsedp.derivative import push
-from sparsedp.errors import ShapeError, UnstableStepError
+from sparsedp.errors import UnstableStepError
 from sparsedp.fields import check_function, check_number, is_whole, rounded_down
 from sparsedp.grid import AXES, check_grid
 from sparsedp.integrators.adaptive import Moving
@@ -35,7 +35,7 @@ from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.shortcuts import on_every_rank
 from sparsedp.solvers.cache import Cache
 from sparsedp.tape import is_variable, plain
-from sparsedp.tree import flatten, leaves, leaves_like, mapped
+from sparsedp.tree import flatten, is_uniform, leaves, mapped, paired
 
 __all__ = ["Leapfrog", "sponge"]
 
@@ -112,8 +112,8 @@ class Leapfrog(Scheme):
     def __call__(self, state, params, t, h):
         (p, q), (f, g) = _pair(state), self.rates
         s, z = self.damping or (None, None)
-        q = _advanced(q, g(p, params), h, z)
-        return _advanced(p, f(q, params), h, s), q
+        q = _advanced(q, g(p, params), h, z, "damping[1]")
+        return _advanced(p, f(q, params), h, s, "damping[0]"), q
 
     def check_reversible(self):
         """Refuse a step that loses something."""
@@ -134,15 +134,14 @@ def _pair(state):
     return pair("the state of leapfrog", state, "(p, v)")
 
 
-def _advanced(x, rate, h, damping):
-    """x after h, with its rate."""
+def _advanced(x, rate, h, damping, name):
+    """x after h, with its rate; `name` of the damping is for messages."""
     if damping is None:
         return combine(x, (h, rate))
-    found, rebuild = flatten(x)
-    rates, damped = of_fields(rate, x), leaves_like(damping, x, "damping", "the state")
-    if len(damped) != len(found):
-        raise ShapeError(f"damping has {len(damped)} parts for a field of {len(found)}; give one for each")
-    rows = zip(found, rates, damped, strict=True)
+    entries, rebuild = flatten(x)
+    rates = of_fields(rate, x)
+    damped = paired(damping, x, name, advice="; give one number, or a tree like the field", prefix=is_uniform)
+    rows = zip(entries, rates, damped, strict=True)
     return rebuild([leaf + h * (r - s * leaf) / (1 + 0.5 * h * s) for leaf, r, s in rows])
 
 

@@ -4,15 +4,13 @@ states: an array, or any tree of arrays, plus multiples of others. Each field of
 
 import inspect
 
-import numpy as np
-
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_function, check_number, check_takes
 from sparsedp.operator import Operator
 from sparsedp.space import fits
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tape_constants import frozen
-from sparsedp.tree import copied, flatten, keys, labels, leaves, mapped, subscript
+from sparsedp.tree import branches_mapped, copied, flatten, keys, leaves, mapped, paired, subscript
 
 __all__ = ["Problem", "combine", "later", "like", "number", "of_fields", "pair", "untraced"]
 
@@ -46,35 +44,9 @@ def combine(u, *pairs):
     return rebuild(found)
 
 
-def of_fields(tree, u):
+def of_fields(tree, u, name="rate"):
     """The leaves of a rate, one for each of the state; broadcasting one into another would hide a mistake."""
-    found, wanted = _by_place(tree), _by_place(u)
-    if found.keys() != wanted.keys():
-        names = (", ".join(labels(x, "u")) or "nothing" for x in (u, tree))
-        raise ShapeError("a rate must have the fields of the state, {}, got {}".format(*names))
-    _check_kinds(tree, u)
-    shapes = [[np.shape(fields[place]) for place in wanted] for fields in (wanted, found)]
-    if shapes[0] != shapes[1]:
-        words = (", ".join(map(str, row)) for row in shapes)
-        raise ShapeError("a rate must have the shape of the state, {}, got {}".format(*words))
-    return [found[place] for place in wanted]
-
-
-def _check_kinds(tree, u):
-    """Refuse a dict whose keys are the numbers of a tuple's fields, and a tuple for such a dict: that is a mistake."""
-    if isinstance(tree, dict) != isinstance(u, dict):
-        names = ([*x] if isinstance(x, dict) else type(x).__name__ for x in (u, tree))
-        raise ShapeError("a rate must have the names of the state, {}, got {}".format(*names))
-    for name in keys(u) or ():
-        _check_kinds(tree[name], u[name])
-
-
-def _by_place(tree):
-    """{the keys that lead to a leaf: the leaf}, from left to right."""
-    names = keys(tree)
-    if names is None:
-        return {(): tree}
-    return {(name, *rest): leaf for name in names for rest, leaf in _by_place(tree[name]).items()}
+    return paired(tree, u, name, advice="; return a tree like the state", shapes=True)
 
 
 def like(new, u):
@@ -120,6 +92,8 @@ class Stiff:
         Where it was given, for messages.
     """
 
+    described = "one operator"
+
     def __init__(self, op, coefficient, place):
         self.op, self._coefficient = op, coefficient
         self.name = f"the coefficient of {op.name}{place.removeprefix('linear')}"
@@ -136,30 +110,21 @@ class Stiff:
 
 
 def _terms(linear, place):
-    """What `linear` holds: a Stiff, None, or a dict of the same for the branches of a tree."""
+    """What `linear` holds, with a Stiff in place of each operator and None where there is none."""
     if linear is None or (isinstance(linear, (int, float)) and linear == 0):
         return None
-    op, coefficient = linear if isinstance(linear, tuple) and len(linear) == 2 else (linear, 1.0)
+    is_pair = isinstance(linear, tuple) and len(linear) == 2 and not hasattr(linear, "_fields")
+    op, coefficient = linear if is_pair else (linear, 1.0)
     if isinstance(op, Operator) and not isinstance(coefficient, (Operator, tuple, list, dict, type(None))):
         return Stiff(op, coefficient, place)
-    names = keys(linear)
-    if names is None:
+    if keys(linear) is None:
         raise TypeError(f"{place} takes an Operator or a pair (Operator, coefficient), got {type(linear).__name__}")
-    return {name: _terms(linear[name], place + subscript(linear, name)) for name in names}
+    return branches_mapped(lambda name: _terms(linear[name], place + subscript(linear, name)), linear)
 
 
-def _matched(terms, u, place):
-    """The terms of the fields of a state, from left to right."""
-    names, branch = keys(u), isinstance(terms, dict)
-    if terms is None or not (branch or names is not None):
-        return [terms] * len(leaves(u))
-    if not branch or names is None or set(terms) != set(names):
-        wanted, given = ("one field" if k is None else f"a tree of {[*k]}" for k in (names, keys(terms)))
-        raise TypeError(
-            f"{place} must be like the state, which has {wanted} there, got one for {given}; "
-            "write None for a field without a stiff part"
-        )
-    return [term for name in names for term in _matched(terms[name], u[name], place + subscript(u, name))]
+def _is_none(term):
+    """Whether a term stands for a whole branch without a stiff part."""
+    return term is None
 
 
 class Problem:
@@ -209,7 +174,8 @@ class Problem:
 
     def terms(self, u):
         """The Stiff of each field of a state, None where there is none."""
-        return _matched(self._terms, u, "linear")
+        advice = "; write None for a field without a stiff part"
+        return paired(self._terms, u, "linear", advice=advice, prefix=_is_none, error=TypeError)
 
     def on_fields(self, act, h, params, u, *trees):
         """act(L, h c, leaf, ...) for each field of the state u, and of trees like it -> a tree like u.

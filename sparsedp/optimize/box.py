@@ -5,9 +5,9 @@ from reprlib import repr as shortened
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.fields import EPS, is_number
+from sparsedp.fields import EPS
 from sparsedp.packing import joined
-from sparsedp.tree import leaves
+from sparsedp.tree import is_uniform
 
 __all__ = ["Box"]
 
@@ -30,9 +30,9 @@ class Box:
     Raises
     ------
     ValueError
-        If bounds is not a pair, has another structure than start, is NaN, or a lower bound is above an upper.
+        If bounds is not a pair, is NaN, or a lower bound is above an upper.
     ShapeError
-        If a bound has another shape than its array.
+        If a side has another structure than start, or a bound another shape than its array.
     """
 
     def __init__(self, bounds=None, packing=None):
@@ -45,8 +45,8 @@ class Box:
                 f"got {shortened(bounds)}; write (0.0, None) for x >= 0"
             )
         lower, upper = bounds
-        self.lower = _side(lower, -np.inf, packing)
-        self.upper = _side(upper, np.inf, packing)
+        self.lower = _side(lower, -np.inf, packing, "bounds[0]")
+        self.upper = _side(upper, np.inf, packing, "bounds[1]")
         if not np.all((self.lower <= self.upper) & (self.lower < np.inf) & (self.upper > -np.inf)):  # nor NaN
             raise ValueError("bounds must be numbers with lower <= upper; write None for a side without a bound")
 
@@ -60,24 +60,20 @@ class Box:
         return ~(((vector - near <= self.lower) & (slope > 0)) | ((vector + near >= self.upper) & (slope < 0)))
 
 
-def _side(side, without, packing):
-    given = leaves(side)
-    if side is None or (not isinstance(side, (tuple, list, dict)) and is_number(side)):
-        given *= packing.count
-    if len(given) != packing.count:
-        raise ValueError(
-            f"a bound must be a number or have the structure of start, got {len(given)} leaves where start has "
-            f"{packing.count}; write one number, or a tree like start"
-        )
-    pairs = zip(packing.values, packing.floating(given))
-    return joined([_full(x, without if b is None else b) for x, b in pairs])
+def _side(side, without, packing, name):
+    """One side of the bounds as a flat vector; a number or None may stand for a whole branch of start."""
+    advice = "; write one number, None, or a tree like start"
+    given = packing.floating(side, name, advice=advice, prefix=is_uniform)
+    labels = zip(packing.names_under(name), packing.names)
+    full = [_full(x, without if b is None else b, *label) for label, x, b in zip(labels, packing.values, given)]
+    return joined(full)
 
 
-def _full(x, bound):
+def _full(x, bound, name, place):
     """A bound for every entry of x; a real one bounds both parts of a complex entry."""
     if np.iscomplexobj(x) and not np.iscomplexobj(bound):
         bound = bound * (1 + 1j)
     try:
         return np.full(np.shape(x), bound)
     except ValueError:
-        raise ShapeError(f"a bound of shape {np.shape(bound)} does not fit start, of shape {np.shape(x)}") from None
+        raise ShapeError(f"{name}: shape {np.shape(bound)} does not fit {place}, of shape {np.shape(x)}") from None

@@ -3,7 +3,6 @@
 import inspect
 from math import inf
 
-from sparsedp.errors import ShapeError
 from sparsedp.fields import advice_near, check_choice, check_function, check_number, check_whole, is_number
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
@@ -20,7 +19,7 @@ from sparsedp.optimize.watch import Watch
 from sparsedp.packing import Packing
 from sparsedp.progress import shown_steps
 from sparsedp.shortcuts import ELSEWHERE, together
-from sparsedp.tree import leaves
+from sparsedp.tree import flatten, leaves, paired
 
 __all__ = ["minimize"]
 
@@ -76,9 +75,10 @@ def minimize(
     progress : bool or str
         A progress bar on standard error, a string is its label; needs the extra `plot`.
     gradient : callable, optional
-        ``gradient(x)``, with the structure of x. Default: reverse mode.
+        ``gradient(x)``, with the structure of x; entries of dicts are paired by key. Default: reverse mode.
     bounds : (lower, upper), optional
-        Each a number, None for none, or a tree like start. Points are moved onto the box. half_inverse compares
+        Each a number, None for none, or a tree like start, in which a number or None may stand for a whole branch;
+        entries of dicts are paired by key. Points are moved onto the box. half_inverse compares
         no losses and may settle elsewhere on the box than the others.
     project : callable, optional
         ``project(x)``, a linear projection such as dp.projection(grid): the loss sees project(x), and so does the
@@ -114,6 +114,9 @@ def minimize(
 
     Raises
     ------
+    ShapeError
+        If a side of the bounds, or what `project` returns, has another structure than start; DerivativeError for
+        `gradient`. The message gives the path of the entry.
     ValueError
         If the method is not known, or maxiter, tolerance, bounds or an option is out of range, or the checkpoint
         folder holds another run: another method, options, bounds, start (static leaves too), loss or batches.
@@ -188,9 +191,8 @@ def minimize(
         kept.write(watch.history)
     x = packing.unpack(trials.best.vector)
     if project is not None:
-        given, x = x, project(x)
-        if len(leaves(x)) != len(leaves(given)):
-            raise ShapeError("project must return a tree like start; write project=lambda x: ...")
+        entries = paired(project(x), x, "project(x)", advice="; return a tree like start", shapes=True)
+        x = flatten(x)[1](entries)
     return watch.minimum(x, method, resumed=kept.resumed, covariance=covariance)
 
 

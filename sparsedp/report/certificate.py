@@ -24,7 +24,7 @@ from sparsedp.derivative import value_and_grad
 from sparsedp.fields import check_number, is_number
 from sparsedp.ledger import recording, thread
 from sparsedp.report.plan import total
-from sparsedp.tree import leaves, norm
+from sparsedp.tree import leaves, norm, paired
 
 __all__ = ["Certificate", "Certified", "certified", "certify", "distance"]
 
@@ -40,10 +40,9 @@ ROUNDING = 1e-14  # of the value
 
 def distance(one, other, unit=None):
     """Euclidean distance of two trees, relative to a third: by default the second; None counts for nothing."""
-    shapes, wanted = ([np.shape(leaf) for leaf in leaves(tree)] for tree in (one, other))
-    if shapes != wanted:
-        raise ValueError(f"workprec cannot compare shapes {shapes} with {wanted}; give compare=function(result, exact)")
-    gaps = [np.subtract(a, b) for a, b in zip(leaves(one), leaves(other)) if a is not None]
+    advice = "; give compare=function(result, exact)"
+    pairs = zip(paired(one, other, "result", " of workprec", advice, shapes=True, error=ValueError), leaves(other))
+    gaps = [np.subtract(a, b) for a, b in pairs if a is not None]
     return norm(gaps) / (norm(other if unit is None else unit) or 1.0)
 
 

@@ -45,7 +45,7 @@ from sparsedp.solvers.scaling import length
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tape_constants import constant
-from sparsedp.tree import flatten, leaves, leaves_like, placed
+from sparsedp.tree import flatten, keys, leaves, paired, placed
 
 __all__ = ["Equation", "Layout", "Newton"]
 
@@ -217,8 +217,20 @@ class Equation:
             )
         return result
 
+    def _parts(self, result):
+        """The leaves of a residual, those of dicts and named tuples in the order of the unknowns.
+
+        Equations that are no tree like the unknowns, such as one array or a list, are taken as they come.
+        """
+        unknowns = self.layout.tree
+        if keys(result) is None or keys(unknowns) is None or isinstance(result, dict) != isinstance(unknowns, dict):
+            return leaves(result)
+        if not isinstance(result, dict) and len(result) != len(unknowns):
+            return leaves(result)
+        return paired(result, unknowns, "residual", f" of {self.name}", "; return a tree like x")
+
     def _flat(self, result):
-        parts = leaves_like(result, self.layout.tree, f"the residual of {self.name}", "x")
+        parts = self._parts(result)
         size = sum(int(np.size(plain(part))) for part in parts)
         if size != self.size:
             raise ShapeError(f"the residual of {self.name} must hold {self.size} numbers, as many as x, got {size}")

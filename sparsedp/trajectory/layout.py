@@ -6,13 +6,13 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import described, is_finite
+from sparsedp.derivative import is_finite
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_native
+from sparsedp.fields import check_finite, check_leaves, check_native
 from sparsedp.shortcuts import ELSEWHERE, array
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.tape_constants import constant
-from sparsedp.tree import flatten, keys, labels, leaves, subscript
+from sparsedp.tree import described, flatten, keys, labels, leaves, paired
 
 __all__ = [
     "Layout", "dense", "fingerprint", "folded", "owned", "refuse_lost", "refuse_mask", "stacked",
@@ -68,6 +68,7 @@ class Layout:
                 refuse_mask(f"rollout takes plain arrays, got a masked array as {self.labels[number]}", leaf)
         check_native("rollout", *entries)
         self.open = _is_open(tree)
+        check_leaves(root, tree, containers=False)
         variables = [plain(entries[place]) for place in self.places]
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
         self.shapes = [np.shape(leaf) for leaf in variables]
@@ -144,8 +145,8 @@ class Layout:
 
     def _parted(self, tree, when):
         """A tree of the same form -> its variables and its other leaves."""
-        entries: list = []
-        self._collect(self._template, tree, (), when, entries)
+        advice = "; return a state like the first one"
+        entries = paired(tree, self._template, self.root, f" after {when}", advice)
         variables = [entries[place] for place in self.places]
         if len(variables) == len(entries):
             return variables, self.statics
@@ -160,18 +161,6 @@ class Layout:
                     "start with a floating value, for example state.astype(float)"
                 )
         return variables, others
-
-    def _collect(self, wanted, tree, path, when, entries):
-        """The leaves of a tree, at a path of keys; refused where it branches otherwise than `wanted`."""
-        names = keys(wanted)
-        if keys(tree) != names:
-            form = described(wanted) if names is not None else "one array" if self.bare else "one leaf"
-            raise ShapeError(_changed(_at(self._template, self.root, path), form, described(tree), when))
-        if names is None:
-            entries.append(tree)
-            return
-        for name in names:
-            self._collect(wanted[name], tree[name], (*path, name), when, entries)
 
     def _settled(self, number, value, when, outer):
         name, shape, dtype = self.names[number], self.shapes[number], self.dtypes[number]
@@ -263,13 +252,6 @@ def folded(value):
     flat = value.reshape(-1).view(np.uint8)
     end = flat.size - flat.size % (8 * fold)
     return flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes() + flat[end:].tobytes()
-
-
-def _at(tree, root, path):
-    """The name of what lies at a path of keys."""
-    for key in path:
-        tree, root = tree[key], root + subscript(tree, key)
-    return root
 
 
 def _changed(name, wanted, given, when):
