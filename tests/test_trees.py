@@ -517,3 +517,19 @@ def test_containers_that_are_no_trees_are_refused_by_name(kind):
             call()
     words_only = MappingProxyType({"name": "scene", "n": 3})  # nothing to differentiate
     assert dp.grad(lambda x: x["u"] ** x["m"]["n"])({"u": 2.0, "m": words_only}) == {"u": 12.0, "m": None}
+
+
+def test_whole_messages():
+    with pytest.raises(
+        TypeError,
+        match=r"x must be float32, float64, complex64 or complex128, got float16; write np.asarray\(x, float\)",
+    ):
+        dp.grad(square)(X.astype(np.float16))
+    with pytest.raises(
+        TypeError,
+        match="x is a mappingproxy, which is not a tree: its numbers would have no derivative; "
+        "write a dict or a NamedTuple",
+    ):
+        dp.grad(lambda x: x["k"] ** 2)(MappingProxyType({"k": 2.0}))
+    with pytest.raises(DerivativeError, match=r"gradient\['b'\]: expected numbers, got dtype object; return a tree"):
+        dp.minimize(loss, START, gradient=lambda x: {"b": None, "a": 1.0})
