@@ -11,6 +11,7 @@ A new public name is one word in ``_WINDOW`` and one in ``__init__.pyi``, the co
 """
 
 from importlib import import_module as _import_module
+from types import FunctionType as _FunctionType
 
 _WINDOW = {
     "grid": "Grid",
@@ -54,20 +55,96 @@ _WINDOW = {
     "parallel.scenes": "ensemble",
     "parallel.front": "distribute gather",
 }
-_MEANT = {  # what people write, coming from the first edition or from elsewhere -> what to write here
-    "minimise": "dp.minimize",
-    "part": "dp.component(grid, axis)",
-    "embed": "dp.component(grid, axis).T",
-    "solve": "dp.inverse(op)(b)",
-    "poisson": "dp.inverse(-dp.laplacian(grid, dp.dirichlet))",
+_SPARSE = "scipy.sparse.linalg.{0}; SciPy takes an Operator as a LinearOperator on flat arrays"
+_STEP = "dp.stepper('rk4', rate, dt), and dp.rollout(step, start, params, n) for n steps"
+_MEANT = {  # names of the first edition and of other libraries: what to write in their place
+    "Adam": "dp.minimize(loss, start, method='adam', rate=0.01)",
+    "Field": "a NumPy array of shape grid.shape: fields are plain arrays",
+    "LBFGS": "dp.minimize(loss, start)",
+    "Mesh": "dp.Grid((64, 64), size=1.0)",
+    "Module": "dp.network.dense(p, x): layers are functions of a dict of parameters",
+    "SGD": "dp.minimize(loss, start, method='gd', rate=0.01, batches=batches)",
+    "Tensor": "a NumPy array: fields are plain arrays",
+    "adam": "dp.minimize(loss, start, method='adam', rate=0.01)",
     "advect": "dp.transport(grid)",
-    "odeint": "dp.rollout(dp.stepper('rk4', rate, dt), u, params, n)",
-    "jacobian": "dp.jvp(f, x, t) and dp.vjp(f, x), the products with it",
+    "array": "numpy.array: fields are plain arrays",
+    "autodiff": "dp.grad(loss)(x) or dp.value_and_grad(loss)(x)",
+    "backward": "dp.value_and_grad(loss)(x)",
+    "cg": "dp.inverse(op, 'krylov')(b), which is differentiable, or " + _SPARSE.format("cg(op, b.ravel())"),
+    "check_grad": "dp.check.gradient(loss, x)",
+    "check_gradient": "dp.check.gradient(loss, x)",
+    "checkpoint": "dp.rollout(step, start, params, n, memory='1 GB')",
+    "curl_free": "dp.projection(grid)",
+    "diffusion": "dp.laplacian(grid, dp.neumann)",
+    "div": "dp.divergence(grid)",
+    "eig": _SPARSE.format("eigs(op, k=6)"),
+    "eigenpairs": _SPARSE.format("eigsh(op, k=6)"),
+    "eigh": _SPARSE.format("eigsh(op, k=6)"),
+    "eigs": _SPARSE.format("eigs(op, k=6)"),
+    "eigsh": _SPARSE.format("eigsh(op, k=6)"),
+    "eigvals": _SPARSE.format("eigs(op, k=6)"),
+    "embed": "dp.component(grid, axis).T",
+    "euler": "dp.stepper('euler', rate, dt)",
+    "fit": "dp.minimize(loss, start)",
+    "fori_loop": "dp.rollout(step, start, params, n)",
+    "fsolve": "dp.implicit(residual)(guess, params)",
+    "gmres": "dp.inverse(op, 'krylov')(b), which is differentiable, or " + _SPARSE.format("gmres(op, b.ravel())"),
+    "heat": "dp.stepper('backward_euler', dp.laplacian(grid), dt)",
+    "helmholtz": "dp.inverse(dp.laplacian(grid, dp.dirichlet) + k**2 * dp.identity(grid.cells))",
     "hessian": "dp.hvp(loss, x, t), the product with it",
+    "hessp": "dp.hvp(loss, x, t)",
+    "imshow": "dp.plot(grid, u)",
+    "integrate": _STEP,
+    "interpolate": "dp.sample(grid, points)",
+    "inv": "dp.inverse(op)",
+    "jacobian": "dp.jvp(f, x, t) and dp.vjp(f, x), the products with it",
+    "jax": "dp.interop.to_jax(f) and dp.interop.from_jax(f)",
+    "jit": "the function itself: loops are compiled where numba is installed; for jax.jit write dp.interop.to_jax(f)",
+    "linspace": "grid.coordinates(axis), the centres of the cells along an axis",
+    "lobpcg": _SPARSE.format("lobpcg(op.to_scipy(), X, M=dp.inverse(op).to_scipy())"),
+    "mesh": "dp.Grid((64, 64), size=1.0)",
+    "meshgrid": "grid.centres()",
+    "minimise": "dp.minimize",
+    "multigrid": "dp.inverse(op, 'multigrid')",
+    "navier_stokes": "dp.flow_step(grid, dt)",
+    "newton": "dp.implicit(residual)(guess, params)",
+    "no_grad": "nothing: without dp.grad no derivatives are recorded",
+    "np": "import autograd.numpy as np",
+    "numpy": "import autograd.numpy as np",
+    "ode": _STEP,
+    "odeint": "dp.rollout(dp.stepper('rk4', rate, dt), u, params, n)",
+    "ones": "numpy.ones(grid.shape): fields are plain arrays",
+    "optim": "dp.minimize(loss, start)",
+    "part": "dp.component(grid, axis)",
+    "periodic": "dp.Grid((64, 64), periodic=True)",
+    "pmap": "dp.ensemble(loss, scenes)",
+    "poisson": "dp.inverse(-dp.laplacian(grid, dp.dirichlet))",
+    "pressure": "dp.projection(grid)",
+    "rk4": "dp.stepper('rk4', rate, dt)",
+    "root": "dp.implicit(residual)(guess, params)",
+    "savez": "dp.save('run.npz', grid, u=u)",
+    "scan": "dp.rollout(step, start, params, n, inputs=values)",
+    "show": "dp.plot(grid, u)",
+    "simulate": _STEP,
+    "solve": "dp.inverse(op)(b)",
+    "solve_ivp": _STEP,
+    "spsolve": "dp.inverse(op, 'direct')(b)",
+    "stop_gradient": "numpy.array(value) outside the loss: what the loss does not compute is a constant",
+    "svds": _SPARSE.format("svds(op, k=6)"),
     "tensor": "a NumPy array: fields are plain arrays",
+    "to_jax": "dp.interop.to_jax(f)",
+    "to_torch": "dp.interop.to_torch(f)",
+    "torch": "dp.interop.to_torch(f) and dp.interop.from_torch(f)",
+    "train": "dp.minimize(loss, start, method='adam', rate=0.01)",
+    "value_and_gradient": "dp.value_and_grad(loss)(x)",
+    "version": "dp.__version__",
     "vmap": "op(u) with a batch in the leading axes of u",
+    "where": "autograd.numpy.where",
+    "write": "dp.save('run.npz', grid, u=u)",
+    "zeros": "numpy.zeros(grid.shape): fields are plain arrays",
 }
 _ROOMS = ("check", "errors", "interop", "network", "report")
+_PACKAGES = ("advection", "optimize")  # not public; a call of one tells what to write
 _HOME = {name: module for module, names in _WINDOW.items() for name in names.split()}
 
 __all__ = sorted([*_HOME, *_ROOMS])
@@ -76,7 +153,9 @@ __all__ = sorted([*_HOME, *_ROOMS])
 def __getattr__(name):
     if name in _HOME:
         value = getattr(_import_module(f"{__name__}.{_HOME[name]}"), name)
-    elif name in _ROOMS:
+        if type(value) is _FunctionType:
+            value = _import_module(f"{__name__}.calls").public_name(value, __name__, name)
+    elif name in (*_ROOMS, *_PACKAGES):
         value = _import_module(f"{__name__}.{name}")
     elif name == "__version__":
         metadata = _import_module("importlib.metadata")
@@ -85,7 +164,7 @@ def __getattr__(name):
         except metadata.PackageNotFoundError:
             value = "0+unknown"  # run from a tree that was never installed
     else:
-        near = _import_module(f"{__name__}.fields").advice_near
+        near = _import_module(f"{__name__}.calls").advice_near
         hint = f"; write {_MEANT[name]}" if name in _MEANT else near(name, __all__)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
     globals()[name] = value  # the next look-up does not come here

@@ -45,7 +45,8 @@ def main(arguments=None):
         place, why = getattr(error, "filename", None), getattr(error, "strerror", None)
         if place is None:
             sys.stdout = open(os.devnull, "w")  # or Python tries once more at its end, and changes the exit code
-        return refuse(f"{place or 'the output'} cannot be written: {why or error}; make room, or write elsewhere")
+        advice = "" if "; " in (why or "") else "; make room, or write elsewhere"
+        return refuse(f"{place or 'the output'} cannot be written: {why or error}{advice}")
     except (ValueError, ImportError) as error:  # the scene, its loss, the field or the folder: what is wrong with it
         return refuse(error)
 

@@ -10,6 +10,7 @@ from zlib import crc32
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.calls import public
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import EPS, check_choice, check_finite, check_function, check_shape
 from sparsedp.ledger import count
@@ -128,6 +129,7 @@ class Adopted(Remade):
         jacobian = self._shapes, self.way, self._coloured
         return Adopted, (self._f, self._sparsity, self._derivative, self.name, jacobian)
 
+    @public("dp.adopt(f)")
     def __call__(self, x):
         return self._rule(x)
 

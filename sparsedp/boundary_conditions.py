@@ -192,7 +192,20 @@ def _check_names(grid, boundary):
 def _sides(axis, entry, kind):
     sides = (entry, entry) if isinstance(entry, kind) else entry
     if not (isinstance(sides, (tuple, list)) and len(sides) == 2 and all(isinstance(s, kind) for s in sides)):
-        names = [word for word in kind.choices.split(", ") if f"'{word}'" in repr(entry)]
-        advice = f"; write dp.{names[0]}" if names else EXAMPLE if "function robin" in repr(entry) else ""
-        raise TypeError(f"boundary on {axis} needs {kind.choices} or a pair of them, got {entry!r}{advice}")
+        raise TypeError(
+            f"boundary on {axis} needs {kind.choices} or a pair of them, got {entry!r}{_instead(sides, kind)}"
+        )
     return tuple(sides)
+
+
+def _instead(sides, kind):
+    """Advice for what is not a condition of a kind."""
+    first = sides[0] if isinstance(sides, (tuple, list)) and sides else sides
+    if isinstance(first, str):
+        names = [word for word in kind.choices.split(", ") if word == first]
+        if names:
+            return f"; write dp.{names[0]}"
+        return "; write dp.Grid(shape, periodic=True) and no condition" if first == "periodic" else ""
+    if isinstance(first, FlowCondition):
+        return f"; {first} belongs to dp.projection and dp.flow_step, write dp.{first.along} here"
+    return EXAMPLE if "function robin" in repr(first) else ""

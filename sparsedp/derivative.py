@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.calls import public
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
 from sparsedp.fields import (
     advise,
@@ -475,7 +476,7 @@ def vjp(fun, *x):
         slopes = together("the function of vjp", (g,), pull, g)
         return slopes[0] if len(x) == 1 else slopes
 
-    return value, back
+    return value, public("pull")(back)
 
 
 def grad(loss, argnum=0):

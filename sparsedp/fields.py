@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from decimal import ROUND_FLOOR, Context
-from difflib import get_close_matches
 from inspect import CO_VARARGS
 from math import isfinite
 from types import FunctionType
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sparsedp.calls import advice_near
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.tree import labels, leaves
 
@@ -65,7 +65,9 @@ def field_array(op, u, batch=False):
         u = _array(op, u)
     shape = op.domain.shape
     if u.shape != shape and not (batch and _is_batch(u.shape, shape)):
-        raise ShapeError(f"{op.name} takes a field on {op.domain.described}, got an array of shape {u.shape}")
+        raise ShapeError(
+            f"{op.name} takes a field on {op.domain.described}, got an array of shape {u.shape}{_in_shape(op, u)}"
+        )
     if u.dtype.char not in "dfDF":
         if u.dtype.kind not in "biu":
             raise TypeError(f"{op.name} takes float or complex numbers, got dtype {u.dtype}; write u.astype(float)")
@@ -79,6 +81,18 @@ def _is_batch(shape, field_shape):
     """Return whether the last axes are those of a field. A 0-d field has none, so every shape is a batch of it."""
     lead = len(shape) - len(field_shape)
     return lead >= 0 and shape[lead:] == field_shape
+
+
+def _in_shape(op, u):
+    """Advice for an array whose shape is not that of the field, but tells what it is."""
+    space = op.domain
+    if u.ndim == 0:
+        return f"; write np.full({space.shape}, {u})"
+    if u.shape == (space.size,):
+        return f"; write op(u.reshape{space.shape}), or op @ u for a flat array"
+    if u.ndim == 2 and u.shape[0] == space.size:
+        return "; for the columns of a matrix, as lobpcg of SciPy gives them, write op.to_scipy()"
+    return ""
 
 
 def _array(op, u):
@@ -244,24 +258,17 @@ def check_choice(name, word, choices, advice=""):
     if not any(isinstance(word, type(one)) and word == one for one in choices):
         words = ", ".join(str(one) for one in choices if one is not None)
         advice = advice or advice_near(word, words.split(", "))
-        raise ValueError(f"{name} must be {'one of ' if ', ' in words else ''}{words}, got {word!r}{advice}")
+        raise ValueError(f"{name} must be {'one of ' if ', ' in words else ''}{words}, got {_shown(word)}{advice}")
 
 
-def advice_near(word, words):
-    """Advice to write the one of some words that is most like one which is none of them; empty if none is."""
-    word = str(word).lower()
-    near = [one for one in words if word and one.startswith(word)] or get_close_matches(word, words)
-    return f"; write {near[0]!r}" if near else ""
-
-
-def advise(error, params=()):
+def advise(error, params=(), example="rollout(step, start, params, n)"):
     """Add to the words of an error what to write, where a list or the params None met arithmetic."""
     said = str(error)
     if isinstance(error, TypeError) and "; write" not in said:
         if "'list'" in said or "multiply sequence" in said:
             error.args = (f"{said}; write np.asarray(x) for an array: a list is a tree of numbers",)
         elif params is None and "NoneType" in said:
-            error.args = (f"{said}; write rollout(step, start, params, n): the params given are None",)
+            error.args = (f"{said}; write {example}: the params given are None",)
 
 
 def check_takes(name, fun, count, example):
@@ -289,8 +296,7 @@ def check_number(name, value, needs="", advice="", kind=""):
     `advice`: what to write where the number is out of range; `kind`: where it is no number.
     """
     if not is_number(value):
-        given = f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
-        raise TypeError(f"{name} must be one real number, got {given}{kind}")
+        raise TypeError(f"{name} must be one real number, got {_shown(value)}{kind}")
     if not isfinite(value):
         raise NonFiniteError(f"{name} must be finite, got {value}")
     if not RANGES[needs](value):
@@ -298,10 +304,15 @@ def check_number(name, value, needs="", advice="", kind=""):
     return float(value)
 
 
+def _shown(value):
+    """An argument in a message: an array by its shape."""
+    return f"an array of shape {value.shape}" if isinstance(value, np.ndarray) else repr(value)
+
+
 def check_whole(name, value, least, advice=""):
     """One whole number from `least` on -> an int; all else is refused."""
     if not is_whole(value, least):
-        raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}{advice}")
+        raise ValueError(f"{name} must be a whole number >= {least}, got {_shown(value)}{advice}")
     return int(value)
 
 

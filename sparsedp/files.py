@@ -1,6 +1,7 @@
 """Files that are there whole or not at all, a full disk and a kill included."""
 
 import contextlib
+import errno
 import json
 import os
 import shutil
@@ -10,8 +11,15 @@ from uuid import uuid4
 
 import numpy as np
 
-__all__ = ["UNFINISHED", "load_tree", "save_tree", "write_file", "write_through"]
+__all__ = ["UNFINISHED", "load_tree", "path_errors", "save_tree", "write_file", "write_through"]
 
+PATH_ADVICE = {
+    errno.EEXIST: "give the path of a folder, this is a file",
+    errno.EISDIR: "give the path of a file, this is a folder",
+    errno.ENAMETOOLONG: "shorten the name, most file systems take up to 255 bytes",
+    errno.ENOENT: "create the folder first",
+    errno.ENOTDIR: "give a path through folders, a part of this one is a file",
+}
 SEQUENCES = {"list": list, "tuple": tuple}
 UNFINISHED = ".part"  # how the name of a file ends that is being written, or was when its run was killed
 
@@ -43,7 +51,7 @@ def write_file(path, content):
     """
     target = Path(os.path.realpath(path))
     part = target.parent / f"{target.name[:40]}.{uuid4().hex[:8]}{UNFINISHED}"  # whoever else writes has another
-    with _errors_name(path):
+    with path_errors(path):
         try:
             there = target.exists()
             if there and not target.is_file():
@@ -62,13 +70,17 @@ def write_file(path, content):
 
 
 @contextlib.contextmanager
-def _errors_name(path):
-    """An OSError inside names `path`, and not the unfinished file beside it."""
+def path_errors(path, reading=False):
+    """Let an OSError inside name `path`, not the unfinished file beside it, and say what to do about the path."""
     try:
         yield
     except OSError as error:
-        error.filename = str(path)
-        del error.filename2
+        if error.errno is not None:  # else of a library, with its own sentence
+            advice = PATH_ADVICE.get(error.errno, "")
+            if advice not in (error.strerror or "") and not (reading and error.errno == errno.ENOENT):
+                error.strerror = f"{error.strerror}; {advice}"
+            error.filename = str(path)
+            del error.filename2
         raise
 
 
@@ -108,7 +120,7 @@ def write_through(path, write):
         If it cannot be written. It names `path`, and what stood there stands there still.
     """
     target = Path(os.path.realpath(path))
-    with _errors_name(path), TemporaryDirectory(suffix=UNFINISHED, dir=target.parent) as folder:
+    with path_errors(path), TemporaryDirectory(suffix=UNFINISHED, dir=target.parent) as folder:
         part, old = Path(folder, f"new{target.suffix.lower()}"), Path(folder, "old")
         write(part)
         if part.is_file():
@@ -146,7 +158,9 @@ def load_tree(path, kind):
     >>> load_tree(path, "numbers"), load_tree(path, "words")
     (({'a': array([1., 1.]), 'n': (3, None)},), None)
     """
-    with open(path, "rb") as file:
+    with path_errors(path, reading=True):
+        file = open(path, "rb")
+    with file:
         try:
             with np.load(file, allow_pickle=False) as stored:
                 words = json.loads(bytes(stored["arr_0"]).decode())

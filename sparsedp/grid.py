@@ -15,6 +15,7 @@ from itertools import compress
 
 import numpy as np
 
+from sparsedp.calls import public
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_number, check_type
 from sparsedp.markup import facts
@@ -28,6 +29,21 @@ __all__ = [
     "node_axes",
     "real_numbers",
 ]
+
+
+def _what_to_write(*shape, **options):
+    """The call in place of one that `Grid` refuses, such as Grid(64, 64) and Grid((64, 64), dx=0.1)."""
+    lengths = [n for n in shape if isinstance(n, (int, np.integer))]
+    if len(lengths) == len(shape) > 1:
+        return f"dp.Grid({tuple(map(int, lengths))})"
+    if len(shape) == 2:
+        return f"dp.Grid({shape[0]!r}, size={shape[1]!r})"
+    for name in options:
+        if name in ("dx", "h", "cell_size", "widths"):
+            return f"spacing={options[name]!r}"
+        if name in ("extent", "extents", "length", "lengths", "domain", "L"):
+            return f"size={options[name]!r}"
+    return "dp.Grid((64, 64), size=1.0)"
 
 
 class Grid(Value, Uncached):
@@ -73,6 +89,7 @@ class Grid(Value, Uncached):
     meant = {"dx": "grid.widths", "h": "grid.widths", "n": "grid.shape", "ndim": "grid.dim", "x": "grid.centres()[0]"}
     layout = None  # of a grid whose fields lie on ranks: see parallel/layout.py
 
+    @public("dp.Grid", _what_to_write)
     def __init__(self, shape, *, size=None, spacing=None, origin=0.0, periodic=False):
         shape = lengths(shape)
         if size is not None and spacing is not None:

@@ -7,8 +7,10 @@ from numbers import Number
 from typing import Any
 
 import numpy as np
+from scipy.sparse import issparse
 
 from sparsedp import kernels, results
+from sparsedp.calls import shortened
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_finite, check_native, check_out, check_shape, field_array
 from sparsedp.ledger import active
@@ -24,6 +26,7 @@ __all__ = ["Operator"]
 # Most unknowns for which one sparse product costs less than stencil passes, for each pass: see benchmarks/apply.py.
 EXPLICIT_BELOW_COMPILED = 4608
 EXPLICIT_BELOW_PLAIN = 262144
+AS_OPERATOR = "dp.from_matrix(M, A.domain, A.codomain)"  # a sparse matrix M beside an operator A
 SPY_BELOW = 20_000  # rows and columns of a matrix that a notebook draws: that takes 0.1 s
 
 
@@ -66,7 +69,10 @@ class Operator(Frozen, Remade):
         "dot": "op(u), or A @ B",
         "toarray": "op.matrix.toarray()",
         "todense": "op.matrix.toarray()",
+        "tocsr": "op.matrix",
+        "tocsc": "op.matrix.tocsc()",
         "nnz": "op.matrix.nnz",
+        "inv": "dp.inverse(op)",
         "H": "op.T; of complex entries from_matrix(op.matrix.conj().T)",
         "solve": "inv(b), with inv = dp.inverse(op)",
     }
@@ -93,7 +99,10 @@ class Operator(Frozen, Remade):
 
         Leading axes are a batch: from (50, *domain.shape) to (50, *codomain.shape).
         """
-        return apply_operator(self, u) if active or isbox(u) else self.apply(u)
+        try:
+            return apply_operator(self, u) if active or isbox(u) else self.apply(u)
+        except Exception as error:
+            raise shortened(error)  # noqa: B904 SPARSEDP_TRACEBACK=full keeps all frames
 
     def apply(self, u, out=None):
         """Apply to a plain array, without the tape.
@@ -187,6 +196,8 @@ class Operator(Frozen, Remade):
             check_shape(f"x of {self.name} @ x", other, (self.domain.size,), "; for a field write op(u)")
             return self._flat(other)
         check_native(self.name, other)
+        if issparse(other):
+            raise TypeError(f"{self.name} @ a sparse matrix is not defined; write A @ {AS_OPERATOR}")
         return NotImplemented
 
     def _compose(self, other):
@@ -203,6 +214,8 @@ class Operator(Frozen, Remade):
     def __add__(self, other):
         if isinstance(other, Number):
             raise TypeError(f"a number cannot be added to {self.name}; write {self.name} + c * dp.identity(space)")
+        if issparse(other):
+            raise TypeError(f"a sparse matrix cannot be added to {self.name}; write A + {AS_OPERATOR}")
         if not isinstance(other, Operator):
             return NotImplemented
         if not (fits(self.domain, other.domain) and fits(self.codomain, other.codomain)):
@@ -214,7 +227,13 @@ class Operator(Frozen, Remade):
     __radd__ = __add__  # for its advice: no sum of an operator and something else is defined
 
     def __sub__(self, other):
-        return self + other * -1.0 if isinstance(other, (Operator, Number)) else NotImplemented  # type: ignore[operator]
+        return self + other * -1.0 if isinstance(other, (Operator, Number)) or issparse(other) else NotImplemented
+
+    def __rsub__(self, other):
+        return self + other  # refused with advice
+
+    def __pow__(self, exponent):
+        raise TypeError(f"{self.name} ** {exponent!r} is not defined; write A @ A, or dp.power(A, exponent)(u)")
 
     def __neg__(self):
         return self * -1.0

@@ -7,6 +7,8 @@ from threading import local
 from types import MethodType
 from typing import Any
 
+from sparsedp.calls import shortened
+
 __all__ = ["Frozen", "Made", "Remade", "Uncached", "Value"]
 
 
@@ -80,7 +82,10 @@ class Made(Remade):
         self.name, self._function, self.made = build.__name__, function, (build, arguments)
 
     def __call__(self, *args, **options):
-        return self._function(*args, **options)
+        try:
+            return self._function(*args, **options)
+        except Exception as error:
+            raise shortened(error)  # noqa: B904 SPARSEDP_TRACEBACK=full keeps all frames
 
     def __repr__(self):
         return f"<function of {self.name}>"

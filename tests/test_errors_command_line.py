@@ -372,7 +372,7 @@ LONG = "a" * 5000
         (["report", "scene.py", "--out", LONG], r"a+\.\.\. cannot be made a folder: File name too long; name another "),
         (
             ["report", f"scene.py:{'b' * 255}"],
-            r".*b+\.\.\. cannot be written: File name too long; make room, or write ",
+            r".*b+\.\.\. cannot be written: File name too long; shorten the name, most file systems take up to 255 b",
         ),
         (["demo", "--out", LONG], r"a+\.\.\. cannot be made a folder: File name too long; name another with --out"),
         (["demo", "--input", f"{LONG}.npy"], r"a+\.\.\. is not there or is no plain file; give the path of a .npy, "),

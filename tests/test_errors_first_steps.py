@@ -21,7 +21,10 @@ WRONG = [
         lambda: dp.curl(GRID)(np.zeros((3, 2))), ShapeError,
         "curl takes a field on nodes(3, 2) of shape (4, 3), got an array of shape (3, 2)",
     ),
-    (lambda: LIFT(0.0), ShapeError, "lift takes a field on walls(3, 2) of shape (10,), got an array of shape ()"),
+    (
+        lambda: LIFT(0.0), ShapeError,
+        "lift takes a field on walls(3, 2) of shape (10,), got an array of shape (); write np.full((10,), 0.0)",
+    ),
     (
         lambda: LIFT([np.zeros(2), np.zeros(2), np.zeros(3), np.zeros(3)]), ShapeError,
         "lift takes one array on walls(3, 2) of shape (10,), got 4 parts; write op.domain.join(*parts)",
@@ -89,11 +92,12 @@ WRONG = [
     (lambda: LIFT.toarray(), AttributeError, "Operator has no attribute 'toarray'; write op.matrix.toarray()"),
     (
         lambda: dp.minimize(lambda x: x**2, 1.0, tol=1e-3), TypeError,
-        "lbfgs has no option 'tol'; it has memory, line_search; write 'tolerance'",
+        "lbfgs has no option 'tol'; it has memory, line_search; write tolerance=...",
     ),
     (
         lambda: dp.minimize(lambda x: x**2, 1.0, jac=True), TypeError,
-        "lbfgs has no option 'jac'; it has memory, line_search",
+        "lbfgs has no option 'jac'; it has memory, line_search; write gradient=function, or leave it out: it is "
+        "computed in reverse mode",
     ),
     (
         lambda: dp.minimize(lambda x: x**2, 1.0, method="L-BFGS-B"), ValueError,
@@ -111,8 +115,8 @@ WRONG = [
     ),
     (
         lambda: dp.value_and_grad(lambda x: anp.sum(x**2), np.ones(2)), ValueError,
-        "argnum of value_and_grad must be a whole number >= 0, got array([1., 1.]); write 0 for the first argument, "
-        "and value_and_grad(loss)(x) for the gradient at x",
+        "argnum of value_and_grad must be a whole number >= 0, got an array of shape (2,); write 0 for the first "
+        "argument, and value_and_grad(loss)(x) for the gradient at x",
     ),
     (
         lambda: dp.check.gradient(dp.value_and_grad(lambda x: anp.sum(x**2)), np.ones(2)), ShapeError,

@@ -26,6 +26,7 @@ import sparsedp
 
 FLOORS = [
     ("errors", -1),
+    ("calls", -1),
     ("tape_constants", 0),
     ("shortcuts", 0),
     ("tree", 0),

@@ -111,7 +111,7 @@ def test_a_shorter_series_leaves_no_file_of_the_longer_one(tmp_path):
     path = tmp_path / "missing" / "a.pvd"
     with pytest.raises(FileNotFoundError) as caught:
         dp.save(path, FLAT, times=[0.0], u=u[:1])
-    assert str(caught.value) == f"[Errno 2] No such file or directory: '{path}'"
+    assert str(caught.value) == f"[Errno 2] No such file or directory; create the folder first: '{path}'"
 
 
 @pytest.mark.parametrize("suffix", [".vti", ".vtr"])

@@ -1,1 +1,7 @@
 """Transport of a field by a velocity: one differentiable rule for each scheme."""
+
+from sparsedp.calls import describe_module
+
+__all__: list[str] = []
+
+describe_module(__name__, "dp.transport(grid)")

@@ -10,6 +10,7 @@ from sparsedp.advection.rule import rule_of
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.advection.values import check_step, flat_numbers
 from sparsedp.boundary_conditions import dirichlet, neumann, resolve
+from sparsedp.calls import public
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import check_choice
 from sparsedp.grid import check_grid
@@ -163,6 +164,7 @@ class Transport(Frozen, Remade):
         """The call that makes it again: see recipe.py."""
         return Transport, (self.setting,)
 
+    @public("dp.transport(grid)")
     def __call__(self, u, v, dt, inflow=0.0):
         """The field after one step; differentiable in every argument; the result is fresh."""
         return self._rule(u, v, dt, inflow)

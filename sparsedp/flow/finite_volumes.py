@@ -27,6 +27,7 @@ import numpy as np
 
 from sparsedp.boundary_conditions import free_slip, outflow, resolve
 from sparsedp.boundary_conditions import inflow as inflow_side
+from sparsedp.calls import public
 from sparsedp.derivative import entrywise
 from sparsedp.errors import ShapeError
 from sparsedp.fields import (
@@ -186,6 +187,7 @@ class ConservationLaw(Remade):
             for axis in range(grid.dim if grid.cells.size else 0)
         ]
 
+    @public("dp.conservation_law(grid, flux, speed)")
     def __call__(self, u, params=None):
         """State -> its rate of change.
 

@@ -23,6 +23,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.boundary_conditions import no_slip, resolve
+from sparsedp.calls import public
 from sparsedp.fields import check_finite, check_kind, check_number, field_array
 from sparsedp.flow.momentum import face_laplacian, momentum_fluxes, stresses
 from sparsedp.flow.projection_setup import pressure_conditions
@@ -193,6 +194,7 @@ class Forces(Remade):
         self.carried, self.carrier, gain = momentum_fluxes(grid, sides)
         self.viscous, self.pressure, self.gain = self.total @ viscous, -self.total @ slope, self.total @ gain
 
+    @public("dp.forces(grid, solid)")
     def __call__(self, v, p, viscosity):
         check_number("the viscosity of forces", plain(viscosity), ">= 0")  # an array would be spread over the torque
         total = viscosity * self.viscous(v) + self.pressure(p) - self.gain(self.carried(v) * self.carrier(v))

@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 
 from sparsedp.boundary_conditions import neumann, no_slip
+from sparsedp.calls import public
 from sparsedp.errors import DerivativeError, ShapeError, UnstableStepError
 from sparsedp.fields import (
     check_choice,
@@ -230,6 +231,7 @@ class FlowStep(Remade):
         state = {"v": v, "p": p, "a": self.acceleration(v, params, s, self._rub(params))}
         return state | ({"s": s, "r": self._rates(v, s, params)} if s else {})
 
+    @public("dp.flow_step(grid, dt)")
     def __call__(self, state, params=None):
         parts = ["v", "p", "a", *(["s", "r"] if self.scalars else [])]
         if not isinstance(state, dict) or state.keys() != set(parts):

@@ -3,9 +3,10 @@
 import numpy as np
 from scipy.sparse.linalg import ArpackError, eigsh
 
+from sparsedp.calls import public
 from sparsedp.derivative import is_finite
 from sparsedp.errors import NonFiniteError, UnstableStepError
-from sparsedp.fields import check_choice, check_finite, check_number, rounded_down
+from sparsedp.fields import advise, check_choice, check_finite, check_number, rounded_down
 from sparsedp.integrators.problem import Problem, like, number, pair
 from sparsedp.integrators.runge_kutta import (
     EXPLICIT,
@@ -158,7 +159,7 @@ def stepper(
     (1.5, -0.375)
     """
     given = copied(locals())  # the caller may reuse the arrays
-    check_choice("method", method, METHODS)
+    check_choice("method", method, METHODS, "; write stepper('rk4', rate, dt)" if callable(method) else "")
     check_choice("unstable", unstable, ("raise", "allow"))
     known = {word: value for word, value in options.items() if word != "sparsity"}  # which `implicit` takes
     settings = check_settings(solver, rtol, maxiter, "raise", known) | dict(options=given["options"])
@@ -256,6 +257,7 @@ class Step(Remade):
     def taken(self):
         return getattr(self.scheme, "taken", [1.0])
 
+    @public("dp.stepper(method, rate, dt)")
     def __call__(self, state, params=None, *inputs):
         """One step.
 
@@ -281,6 +283,9 @@ class Step(Remade):
             new = like(self.scheme(u, params, t, h), u)
         except NonFiniteError:  # a solver on the way may have met it: name the argument
             self._blame(state, params)
+            raise
+        except TypeError as error:
+            advise(error, params, "step(state, params)")
             raise
         if not all(is_finite(leaf) for leaf in leaves(new) if is_variable(leaf)):
             self._blame(state, params)

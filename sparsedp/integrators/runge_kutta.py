@@ -50,7 +50,6 @@ from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.ledger import note
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_matrix
-from sparsedp.operators.masks_and_lift import identity
 from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.choose_method import build
 from sparsedp.solvers.nullspace import Projector
@@ -216,6 +215,8 @@ class Resolvent:
     """
 
     def __init__(self, op, name, settings, most=2, log=None):
+        from sparsedp.operators.masks_and_lift import identity  # explicit schemes do without
+
         self.op, self.name, self.settings, self._one = op, name, settings, identity(op.domain)
         self.info, self._inverse = log or SolveLog(), lru_cache(most)(self._set_up)
 

@@ -9,6 +9,8 @@ A library is imported when one of its two names is first used.
 
 from importlib import import_module
 
+from sparsedp.calls import describe_module, public_name
+
 __all__ = ["from_jax", "from_torch", "from_xarray", "to_jax", "to_torch", "to_xarray"]
 
 EXTRAS = {  # of each library, and the module with its two functions
@@ -24,6 +26,11 @@ def __getattr__(name):
     library = name.partition("_")[2]
     extra, module = EXTRAS[library]
     try:
-        return getattr(import_module(module), name)
+        function = getattr(import_module(module), name)
     except ImportError as error:
         raise ImportError(f"dp.interop.{name} needs {library}; install sparsedp[{extra}]") from error
+    globals()[name] = public_name(function, __name__, name)
+    return globals()[name]
+
+
+describe_module(__name__, "dp.interop.to_torch(f)")

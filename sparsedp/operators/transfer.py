@@ -85,7 +85,8 @@ def sample(grid, points):
     if points.ndim == 1 and grid.dim == 1:
         points = points[:, None]
     if points.ndim != 2 or points.shape[1] != grid.dim:
-        raise ShapeError(f"sample needs points of shape (m, {grid.dim}), got an array of shape {points.shape}")
+        advice = f"; write [{given.tolist()}] for one point" if given.shape == (grid.dim,) else ""
+        raise ShapeError(f"sample needs points of shape (m, {grid.dim}), got an array of shape {points.shape}{advice}")
     if not grid.cells.size:
         raise ShapeError(f"sample needs a grid with cells, got {grid}")
     check_finite("points", given, "need finite coordinates")

@@ -1,1 +1,7 @@
 """Optimization over any nesting of arrays: minimize() and its methods."""
+
+from sparsedp.calls import describe_module
+
+__all__: list[str] = []
+
+describe_module(__name__, "dp.minimize(loss, start)")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.files import UNFINISHED, load_tree, save_tree
+from sparsedp.files import UNFINISHED, load_tree, path_errors, save_tree
 from sparsedp.optimize.result import Failure, Record, Trial
 from sparsedp.shortcuts import ranks, whole
 from sparsedp.tree import flatten, leaves, norm
@@ -49,7 +49,8 @@ class Checkpoint:
         """
         if self._folder is None:
             return None
-        self._folder.mkdir(parents=True, exist_ok=True)
+        with path_errors(self._folder):
+            self._folder.mkdir(parents=True, exist_ok=True)
         self._settings = {name: fingerprint(value) for name, value in self._settings.items()}
         self._settings["list of batches"] = ""
         content, skipped = self._load()

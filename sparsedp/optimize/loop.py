@@ -35,6 +35,26 @@ METHODS = {
 }
 
 
+# Options of scipy.optimize.minimize and of optimizers in torch and optax: what to write in their place.
+ELSEWHERE_CALLED = {
+    "args": "loss=lambda x: loss(x, *args)",
+    "constraints": "bounds=(lower, upper), project= for linear equations, or a penalty added to the loss",
+    "epochs": "maxiter=...",
+    "grad": "gradient=function, or leave it out: it is computed in reverse mode",
+    "hess": "method='newton_cg', which computes products with the Hessian",
+    "hessp": "method='newton_cg', which computes products with the Hessian",
+    "iterations": "maxiter=...",
+    "jac": "gradient=function, or leave it out: it is computed in reverse mode",
+    "learning_rate": "method='adam', rate=...",
+    "lr": "method='adam', rate=...",
+    "n_iter": "maxiter=...",
+    "optimizer": "method='adam'",
+    "options": "the options themselves as keyword arguments, as in memory=20",
+    "steps": "maxiter=...",
+    "tol": "tolerance=...",
+}
+
+
 def minimize(
     loss,
     start,
@@ -232,5 +252,9 @@ def _stepper(method, options):
 def _check_options(method, options, names):
     for name in options:
         if name not in names:
-            near = advice_near(name, [*names, *inspect.signature(minimize).parameters])
+            if name in ELSEWHERE_CALLED:
+                near = f"; write {ELSEWHERE_CALLED[name]}"
+            else:
+                parameters = [word for word in inspect.signature(minimize).parameters if word != "options"]
+                near = advice_near(name, [*names, *parameters])
             raise TypeError(f"{method} has no option {name!r}; it has {', '.join(names)}{near}")

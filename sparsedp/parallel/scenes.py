@@ -3,6 +3,7 @@
 import os
 import pickle
 from collections import OrderedDict
+from collections.abc import Iterable
 from hashlib import sha256
 from platform import node
 from threading import RLock
@@ -11,6 +12,7 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.calls import public
 from sparsedp.derivative import check_loss, grad, jvp, value_and_grad, zero_like
 from sparsedp.fields import check_finite, check_function, check_shape, check_whole, is_whole
 from sparsedp.progress import shown_steps
@@ -96,6 +98,10 @@ class Ensemble(Remade):
 
     def __init__(self, loss, scenes, executor=None, weights=None, chunk=None, progress=False):
         check_function("ensemble", loss, "lambda x, scene: ...")
+        if not isinstance(scenes, Iterable):
+            raise TypeError(
+                f"ensemble takes a list of scenes, got {scenes!r}; write [first, second, ...], or range(n) for numbers"
+            )
         scenes = [*map(copied, scenes)]
         self.count = len(scenes)
         if not scenes:
@@ -119,6 +125,7 @@ class Ensemble(Remade):
     def __repr__(self):
         return f"<ensemble of {self.count} scenes>"
 
+    @public("dp.ensemble(loss, scenes)")
     def __call__(self, x, numbers=None):
         numbers = list(range(self.count) if numbers is None else numbers)
         for number in numbers:

@@ -13,6 +13,9 @@ demo/                the command `demo`
 It may import every floor; only __main__ and the shop window open it.
 """
 
+from sparsedp.calls import describe_module
 from sparsedp.report.plots import animate, convergence, plot, v_curve
 
 __all__ = ["animate", "convergence", "plot", "v_curve"]
+
+describe_module(__name__, "dp.explain(loss, x), or python -m sparsedp report scene.py")

@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import tracemalloc
+from collections.abc import Iterable
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from math import inf, isfinite, nan
@@ -20,7 +21,7 @@ from sparsedp.check.table import table_of
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.fields import check_function, check_whole
-from sparsedp.files import write_file
+from sparsedp.files import path_errors, write_file
 from sparsedp.ledger import recording
 from sparsedp.report import plots
 from sparsedp.report.certificate import distance
@@ -115,6 +116,9 @@ def workprec(
     repeats = check_whole("repeats of workprec", repeats, 1, "; the default is 3")
     if not methods or not isinstance(methods, dict):
         raise ValueError("workprec needs at least one method; write {'name': {settings}}")
+    for name, values in (over or {}).items():
+        if isinstance(values, str) or not isinstance(values, Iterable):
+            raise TypeError(f"over of workprec takes a list of values for {name!r}, got {values!r}; write [{values!r}]")
     scene, over, now, rows = scene or getattr(problem, "__name__", "scene"), over or {}, _versions(), []
     finished = {tuple(map(row.get, KEY)): row for row in _stored(file)}
     compare, known = compare or distance, {}
@@ -386,7 +390,8 @@ class Rows(Result):
         OSError.
         """
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        with path_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
         return plots.write_result(self, folder, self.stem, self.plot)
 
 
@@ -397,7 +402,9 @@ def _stored(file):
     """CSV file -> its rows, without one that was cut off; none without a file."""
     if not file or not os.path.exists(file):
         return []
-    with open(file, encoding="utf-8", newline="") as stream:
+    with path_errors(file, reading=True):
+        stream = open(file, encoding="utf-8", newline="")
+    with stream:
         reader = csv.DictReader(stream)
         if reader.fieldnames not in (None, list(COLUMNS)):
             raise ValueError(f"{Path(file).name} is no table of workprec; give another file name")

@@ -6,6 +6,7 @@ from time import perf_counter
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.calls import public
 from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
 from sparsedp.fields import (
     advice_near,
@@ -181,13 +182,20 @@ def _set_up(solver, clock):
 
 def check_settings(method, rtol, maxiter, nullspace, options):
     """Refuse settings that the method, or with "auto" every method, cannot take -> them, as keywords of `build`."""
-    check_choice("method", method, ("auto", *METHODS), f"; write {MEANT[method]!r}" if method in MEANT else "")
+    check_choice("method", method, ("auto", *METHODS), _advice(method))
     rtol = check_number("rtol", rtol, "between 0 and 1", "; the default is 1e-10")
     if maxiter is not None:
         maxiter = check_whole("maxiter", maxiter, 1, "; None leaves it to the method")
     check_choice("nullspace", nullspace, ("raise", "project"))
     _check_options(method, options)
     return dict(method=method, rtol=rtol, maxiter=maxiter, nullspace=nullspace, options=copied(options))
+
+
+def _advice(method):
+    """Advice for what is no method: the method of another name, or where a field belongs."""
+    if isinstance(method, np.ndarray):
+        return "; write dp.inverse(op)(b) for a right-hand side b"
+    return f"; write {MEANT[method]!r}" if isinstance(method, str) and method in MEANT else ""
 
 
 def _check_options(word, options):
@@ -371,6 +379,7 @@ class Inverse(Operator):
 
     # ------------------------------------------------------------ application
 
+    @public("dp.inverse(op)")
     def __call__(self, b, start=None):
         """Solve; differentiable in b. `start`: first guess, which saves iterations of iterative methods.
 

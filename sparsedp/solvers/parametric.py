@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.calls import public
 from sparsedp.derivative import of_argument
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_finite, check_kind, check_plain, check_shape, check_type
@@ -180,6 +181,7 @@ class EllipticSolver(ParametricSolver):
         """The call that makes it again: see recipe.py."""
         return EllipticSolver, (self.D, self.G, self._settings)  # what is cached is set up again
 
+    @public("dp.elliptic_solver(D, G)")
     def __call__(self, k, b, shift=0.0):
         """Solve (shift - D diag(k) G) x = b.
 
@@ -487,6 +489,7 @@ class MatrixSolver(ParametricSolver):
         matrix = sp.csr_array((np.full(place.size, sign), place, np.arange(place.size + 1)), shape=shape)
         return from_matrix(matrix, self.domain, name="entries")
 
+    @public("dp.matrix_solver(pattern)")
     def __call__(self, data, b):
         """Solve A x = b.
 

@@ -12,6 +12,7 @@ from threading import get_ident
 
 import numpy as np
 
+from sparsedp.calls import public
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import check_function, check_takes, check_whole
@@ -204,6 +205,7 @@ class Root(Remade):
         finally:
             del self._series[get_ident()]
 
+    @public("dp.implicit(residual)")
     def __call__(self, guess, *params):
         """Solve residual(x, *params) = 0 from a guess.
 

@@ -1,5 +1,6 @@
 """Fields with their grid in files: what the end of a name means."""
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -165,6 +166,8 @@ def load(path):
 
 
 def _suffix(name, path, allowed):
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"{name} takes the path of a file first, got {type(path).__name__}; write 'fields.npz'")
     suffix = Path(path).suffix.lower()
     if suffix not in allowed:
         *others, last = allowed

@@ -12,7 +12,7 @@ import xarray
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_type
-from sparsedp.files import write_file, write_through
+from sparsedp.files import path_errors, write_file, write_through
 from sparsedp.grid import AXES, check_grid, node_axes
 from sparsedp.storage.contents import KIND, check_fields, check_names
 
@@ -180,10 +180,11 @@ def _is_zarr(path):
 
 def read_dataset(path):
     """File that `write_dataset` wrote -> (what `save` puts into .npz,); None when it is another file, or changed."""
-    if _is_zarr(path):  # what is not there or may not be read is not damaged
-        os.scandir(path).close()
-    else:
-        open(path, "rb").close()
+    with path_errors(path, reading=True):  # what is not there or may not be read is not damaged
+        if _is_zarr(path):
+            os.scandir(path).close()
+        else:
+            open(path, "rb").close()
     try:
         engine = "zarr" if _is_zarr(path) else "h5netcdf"
         with xarray.open_dataset(path, engine=engine, mask_and_scale=False, decode_times=False) as stored:

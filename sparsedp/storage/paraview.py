@@ -7,7 +7,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from pyevtk.hl import gridToVTK, imageToVTK
 
-from sparsedp.files import write_file, write_through
+from sparsedp.files import path_errors, write_file, write_through
 from sparsedp.grid import node_axes
 
 __all__ = ["write_grid", "write_series"]
@@ -16,11 +16,8 @@ __all__ = ["write_grid", "write_series"]
 def write_series(path, grid, times, content):
     """Fields at each time -> a file in the folder that is called as `path` without .pvd, and then `path` itself."""
     folder = Path(path).with_suffix("")
-    try:
+    with path_errors(path):
         folder.mkdir(exist_ok=True)
-    except FileNotFoundError as error:
-        error.filename = str(path)
-        raise
     entries = []
     for number, time in enumerate(times):
         place = f"{folder.name}/{number:04}.vtr"

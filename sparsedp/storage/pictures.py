@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from sparsedp.files import path_errors
+
 __all__ = ["from_image"]
 
 SHADES = {"1": 1, "L": 255, "P": 255, "RGB": 255, "I;16": 65535, "I;16L": 65535, "I;16B": 65535}  # what counts as white
@@ -44,7 +46,9 @@ def from_image(path):
         from PIL import Image, ImageOps
     except ImportError as error:
         raise ImportError("from_image needs Pillow; install sparsedp[plot]") from error
-    with Image.open(path) as stored:
+    with path_errors(path, reading=True):
+        picture = Image.open(path)
+    with picture as stored:
         image = ImageOps.exif_transpose(stored)
         if image.mode not in SHADES or "transparency" in image.info:
             raise ValueError(

@@ -177,7 +177,7 @@ def _warn_of_repeats(memory, size, n, beside):
                 f"rollout runs {n} steps {many:.3g} times each within memory={memory!r}, and {few:.3g} times with "
                 f"more; write memory={more}"
             ),
-            stacklevel=3,
+            stacklevel=4,  # the caller of the public function, which is wrapped once
         )
 
 

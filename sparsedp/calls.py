@@ -1,0 +1,224 @@
+"""Calls of public functions: advice for calls that do not fit the signature, and tracebacks without internal frames.
+
+``SPARSEDP_TRACEBACK=full`` in the environment keeps every frame.
+"""
+
+import os
+import sys
+from difflib import get_close_matches
+from functools import wraps
+from inspect import Parameter, signature
+from types import FunctionType, ModuleType, TracebackType
+
+__all__ = ["advice_near", "describe_module", "public", "public_name", "shortened"]
+
+# Packages whose frames stand between a user's call and the error: the library, and what runs its code.
+HIDDEN = ("sparsedp", "autograd", "functools", "contextlib", "scipy", "pyamg")
+# Keyword arguments of other libraries: the parameters that take their place, the first that a function has.
+SYNONYMS = {
+    "argnums": ("argnum",),
+    "bc": ("boundary",),
+    "bcs": ("boundary",),
+    "boundaries": ("boundary",),
+    "boundary_conditions": ("boundary",),
+    "fun": ("loss", "fun"),
+    "jac": ("gradient", "jacobian"),
+    "max_iter": ("maxiter",),
+    "max_iterations": ("maxiter",),
+    "max_workers": ("executor",),
+    "n_jobs": ("executor",),
+    "n_steps": ("n",),
+    "num_steps": ("n",),
+    "order": ("scheme", "method"),
+    "parameters": ("params",),
+    "solver": ("method",),
+    "steps": ("n",),
+    "timestep": ("dt",),
+    "tol": ("tolerance", "rtol"),
+    "u0": ("start",),
+    "workers": ("executor",),
+    "x0": ("start", "guess", "x"),
+}
+# Calls whose required parameters alone do not tell what to write.
+EXAMPLES = {
+    "dp.ensemble": "dp.ensemble(loss, scenes), and executor=concurrent.futures.ProcessPoolExecutor(2) for processes",
+    "dp.hvp": "dp.hvp(loss, x, tangent)",
+    "dp.rollout": "dp.rollout(step, start, params, n), with params=None if the step has none",
+    "dp.save": "dp.save('run.npz', grid, u=u)",
+    "dp.stepper": "dp.stepper('rk4', rate, dt)",
+}
+
+
+def advice_near(word, words):
+    """Advice to write the one of some words that is most like one which is none of them; empty if none is."""
+    word = str(word).lower()
+    near = [one for one in words if word and one.startswith(word)] or get_close_matches(word, words)
+    return f"; write {near[0]!r}" if near else ""
+
+
+def public(written, advice=None):
+    """Decorate a public function: add advice to calls that do not fit, and remove internal frames from tracebacks.
+
+    Parameters
+    ----------
+    written : str
+        What a user writes in front of the parentheses, such as ``"dp.rollout"``.
+    advice : callable, optional
+        ``advice(*args, **options)`` returns what to write in place of a wrong call, or None for the default. It is
+        called with the arguments of that call.
+
+    Returns
+    -------
+    callable
+        The decorator. What it returns has the signature, docstring and name of the function.
+
+    Examples
+    --------
+    >>> @public("dp.plot")
+    ... def plot(grid, u): ...
+    >>> plot(1)
+    Traceback (most recent call last):
+        ...
+    TypeError: dp.plot needs the argument 'u'; write dp.plot(grid, u)
+    """
+
+    def decorate(function):
+        @wraps(function)
+        def call(*args, **options):
+            try:
+                return function(*args, **options)
+            except Exception as error:
+                error = _call_error(error, function, written, advice, args, options)
+                raise shortened(error)  # noqa: B904 SPARSEDP_TRACEBACK=full keeps all frames
+
+        return call
+
+    return decorate
+
+
+def _call_error(error, function, written, advice, args, options):
+    """Return a TypeError with advice if the arguments do not fit the signature of a function, else the error."""
+    raised_by_the_call = error.__traceback__.tb_next is None
+    if not (isinstance(error, TypeError) and raised_by_the_call):
+        return error
+    form = signature(function)
+    try:
+        form.bind(*args, **options)
+    except TypeError:
+        return _misfit(form, written, advice, args, options).with_traceback(error.__traceback__)
+    return error
+
+
+def _misfit(form, written, advice, args, options):
+    parameters = {name: parameter for name, parameter in form.parameters.items() if name != "self"}
+    given = args[1:] if "self" in form.parameters else args
+    example = advice(*given, **options) if advice else None
+    example = example or EXAMPLES.get(written) or _example(written, parameters)
+    takes_any_keyword = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values())
+    for name in options:
+        if name not in parameters and not takes_any_keyword:
+            return TypeError(f"{written} has no argument {name!r}; write {_instead(name, parameters) or example}")
+    by_position = Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD
+    positional = [parameter for parameter in parameters.values() if parameter.kind in by_position]
+    if len(given) > len(positional):
+        return TypeError(f"{written} takes {len(positional)} by position, got {len(given)}; write {example}")
+    for name, parameter in parameters.items():
+        filled = name in options or parameter in positional[: len(given)]
+        if _is_required(parameter) and not filled:
+            return TypeError(f"{written} needs the argument {name!r}; write {example}")
+    return TypeError(f"{written} was given an argument twice, by position and by name; write {example}")
+
+
+def _instead(name, parameters):
+    """What to write for a keyword argument that a function does not have, or None."""
+    for synonym in SYNONYMS.get(name.lower(), ()):
+        if synonym in parameters:
+            return f"{synonym}=..."
+    near = advice_near(name, list(parameters)).removeprefix("; write ").strip("'")
+    return f"{near}=..." if near else None
+
+
+def _example(written, parameters):
+    """A call with the required arguments."""
+    return f"{written}({', '.join(name for name, parameter in parameters.items() if _is_required(parameter))})"
+
+
+def _is_required(parameter):
+    return parameter.default is Parameter.empty and parameter.kind not in (
+        Parameter.VAR_POSITIONAL,
+        Parameter.VAR_KEYWORD,
+    )
+
+
+def shortened(error):
+    """Remove internal frames from the traceback of an error and of its causes; the frame that raised it stays.
+
+    Returns
+    -------
+    Exception
+        The same object.
+    """
+    if os.environ.get("SPARSEDP_TRACEBACK") == "full":
+        return error
+    seen: set = set()
+    link = error
+    while link is not None and id(link) not in seen:
+        seen.add(id(link))
+        link.__traceback__ = _without_internal_frames(link.__traceback__)
+        link = link.__cause__ or link.__context__
+    return error
+
+
+def _without_internal_frames(traceback):
+    entries = []
+    while traceback is not None:
+        entries.append(traceback)
+        traceback = traceback.tb_next
+    kept = [entry for entry in entries[:-1] if _is_of_the_user(entry.tb_frame)] + entries[-1:]
+    following = None
+    for entry in reversed(kept):
+        following = TracebackType(following, entry.tb_frame, entry.tb_lasti, entry.tb_lineno)
+    return following
+
+
+def _is_of_the_user(frame):
+    return frame.f_globals.get("__name__", "").partition(".")[0] not in HIDDEN
+
+
+class _CallableModule(ModuleType):
+    """A public module that tells what to write when it is called like a function."""
+
+    def __call__(self, *args, **options):
+        raise TypeError(f"{self.__name__} is a module; write {self._example}")
+
+    def __getattr__(self, name):
+        if "__getattr__" in vars(self):  # the module's own, which has been asked in vain: its error is the answer
+            return vars(self)["__getattr__"](name)
+        raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}{advice_near(name, self.__all__)}")
+
+
+def describe_module(name, example):
+    """Let calls of a module, and of its public functions, tell what to write.
+
+    Parameters
+    ----------
+    name : str
+        Of the module, such as ``"sparsedp.check"``.
+    example : str
+        What to write in place of a call of the module.
+    """
+    module = sys.modules[name]
+    module.__class__ = _CallableModule
+    vars(module)["_example"] = example
+    for word in module.__all__:
+        function = vars(module).get(word)  # some modules import a function when it is first used
+        if type(function) is FunctionType:
+            setattr(module, word, public_name(function, name, word))
+
+
+def public_name(function, module, name):
+    """Wrap a function for the public module that shows it under a name."""
+    written = f"{module.replace('sparsedp', 'dp', 1)}.{name}"
+    wrapped = public(written)(function)
+    wrapped.__module__ = module  # pickle looks for the function there
+    return wrapped
