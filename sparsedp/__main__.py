@@ -24,6 +24,7 @@ LOOPS = [  # where loops are defined
     "sparsedp.kernels.interpolation",
     "sparsedp.kernels.projection",
     "sparsedp.kernels.stencil",
+    "sparsedp.kernels.substitution",
     "sparsedp.solvers.multigrid.loops",
 ]
 

@@ -54,10 +54,17 @@ def _types(words):
     from numba import types
 
     numbers = {"int": types.int64, "real": types.float64, "flag": types.boolean}
-    entries = {"read": types.float64, "write": types.float64, "index": types.int64, "mask": types.boolean}
+    entries = {
+        "read": types.float64,
+        "write": types.float64,
+        "index": types.int64,
+        "place": types.int32,
+        "mask": types.boolean,
+    }
+    marked = {"^": types.float32, "*": types.complex128}
     for word in words.split():
-        kind, axes = word.strip("~^")[:-1], word[-1]
-        entry = types.float32 if "^" in word else entries.get(kind)
+        kind, axes = word.strip("~^+*")[:-1], word[-1]
+        entry = marked.get(word[0]) or entries.get(kind)
         yield numbers.get(word) or types.Array(entry, int(axes), "C", readonly=kind != "write")
 
 
@@ -87,8 +94,9 @@ class Kernel:
         Its last two arguments are the rows it works on, `start` and `stop`.
     words : str
         The types of its other arguments: read1 to read4 (may be read-only), write1 to write4 (float64), index1 to
-        index4 (int64), mask1 to mask4 (bool), real, int, flag. With ~ before it an array is of float32 in `single`,
-        where ^ stands for it.
+        index4 (int64), place1 to place4 (int32, may be read-only), mask1 to mask4 (bool), real, int, flag. With ~
+        before it an array is of float32 in `single`, where ^ stands for it; with + of complex128 in `complex`, where
+        * stands for it.
     uses : tuple of functions
         That the loop calls, and these functions themselves. They are compiled once for all loops that use them, and
         stand in the same file: that is where numba looks whether what it has kept is still good.
@@ -103,12 +111,15 @@ class Kernel:
     ----------
     single : Kernel
         The same loop for arrays of float32, where its words have a ~.
+    complex : Kernel
+        The same loop for arrays of complex128, where its words have a +.
     """
 
     def __init__(self, loop, words, uses=(), given=None, name=None, **options):
         self.loop, self.words, self.uses, self.given, self.options = loop, words, uses, given or {}, options
         self.name, self.__doc__ = name or loop.__name__, loop.__doc__
         self.single = Kernel(loop, words.replace("~", "^"), uses, given, name, **options) if "~" in words else self
+        self.complex = Kernel(loop, words.replace("+", "*"), uses, given, name, **options) if "+" in words else self
         loops.append(self)
 
     @functools.cached_property

@@ -72,7 +72,7 @@ def _matrix(shape, indptr, columns, data, layout):
 class RanksSystem(System):
     """What the contract and the engine ask of the operator, for fields on ranks. Arrays are flat blocks."""
 
-    faces = last = None
+    faces = splitting = None
     here: Any = 0
 
     def __init__(self, op, rtol=1e-10, maxiter=None):

@@ -14,15 +14,27 @@ import scipy.linalg as la
 from scipy.sparse import csr_array, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from sparsedp.errors import ConvergenceError
 from sparsedp.fields import check_choice, check_number, check_whole
 from sparsedp.solvers.krylov import Krylov
 from sparsedp.solvers.scaling import exponent_of
+from sparsedp.solvers.solve import failure
 
-__all__ = ["Hierarchy", "Level", "Multigrid", "coarse_solver", "coloured_graph", "multigrid_engine", "ruge_stueben"]
+__all__ = [
+    "Hierarchy",
+    "Level",
+    "Multigrid",
+    "check_multigrid_options",
+    "coarse_solver",
+    "coloured_graph",
+    "multigrid_engine",
+    "ruge_stueben",
+]
 
 CYCLES = {"V": 1, "W": 2}
 SWEEPS = {"forward": "backward", "backward": "forward"}  # each with its mirror image
-COARSEST = 100  # unknowns that are solved densely
+COARSEST = 100  # unknowns up to which a level is not coarsened further, but solved by a dense matrix
+DENSE_UP_TO = 2000  # unknowns of a coarsest level, where coarsening ends before: its matrix takes 32 MB
 MAXITER = 200
 RESIDUE = 1e-13  # share of the entries that were added up, below which a row of a coarse level is rounding
 
@@ -52,20 +64,17 @@ def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), 
     ------
     ValueError
         If the diagonal has both signs or a zero, there are no entries, or an option is out of range.
+    ConvergenceError
+        With status setup_failed, when coarsening ends at a level of more than 2000 unknowns.
 
     Notes
     -----
+    The coarsest level is solved by a dense matrix. It has at most 100 unknowns, or 2000 where `levels` is reached or
+    the matrix does not coarsen further.
     Set-up: deterministic. Source: Ruge and Stueben, Algebraic Multigrid, in Multigrid Methods, SIAM, 1987;
     PyAMG, Bell, Olson and Schroder, J. Open Source Software 7, 2022.
     """
-    check_choice("cycle", cycle, CYCLES, "; the F cycle has no transpose of its own kind")
-    strength = check_number("strength", strength, "from 0 to below 1", "; the default is 0.25")
-    if not _are_sweeps(sweeps):
-        raise ValueError(
-            f"sweeps must be two tuples of 'forward' and 'backward', got {sweeps!r}; "
-            "write for example (('forward',), ('backward',))"
-        )
-    levels = check_whole("levels", levels, 1, "; the default is 25")
+    strength, levels = check_multigrid_options(cycle, strength, sweeps, levels)
     if not system.op.structure.has_entries:
         raise ValueError(f"multigrid needs the entries, {system.given} only knows its products; write method='krylov'")
     if not system.sign:
@@ -75,6 +84,18 @@ def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), 
             "write method='direct'"
         )
     return Multigrid(system, CYCLES[cycle], strength, tuple(map(tuple, sweeps)), levels)
+
+
+def check_multigrid_options(cycle="V", strength=0.25, sweeps=(("forward",), ("backward",)), levels=25):
+    """Refuse options of `multigrid_engine` that are out of range; return `strength` and `levels` as numbers."""
+    check_choice("cycle", cycle, CYCLES, "; the F cycle has no transpose of its own kind")
+    strength = check_number("strength", strength, "from 0 to below 1", "; the default is 0.25")
+    if not _are_sweeps(sweeps):
+        raise ValueError(
+            f"sweeps must be two tuples of 'forward' and 'backward', got {sweeps!r}; "
+            "write for example (('forward',), ('backward',))"
+        )
+    return strength, check_whole("levels", levels, 1, "; the default is 25")
 
 
 def _are_sweeps(given):
@@ -98,7 +119,15 @@ class Multigrid(Krylov):
         unit = 2.0 ** -exponent_of(system.norm(False))  # PyAMG prints where entries are far from 1
         self._scale = unit * system.sign * (system.weights if self.symmetric else 1.0)
         matrix = csr_array(system.matrix * np.broadcast_to(self._scale, system.size)[:, None])
-        self.forward = Hierarchy(ruge_stueben(matrix, strength, levels), visits, *sweeps)
+        found = ruge_stueben(matrix, strength, levels)
+        coarsest = found[-1].A.shape[0]
+        if coarsest > DENSE_UP_TO:
+            raise ConvergenceError(
+                f"multigrid on {system.given} ends at a coarsest level of {coarsest} unknowns, after {len(found)} of "
+                f"{levels} levels; it may have {DENSE_UP_TO}; write method='direct' or 'krylov', or raise levels",
+                info=failure("setup_failed"),
+            )
+        self.forward = Hierarchy(found, visits, *sweeps)
         self.hierarchy = self.forward.words
 
     def precondition(self, r, transposed):

@@ -2,6 +2,7 @@
 
 import inspect
 from time import perf_counter
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
@@ -23,8 +24,8 @@ from sparsedp.markup import facts
 from sparsedp.operator import Operator
 from sparsedp.operators.given import check_operator
 from sparsedp.shortcuts import together
-from sparsedp.solvers.amg import multigrid_engine
-from sparsedp.solvers.direct import DenseSystem, dense_engine, direct_engine
+from sparsedp.solvers.amg import check_multigrid_options, multigrid_engine
+from sparsedp.solvers.direct import DenseSystem, check_precision, dense_engine, direct_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
 from sparsedp.solvers.preconditioners import Near, krylov_engine
 from sparsedp.solvers.separable import eigenbasis, separable_engine, transforming
@@ -45,6 +46,8 @@ METHODS = {
     "multigrid": multigrid_engine,
     "krylov": krylov_engine,
 }
+# What refuses the values of options where the method itself is not needed.
+CHECKS = {"direct": check_precision, "structured": check_precision, "multigrid": check_multigrid_options}
 MEANT = {"cg": "krylov", "gmres": "krylov", "amg": "multigrid", "mg": "structured", "lu": "direct", "fft": "separable"}
 
 # Transforms win from this number of unknowns on, in 2-D and 3-D, while the axes that need dense
@@ -118,6 +121,10 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     Null space: one vector for each connected component, found from the entries. Data are projected
     with it, and the solution has volume-weighted mean 0 on each singular component; see nullspace.py.
     Transpose: `inv.T` uses the same set-up, is exact to rtol, and never refuses.
+    Triangular parts: "direct", "structured", "multigrid" and "auto" find the unknowns that follow from known ones, and
+    those that no other equation uses, by substitution; only the coupled ones are factored or iterated on. A system
+    that is triangular in some order, such as a chain or upwind differences, takes one pass over its entries.
+    Memory: the coarsest level of "multigrid" is a dense matrix of at most 2000 unknowns; a larger one is refused.
     Threads: several may solve at once, to the same bits; `inv.info` is of the solve that ended last.
 
     Examples
@@ -148,13 +155,11 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
         word, reason, engine = "petsc", str(op.layout), None
     else:
         system = System(op, rtol, maxiter)
-        word, reason, engine = (method, "as asked", None) if method != "auto" else _chosen(system, solves)
+        word, reason, engine = _as_asked(system, method) if method != "auto" else _chosen(system, solves)
         _check_options(word, options)
     if system.complex and word not in ("direct", "krylov"):
         raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct' or 'krylov'")
-    if near is not None and word == "direct":
-        engine = Near(system, getattr(near, "lu", near))
-    engine = _engine(system, word, options, engine)
+    engine = _engine(system, word, options, engine, near)
     name = name or f"inverse({op.name})"
     made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
     solver = Solver(system, engine, nullspace, log or SolveLog(), name, made, reason)
@@ -208,8 +213,26 @@ def _check_options(word, options):
             raise TypeError(f"method {word} takes the options {', '.join(known) or '(none)'}, got {name!r}{near}")
 
 
-def _engine(system, word, options, suited=None):
-    """The engine of a method; `suited`: the one without options, where it was made to see whether it suits."""
+def _as_asked(system, method):
+    """The word of the method that the user wrote, the reason, and no engine."""
+    if method in ("krylov", "separable"):
+        system.splitting = None  # these solve for all unknowns, without looking at the entries
+    return method, "as asked", None
+
+
+def _engine(system, word, options, suited=None, near=None):
+    """Build the engine of a method.
+
+    Parameters
+    ----------
+    system : System
+    word : str
+    options : dict
+    suited : Engine, optional
+        That of the coupled unknowns without options, if it has been built to see whether it suits.
+    near : Engine, optional
+        That of a matrix nearby, for the direct method.
+    """
     if system.unknowns == 0:
         return EmptySystem()
     if system.empty_row is not None:
@@ -218,12 +241,22 @@ def _engine(system, word, options, suited=None):
             "give it an equation",
             info=failure("empty_row"),
         )
-    if word in ("structured", "multigrid") and system.last is not None:
-        engine = _engine(system.rest, word, options, suited)
-        engine.last = system.last
-        return engine
     try:
-        engine = (system.make or METHODS[word])(system, **options) if suited is None or options else suited
+        if system.splitting is not None:
+            from sparsedp.solvers.substitution import BlockTriangular
+
+            inner = None
+            if system.coupled.unknowns:
+                inner = _engine(system.coupled, word, options, suited, getattr(near, "inner", near))
+            else:
+                CHECKS[word](**options)
+            engine: Any = BlockTriangular(system, inner)
+        elif near is not None and word == "direct":
+            engine = Near(system, getattr(near, "lu", near))
+        elif suited is None or options:
+            engine = (system.make or METHODS[word])(system, **options)
+        else:
+            engine = suited
         return engine if system.null_space is not None else None
     except ArithmeticError as error:
         message = f"{system.given} is singular and cannot be projected: {error}; add a shift"
@@ -235,25 +268,52 @@ def _engine(system, word, options, suited=None):
 
 def _chosen(system, solves):
     """The word of a method, why, and its engine if it is built. Depends on the operator only, so that bits repeat."""
-    size, grid = system.unknowns, system.op.domain.grid
+    grid = system.op.domain.grid
     dimension = 0 if grid is None else grid.dim
     engine = _transforms(system, dimension)
     if engine is not None:
         what = "" if system.op.structure.separable else "a function of "
-        reason = f"{size} unknowns in {dimension}-D, {what}a sum of 1-D factors: transforms solve it exactly"
+        reason = f"{system.unknowns} unknowns in {dimension}-D, {what}a sum of 1-D factors: transforms solve it exactly"
         return "separable", reason, engine
     if not system.op.structure.has_entries:
         return "krylov", "only products with the operator are known", None
+    splitting = _splitting(system)
+    if splitting is None:
+        return _chosen_by_entries(system, solves, dimension, "")
+    if not system.coupled.unknowns:
+        where = _size_in_words(system, "", dimension)
+        return "direct", f"{where}: the system is triangular, substitution solves it", None
+    others = f", {splitting.size} others by substitution"
+    return _chosen_by_entries(system.coupled, solves, dimension, others)
+
+
+def _size_in_words(system, kind, dimension):
+    """The number of unknowns of some kind, and the dimension of the grid."""
+    where = f"in {dimension}-D" if dimension else "without a grid"
+    return f"{system.unknowns} {kind}unknowns {where}"
+
+
+def _splitting(system):
+    """The Splitting of a system, or None; also where it is singular, which is refused when the engine is built."""
+    try:
+        return system.splitting
+    except ArithmeticError:
+        return None
+
+
+def _chosen_by_entries(system, solves, dimension, others):
+    """As `_chosen`, for a system with entries that no transform solves.
+
+    `others`: words about the unknowns that are not in this system, because they are found by substitution.
+    """
+    size, kind = system.unknowns, "coupled " if others else ""
     if system.complex:
         if size <= COMPLEX_UP_TO[dimension]:
-            return "direct", "complex entries", None
+            return "direct", "complex entries" + others, None
         engine = krylov_engine(system, preconditioner="shifted_laplace")
-        return (
-            "krylov",
-            f"{size} complex unknowns in {dimension}-D: LU would not fit, GMRES and shifted Laplace do",
-            engine,
-        )
-    where = f"{size} unknowns in {dimension}-D" if dimension else f"{size} unknowns without a grid"
+        where = _size_in_words(system, kind + "complex ", dimension) + others
+        return "krylov", f"{where}: LU would not fit, GMRES and shifted Laplace do", engine
+    where = _size_in_words(system, kind, dimension) + others
     limit = DIRECT_BELOW_STRUCTURED[solves].get(dimension, 0)
     engine, unsuited = (None, "") if size <= limit else structured_if_suited(system)
     if engine is not None:
@@ -262,12 +322,14 @@ def _chosen(system, solves):
     limit = DIRECT_UP_TO[solves][dimension]
     if size <= limit:
         return "direct", f"{where}; up to {limit}, for {solves} solves, kept LU factors are fastest", None
-    if system.last is not None:
-        return _chosen(system.rest, solves)
     where = f"{where}; {unsuited}; above {limit}, for {solves} solves, LU costs more"
-    if system.sign:
-        return "multigrid", f"{where}; the diagonal has one sign", None
-    return "direct", f"{where}; the diagonal has no single sign, which rules multigrid out", None
+    if not system.sign:
+        return "direct", f"{where}; the diagonal has no single sign, which rules multigrid out", None
+    try:
+        engine = multigrid_engine(system)
+    except ConvergenceError:
+        return "direct", f"{where}; but multigrid does not coarsen it", None
+    return "multigrid", f"{where}; the diagonal has one sign", engine
 
 
 def _transforms(system, dimension):
@@ -410,11 +472,15 @@ class Inverse(Operator):
         system, space = self.solver.system, self.solver.system.null_space
         return {
             "method": f"{self.method}: {self.reason}",
-            "unknowns": f"{system.unknowns} of {system.size}",
+            "unknowns": f"{system.unknowns} of {system.size}{self._by_substitution()}",
             "tolerance": f"relative residual {system.rtol:g}",
             "null space": f"{space.count} singular component{'s' * (space.count != 1)}, {self.solver.nullspace!r}",
             "set-up": f"{self.info.setup_seconds:.2g} s; {self.info.hierarchy}",
         }
+
+    def _by_substitution(self):
+        splitting = self.solver.system.splitting
+        return "" if splitting is None else f", {splitting.size} of them found by substitution"
 
     def __str__(self):
         lines = (f"  {name:10}  {words}" for name, words in self._facts().items())

@@ -24,7 +24,7 @@ from sparsedp.solvers.solve import Engine, failure
 from sparsedp.solvers.system import System
 from sparsedp.structure.base import probes
 
-__all__ = ["DENSE_UP_TO", "DenseSystem", "dense_engine", "dense_lu", "direct_engine"]
+__all__ = ["DENSE_UP_TO", "DenseSystem", "check_precision", "dense_engine", "dense_lu", "direct_engine"]
 
 DENSE_UP_TO = 64
 MOST_GROWTH = 2.0**49  # |A^-1| |A| beyond this leaves no digit
@@ -52,12 +52,15 @@ class Direct(Engine):
         Unknowns that are pinned.
     single : bool
         Whether the factors are in single precision.
+    unknowns : int array, optional
+        Those that the factors are of; None: all.
     """
 
     method = "direct"
 
-    def __init__(self, solve, words, anchors=(), single=False):
+    def __init__(self, solve, words, anchors=(), single=False, unknowns=None):
         self._solve, self.hierarchy, self._anchors, self.iterative = solve, words, anchors, single
+        self._unknowns = unknowns
         if single:
             self.rounds, self.shrink, self.advice = MOST_ROUNDS, MOST_LEFT, "; write precision='double'"
 
@@ -66,7 +69,11 @@ class Direct(Engine):
         if len(self._anchors):
             b = b.copy()
             b[self._anchors] = 0.0
-        return self._solve(b, transposed), 0, ""
+        if self._unknowns is None:
+            return self._solve(b, transposed), 0, ""
+        x = np.zeros_like(b)
+        x[self._unknowns] = self._solve(b[self._unknowns], transposed)
+        return x, 0, ""
 
 
 def direct_engine(system, *, precision="auto"):
@@ -86,14 +93,18 @@ def direct_engine(system, *, precision="auto"):
     ConvergenceError
         With status setup_failed, when the matrix cannot be inverted and its null space is not known.
     """
-    check_choice("precision", precision, ("auto", "single", "double"))
-    single = precision == "single" or (precision == "auto" and system.complex and system.size >= SINGLE_FROM)
-    matrix = system.regular_matrix
-    if system.size <= DENSE_UP_TO:
+    check_precision(precision)
+    single = precision == "single" or (precision == "auto" and system.complex and system.unknowns >= SINGLE_FROM)
+    matrix, unknowns = system.regular_matrix, None
+    if system.active is not None:
+        unknowns = np.flatnonzero(system.active)
+        matrix = matrix[unknowns][:, unknowns]
+    size = matrix.shape[0]
+    if size <= DENSE_UP_TO:
         solve, words, single = dense_lu(matrix.toarray())[0], "dense LU", False
     else:
         solve, words = _sparse(matrix, system, single)
-    growth, left = _growth(system, matrix, solve)
+    growth, left = _growth(matrix, solve)
     if single and not left < MOST_LEFT:
         return direct_engine(system, precision="double")
     if not growth < MOST_GROWTH:
@@ -102,21 +113,27 @@ def direct_engine(system, *, precision="auto"):
             "condition number is beyond 1e14; add a shift, or remove the rows that depend on others",
             info=failure("setup_failed"),
         )
-    words = f"{words}, {system.size} rows, {matrix.nnz} entries"
-    return Direct(solve, words, system.null_space.anchors(), single)
+    words = f"{words}, {size} rows, {matrix.nnz} entries"
+    return Direct(solve, words, system.null_space.anchors(), single, unknowns)
 
 
-def _growth(system, matrix, solve):
+def check_precision(precision="auto"):
+    """Refuse a word for the precision that is not known."""
+    check_choice("precision", precision, ("auto", "single", "double"))
+
+
+def _growth(matrix, solve):
     """Solutions for row sums times numbers up to 1 are of order |A^-1| |A|: huge when A is singular.
 
     The numbers are random signs, then what comes of them: next to an eigenvalue, its own vector. Of these last data
     the share that their solution leaves is returned too.
     """
-    if not system.size:
+    size = matrix.shape[0]
+    if not size:
         return 0.0, 0.0
-    sums = abs(matrix) @ np.ones(system.size)
+    sums = abs(matrix) @ np.ones(size)
     with np.errstate(all="ignore"):
-        images = [solve((sums * probe).astype(matrix.dtype), False) for probe in probes(system.size)]
+        images = [solve((sums * probe).astype(matrix.dtype), False) for probe in probes(size)]
         growth, image = max(((np.max(np.abs(image)), image) for image in images), key=lambda pair: pair[0])
         data = sums * (image / growth)
         last = solve(data, False)
@@ -133,7 +150,7 @@ class DenseSystem(System):
     rtol : float
     """
 
-    active, null_space = None, NullSpace.none()
+    active, splitting, null_space = None, None, NullSpace.none()
     exponent = 0
 
     def __init__(self, op, rtol):

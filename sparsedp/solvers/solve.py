@@ -29,7 +29,6 @@ need not be exact: the contract refines with further calls on the residual. Attr
     hierarchical     True: its set-up is a multigrid hierarchy
     refines          False: one call, no refinement and no error (fixed numbers of iterations)
     unrolled         True: inv(b) is engine.unroll(b, goal, transposed)[0], differentiated as it runs
-    last             None, or the unknowns that it leaves to the contract: see System.last
 
 Its builder is a function (system, **options) -> engine; `system` is a System (system.py).
 """
@@ -70,7 +69,6 @@ class Engine:
     shrink = 0.5  # what each must leave of the residual at most
     advice = ""  # for solves that do not meet the tolerance
     unrolled = False
-    last: Any = None
 
 
 class EmptySystem(Engine):
@@ -319,20 +317,8 @@ class Solver(Remade):
 
     def _correction(self, r, goal, transposed):
         """One call of the engine."""
-        solve = self.engine.solve if self.engine.last is None else self._in_order
-        step, used, trouble = solve(r, goal, transposed)
+        step, used, trouble = self.engine.solve(r, goal, transposed)
         return self.system.masked(step), used, trouble
-
-    def _in_order(self, r, goal, transposed):
-        """One call of an engine of all unknowns but the last ones: those follow; of the transpose they come first."""
-        last, product = self.engine.last, self.system.product
-        x = last * r
-        if transposed:
-            r = r - product(x, True)
-        rest = np.where(last, 0.0, r)
-        y, used, trouble = self.engine.solve(rest, goal, transposed) if norm(rest) > goal else (rest, 0, "")
-        y = np.where(last, 0.0, y)
-        return y + (x if transposed else last * (r - product(y))), used, trouble
 
 
 def _remade(build, arguments):

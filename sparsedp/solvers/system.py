@@ -212,7 +212,11 @@ class System:
     @cached_property
     def null_space(self):
         """The null vectors of the singular components. An engine builder may set it."""
-        return find_null_space(self)
+        if self.splitting is None:
+            return find_null_space(self)
+        from sparsedp.solvers.substitution import extended_null_space
+
+        return extended_null_space(self)
 
     def kernel(self, labels, right, left, count):
         """The NullSpace of these vectors."""
@@ -296,24 +300,32 @@ class System:
         return matrix
 
     @cached_property
-    def last(self):
-        """1 / diagonal on the unknowns that no row reads but their own, which has more entries, else 0; None: no such.
+    def splitting(self):
+        """The Splitting of a block triangular system; None where substitution finds no unknown.
 
         In an obstacle that is held at 0, 1 - z L takes values from the fluid beside it and gives none back: such
         rows cannot be smoothed, and need not be solved.
+
+        Raises
+        ------
+        ArithmeticError
+            If the matrix is singular because an unknown that substitution should find has no pivot.
         """
-        if self.faces is not None or not self.op.structure.has_entries:
+        if self.faces is not None or not self.op.structure.has_entries or self.empty_row is not None:
             return None
-        matrix, diagonal = self.matrix, self.matrix.diagonal()
-        links = np.diff(matrix.indptr) > 1
-        last = links & (diagonal != 0) & (np.bincount(matrix.indices, minlength=self.size) == 1)
-        return np.where(last, 1 / np.where(last, diagonal, 1.0), 0.0) if last.any() else None
+        if self.op.structure.separable and not self.op.structure.may_be_triangular():
+            return None
+        from sparsedp.solvers.substitution import split
+
+        return split(self.matrix, self.active)
 
     @cached_property
-    def rest(self):
-        """The System of all unknowns but the `last`."""
-        keep = Operator(Mask(self.last == 0), self.op.domain, self.op.domain, "mask")
-        return System(self.op @ keep, self.rtol, self.maxiter)
+    def coupled(self):
+        """The System of the unknowns that substitution does not find."""
+        keep = Operator(Mask(self.splitting.coupled), self.op.domain, self.op.domain, "mask")
+        system = System(self.op @ keep, self.rtol, self.maxiter)
+        system.splitting = None
+        return system
 
     @cached_property
     def regular_matrix(self):

@@ -115,6 +115,15 @@ class Kronecker(Structure):
             labels, count = np.add.outer(labels * many, line), count * many
         return labels.reshape(-1), count
 
+    def may_be_triangular(self):
+        """Whether some rows of a Kronecker sum are part of no cycle: along each axis there must be such rows."""
+        for axis, n in enumerate(self.out_parts[0]):
+            if axis in self.lines:
+                count, labels = connected_components(self.lines[axis].matrix, directed=True, connection="strong")
+                if n and not np.any(np.bincount(labels, minlength=count) == 1):
+                    return False
+        return True
+
     # ------------------------------------------------------------ algebra
 
     def transpose(self):

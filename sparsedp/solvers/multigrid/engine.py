@@ -11,7 +11,8 @@ import threading
 import numpy as np
 
 from sparsedp import kernels
-from sparsedp.fields import EPS, check_choice
+from sparsedp.fields import EPS
+from sparsedp.solvers.direct import check_precision
 from sparsedp.solvers.multigrid.stencil import Unfit, components, stencil_of
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import exponent_of
@@ -57,7 +58,7 @@ def structured_engine(system, *, precision="auto"):
     -----
     Source: J. E. Dendy, Black box multigrid, J. Comput. Phys. 48 (1982) 366-386.
     """
-    check_choice("precision", precision, PRECISIONS)
+    check_precision(precision)
     if not kernels.compiled():
         raise ValueError("structured needs numba, which is not installed; write method='multigrid'")
     try:

@@ -1,0 +1,46 @@
+"""Compiled substitution: systems that are triangular when their rows are taken in a given order."""
+
+from sparsedp.kernels.team import kernel
+
+__all__ = ["backward", "backward_complex", "forward", "forward_complex"]
+
+
+@kernel("place1 place1 +read1 place1 +read1 +write1")
+def forward(indptr, indices, data, order, b, x, start, stop):
+    """Solve A x = b for the rows in order[start:stop], one after the other.
+
+    x[i] = (b[i] - sum over j != i of A[i, j] x[j]) / A[i, i]; the x[j] that a row reads are known before.
+    """
+    for number in range(start, stop):
+        i = order[number]
+        total, pivot = b[i], data[indptr[i]]
+        for k in range(indptr[i], indptr[i + 1]):
+            j = indices[k]
+            if j == i:
+                pivot = data[k]
+            else:
+                total -= data[k] * x[j]
+        x[i] = total / pivot
+
+
+@kernel("place1 place1 +read1 place1 +write1 +write1")
+def backward(indptr, indices, data, order, r, x, start, stop):
+    """Solve A^T x = r for the rows of A in order[start:stop], from the last one to the first.
+
+    x[i] = r[i] / A[i, i], then r[j] -= A[i, j] x[i] for all j != i. So r becomes r - A^T x for all other unknowns.
+    """
+    for number in range(stop - 1, start - 1, -1):
+        i = order[number]
+        pivot = data[indptr[i]]
+        for k in range(indptr[i], indptr[i + 1]):
+            if indices[k] == i:
+                pivot = data[k]
+        value = r[i] / pivot
+        x[i] = value
+        for k in range(indptr[i], indptr[i + 1]):
+            j = indices[k]
+            if j != i:
+                r[j] -= data[k] * value
+
+
+forward_complex, backward_complex = forward.complex, backward.complex

@@ -1,0 +1,292 @@
+"""Block triangular systems: the unknowns that follow from known ones by substitution, before and after the others.
+
+Row i of A uses unknown j where A[i, j] is not 0. Unknowns that use each other, directly or through others, form the
+strongly connected components of that graph. In a topological order of the components A is block lower triangular. A
+component of one unknown with a pivot A[i, i] is solved by a division; all others need a solver. With F the unknowns of
+that kind which use no component of the other kind, even through others, and L those which no such component uses,
+
+        | A_FF             |
+    A = | A_CF  A_CC       |
+        | A_LF  A_LC  A_LL |
+
+where A_FF and A_LL are lower triangular in topological order, so that only A_CC has to be factored. The transposed
+system is solved in the opposite order. Upwind differences and chains have no C at all.
+
+References
+----------
+Tarjan, Depth-first search and linear graph algorithms, SIAM Journal on Computing 1 (1972) 146-160.
+Duff and Reid, An implementation of Tarjan's algorithm for the block triangularization of a matrix, ACM Transactions on
+Mathematical Software 4 (1978) 137-147.
+"""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.linalg import splu
+
+from sparsedp import kernels
+from sparsedp.errors import ConvergenceError
+from sparsedp.solvers.nullspace import NullSpace
+from sparsedp.solvers.scaling import norm, shifted
+from sparsedp.solvers.solve import Engine, failure
+from sparsedp.structure.base import probes, rows_of
+
+__all__ = ["BlockTriangular", "Splitting", "Substitution", "extended_null_space", "split"]
+
+LARGEST_GROWTH = 2.0**49  # |A^-1| |A| beyond this leaves no correct digit in the solution
+
+
+class Splitting(NamedTuple):
+    """Which unknowns of a block triangular system are found by substitution.
+
+    Attributes
+    ----------
+    first, last : int32 arrays
+        The unknowns F and L, each in an order of substitution.
+    coupled : bool array, shape (n,)
+        The unknowns C.
+    """
+
+    first: np.ndarray
+    last: np.ndarray
+    coupled: np.ndarray
+
+    @property
+    def size(self):
+        """Number of unknowns that are found by substitution."""
+        return self.first.size + self.last.size
+
+
+def split(matrix, active):
+    """Find the unknowns of a matrix that are solved by substitution.
+
+    Parameters
+    ----------
+    matrix : csr_array
+        Square, without explicit zeros.
+    active : bool array, shape (n,), or None
+        The unknowns; None: all of them.
+
+    Returns
+    -------
+    Splitting or None
+        None if no unknown is found by substitution.
+
+    Raises
+    ------
+    ArithmeticError
+        If an unknown that is a component of its own has no pivot: then the matrix is singular.
+    """
+    size = matrix.shape[0]
+    active = np.ones(size, dtype=bool) if active is None else active
+    graph = sp.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
+    count, labels = connected_components(graph, directed=True, connection="strong")
+    alone = np.bincount(labels, minlength=count)[labels] == 1
+    alone &= active & (np.diff(matrix.indptr) + np.bincount(matrix.indices, minlength=size) > 0)  # else a null vector
+    if not alone.any() or not _is_topological(graph, labels):
+        return None
+    without_pivot = np.flatnonzero(alone & (matrix.diagonal() == 0))
+    if without_pivot.size:
+        raise ArithmeticError(f"row {without_pivot[0]} has no entry on the diagonal and is not part of a cycle")
+    others = np.flatnonzero(active & ~alone)
+    first = alone & ~_reached(graph.T.tocsr(), others)
+    last = alone & ~first & ~_reached(graph, others)
+    if not (first.any() or last.any()):
+        return None
+    return Splitting(_in_order(first, labels), _in_order(last, labels), active & ~first & ~last)
+
+
+def _is_topological(graph, labels):
+    """Whether no row uses a component of a higher number. SciPy numbers them in that way, but does not promise it."""
+    return bool(np.all(labels[rows_of(graph)] >= labels[graph.indices]))
+
+
+def _in_order(chosen, labels):
+    """Return the chosen unknowns, each a component of its own, by increasing number of their component."""
+    unknowns = np.flatnonzero(chosen)
+    members = np.full(labels.size, -1, dtype=np.int32)
+    members[labels[unknowns]] = unknowns
+    return members[members >= 0]
+
+
+def _reached(graph, starts):
+    """Return which nodes of a directed graph can be reached from any of the starts, these included."""
+    size = graph.shape[0]
+    found = np.zeros(size + 1, dtype=bool)
+    if starts.size:
+        indices = np.concatenate([graph.indices, starts.astype(graph.indices.dtype)])
+        indptr = np.append(graph.indptr, graph.indptr.dtype.type(indices.size))  # one more node, linked to all starts
+        links = sp.csr_array((np.ones(indices.size), indices, indptr), shape=(size + 1, size + 1))
+        found[breadth_first_order(links, size, return_predecessors=False)] = True
+    return found[:size]
+
+
+class Substitution:
+    """Forward and backward substitution with some rows of a matrix, in a given order.
+
+    Parameters
+    ----------
+    matrix : csr_array
+        With 32-bit indices.
+    order : int32 array
+        Rows; each uses only rows before it, and unknowns that are known.
+    """
+
+    def __init__(self, matrix, order):
+        self.matrix, self.order = matrix, order
+
+    def forward(self, b, x):
+        """Write into x the unknowns in order: the solution of their rows of A x = b. The others of x are given."""
+        if not self.order.size or self._run("forward", b, x):
+            return
+        reverse = self.order[::-1]
+        x[reverse] = 0.0
+        x[reverse] = self.factors.solve((b - self.matrix @ x)[reverse])
+
+    def backward(self, r, x):
+        """Write into x the unknowns in order: the solution of their columns of A^T x = r; r becomes r - A^T x."""
+        if not self.order.size or self._run("backward", r, x):
+            return
+        reverse, found = self.order[::-1], np.zeros_like(x)
+        found[reverse] = self.factors.solve(r[reverse], trans="T")
+        r -= self.matrix.T @ found
+        x[reverse] = found[reverse]
+
+    def _run(self, name, b, x):
+        """Run a compiled loop; return whether there is one."""
+        matrix = self.matrix
+        name += "_complex" * (matrix.dtype.kind == "c")
+        entries = matrix.indptr, matrix.indices, matrix.data
+        return kernels.run("substitution", name, self.order.size, 0, 1, *entries, self.order, b, x)
+
+    @cached_property
+    def factors(self):
+        """Without compiled loops: LU factors of the rows and columns in reverse order, an upper triangular matrix.
+
+        It is its own factor, without fill-in: columns are eliminated one by one, and the only pivot is the diagonal.
+        """
+        reverse = self.order[::-1]
+        block = sp.csc_array(self.matrix[reverse][:, reverse])
+        return splu(block, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=dict(Equil=False))
+
+    def row_sums(self):
+        """Sums of the magnitudes of the entries that link the unknowns in order to each other."""
+        members = np.zeros(self.matrix.shape[0])
+        members[self.order] = 1.0
+        return members * (abs(self.matrix) @ members)
+
+
+class BlockTriangular(Engine):
+    """The engine of a System that is split: substitution around the engine of the coupled unknowns.
+
+    Parameters
+    ----------
+    system : System
+    inner : Engine or None
+        That of `system.coupled`; None if there is no coupled unknown.
+
+    Raises
+    ------
+    ConvergenceError
+        If the triangular parts are singular to working precision.
+    """
+
+    def __init__(self, system, inner):
+        self.system, self.inner = system, inner
+        splitting = system.splitting
+        self.first, self.last = (Substitution(system.matrix, order) for order in (splitting.first, splitting.last))
+        self.method, self.unit = ("direct", "iterations") if inner is None else (inner.method, inner.unit)
+        words = f"substitution, {splitting.size} unknowns"
+        self.hierarchy = f"{words}, {system.matrix.nnz} entries" if inner is None else f"{inner.hierarchy}; {words}"
+        if inner is not None:
+            for name in ("iterative", "hierarchical", "refines", "rounds", "shrink", "advice"):
+                setattr(self, name, getattr(inner, name))
+        if not self._growth() < LARGEST_GROWTH:
+            raise ConvergenceError(
+                f"{system.given} is singular, or its condition number is beyond 1e14: in its triangular part a pivot "
+                "is too small for its row, or the solution grows from row to row; add a shift, or remove rows that "
+                "depend on others",
+                info=failure("setup_failed"),
+            )
+
+    def _growth(self):
+        """Return an estimate of |A^-1| |A| for the triangular parts, from solutions for random data."""
+        largest = []
+        with np.errstate(all="ignore"):
+            for part in (self.first, self.last):
+                sums = part.row_sums()
+                for probe in probes(sums.size) if part.order.size else ():
+                    x = np.zeros(sums.size, part.matrix.dtype)
+                    part.forward((sums * probe).astype(x.dtype), x)
+                    largest.append(np.max(np.abs(x)))
+        return np.max(largest)
+
+    def solve(self, b, goal, transposed):
+        """Substitute, solve for the coupled unknowns to the residual `goal`, substitute."""
+        return (self._transposed if transposed else self._forward)(b, goal)
+
+    def _forward(self, b, goal):
+        x = np.zeros_like(b)
+        self.first.forward(b, x)
+        used, trouble = 0, ""
+        if self.inner is not None:
+            residual = b - self.system.product(x) if self.first.order.size else b
+            used, trouble = self._coupled(residual, goal, x, False)
+        self.last.forward(b, x)
+        return x, used, trouble
+
+    def _transposed(self, b, goal):
+        x, residual = np.zeros_like(b), b.copy()
+        self.last.backward(residual, x)
+        used, trouble = 0, ""
+        if self.inner is not None:
+            used, trouble = self._coupled(residual, goal, x, True)
+            if self.first.order.size:
+                residual = b - self.system.product(x, True)
+        self.first.backward(residual, x)
+        return x, used, trouble
+
+    def _coupled(self, residual, goal, x, transposed):
+        """Write the coupled unknowns into x, and return iterations and status word."""
+        system, members = self.system.coupled, self.system.splitting.coupled
+        residual = np.where(members, residual, 0.0)
+        if not norm(residual) > goal:
+            return 0, ""
+        residual = system.null_space.project(residual, transposed)
+        y, used, trouble = self.inner.solve(residual, goal, transposed)
+        x[members] = shifted(y[members], -system.exponent)
+        return used, trouble
+
+
+def extended_null_space(system):
+    """Return the NullSpace of a System that is split, from that of its coupled unknowns.
+
+    With A_CC r_C = 0 and l_C A_CC = 0 the null vectors of A are r = (0, r_C, -A_LL^-1 A_LC r_C) and
+    l = (-A_FF^-T A_CF^T l_C, l_C, 0).
+
+    Raises
+    ------
+    ArithmeticError
+        If an unknown belongs to the null vectors of two components.
+    """
+    splitting = system.splitting
+    inner = system.coupled.null_space if splitting.coupled.any() else NullSpace.none()
+    if not inner.count:
+        return NullSpace.none(system.size)
+    first, last = (Substitution(system.matrix, order) for order in (splitting.first, splitting.last))
+    labels = np.where(splitting.coupled, 0, -1) if inner.labels is None else inner.labels.copy()
+    right, left = inner.right.copy(), inner.left.copy()
+    for number in range(inner.count):
+        members = labels == number
+        r, l = np.where(members, inner.right, 0.0), np.where(members, inner.left, 0.0)
+        last.forward(np.zeros_like(r), r)
+        first.backward(-system.product(l, True), l)
+        others = ((r != 0) | (l != 0)) & ~members
+        if np.any(labels[others] >= 0):
+            raise ArithmeticError("an unknown is linked to two singular components")
+        labels[others] = number
+        right[others], left[others] = r[others], l[others]
+    return system.kernel(labels, right, left, inner.count)
