@@ -31,6 +31,8 @@ class Thread(local):
         Called for every node of a tape when it is made: see `Recorder`.
     solves : int
         Since the thread began, forward and adjoint: counted always, for one addition a solve.
+    controlled : int
+        Intervals under error control since the thread began.
     grown : int
         Warnings of cotangents that grew, since the thread began; what warnings do is one for all threads.
     inner : list of float
@@ -43,7 +45,7 @@ class Thread(local):
         self.loop_hooks: list[Any] = []
         self.witnesses: list[Any] = []
         self.inner: list[float] = []
-        self.solves = self.grown = 0
+        self.solves = self.controlled = self.grown = 0
 
 
 thread = Thread()

@@ -209,3 +209,41 @@ def test_a_right_gradient_among_kinks_is_not_accused_and_a_wrong_one_is():
     assert "a kink: the one-sided" in str(found) and found.verdict == "inconclusive"
     found = dp.check.gradient(lambda p: anp.sum(wrong(end(p))), start)
     assert found.verdict == "disagrees" and found.culprit == "wrong"
+
+
+# ---- steps with error control ----------------------------------------------------------------------------------------
+
+
+CONTROLLED = dp.stepper("heun", lambda u, p: p * anp.sin(u), 0.5, tolerance=1e-3)
+RATE = np.array([1.1, 0.9])
+
+
+def with_controlled_steps(error):
+    """A loss with error-controlled steps and a rule whose VJP and JVP are off by the share `error`."""
+    cube = dp.differentiable(
+        "cube",
+        lambda u: u**3,
+        lambda nums, ans, u: lambda g: (3 * (1 + error) * u**2 * g,),
+        lambda nums, tangents, ans, u: 3 * (1 + error) * u**2 * tangents[0],
+    )
+    return lambda rate: anp.sum(cube(CONTROLLED(np.array([1.0, 0.4]), rate)))
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-3, 0.1])
+def test_what_the_tolerance_of_steps_leaves_is_inconclusive(error):
+    """The gap is below the tolerance; a wrong rule of the same size is found by itself."""
+    found = dp.check.gradient(with_controlled_steps(error), RATE, directions=1, quick=True)
+    if error:
+        assert found.verdict == "disagrees" and found.culprit == "cube"
+    else:
+        assert found.verdict == "inconclusive" and found.culprit is None
+        assert "the steps' tolerance of 0.001 leaves this, tighten it" in found.reason
+
+
+def test_a_given_gradient_behind_controlled_steps():
+    """Ten tolerances are the limit where no call can be examined."""
+    loss = with_controlled_steps(0.0)
+    slope = dp.grad(loss)
+    assert dp.check.gradient(loss, RATE, slope, directions=1, quick=True).verdict == "inconclusive"
+    wrong = dp.check.gradient(loss, RATE, lambda rate: 1.05 * slope(rate), directions=1, quick=True)
+    assert wrong.verdict == "disagrees"

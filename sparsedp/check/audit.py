@@ -103,8 +103,8 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
     losses, minutes where a loss takes a thousand implicit steps.
 
     A `stepper` with a `tolerance` is differentiable to that tolerance, not to rounding: its gradient differs from that
-    of the value it returns by a few tolerances, and the verdict is "disagrees" with no culprit. Check such a loss with
-    a fixed dt, or with a tolerance of 1e-9.
+    of the value it returns by a few tolerances. Where the gap is at most ten tolerances, and no other call is at
+    fault, the verdict is "inconclusive" and says so. Check such a loss with a fixed dt, or with a tolerance of 1e-9.
 
     Everything is relative: a loss times 1e-200 or 1e200 is judged the same. A loss that refuses a trial
     point (unstable step, no convergence, not finite, a ValueError) makes that step unusable. At a kink
@@ -160,10 +160,14 @@ def _audit(trials, taped, count, rng, quick):
         doubts.append(("unsound", "the loss gives another value after the audit: it keeps a state"))
     outcome, reason = verdict(judged, doubts)
     notes = [note for word, note in doubts if word == "note"]
-    if outcome == "disagrees" and taped:
+    loose_steps = any(one.word == "loose steps" for one in judged)
+    if taped and (outcome == "disagrees" or loose_steps):
         culprit, why = culprit_of(loss, point)
-        notes.append(f"culprit: {why}")
-        if culprit is None and trials.tolerance > LOOSE:
+        if culprit or outcome == "disagrees":
+            notes.append(f"culprit: {why}")
+        if culprit and loose_steps and outcome == "inconclusive":
+            outcome, reason = "disagrees", f"{reason}; but {why}"
+        if culprit is None and outcome == "disagrees" and trials.tolerance > LOOSE:
             outcome = "inconclusive"
             reason += f"; no call is at fault, but solves stop at rtol {trials.tolerance:g}: tighten them"
     if quick:

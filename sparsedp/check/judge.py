@@ -31,6 +31,7 @@ AGREED = 1e-8  # a gap below this share is agreement, whatever the bar
 NOISY = 1e-6  # the same behind a solve that the ledger shows, or in noise: what a solve leaves may be smooth
 LEFT = 1e-9  # a gap below this share of the loss may be what a solve leaves: not wrong, but not right either
 LOOSE = 10.0  # the same in units of the tolerance of the solves, where that is looser
+STEPS = 10.0  # a gap below this many tolerances of time steps is what their error control leaves
 PER_NOISE = 1e4  # between the two: this multiple of the measured noise of the loss
 UNDERFLOW = 1e-303  # differences of a loss that changes by less are not normal numbers
 VANISHED = 1e-6  # a derivative and bar below this share of the curvature are 0
@@ -93,6 +94,8 @@ def words(e):
         ("kink", e.split, "a kink: the one-sided derivatives differ by {e.split:.1e}, of {e.scale:.1e}"),
         ("noise", e.wrong and e.size <= e.left,
          "off by {e.share:.1e}: solves may leave this in such a loss, tighten their rtol"),
+        ("loose steps", e.wrong and e.size <= e.left_by_steps,
+         "off by {e.share:.1e}: the steps' tolerance of {e.line.trials.step_tolerance:g} leaves this, tighten it"),
         # Noise that swallows the whole difference may be a chaotic loss with a right gradient.
         ("disagrees", e.wrong and (e.jitter < ROUNDING or abs(e.difference) > FAR * e.bar),
          "off by {e.share:.1e}, with error bars of {e.resolution:.1e}"),
@@ -122,7 +125,7 @@ VERDICTS = (
     (("broken",), "disagrees"),
     (("ripple",), "inconclusive"),
     (("disagrees", "outside"), "disagrees"),
-    (("open", "kink", "rough", "noise", "masked", "few"), "inconclusive"),
+    (("open", "kink", "rough", "noise", "masked", "few", "loose steps"), "inconclusive"),
 )
 
 
@@ -165,6 +168,7 @@ class Judgement(Result):
         agrees, disagrees; vanishes: both derivatives are 0 to rounding; kink: the one-sided derivatives differ;
         outside: they differ, and the gradient is beyond both; rough: a Taylor remainder has the wrong order;
         noise, few: nothing is proved, by noise or for want of usable steps;
+        loose steps: the gap is a few tolerances of time steps with error control;
         masked: gap and bar are small, but noise that is no rounding leaves too few digits;
         constant: the loss does not change, as the gradient says; ripple: coarse and fine steps see two derivatives.
     difference, slope : float
@@ -275,6 +279,7 @@ def _compared(line, gap, bar, scale, split, jitter, agreed, curvature, **_):
         "size": size, "share": size / scale, "beyond": (size - split / 2) * (split > 0), "resolved": resolved,
         "wrong": size > max(far, agreed * scale, agreed * 1e-4 * curvature),
         "left": max(LEFT * base, LOOSE * trials.tolerance * max(base, scale)) * trials.solved,
+        "left_by_steps": STEPS * trials.step_tolerance * scale,
         "close": bool(resolved and size <= max(min(NEAR * bar, RESOLVED * scale - bar), agreed * scale)),
         "zero": zero, "loudness": jitter * trials.eps,
         "digits": float(np.clip(-np.log10(max(size, bar) / (curvature if zero else scale)), 0, 16)),

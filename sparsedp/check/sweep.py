@@ -165,6 +165,8 @@ class Trials:
         Whether the loss takes a solve of this library at the point.
     tolerance : float
         The loosest relative tolerance of iterative ones.
+    step_tolerance : float
+        The loosest tolerance of time steps with error control; 0 without any.
     eps : float
         Rounding of the coarsest dtype that the loss has returned.
     """
@@ -174,6 +176,7 @@ class Trials:
         self.steps, self.extend = steps or default_steps(point.eps), not steps
         self.base = self.gradient = np.nan  # until it is started
         self.count, self.solved, self.tolerance, self.noise = 0, False, 0.0, 0.0
+        self.step_tolerance = 0.0
         self.eps = eps_of(float)
 
     def value(self, tree):
@@ -193,19 +196,24 @@ class Trials:
         return self.point.gradient(self.slope(tree) if callable(self.slope) else self.slope)
 
     def start(self):
-        """Find the loss at the point. Solves are seen in one more run: recording is no part of what is judged."""
-        before = thread.solves
+        """Find the loss at the point, and the tolerances of solves and time steps in it.
+
+        Those are recorded in one more run: recording is no part of what is judged.
+        """
+        solves, controlled = thread.solves, thread.controlled
         try:
             self.base = self.value(self.point.fresh())
         except TypeError as error:
             advise(error)
             raise
-        self.solved = thread.solves > before
-        if self.solved:
+        self.solved = thread.solves > solves
+        if self.solved or thread.controlled > controlled:
             with recording() as calls, np.errstate(all="ignore"):
                 self.loss(self.point.fresh())
             loose = [solver.system.rtol for _, solver in solvers_of(calls) if solver.engine.iterative]
             self.tolerance = max(loose, default=0.0)
+            of_steps = [tolerances for (_, what), tolerances in calls.notes.items() if what == "tolerance"]
+            self.step_tolerance = max((max(tolerances) for tolerances in of_steps), default=0.0)
 
 
 def solvers_of(calls):

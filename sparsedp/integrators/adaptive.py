@@ -40,6 +40,7 @@ import numpy as np
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.integrators.runge_kutta import Scheme
+from sparsedp.ledger import note, thread
 from sparsedp.shortcuts import on_every_rank
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain
@@ -117,7 +118,12 @@ class Adaptive(Scheme):
         return self._followed([*path], given, moves) if traced else path[-1].new
 
     def _check_tolerance(self, u):
-        """Refuse a floor that does not fit the state, and digits that it cannot hold: steps would shrink to nothing."""
+        """Refuse a floor that does not fit the state, and digits that it cannot hold: steps would shrink to nothing.
+
+        The ledger learns the tolerance: a check of a gradient compares its gap with it.
+        """
+        thread.controlled += 1
+        note(self.name, "tolerance", self.tolerance)
         for place, floor, leaf in zip(labels(u, "floor"), self._floors(u), leaves(u), strict=True):
             try:
                 np.broadcast_to(floor, np.shape(plain(leaf)))
