@@ -37,6 +37,7 @@ __all__ = [
     "field_array",
     "is_number",
     "is_whole",
+    "number_beside",
     "place",
     "rounded_down",
     "surely_finite",
@@ -300,7 +301,8 @@ def check_number(name, value, needs="", advice="", kind=""):
     if not isfinite(value):
         raise NonFiniteError(f"{name} must be finite, got {value}")
     if not RANGES[needs](value):
-        raise ValueError(f"{name} must be {needs}, got {value:g}{advice}")
+        limits = [float(word) for word in needs.split() if word.isdigit()]
+        raise ValueError(f"{name} must be {needs}, got {number_beside(value, *limits)}{advice}")
     return float(value)
 
 
@@ -327,6 +329,38 @@ def is_number(value):
 def is_whole(value, least):
     """Whether a value is a whole number from `least` on; 2.0 counts."""
     return bool(is_number(value) and value % 1 == 0 and value >= least)  # the rest of NaN and infinity is NaN
+
+
+def number_beside(number, *limits, digits=6, style="g"):
+    """Format a number with enough digits to show on which side of some limits it lies.
+
+    Parameters
+    ----------
+    number : float
+    *limits : float
+        Other numbers of the same message, which are printed with the format ``:g``.
+    digits : int
+        Least precision of the format.
+    style : "g" or "e"
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> number_beside(1.5, 0.0, 1.0), number_beside(1 + 1e-12, 0.0, 1.0)
+    ('1.5', '1.000000000001')
+    >>> number_beside(1.01e-10, 1e-10, digits=1, style="e")
+    '1.01e-10'
+    """
+    bounds = [*limits, *(float(f"{limit:g}") for limit in limits)]
+    for precision in range(digits, 17):
+        text = f"{number:.{precision}{style}}"
+        shown = float(text)
+        if all((shown > bound) == (number > bound) and (shown < bound) == (number < bound) for bound in bounds):
+            return text
+    return repr(float(number))
 
 
 def rounded_down(number):

@@ -15,7 +15,7 @@ Beyond a wall the points go on at the distance of the width of the last cell.
 import numpy as np
 
 from sparsedp import results
-from sparsedp.fields import EPS
+from sparsedp.fields import EPS, number_beside
 
 __all__ = ["Coordinates"]
 
@@ -95,7 +95,8 @@ def _check_monotone(scheme, gaps):
     if ratio > STEEPEST * (1 + 1e-9):
         raise ValueError(
             f"transport {scheme} with cubic interpolation needs points whose distances change by at most "
-            f"a factor of {STEEPEST:g} from one to the next, got {ratio:.3g}; write interpolation='linear'"
+            f"a factor of {STEEPEST:g} from one to the next, got {number_beside(ratio, STEEPEST, digits=3)}; "
+            "write interpolation='linear'"
         )
 
 

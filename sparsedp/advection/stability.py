@@ -4,7 +4,7 @@ import numpy as np
 
 from sparsedp.advection.control_volumes import place_words
 from sparsedp.errors import UnstableStepError
-from sparsedp.fields import EPS, check_finite, rounded_down
+from sparsedp.fields import EPS, check_finite, number_beside, rounded_down
 
 __all__ = ["ROUNDING", "check_numbers", "check_weights"]
 
@@ -25,8 +25,9 @@ def check_weights(setting, dt, rate, share):
     if setting.unstable == "raise" and np.any(bad):
         worst = int(np.argmax(rate))
         largest = rounded_down(share / np.max(rate))
+        given = number_beside(dt, float(largest), digits=12)
         raise UnstableStepError(
-            f"transport {setting.scheme}: dt = {dt:.12g} is too large at {np.count_nonzero(bad)} of {rate.size} "
+            f"transport {setting.scheme}: dt = {given} is too large at {np.count_nonzero(bad)} of {rate.size} "
             f"points, most at {place_words(setting, worst)}; the largest stable dt is {largest}, "
             "or write unstable='allow'"
         )

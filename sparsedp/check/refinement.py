@@ -7,7 +7,7 @@ import numpy as np
 
 from sparsedp.check.summary import Result
 from sparsedp.check.table import Table
-from sparsedp.fields import check_function
+from sparsedp.fields import check_function, number_beside
 
 __all__ = ["Refinement", "order"]
 
@@ -61,6 +61,8 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
     elif expected is not None:
         verdict = "agrees" if expected[0] <= slope <= expected[1] else "disagrees"
         reason = f"expected {expected[0]:g} to {expected[1]:g}"
+        if verdict == "disagrees":
+            reason += f", got {number_beside(slope, *expected, digits=3)}"
     orders = tuple((np.diff(rise) / np.diff(run)).tolist())
     return Refinement(
         sizes=sizes, errors=errors, orders=orders, order=slope, expected=expected, verdict=verdict, reason=reason

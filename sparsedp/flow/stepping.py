@@ -45,6 +45,7 @@ from sparsedp.fields import (
     check_number,
     check_on,
     check_type,
+    number_beside,
     rounded_down,
 )
 from sparsedp.flow.momentum import convection, face_laplacian, free_faces
@@ -293,9 +294,11 @@ class FlowStep(Remade):
             terms = [self.viscous, *(one.diffused for one in self.scalars.values())]
             growth = max(_growth(self.dt * fastest, term.damping, self.implicit) for term in terms)
             if growth > GROWTH:
+                safe = rounded_down(SURE / fastest)
+                given = number_beside(self.dt, float(safe), digits=12)
                 raise UnstableStepError(
-                    f"flow_step is unstable for this velocity with dt = {self.dt:.12g}: waves grow by {growth - 1:.0%} "
-                    f"a step, at a Courant number of {self.dt * fastest:.3g}; dt = {rounded_down(SURE / fastest)} is "
+                    f"flow_step is unstable for this velocity with dt = {given}: waves grow by {growth - 1:.0%} "
+                    f"a step, at a Courant number of {self.dt * fastest:.3g}; dt = {safe} is "
                     "safe, or write unstable='allow'"
                 )
 
@@ -377,9 +380,11 @@ class Diffusion:
         """Adams-Bashforth is stable for dt nu |lambda| <= 1."""
         rate, dt = number * self._steepest, self.flow.dt
         if self.flow.strict and dt * rate > 1 + ROUNDING:
+            largest = rounded_down(1 / rate)
+            given = number_beside(dt, float(largest), digits=12)
             raise UnstableStepError(
-                f"flow_step is unstable for {self.name} = {number:.6g} with dt = {dt:.12g}: the largest "
-                f"stable dt is {rounded_down(1 / rate)}; take smaller steps or write implicit=True"
+                f"flow_step is unstable for {self.name} = {number:.6g} with dt = {given}: the largest "
+                f"stable dt is {largest}; take smaller steps or write implicit=True"
             )
 
 

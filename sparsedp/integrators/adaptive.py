@@ -38,6 +38,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
+from sparsedp.fields import number_beside
 from sparsedp.integrators.problem import combine, later, untraced
 from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.ledger import note, thread
@@ -300,8 +301,9 @@ class Adaptive(Scheme):
                 return derivative.copy()
             # Without extrapolation errors fall more slowly than the tolerance: a smaller one is refused all the more.
             cure = "give a smaller floor or tolerance" if self.weight else "take tr_bdf2, which extrapolates"
+            share = number_beside(error / size, limit, float(f"{limit:.1e}"), digits=1, style="e")
             raise DerivativeError(
-                f"the derivative of {self.name} over {count} steps is uncertain by {error / size:.1e} of its "
+                f"the derivative of {self.name} over {count} steps is uncertain by {share} of its "
                 f"size, more than the {limit:.1e} that its tolerance {self.tolerance:g} allows; {cure}, end no "
                 "interval in the middle of a fast change, or take fixed steps"
             )

@@ -6,7 +6,7 @@ from scipy.sparse.linalg import ArpackError, eigsh
 from sparsedp.calls import public
 from sparsedp.derivative import is_finite
 from sparsedp.errors import NonFiniteError, UnstableStepError
-from sparsedp.fields import advise, check_choice, check_finite, check_number, rounded_down
+from sparsedp.fields import advise, check_choice, check_finite, check_number, number_beside, rounded_down
 from sparsedp.integrators.problem import Problem, like, number, pair
 from sparsedp.integrators.runge_kutta import (
     EXPLICIT,
@@ -321,9 +321,11 @@ class Step(Remade):
     def _check_stable(self, h, c, name, largest):
         """Refuse a step that would grow without bound."""
         if h * c > largest * (1 + ROUNDING):
+            most = rounded_down(largest / c)
+            given = number_beside(h, float(most), digits=12)
             raise UnstableStepError(
-                f"{self.method} is unstable for {name} with dt = {h:.12g}: the largest stable dt is "
-                f"{rounded_down(largest / c)}; take smaller steps or an implicit method, or write unstable='allow'"
+                f"{self.method} is unstable for {name} with dt = {given}: the largest stable dt is "
+                f"{most}; take smaller steps or an implicit method, or write unstable='allow'"
             )
 
     def _parts(self, state):

@@ -27,7 +27,7 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
 from sparsedp.derivative import push
 from sparsedp.errors import UnstableStepError
-from sparsedp.fields import check_function, check_number, is_whole, rounded_down
+from sparsedp.fields import check_function, check_number, is_whole, number_beside, rounded_down
 from sparsedp.grid import AXES, check_grid
 from sparsedp.integrators.adaptive import Moving
 from sparsedp.integrators.problem import combine, of_fields, pair, untraced
@@ -79,8 +79,9 @@ class Leapfrog(Scheme):
             fastest = self._speeds.put(key, self._fastest(state, params, h))
         if fastest > 4 * (1 + SLACK):
             safe = rounded_down(SAFE * 2 * h / fastest**0.5)
+            given = number_beside(h, float(safe), digits=12)
             raise UnstableStepError(
-                f"leapfrog is unstable with dt = {h:.12g}: waves of frequency {fastest**0.5 / h:.4g} grow; dt = {safe} "
+                f"leapfrog is unstable with dt = {given}: waves of frequency {fastest**0.5 / h:.4g} grow; dt = {safe} "
                 "is safe, or write unstable='allow'"
             )
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.fields import EPS
+from sparsedp.fields import EPS, number_beside
 
 __all__ = ["linear_weights"]
 
@@ -30,7 +30,8 @@ def linear_weights(grid, axis, x):
     outside = (x < start - slack) | (x > start + extent + slack)
     if not periodic and np.any(outside):
         name = grid.axes[axis]
-        raise ValueError(f"points need {name} from {start:g} to {start + extent:g}, got {name} = {x[outside][0]:g}")
+        got = number_beside(x[outside][0], start, start + extent)
+        raise ValueError(f"points need {name} from {start:g} to {start + extent:g}, got {name} = {got}")
     if n < 2:
         index = np.zeros(x.shape, dtype=np.int64)
         return index, index, np.zeros(x.shape)

@@ -36,7 +36,7 @@ import numpy as np
 
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_finite, check_plain
+from sparsedp.fields import check_finite, check_plain, number_beside
 from sparsedp.ledger import note
 from sparsedp.shortcuts import array, elsewhere, on_every_rank
 from sparsedp.solvers.direct import DENSE_UP_TO
@@ -505,7 +505,8 @@ class Newton:
     def _fail(self, word, reason=""):
         run, name = self.run, self.equation.name
         run.status = word
-        reached = f"relative residual {run.residual:.1e}, wanted {self.rtol:g} ({word})"
+        residual = number_beside(run.residual, self.rtol, digits=1, style="e")
+        reached = f"relative residual {residual}, wanted {self.rtol:g} ({word})"
         hint = self.jacobians.hint(self.J) if self.J is not None else ""
         if word == "stagnated" and self.J.singular:
             hint += "; its Jacobian is singular there, start from another guess or fix what is free by a constant"

@@ -41,7 +41,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
-from sparsedp.fields import EPS, check_finite, place
+from sparsedp.fields import EPS, check_finite, number_beside, place
 from sparsedp.ledger import count, thread, timed
 from sparsedp.markup import facts, table
 from sparsedp.recipe import Remade
@@ -248,11 +248,12 @@ class Solver(Remade):
     def _refuse_defect(self, run, defect, worst):
         space = self.system.null_space
         cells = space.cells(worst)
+        share = number_beside(defect, COMPATIBLE, digits=1, style="e")
         self._incompatible(
             run,
             f" is singular and the right-hand side is not in its range: on component {worst + 1} of {space.count} "
-            f"({cells.size} cells from {self._cell(cells[0])}) the defect is {defect:.1e}, allowed is {COMPATIBLE:g}; "
-            "subtract the weighted mean",
+            f"({cells.size} cells from {self._cell(cells[0])}) the defect is {share}, "
+            f"allowed is {COMPATIBLE:g}; subtract the weighted mean",
         )
 
     def _cell(self, number):
@@ -302,8 +303,9 @@ class Solver(Remade):
     def _refuse(self, run, x, how="", why=""):
         """Raise: x does not meet the tolerance."""
         op = self.system.given.T if run.transposed else self.system.given
+        reached = number_beside(run.residual, run.rtol, digits=1, style="e")
         raise ConvergenceError(
-            f"{how}{self.engine.method} on {op}: relative residual {run.residual:.1e} after {run.iterations} "
+            f"{how}{self.engine.method} on {op}: relative residual {reached} after {run.iterations} "
             f"{self.engine.unit}, wanted {run.rtol:g}{why}",
             info=run.info(),
             best=self.system.shaped(shifted(x, run.exponent), op.domain),
