@@ -1,16 +1,19 @@
 """Derivatives of whole programs: any function of a tree of arrays, forward and backward."""
 
 import gc
+import sys
 import threading
+import warnings
 from contextlib import contextmanager
 from numbers import Number
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.calls import public
-from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, SparsedpError
+from sparsedp.errors import DerivativeError, NonFiniteError, NonFiniteGradientWarning, ShapeError, SparsedpError
 from sparsedp.fields import (
     advise,
     check_function,
@@ -23,7 +26,7 @@ from sparsedp.fields import (
 )
 from sparsedp.ledger import thread
 from sparsedp.recipe import Made
-from sparsedp.shortcuts import ELSEWHERE, alike, together
+from sparsedp.shortcuts import ELSEWHERE, alike, ranks, together
 from sparsedp.tape import (
     Recorder,
     Rule,
@@ -46,13 +49,14 @@ from sparsedp.tree import copied, described, flatten, labels, leaves, mapped, pa
 __all__ = [
     "NO_JVP", "check_loss", "entrywise", "grad", "gradient_of", "growing", "hvp", "is_finite", "judged",
     "jvp", "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "taped", "traced",
-    "value_and_grad", "vjp", "witnessed", "zero_like",
+    "unwarned", "value_and_grad", "vjp", "witnessed", "zero_like",
 ]  # fmt: skip
 
 # What `pushforward` raises where one of our rules, or of autograd's, has none.
 NO_JVP = (DerivativeError, NotImplementedError)
 SPREAD = ": autograd's np.where does not add up what it spreads; multiply by the condition instead, a * c + b * (1 - c)"
 
+PACKAGE = Path(__file__).parent
 LARGE = 1e100  # a cotangent that makes others overflow, through derivatives that do not
 SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
 _lock = threading.Lock()
@@ -217,6 +221,55 @@ def judged():
         yield
 
 
+@contextmanager
+def unwarned():
+    """Within the block derivatives that are not finite raise no warning: the caller refuses them itself."""
+    thread.quiet += 1
+    try:
+        yield
+    finally:
+        thread.quiet -= 1
+
+
+def _warn_unless_finite(name, derivative, again):
+    """Warn of NaN or infinity in a derivative, with the name of the call it comes from.
+
+    Parameters
+    ----------
+    name : str
+        Of the public function that returns the derivative.
+    derivative : tree
+        Traced ones belong to an outer derivative, which is examined itself.
+    again : callable
+        ``again()`` computes the derivative once more in reverse mode.
+    """
+    found = [leaf for leaf in leaves(derivative) if is_variable(leaf)]
+    if thread.quiet or any(map(isbox, found)) or all(map(is_finite, found)):
+        return
+    reason = "dp.check.gradient(loss, x) shows where it comes from"
+    if ranks() == 1:
+        try:
+            with unwarned(), judged():
+                again()
+        except NonFiniteError as error:
+            reason = str(error)
+        except Exception:  # a function that cannot run twice
+            pass
+    warnings.warn(
+        NonFiniteGradientWarning(f"the derivative returned by {name} holds NaN or infinity: {reason}"),
+        stacklevel=_frames_inside() + 1,
+    )
+
+
+def _frames_inside():
+    """How many frames of this package lie between this function's caller and the user's code."""
+    frame: Any = sys._getframe(1)
+    count = 0
+    while frame is not None and Path(frame.f_code.co_filename).is_relative_to(PACKAGE):
+        frame, count = frame.f_back, count + 1
+    return count
+
+
 def name_of(subject):
     """How the user knows a rule, an Operator or a function of autograd."""
     return getattr(subject, "name", None) or getattr(subject, "__name__", type(subject).__name__)
@@ -362,6 +415,11 @@ def jvp(fun, x, tangent):
     ShapeError
         If the tangent has another structure than `x`, or a leaf of it another shape.
 
+    Warns
+    -----
+    NonFiniteGradientWarning
+        If the derivative holds NaN or infinity; it names the call whose derivative is not finite.
+
     Notes
     -----
     Forward mode; by two reverse passes where a part of `fun` has no forward derivative.
@@ -373,10 +431,23 @@ def jvp(fun, x, tangent):
     (10.0, 5.0)
     """
     check_function("jvp", fun, "lambda u: ...")
+    return _jvp("jvp", fun, x, tangent)
+
+
+def _jvp(name, fun, x, tangent):
+    """Value and directional derivative, with a warning where the derivative is not finite."""
     check_native("jvp", *leaves((x, tangent)))
     check_leaves("x", x)
     check_leaves("tangent", tangent)
-    results = together("jvp", (x, tangent), push, fun, x, _directions(x, tangent))
+    tangents = _directions(x, tangent)
+    results = together("jvp", (x, tangent), push, fun, x, tangents)
+
+    def again():
+        values, _, pull = linearised(fun, x, [direction is not None for direction in tangents])
+        pull([np.ones_like(value) if is_variable(value) else None for value in values])
+
+    if all(is_finite(direction) for direction in tangents if direction is not None):
+        _warn_unless_finite(name, results[1], again)
     return copied(results)  # the caller may write into x, the tangent and the results
 
 
@@ -400,12 +471,17 @@ def hvp(loss, x, tangent):
     TypeError, ShapeError, DerivativeError
         As `jvp` and `value_and_grad`.
 
+    Warns
+    -----
+    NonFiniteGradientWarning
+        If the product holds NaN or infinity; it names the call whose derivative is not finite.
+
     Examples
     --------
     >>> hvp(lambda x: x[0] ** 2 * x[1], (2.0, 5.0), (1.0, 0.0))
     (10.0, 4.0)
     """
-    return mapped(_as_given, jvp(grad(loss), x, tangent)[1], x)
+    return mapped(_as_given, _jvp("hvp", grad(loss), x, tangent)[1], x)
 
 
 def push(fun, tree, tangents):
@@ -463,6 +539,11 @@ def vjp(fun, *x):
     ShapeError
         On use of `pull`, if `g` has another shape than the value.
 
+    Warns
+    -----
+    NonFiniteGradientWarning
+        If a result of `pull` holds NaN or infinity; it names the call whose derivative is not finite.
+
     Examples
     --------
     >>> value, pull = vjp(lambda u, v: u * v, 2.0, 5.0)
@@ -474,6 +555,8 @@ def vjp(fun, *x):
 
     def back(g):
         slopes = together("the function of vjp", (g,), pull, g)
+        if is_finite(g):
+            _warn_unless_finite("vjp", slopes, lambda: pullback(lambda parts: fun(*parts), x)[1](g))
         return slopes[0] if len(x) == 1 else slopes
 
     return value, public("pull")(back)
@@ -501,6 +584,11 @@ def grad(loss, argnum=0):
         If `argnum` is no whole number >= 0.
     ShapeError, DerivativeError
         On use, as `value_and_grad`.
+
+    Warns
+    -----
+    NonFiniteGradientWarning
+        If the gradient holds NaN or infinity; it names the call whose derivative is not finite.
 
     Examples
     --------
@@ -539,6 +627,11 @@ def value_and_grad(loss, argnum=0):
     DerivativeError
         If the loss is complex, or `x` holds no floating value.
 
+    Warns
+    -----
+    NonFiniteGradientWarning
+        If the gradient holds NaN or infinity; it names the call whose derivative is not finite.
+
     Notes
     -----
     `x` and the constant arrays that the loss uses in calls may be written into at once after a call (``work[:] = c`` in
@@ -565,6 +658,7 @@ def value_and_grad(loss, argnum=0):
         value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
         check_loss(value)
         gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
+        _warn_unless_finite("value_and_grad", gradient, lambda: both(*args))
         return value if isbox(value) else float(value), gradient
 
     return Made(evaluate, value_and_grad, loss, argnum)

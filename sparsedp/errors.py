@@ -11,6 +11,7 @@ __all__ = [
     "GrowthWarning",
     "IncompatibleError",
     "NonFiniteError",
+    "NonFiniteGradientWarning",
     "ShapeError",
     "SparsedpError",
     "UnstableStepError",
@@ -43,6 +44,14 @@ class GrowthWarning(UserWarning):
 
 class BudgetWarning(UserWarning):
     """A memory budget with which a run takes three times as long as with at most twice as much."""
+
+
+class NonFiniteGradientWarning(UserWarning):
+    """A derivative that is returned holds NaN or infinity; the message names the call it comes from.
+
+    `grad`, `value_and_grad`, `vjp`, `jvp` and `hvp` warn. Turn it into an error by
+    ``warnings.filterwarnings("error", category=sparsedp.NonFiniteGradientWarning)``.
+    """
 
 
 class ConvergenceError(SparsedpError, RuntimeError):

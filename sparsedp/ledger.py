@@ -35,6 +35,8 @@ class Thread(local):
         Intervals under error control since the thread began.
     grown : int
         Warnings of cotangents that grew, since the thread began; what warnings do is one for all threads.
+    quiet : int
+        Open blocks whose caller refuses derivatives that are not finite: no warning is needed.
     inner : list of float
         For each timed call that is under way, the seconds of the calls inside it.
     """
@@ -45,7 +47,7 @@ class Thread(local):
         self.loop_hooks: list[Any] = []
         self.witnesses: list[Any] = []
         self.inner: list[float] = []
-        self.solves = self.controlled = self.grown = 0
+        self.solves = self.controlled = self.grown = self.quiet = 0
 
 
 thread = Thread()

@@ -19,7 +19,7 @@ from sparsedp.check.judge import (
 from sparsedp.check.summary import Result
 from sparsedp.check.sweep import POINTS, QUICK, REFUSALS, Point, Trials, generator
 from sparsedp.check.table import Table, table_of
-from sparsedp.derivative import grad, hvp
+from sparsedp.derivative import grad, hvp, unwarned
 from sparsedp.fields import check_function, check_whole
 from sparsedp.progress import bar
 
@@ -130,7 +130,8 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
     lines = len(point.directions(point.vector, count, generator(0), names))
     ticks = _announced(3 + POINTS * min(lines, 2) + 2 * len(trials.steps) * lines)
     trials.tick = lambda: next(ticks, None)
-    return _audit(trials, gradient is None, count, generator(rng), names)
+    with unwarned():  # a gradient that is not finite is a verdict
+        return _audit(trials, gradient is None, count, generator(rng), names)
 
 
 def _announced(total):

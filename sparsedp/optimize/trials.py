@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.derivative import check_loss, judged, pullback, value_and_grad
+from sparsedp.derivative import check_loss, judged, pullback, unwarned, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.optimize.linearised import Linearised
 from sparsedp.optimize.result import Failure, Stuck, Trial
@@ -124,6 +124,10 @@ class Trials:
 
     def _both(self, vector):
         """Loss and flat gradient, each from a fresh tree."""
+        with unwarned():  # a gradient that is not finite is refused below
+            return self._value_and_gradient(vector)
+
+    def _value_and_gradient(self, vector):
         tree, batch = self._packing.unpack(vector), self.batches.at(self.iteration)
         if self._gradient is None:
             value, gradient = value_and_grad(self._loss)(tree, *batch)

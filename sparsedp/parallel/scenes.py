@@ -13,7 +13,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.calls import public
-from sparsedp.derivative import check_loss, grad, jvp, value_and_grad, zero_like
+from sparsedp.derivative import check_loss, grad, jvp, unwarned, value_and_grad, zero_like
 from sparsedp.fields import check_finite, check_function, check_shape, check_whole, is_whole
 from sparsedp.progress import shown_steps
 from sparsedp.recipe import Remade
@@ -257,12 +257,14 @@ def _value(of, values, tangents):
 
 
 def _slopes(of, values, tangents):
-    value, slopes = value_and_grad(of)(values)
+    with unwarned():  # the gradient of the whole ensemble is examined
+        value, slopes = value_and_grad(of)(values)
     return [value, *slopes]
 
 
 def _curvature(of, values, tangents):
-    return jvp(grad(of), values, list(tangents))[1]
+    with unwarned():
+        return jvp(grad(of), values, list(tangents))[1]
 
 
 def _placed(x, moving, values):

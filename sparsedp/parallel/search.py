@@ -6,7 +6,7 @@ The unknowns are a vector of PETSc: of a field its blocks, of what every rank kn
 import numpy as np
 from petsc4py import PETSc
 
-from sparsedp.derivative import value_and_grad
+from sparsedp.derivative import unwarned, value_and_grad
 from sparsedp.fields import check_finite
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
@@ -58,7 +58,8 @@ class Spread(Trials):
         self.blocks = blocks
 
     def _both(self, vector):
-        value, slopes = value_and_grad(self._loss)(self.blocks.tree(self._packing.unpack(vector)))
+        with unwarned():  # a gradient that is not finite is refused below
+            value, slopes = value_and_grad(self._loss)(self.blocks.tree(self._packing.unpack(vector)))
         for name, g, x in zip(labels(self.blocks.start, "start"), leaves(slopes), leaves(self.blocks.start)):
             if is_variable(x):
                 check_finite(f"the gradient of {name}", g, FINITE)

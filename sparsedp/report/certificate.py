@@ -20,7 +20,7 @@ import numpy as np
 
 from sparsedp.check.summary import Result
 from sparsedp.check.table import table_of
-from sparsedp.derivative import value_and_grad
+from sparsedp.derivative import unwarned, value_and_grad
 from sparsedp.fields import check_number, is_number
 from sparsedp.ledger import recording, thread
 from sparsedp.report.plan import total
@@ -85,7 +85,7 @@ class RecordedSolves(dict):
         """function(x), with its solves recorded."""
         thread.solve_hooks.append(self)
         try:
-            with recording() as calls:
+            with recording() as calls, unwarned():  # a second run would mix its solves with the recorded ones
                 return function(x)
         finally:
             thread.solve_hooks.pop()

@@ -8,7 +8,7 @@ from sparsedp.check.nodes import bytes_held
 from sparsedp.check.summary import Result
 from sparsedp.check.sweep import solvers_of
 from sparsedp.check.table import table_of
-from sparsedp.derivative import value_and_grad, witnessed
+from sparsedp.derivative import unwarned, value_and_grad, witnessed
 from sparsedp.fields import check_function
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
@@ -92,7 +92,7 @@ def explain(loss, x, gradient=True):
         return value
 
     start = perf_counter()
-    with recording() as calls, witnessed(lambda node, *_: nodes.append(node)):
+    with recording() as calls, witnessed(lambda node, *_: nodes.append(node)), unwarned():
         value = value_and_grad(watched)(x)[0] if gradient else watched(x)
     end, tape_nodes, tape_bytes, before, begin = forward
     seconds = end - start, perf_counter() - begin

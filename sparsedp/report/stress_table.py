@@ -6,6 +6,7 @@ import numpy as np
 
 from sparsedp.check.summary import Result
 from sparsedp.check.table import table_of
+from sparsedp.derivative import unwarned
 from sparsedp.fields import check_choice, check_function
 from sparsedp.report import plots
 from sparsedp.report.stability import stability_map
@@ -78,7 +79,7 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     for group in only or ():
         check_choice("a group of stress cases", group, GROUPS)
     chosen = [name for name in GROUPS if only is None or name in only]
-    with np.errstate(all="ignore"), warnings.catch_warnings():
+    with np.errstate(all="ignore"), unwarned(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the rows say what became of a case
         scene = Scene(loss, x, ranges, step, time_step, viscosity)
         rows = [dict(zip(COLUMNS, (*names, *judge()))) for *names, judge in cases(scene, chosen)]
