@@ -162,6 +162,8 @@ class Space(Value, Uncached):
         if self.layout is not None and self.layout.holds(*parts):
             return self.layout.join(self, parts)
         numpy = anp if any(map(isbox, parts)) else np  # the same, without the tape
+        if not parts:  # as of walls in a periodic box
+            return np.zeros(self.shape)
         flat = [numpy.reshape(_broadcast(self, part, shape), (-1,)) for part, shape in zip(parts, self.parts)]
         return numpy.reshape(numpy.concatenate(flat), self.shape)
 

@@ -112,6 +112,34 @@ def test_nothing_on_walls_and_inflows():
     assert repr(step).endswith("pressure, convection, viscosity, friction>")
 
 
+@pytest.mark.parametrize("friction", [False, True])
+@pytest.mark.parametrize("term", ["number", "function", "diffusivity"])
+def test_a_step_that_is_too_long_is_told_what_is_possible(term, friction):
+    """Friction, and a viscosity that is a function, are refused beside implicit viscosity."""
+    grid = dp.Grid((4, 4))
+    given = {"friction": np.ones(grid.faces.size)} if friction else {}
+    s = None
+    if term == "diffusivity":
+        given |= {"scalars": {"heat": {"diffusivity": 3.0}}}
+        s = {"heat": np.zeros((4, 4))}
+    else:
+        given["viscosity"] = 3.0 if term == "number" else lambda params: 3.0
+    run = lambda **more: dp.flow_step(grid, 0.5, **given, **more).start(np.zeros(grid.faces.size), None, s)
+    with pytest.raises(
+        dp.errors.UnstableStepError, match="unstable for (viscosity|diffusivity of 'heat') = 3 "
+    ) as caught:
+        run()
+    possible = not friction and term != "function"
+    assert ("implicit=True" in str(caught.value)) == possible
+    if possible:
+        run(implicit=True)
+    else:
+        assert str(caught.value).endswith("take smaller steps, or write unstable='allow'")
+        run(unstable="allow")
+        with pytest.raises(ValueError, match="write implicit=False"):
+            run(implicit=True)
+
+
 def test_frictions_refused_by_name():
     grid = dp.Grid((2, 2))
     wrong = [

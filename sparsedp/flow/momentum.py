@@ -3,14 +3,21 @@
 Every component lives on its own faces. Along its own axis it is a field on nodes, and the wall faces
 hold the wall values; along the other axes it is a field between walls half a cell away, with the
 condition that what the fluid does there implies (`along` of boundary_conditions.py).
+
+The velocity of a wall therefore has two parts. Its normal component stands on the faces of the wall. Its tangential
+components are the wall velocities, a flat array on ``face_lift(grid, boundary).domain``: those of walls that move along
+themselves, and those of a flow that enters at an angle. Viscosity takes them by `face_lift`, convection by its argument
+`walls`.
 """
 
+from functools import cached_property
 from itertools import product
 
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.boundary_conditions import dirichlet, free_slip, no_slip, outflow, resolve
+from sparsedp.boundary_conditions import dirichlet, free_slip, inflow, no_slip, outflow, resolve
+from sparsedp.fields import check_on
 from sparsedp.flow.projection_setup import faces_that
 from sparsedp.grid import Grid
 from sparsedp.operator import Operator
@@ -32,9 +39,21 @@ from sparsedp.structure.base import Matrix
 from sparsedp.structure.factor import Factor
 from sparsedp.structure.kronecker import Kronecker
 from sparsedp.structure.lazy import Mask, compose, total
+from sparsedp.tape import plain
 from sparsedp.tree import copied
 
-__all__ = ["convection", "face_laplacian", "face_lift", "momentum_fluxes", "stresses"]
+__all__ = [
+    "MomentumFluxes",
+    "check_walls",
+    "convection",
+    "face_laplacian",
+    "face_lift",
+    "free_faces",
+    "stresses",
+    "velocities_of",
+    "wall_stresses",
+    "wall_velocities",
+]
 
 
 def face_laplacian(grid, boundary=no_slip, solid=None, solid_boundary=no_slip):
@@ -80,13 +99,13 @@ def face_laplacian(grid, boundary=no_slip, solid=None, solid_boundary=no_slip):
 
 
 def face_lift(grid, boundary=no_slip):
-    """Wall velocities -> faces: what walls that move along themselves add, L(v) + B(values).
+    """Return the operator from tangential wall velocities to their part of the Laplacian, L(v) + B(values).
 
     Parameters
     ----------
     grid : Grid
     boundary : flow condition or dict
-        The same as for `face_laplacian`. Walls that are no_slip (and inflows) have a velocity along them.
+        The same as for `face_laplacian`. Walls that are no_slip and inflows have a velocity along them.
 
     Returns
     -------
@@ -110,32 +129,22 @@ def face_lift(grid, boundary=no_slip):
     array([0., 0., 0., 2., 0., 0., 0., 0., 0., 0., 0., 0.])
     """
     sides = resolve(grid, boundary, no_slip)
-    parts: list[tuple[int, ...]] = []
-    blocks = {}
-    for a in range(grid.dim):
-        for side, condition in enumerate(sides[a] or ()):
-            for c in range(grid.dim):
-                if c != a and condition.along is dirichlet:
-                    factor = differences(grid, a) @ wall_slopes(grid, a, side, dirichlet)
-                    blocks[c, len(parts)] = along(a, grid.dim, factor)
-                    parts.append(tuple(1 if b == a else n for b, n in enumerate(grid.face_shape(c))))
-    walls = Space(None, "moving walls", grid, parts)
-    structure = compose(Mask(free_faces(grid, sides, None)), Kronecker(grid.faces.parts, parts, blocks))
-    return Operator(structure, walls, grid.faces, "face_lift")
+    structure = compose(Mask(free_faces(grid, sides, None)), wall_stresses(grid, sides))
+    return Operator(structure, wall_velocities(grid, sides), grid.faces, "face_lift")
 
 
 def convection(grid, boundary=no_slip, solid=None):
-    """Grid -> convect(v, w): the momentum that w carries, div(w v) on the faces, by central differences.
+    """Return ``convect(v, w, walls=None)``: the momentum that w carries, div(w v) on faces, by central differences.
 
     Each component of v and the velocity w that carries it are averaged to the sides of its control
     volume. The flux form conserves momentum and, where w has no divergence, energy.
 
-        N(v, w) = C ((A v) (B w))
+        N(v, w) = C ((A v + E walls) (B w))
 
     Parameters
     ----------
     grid : Grid
-    boundary : str or dict
+    boundary : flow condition or dict
         As in `face_laplacian`.
     solid : bool array, shape `grid.shape`, optional
 
@@ -143,12 +152,14 @@ def convection(grid, boundary=no_slip, solid=None):
     -------
     callable
         ``convect(v, w)`` with two face fields [velocity] -> faces [velocity^2 / length], 0 on faces that
-        are not free; differentiable in both, to every order. Order 2.
+        are not free; differentiable in all arguments, to every order. Order 2.
+        ``convect(v, w, walls)``: with the tangential velocity of v at walls and inflows, one flat array on
+        ``face_lift(grid, boundary).domain`` [velocity]. Without it, it is 0: flow enters at right angles.
 
     Raises
     ------
     ShapeError
-        If `solid` has another shape than the grid.
+        If `solid` has another shape than the grid; on use, if a field or `walls` has another shape.
     ValueError
         If an axis is named that is periodic or not there.
     TypeError
@@ -165,13 +176,24 @@ def convection(grid, boundary=no_slip, solid=None):
     >>> v = np.array([1.0, 2.0, 1.0, 0.0])
     >>> convect(v, v)
     array([ 2.,  0., -2.,  0.])
+
+    A uniform flow that enters at an angle is steady:
+
+    >>> from sparsedp import inflow, outflow
+    >>> grid, sides = Grid((3, 3)), {"x": (inflow, outflow), "y": (inflow, outflow)}
+    >>> convect, walls = convection(grid, sides), face_lift(grid, sides).domain
+    >>> v = grid.join(1.0, 0.5)
+    >>> float(np.max(np.abs(convect(v, v, walls.join(0.5, 1.0)))))  # v at x-lower, u at y-lower
+    0.0
     """
     sides = resolve(grid, boundary, no_slip)
-    A, B, gain = momentum_fluxes(grid, sides)
+    fluxes = MomentumFluxes(grid, sides)
+    gain = fluxes.gain
     C = Operator(compose(Mask(free_faces(grid, sides, solid)), gain.structure), gain.domain, grid.faces, "gain")
 
-    def convect(v, w):
-        return C(A(v) * B(w))
+    def convect(v, w, walls=None):
+        # On walls where the carrying velocity w needs a wall velocity, the faces are not free: C drops the flux.
+        return C(fluxes.carried(v, walls) * fluxes.carrier(w))
 
     return Made(convect, convection, *copied((grid, boundary, solid)))
 
@@ -197,23 +219,144 @@ def stresses(grid, sides, solid, solid_boundary):
     return Matrix(sp.block_diag(lines, format="csr"))
 
 
-def momentum_fluxes(grid, sides):
-    """Operators A, B, C: div(w v) = C ((A v) (B w)), as in `convection`."""
-    carried, carrier, gain, flux = {}, {}, {}, []
-    for number, (c, a) in enumerate(product(range(grid.dim), repeat=2)):  # component c through the sides across axis a
-        if a == c:
-            mean = other = _to_centres(grid, c)
-            back = _from_centres(grid, c)
-        else:
-            mean, other = (means(grid, b, _conditions(sides[b])) for b in (a, c))
-            back = differences(grid, a)
-        carried[number, c], carrier[number, a] = along(a, grid.dim, mean), along(c, grid.dim, other)
-        gain[c, number] = along(a, grid.dim, back)
-        flux.append(tuple(mean.shape[0] if b == a else n for b, n in enumerate(grid.face_shape(c))))
-    faces, sites = grid.faces, Space(None, "fluxes", grid, flux)
-    A = kronecker_operator(faces, sites, carried, "carried")
-    B = kronecker_operator(faces, sites, carrier, "carrier")
-    return A, B, kronecker_operator(sites, faces, gain, "gain")
+class MomentumFluxes:
+    """The parts of div(w v) = gain (carried(v) * carrier(w)), on all faces, as in `convection`.
+
+    Parameters
+    ----------
+    grid : Grid
+    sides : tuple
+        The flow conditions as `resolve` returns them.
+
+    Attributes
+    ----------
+    gain : Operator
+        From the fluxes through the sides of control volumes to faces.
+    """
+
+    def __init__(self, grid, sides):
+        self._walls = wall_velocities(grid, sides)
+        carried = {}
+        carrier = {}
+        gain = {}
+        sites = []
+        # At walls: the tangential velocity is the value on the side itself.
+        wall_carried = {}
+        wall_carrier = {}
+        numbers = {pair: number for number, pair in enumerate(product(range(grid.dim), repeat=2))}
+        for (c, a), number in numbers.items():  # component c through the sides across axis a
+            if a == c:
+                mean = other = _to_centres(grid, c)
+                back = _from_centres(grid, c)
+            else:
+                mean, other = (means(grid, b, _conditions(sides[b])) for b in (a, c))
+                back = differences(grid, a)
+            carried[number, c], carrier[number, a] = along(a, grid.dim, mean), along(c, grid.dim, other)
+            gain[c, number] = along(a, grid.dim, back)
+            sites.append(tuple(mean.shape[0] if b == a else n for b, n in enumerate(grid.face_shape(c))))
+        for part, (a, side, c) in enumerate(_moving_sides(grid, sides)):
+            at_wall = along(a, grid.dim, _at_wall(grid, a, side))
+            wall_carried[numbers[c, a], part] = at_wall
+            wall_carrier[numbers[a, c], part] = at_wall
+        fluxes = Space(None, "fluxes", grid, sites)
+        self._carried = kronecker_operator(grid.faces, fluxes, carried, "carried")
+        self._carrier = kronecker_operator(grid.faces, fluxes, carrier, "carrier")
+        self._at_walls = fluxes, wall_carried, wall_carrier
+        self.gain = kronecker_operator(fluxes, grid.faces, gain, "gain")
+
+    @cached_property
+    def _wall_carried(self):
+        fluxes, blocks, _ = self._at_walls
+        return kronecker_operator(self._walls, fluxes, blocks, "carried at walls")
+
+    @cached_property
+    def _wall_carrier(self):
+        fluxes, _, blocks = self._at_walls
+        return kronecker_operator(self._walls, fluxes, blocks, "carrier at walls")
+
+    def carried(self, v, walls=None):
+        """Return the velocity that is carried, at the sides of the control volumes of its components."""
+        if walls is None:
+            return self._carried(v)
+        check_walls("convection", walls, self._walls)
+        return self._carried(v) + self._wall_carried(walls)
+
+    def carrier(self, w, walls=None):
+        """Return the velocity that carries, at the same sides."""
+        if walls is None:
+            return self._carrier(w)
+        check_walls("convection", walls, self._walls)
+        return self._carrier(w) + self._wall_carrier(walls)
+
+
+# ------------------------------------------------------------ tangential velocities of walls
+
+
+def wall_velocities(grid, sides):
+    """Return the space of tangential wall velocities."""
+    parts = [
+        tuple(1 if b == a else n for b, n in enumerate(grid.face_shape(c))) for a, _, c in _moving_sides(grid, sides)
+    ]
+    return Space(None, "moving walls", grid, parts)
+
+
+def check_walls(name, walls, space):
+    """Refuse wall velocities of another shape than their space."""
+    check_on(f"{name}, as walls,", walls, space, "; write face_lift(grid, boundary).domain.join(...)")
+
+
+def velocities_of(lifted, grid, sides):
+    """Return the wall velocities at inflows that `face_lift` turned into an array on faces, and 0 at other walls.
+
+    Raises
+    ------
+    ValueError
+        If a face at an inflow lies at another wall too: the array holds the sum of their parts.
+    """
+    matrix = compose(Mask(free_faces(grid, sides, None)), wall_stresses(grid, sides)).explicit().tocsr()
+    walls = wall_velocities(grid, sides)
+    enters = [sides[a][side] == inflow for a, side, _ in _moving_sides(grid, sides)]
+    wanted = np.repeat(np.array(enters, bool), np.diff(walls.offsets))
+    values = plain(lifted)
+    count = np.diff(matrix.indptr)  # walls that a face touches
+    entering = abs(matrix) @ wanted > 0
+    if np.any(values[entering & (count > 1)]):
+        raise ValueError(
+            "walls of flow_step does not tell which of the walls that meet at an inflow has which velocity; write "
+            "walls=lambda params: values, with values on face_lift(grid, boundary).domain"
+        )
+    face, wall = matrix.nonzero()
+    alone = (count[face] == 1) & wanted[wall]
+    weights = 1.0 / matrix.data[alone]
+    back = sp.csr_array((weights, (wall[alone], face[alone])), shape=matrix.shape[::-1])
+    return Operator(Matrix(back), grid.faces, walls, "wall velocities")(lifted)
+
+
+def wall_stresses(grid, sides):
+    """Return the structure from tangential wall velocities to their part of the Laplacian, on all faces."""
+    blocks = {}
+    for part, (a, side, c) in enumerate(_moving_sides(grid, sides)):
+        factor = differences(grid, a) @ wall_slopes(grid, a, side, dirichlet)
+        blocks[c, part] = along(a, grid.dim, factor)
+    return Kronecker(grid.faces.parts, wall_velocities(grid, sides).parts, blocks)
+
+
+def _moving_sides(grid, sides):
+    """Return (axis, side, component) for each tangential component of each wall that has one."""
+    return [
+        (a, side, c)
+        for a in range(grid.dim)
+        for side, condition in enumerate(sides[a] or ())
+        for c in range(grid.dim)
+        if c != a and condition.along is dirichlet
+    ]
+
+
+def _at_wall(grid, axis, side):
+    """Return the factor from the value at a wall to the faces across an axis."""
+    nodes = grid.node_count(axis)
+    wall = np.full(min(nodes, 1), side * (nodes - 1))
+    return Factor.from_diagonals((nodes, 1), (wall, np.zeros_like(wall), np.ones(wall.size)))
 
 
 # ------------------------------------------------------------ the factors

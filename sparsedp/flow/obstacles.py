@@ -15,7 +15,7 @@ is left is of order h^2. The second difference is log(1 + (cosh(b d) - 1) / (1 +
 any level set, in units of its change over a cell.
 """
 
-from functools import reduce
+from functools import cached_property, reduce
 from operator import add
 
 import autograd.numpy as anp
@@ -25,7 +25,13 @@ import scipy.sparse as sp
 from sparsedp.boundary_conditions import no_slip, resolve
 from sparsedp.calls import public
 from sparsedp.fields import check_finite, check_kind, check_number, field_array
-from sparsedp.flow.momentum import face_laplacian, momentum_fluxes, stresses
+from sparsedp.flow.momentum import (
+    MomentumFluxes,
+    face_laplacian,
+    stresses,
+    wall_stresses,
+    wall_velocities,
+)
 from sparsedp.flow.projection_setup import pressure_conditions
 from sparsedp.grid import check_grid, numbers_per_axis
 from sparsedp.operator import Operator
@@ -47,13 +53,13 @@ FLAT = 1e-10  # change over a cell, of the largest level, that counts as none
 
 
 def forces(grid, solid=None, boundary=no_slip, solid_boundary=no_slip, cells=None, about=0.0):
-    """Grid -> ``on(v, p, viscosity)``: force and torque on an obstacle, or on what a set of cells holds.
+    """Return ``on(v, p, viscosity)``: force and torque on an obstacle, or on what a set of cells holds.
 
     Parameters
     ----------
     grid : Grid
     solid, boundary, solid_boundary
-        As in `flow_step`. Walls are at rest.
+        As in `flow_step`.
     cells : slices or bool array, optional
         Whose faces count, as in `flux`. Default: those of `solid`. An obstacle among others, or a box around one that
         a friction stands for, as of `brinkman`.
@@ -67,6 +73,9 @@ def forces(grid, solid=None, boundary=no_slip, solid_boundary=no_slip, cells=Non
         shape (1,), (3,) or (6,): the force along x, y, z [velocity^2 length^(dim - 1)] and its torque [times length],
         of which there is one in 2-D; for a fluid of density 1. Differentiable. ``on.viscous`` (for viscosity 1) and
         ``on.pressure`` are its linear parts, Operators; ``on.total`` sums any acceleration given on faces.
+        ``on(v, p, viscosity, walls)``: with tangential wall velocities, one flat array on
+        ``face_lift(grid, boundary).domain``. They matter where the cells touch a wall that moves, or an inflow at an
+        angle. Default: 0.
 
     Raises
     ------
@@ -191,13 +200,24 @@ class Forces(Remade):
         viscous = Operator(stresses(grid, sides, solid, solid_boundary), grid.faces, grid.faces, "stresses")
         wet = ~check_solid(grid, solid)
         slope = gradient(grid, pressure_conditions(grid, sides)) @ mask(grid.cells, wet)
-        self.carried, self.carrier, gain = momentum_fluxes(grid, sides)
-        self.viscous, self.pressure, self.gain = self.total @ viscous, -self.total @ slope, self.total @ gain
+        self.fluxes, self.walls = MomentumFluxes(grid, sides), wall_velocities(grid, sides)
+        self.viscous, self.pressure = self.total @ viscous, -self.total @ slope
+        self.gain = self.total @ self.fluxes.gain
+        self._sides = sides
+
+    @cached_property
+    def dragged(self):
+        """Operator from tangential wall velocities to their part of the viscous force, for viscosity 1."""
+        grid = self.total.domain.grid
+        return self.total @ Operator(wall_stresses(grid, self._sides), self.walls, grid.faces, "wall stresses")
 
     @public("dp.forces(grid, solid)")
-    def __call__(self, v, p, viscosity):
+    def __call__(self, v, p, viscosity, walls=None):
         check_number("the viscosity of forces", plain(viscosity), ">= 0")  # an array would be spread over the torque
-        total = viscosity * self.viscous(v) + self.pressure(p) - self.gain(self.carried(v) * self.carrier(v))
+        momentum = self.gain(self.fluxes.carried(v, walls) * self.fluxes.carrier(v, walls))
+        total = viscosity * self.viscous(v) + self.pressure(p) - momentum
+        if walls is not None:
+            total = total + viscosity * self.dragged(walls)
         check_finite("what forces finds", plain(total))
         return total
 

@@ -30,11 +30,12 @@ Adams-Bashforth, by the largest root |z| of
     z^2 - z = (3/2 z - 1/2) (i c - d),      or, with implicit damping,  (z^2 - z) + d z (z + 1) / 2 = (3/2 z - 1/2) i c.
 """
 
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
+from sparsedp.boundary_conditions import inflow as inflow_side
 from sparsedp.boundary_conditions import neumann, no_slip
 from sparsedp.calls import public
 from sparsedp.errors import DerivativeError, ShapeError, UnstableStepError
@@ -48,8 +49,9 @@ from sparsedp.fields import (
     number_beside,
     rounded_down,
 )
-from sparsedp.flow.momentum import convection, face_laplacian, free_faces
+from sparsedp.flow.momentum import check_walls, convection, face_laplacian, face_lift, free_faces, velocities_of
 from sparsedp.flow.pressure_projection import projection
+from sparsedp.flow.projection_setup import faces_that
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.difference import divergence, gradient, laplacian
@@ -57,7 +59,7 @@ from sparsedp.operators.masks_and_lift import identity, lift, mask
 from sparsedp.operators.transfer import average
 from sparsedp.recipe import Remade
 from sparsedp.solvers.choose_method import inverse
-from sparsedp.tape import dtype_of, isbox, plain
+from sparsedp.tape import cast, dtype_of, isbox, plain
 from sparsedp.tape_constants import frozen
 from sparsedp.tree import copied, mapped
 
@@ -83,8 +85,9 @@ def flow_step(
     scalars=None,
     unstable="raise",
     friction=None,
+    inflow=None,
 ):
-    """Grid -> ``step(state, params)`` of incompressible flow, of order 2 in space and time.
+    """Return ``step(state, params)`` of incompressible flow, of order 2 in space and time.
 
     Parameters
     ----------
@@ -101,8 +104,10 @@ def flow_step(
         Whether viscosity is implicit: any dt nu / h^2, for one more solve.
     convective : bool
         False: Stokes flow, no div(v v).
-    walls : array, optional
-        What moving walls add, ``face_lift(grid, boundary)(values)``.
+    walls : callable or array, optional
+        Tangential velocities of moving walls and of flow that enters at an angle: ``walls(params)`` -> one flat array
+        on ``face_lift(grid, boundary).domain`` [velocity], at the end of a step; differentiable. Velocities that do
+        not change may be given as ``face_lift(grid, boundary)(values)``. Default: 0.
     scalars : dict, optional
         Of cell fields that the flow carries: ``{"heat": {"diffusivity": 0.1, "boundary": {"x": dp.dirichlet},
         "values": values, "source": lambda s, params: ...}}``, all four optional: a number >= 0 [length^2 / time], a
@@ -116,23 +121,28 @@ def flow_step(
         Faces >= 0 [1 / time], or ``friction(params)`` -> such faces: the term -friction * v, implicit, for any size of
         it; viscosity is explicit then. With ``rub = dp.brinkman(grid)`` an obstacle of any shape is
         ``lambda radius: viscosity * rub(distance - radius)``. Differentiable. It does nothing on walls and inflows.
+    inflow : callable or array, optional
+        ``inflow(params)`` -> faces [velocity], whose values on sides of inflow are the normal velocity there at the
+        end of a step; differentiable. Default: what the velocity of the state has there, the same at all times.
 
     Returns
     -------
     FlowStep
         ``step.start(v, params=None)`` makes the first state, a dict of the velocity "v" [velocity], the pressure "p"
         [velocity^2] and the acceleration before "a"; ``step(state, params)`` the next one. For `rollout`. The params
-        are those of force, friction and viscosity. With scalars ``step.start(v, params, s)``, s a dict of fields: the
-        state has them as "s", and their rates before as "r".
+        are those of force, friction, viscosity, walls and inflow. With scalars ``step.start(v, params, s)``, s a dict
+        of fields: the state has them as "s", and their rates before as "r". With a function as walls the state has
+        the wall velocities as "walls".
 
     Raises
     ------
     ValueError
-        If dt or the viscosity is out of range, a scalar has another entry than those four, or a friction comes with
-        implicit viscosity; on use, if a friction is < 0 or complex.
+        If dt or the viscosity is out of range, a scalar has another entry than those four, a friction comes with
+        implicit viscosity, inflow is given without a side of inflow, or an array as walls does not tell the velocity of
+        a flow that enters; on use, if a friction is < 0 or complex.
     ShapeError
-        If walls are not on the faces; on use, if the state is not one that ``step.start`` makes, or a force, friction
-        or source does not fit its field.
+        If an array as walls is not on the faces; on use, if the state is not one that ``step.start`` makes, or a force,
+        friction, source, inflow or wall velocity does not fit its space.
     TypeError
         If scalars is not a dict, or a force or source is no function of as many arguments.
     DerivativeError
@@ -159,6 +169,18 @@ def flow_step(
     >>> state = step(step.start(np.ones(32)), None)
     >>> bool(np.allclose(state["v"], 1.0))
     True
+
+    A wind (1, 0.3) enters through the lower side of each axis, at an angle, and leaves through the upper one.
+
+    >>> from sparsedp import face_lift
+    >>> from sparsedp import inflow as enters
+    >>> from sparsedp import outflow as leaves
+    >>> grid, sides = Grid((4, 4)), {"x": (enters, leaves), "y": (enters, leaves)}
+    >>> values = face_lift(grid, sides).domain.join(0.3, 1.0)  # v at x-lower, u at y-lower
+    >>> step = flow_step(grid, 0.1, 0.01, boundary=sides, walls=lambda params: values)
+    >>> wind = grid.join(1.0, 0.3)
+    >>> bool(np.allclose(step(step.start(wind))["v"], wind))
+    True
     """
     given = copied(locals())  # the caller may change them
     check_grid("flow_step", grid)
@@ -172,8 +194,13 @@ def flow_step(
     if force is not None:
         example = f"force=lambda v, {'s, ' * bool(scalars)}params: ..."
         check_function("flow_step", force, example, 3 if scalars else 2)
-    if walls is not None:
-        check_on("flow_step, as walls,", walls, grid.faces, "; write face_lift(grid, boundary)(values)")
+    if callable(walls):
+        check_function("flow_step, as walls,", walls, "walls=lambda params: values", 1)
+    elif walls is not None:
+        advice = "; write walls=lambda params: values, or face_lift(grid, boundary)(values)"
+        check_on("flow_step, as walls,", walls, grid.faces, advice)
+    if callable(inflow):
+        check_function("flow_step, as inflow,", inflow, "inflow=lambda params: ...", 1)
     if friction is not None and implicit:
         raise ValueError("flow_step takes no friction beside implicit viscosity; write implicit=False")
     check_choice("unstable", unstable, ("raise", "allow"))
@@ -207,6 +234,7 @@ class FlowStep(Remade):
         grid, boundary, solid = given["grid"], given["boundary"], given["solid"]
         self.grid, self.dt, self.force, self.friction = grid, float(given["dt"]), given["force"], given["friction"]
         self.strict, self.implicit = given["unstable"] == "raise", given["implicit"]
+        self.may_be_implicit = self.friction is None and not callable(given["viscosity"])
         self.project = projection(grid, solid, boundary)
         self.pressure, self.divergence = self.project.pressure, divergence(grid)
         self.passing = Operator(self.divergence.structure.absolute, grid.faces, grid.cells, "passing")
@@ -217,24 +245,46 @@ class FlowStep(Remade):
         self.free = mask(grid.faces, free_faces(grid, setup.sides, solid))
         self.convect: Any = convection(grid, boundary, solid) if given["convective"] else None
         viscous = partial(face_laplacian, grid, boundary, solid, given["solid_boundary"])
-        self.viscous = Diffusion("viscosity", given["viscosity"], viscous, given["walls"], self)
+        self.viscous = Diffusion("viscosity", given["viscosity"], viscous, self)
+        self.wall_motion = WallMotion(grid, boundary, setup.sides, given["walls"], self.convect is not None)
+        self.inflow = given["inflow"]
+        self.entering: Any = None if self.inflow is None else self._sides_of_inflow(setup.sides, solid)
         self.scalars = {name: Scalar(name, solid, self, **parts) for name, parts in (given["scalars"] or {}).items()}
+
+    def _sides_of_inflow(self, sides, solid):
+        """Return the mask of the faces where inflow= says what enters."""
+        if inflow_side not in [side for pair in sides for side in pair or ()]:
+            raise ValueError("flow_step got inflow= without a side of dp.inflow in boundary=; give both or none")
+        inside = faces_that(self.grid, sides, solid, lambda condition: False)
+        with_inflows = faces_that(self.grid, sides, solid, lambda condition: condition == inflow_side)
+        return mask(self.grid.faces, with_inflows & ~inside)
 
     def start(self, v, params=None, s=None):
         """Velocity and scalars -> the first state: made incompressible, the pressure still unknown."""
-        v, s = self.project(v), {} if s is None else s
+        v, s = self.project(self._entered(v, params)), {} if s is None else s
         if not isinstance(s, dict) or s.keys() != self.scalars.keys():
             raise ShapeError(
                 f"flow_step needs the scalars {sorted(self.scalars)}, got "
                 f"{list(s) if isinstance(s, dict) else type(s).__name__}; write step.start(v, params, s)"
             )
-        p = np.zeros(np.shape(v)[:-1] + self.grid.shape)
-        state = {"v": v, "p": p, "a": self.acceleration(v, params, s, self._rub(params))}
+        p = np.zeros(np.shape(v)[:-1] + self.grid.shape, dtype_of(v))
+        walls = self.wall_motion.velocities(params, dtype_of(v))
+        state = {"v": v, "p": p, "a": self.acceleration(v, params, s, self._rub(params), walls)}
+        if self.wall_motion.changes:
+            state["walls"] = walls
         return state | ({"s": s, "r": self._rates(v, s, params)} if s else {})
+
+    def _entered(self, v, params):
+        """The velocity with what enters at sides of inflow."""
+        if self.inflow is None:
+            return v
+        given = self.inflow(params) if callable(self.inflow) else self.inflow
+        check_on("flow_step, as inflow,", given, self.grid.faces, "; join its components with grid.join")
+        return v + self.entering(cast(given, dtype_of(v)) - v)
 
     @public("dp.flow_step(grid, dt)")
     def __call__(self, state, params=None):
-        parts = ["v", "p", "a", *(["s", "r"] if self.scalars else [])]
+        parts = ["v", "p", "a", *(["s", "r"] if self.scalars else []), *(["walls"] if self.wall_motion.changes else [])]
         if not isinstance(state, dict) or state.keys() != set(parts):
             words = f"{', '.join(parts[:-1])} and {parts[-1]}"
             raise ShapeError(f"flow_step takes a dict of {words} as its state; make it with step.start")
@@ -242,13 +292,19 @@ class FlowStep(Remade):
         if self.convect is not None and self.strict:
             self._check_convection(v)
         rub = self._rub(params)
-        a = self.acceleration(v, params, s, rub)
+        walls = state.get("walls", self.wall_motion.constant)
+        walls_after = self.wall_motion.velocities(params, dtype_of(v))
+        a = self.acceleration(v, params, s, rub, walls)
         ahead = v + dt * (1.5 * a - 0.5 * state["a"] - self.slope(p))
         if rub is not None:
             ahead = (ahead - dt * rub * v) / (1.0 + dt * rub)
-        ahead = self.viscous.relaxed(ahead, v)
+        ahead = self._entered(ahead, params)
+        if self.viscous.relax is not None:
+            ahead = self.viscous.relaxed(ahead, v, self.wall_motion.lifted_sum(walls, walls_after))
         q = self.pressure(ahead)
         new = {"v": self.open(ahead) + self.slope(q), "p": p - q / dt, "a": a}
+        if self.wall_motion.changes:
+            new["walls"] = walls_after
         if s:
             new["r"] = self._rates(v, s, params)
             new["s"] = {k: one.step(s[k], new["r"][k], state["r"][k]) for k, one in self.scalars.items()}
@@ -257,14 +313,14 @@ class FlowStep(Remade):
     def _rates(self, v, s, params):
         return {name: one.rate(v, s, params) for name, one in self.scalars.items()}
 
-    def acceleration(self, v, params, s=None, rub=None):
+    def acceleration(self, v, params, s=None, rub=None, walls=None):
         """a(v): what is explicit, of those parts that the scene has, and rub v (see the head of this file)."""
-        a = 0.0 * v if self.convect is None else -self.convect(v, v)
+        a = 0.0 * v if self.convect is None else -self.convect(v, v, walls)
         if self.force is not None:
             a = a + self.free(self._pushed(v, params, *([s] if self.scalars else [])))
         if rub is not None:
             a = a + rub * v
-        return self.viscous.added(a, v, params)
+        return self.viscous.added(a, v, params, partial(self.wall_motion.lifted, walls))
 
     def _pushed(self, v, params, *scalars):
         """The force; a number is the same on all faces."""
@@ -314,6 +370,58 @@ class FlowStep(Remade):
         return f"<flow step on {self.grid}: {', '.join(['pressure', *words])}>"
 
 
+class WallMotion:
+    """The tangential velocities of walls and inflows, for convection and viscosity.
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary, sides
+        Flow conditions, as they are given and as `resolve` returns them.
+    given : callable, array or None
+        As `flow_step` takes walls.
+    convective : bool
+
+    Attributes
+    ----------
+    changes : bool
+        Whether the velocities are a function of params; the state then holds them.
+    constant : array or None
+        Velocities on the space of `face_lift` that do not change, as convection needs them.
+    """
+
+    def __init__(self, grid, boundary, sides, given, convective):
+        self._grid, self._boundary = grid, boundary
+        self.given = given
+        self.changes = callable(given)
+        self.constant: Any = None
+        enters = any(side == inflow_side for pair in sides for side in pair or ())
+        if given is not None and not self.changes and convective and enters:
+            self.constant = velocities_of(given, grid, sides)
+
+    @cached_property
+    def _lift(self):
+        return face_lift(self._grid, self._boundary)
+
+    def velocities(self, params, dtype):
+        """Return the wall velocities that belong to params, in the dtype of the flow; None where all are 0."""
+        if not self.changes:
+            return self.constant
+        values = self.given(params)
+        check_walls("flow_step", values, self._lift.domain)
+        return cast(values, dtype)
+
+    def lifted(self, walls):
+        """Return what wall velocities add to the Laplacian; None where that is 0."""
+        return self._lift(walls) if self.changes else self.given
+
+    def lifted_sum(self, before, after):
+        """Return the same for the sum of the wall velocities at both ends of a step."""
+        if self.changes:
+            return self._lift(before + after)
+        return None if self.given is None else 2.0 * self.given
+
+
 class Diffusion:
     """A term nu (L u + held) of a flow step, by the trapezoidal rule or explicit. For nu = 0 nothing is built.
 
@@ -325,8 +433,6 @@ class Diffusion:
         nu.
     make_operator : callable
         Makes L.
-    held : array or None
-        What walls add to L u.
     flow : FlowStep
 
     Attributes
@@ -339,8 +445,8 @@ class Diffusion:
         dt nu |L|; 0 where nu is a function.
     """
 
-    def __init__(self, name, number, make_operator, held, flow):
-        self.name, self.number, self.held, self.flow = name, number, held, flow
+    def __init__(self, name, number, make_operator, flow):
+        self.name, self.number, self.flow = name, number, flow
         self.op: Any = make_operator() if number else None
         self.damping = 0.0
         self.relax: Any = None
@@ -355,8 +461,8 @@ class Diffusion:
         elif not callable(number):
             self._check_stable(number)
 
-    def added(self, rate, u, params):
-        """A rate and nu (L u + held), where that is explicit."""
+    def added(self, rate, u, params, held):
+        """A rate and nu (L u + held()), where that is explicit; held: a function that returns an array or None."""
         if self.op is None or self.relax is not None:
             return rate
         number = self.number
@@ -364,17 +470,23 @@ class Diffusion:
             number = number(params)
             check_number("the viscosity of flow_step", plain(number), ">= 0")
             self._check_stable(float(plain(number)))
-        return rate + number * self._slope(u, 1.0)
+        return rate + number * self._bent(u, held())
 
-    def relaxed(self, ahead, u):
-        """The new field, from that which all other terms lead to, and the old one u."""
-        if self.relax is None:
-            return ahead
-        return self.relax(ahead + (0.5 * self.flow.dt * self.number) * self._slope(u, 2.0))
+    def relaxed(self, ahead, u, held):
+        """The new field of the trapezoidal rule.
 
-    def _slope(self, u, share):
-        """L u and that share of what walls add: 2 for the old and the new field."""
-        return self.op(u) if self.held is None else self.op(u) + share * self.held
+        Parameters
+        ----------
+        ahead, u : arrays
+            The field that all other terms lead to, and the old one.
+        held : array or None
+            What walls add to L u at the beginning and at the end of the step, in sum.
+        """
+        return self.relax(ahead + (0.5 * self.flow.dt * self.number) * self._bent(u, held))
+
+    def _bent(self, u, held):
+        """L u and what walls add to it."""
+        return self.op(u) if held is None else self.op(u) + held
 
     def _check_stable(self, number):
         """Adams-Bashforth is stable for dt nu |lambda| <= 1."""
@@ -382,9 +494,13 @@ class Diffusion:
         if self.flow.strict and dt * rate > 1 + ROUNDING:
             largest = rounded_down(1 / rate)
             given = number_beside(dt, float(largest), digits=12)
+            if self.flow.may_be_implicit:
+                advice = "take smaller steps or write implicit=True"
+            else:  # refused beside a friction, and for a viscosity that is a function
+                advice = "take smaller steps, or write unstable='allow'"
             raise UnstableStepError(
                 f"flow_step is unstable for {self.name} = {number:.6g} with dt = {given}: the largest "
-                f"stable dt is {largest}; take smaller steps or write implicit=True"
+                f"stable dt is {largest}; {advice}"
             )
 
 
@@ -393,13 +509,13 @@ class Scalar:
 
     def __init__(self, name, solid, flow, diffusivity=0.0, boundary=neumann, values=None, source=None):
         grid, self.name, self.flow, self.source = flow.grid, name, flow, source
-        self.mean, self.held, bend = average(grid, boundary), 0.0, None  # type: Any, Any, Any
+        self.mean, self.held, self.bend = average(grid, boundary), 0.0, None  # type: Any, Any, Any
         if values is not None:
             slopes, normal = lift(grid, boundary)(values), flow.divergence.T(np.ones(grid.shape))
-            bend = flow.divergence(slopes)
+            self.bend = flow.divergence(slopes)  # what the walls add to the Laplacian
             self.held = slopes / np.where(slopes != 0, 2 * normal, 1.0)  # the wall's value
         op = partial(laplacian, grid, boundary, solid)
-        self.diffused = Diffusion(f"diffusivity of {name!r}", float(diffusivity), op, bend, flow)
+        self.diffused = Diffusion(f"diffusivity of {name!r}", float(diffusivity), op, flow)
 
     def rate(self, v, s, params):
         """What is explicit."""
@@ -413,13 +529,16 @@ class Scalar:
                     f"{np.shape(plain(source))}; write one number for each cell"
                 )
             rate = rate + source
-        rate = self.diffused.added(rate, u, params)
+        rate = self.diffused.added(rate, u, params, lambda: self.bend)
         check_finite(f"the rate of {self.name!r}", plain(rate))
         return rate
 
     def step(self, u, rate, before):
         """The field after a step."""
-        return self.diffused.relaxed(u + self.flow.dt * (1.5 * rate - 0.5 * before), u)
+        ahead = u + self.flow.dt * (1.5 * rate - 0.5 * before)
+        if self.diffused.relax is None:
+            return ahead
+        return self.diffused.relaxed(ahead, u, None if self.bend is None else 2.0 * self.bend)
 
 
 def _growth(courant, damping, implicit):

@@ -64,7 +64,10 @@ def structured_engine(system, *, precision="auto"):
     try:
         return _built(system, PRECISIONS[precision])
     except Unfit as reason:
-        message = f"structured does not take {system.given}: {reason}; write method='multigrid'"
+        method = "multigrid" if system.sign else "direct"  # multigrid needs a diagonal of one sign, and entries
+        if not system.op.structure.has_entries:
+            method = "krylov"
+        message = f"structured does not take {system.given}: {reason}; write method={method!r}"
         raise ValueError(message) from None
 
 
