@@ -35,7 +35,7 @@ import sparsedp as dp
 SCENES = int(os.environ.get("SPARSEDP_SCENES", 20_000))
 SEED = int(os.environ.get("SPARSEDP_SEED", 0))
 FOLDER = Path(os.environ.get("SPARSEDP_FAILURES", ROOT / ".pytest_cache" / "campaign"))
-PER_TEST = 100
+PER_TEST = 50
 QUICK = 40
 
 

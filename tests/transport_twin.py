@@ -34,7 +34,7 @@ def inside(x, grid, axis, nodes):
     return anp.concatenate([cut(x, axis, 0, 1), middle, cut(x, axis, -1, None)], axis)
 
 
-def speeds(grid, v, velocity, form, own):
+def carrying_speeds(grid, v, velocity, form, own):
     """The velocity along each axis where component `own` (None: cells) needs it."""
     parts = (
         grid.split(v) if velocity == "faces" else [anp.reshape(v, (grid.dim, *grid.shape))[a] for a in range(grid.dim)]
@@ -123,7 +123,7 @@ def twin(grid, scheme, boundary, velocity, of, form):
         moved = []
         for number, part in enumerate(parts):
             own = None if of == "cells" else number
-            w = speeds(grid, v, velocity, form, own)
+            w = carrying_speeds(grid, v, velocity, form, own)
             moved.append(component(grid, own, part, w, dt, values, sides, form, points, scheme))
         return moved[0] if of == "cells" else space.join(*moved)
 

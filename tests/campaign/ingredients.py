@@ -42,8 +42,8 @@ class OnCells(Ingredient):
 def flat_product(dense_matrix, u, shape, result_shape):
     """Return the product of a dense matrix with each field of a batch."""
     batch = anp.shape(u)[: anp.ndim(u) - len(shape)]
-    columns = anp.reshape(u, (-1, dense_matrix.shape[1]))
-    return anp.reshape(anp.dot(columns, dense_matrix.T), (*batch, *result_shape))
+    rows = anp.reshape(u, (int(np.prod(batch)), dense_matrix.shape[1]))
+    return anp.reshape(anp.dot(rows, dense_matrix.T), (*batch, *result_shape))
 
 
 def constant_part(x):
@@ -390,7 +390,7 @@ class BlackBox(OnCells):
     order = 1
     batched = False
     tolerance = 1e-6
-    refusals = ((dp.errors.DerivativeError, "second order"),)
+    refusals = ((dp.errors.DerivativeError, "its second derivative is not"),)
 
     def library(self, box):
         def plain(u):
@@ -551,7 +551,7 @@ def convection_factors(box, sides, solid):
                 width = table.h[axis][place[axis]]
                 for step, node in ((-1, place[axis]), (1, place[axis] + 1)):
                     along = mean_of_two(table, axis, node, component, place, units)
-                    across = mean_of_two(table, component, place[component], axis, moved(place, axis, node), units)
+                    across = mean_of_two(table, component, place[component], axis, at_index(place, axis, node), units)
                     add(row, step / width, along, across)
     if not carried:
         nothing = np.zeros((0, len(units)))
@@ -559,7 +559,7 @@ def convection_factors(box, sides, solid):
     return np.array(carried), np.array(carrying), np.array(balance).T
 
 
-def moved(place, axis, index):
+def at_index(place, axis, index):
     return (*place[:axis], index, *place[axis + 1 :])
 
 
@@ -571,9 +571,9 @@ def mean_of_two(table, axis, node, component, place, units):
     cells, widths = table.shape[axis], table.h[axis]
 
     def weights(index):
-        at = moved(place, axis, index)
+        at = at_index(place, axis, index)
         if table.periodic[component]:
-            at = moved(at, component, at[component] % table.shape[component])
+            at = at_index(at, component, at[component] % table.shape[component])
         return units[table.faces[component, at]]
 
     if table.periodic[axis]:

@@ -46,6 +46,12 @@ class Scene:
         How the field and the parameters are arranged, a key of `TREES`.
     seed : int
         Of the field, of the weights of the loss, and of the tangents.
+    ensemble : int
+        Number of members over which `ensemble` sums the loss, or 0.
+    layout : str
+        How the field lies in memory, a key of `LAYOUTS`.
+    bridge : str
+        "none", or the library that differentiates the loss: "torch".
     """
 
     box: Box
@@ -56,11 +62,18 @@ class Scene:
     tree: str = "dict"
     seed: int = 0
     ensemble: int = 0
+    layout: str = "C"
+    bridge: str = "none"
 
     @property
     def order(self):
         orders = [part.order for part in self.chain]
         return 1 if self.dtype == "complex128" else min([2, *orders])
+
+    @property
+    def second_order(self):
+        """Whether a Hessian product is asked, to be compared or refused."""
+        return self.dtype != "complex128" and (self.order > 1 or bool(self.refusals))
 
     @property
     def tolerance(self):
@@ -75,7 +88,7 @@ class Scene:
     def leaves(self):
         """Return the values by name: the field, and the parameters of each ingredient."""
         shape = (*self.batch, *self.box.field_shape(self.chain[0].source))
-        values = {"u": numbers(5000 + self.seed, shape, self.dtype)}
+        values = {"u": LAYOUTS[self.layout](numbers(5000 + self.seed, shape, self.dtype))}
         for number, part in enumerate(self.chain):
             for name, value in part.parameters(self.box).items():
                 values[f"{number} {name}"] = in_precision(value, self.dtype)
@@ -145,6 +158,31 @@ def in_precision(value, dtype):
     if isinstance(value, float):
         return value
     return np.asarray(value, "float32" if dtype == "float32" else "float64")
+
+
+# ---- layouts in memory --------------------------------------------------------------------------------------------
+
+
+def in_every_second_place(u):
+    wide = np.zeros((*u.shape[:-1], 2 * u.shape[-1]), u.dtype)
+    wide[..., ::2] = u
+    return wide[..., ::2]
+
+
+def read_only(u):
+    u = u.copy()
+    u.flags.writeable = False
+    return u
+
+
+LAYOUTS = {
+    "C": np.ascontiguousarray,
+    "F": np.asfortranarray,
+    "strided": in_every_second_place,
+    "reversed": lambda u: u[..., ::-1],
+    "read-only": read_only,
+    "broadcast": lambda u: np.broadcast_to(u[:1], u.shape),
+}
 
 
 # ---- losses --------------------------------------------------------------------------------------------------------
@@ -233,7 +271,7 @@ def compare(scene):
 
     with np.errstate(all="ignore"):
         twin = Twin(scene, values, tangents)
-        wanted_product = twin.hessian_product() if scene.order > 1 else None
+        wanted_product = twin.hessian_product() if scene.second_order else None
     loss = attempt(scene, outcome, "set-up", scene.library)
     if loss is None:
         return outcome
@@ -255,16 +293,53 @@ def compare(scene):
         check_close(scene, "jvp", pushed[1], twin.slope, twin.slope_scale)
         outcome.compared.append("jvp")
 
-    if scene.order > 1:
+    if scene.second_order:
         product = attempt(scene, outcome, "hvp", lambda: dp.hvp(loss, x, direction))
         if product is not None:
             check_gradient(scene, "hvp", entries(product, names), wanted_product, values)
             outcome.compared.append("hvp")
 
+    if scene.bridge == "torch":
+        attempt(scene, outcome, "torch", lambda: compare_by_torch(scene, loss, values, twin, wanted_product, outcome))
+
     for name, value in values.items():
         if not np.array_equal(before[name], value):
             raise Mismatch(f"argument {name} was modified")
     return outcome
+
+
+def compare_by_torch(scene, loss, values, twin, wanted_product, outcome):
+    """Compare value, gradient and Hessian product that torch computes of the loss."""
+    import torch
+
+    arrange = TREES[scene.tree][0]
+    tensors = {name: torch.tensor(np.array(value), requires_grad=True) for name, value in values.items()}
+    bridged = dp.interop.to_torch(loss)
+    value = bridged(arrange(tensors))
+    check_close(scene, "value by torch", value.detach(), twin.value, twin.value_scale)
+    found = torch.autograd.grad(value, list(tensors.values()), create_graph=scene.order > 1, allow_unused=True)
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    check_gradient(scene, "gradient by torch", of_tensors(tensors, found, values), twin.gradient, arrays)
+    outcome.compared.append("gradient by torch")
+    if scene.order > 1:
+        slope = 0.0
+        for gradient, tangent in zip(found, twin.tangents):
+            if gradient is not None and gradient.requires_grad:
+                slope = slope + torch.sum(gradient * torch.tensor(np.array(tangent)))
+        if not isinstance(slope, float):
+            found = torch.autograd.grad(slope, list(tensors.values()), allow_unused=True)
+            check_gradient(scene, "hvp by torch", of_tensors(tensors, found, values), wanted_product, arrays)
+            outcome.compared.append("hvp by torch")
+
+
+def of_tensors(tensors, found, values):
+    """Return arrays by name, zeros where torch has no gradient."""
+    result = {}
+    for (name, tensor), gradient in zip(tensors.items(), found):
+        given = np.zeros(tuple(tensor.shape)) if gradient is None else gradient.detach().numpy()
+        given = np.conj(given)  # torch returns dL/dRe + i dL/dIm
+        result[name] = np.asarray(given, np.asarray(values[name]).dtype) if gradient is None else given
+    return result
 
 
 def order_of(tangents, values, tree):
@@ -320,6 +395,8 @@ def attempt(scene, outcome, stage, act):
     """Return act(), or None where the library refuses for a reason that an ingredient announces."""
     try:
         return act()
+    except Mismatch:
+        raise
     except Exception as error:
         for kind, words in scene.refusals:
             if isinstance(error, kind) and re.search(words, str(error)):

@@ -8,7 +8,8 @@ HELPERS = Path(__file__).resolve().parent.parent
 FILES = [
     HELPERS / "dense.py",
     HELPERS / "transport_twin.py",
-    *(HELPERS / "campaign" / f"{name}.py" for name in ("boxes", "operators", "ingredients", "scene")),
+    HELPERS / "looking_back.py",
+    *(HELPERS / "campaign" / f"{name}.py" for name in ("boxes", "operators", "ingredients", "physics", "scene")),
 ]
 OWN = {path.stem for path in FILES} | {"campaign"}
 

@@ -1,13 +1,17 @@
 """What Hypothesis draws: boxes, expressions of operators, ingredients, and whole scenes."""
 
+from importlib.util import find_spec
+
 import numpy as np
 from hypothesis import strategies as st
 
 from campaign import ingredients as parts
+from campaign import physics
 from campaign.boxes import Box
 from campaign.operators import matrix, total
-from campaign.scene import LOSSES, TREES, Scene
+from campaign.scene import LAYOUTS, LOSSES, TREES, Scene
 
+BRIDGES = ["torch"] if find_spec("torch") else []
 SEEDS = st.integers(0, 999)
 SIDES = st.sampled_from(["neumann", "dirichlet", (2.0, 0.5), (1.0, 2.0)])
 WORDS = st.sampled_from(["no_slip", "free_slip"])
@@ -170,7 +174,13 @@ def simple(draw, box, source, batched, complex_field):
             choices += ["convection"]
         if not batched:
             choices += ["transport"]
+            choices += ["lagrangian"]
+        if source == "faces" and not batched:
+            choices += ["flow"]
+        if source == "cells":
+            choices += ["spectral"]
         if source == "cells" and not batched:
+            choices += ["law", "fields", "waves"] + ["network"] * (box.dim < 3)
             choices += ["elliptic", "elliptic", "entries", "root", "adopted"]
     name = draw(st.sampled_from(choices))
     if name == "linear":
@@ -201,7 +211,48 @@ def simple(draw, box, source, batched, complex_field):
     if name == "root":
         entry, method = draw(st.sampled_from(["implicit", "steady"])), draw(st.sampled_from(["auto", "krylov"]))
         return parts.Root(draw(sides_of(box)), entry, method, draw(SEEDS))
-    return parts.BlackBox(draw(st.sampled_from(["auto", "complex", "difference"])))
+    if name == "adopted":
+        return parts.BlackBox(draw(st.sampled_from(["auto", "complex", "difference"])))
+    return draw(physical(name, box, source))
+
+
+@st.composite
+def physical(draw, name, box, source):
+    """One ingredient of `physics`."""
+    seed, flag = draw(SEEDS), draw(st.booleans())
+    if name == "lagrangian":
+        return physics.Lagrangian(
+            draw(st.sampled_from(["semi_lagrangian", "maccormack"])),
+            draw(st.sampled_from(["neumann", "dirichlet"])),
+            draw(st.sampled_from(["faces", "cells"])),
+            source,
+            draw(st.sampled_from(["linear", "cubic"])),
+            draw(st.sampled_from(["euler", "midpoint"])),
+            flag,
+            seed,
+        )
+    if name == "law":
+        sides = draw(sides_of(box, st.sampled_from(["outflow", "free_slip", "inflow"])))
+        return physics.Law(draw(st.sampled_from(["upwind", "van_leer"])), sides, flag, draw(st.booleans()), seed)
+    if name == "flow":
+        viscosity = draw(st.sampled_from(["none", "explicit", "implicit", "params"]))
+        sides, steps = draw(flow_sides(box)), draw(st.integers(1, 3))
+        return physics.Flow(sides, draw(SOLIDS), viscosity, flag, draw(st.booleans()), steps, seed)
+    if name == "fields":
+        return physics.TwoFields(draw(st.sampled_from(["rk4", "imex", "backward_euler"])), draw(sides_of(box)), seed)
+    if name == "waves":
+        memory = draw(st.sampled_from([None, 6000, "1 MB"] if flag else [None, "reverse", "1 MB"]))
+        return physics.Waves(flag, memory, draw(st.integers(1, 6)), seed)
+    if name == "spectral":
+        return physics.Spectral(draw(sides_of(box)), draw(st.sampled_from(["exponential", "power", "function"])))
+    padding = draw(st.sampled_from(["periodic", "zero", "replicate"]))
+    return physics.Network(padding, draw(st.sampled_from(["tanh", "relu", "softplus"])), seed)
+
+
+@st.composite
+def readings(draw, source):
+    names = ["flux", "component"] if source == "faces" else ["sample", "restrict"]
+    return physics.Reading(draw(st.sampled_from(names)), source, draw(SEEDS))
 
 
 @st.composite
@@ -241,6 +292,19 @@ def scenes(draw):
                 multiplied = draw(st.booleans()) and not complex_field
                 part = parts.Sum(part, other, multiplied)
         chain.append(part)
+    if draw(st.integers(0, 4)) == 4:
+        chain.append(draw(readings(chain[-1].target)))
     loss = "squares" if complex_field else draw(st.sampled_from(sorted(LOSSES)))
-    ensemble = draw(st.sampled_from([0, 0, 0, 0, 2, 3]))
-    return Scene(box, tuple(chain), batch, dtype, loss, draw(st.sampled_from(sorted(TREES))), draw(SEEDS), ensemble)
+    layouts = sorted(set(LAYOUTS) - (set() if batch else {"broadcast"}))
+    return Scene(
+        box,
+        tuple(chain),
+        batch,
+        dtype,
+        loss,
+        draw(st.sampled_from(sorted(TREES))),
+        draw(SEEDS),
+        draw(st.sampled_from([0, 0, 0, 0, 2, 3])),
+        draw(st.sampled_from(["C", "C", *layouts])),
+        draw(st.sampled_from(["none"] * 7 + BRIDGES)),
+    )
