@@ -6,6 +6,7 @@ import random
 import signal
 import sys
 import zlib
+from collections import Counter
 from pathlib import Path
 
 os.environ["MPLBACKEND"] = "Agg"  # before anything can import matplotlib
@@ -69,3 +70,19 @@ def pytest_collection_modifyitems(items):
 def drawn(request):
     """For loops inside a test: a sample of a list of scenes, tuples of what they are made of, or all of it."""
     return request.param
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Print what a campaign of random scenes came to: scenes, comparisons, and refusals by reason."""
+    total, reasons = Counter(), Counter()
+    for report in terminalreporter.getreports("passed"):
+        for name, tally in report.user_properties:
+            if name == "campaign" and report.when == "call":
+                reasons.update(tally["reasons"])
+                total.update({key: count for key, count in tally.items() if key != "reasons"})
+    if total:
+        share = (total["refused"] + total["discarded"]) / max(1, total["scenes"] + total["discarded"])
+        counts = ", ".join(f"{count} {key}" for key, count in total.items())
+        terminalreporter.write_line(f"campaign: {counts}; {share:.1%} refused as a whole or out of range")
+        for reason, count in reasons.most_common():
+            terminalreporter.write_line(f"  {count} times {reason}")

@@ -889,7 +889,7 @@ class Rollout(Ingredient):
 
     chain: tuple
     n: int
-    memory: object  # None, a number of bytes, or a text
+    memory: object  # None, a text, or a number of states for which there is room
     keep: object  # "last", "all", or a tuple of numbers of steps
     truncate: int | None
     inputs: bool
@@ -944,6 +944,14 @@ class Rollout(Ingredient):
             total = total + float(weight) * states[number]
         return total
 
+    def _budget(self, u, p, inputs):
+        """Return the argument `memory`: states are kept beside parameters, inputs and their gradients."""
+        if not isinstance(self.memory, int):
+            return self.memory
+        beside = sum(constant_part(value).nbytes for value in p.values() if anp.ndim(value))
+        beside += 0 if inputs is None else constant_part(inputs).nbytes
+        return self.memory * constant_part(u).nbytes + 2 * beside + 200
+
     def _advance(self, parts):
         def advance(u, p):
             for number, part in enumerate(parts):
@@ -967,7 +975,8 @@ class Rollout(Ingredient):
             p = dict(p)
             inputs = p.pop("inputs", None)
             state = {"field": u, "time": 0.0, "name": "ink"} if self.tree else u
-            end = dp.rollout(step, state, p, self.n, inputs, memory=self.memory, keep=keep, truncate=self.truncate)
+            memory = self._budget(u, p, inputs)
+            end = dp.rollout(step, state, p, self.n, inputs, memory=memory, keep=keep, truncate=self.truncate)
             end = end["field"] if self.tree else end
             return end if self.keep == "last" else self._summed(end)
 
