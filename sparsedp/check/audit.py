@@ -23,7 +23,7 @@ from sparsedp.derivative import grad, hvp, unwarned
 from sparsedp.fields import check_function, check_whole
 from sparsedp.progress import bar
 
-__all__ = ["Audit", "gradient"]
+__all__ = ["Audit", "gradient", "look_beside"]
 
 FEWEST_STEPS = 8
 RANDOM = 3  # random directions
@@ -146,8 +146,7 @@ def _audit(trials, taped, count, rng, quick):
     """The audit; `quick`: names of its directions, or None for all."""
     loss, point, hessian, culprit = trials.loss, trials.point, None, None
     judged, doubts = looked_at(trials, count, rng, quick)
-    if at_kinks(judged) and callable(trials.slope):
-        _look_beside(trials, judged)
+    look_beside(trials, judged)
     random = judged[:count]
     first = None if quick or not random else random[0]
     if taped and random:
@@ -182,11 +181,13 @@ def _audit(trials, taped, count, rng, quick):
     )  # fmt: skip
 
 
-def _look_beside(trials, judged):
+def look_beside(trials, judged):
     """At several kinks at once a derivative may lie outside the one-sided ones and follow a convention all the same.
 
     What is wrong beside the kinks as well is wrong.
     """
+    if not (at_kinks(judged) and callable(trials.slope)):
+        return
     point = trials.point
     with suppress(*REFUSALS):
         beside = Point(point.unpack(point.vector + SHIFT * point.random(generator(BESIDE))))

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp.check.judge import judgement
+from sparsedp.check.audit import look_beside
+from sparsedp.check.judge import NEGLIGIBLE, looked_at, verdict
 from sparsedp.check.operators import layouts
 from sparsedp.check.summary import error_text
-from sparsedp.check.sweep import QUICK, Line, Point, Trials, generator, rms
+from sparsedp.check.sweep import Line, Point, Trials, generator, rms
 from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
 from sparsedp.fields import EPS
@@ -27,7 +28,8 @@ __all__ = ["FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 WORDS = PASSED, REFUSED, DEGRADED, FAILED = "passed", "refused correctly", "degraded", "FAILED"
 TIME_STEPS, VISCOSITIES = ("dt", "time_step", "tau"), ("nu", "viscosity", "diffusivity", "kappa", "mu")
 DIFFERENCES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-2, 1e-7)  # their steps, in units of x; the one that mostly serves comes first
-GOOD, BAD = 1e-5, 1e-2  # gaps between gradient and differences
+GOOD = 1e-5  # gap between gradient and differences that needs no further look
+WRONG = "the differences settle on another gradient,"
 UNSEEN = 100 * EPS  # changes of the value, relative, that no difference sees
 ROUNDING = 8 * EPS  # change of x in its last digits
 DIGITS = {"good": 1e-8, "bad": 1e-5}  # changes of the result by a change in the last digits: allowed, and too large
@@ -214,32 +216,61 @@ def growing(scene, *_):
 
 
 def _against_differences(scene, other, out):
-    """The gradient against central differences along itself (a random direction, where it is 0).
+    """The gradient against central differences along random directions in every leaf, and along itself.
 
-    One difference that meets it is enough, else all are judged.
+    One difference that meets the gradient is enough along each direction. Where one does not, and for the point as it
+    is given, all evidence is gathered and judged as `check.gradient` does it.
     """
     point = Point(scene.at(other))
     trials = Trials(scene.sheltered, point, out.gradient)
     trials.base, trials.gradient = out.value, point.gradient(out.gradient)
-    name, direction = point.directions(trials.gradient, 1, generator(SEED), QUICK.__contains__)[-1]
-    line = Line(name, direction, trials)
-    unseen, gap = abs(line.slope) <= UNSEEN * abs(out.value), inf
+    lines = [Line(name, direction, trials) for name, direction in _directions(point, trials.gradient)]
+    largest = max((abs(line.slope) for line in lines), default=0.0)
+    gap = max((_smallest_gap(line, largest) for line in lines), default=0.0)
+    met = gap <= GOOD
+    if met and other:
+        return PASSED, gap, ""
+    trials = Trials(scene.sheltered, point, lambda tree: value_and_grad(scene.loss)(tree)[1])
+    try:
+        judged, doubts = looked_at(trials, 1, generator(SEED), None)
+        look_beside(trials, judged)
+    except Exception as error:  # a scene may raise anything beside the point
+        return DEGRADED, gap, f"the gradient cannot be compared with differences: {error_text(error)}"
+    word, reason = verdict(judged, doubts)
+    if word == "disagrees" and out.flagged:
+        return DEGRADED, gap, "the gradient grows without bound on its way back"
+    if word == "disagrees":
+        lost = not np.any(trials.gradient)
+        return FAILED, gap, "the gradient is 0, the differences are not" if lost else f"{WRONG} {reason}"
+    unseen = largest <= UNSEEN * abs(out.value)
+    if word == "agrees" or met or unseen:
+        return PASSED, 0.0 if unseen else gap, "the gradient is smaller than differences can see" if unseen else ""
+    return DEGRADED, gap, f"the differences do not settle on the gradient: {reason}"
+
+
+def _directions(point, gradient):
+    """Names and displacements: random in each leaf, or in all where they are many, and the gradient itself."""
+    wanted = lambda name: name.startswith("random in") or name == "gradient"
+    found = point.directions(gradient, 0, generator(SEED), wanted)
+    alone = any(name != "gradient" for name, _ in found)
+    return found if alone else [("random", point.random(generator(SEED))), *found]
+
+
+def _smallest_gap(line, largest):
+    """Smallest gap between gradient and differences, as a share of the derivative; steps are tried until it is GOOD.
+
+    A derivative far below the largest one is compared with that: rounding of the loss hides the rest.
+    """
+    scale = max(abs(line.slope), NEGLIGIBLE * largest)
+    gap = inf
     for step in DIFFERENCES:
         line.sweep([step])
-        gaps = [abs(level.difference - level.slope) / abs(line.slope or 1.0) for level in line.usable]
+        gaps = [abs(level.difference - level.slope) / (scale or 1.0) for level in line.usable]
         gap = min(gaps, default=inf)
-        if gap <= GOOD and not unseen:
-            return PASSED, gap, ""
-    wrong = judgement(line).word == "disagrees"
-    if unseen and wrong:
-        return FAILED, inf, "the gradient is 0, the differences are not"
-    if unseen:
-        return PASSED, 0.0, "the gradient is smaller than differences can see"
-    if out.flagged:
-        return DEGRADED, gap, "the gradient grows without bound on its way back"
-    if gap > BAD and wrong:
-        return FAILED, gap, "the differences settle on another gradient"
-    return DEGRADED, gap, "the differences do not settle on the gradient: a kink, noise or a steep change"
+        if gap <= GOOD and scale:
+            return gap
+    hidden = line.silent and abs(line.slope) <= UNSEEN * abs(line.base)
+    return 0.0 if hidden else gap if scale else inf
 
 
 # ---------------------------------------------------------------- cases: (scene, name, x) -> case, other x, judge

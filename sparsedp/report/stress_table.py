@@ -56,7 +56,9 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
 
     Notes
     -----
-    passed: finite, and the gradient agrees with differences to 1e-5, or the bits are those of the plain case.
+    passed: finite, and the gradient agrees with differences to 1e-5 along a random direction in each leaf (in all
+    together of more than eight) and along itself, or the bits are those of the plain case. At x itself, and where a
+    direction does not agree, all evidence is gathered and judged as by `check.gradient`, with its detection limits.
     refused correctly: a typed error. degraded: a finite answer with a gap, shown as the figure; numbers that
     overflow far outside any stated range; a foreign error. FAILED: within the scene's own values or stated ranges
     a number that is not finite, without an error; another gradient than that of the differences; NaN in, finite
