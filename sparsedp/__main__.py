@@ -74,7 +74,7 @@ def _parser():
         room = rooms.add_parser(name, help=words, description=words)
         for argument in arguments.split():
             room.add_argument(argument, **ARGUMENTS[argument])
-        room.set_defaults(run=run, out=Path(f"sparsedp-{name}"))
+        room.set_defaults(run=run)
     return parser
 
 
@@ -92,10 +92,11 @@ def run_check(options):
 
 def run_report(options):
     """Options of the command `report` -> exit code."""
-    from sparsedp.report.scene_report import load, write_report
+    from sparsedp.report.scene_report import PAGES, free_folder, load, write_report
 
-    verdict, lines = write_report(load(options.scene), options.out, options.force)
-    print(*lines, f"{verdict}; see {options.out / 'report.html'}", sep="\n")
+    out = options.out or free_folder(Path("sparsedp-report"), PAGES, options.force)
+    verdict, lines = write_report(load(options.scene), out, options.force)
+    print(*lines, f"{verdict}; see {out / 'report.html'}", sep="\n")
     return CODES[verdict]
 
 
@@ -131,19 +132,20 @@ def run_demo(options):
     """Options of the command `demo` -> exit code."""
     # Here and not at the top: --help and a wrong command line load nothing.
     from sparsedp.report.demo import story, terrain
-    from sparsedp.report.scene_report import claim
+    from sparsedp.report.scene_report import claim, free_folder
 
     ground = terrain.load(options.input)
     grids = story.grids_for(ground, options.size)
-    claim(options.out, story.FILES, options.force)
-    return 0 if story.tell(story.prepare(ground, grids), options.out, options.force) else 1
+    out = options.out or free_folder(Path("sparsedp-demo"), story.FILES, options.force)
+    claim(out, story.FILES, options.force)
+    return 0 if story.tell(story.prepare(ground, grids), out, options.force) else 1
 
 
 ARGUMENTS: dict[str, Any] = {
     "scene": {"help": "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"},
     "--input": {"type": Path, "metavar": "FILE", "help": "a 2-D field as .npy, .npz or .png (default: terrain)"},
     "--size": {"type": int, "default": 64, "metavar": "N", "help": "cells along the longest side (default: 64)"},
-    "--out": {"type": Path, "metavar": "DIR", "help": "where the results go (default: %(default)s)"},
+    "--out": {"type": Path, "metavar": "DIR", "help": "where the results go (default: a new folder sparsedp-...)"},
     "--force": {"action": "store_true", "help": "overwrite results of an earlier run"},
     "--quick": {"action": "store_true", "help": "two directions only, for a loss that takes minutes"},
 }

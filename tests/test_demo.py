@@ -27,9 +27,9 @@ def relief(shape=(28, 24)):
     return np.sin(x) * np.cos(2 * y) + 0.3 * x
 
 
-def demo(folder, *arguments, way=("-m", "sparsedp")):
+def demo(folder, *arguments, way=("-m", "sparsedp"), **variables):
     """The command in a process of its own, as a reader types it."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", **variables}
     command = [sys.executable, *way, "demo", *map(str, arguments)]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
@@ -44,10 +44,16 @@ FEWER = (
 
 @pytest.fixture(scope="module", params=["short", pytest.param("whole", marks=pytest.mark.whole)])
 def finished(request, tmp_path_factory):
-    """One small run with the default terrain, shared by the tests that look at it; by default with few iterations."""
+    """One small run with the default terrain, shared by the tests that look at it; by default with few iterations.
+
+    The whole one compiles its loops.
+    """
     folder = tmp_path_factory.mktemp("demo")
-    way = ["-c", FEWER + "sys.exit(main(sys.argv[1:]))"] if request.param == "short" else ["-m", "sparsedp"]
-    return folder / "sparsedp-demo", demo(folder, "--size", "16", way=way)
+    if request.param == "short":
+        done = demo(folder, "--size", "16", way=["-c", FEWER + "sys.exit(main(sys.argv[1:]))"])
+    else:
+        done = demo(folder, "--size", "16", NUMBA_CACHE_DIR=str(folder / "numba"))
+    return folder / "sparsedp-demo", done
 
 
 def test_it_ends_well(finished):
@@ -61,11 +67,22 @@ def test_it_shows_the_gradient_table_and_its_verdict(finished):
     assert re.search(r"^verdict: agrees", finished[1].stdout, re.MULTILINE)
 
 
-def test_it_prints_a_line_for_each_iteration(finished):
+def test_it_prints_few_iterations_and_the_last_one_of_each_grid(finished):
     lines = re.findall(r"^ +(\d+) +[\d.]+ +[\d.]+ +[\d.]+$", finished[1].stdout, re.MULTILINE)
     with open(finished[0] / "table.csv", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(lines) == sum(int(row["iterations"]) for row in rows)
+        counts = [int(row["iterations"]) for row in csv.DictReader(stream)]
+    printed = [sorted({*(n for n in story.PRINTED if n <= count), count}) for count in counts]
+    assert lines == [str(number) for numbers in printed for number in numbers]
+    assert len(finished[1].stdout.splitlines()) < 90
+
+
+def test_the_seconds_contain_no_compilation(finished):
+    """The first iteration takes a few times what the others take; compiling the loops takes seconds."""
+    parts = finished[1].stdout.split("iteration   misfit/noise   error   seconds")[1:]
+    for part in parts:
+        found = re.findall(r"^ +(\d+) +[\d.]+ +[\d.]+ +([\d.]+)$", part, re.MULTILINE)
+        first, (number, last) = float(found[0][1]), found[-1]
+        assert first <= 0.1 + 10 * float(last) / int(number)
 
 
 def test_it_ends_with_what_to_try_next(finished):
@@ -84,7 +101,8 @@ def test_a_log_is_written_before_each_long_piece_of_work(monkeypatch):
     monkeypatch.setattr(story, "ITERATIONS", 1)
     monkeypatch.setattr(dp, "minimize", lambda *given, **how: seen.append(raw.getvalue()) or real(*given, **how))
     story.recover(study, study.grids[0])
-    assert seen and b"Is the gradient right?" in seen[0] and seen[0].endswith(b"seconds\n")
+    warm_up, measured = seen
+    assert b"Is the gradient right?" in warm_up and measured.endswith(b"seconds\n")
     assert raw.getvalue().endswith(b" setups\n\n")  # the counts, before the next grid
 
 
@@ -106,10 +124,23 @@ def test_recovered_field(finished):
     assert found.shape == (16, 14) and np.all(np.isfinite(found))
 
 
+def test_a_second_run_writes_beside_the_first(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(dp.check, "gradient", audit("agrees"))
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setattr(story, "ITERATIONS", 1)
+    monkeypatch.chdir(tmp_path)
+    for folder in ("sparsedp-demo", "sparsedp-demo-2", "sparsedp-demo-3"):
+        assert main(["demo", "--size", "12"]) == 0
+        assert sorted(os.listdir(folder)) == sorted(story.ARRAYS)
+        assert f"Written to {folder}: " in capsys.readouterr().out
+    assert main(["demo", "--size", "12", "--force"]) == 0
+    assert len(os.listdir()) == 3
+
+
 def test_nothing_is_overwritten_unasked(finished):
     folder, _ = finished
     before = {name: (folder / name).read_bytes() for name in os.listdir(folder)}
-    again = demo(folder.parent, "--size", "16")
+    again = demo(folder.parent, "--size", "16", "--out", folder.name)
     assert again.returncode == 2 and again.stdout == ""
     assert re.fullmatch(r"sparsedp: .* is there already; [^\n]*\n", again.stderr)
     assert before == {name: (folder / name).read_bytes() for name in os.listdir(folder)}

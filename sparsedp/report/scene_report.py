@@ -133,6 +133,15 @@ def _where(error, file):
 # ---------------------------------------------------------------- the report on it
 
 
+def free_folder(folder, names, force):
+    """Return a folder, or if it holds one of these files and `force` is not set the first of folder-2, folder-3, ..."""
+    number, free = 1, folder
+    while not force and any(os.path.lexists(free / name) for name in names):
+        number += 1
+        free = folder.with_name(f"{folder.name}-{number}")
+    return free
+
+
 def claim(folder, names, force):
     """Make a folder, and refuse when it holds one of these files and `force` is not set."""
     try:
