@@ -129,6 +129,64 @@ def test_lake_at_rest(dim):
     np.testing.assert_array_equal(called(wave), still(wave))
 
 
+def river(n, flow, equilibrium="lake", bump=True):
+    """A channel of 25 m with a bump (Goutal and Maurel, 1997), depth 2 m and discharge `flow` at both ends."""
+    grid = dp.Grid(n, size=25.0)
+    x, h = grid.centres()[0], 25.0 / n
+    ground = bump * np.maximum(0.2 - 0.05 * (x - 10) ** 2, 0.0)
+    slope = np.gradient(ground, h)
+    lake = np.stack([2.0 - ground, 0.0 * ground])
+    law = dp.conservation_law(
+        grid,
+        water_flux,
+        water_speed,
+        boundary=dp.inflow,
+        inflow=lambda params, axis, side: np.array([2.0, flow]) if params is None else params[:, [0, -1][side]],
+        source=lambda u, params: anp.stack([0 * u[0], -GRAVITY * u[0] * slope]),
+        equilibrium=lake if equilibrium == "lake" else equilibrium,
+    )
+    return law, lake, ground
+
+
+def settled(law, lake, flow, end):
+    """The state that a lake with such an inflow is in after a time."""
+    dt = 0.5 * law.grid.widths[0][0] / (np.sqrt(2 * GRAVITY) + 0.5 * flow)
+    return dp.rollout(dp.stepper("ssprk3", law, dt), lake, None, int(end / dt))
+
+
+@pytest.mark.parametrize("flow", [1.0, pytest.param(4.42, marks=pytest.mark.whole)])
+def test_a_river_over_a_lake_at_rest(flow):
+    """The inflow acts beside an equilibrium: the discharge is that of the inflow, and Bernoulli's head the same all
+    along; both are 2.249 m for 4.42."""
+    law, lake, ground = river(25, flow)
+    depth, discharge = settled(law, lake, flow, 30.0)
+    head = discharge**2 / (2 * GRAVITY * depth**2) + depth + ground
+    np.testing.assert_allclose(discharge, flow, rtol=5e-3)
+    np.testing.assert_allclose(head, flow**2 / (8 * GRAVITY) + 2.0, rtol=4e-3)
+
+
+def test_lakes_and_rivers_are_kept_to_the_last_bit():
+    """A lake at rest whose inflow is the lake, and a river whose inflow is its own at both ends."""
+    law, lake, _ = river(24, 0.0)
+    assert not np.any(law(lake))
+    law, lake, _ = river(24, 1.0)
+    moving = settled(law, lake, 1.0, 2.0)
+    kept = river(24, 1.0, equilibrium=lambda params: moving)[0]
+    assert not np.any(kept(moving, moving)) and np.any(kept(moving))
+    slope = dp.jvp(lambda u: kept(u, moving), moving, np.ones_like(moving))[1]
+    assert np.any(slope)
+
+
+def test_an_inflow_acts_alike_with_and_without_an_equilibrium():
+    """Over flat ground the slopes of the difference to a lake are those of the field."""
+    laws = [river(24, 1.0, given, bump=False)[0] for given in ("lake", None)]
+    _, lake, _ = river(24, 1.0, bump=False)
+    wave = lake + 0.1 * np.sin(np.arange(48.0)).reshape(2, 24)
+    np.testing.assert_allclose(laws[0](wave), laws[1](wave), rtol=0, atol=1e-12)
+    losses = [lambda u, law=law: anp.sum(law(u) ** 2) for law in laws]
+    np.testing.assert_allclose(*(dp.grad(loss)(wave) for loss in losses), rtol=0, atol=1e-9)
+
+
 def test_wave_of_euler_in_a_plane():
     """A wave of density is carried along the diagonal of a periodic box: order 2, and everything is conserved."""
     errors = []
@@ -294,6 +352,8 @@ def test_time_step():
     assert law.time_step(np.ones((4, 5))) == pytest.approx(0.4 / (1 / 0.25 + 2 / 0.4))
     assert law.time_step(np.zeros((4, 5))) == np.inf
     assert repr(law) == "<conservation_law van_leer: cells(4, 5)>"
+    fast, lake, _ = river(24, 20.0)  # the river is faster than any wave of the lake
+    assert fast.time_step(lake) == pytest.approx(0.4 * 25 / 24 / (10 + np.sqrt(2 * GRAVITY)))
 
 
 def test_what_is_at_rest_stays():

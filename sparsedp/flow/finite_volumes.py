@@ -15,8 +15,10 @@ With one speed s for both directions, a = -s and b = s, this is Rusanov's flux.
 Two ghost cells stand beyond each end of an axis: they go round where it is periodic, repeat the last cell (outflow),
 mirror the cells with the momentum across the wall turned round (free_slip), or hold what is given (inflow).
 
-Steady states: with an equilibrium e the slopes are those of u - e, and what the same formulas make of e itself is taken
-away. So e stays as it is, to the last bit: a lake at rest over any ground, a gas at rest in its weight.
+Steady states: with an equilibrium e the slopes are those of u - e, and the rate that the same formulas give for e is
+subtracted. So e stays as it is, to the last bit: a lake at rest over any ground, a gas at rest in its weight. Beyond a
+side of inflow e goes on with its last cell. An inflow that differs from that acts on the field; one that equals it, as
+that of a moving steady state, keeps e.
 
 Everything but the limiter is arithmetic on the tape: its derivatives of every order are those of autograd, and those of
 the user's flux, speed and source. The limiter is one rule, with the derivatives that stand beside its formula.
@@ -85,7 +87,8 @@ def conservation_law(
     source : callable, optional
         ``source(u, params)``: S(u) in the cells [unit / time], of the shape of u.
     equilibrium : array or callable, optional
-        A state, or ``equilibrium(params)``, that is to stay exactly as it is.
+        A state, or ``equilibrium(params)``, that is to stay exactly as it is, at rest or moving. At a side of inflow it
+        stays if its last cell there holds the state that flows in; another inflow disturbs it.
 
     Returns
     -------
@@ -207,7 +210,7 @@ class ConservationLaw(Remade):
             rate = self._rate(u, None, params)
         else:
             e = _shaped("equilibrium", e(params) if callable(e) else e, u)
-            rate = self._rate(u, e, params) - self._rate(e, e, params)
+            rate = self._rate(u, e, params) - self._rate(e, e, params, flows=False)
         check_finite("the rate of a conservation_law", plain(rate))
         return cast(rate, dtype_of(u))
 
@@ -227,11 +230,11 @@ class ConservationLaw(Remade):
         check_kind("u of conservation_law", values.dtype, "real numbers", "; write u.real")
         return frozen(u if isbox(u) else values)
 
-    def _rate(self, u, e, params):
-        """The rate; of an equilibrium e only the slopes take notice."""
+    def _rate(self, u, e, params, flows=True):
+        """The rate; of an equilibrium e only the slopes take notice. `flows`: see `Axis.padded`."""
         total = np.zeros(u.shape) if self.source is None else _shaped("source", self.source(u, params), u)
         for axis in self.axes:
-            padded = axis.padded(u, params)
+            padded = axis.padded(u, params, flows)
             if e is None:
                 lower, upper = axis.beside_faces(padded)
             else:
@@ -267,12 +270,12 @@ class ConservationLaw(Remade):
         return given
 
     def time_step(self, u, params=None, cfl=0.4):
-        """State -> a stable dt: `cfl` over the largest sum over the axes of speed / width.
+        """Return a stable dt: `cfl` over the largest sum over the axes of speed / width.
 
         Parameters
         ----------
         u : array
-            As for the call; the values in the cells count.
+            As for the call. The values in the cells count, and at sides of inflow what flows in.
         params : tree, optional
         cfl : float
             Up to 0.5 for limited slopes, up to 1 for "upwind".
@@ -284,9 +287,19 @@ class ConservationLaw(Remade):
         """
         check_number("cfl of time_step", cfl, "> 0", "; write cfl=0.4")
         u, params = mapped(plain, (self._state(u), params))
-        speeds = [np.max(np.abs(self._speeds(axis.number, u, params)), axis=0) / axis.widths for axis in self.axes]
-        most = np.max(sum(speeds), initial=0.0)
+        most = np.max(sum(self._fastest(axis, u, params) / axis.widths for axis in self.axes), initial=0.0)
         return float(cfl / most) if most else np.inf
+
+    def _fastest(self, axis, u, params):
+        """Return the speed of the fastest wave along an axis in each cell, with those that enter it at a side."""
+        speeds = np.max(np.abs(self._speeds(axis.number, u, params)), axis=0)
+        for side, edge in ((0, slice(0, 1)), (1, slice(-1, None))):
+            if axis.sides[side] is inflow_side:
+                entering = plain(axis.ghosts_beyond(u, params, side))
+                beyond = np.max(np.abs(self._speeds(axis.number, entering, params)), axis=0)
+                cells = axis.at(edge)
+                speeds[cells] = np.maximum(speeds[cells], axis.part(beyond, 0, 1))
+        return speeds
 
     def __repr__(self):
         return f"<conservation_law {self.scheme}: {self.grid.cells}>"
@@ -332,9 +345,9 @@ class Axis:
 
     def part(self, x, start, stop=None):
         """The places from start to stop along this axis."""
-        return x[self._at(slice(start, stop))]
+        return x[self.at(slice(start, stop))]
 
-    def _at(self, places):
+    def at(self, places):
         """An index of places along this axis."""
         return (Ellipsis, places, *[slice(None)] * (-1 - self.place))
 
@@ -345,12 +358,12 @@ class Axis:
 
     def padded(self, u, params, flows=True):
         """The field with its ghost cells; `flows`: those beyond an inflow are what flows in, else the last cell."""
-        lower, upper = (self._ghosts(u, params, upper, flows) for upper in (0, 1))
+        lower, upper = (self.ghosts_beyond(u, params, upper, flows) for upper in (0, 1))
         return anp.concatenate([lower, u, upper], self.place)
 
-    def _ghosts(self, u, params, upper, flows):
+    def ghosts_beyond(self, u, params, upper, flows=True):
         """What stands beyond an end."""
-        ghosts, side = u[self._at(self.ghosts[upper])], self.sides[upper]
+        ghosts, side = u[self.at(self.ghosts[upper])], self.sides[upper]
         if side is free_slip:  # the momentum changes its sign
             signs = 1.0 - 2.0 * (np.arange(len(u)) == self.momentum)
             return -ghosts if u.ndim == self.dim else ghosts * self._fields(signs)
