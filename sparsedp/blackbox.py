@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from sparsedp.calls import public
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import EPS, check_choice, check_finite, check_function, check_shape
+from sparsedp.fields import EPS, check_choice, check_finite, check_function, check_precision, check_shape
 from sparsedp.ledger import count
 from sparsedp.operators.given import from_matrix
 from sparsedp.recipe import Remade
@@ -147,12 +147,14 @@ class Adopted(Remade):
 
     def _run(self, x):
         """One run on plain values; a copy, for foreign code may return the array that it will write into next."""
+        check_precision(f"the argument of {self.name}", x)
         count(f"{self.name}.run", "forward")
         with self._alone:
             self.runs += 1
             y = np.array(self._f(np.array(x)))
         if y.dtype.kind not in "biuf" and np.asarray(x).dtype.kind != "c":
             raise TypeError(f"{self.name} must return real numbers, got dtype {y.dtype}; take the real part")
+        check_precision(f"the result of {self.name}", y)
         return y.astype(float) if y.dtype.kind in "biu" else y
 
     def _operator(self, x, y):

@@ -136,7 +136,6 @@ def pullback(fun, x):
 
     def pull(g):
         check_shape("the cotangent", g, np.shape(value), "; give one like the value")
-        check_precision("the cotangent", g)
         slopes = zip(entries, moving, back([g]), strict=True)
         return rebuild(_apart([gradient_of(leaf, slope) if moves else None for leaf, moves, slope in slopes], g))
 
@@ -554,6 +553,7 @@ def vjp(fun, *x):
     value, pull = together("vjp", x, pullback, lambda parts: fun(*parts), x)
 
     def back(g):
+        check_precision("the cotangent", g)
         slopes = together("the function of vjp", (g,), pull, g)
         if is_finite(g):
             _warn_unless_finite("vjp", slopes, lambda: pullback(lambda parts: fun(*parts), x)[1](g))

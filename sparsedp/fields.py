@@ -17,6 +17,7 @@ from sparsedp.tree import labels, leaves
 __all__ = [
     "BLOCK",
     "EPS",
+    "PRECISIONS",
     "advice_near",
     "advise",
     "check_choice",
@@ -130,7 +131,9 @@ def check_precision(name, value):
     settings, such as dt, and derivatives that a user's own function returns are rounded to double precision instead.
     """
     dtype: Any = getattr(value, "dtype", None)
-    if getattr(dtype, "kind", None) in ("f", "c") and dtype.char not in PRECISIONS:
+    if getattr(dtype, "name", None) == "bfloat16" or (
+        getattr(dtype, "kind", None) in ("f", "c") and dtype.char not in PRECISIONS
+    ):
         kind = "complex" if dtype.kind == "c" else "float"
         raise TypeError(
             f"{name} must be float32, float64, complex64 or complex128, got {dtype}; write np.asarray(x, {kind})"

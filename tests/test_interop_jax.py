@@ -1,6 +1,7 @@
 """JAX: functions of this library under jit, grad and vmap and its check_grads, and functions of JAX on our tape."""
 
 import pickle
+from collections import OrderedDict
 
 import autograd.numpy as anp
 import numpy as np
@@ -140,8 +141,38 @@ def test_refusals():
         picky(jnp.ones(GRID.shape))  # at once: the error as it is
     with pytest.raises(Exception, match="UnstableStepError"):
         jax.jit(to_jax(picky, np.ones(GRID.shape)))(jnp.ones(GRID.shape)).block_until_ready()
-    with pytest.raises(Exception, match=r"Expected: \(3,\), Actual: \(5, 4\)"):
+    with pytest.raises(Exception, match=r"result of to_jax: expected shape \(3,\), as like has it, got \(5, 4\)"):
         jax.jit(to_jax(L, np.zeros(3)))(jnp.ones(GRID.shape)).block_until_ready()
+    for like, words in (
+        (
+            {"p": 1.0, "q": 1.0},
+            r"result of to_jax: expected the entries \['p'\], \['q'\], got \['a'\], \['b'\]; return the",
+        ),
+        ({"a": 1.0}, r"result of to_jax: expected the entries \['a'\], got \['a'\], \['b'\]; return the same"),
+        ((1.0, 1.0), r"result of to_jax: expected the entries \[0\], \[1\], got \['a'\], \['b'\]"),
+        (
+            {"a": np.ones(2), "b": np.ones(3)},
+            r"result of to_jax\['b'\]: expected shape \(3,\), as like has it, got \(2,\)",
+        ),
+    ):
+        with pytest.raises(dp.errors.ShapeError, match=words):
+            to_jax(lambda x: {"a": x, "b": x}, like)(jnp.ones(2))
+    with pytest.raises(
+        dp.errors.ShapeError,
+        match=r"result of to_jax: expected the entries \['a'\], got \['a'\], \['b'\]; return the same each time",
+    ):
+        to_jax(lambda x: {"a": x, "b": x}, {"a": 1.0})(jnp.ones(2))
+    for dtype in (jnp.float16, jnp.bfloat16):
+        with pytest.raises(TypeError, match="an argument of to_jax must be float32, float64, complex64 or complex128"):
+            to_jax(L)(jnp.ones(GRID.shape, dtype))
+        with pytest.raises(TypeError, match="a result of another library must be float32, float64, complex64"):
+            from_jax(lambda x: x.astype(dtype))(FIELD)
+    with pytest.raises(TypeError, match="result of to_jax must be float32, float64, complex64 or complex128, got"):
+        to_jax(lambda x: x.astype(np.longdouble))(jnp.ones(2))
+    with pytest.raises(
+        TypeError, match="an argument of from_jax must be float32, float64, complex64 or complex128, got"
+    ):
+        from_jax(jnp.sin)(np.ones(2, np.longdouble))
     with pytest.raises(TypeError, match="forward-mode"):
         jax.jvp(to_jax(L), (jnp.ones(GRID.shape),), (jnp.ones(GRID.shape),))
     with pytest.raises(TypeError, match="^laplacian needs arrays of NumPy, got a ArrayImpl of jax; wrap"):
@@ -236,3 +267,45 @@ def test_there_and_back():
     assert close(dp.grad(loss)(SIDES), dp.grad(direct)(SIDES))
     slope = lambda f: dp.grad(lambda k: anp.sum(dp.grad(f)(k) ** 2))(SIDES)
     assert close(slope(loss), slope(direct), 1e-9)
+
+
+# ---- results in another order ----------------------------------------------------------------------------------------
+
+
+def in_turn(function):
+    """The function, which returns an ordered dict in another order each time."""
+    calls = []
+
+    def turned(x):
+        calls.append(None)
+        entries = [*function(x).items()]
+        return OrderedDict(entries if len(calls) % 2 else entries[::-1])
+
+    return turned
+
+
+def powers(x):
+    return {"a": x**2, "b": 10.0 * x**3}
+
+
+def test_results_are_paired_by_key():
+    """JAX keeps the order of an OrderedDict, so that one run may differ from the next."""
+    x = jnp.array([1.0, 2.0])
+    for f in (to_jax(in_turn(powers)), to_jax(in_turn(powers), OrderedDict(b=np.ones(2), a=np.ones(2)))):
+        for call in (f, f, jax.jit(f), jax.jit(f)):
+            result = call(x)
+            assert result["a"].tolist() == [1.0, 4.0] and result["b"].tolist() == [10.0, 80.0]
+            assert jax.grad(lambda x, call=call: jnp.sum(call(x)["a"]))(x).tolist() == [2.0, 4.0]
+    f = from_jax(in_turn(powers))
+    assert dp.grad(lambda x: anp.sum(f(x)["a"]))(np.array([1.0, 2.0])).tolist() == [2.0, 4.0]
+    assert dp.hvp(lambda x: anp.sum(f(x)["a"]), np.array([1.0, 2.0]), np.ones(2)).tolist() == [2.0, 2.0]
+
+
+def test_the_form_of_a_result_may_depend_on_shapes():
+    def f(x):
+        return OrderedDict(a=x**2, b=x) if x.size == 2 else OrderedDict(b=x, a=x**2)
+
+    for bridged, kind in ((from_jax(f), np.arange), (to_jax(f), jnp.arange)):
+        for size in (2, 3, 2):
+            x = 1.0 + kind(size)
+            assert close(bridged(x), f(x)) and [*bridged(x)] == [*f(x)]

@@ -146,6 +146,20 @@ def test_refusals():
             TypeError, match=r"^to_torch takes float32 or float64, got torch.*; write tensor.float\(\)$"
         ):
             to_torch(L)(torch.ones(GRID.shape, dtype=half))
+        with pytest.raises(
+            TypeError, match=r"^from_torch takes and gives float32 or float64, got torch.*; write tensor.float\(\)$"
+        ):
+            from_torch(lambda x, half=half: x.to(half))(FIELD)
+    with pytest.raises(TypeError, match="result of to_torch must be float32, float64, complex64 or complex128, got"):
+        to_torch(lambda x: x.astype(np.longdouble))(torch.ones(2))
+    for dtype in (np.float16, np.longdouble):
+        with pytest.raises(TypeError, match=r"arguments of from_torch\[0\] must be float32, float64, complex64 or"):
+            from_torch(torch.sin)(np.ones(2, dtype))
+    net = from_torch(torch.nn.Linear(2, 1).double())
+    with pytest.raises(
+        dp.errors.ShapeError, match="parameters of from_torch: unknown key 'q'; expected 'weight', 'bias'"
+    ):
+        net({**net.parameters, "q": np.ones(2)}, np.ones(2))
     with pytest.raises(TypeError, match="^laplacian needs arrays of NumPy, got a Parameter of torch; wrap"):
         L(torch.nn.Parameter(torch.ones(GRID.shape)))
     with pytest.raises(dp.errors.ShapeError, match="laplacian takes a field on cells"):
@@ -317,3 +331,25 @@ def test_there_and_back():
     direct = lambda k: anp.sum(SCENES["elliptic_solver"][0](k, FIELD) ** 2)
     assert np.allclose(dp.grad(loss)(SIDES), dp.grad(direct)(SIDES), rtol=1e-12)
     assert np.allclose(dp.hvp(loss, SIDES, SIDES), dp.hvp(direct, SIDES, SIDES), rtol=1e-9)
+
+
+def test_a_second_run_in_another_order():
+    """A gradient of the gradient runs the function again, which may then return its dict in another order."""
+    calls = []
+
+    def f(x):
+        calls.append(None)
+        results = {"a": x**2, "b": 10.0 * x**3}
+        return results if len(calls) % 2 else dict(reversed(results.items()))
+
+    x = tensor(np.array([1.0, 2.0]))
+    (slope,) = torch.autograd.grad(to_torch(f)(x)["a"].sum(), x, create_graph=True)
+    assert len(calls) == 2 and slope.tolist() == [2.0, 4.0]
+    assert torch.autograd.grad(slope.sum(), x)[0].tolist() == [2.0, 2.0]
+    calls.clear()
+    answers = iter([{"a": 1.0, "b": 1.0}, {"a": 1.0, "c": 1.0}])
+    loss = to_torch(lambda x: {name: scale * x for name, scale in next(answers).items()})(x)["a"].sum()
+    with pytest.raises(
+        dp.errors.ShapeError, match="result of to_torch: unknown key 'c'; expected 'a', 'b'; return the"
+    ):
+        torch.autograd.grad(loss, x, create_graph=True)

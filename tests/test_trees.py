@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import autograd.numpy as anp
 import numpy as np
 import pytest
+import scipy.sparse as sp
 
 import sparsedp as dp
 from sparsedp.errors import DerivativeError, ShapeError
@@ -257,6 +258,28 @@ def test_a_checked_gradient_in_another_order():
     assert swapped.verdict == "disagrees"
 
 
+def test_the_inner_function_of_admm_in_another_order():
+    def inner(target, rho, x):
+        return {"b": target[1] / 3.0 + 2.0, "a": target[0] + 1.0}
+
+    best = dp.minimize(loss, START, "admm", weight=1e-9, operator=residuals, inner=inner, maxiter=3)
+    assert list(best.x) == ["a", "b"]
+    with pytest.raises(ShapeError, match=r"inner\(target, rho, x\): missing key 'b'; expected 'a', 'b'; return a tree"):
+        dp.minimize(loss, START, "admm", weight=1.0, operator=residuals, inner=lambda target, rho, x: {"a": 1.0})
+
+
+def test_references_of_workprec_in_another_order():
+    x = {"a": np.ones(2), "b": np.zeros(3)}
+    reference = 2.0, {"b": np.zeros(3), "a": 2.0 * np.ones(2)}
+    table = dp.workprec(
+        lambda n: (lambda x: anp.sum(x["a"] ** 2) + anp.sum(x["b"] ** 2), x),
+        {"n": {"n": 1}},
+        reference=reference,
+        repeats=1,
+    )
+    assert (table.rows[0]["status"], table.rows[0]["gradient_error"]) == ("ok", 0.0)
+
+
 # ---- tangents --------------------------------------------------------------------------------------------------------
 
 
@@ -423,6 +446,57 @@ def test_other_states_are_refused():
         dp.rollout(lambda s, p: Other(s.a, s.b), Pair(1.0, 2.0), None, 2)
 
 
+def in_turn(results):
+    """A function that returns what `results` does, its entries in another order each time."""
+    calls = []
+
+    def function(i, state):
+        calls.append(None)
+        entries = results(state)
+        return entries if len(calls) % 3 else dict(reversed(entries.items()))
+
+    return function
+
+
+@pytest.mark.parametrize("memory", [None, 240, "reverse"])
+def test_what_keep_returns_in_another_order(memory):
+    """Both entries have one shape and, at the start, equal values: nothing but their names tells them apart."""
+    step = dp.stepper("leapfrog", (lambda q, c: -c * q, lambda p, c: p), 0.1)
+    start = np.ones(2), np.ones(2)
+
+    def loss(keep):
+        def total(c):
+            kept = dp.rollout(step, start, c, 8, memory=memory, keep=keep)
+            return sum(anp.sum(one["a"] ** 2 + 3.0 * one["b"]) for one in kept)
+
+        return total
+
+    def both(state):
+        return {"a": state[0], "b": state[1]}
+
+    wanted = dp.value_and_grad(loss(lambda i, state: both(state)))(0.7)
+    keep = in_turn(both)
+    assert dp.value_and_grad(loss(keep))(0.7) == wanted
+    value, pull = dp.vjp(loss(keep), 0.7)
+    assert (pull(1.0), pull(1.0)) == (wanted[1], wanted[1])
+
+
+def test_other_entries_of_keep_are_refused():
+    calls = []
+
+    def keep(i, state):
+        calls.append(None)
+        return {"a" if len(calls) <= 4 else "c": state}
+
+    def loss(p):
+        return sum(anp.sum(one["a"]) for one in dp.rollout(lambda u, p: p * u, np.ones(2), p, 3, keep=keep))
+
+    with pytest.raises(
+        DerivativeError, match=r"keep\(3, state\): unknown key 'c'; expected 'a'; keep returns something"
+    ):
+        dp.grad(loss)(0.5)
+
+
 # ---- roots -----------------------------------------------------------------------------------------------------------
 
 
@@ -465,6 +539,21 @@ ENTRANCES = {
     "update_direction": lambda x: dp.update_direction(lambda u: u - 1.0, x),
     "rollout": lambda x: dp.rollout(lambda u, p: 0.5 * u, x, None, 9, memory=2000),
     "params of rollout": lambda x: dp.rollout(lambda u, p: p * u, X, x, 9),
+    "guess of implicit": lambda x: dp.implicit(lambda x, p: x**2 - p)(x + 1, X),
+    "params of implicit": lambda x: dp.implicit(lambda x, p: x**2 - p)(X, x),
+    "guess of steady": lambda x: dp.steady(lambda x: x - 1.0, x),
+    "argument of adopt": lambda x: dp.adopt(lambda x: x**2)(x),
+    "ensemble": lambda x: dp.ensemble(lambda x, scene: anp.sum(abs(x)), [1])(x),
+    "certify": lambda x: dp.certify(square, x),
+    "stress": lambda x: dp.stress(square, x),
+    "explain": lambda x: dp.explain(square, x),
+    **{
+        f"state of {method}": lambda x, method=method: dp.stepper(method, lambda u, p: -u, 0.1)(x)
+        for method in ["euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2", "radau"]
+    },
+    "state with a tolerance": lambda x: dp.stepper("rk4", lambda u, p: -u, 0.1, tolerance=0.01)({"u": x}),
+    "state of leapfrog": lambda x: dp.stepper("leapfrog", (lambda q, c: -q, lambda p, c: p), 0.1)((x, x)),
+    "params of stepper": lambda x: dp.stepper("rk4", lambda u, p: -p * u, 0.1)(X, {"k": x}),
     "inputs of rollout": lambda x: dp.rollout(lambda u, p, i: i * u, 1.0, None, 3, inputs=x),
     **{
         f"minimize, {method}": lambda x, method=method: dp.minimize(
@@ -483,12 +572,41 @@ def test_other_precisions_are_refused_by_name(entrance, dtype):
         ENTRANCES[entrance](X.astype(dtype))
 
 
+@pytest.mark.parametrize("dtype", [np.float16, np.longdouble])
+def test_adopted_functions_of_other_precision_are_refused(dtype):
+    """Differences of half precision would give a derivative of 0."""
+    with pytest.raises(TypeError, match="the result of <lambda> must be float32, float64, complex64 or complex128"):
+        dp.adopt(lambda u: (u**2).astype(dtype))(X)
+
+
 def test_derivatives_of_other_precision_are_rounded():
     best = dp.minimize(square, X, gradient=lambda u: 2 * (u - 1.0).astype(np.longdouble))
     assert best.x == pytest.approx(1.0)
     assert dp.check.gradient(square, X, gradient=lambda u: 2 * (u - 1.0).astype(np.longdouble))
+    assert dp.implicit(lambda x, p: (x**2 - p).astype(np.longdouble))(X + 1.0, X + 4.0) == pytest.approx(
+        np.sqrt(X + 4.0)
+    )
+    best = dp.minimize(lambda u: (u - 1.0).astype(np.longdouble), X, "levenberg_marquardt")
+    assert best.x == pytest.approx(1.0)
+    for method in ("rk4", "radau"):
+        step, exact = (
+            dp.stepper(method, lambda u, p, kind=kind: (-u).astype(kind), 0.1) for kind in (np.longdouble, float)
+        )
+        assert step(X).dtype == float and step(X) == pytest.approx(exact(X))
+    best = dp.minimize(square, X, "admm", weight=1e-9, operator=lambda u: u.astype(np.longdouble))
+    assert best.x == pytest.approx(1.0)
     best = dp.minimize(square, X, bounds=(np.zeros(3, np.longdouble), np.full(3, 0.5, np.float16)))
     assert best.x == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.longdouble])
+def test_constants_of_other_precision_are_rounded(dtype):
+    for matrix in (np.diag(X + 1.0).astype(dtype), sp.diags_array(X + 1.0).tocsr().astype(np.longdouble)):
+        op = dp.from_matrix(matrix)
+        assert op.matrix.dtype == float and dp.check.operator(op)
+        assert dp.inverse(op)(X) == pytest.approx(X / (X + 1.0))
+    step = dp.stepper("rk4", lambda u, p: -u, dtype(0.125), tolerance=0.01, floor=X.astype(dtype) + 1)
+    assert np.array_equal(step(X), dp.stepper("rk4", lambda u, p: -u, 0.125, tolerance=0.01, floor=X + 1)(X))
 
 
 # ---- containers that are no trees ------------------------------------------------------------------------------------

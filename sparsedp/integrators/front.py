@@ -6,7 +6,15 @@ from scipy.sparse.linalg import ArpackError, eigsh
 from sparsedp.calls import public
 from sparsedp.derivative import is_finite
 from sparsedp.errors import NonFiniteError, UnstableStepError
-from sparsedp.fields import advise, check_choice, check_finite, check_number, number_beside, rounded_down
+from sparsedp.fields import (
+    advise,
+    check_choice,
+    check_finite,
+    check_leaves,
+    check_number,
+    number_beside,
+    rounded_down,
+)
 from sparsedp.integrators.problem import Problem, like, number, pair
 from sparsedp.integrators.runge_kutta import (
     EXPLICIT,
@@ -274,6 +282,8 @@ class Step(Remade):
         """
         known, params = params, (params, *inputs) if inputs else params
         u, t = self._parts(state)
+        check_leaves(f"state of {self.name}", u, containers=False)
+        check_leaves(f"params of {self.name}", params, containers=False)
         h = self._length(params)
         if self.problem.stiff:
             self.problem.terms(u)  # refuses another tree before anything is solved

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from sparsedp.fields import check_function
+from sparsedp.errors import ShapeError
+from sparsedp.fields import check_function, check_precision
 from sparsedp.interop.recording import owned, parts, recorded
 from sparsedp.recipe import Made
 from sparsedp.tape import Rule, dtype_of, plain
@@ -31,8 +32,8 @@ def to_jax(f, like=None):
         ``f(*args)``, made of this library and autograd.numpy: an Operator, an inverse, a solver, a rollout, a loss.
         Arguments and result are arrays, or pytrees of arrays.
     like : pytree of arrays, optional
-        Of the structure, shapes and dtypes of the result of f. Default: f is run once with ones, for each set of
-        shapes that jit or vmap bring.
+        Of the structure, shapes and dtypes of the result of f, whose entries are paired with it by key. Default: f is
+        run once with ones, for each set of shapes that jit or vmap bring.
 
     Returns
     -------
@@ -42,7 +43,10 @@ def to_jax(f, like=None):
     Raises
     ------
     TypeError
-        If f is no function; on use, if f does not take ones and `like` is not given.
+        If f is no function; on use, if f does not take ones and `like` is not given, or a dtype has other than single
+        or double precision.
+    ShapeError
+        On use, if the result has other entries or shapes than `like`.
 
     Notes
     -----
@@ -59,27 +63,32 @@ def to_jax(f, like=None):
     Array([-16.,  -2.,  -4.,  22.], dtype=float32)
     """
     check_function("to_jax", f, "dp.interop.to_jax(dp.laplacian(grid))")
-    nodes: dict = {}  # by structure of the arguments
+    nodes: dict = {}  # by structure, shapes and dtypes of the arguments: those of the result may depend on all of them
 
     def call(*args):
         entries, structure = jax.tree.flatten(args)
-        if structure not in nodes:
-            nodes[structure] = _called(f, structure, like)
-        node, built = nodes[structure]
-        results = node.call(*map(jnp.asarray, entries))
-        return jax.tree.unflatten(built[0], results)
+        arrays = [*map(jnp.asarray, entries)]
+        key = structure, tuple((array.shape, array.dtype) for array in arrays)
+        if key not in nodes:
+            nodes[key] = _called(f, structure, like)
+        node, result = nodes[key]
+        entries = node.call(*arrays)  # the first call finds the structure
+        return jax.tree.unflatten(result.structure, entries)
 
     return Made(call, to_jax, f, like)
 
 
 def _called(f, structure, like):
-    """f, called with trees of one structure -> its node, and a list that will hold the structure of its result."""
-    built, known = [jax.tree.structure(like)], {}  # type: list, dict
+    """f, called with trees of one structure -> its node, and the form of its result."""
+    result, known = _Result("result of to_jax", like), {}  # type: _Result, dict
 
     def fun(arrays):
-        results, found = jax.tree.flatten(f(*jax.tree.unflatten(structure, arrays)))
-        built[0] = found if like is None else built[0]
-        return results
+        for array in arrays:
+            check_precision("an argument of to_jax", array)
+        entries = result.leaves(f(*jax.tree.unflatten(structure, arrays)))
+        for entry in entries:
+            check_precision("result of to_jax", entry)
+        return entries
 
     def forms(values):
         key = tuple((value.shape, value.dtype) for value in values)
@@ -93,7 +102,50 @@ def _called(f, structure, like):
                 ) from error
         return known.get(key) or jax.tree.leaves(like)
 
-    return _Node(fun, forms), built
+    return _Node(fun, forms), result
+
+
+class _Result:
+    """The form of a result of a function: that of `like`, or of its first run. Other runs are brought into its order.
+
+    Parameters
+    ----------
+    name : str
+        Root of the paths in messages.
+    like : pytree of arrays, optional
+
+    Attributes
+    ----------
+    structure : treedef
+    """
+
+    structure: Any = None
+
+    def __init__(self, name, like=None):
+        self._name, self._shapes = name, None
+        if like is not None:
+            self._shapes = [np.shape(leaf) for leaf in self.leaves(like)]
+
+    def leaves(self, tree):
+        """The leaves of a result, paired by their paths: keys of dicts, fields of named tuples."""
+        rows, structure = jax.tree_util.tree_flatten_with_path(tree)
+        if self.structure is None:
+            self.structure, self._paths = structure, [path for path, _ in rows]
+        entries = [leaf for _, leaf in rows]
+        if structure != self.structure:
+            entries = self._paired(dict(rows))
+        for path, shape, leaf in zip(self._paths, self._shapes or (), entries):
+            if np.shape(leaf) != shape:
+                place = f"{self._name}{jax.tree_util.keystr(path)}"
+                raise ShapeError(f"{place}: expected shape {shape}, as like has it, got {np.shape(leaf)}")
+        return entries
+
+    def _paired(self, found):
+        """The leaves of a dict {path: leaf} in the order of the form."""
+        if found.keys() != set(self._paths):
+            expected, got = (", ".join(map(jax.tree_util.keystr, paths)) or "none" for paths in (self._paths, found))
+            raise ShapeError(f"{self._name}: expected the entries {expected}, got {got}; return the same each time")
+        return [found[path] for path in self._paths]
 
 
 class _Node:
@@ -174,7 +226,7 @@ def from_jax(function):
     Raises
     ------
     TypeError
-        If it is no function.
+        If it is no function; on use, if a dtype has other than single or double precision.
 
     Notes
     -----
@@ -189,21 +241,23 @@ def from_jax(function):
     (9.0, array([ 3., 12.]))
     """
     check_function("from_jax", function, "dp.interop.from_jax(jax.numpy.sin)")
-    rules: dict = {}  # by structure of the arguments
+    rules: dict = {}  # by structure, shapes and dtypes of the arguments: the form of the result may depend on all
 
     def call(*args):
         entries, structure = jax.tree.flatten(args)
-        if structure not in rules:
-            built: list = []  # the structure of the result
+        for entry in entries:
+            check_precision("an argument of from_jax", entry)
+        key = structure, tuple((np.shape(plain(entry)), dtype_of(entry)) for entry in entries)
+        if key not in rules:
+            form = _Result("result of from_jax")
 
             def of_entries(*entries):
-                results, *built[:] = jax.tree.flatten(function(*jax.tree.unflatten(structure, entries)))
-                return results
+                return form.leaves(function(*jax.tree.unflatten(structure, entries)))
 
-            rules[structure] = _Traced(of_entries), built
-        traced, built = rules[structure]
+            rules[key] = _Traced(of_entries), form
+        traced, form = rules[key]
         results = traced.rule(*entries)
-        return jax.tree.unflatten(built[0], parts(results, built[0].num_leaves))
+        return jax.tree.unflatten(form.structure, parts(results, form.structure.num_leaves))
 
     return Made(call, from_jax, function)
 

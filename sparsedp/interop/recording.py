@@ -3,6 +3,7 @@
 import numpy as np
 
 from sparsedp.derivative import gradient_of, growing, linearised
+from sparsedp.fields import check_precision
 
 __all__ = ["owned", "parts", "recorded"]
 
@@ -24,6 +25,7 @@ def recorded(fun, arrays, moving):
 
 def owned(array):
     """Array of another library -> one of our own, or a number; whole numbers stay arrays, as the tape takes them."""
+    check_precision("a result of another library", array)
     array = np.array(array)
     return array[()] if array.dtype.kind in "fc" else array
 

@@ -8,14 +8,17 @@ import autograd.numpy as anp
 import numpy as np
 import torch
 
-from sparsedp.fields import check_function
+from sparsedp.errors import ShapeError
+from sparsedp.fields import check_function, check_leaves
 from sparsedp.interop.recording import owned, parts, recorded
 from sparsedp.recipe import Made
 from sparsedp.tape import Rule, dtype_of, is_variable, isbox
 from sparsedp.tape_constants import constant, frozen
-from sparsedp.tree import flatten, leaves, placed
+from sparsedp.tree import flatten, leaves, paired, placed
 
 __all__ = ["from_torch", "to_torch"]
+
+SAME = "; return the same entries each time"
 
 
 # ---- functions of this library for torch -----------------------------------------------------------------------------
@@ -91,10 +94,13 @@ class _Call(torch.autograd.Function):
             return tree
 
         values, rebuild, gradients = recorded(watched, arrays, moving)
+        check_leaves("result of to_torch", rebuild(values), containers=False)
         places = [place for place, value in enumerate(values) if is_variable(value) or isinstance(value, np.ndarray)]
         outputs = _tensors([values[k] if made[k] else np.array(values[k]) for k in places], arrays)
         result += values, places, rebuild
-        ctx.kept = fun, moving, gradients, places, len(values)
+        form = rebuild(range(len(values)))  # a second run may return a dict in another order
+        again = lambda arrays: paired(fun(arrays), form, "result of to_torch", advice=SAME)
+        ctx.kept = again, moving, gradients, places, len(values)
         ctx.save_for_backward(*tensors, *outputs)  # torch refuses what has been changed in place since
         ctx.set_materialize_grads(False)
         return tuple(outputs)
@@ -167,7 +173,9 @@ def from_torch(function):
     Raises
     ------
     TypeError
-        If it is no function.
+        If it is no function; on use, if a dtype has other than single or double precision.
+    ShapeError
+        On use, if the dict holds parameters that the module does not have.
 
     Notes
     -----
@@ -186,12 +194,23 @@ def from_torch(function):
     (9.0, array([ 3., 12.]))
     """
     check_function("from_torch", function, "dp.interop.from_torch(module)")
-    run, parameters = function, {}
+    run, parameters, names = function, {}, set()
     if isinstance(function, torch.nn.Module):
         run = lambda parameters, *args: torch.func.functional_call(function, parameters, args)
         parameters = {name: _owned(tensor) for name, tensor in function.named_parameters()}
+        names = {*parameters, *(name for name, _ in function.named_buffers())}
+
+    def check_names(given):
+        """Refuse parameters that the module does not have; torch ignores them."""
+        unknown = [repr(name) for name in given if name not in names]
+        if unknown:
+            expected = ", ".join(map(repr, parameters))
+            raise ShapeError(f"parameters of from_torch: unknown key {', '.join(unknown)}; expected {expected}")
 
     def call(*args):
+        check_leaves("arguments of from_torch", args, containers=False)
+        if parameters:
+            check_names(args[0])
         entries, rebuild = flatten(args)
         moving = [*map(isbox, entries)]
         built: list = []
@@ -269,4 +288,6 @@ _rule = Rule("torch function", _Graph.run, _pull)
 
 def _owned(tensor):
     """Tensor -> array or number apart from it: it may be a parameter, or what the way back needs."""
+    if tensor.is_floating_point() and tensor.dtype.itemsize < 4:
+        raise TypeError(f"from_torch takes and gives float32 or float64, got {tensor.dtype}; write tensor.float()")
     return owned(tensor.numpy(force=True))

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_function, check_kind, check_plain, check_type
+from sparsedp.fields import PRECISIONS, check_finite, check_function, check_kind, check_plain, check_type
 from sparsedp.operator import Operator
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
@@ -28,7 +28,8 @@ def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
     Parameters
     ----------
     matrix : scipy.sparse matrix or array, or 2-D ndarray, shape (codomain.size, domain.size)
-        Any format, real or complex. Copied.
+        Any format, real or complex. Copied; entries of other precision than float32, float64, complex64 and complex128
+        are rounded to double precision.
     domain, codomain : Space, int or tuple of int, optional
         Default: flat spaces of the matrix's sizes.
     name : str
@@ -61,6 +62,8 @@ def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
             f"{name} needs a 2-D matrix, got an array of shape {entries.shape}; write matrix[None] for a row"
         )
     check_kind(name, entries.dtype, "numbers", "; write matrix.astype(float)")
+    if entries.dtype.kind in "fc" and entries.dtype.char not in PRECISIONS:
+        entries = entries.astype(complex if entries.dtype.kind == "c" else float)
     structure = Matrix(sp.csr_array(entries, copy=True))
     rows, columns = structure.matrix.indptr, structure.matrix.indices
     check_finite(

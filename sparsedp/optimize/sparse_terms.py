@@ -18,11 +18,11 @@ from itertools import count, islice
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import vjp
+from sparsedp.derivative import pullback
 from sparsedp.fields import check_function, check_number, check_shape, check_whole
 from sparsedp.ledger import thread
 from sparsedp.optimize.result import Minimum, Record
-from sparsedp.tree import norm
+from sparsedp.tree import flatten, norm, paired
 
 __all__ = ["admm"]
 
@@ -63,7 +63,12 @@ def admm(
             raise KeyboardInterrupt
         return best.x, best.evaluations
 
-    minimized = (lambda *state: (inner(*state), 1)) if callable(inner) else searched
+    def given(target, rho, x):
+        """The x of a round from the function of the user, in the order of the start."""
+        found = paired(inner(target, rho, x), start, "inner(target, rho, x)", advice="; return a tree like start")
+        return flatten(start)[1](found), 1
+
+    minimized = given if callable(inner) else searched
     x, first = start, np.asarray(K(start))
     record(x, first, np.inf)
     try:
@@ -90,7 +95,7 @@ def _rounds(minimized, x, K, z, weight, rho, prox):
         rho = weight / (float(np.mean(np.abs(z))) or 1.0)
     for number in count():
         x, spent = minimized(z - w, rho, x)
-        image, pull = vjp(K, x)
+        image, pull = pullback(K, x)
         check_shape("what the operator of admm gives", image, z.shape, "; it must not change from call to call")
         before, z = z, prox(image + w, weight / rho)
         w = w + image - z

@@ -14,7 +14,7 @@ import numpy as np
 
 from sparsedp.calls import public
 from sparsedp.derivative import check_loss, grad, jvp, unwarned, value_and_grad, zero_like
-from sparsedp.fields import check_finite, check_function, check_shape, check_whole, is_whole
+from sparsedp.fields import check_finite, check_function, check_leaves, check_shape, check_whole, is_whole
 from sparsedp.progress import shown_steps
 from sparsedp.recipe import Remade
 from sparsedp.tape import Rule, isbox
@@ -133,6 +133,7 @@ class Ensemble(Remade):
                 raise IndexError(f"ensemble has scenes 0 to {self.count - 1}, got {number!r}")
         if not numbers:
             raise ValueError("ensemble needs a scene, got none")
+        check_leaves("x", x, containers=False)
         x = copied(x)  # the caller may write into what is not traced, before a second derivative is asked for
         entries = leaves(x)
         moving = [place for place, leaf in enumerate(entries) if isbox(leaf)]

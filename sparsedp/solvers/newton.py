@@ -36,7 +36,7 @@ import numpy as np
 
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_finite, check_plain, number_beside
+from sparsedp.fields import check_finite, check_leaves, check_plain, check_precision, number_beside
 from sparsedp.ledger import note
 from sparsedp.shortcuts import array, elsewhere, on_every_rank
 from sparsedp.solvers.direct import DENSE_UP_TO
@@ -145,6 +145,7 @@ class Layout:
 
 def _check_unknown(leaf, name):
     check_plain(name, leaf)
+    check_precision(f"the guess of {name}", leaf)
     kind = dtype_of(leaf).kind
     if kind == "c":
         raise TypeError(f"{name} solves for real unknowns; give real and imaginary part as two fields")
@@ -176,6 +177,7 @@ class Equation:
 
     def __init__(self, residual, layout, params, name):
         self.residual, self.layout, self.name = residual, layout, name
+        check_leaves(f"parameters of {name}", params, containers=False)
         found, rebuild = flatten(params)
         self._places = [place for place, leaf in enumerate(found) if is_variable(leaf)]
         self.statics = [None if is_variable(leaf) else constant(leaf) for leaf in found]
@@ -240,7 +242,7 @@ class Equation:
             return cast(self.layout.ranks.join(self.layout.space, parts), np.float64)
         lines = [anp.reshape(on_every_rank(part), (-1,)) for part in parts]
         flat = lines[0] if len(lines) == 1 else anp.concatenate(lines) if lines else np.zeros(0)
-        return flat if dtype_of(flat) == np.float64 else flat + np.zeros(self.size)
+        return cast(flat, np.float64)
 
     # ------------------------------------------------------------ products with J = dF/dx
 

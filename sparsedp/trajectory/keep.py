@@ -16,7 +16,7 @@ from sparsedp.shortcuts import ELSEWHERE, array
 from sparsedp.tape import dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.tape_constants import constant
 from sparsedp.trajectory.layout import fingerprint, owned, refuse_mask, stacked
-from sparsedp.tree import leaves, mapped
+from sparsedp.tree import flatten, leaves, mapped, paired
 
 __all__ = ["All", "Each", "Last", "Some", "kind"]
 
@@ -35,6 +35,9 @@ def kind(keep, layout, n):
     if not isinstance(keep, str) or keep not in ("last", "all"):
         raise ValueError(f'keep must be "last", "all", a list of states or a function of (index, state), got {keep!r}')
     return All(layout, range(n + 1)) if keep == "all" else Last(layout)
+
+
+AGAIN = "keep returns something else when it is called again; it must depend on its arguments only"
 
 
 class Last:
@@ -176,20 +179,31 @@ class Each(Last):
         super().__init__(layout)
         self.function = function
         self._marks: list = []  # of what the function returned, where it will be called again
+        self._trees: list = []  # what the function returned, rows in place of floating results
+        self._forms: list = []  # those of the first run: the order of entries is theirs
 
     def start(self, steps):
         """A run begins."""
         self._stacks: dict = {}
-        self._trees: list = []  # what the function returned, rows in place of floating results
+        self._forms = self._forms or self._trees
+        self._trees = []
         self._steps = steps
 
     def see(self, state):
         """A state of the run -> the same."""
         result = self.function(state.i, self._steps.shown(state))
+        if state.i < len(self._forms):
+            form = self._forms[state.i]
+            result = flatten(form)[1](self._paired(result, form, state.i))
         self._trees.append(mapped(self._kept, result))
         if self._steps.loop.wanted:
             self._compare(state.i, leaves(result))
         return state
+
+    def _paired(self, result, form, i):
+        """The leaves of a result in the order of one of another call."""
+        words = f"; {AGAIN}"
+        return paired(result, form, f"keep({i}, state)", advice=words, error=DerivativeError)
 
     def _kept(self, leaf):
         """A result -> where it is kept, or a constant."""
@@ -215,9 +229,7 @@ class Each(Last):
         if i == len(self._marks):
             self._marks.append(marks)
         elif self.exact and self._marks[i] != marks:
-            raise DerivativeError(
-                "keep returns something else when it is called again; it must depend on its arguments only"
-            )
+            raise DerivativeError(AGAIN)
 
     def finish(self, last):
         """One array for each shape and dtype."""
@@ -234,10 +246,14 @@ class Each(Last):
 
         def at(state):
             given = self.layout.build(state.values, state.statics)
-            function = lambda tree: self.function(state.i, tree)
+            form = self._trees[state.i]
+
+            def function(tree):
+                return self._paired(self.function(state.i, tree), form, state.i)
+
             results, _, pull = linearised(function, given, map(is_variable, leaves(given)))
             self._compare(state.i, results)
-            cotangents = pull([leaf.of(g) if isinstance(leaf, Row) else None for leaf in leaves(self._trees[state.i])])
+            cotangents = pull([leaf.of(g) if isinstance(leaf, Row) else None for leaf in leaves(form)])
             return [cotangents[place] for place in self.layout.places]
 
         return at
