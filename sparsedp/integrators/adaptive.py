@@ -37,18 +37,19 @@ from typing import Any, NamedTuple
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.derivative import push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import number_beside
-from sparsedp.integrators.problem import combine, later, untraced
+from sparsedp.integrators.problem import combine, later, unsided, untraced
 from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.ledger import note, thread
 from sparsedp.shortcuts import on_every_rank
 from sparsedp.space import Space
-from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain
+from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
 from sparsedp.tape_constants import constant
 from sparsedp.tree import flatten, is_uniform, labels, leaves, mapped, paired
 
-__all__ = ["Adaptive", "Moving", "Taken", "relative"]
+__all__ = ["Adaptive", "Moving", "Taken", "inner", "relative"]
 
 FITTING = "; give one number, or a tree like the state"  # advice about a floor
 SAFETY, SMALLEST, LARGEST = 0.9, 0.2, 5.0  # of one change of the length
@@ -65,6 +66,7 @@ EPSILON = 1e-3  # share of the shadows
 LESS = 0.0, EPSILON, 0.0  # how much less the steps that count and both shadows are extrapolated
 UNCERTAIN = 6.0  # error of a derivative without extrapolation, in units of tolerance^(p / (p + 1)), that is taken
 TIMES = 10.0  # error of a derivative in units of the tolerance: aim with extrapolation, limit without
+STEEP = 0.1  # relative uncertainty of the rate of change of an event, from which on it grazes its surface
 SHARE = 1e-4  # of what goes in: derivatives that are smaller are judged by it
 
 
@@ -88,6 +90,8 @@ class Adaptive(Scheme):
         Of the error of two half steps, relative to |u| + floor, root mean square over all entries.
     floor : None, number, or tree like the state
         None: for each array of the state a tenth of its largest entry.
+    max_step : float, optional
+        Longest step.
 
     Attributes
     ----------
@@ -101,24 +105,92 @@ class Adaptive(Scheme):
 
     window = WINDOW
 
-    def __init__(self, scheme, tolerance, floor):
+    def __init__(self, scheme, tolerance, floor, max_step=None):
         super().__init__(scheme.problem, f"stepper({scheme.name})", scheme.order)
+        self.max_step = np.inf if max_step is None else float(max_step)
         self.scheme, self.tolerance, self.floor, self.info = scheme, tolerance, constant(floor), scheme.info
         self.taken, self.ratio, self.compared, self.dyadic = [], 2**self.order - 1, self.order, scheme.dyadic
         self.weight = 0.0 if scheme.name == "crank_nicolson" else 1 / self.ratio
 
     def __call__(self, *given):
         """(u, params, t, h) -> the state after the interval h."""
-        self._check_tolerance(given[0])
+        self.check_tolerance(given[0])
         return self._crossed(given, isbox)
 
     def _crossed(self, given, moves):
         """The state after the interval; `moves`: which leaves of what is given have a derivative."""
         traced = any(map(isbox, leaves(given)))
-        path = deque(self._steps(*untraced(given)), None if traced else 1)
-        return self._followed([*path], given, moves) if traced else path[-1].new
+        path, _, self.taken = self.path(untraced(given), traced)
+        return self._followed(path, given, moves) if traced else path[-1].new
 
-    def _check_tolerance(self, u):
+    def path(self, known, whole, watch=None):
+        """The steps over an interval, or up to the first event in it.
+
+        Parameters
+        ----------
+        known : tuple
+            (u, params, t, h), plain.
+        whole : bool
+            Whether all steps are wanted; else the last one alone.
+        watch : Watch, optional
+            Looks for events in each step.
+
+        Returns
+        -------
+        (list of Taken, Event or None, list of the lengths of all steps)
+        """
+        crossing, taken = None, []
+        path: deque = deque(maxlen=None if whole else 1)
+        for step in self._steps(*known):
+            crossing = watch and watch.crossing(self, step, known)
+            path.append(crossing.step if crossing else step)
+            taken.append(path[-1].length)
+            if crossing:
+                return [*path], crossing.event, taken
+        return [*path], None, taken
+
+    def interval(self, u, params, t, h):
+        """What crosses an interval: a scheme, and what it is given."""
+        return self, (u, params, t, h)
+
+    def rerun(self, path, given, event):
+        """The ends of the steps that were taken: (state, time of the event or None) for each run.
+
+        Parameters
+        ----------
+        path : list of Taken
+        given : list of tuples
+            (u, params, t, h) of each run: of equal value, with derivatives of their own.
+        event : Event or None
+            What ended the path.
+        """
+        _, params, t, h = untraced(given[0])
+        slopes = self._slopes(path, params, t, h, event)
+        return [self._again(path, slopes, less, event, *start) for less, start in zip(LESS, given, strict=True)]
+
+    def tree(self, u):
+        """The state of a step as the user knows it."""
+        return u
+
+    def rounded(self, u):
+        """The state at the end of an interval."""
+        return u
+
+    def rate(self, u, params, t):
+        """The rate at a state of a step."""
+        return self.problem(u, params, t)
+
+    def between(self, step):
+        """A state inside a step, and the share of the step at which it is."""
+        return step.middle, 0.5
+
+    def partial(self, step, known, length):
+        """The step from the same state with another length, as a share of the interval; None where there is none."""
+        _, params, t, h = known
+        middle, new, _ = self._trial(step.u, params, later(t, step.done * h), length, h)
+        return None if new is None else Taken(length, step.done, step.u, middle, new)
+
+    def check_tolerance(self, u):
         """Refuse a floor that does not fit the state, and digits that it cannot hold: steps would shrink to nothing.
 
         The ledger learns the tolerance: a check of a gradient compares its gap with it.
@@ -143,19 +215,19 @@ class Adaptive(Scheme):
 
     def _steps(self, u, params, t, h):
         """The steps over the interval, one after the other."""
-        length, done, taken, mark = self._first(u, params, t, h), 0.0, [], 0.0
+        length, done, count, mark = self._first(u, params, t, h), 0.0, 0, 0.0
         before, most, power = None, LARGEST, -1 / (self.compared + 1)
+        longest = self.max_step / h
         for trial in range(1, MOST + 1):
             left = 1.0 - done
-            length = self._allowed(length, left)
+            length = self._allowed(min(length, longest), left)
             middle, new, error = self._trial(u, params, later(t, done * h), length, h)
             change = SAFETY * max(error, 1e-10) ** power
             if error <= 1:
                 yield Taken(length, done, u, middle, new)
-                taken.append(length)
+                count += 1
                 u, done, error = new, done + length if length < left else 1.0, max(error, QUIET)
                 if done == 1.0:
-                    self.taken = taken
                     return
                 if before is not None:  # errors go on growing as they did
                     change = min(change, change * length / before[0] * (error / before[1]) ** power)
@@ -168,7 +240,7 @@ class Adaptive(Scheme):
             mark = done if turn else mark
         raise ConvergenceError(
             f"{self.name} found no step that meets the tolerance {self.tolerance:g} at {done:.3g} of its interval "
-            f"after {len(taken)} steps; take a larger tolerance, a method for stiff problems, or an interval "
+            f"after {count} steps; take a larger tolerance, a method for stiff problems, or an interval "
             "that ends before the solution does"
         )
 
@@ -241,9 +313,8 @@ class Adaptive(Scheme):
 
     def _runs(self, path, known, start, end, entered):
         """How far the ends of the three runs are off, from how far their starts are."""
-        slopes = self._slopes(path, *known[1:])
-        runs = (self._again(path, slopes, less, *start.at(x)) for less, x in zip(LESS, entered, strict=True))
-        return anp.array([*map(end.off, runs)])
+        ends = self.rerun(path, [start.at(x) for x in entered], None)
+        return anp.array([end.off(new) for new, _ in ends])
 
     def section(self, u, rates, half):
         """The derivative of d for each array of the state, and the speed, as a share of the state's size by time."""
@@ -254,25 +325,29 @@ class Adaptive(Scheme):
         speed = np.sqrt(square)
         return [-half / (speed * half + SLACK) / (speed or 1.0) * row for row in rows], speed
 
-    def _slopes(self, path, params, t, h):
+    def _slopes(self, path, params, t, h, event):
         """(for each step the derivatives of d at both halves, None where the shift is given back; its time)."""
         rows, speeds = [], []
-        for step in path:
+        for step in path[:-1] if event else path:
             half, at = 0.5 * step.length * h, later(t, step.done * h)
             places = (step.u, at), (step.middle, later(at, half))
             (first, speed), (second, _) = (self.section(u, leaves(self.problem(u, params, t)), half) for u, t in places)
             rows.append((first, second))
             speeds.append(speed)
+        if event:  # its time is free: nothing is given back
+            return [*rows, None], np.inf
         rest = h * (1.0 - np.array([step.done for step in path]))
         turn = int(np.argmin(np.maximum.accumulate(speeds[::-1])[::-1] + 1 / rest))  # the fastest from each step on
         return rows[:turn] + [None] * (len(path) - turn), rest[turn]
 
-    def _again(self, path, slopes, share, u, params, t, h):
-        """The steps that were taken; the new state of each has the value that is known."""
+    def _again(self, path, slopes, share, event, u, params, t, h):
+        """The steps that were taken; the new state of each has the value that is known. And the time of an event."""
         rows, rest = slopes
         shift = back = 0.0
         for step, row in zip(path, rows, strict=True):
             half, at = 0.5 * step.length * h, later(later(t, step.done * h), shift)
+            if event and step is path[-1]:
+                return self._until(event, step, share, u, params, at, half)
             bend = _bend(u, row[0]) if row else -back * plain(half)
             middle = _at(self.scheme(u, params, at, half + bend), step.middle)
             other = _bend(middle, row[1]) if row else -back * plain(half)
@@ -280,7 +355,51 @@ class Adaptive(Scheme):
             whole = self.scheme(u, params, at, half + bend + (half + other))
             u, shift = _at(self.joined(fine, whole, self.weight - share), step.new), shift + bend + other
             back = shift / rest if row else back
-        return u
+        return u, None
+
+    def _until(self, event, step, share, u, params, t, half):
+        """The state and the time at the end of a step that an event ends."""
+        weight = self.weight - share
+
+        def ahead(point, bend):
+            """The state after a step of length 2 half + bend, and the time."""
+            u, params, t = point
+            length = half + 0.5 * bend
+            middle = _at(self.scheme(u, params, t, length), step.middle)
+            fine = self.scheme(middle, params, t + length, length)
+            whole = self.scheme(u, params, t, length + length)
+            return _at(self.joined(fine, whole, weight), step.new), t + (length + length)
+
+        def value(point, bend):
+            new, time = ahead(point, bend)
+            return event.value(new, unsided(point[1]), time)
+
+        point = u, params, t
+        known = untraced(point)
+        change = float(push(lambda bend: 1.0 * value(known, bend), 0.0, [1.0])[1])
+        if not share:
+            self._check_transversal(event, step, known, change, 2.0 * half)
+        bend = 0.0
+        for _ in traces_of(leaves(point)):  # each one makes the derivative of one more order exact
+            found = value(point, bend)
+            bend = bend - (found - plain(found)) / change
+        return ahead(point, bend)
+
+    def _check_transversal(self, event, step, known, change, length):
+        """Refuse the derivative of an event where the solution, to the tolerance, only touches the surface."""
+        _, params, t = known
+        u, new = self.tree(step.u), self.tree(step.new)
+        of_state, of_time = event.gradient(u, unsided(params), t)
+        before = of_time + inner(of_state, self.tree(self.rate(step.u, params, t)))
+        sizes = self.tree(flatten(step.u)[1](self.sizes(step.u)))
+        of_state, _ = event.gradient(new, unsided(params), t + length)
+        uncertain = self.tolerance * inner(mapped(_magnitude, of_state), sizes)
+        if change == 0 or abs(change - before) / length * uncertain > STEEP * change**2:
+            raise DerivativeError(
+                f"{event.name} of {self.name} grazes its surface at t = {t + length:.9g}: its rate of change there, "
+                f"{change:.3g}, is zero to the tolerance {self.tolerance:g}, so that its time has no derivative; "
+                "give another event or parameter, or a smaller tolerance"
+            )
 
     def doors(self, count):
         """(spread, judge): where the three runs part, and where they meet; on plain arrays."""
@@ -364,6 +483,16 @@ def _bend(u, rows):
     """d: 0, with its derivative."""
     pairs = zip(leaves(u), rows, strict=True)
     return sum(anp.sum(anp.real(row * _off(leaf, plain(leaf)))) for leaf, row in pairs if isbox(leaf))
+
+
+def _magnitude(leaf):
+    return None if leaf is None else np.abs(leaf)
+
+
+def inner(cotangent, tangent):
+    """The real product of two trees; None in the first one counts for nothing."""
+    pairs = zip(leaves(cotangent), leaves(tangent), strict=True)
+    return float(sum(np.sum(np.real(row * rate)) for row, rate in pairs if row is not None))
 
 
 def relative(leaf):

@@ -38,7 +38,7 @@ UNUSED = {
     **dict.fromkeys(EXPLICIT, ("jacobian", "damping")),
     **dict.fromkeys((*IMPLICIT, "radau"), ("damping",)),
     "etdrk4": ("jacobian", "damping"),
-    "leapfrog": ("linear", "source", "timed", "tolerance", "jacobian"),
+    "leapfrog": ("linear", "source", "timed", "tolerance", "max_step", "breaks", "events", "jacobian"),
 }
 METHODS = tuple(UNUSED)
 KEPT = {False: 2, True: 12}  # set-ups of linear steps, without and with error control
@@ -56,6 +56,9 @@ def stepper(
     timed=None,
     tolerance=None,
     floor=None,
+    max_step=None,
+    breaks=None,
+    events=None,
     unstable="raise",
     jacobian=None,
     damping=None,
@@ -107,6 +110,22 @@ def stepper(
         all of its array is then followed down to nothing, in many steps: give the size below which it no longer
         matters. Where entries of very different size matter (species of 1 and 1e-5), give one for each. In a tree
         entries of dicts are paired by key, and a number or None may stand for a whole branch.
+    max_step : float, optional
+        Longest step that error control may take. Shorten it where something brief (a pulse, a spike of the rate) could
+        fall between two evaluations of the rate.
+    breaks : sequence of float, or callable, optional
+        Times at which the rate, or its derivative, jumps; or ``breaks(params)``, which returns such times. Steps end
+        there, and the rate is evaluated at the last time before a break and at the first one after it, so that
+        ``np.where(t < params["off"], 1.0, 0.0)`` is meant as it stands. Times returned by a function are
+        differentiated. Any order; times outside of the interval (t, t + dt] and repeated constants are ignored. Needs
+        a tolerance. The state is the pair (u, t).
+    events : callable, pair (callable, jump), or list of these, optional
+        Functions ``event(u, params)`` or ``event(u, params, t)`` whose zeros are located, and stop a step. The step
+        then goes on with the state that ``jump(u, params)`` or ``jump(u, params, t)`` returns, and without a jump with
+        the state as it is: for a rate that switches where the event is 0. Two attributes of the function, as of
+        SciPy's `solve_ivp`: ``event.terminal = True`` ends the interval there, so that the time returned beside
+        the state is that of the event; ``event.direction`` > 0 (< 0) has only zeros from negative to positive (from
+        positive to negative) count. Needs a tolerance. The state is the pair (u, t).
     unstable : "raise" or "allow"
         Explicit steps of an Operator whose spectrum is known, and leapfrog, for which it is estimated once for each
         content of dt and params: refuse a dt beyond the stable limit, or take it.
@@ -136,9 +155,10 @@ def stepper(
         On use, if an explicit step is beyond the stable limit of the operator, or one of leapfrog beyond its own; or if
         the operator of an implicit one makes fields grow faster than the step can follow, as -laplacian does.
     ConvergenceError
-        On use, if a solve fails, or no step meets the tolerance.
+        On use, if a solve fails, or no step meets the tolerance, or an event occurs again and again at one time.
     DerivativeError
-        On use of a derivative, if the tolerance is too coarse for it.
+        On use of a derivative, if the tolerance is too coarse for it; if an event grazes its surface, so that its time
+        has no derivative; if two differentiated breaks coincide.
 
     Notes
     -----
@@ -154,6 +174,13 @@ def stepper(
     takes about six times the steps of its value: three times as long as without the judgement. radau takes three
     Jacobians for the derivative of a step, those of many steps together, and one rule on the tape for an interval: a
     gradient takes 1.5 to 3.2 times the time of its value, and 3 to 5 times where the rate is written for vectors.
+    Breaks and events: with f_- and f_+ the rates before and after a break b, du/db = f_- - f_+ there. The time of an
+    event g = 0 has the derivative of the implicit function theorem, -(g_u du + g_p dp + g_t dt) / (g_u f + g_t), of
+    the step that ends there, located by Brent's method to rounding (implicit methods: to `rtol`). All orders, and in
+    rollouts under any memory; radau: first derivatives. Zeros that an event has twice within a step are found where
+    the values at the start, the middle and the end of the step show a dip. After a terminal event the next step of a
+    rollout goes on from the state and time returned. `step.t_events` lists the times of the last interval, constants:
+    a time with a derivative is that of a terminal event, or one that a jump writes into the state.
     Ranks: fields in blocks too (`distribute`), not by radau and etdrk4; nonlinear implicit steps within the limits of
     `implicit`: no `sparsity`.
     Source: runge_kutta.py and radau.py name the papers.
@@ -165,6 +192,21 @@ def stepper(
     >>> step = stepper("backward_euler", laplacian(Grid(2), dirichlet), 0.25)  # eigenvalue -2 of (1, 1)
     >>> value_and_grad(lambda nu: step(np.array([3.0, 3.0]), nu)[0])(2.0)
     (1.5, -0.375)
+
+    A source that is switched off at a time; a ball from a height h, and when it lands:
+
+    >>> import autograd.numpy as anp
+    >>> heating = lambda u, off, t: anp.where(t < off, 1.0, 0.0)
+    >>> step = stepper("rk4", heating, 2.0, tolerance=1e-6, breaks=lambda off: [off])
+    >>> u, slope = value_and_grad(lambda off: step((0.0, 0.0), off)[0])(0.5)
+    >>> round(u, 12), round(slope, 12)
+    (0.5, 1.0)
+    >>> ground = lambda u, g, t: u[0]
+    >>> ground.terminal = True
+    >>> fall = stepper("rk4", lambda u, g, t: anp.array([u[1], -g]), 9.0, tolerance=1e-6, events=ground)
+    >>> t, slope = value_and_grad(lambda h: fall((anp.array([h, 0.0]), 0.0), 10.0)[1])(5.0)
+    >>> round(t, 12), round(slope, 12)
+    (1.0, 0.1)
     """
     given = copied(locals())  # the caller may reuse the arrays
     check_choice("method", method, METHODS, "; write stepper('rk4', rate, dt)" if callable(method) else "")
@@ -176,6 +218,7 @@ def stepper(
         unused.append("solver")  # full systems are solved by LU
     if unused:
         raise TypeError(f"{method} does not use {', '.join(unused)}; leave it out")
+    _check_interruptions(given)
     if tolerance is not None:
         check_number("tolerance of stepper", tolerance, "between 0 and 1", "; write for example 1e-6")
     if not all(map(_is_floor, leaves(floor))):
@@ -185,6 +228,18 @@ def stepper(
     if method in EXPLICIT and tolerance is None and unstable == "raise":
         limits = [(term, largest_step(term.op, EXPLICIT[method].reach)) for term in scheme.problem.stiff]
     return Step(method, dt, scheme, limits, given)
+
+
+def _check_interruptions(given):
+    """Refuse options of error control without it, and a longest step that is none."""
+    for word in ("max_step", "breaks", "events"):
+        if given[word] is not None and given["tolerance"] is None:
+            raise TypeError(f"{word} needs steps with error control; write tolerance=1e-6")
+    if given["max_step"] is not None:
+        check_number("max_step of stepper", given["max_step"], "> 0", "; write the longest step, in the units of dt")
+    for word in ("breaks", "events"):
+        if given[word] is not None and given["timed"] is False:
+            raise TypeError(f"{word} needs the time in the state; leave timed out, and give the state (u, t)")
 
 
 def _is_floor(leaf):
@@ -205,12 +260,15 @@ def _scheme(method, given, settings):
         from sparsedp.integrators.leapfrog import Leapfrog
 
         return Leapfrog(given["rate"], given["damping"])
-    problem = Problem(given["rate"], given["linear"], given["source"], given["timed"])
+    interrupted = given["breaks"] is not None or given["events"] is not None
+    timed = True if interrupted else given["timed"]
+    problem = Problem(given["rate"], given["linear"], given["source"], timed)
     jacobian, tolerance, floor = given["jacobian"], given["tolerance"], given["floor"]
+    max_step = given["max_step"]
     if method == "radau":
         from sparsedp.integrators.radau import Radau
 
-        return Radau(problem, jacobian, tolerance, floor, settings)
+        return _interrupted(Radau(problem, jacobian, tolerance, floor, settings, max_step), given)
     if method in ("imex", "etdrk4") and not problem.stiff:
         raise TypeError(f"{method} needs the stiff linear term: write linear=L or linear=(L, coefficient)")
     scheme: Scheme
@@ -229,7 +287,18 @@ def _scheme(method, given, settings):
         return scheme
     from sparsedp.integrators.adaptive import Adaptive
 
-    return Adaptive(scheme, float(tolerance), floor)
+    return _interrupted(Adaptive(scheme, float(tolerance), floor, max_step), given)
+
+
+def _interrupted(scheme, given):
+    """A scheme with error control that stops at breaks and events, where there are any."""
+    breaks, events = given["breaks"], given["events"]
+    if breaks is None and events is None:
+        return scheme
+    from sparsedp.integrators.interruptions import Interrupted, break_times, event_list
+
+    breaks = break_times(() if breaks is None else breaks)
+    return Interrupted(scheme, breaks, event_list([] if events is None else events))
 
 
 class Step(Remade):
@@ -254,16 +323,23 @@ class Step(Remade):
         Records of the last solves and set-up.
     taken : list of float
         With error control: the accepted lengths of the last interval, as shares of it.
+    t_events : list of arrays
+        With events: for each one its times in the last interval, without a derivative.
     """
 
     def __init__(self, method, dt, scheme, limits, given):
         self.method, self.problem, self.dt, self.scheme, self.limits = method, scheme.problem, dt, scheme, limits
         self.name, self.given, self.order, self.info = f"stepper({method})", given, scheme.order, scheme.info
+        self.interrupted = given["breaks"] is not None or given["events"] is not None
         self.made = _remade, (given,)
 
     @property
     def taken(self):
         return getattr(self.scheme, "taken", [1.0])
+
+    @property
+    def t_events(self):
+        return getattr(self.scheme, "t_events", [])
 
     @public("dp.stepper(method, rate, dt)")
     def __call__(self, state, params=None, *inputs):
@@ -289,8 +365,12 @@ class Step(Remade):
             self.problem.terms(u)  # refuses another tree before anything is solved
         for term, largest in self.limits:
             self._check_stable(float(plain(h)), float(plain(term.coefficient(params))), term.op.name, largest)
+        end = None
         try:
-            new = like(self.scheme(u, params, t, h), u)
+            new = self.scheme(u, params, t, h)
+            if self.interrupted:
+                new, end = new
+            new = like(new, u)
         except NonFiniteError:  # a solver on the way may have met it: name the argument
             self._blame(state, params)
             raise
@@ -305,7 +385,9 @@ class Step(Remade):
             )
         if self.method == "leapfrog" and self.given["unstable"] == "raise":
             self.scheme.check_stable(u, params, h, known)
-        return (new, t + h) if self.problem.timed else new
+        if not self.problem.timed:
+            return new
+        return new, end if self.interrupted else t + h
 
     def back(self, state, params=None, *inputs):
         """The state before a step of leapfrog without damping: the step turned round, to rounding.

@@ -1,8 +1,17 @@
 """What is integrated: u' = c L u + rate(u, params, t) + source(params, t), the checks of its numbers, and arithmetic on
 states: an array, or any tree of arrays, plus multiples of others. Each field of a tree has a c L of its own, or none.
+
+Where a rate switches, at a time or on a surface of the state, it has two values. Steps that end there need the value
+before, steps that begin there the value after. The stepper then passes the params of the rate as `Sided`, and `Problem`
+evaluates the rate a rounding error inside the interval, and on the side of the surface where the step began. The shifts
+are constants: they have no derivative. So the derivative of a Runge-Kutta stage beyond a surface is that of the smooth
+continuation of the rate, to an error of the size of the shift.
 """
 
 import inspect
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from sparsedp.errors import ShapeError
 from sparsedp.fields import check_function, check_number, check_takes
@@ -12,7 +21,10 @@ from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.tape_constants import frozen
 from sparsedp.tree import branches_mapped, copied, flatten, keys, leaves, mapped, paired, subscript
 
-__all__ = ["Problem", "combine", "later", "like", "number", "of_fields", "pair", "untraced"]
+__all__ = [
+    "Problem", "Side", "Sided", "combine", "later", "like", "number", "of_fields", "pair", "takes", "unsided",
+    "untraced",
+]  # fmt: skip
 
 
 def combine(u, *pairs):
@@ -80,6 +92,57 @@ def untraced(tree):
     return mapped(plain, tree)
 
 
+# ---- sides of switching times and surfaces ---------------------------------------------------------------------------
+
+
+class Side:
+    """An interval of time, and the sides of event surfaces, in which a rate is evaluated.
+
+    Parameters
+    ----------
+    earliest, latest : float
+        First and last time at which the rate may be evaluated.
+    surfaces : tuple of objects
+        ``surface.inside(u, params, t)`` returns the state and time on the right side of it.
+    """
+
+    __slots__ = ("earliest", "latest", "surfaces")
+
+    def __init__(self, earliest=-np.inf, latest=np.inf, surfaces=()):
+        # Between adjacent numbers there is none: the later one is after both.
+        self.earliest, self.latest, self.surfaces = earliest, max(earliest, latest), surfaces
+
+    def time(self, t):
+        """The time, clipped to the interval; its derivative is 1."""
+        if t is None:
+            return None
+        known = plain(t)
+        inside = min(max(known, self.earliest), self.latest)
+        return t if inside == known else t + (inside - known)
+
+    def inside(self, u, params, t):
+        """The state and time at which the rate is evaluated in the place of (u, t)."""
+        t = self.time(t)
+        for surface in self.surfaces:
+            u, t = surface.inside(u, params, t)
+        return u, t
+
+
+class Sided(NamedTuple):
+    """Params of a rate, and the side of switching times and surfaces on which it is evaluated."""
+
+    params: Any
+    side: Side
+
+
+def unsided(params):
+    """The params as the user knows them."""
+    return params.params if type(params) is Sided else params
+
+
+# ---- the right-hand side ---------------------------------------------------------------------------------------------
+
+
 class Stiff:
     """c L of one field.
 
@@ -105,7 +168,7 @@ class Stiff:
     def coefficient(self, params):
         """The number c >= 0, traced or not."""
         given = self._coefficient
-        given = given(params) if callable(given) else given
+        given = given(unsided(params)) if callable(given) else given
         return number(given, self.name, ">= 0", "; write a number >= 0, the sign is that of the operator")
 
 
@@ -158,7 +221,7 @@ class Problem:
         self.stiff = [term for term in leaves(self._terms) if term is not None]
         self.operators = {term.op for term in self.stiff}
         self._check_functions()
-        self.driven, self.moving = _takes(rate, 3), _takes(source, 2)
+        self.driven, self.moving = takes(rate, 3), takes(source, 2)
         self.timed = self.driven or self.moving if timed is None else timed
         self.linear = rate is None
         if rate is not None:
@@ -195,11 +258,19 @@ class Problem:
         """The rate alone, or None; a copy: it may write into the array that it returned before."""
         if self.rate is None:
             return None
+        if type(params) is Sided:
+            u, t = params.side.inside(u, params.params, t)
+            params = params.params
         return copied(_unchanged(self.rate, u, (params, t) if self.driven else (params,)))
 
     def given(self, params, t):
         """The source alone, or None."""
-        return None if self.source is None else copied(self.source(*((params, t) if self.moving else (params,))))
+        if self.source is None:
+            return None
+        if type(params) is Sided:
+            t = params.side.time(t)
+            params = params.params
+        return copied(self.source(*((params, t) if self.moving else (params,))))
 
     def __call__(self, u, params, t):
         """The whole right-hand side."""
@@ -212,7 +283,7 @@ class Problem:
         return combine(first, *((1.0, part) for part in others))
 
 
-def _takes(fun, least):
+def takes(fun, least):
     """Whether a function takes this many arguments: then the last one is the time."""
     try:
         found = inspect.signature(fun).parameters.values()

@@ -31,13 +31,14 @@ stiff parts are large in it.
 from copy import copy
 from typing import Any
 
+import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import check_shape
-from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Taken
+from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Moving, Taken, relative
 from sparsedp.integrators.jacobians import jacobians_of
-from sparsedp.integrators.problem import combine, like, untraced
+from sparsedp.integrators.problem import Sided, combine, like, unsided, untraced
 from sparsedp.integrators.runge_kutta import Scheme, as_matrix
 from sparsedp.shortcuts import refuse_elsewhere
 from sparsedp.solvers.direct import dense_lu
@@ -142,8 +143,8 @@ class Radau(Adaptive):
     guess: Any = None
     fresh = slow = False
 
-    def __init__(self, problem, jacobian, tolerance, floor, settings):
-        super().__init__(Scheme(problem, "radau", 5), tolerance, floor)
+    def __init__(self, problem, jacobian, tolerance, floor, settings, max_step=None):
+        super().__init__(Scheme(problem, "radau", 5), tolerance, floor, max_step)
         self.given, self.taken = jacobian, [1.0]
         self.goal = NEWTON * tolerance if tolerance else settings["rtol"]
         self.most = ITERATIONS if tolerance else settings["maxiter"] or 50
@@ -151,17 +152,54 @@ class Radau(Adaptive):
 
     def __call__(self, u, params, t, h):
         """The state after the interval h."""
+        run, given = self.interval(u, params, t, h)
+        if not run.problem.size:
+            return u
+        new = run._crossed(given, is_variable)
+        self.taken = run.taken
+        return run.rounded(new)
+
+    def interval(self, u, params, t, h):
+        """A copy for an interval, and what it is given: flat unknowns, the params that move, time and length."""
         run = copy(self)
         run.problem, run.params = Flat(self.problem, u, self.name), constant(untraced(params))
         run.moving = [isbox(leaf) for leaf in leaves(params)]
         v = run.problem.layout.space.join(*(cast(leaf, float) for leaf in leaves(u)))
-        if not v.size:
-            return u
-        run.check(u, params, t, h)
+        if v.size:
+            run.check(u, params, t, h)
         moving = [leaf for leaf in leaves(params) if isbox(leaf)]
-        new = run._crossed((v, moving, 0.0 if t is None else t + 0.0, h), is_variable)
-        self.taken = run.taken
-        return run.problem.layout.rounded(new)
+        return run, (v, moving, 0.0 if t is None else t + 0.0, h)
+
+    def rerun(self, path, given, event):
+        runs, starts = zip(*(self.interval(*start) for start in given), strict=True)
+        run, known = runs[0], untraced(starts[0])
+        start = Moving(starts[0], is_variable, [*run.sizes(path[0].u), *map(relative, leaves(known[1:]))])
+        sizes = run.sizes(path[0].u, path[-1].new)
+        time = None
+        if event:
+            time = known[2] + (path[-1].done + path[-1].length) * known[3]
+            sizes = [*sizes, known[3]]
+        end = Moving((path[-1].new, time), is_variable, sizes if event else [*sizes, 1.0])
+        entered = anp.array([start.off(one) for one in starts])
+        ends = run._runs(path, known, start, end, entered, event)
+        return [(run.rounded(new), time) for new, time in (end.at(ends[k]) for k in range(len(given)))]
+
+    def tree(self, v):
+        return self.problem.state(v)
+
+    def rounded(self, v):
+        return self.problem.layout.rounded(v)
+
+    def between(self, step):
+        """A state inside a step, and the share of the step at which it is."""
+        return self.tree(step.u + step.middle[1]), C[1]
+
+    def partial(self, step, known, length):
+        goal, most, self.goal, self.most = self.goal, self.most, ROUNDING, 2 * ITERATIONS
+        try:
+            return super().partial(step, known, length)
+        finally:
+            self.goal, self.most = goal, most
 
     def check(self, *given):
         """Refuse a state, a rate, or derivatives that it cannot serve."""
@@ -181,7 +219,7 @@ class Radau(Adaptive):
         if any(dtype_of(leaf).kind == "c" for leaf in traced):
             raise DerivativeError(f"{self.name} has derivatives in real params; give real and imaginary part as two")
         if self.tolerance is not None:
-            self._check_tolerance(u)
+            self.check_tolerance(u)
 
     def _steps(self, v, params, t, h):
         if self.tolerance is not None:
@@ -194,7 +232,6 @@ class Radau(Adaptive):
                 f"{self.name}: Newton's method does not converge in a step of {h:.3g}; "
                 "take a smaller dt, or give stepper a tolerance"
             )
-        self.taken = [1.0]
         return [Taken(1.0, 0.0, v, z, v + z[2])]
 
     def _trial(self, v, params, t, length, h):
@@ -246,7 +283,10 @@ class Radau(Adaptive):
         n = self.problem.size
         if self.given is None:
             return self.problem.rows([(v, t)], self.params, [False] * len(self.moving))[1][0, :, :n]
-        args = (self.problem.state(v), self.params, t)
+        u = self.problem.state(v)
+        if type(self.params) is Sided:
+            u, t = self.params.side.inside(u, self.params.params, t)
+        args = (u, unsided(self.params), t)
         J = as_matrix(self.given(*args[: 2 + self.problem.timed])).toarray()
         check_shape(f"the jacobian of {self.name}", J, (n, n))
         return J
@@ -286,11 +326,14 @@ class Radau(Adaptive):
     def doors(self, count):
         return super().doors(count) if self.tolerance else (lambda x: x[None], lambda x: x[0])
 
-    def _runs(self, path, known, start, end, entered):
-        """As a linear map of (u, params that move, t, h); all d so far stand between the first two."""
+    def _runs(self, path, known, start, end, entered, event=None):
+        """As a linear map of (u, params that move, t, h); all d so far stand between the first two.
+
+        Where an event ends the path, its time is that of the steps and all d.
+        """
         *_, t, h = known
         n, less = self.problem.size, np.array(LESS[: len(entered)])
-        (size,), scales = end.units, np.concatenate([*map(np.ravel, start.units)])
+        size, scales = np.concatenate([*map(np.ravel, end.units)]), np.concatenate([*map(np.ravel, start.units)])
         many = int(np.clip(ENTRIES / (9 * n * scales.size), 1, TOGETHER))
         parts = [path[first : first + many] for first in range(0, len(path), many)]
 
@@ -299,28 +342,33 @@ class Radau(Adaptive):
             y = np.insert(x * scales, n, 0.0, axis=1).T
             if x.any():  # else it is the value that goes on the tape
                 for part in parts:
-                    for step, shadow in self._linearised(part, path[-1], t, h):
+                    for step, shadow in self._linearised(part, path[-1], t, h, event):
                         y[: n + 1] = step @ y + less * (shadow @ y)
-            return y[:n].T / size
+            if event:
+                y[n] += y[-2]  # its time: that of the start, and all d
+            return y[: size.size].T / size
 
         def cotangent(g):
             """The transpose."""
             y = np.zeros((scales.size + 1, len(g)))
-            y[:n] = (g / size).T
+            y[: size.size] = (g / size).T
+            of_time = y[n].copy() if event else 0.0
             for part in reversed(parts):
-                for step, shadow in self._linearised(part, path[-1], t, h)[::-1]:
+                for step, shadow in self._linearised(part, path[-1], t, h, event)[::-1]:
                     head = y[: n + 1].copy()
                     y[: n + 1] = 0.0
                     y += step.T @ head + shadow.T @ (less * head)
+            y[-2] += of_time
             return np.delete(y, n, 0).T * scales
 
         return linear(f"{self.name}.steps", tangent, cotangent)[0](entered)
 
-    def _linearised(self, steps, end, t, h):
+    def _linearised(self, steps, end, t, h, event):
         """Of some steps the derivatives of (u, all d) after each, and what the shadow adds; `end`: the last one of all.
 
         Array (steps, 2, n + 1, numbers that go in and all d).
         """
+        ends = event and steps[-1] is end
         n, one = self.problem.size, np.eye(self.problem.size)
         length, done, u, z, new = (np.array(part) for part in zip(*steps, strict=True))
         places = [(u, done), (new[-1:], done[-1:] + length[-1:])]
@@ -331,6 +379,9 @@ class Radau(Adaptive):
         first, rows = rows[:m], np.stack([rows[m + 1 : -m], rows[-m:], rows[1 : m + 1]], 1)
         sections = [self.section(*row)[0][0] for row in zip(u, rates[:m, None], length * h)]
         section = np.where(last[:, None], 0.0, sections)
+        if event:
+            last = np.zeros(m, bool)
+        interval = h
         length, done, last, h = (part[:, None, None] for part in (length, done, last, length * h))
         hA = h * A
         K = np.eye(3 * n) - np.einsum("sab,sbij->saibj", hA, rows[..., :n]).reshape(m, 3 * n, 3 * n)
@@ -344,7 +395,37 @@ class Radau(Adaptive):
         M[..., :n] += stretch[..., None] * section[:, None, None]
         shift = np.zeros((m, 2, 1, M.shape[3]))
         shift[:, 0, 0, : n + 1] = np.insert(section, n, ~last[:, 0, 0], axis=1)
+        if ends:
+            start = t + end.done * interval
+            self._end_at(event, end, start, end.length * interval, M[-1], shift[-1, :, 0], stretch[-1])
         return np.concatenate([M, shift], 2)
+
+    def _end_at(self, event, step, t, length, M, shift, stretch):
+        """Let d of the last step be that with which the event stays 0; `M` and `shift` are written into.
+
+        With the new state M x + stretch d and the time S + t + d, S all d before,
+
+            d = -(g_u M x + g_p p + g_t (S + t)) / (g_u stretch + g_t).
+        """
+        n, params = self.problem.size, unsided(self.params)
+        u = self.problem.state(step.new)
+        moving = [*[True] * len(self.problem.layout.shapes), *self.moving[: len(leaves(params))], True]
+        _, rows = jacobians_of(
+            lambda point: event.value(point[0], unsided(point[1]), point[2]), [(u, params, t + length)], moving
+        )
+        of_state, of_params, of_time = np.split(rows[0, 0], [n, rows.shape[2] - 1])
+        change = float(of_state @ stretch[0] + of_time[0])
+        self._check_transversal(event, step, (None, self.params, t), change, length)
+        constant_part = np.zeros(M.shape[2])
+        constant_part[n + 1 : -2] = of_params
+        constant_part[[n, -2]] = of_time[0]
+        first = -(of_state @ M[0] + constant_part) / change
+        M[0] += np.outer(stretch[0], first)
+        M[1] += np.outer(stretch[1], first)
+        second = -(of_state @ M[1]) / change
+        M[1] += np.outer(stretch[0], second)
+        shift[0] += first
+        shift[1] += second
 
 
 def solved(matrices, b):

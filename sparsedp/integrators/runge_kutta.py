@@ -46,7 +46,7 @@ import scipy.sparse as sp
 
 from sparsedp.derivative import of_argument
 from sparsedp.errors import ConvergenceError, UnstableStepError
-from sparsedp.integrators.problem import combine, later, untraced
+from sparsedp.integrators.problem import Sided, combine, later, unsided, untraced
 from sparsedp.ledger import note
 from sparsedp.operator import Operator
 from sparsedp.operators.given import from_matrix
@@ -414,7 +414,9 @@ def shifted(jacobian, timed):
     """df/du -> the derivative 1 - h df/du of a stage's residual."""
 
     def of_residual(x, b, h, params, t):
-        J = as_matrix(jacobian(*(x, params, t)[: 2 + timed]))
+        if type(params) is Sided:
+            x, t = params.side.inside(x, params.params, t)
+        J = as_matrix(jacobian(*(x, unsided(params), t)[: 2 + timed]))
         return sp.eye_array(J.shape[0]) - h * J
 
     return of_residual
