@@ -32,6 +32,8 @@ __all__ = [
     "subscript",
 ]
 
+DEEPEST = 100  # containers in containers: recursions over deeper trees would leave Python's limit
+
 
 def flatten(tree):
     """Tree -> (list of leaves, function that builds the same tree from other leaves).
@@ -90,16 +92,23 @@ def mapped(function, tree, *others):
     return _build(tree, map(function, leaves(tree), *(paired(other, tree, "tree") for other in others)))
 
 
-def leaves(tree):
+def leaves(tree, depth=0):
     """Tree -> list of its leaves, from left to right.
 
     Parameters
     ----------
     tree : any nesting of tuple, list and dict
+    depth : int
+        How many containers it is in.
 
     Returns
     -------
     list
+
+    Raises
+    ------
+    ValueError
+        If containers are nested too deep, as those that contain themselves.
 
     Examples
     --------
@@ -107,7 +116,13 @@ def leaves(tree):
     [1, 2, 3]
     """
     names = keys(tree)
-    return [tree] if names is None else [leaf for name in names for leaf in leaves(tree[name])]
+    if names is None:
+        return [tree]
+    if depth >= DEEPEST:
+        raise ValueError(
+            f"a tree has containers nested more than {DEEPEST} deep, or one that contains itself; flatten it"
+        )
+    return [leaf for name in names for leaf in leaves(tree[name], depth + 1)]
 
 
 def paired(tree, reference, name, owner="", advice="", shapes=False, prefix=None, error=ShapeError):

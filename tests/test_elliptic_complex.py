@@ -416,3 +416,10 @@ def test_singular_systems_and_solids_in_complex_numbers(options):
     x = dp.elliptic_solver(D, G, "krylov", **options)(k, b, shift)
     assert not np.any(x[solid])
     close(x, dp.elliptic_solver(D, G, "direct")(k, b, shift), 1e-8)
+
+
+def test_a_complex_number_as_shift():
+    """It is an array without axes."""
+    solve, k = dp.elliptic_solver(dp.divergence(dp.Grid(1)), dp.gradient(dp.Grid(1), dp.dirichlet)), np.ones(2)
+    assert solve(k, np.array([2.0]), -1 - 0.5j)[0] == pytest.approx(2 / (3 - 0.5j))
+    assert solve(k, np.array([2.0]), np.asarray(-1e-300j))[0] == pytest.approx(0.5)

@@ -1,6 +1,7 @@
 """inverse(op): which method solves, by a fixed rule, with its reason in words."""
 
 import inspect
+from copy import deepcopy
 from time import perf_counter
 from typing import Any
 
@@ -49,6 +50,8 @@ METHODS = {
 # What refuses the values of options where the method itself is not needed.
 CHECKS = {"direct": check_precision, "structured": check_precision, "multigrid": check_multigrid_options}
 MEANT = {"cg": "krylov", "gmres": "krylov", "amg": "multigrid", "mg": "structured", "lu": "direct", "fft": "separable"}
+
+FRAMES = 10  # calls inside of a solve, in units of those that a nested product or sum takes
 
 # Transforms win from this number of unknowns on, in 2-D and 3-D, while the axes that need dense
 # eigenvectors are not longer than this.
@@ -359,6 +362,7 @@ class Solution(Structure):
     def __init__(self, solver, transposed=False, checked=True, start=None):
         self.solver, self.transposed, self.checked, self.start = solver, transposed, checked, start
         self.shape, self.dtype = (solver.system.size,) * 2, solver.system.op.dtype
+        self.depth = solver.system.op.structure.depth + FRAMES
 
     def apply(self, x, out):
         """A^-1 x: solved in double precision, rounded once; of a real operator real and imaginary part apart."""
@@ -387,6 +391,9 @@ class Solution(Structure):
 
     def transpose(self):
         return Solution(self.solver, not self.transposed, checked=False)
+
+    def __deepcopy__(self, memo):
+        return Solution(deepcopy(self.solver, memo), self.transposed, self.checked, deepcopy(self.start, memo))
 
     def tangent(self):
         warm = self.start is not None

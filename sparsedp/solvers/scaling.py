@@ -90,7 +90,7 @@ def shifted(x, exponent):
     """x * 2^exponent, one for all or one for each, exact unless it leaves the range of floats; always a fresh array."""
     if x.dtype.kind == "c":
         each = np.repeat(exponent, 2) if np.ndim(exponent) else exponent  # for the real part and for the imaginary one
-        return shifted(x.view(float), each).view(complex)
+        return shifted(x.reshape(-1).view(float), each).view(complex).reshape(x.shape)  # a number has no view
     with np.errstate(over="ignore", under="ignore"):  # what overflows is found by the caller
         return x * 2.0**exponent if np.max(np.abs(exponent)) < 1000 else np.ldexp(x, exponent)
 

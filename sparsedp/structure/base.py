@@ -1,5 +1,6 @@
 """Structure: what acts linearly on flat arrays. Its plainest kind is a matrix."""
 
+from copy import deepcopy
 from operator import is_
 
 import numpy as np
@@ -40,6 +41,8 @@ class Structure(Uncached):
         Whether `act` takes complex arrays; else real and imaginary parts go through it apart.
     separable : bool
         Whether it is a Kronecker sum: one 1-D factor for each axis.
+    depth : int
+        How deep products and sums are nested in it.
     passes : int
         How many passes over memory the map takes where it is not fused: for the choice of a form.
     """
@@ -51,6 +54,7 @@ class Structure(Uncached):
     takes_complex = True
     is_identity = False
     separable = False
+    depth = 0
     passes = 1  # over memory, of the matrix-free form
 
     def apply(self, x, out):
@@ -93,6 +97,11 @@ class Structure(Uncached):
         """The same map inside derivative rules: without checks that only primal data must meet."""
         tangents = [member.tangent() for member in self.members]
         return self if all(map(is_, tangents, self.members)) else self.rebuilt(tangents)
+
+    def __deepcopy__(self, memo):
+        """The same object, because it is frozen, unless a member holds what changes, as a solver."""
+        members = [deepcopy(member, memo) for member in self.members]
+        return self if all(map(is_, members, self.members)) else self.rebuilt(members)
 
     def rebuilt(self, members):
         """The same of other members."""
@@ -144,6 +153,9 @@ class Turning(Structure):
 
     def transpose(self):
         return type(self)(self.inner, self.shape[::-1], not self.transposed)
+
+    def __deepcopy__(self, memo):
+        return type(self)(deepcopy(self.inner, memo), self.shape, self.transposed)
 
 
 def result_dtype(structure, dtype):

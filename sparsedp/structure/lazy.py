@@ -29,6 +29,7 @@ __all__ = [
     "total",
 ]
 
+DEEPEST = 200  # products in sums in products: recursions over deeper operators would leave Python's limit
 FEW = 16384  # cells for which passes one after the other are quick
 SHORT = 80  # cells along the last axis, the inner loop of the fused pass: below, its rows cost more than they save
 
@@ -80,6 +81,7 @@ class Chain(Structure):
         self.shape = (members[0].shape[0], members[-1].shape[1])
         self.dtype = np.result_type(*(member.dtype for member in members))
         self.has_entries = all(member.has_entries for member in members)
+        self.depth = _nested(self.members)
         self.passes = max(member.passes for member in members)
 
     def act(self, x, out):
@@ -118,6 +120,7 @@ class Sum(Structure):
         self.members = tuple(sorted(members, key=lambda member: member.dtype.kind))  # a complex one first: it has room
         self.shape, self.dtype = members[0].shape, self.members[0].dtype
         self.has_entries = all(member.has_entries for member in members)
+        self.depth = _nested(self.members)
 
     def act(self, x, out):
         first, *rest = self.members
@@ -185,6 +188,17 @@ def compose(a, b):
             members, member = members[:-1], joined
         members.append(member)
     return members[0] if len(members) == 1 else Chain(members)
+
+
+def _nested(members):
+    """Return the depth of a product or sum of these members; refuse what Python could not recurse over."""
+    depth = 1 + max((member.depth for member in members), default=0)
+    if depth > DEEPEST:
+        raise ValueError(
+            f"an operator nests sums and products of operators more than {DEEPEST} deep; apply the operators one after "
+            "the other, as in v = A(v) + u, or assemble a part of it: dp.from_matrix(part.matrix)"
+        )
+    return depth
 
 
 def _members(structure, kind):
