@@ -128,9 +128,9 @@ def test_own_steps_and_bad_arguments():
         match="x must be finite where a gradient is checked, got 20 that are NaN or infinite, the first at ",
     ):
         AUDIT(smooth, X * np.nan)
-    with pytest.raises(dp.errors.DerivativeError, match="the gradient has 2 leaves where x has 1; return"):
+    with pytest.raises(dp.errors.DerivativeError, match="gradient: expected one array or number, got a tuple"):
         AUDIT(smooth, X, gradient=lambda u: (u, u))
-    with pytest.raises(dp.errors.DerivativeError, match=r"the gradient of x has shape \(1,\) where \(20,\) is needed"):
+    with pytest.raises(dp.errors.DerivativeError, match=r"gradient: expected shape \(20,\), got \(1,\)"):
         AUDIT(smooth, X, gradient=lambda u: u[:1])
     with pytest.raises(dp.errors.ShapeError, match="the loss must be a scalar"):
         AUDIT(lambda u: u, X, gradient=lambda u: u)

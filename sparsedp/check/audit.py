@@ -8,6 +8,7 @@ from math import inf, isinf, isnan
 import numpy as np
 
 from sparsedp.check.culprit import culprit_of
+from sparsedp.check.entries import MOST_ENTRIES, gaps_along_entries, listed, spaces_of
 from sparsedp.check.judge import (
     PROVED,
     at_kinks,
@@ -99,8 +100,9 @@ def gradient(loss, x, gradient=None, steps=None, directions=RANDOM, rng=None, qu
 
     Cost: two evaluations of the loss for each step and direction (a hundred or two in all, about 60 of a quick
     audit), and a few gradients. A terminal shows how many are to come on standard error, with a bar if tqdm is there.
-    Where the verdict is "disagrees" the calls on the tape are looked at one by one for the culprit: seconds for most
-    losses, minutes where a loss takes a thousand implicit steps.
+    Where the verdict is "disagrees" the entries with the largest gaps are found by bisection, with about 2 log2(n) more
+    evaluations for each of three (one of a quick audit), and the calls on the tape are looked at one by one for the
+    culprit: seconds for most losses, minutes where a loss takes a thousand implicit steps.
 
     A `stepper` with a `tolerance` is differentiable to that tolerance, not to rounding: its gradient differs from that
     of the value it returns by a few tolerances. Where the gap is at most ten tolerances, and no other call is at
@@ -161,8 +163,10 @@ def _audit(trials, taped, count, rng, quick):
     outcome, reason = verdict(judged, doubts)
     notes = [note for word, note in doubts if word == "note"]
     loose_steps = any(one.word == "loose steps" for one in judged)
-    if taped and (outcome == "disagrees" or loose_steps):
-        culprit, why = culprit_of(loss, point)
+    suspicious = outcome == "disagrees" or loose_steps
+    spaces = spaces_of(loss, point.fresh()) if suspicious else []
+    if taped and suspicious:
+        culprit, why = culprit_of(loss, point, spaces)
         if culprit or outcome == "disagrees":
             notes.append(f"culprit: {why}")
         if culprit and loose_steps and outcome == "inconclusive":
@@ -170,6 +174,12 @@ def _audit(trials, taped, count, rng, quick):
         if culprit is None and outcome == "disagrees" and trials.tolerance > LOOSE:
             outcome = "inconclusive"
             reason += f"; no call is at fault, but solves stop at rtol {trials.tolerance:g}: tighten them"
+    gaps = ()
+    if outcome == "disagrees":
+        found = gaps_along_entries(trials, judged, 1 if quick else MOST_ENTRIES)
+        gaps = tuple(listed(found, point, trials.gradient, spaces))
+    if gaps:
+        notes.append(f"largest gaps: {'; '.join(gaps)}")
     if quick:
         names = " and ".join(one.direction for one in judged) or "no direction"
         notes.append(f"quick: looked at along {names}; {LEFT_OUT}")
@@ -177,7 +187,8 @@ def _audit(trials, taped, count, rng, quick):
     digits = [int(one.digits) for one in judged if outcome == "agrees" and one.word in PROVED]
     return Audit(
         verdict=outcome, reason=reason, digits=min(digits, default=None), culprit=culprit, hessian=hessian,
-        value=trials.base, evaluations=trials.count, size=point.entries, notes=tuple(notes), lines=tuple(judged),
+        gaps=gaps, value=trials.base, evaluations=trials.count, size=point.entries, notes=tuple(notes),
+        lines=tuple(judged),
     )  # fmt: skip
 
 
@@ -269,6 +280,9 @@ class Audit(Result):
         Name of the first operator, rule or function of autograd on the tape whose VJP or JVP is at
         fault, when the verdict is "disagrees"; a note says what is wrong with it. None when each is right:
         then a value bypasses the tape, or the gradient was given.
+    gaps : tuple of str
+        Entries of x where gradient and differences are farthest apart, when the verdict is "disagrees": both
+        derivatives, the place where the loss uses Operators on a grid, and the region that holds the whole gap.
     hessian : "agrees", "disagrees", "inconclusive" or None
         What the third Taylor remainder says of a Hessian product along the first direction; it does not touch the
         verdict on the gradient. None where there is no product: no second derivatives, or a gradient that was given.
@@ -280,7 +294,7 @@ class Audit(Result):
         How often the loss was evaluated.
     """
 
-    _plain = (*"verdict reason digits culprit hessian value evaluations size notes lines rows".split(),)
+    _plain = (*"verdict reason digits culprit gaps hessian value evaluations size notes lines rows".split(),)
 
     @property
     @np.errstate(all="ignore")
@@ -318,7 +332,7 @@ class Audit(Result):
 
     def __repr__(self):
         """One line, which is what pytest shows of an assertion that fails."""
-        words = [self.reason, *(note for note in self.notes if note.startswith("culprit"))]
+        words = [self.reason, *(note for note in self.notes if note.startswith(("culprit", "largest gaps")))]
         return f"<gradient {self.verdict}: {'; '.join(filter(None, words)) or f'{self.digits} digits'}>"
 
     def _gaps(self):

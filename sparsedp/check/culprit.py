@@ -4,20 +4,25 @@ The loss of a call f is <g, f(x)> with a fixed random g. Its gradient by the rul
 any loss. An Operator is linear: <A u, g> - <u, A^T g> and A (u + v) - A u - A v tell all, without differences.
 """
 
+import re
+from math import prod
+
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.check.entries import DEFAULT_STEP, gaps_along_entries, largest_gaps, listed, subscript, where
 from sparsedp.check.judge import forward_mode, looked_at
 from sparsedp.check.nodes import calls_seen, in_order
 from sparsedp.check.operators import fault_of, field
 from sparsedp.check.summary import error_text
 from sparsedp.check.sweep import Point, Trials, generator
-from sparsedp.derivative import grad
+from sparsedp.derivative import grad, linearised
 from sparsedp.errors import DerivativeError
 from sparsedp.ledger import recording
 from sparsedp.operator import Operator
 from sparsedp.solvers.choose_method import Inverse
 from sparsedp.tape import is_variable
+from sparsedp.tree import leaves
 
 __all__ = ["culprit_of"]
 
@@ -28,13 +33,15 @@ JUDGES = ".variation"  # in error control: with its transpose it is right along 
 NOBODY = "every call on the tape is right or refused at the values it met; a value may bypass the tape"
 
 
-def culprit_of(loss, point):
+def culprit_of(loss, point, spaces=()):
     """Loss and point -> (name of the first call on the tape whose derivative is at fault or None, sentence).
 
     Parameters
     ----------
     loss : callable
     point : Point
+    spaces : sequence of Space
+        On which its fields may live, to name places.
 
     Returns
     -------
@@ -50,7 +57,7 @@ def culprit_of(loss, point):
             grad(loss)(point.fresh())
         for node in _examined(nodes):
             try:
-                fault = _fault(node, cleared, rng)
+                fault = _fault(node, cleared, rng, spaces)
             except DerivativeError:  # the call refuses the cotangents that were tried
                 continue
             except Exception as error:  # a function of the user may raise anything; the verdict does not need it
@@ -71,17 +78,17 @@ def _examined(nodes):
     return [node for node in nodes if id(node) in chosen and node.plain]
 
 
-def _fault(node, cleared, rng):
+def _fault(node, cleared, rng, spaces):
     """(name, reason) of what is wrong with a call: its Operator, an Operator that it applies, or its rule; or None."""
     if isinstance(node.subject, Operator):
         return _of_operator(node.subject, cleared, rng)
-    reason = _wrong_rule(node, rng)
+    reason = _wrong_rule(node, rng, spaces)
     if not reason:
         return None
     if getattr(node.subject, "truncate", None):
         reason += f"; its derivative is cut by truncate={node.subject.truncate}"
     with recording() as calls:
-        grad(_functional(node, None))(node.values)
+        grad(_functional(node, _weights(node, None)))(node.values)
     actors = [actor for group in calls.actors.values() for actor in group.values() if isinstance(actor, Operator)]
     return next(filter(None, (_of_operator(op, cleared, rng) for op in actors)), (node.name, reason))
 
@@ -94,34 +101,115 @@ def _of_operator(op, cleared, rng):
     reason = fault_of(op, rng)
     if reason and isinstance(op, Inverse) and fault_of(op.solver.system.given, rng):
         reason += f"; so is that of {op.solver.system.given.name}, which it inverts"
+    if reason.startswith("its transpose is"):
+        reason += _entries_of_operator(op, rng)
     return (op.name.removesuffix(".T"), reason) if reason else None  # it and its transpose are one operator
 
 
-def _functional(node, rng):
-    """Return ``loss(values)``, the sum of random weights (ones without `rng`) times the results of a call."""
-    several = isinstance(node.value, tuple)
-    results = node.value if several else (node.value,)
-    weights = {
+def _results(node, value):
+    """Results of a call as a list, traced or not."""
+    return [value[k] for k in range(len(node.value))] if isinstance(node.value, tuple) else [value]
+
+
+def _weights(node, rng):
+    """Random weights for each result that has a derivative, by its number; ones without `rng`."""
+    return {
         k: field(rng, np.shape(result), np.asarray(result).dtype) if rng else np.ones_like(result)
-        for k, result in enumerate(results)
+        for k, result in enumerate(_results(node, node.value))
         if is_variable(result)
     }
 
+
+def _functional(node, weights):
+    """Return ``loss(values)``, the sum of weights times the results of a call."""
+
     def loss(values):
-        again = node.again(values)
-        parts = [(weight, again[k] if several else again) for k, weight in weights.items()]
-        return sum(anp.sum(anp.real(weight * part)) for weight, part in parts)
+        results = _results(node, node.again(values))
+        return sum(anp.sum(anp.real(weight * results[k])) for k, weight in weights.items())
 
     return loss
 
 
-def _wrong_rule(node, rng):
+class Arguments(Point):
+    """The differentiated arguments of a call, with the names that a user knows."""
+
+    def __init__(self, node):
+        super().__init__(node.values)
+        labels = dict(zip(range(len(node.values)), node.places, strict=True))
+        several = len(labels) > 1
+        self.names = [
+            re.sub(r"^x\[(\d+)\]", lambda found: f"argument {labels[int(found[1])]}" if several else "argument", name)
+            for name in self.names
+        ]
+
+
+def _entries_of_rule(node, trials, judged, worst, weights, spaces):
+    """Where in its arguments and results the VJP of a call is wrong, in words.
+
+    For weights w of the results and a direction d of the arguments the gap <w, J d> - <VJP(w), d> is linear in w.
+    """
+    point, direction = trials.point, worst.line.direction
+    found = gaps_along_entries(trials, judged, 1)
+    words = [f"largest gap in its {one}" for one in listed(found, point, trials.gradient, spaces, "its VJP")]
+    shapes = [np.shape(weight) for weight in weights.values()]
+    real = not (point.complex or any(map(np.iscomplexobj, weights.values())))
+    if real and sum(map(prod, shapes)) > 1:
+        step = worst.step if worst.step > 0 else DEFAULT_STEP
+        places = [point.unpack(point.vector + side * direction) for side in (step, -step)]
+        ahead, behind = ([np.asarray(y) for y in _results(node, node.again(place))] for place in places)
+        slopes = [(ahead[k] - behind[k]) / (2 * step) for k in weights]
+        moving = [True] * len(leaves(node.values))
+        values, _, pull = linearised(lambda values: _results(node, node.again(values)), point.fresh(), moving)
+
+        def gap_along(parts):
+            cotangents: list = [None] * len(values)
+            gap = 0.0
+            for (k, weight), part, slope in zip(weights.items(), parts, slopes, strict=True):
+                cotangents[k] = np.asarray(weight * part, np.asarray(values[k]).dtype)[()]
+                gap += float(np.sum(cotangents[k] * slope))
+            backs = [np.zeros(x.shape) if back is None else back for back, x in zip(pull(cotangents), point.values)]
+            return gap - float(np.concatenate([np.ravel(back) for back in backs]) @ direction)
+
+        for one in largest_gaps(gap_along, shapes, 1):
+            name = f"result {one.leaf}" if len(shapes) > 1 else "result"
+            words.append(f"in its {_named(name, one, shapes[one.leaf], spaces)}")
+    return "".join(f"; {word}" for word in words)
+
+
+def _entries_of_operator(op, rng):
+    """Where in its argument and result the transpose of a real Operator is wrong, in words."""
+    if op.dtype.kind == "c":
+        return ""
+    op = op.tangent
+    u, g = field(rng, op.domain.shape, float), field(rng, op.codomain.shape, float)
+    forward, backward = op.apply(u), op.T.apply(g)
+    in_argument = largest_gaps(
+        lambda parts: float(np.sum(op.apply(parts[0] * u) * g) - np.sum(parts[0] * u * backward)), [u.shape], 1
+    )
+    in_result = largest_gaps(
+        lambda parts: float(np.sum(forward * parts[0] * g) - np.sum(u * op.T.apply(parts[0] * g))), [g.shape], 1
+    )
+    words = ""
+    for name, found, space in (("argument", in_argument, op.domain), ("result", in_result, op.codomain)):
+        spaces = [space] if space.grid is not None and space.layout is None else []
+        words += "".join(f"; largest gap in its {_named(name, one, space.shape, spaces)}" for one in found)
+    return words
+
+
+def _named(name, one, shape, spaces):
+    """An entry, or the region that holds the whole gap, and its place."""
+    block = one.block if one.region is None else one.region
+    return f"{name}{subscript(block, shape)}{where(block, shape, spaces)}"
+
+
+def _wrong_rule(node, rng, spaces):
     """What differences say against the VJP of a call, or its VJP against its JVP; "" if nothing."""
     try:
-        point = Point(node.values)
+        point = Arguments(node)
     except Exception:  # no values that could be moved: nothing to be judged here
         return ""
-    loss = _functional(node, rng)
+    weights = _weights(node, rng)
+    loss = _functional(node, weights)
     # In each argument alone, and the largest entry: a loss of many entries hides single ones.
     trials = Trials(loss, point, grad(loss))
     judged, doubts = looked_at(trials, DIRECTIONS, rng, lambda name: name not in SKIPPED)
@@ -129,6 +217,7 @@ def _wrong_rule(node, rng):
         return "its VJP gives NaN or infinity"
     for one in judged:
         if one.word == "disagrees":
-            return f"its VJP is {one.note}" if one.note.startswith("off") else one.note
+            words = f"its VJP is {one.note}" if one.note.startswith("off") else one.note
+            return words + _entries_of_rule(node, trials, judged, one, weights, spaces)
     gap, allowed = forward_mode(loss, judged[:DIRECTIONS]) or (0.0, 0.0)
     return "" if gap <= allowed else f"its JVP differs from its VJP by {gap:.1e}, and its VJP is right"

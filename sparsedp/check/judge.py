@@ -23,6 +23,7 @@ import numpy as np
 from sparsedp.check.summary import Result
 from sparsedp.check.sweep import REFUSALS, Line, noise_of
 from sparsedp.derivative import NO_JVP, pushforward
+from sparsedp.fields import place
 
 __all__ = ["PROVED", "at_kinks", "curvature", "forward_mode", "judgement", "looked_at", "verdict"]
 
@@ -361,7 +362,7 @@ def looked_at(trials, count, rng, wanted=None):
         ("unsound", not np.array_equal(vector, again, equal_nan=True),
          "two evaluations of the gradient differ: it is not deterministic"),
         ("unsound", 0 < change < UNDERFLOW, f"the loss changes by less than {UNDERFLOW:g}: it underflows, scale it"),
-        *(("broken", not np.all(np.isfinite(values)), f"the gradient of {name} holds NaN or infinity")
+        *(("broken", not np.all(np.isfinite(values)), f"the gradient of {name} holds NaN or infinity{_first(values)}")
           for name, values in zip(point.names, point.arrays(vector))),
     ]  # fmt: skip
     doubts = [(word, reason) for word, holds, reason in evidence if holds]
@@ -374,6 +375,12 @@ def looked_at(trials, count, rng, wanted=None):
     for one in judged if callable(trials.slope) else ():
         explained(one)
     return judged, doubts
+
+
+def _first(values):
+    """Where the first number of an array is that is not finite, in words; nothing for a single number."""
+    finite = np.isfinite(values)
+    return f", the first at {place(int(np.argmin(finite)), finite.shape)}" if finite.ndim else ""
 
 
 def at_kinks(judged):

@@ -29,6 +29,8 @@ class Node:
         Its result.
     values : list
         The arguments that are differentiated.
+    places : list of int
+        Their numbers among the arguments that the user gives.
     plain : bool
         Whether no argument belongs to an outer trace.
     inner : list of Node
@@ -42,6 +44,7 @@ class Node:
         self.subject, self.value = called(fun, args), value
         self.name, self.inner = name_of(self.subject), []  # type: str, list[Node]
         self.values, self.plain = [args[num] for num in nums], not any(map(isbox, args))
+        self.places = [num - (self.subject is not fun) for num in nums]  # a rule is the first argument of its call
 
         def again(values):
             given = dict(zip(nums, values, strict=True))

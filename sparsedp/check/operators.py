@@ -13,7 +13,7 @@ import numpy as np
 from sparsedp.check.properties import facts_of
 from sparsedp.check.summary import Row, Summary, error_text
 from sparsedp.check.sweep import generator
-from sparsedp.derivative import hvp, pullback, pushforward
+from sparsedp.derivative import hvp, pullback, pushforward, unwarned
 from sparsedp.errors import DerivativeError
 from sparsedp.fields import EPS
 from sparsedp.operators.given import check_operator
@@ -372,7 +372,7 @@ def operator(op, seeds=3, rng=None):
     True
     """
     check_operator("check.operator", op)
-    with np.errstate(all="ignore"):  # what overflows shows in the figures
+    with np.errstate(all="ignore"), unwarned():  # what overflows shows in the figures
         try:
             probe = Probe(op, seeds, rng)
         except Exception as error:  # a foreign function may raise anything
