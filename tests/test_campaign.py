@@ -16,8 +16,8 @@ import pytest
 from campaign import ingredients as parts
 from campaign import script
 from campaign.boxes import Box
+from campaign.ingredients import Discarded
 from campaign.scene import (
-    Discarded,
     Mismatch,
     Outcome,
     Scene,
@@ -39,8 +39,8 @@ PER_TEST = 50
 QUICK = 30
 
 
-def run(count, seed, strategy=None):
-    """Compare `count` scenes; the shrunk one that fails is written to a file.
+def run(count, seed, before=0):
+    """Compare `count` scenes, after `before` others; the shrunk one that fails is written to a file.
 
     Returns
     -------
@@ -48,6 +48,7 @@ def run(count, seed, strategy=None):
         How many scenes, comparisons and refusals there were, and the refusals by reason.
     """
     tally = {"scenes": 0, "discarded": 0, "comparisons": 0, "refused": 0, "reasons": {}}
+    first: list = []  # number of the scene that failed before it was shrunk
     file = FOLDER / f"scene_{seed}.py"
 
     warnings.filterwarnings("ignore", "Output seems independent of input")  # autograd's, of a twin of a constant
@@ -64,7 +65,7 @@ def run(count, seed, strategy=None):
         report_multiple_bugs=False,
         phases=[hypothesis.Phase.generate, hypothesis.Phase.shrink],
     )
-    @hypothesis.given(scenes() if strategy is None else strategy)
+    @hypothesis.given(scenes())
     def one(scene):
         try:
             outcome = compare(scene)
@@ -74,7 +75,8 @@ def run(count, seed, strategy=None):
         except Mismatch as error:
             FOLDER.mkdir(parents=True, exist_ok=True)
             file.write_text(script.script(scene, str(error)), encoding="utf-8")  # the last one written is the smallest
-            raise Mismatch(f"{error}\n{file} shows it") from error.__cause__
+            first.append(before + tally["scenes"] + 1)
+            raise Mismatch(f"{error}\nfound after {first[0]} scenes; {file} shows it") from error.__cause__
         tally["scenes"] += 1
         tally["comparisons"] += len(outcome.compared)
         tally["refused"] += bool(outcome.refused) and not outcome.compared
@@ -94,7 +96,7 @@ def test_a_few_scenes():
 @pytest.mark.parametrize("number", range(-(-SCENES // PER_TEST)))
 def test_many_scenes(number, record_property):
     """The hook in conftest.py adds up what each test counts; at most a quarter of its scenes is refused as a whole."""
-    tally = run(PER_TEST, 1_000_003 * (SEED + 1) + number)
+    tally = run(PER_TEST, 1_000_003 * (SEED + 1) + number, PER_TEST * number)
     record_property("campaign", tally)
     assert tally["refused"] + tally["discarded"] <= 0.25 * PER_TEST, tally
 

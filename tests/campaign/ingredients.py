@@ -18,6 +18,10 @@ from campaign.boxes import boundary, dense, numbers, obstacle
 from campaign.operators import bound, matrix, operator
 
 
+class Discarded(Exception):
+    """The numbers of the scene leave the range in which a comparison says something."""
+
+
 class Ingredient:
     """One part of a scene: a map from a field of kind `source` to one of kind `target`."""
 
@@ -593,8 +597,13 @@ def mean_of_two(table, axis, node, component, place, units):
 def newton(residual, jacobian, start):
     """Return the root: iterations on numbers, then two on the tape, which make its derivatives exact to order 3."""
     x = start
-    for _ in range(30):
-        x = x - np.linalg.solve(jacobian(x, constant_part), residual(x, constant_part))
+    for _ in range(100):
+        change = np.linalg.solve(jacobian(x, constant_part), residual(x, constant_part))
+        x = x - change
+        if np.max(np.abs(change), initial=0.0) <= 1e-12 * (1 + np.max(np.abs(x), initial=0.0)):
+            break
+    else:
+        raise Discarded
     for _ in range(2):
         x = x - anp.linalg.solve(jacobian(x, traced), residual(x, traced))
     return x

@@ -10,16 +10,13 @@ import numpy as np
 
 import sparsedp as dp
 from campaign.boxes import Box, numbers
+from campaign.ingredients import Discarded
 
 SMALLEST = 1e-3  # numbers of a scene are about 1: what is smaller than this may be what cancellation leaves
 
 
 class Mismatch(AssertionError):
     """The library and the twin disagree."""
-
-
-class Discarded(Exception):
-    """The numbers of the scene leave the range in which a comparison says something."""
 
 
 class Pair(NamedTuple):
@@ -257,7 +254,7 @@ def compare(scene):
     Raises
     ------
     Discarded
-        If the numbers of the twin grow beyond 1e8.
+        If the numbers of the twin grow beyond 1e5.
     Mismatch
         If a quantity differs by more than the tolerance, has another dtype or shape, or changes when it is computed
         twice; if an argument is modified; or if the library refuses what it should accept.
@@ -386,9 +383,9 @@ class Twin:
 
 
 def check_range(*values):
-    """Discard a scene whose numbers grow beyond 1e8."""
+    """Discard a scene whose numbers grow beyond 1e5."""
     for value in values:
-        if not np.all(np.abs(value) < 1e8):
+        if not np.all(np.abs(value) < 1e5):
             raise Discarded
 
 

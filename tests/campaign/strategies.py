@@ -10,6 +10,7 @@ from campaign import physics
 from campaign.boxes import Box
 from campaign.operators import matrix, total
 from campaign.scene import LAYOUTS, LOSSES, TREES, Scene
+from sparsedp.kernels import compiled
 
 BRIDGES = ["torch"] if find_spec("torch") else []
 SEEDS = st.integers(0, 999)
@@ -120,7 +121,7 @@ def solves(draw, box, source):
     kind = draw(st.sampled_from(["poisson", "closed", "wind", "any"])) if source == "cells" else "any"
     shift = draw(st.sampled_from([1.0, 3.0]))
     methods = ["auto", "direct", "krylov"]
-    structured = ["multigrid"] if box.dim == 1 else ["multigrid", "structured"]
+    structured = ["multigrid", *structured_methods(box)]
     if kind == "poisson":
         solid = draw(SOLIDS)
         expression = ("scale", -1.0, ("laplacian", draw(sides_of(box)), solid, "neumann"))
@@ -145,12 +146,17 @@ def solves(draw, box, source):
     return parts.Solve(expression, shift, draw(st.sampled_from(methods)), draw(st.booleans()), source)
 
 
+def structured_methods(box):
+    """Structured multigrid needs two axes and compiled loops."""
+    return ["structured"] if box.dim > 1 and compiled() else []
+
+
 @st.composite
 def elliptics(draw, box):
     shift = draw(st.sampled_from(["none", "number", "cells"]))
     solid = draw(SOLIDS) if shift != "none" else None
     coefficient = draw(st.sampled_from(["number", "faces", "average", "harmonic"]))
-    method = draw(st.sampled_from(["auto", "direct", "krylov", "multigrid"] + ["structured"] * (box.dim > 1)))
+    method = draw(st.sampled_from(["auto", "direct", "krylov", "multigrid", *structured_methods(box)]))
     return parts.Elliptic(draw(sides_of(box)), solid, coefficient, shift, method, draw(SEEDS))
 
 
