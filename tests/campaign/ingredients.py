@@ -451,6 +451,7 @@ class Transport(Ingredient):
     form: str
     still: bool  # whether the velocity is 0 in places
     seed: int
+    solid: int | None = None  # for "upwind" of a field on cells, with a velocity on faces
     batched = False
 
     @property
@@ -473,7 +474,15 @@ class Transport(Ingredient):
         return boundary(box, self.sides)
 
     def _move(self, box):
-        return dp.transport(box.grid(), self.scheme, self._boundary(box), self.velocity, self.of, form=self.form)
+        return dp.transport(
+            box.grid(),
+            self.scheme,
+            self._boundary(box),
+            self.velocity,
+            self.of,
+            form=self.form,
+            solid=obstacle(box, self.solid),
+        )
 
     def parameters(self, box):
         move = self._move(box)
@@ -489,7 +498,11 @@ class Transport(Ingredient):
 
     def twin(self, box):
         move = transport_twin(box.grid(), self.scheme, self._boundary(box), self.velocity, self.of, self.form)
-        return lambda u, p: move(u, p["v"], p["dt"], p["inflow"])
+        if self.solid is None:
+            return lambda u, p: move(u, p["v"], p["dt"], p["inflow"])
+        words = tuple(None if periodic else ("outflow", "outflow") for periodic in box.periodic)
+        passing = 1.0 * dense(box, words, self.solid).flags((dp.outflow,))
+        return lambda u, p: move(u, p["v"] * passing, p["dt"], p["inflow"])
 
 
 # ---- flow ----------------------------------------------------------------------------------------------------------
@@ -899,7 +912,7 @@ class Rollout(Ingredient):
     chain: tuple
     n: int
     memory: object  # None, a text, or a number of states for which there is room
-    keep: object  # "last", "all", or a tuple of numbers of steps
+    keep: object  # "last", "all", "function", or a tuple of numbers of steps
     truncate: int | None
     inputs: bool
     tree: bool  # whether the state is a dict of the field, a number and a text
@@ -943,7 +956,7 @@ class Rollout(Ingredient):
         return values
 
     def _weights(self):
-        count = self.n + 1 if self.keep == "all" else len(self.keep)
+        count = self.n + 1 if self.keep in ("all", "function") else len(self.keep)
         return 1.0 / (1.0 + np.arange(count))
 
     def _summed(self, states):
@@ -973,6 +986,13 @@ class Rollout(Ingredient):
         advance = self._advance([part.library(box) for part in self.chain])
         keep = list(self.keep) if isinstance(self.keep, tuple) else self.keep
 
+        def kept(index, state):
+            u = state["field"] if self.tree else state
+            return {"at": index, "sine": anp.sin(u)}
+
+        if keep == "function":
+            keep = kept
+
         def step(state, p, *added):
             u = state["field"] if self.tree else state
             u = advance(u, p)
@@ -986,6 +1006,8 @@ class Rollout(Ingredient):
             state = {"field": u, "time": 0.0, "name": "ink"} if self.tree else u
             memory = self._budget(u, p, inputs)
             end = dp.rollout(step, state, p, self.n, inputs, memory=memory, keep=keep, truncate=self.truncate)
+            if self.keep == "function":
+                return self._summed([one["sine"] for one in end])
             end = end["field"] if self.tree else end
             return end if self.keep == "last" else self._summed(end)
 
@@ -1005,6 +1027,8 @@ class Rollout(Ingredient):
                 states.append(u)
             if self.keep == "last":
                 return u
+            if self.keep == "function":
+                return self._summed([anp.sin(state) for state in states])
             chosen = states if self.keep == "all" else [states[number] for number in self.keep]
             return self._summed(chosen)
 

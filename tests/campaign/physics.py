@@ -9,6 +9,7 @@ from looking_back import moved as lagrangian_twin
 import sparsedp as dp
 from campaign.boxes import boundary, condition, dense, numbers, obstacle
 from campaign.ingredients import (
+    Equation,
     Ingredient,
     OnCells,
     cell_volumes,
@@ -16,6 +17,9 @@ from campaign.ingredients import (
     flat_product,
     newton,
     phi,
+    reaction,
+    rk4,
+    time_step_of,
 )
 from campaign.operators import bound, matrix, operator
 
@@ -516,6 +520,99 @@ class Waves(OnCells):
                 v = ((1 - b * h / 2) * v - h * anp.dot(G, q)) / (1 + b * h / 2)
                 q = ((1 - a * h / 2) * q - h * p["c"] * anp.dot(D, v)) / (1 + a * h / 2)
             return anp.reshape(q + anp.dot(D, v), box.shape)
+
+        return act
+
+
+@dataclass(frozen=True)
+class Adaptive(OnCells):
+    """u -> the state after an interval that is crossed with error control, beside many small steps of rk4."""
+
+    method: str
+    sides: tuple
+    seed: int
+    batched = False
+    tolerance = 1e-4
+
+    @property
+    def order(self):
+        return 1 if self.method == "radau" else 2
+
+    @property
+    def refusals(self):
+        coarse = (dp.errors.DerivativeError, "tolerance")
+        return (*FIRST_ORDER, coarse) if self.method == "radau" else (coarse,)
+
+    def _expression(self):
+        return ("laplacian", self.sides, None, "neumann")
+
+    def parameters(self, box):
+        size = bound(box, self._expression())
+        return {"nu": 0.6 / size, "r": 0.8, "f": numbers(self.seed, box.shape), "dt": 0.4}
+
+    def library(self, box):
+        L = operator(box, self._expression())
+
+        def rate(u, p):
+            return p["nu"] * L(u) + reaction(u, p)
+
+        return dp.stepper(self.method, rate, time_step_of, tolerance=1e-7 if self.method in SHARP else 1e-6)
+
+    def twin(self, box):
+        A = matrix(box, self._expression())
+
+        def act(u, p):
+            equation = Equation(A, {**p, "f": anp.ravel(p["f"])})
+            u = anp.ravel(u)
+            for _ in range(24):
+                u = rk4(equation, u, p["dt"] / 24)
+            return anp.reshape(u, box.shape)
+
+        return act
+
+
+SHARP = ("rk4", "ssprk3", "radau")
+
+
+@dataclass(frozen=True)
+class Damped(OnCells):
+    """u -> real and imaginary parts of x of (shift - D k G) x = u, k and the shift complex."""
+
+    sides: tuple
+    method: str
+    seed: int
+    batched = False
+    tolerance = 1e-7
+
+    def parameters(self, box):
+        return {"k": 1 + 0.3 * np.sin(numbers(self.seed, box.field_shape("faces"))), "shift": 0.7}
+
+    def library(self, box):
+        grid = box.grid()
+        solve = dp.elliptic_solver(
+            dp.divergence(grid), dp.gradient(grid, boundary(box, self.sides)), self.method, rtol=1e-12
+        )
+
+        def act(u, p):
+            x = solve(p["k"] * (1.0 + 0.2j), u, p["shift"] * (0.5 - 1.0j))
+            return anp.real(x) + 0.5 * anp.imag(x)
+
+        return act
+
+    def twin(self, box):
+        table = dense(box, self.sides)
+        D, G = table.divergence(), table.gradient()
+        eye = np.eye(len(D))
+
+        def act(u, p):
+            diffusion = -anp.dot(D * p["k"], G)
+            real = diffusion + 0.5 * p["shift"] * eye
+            imaginary = 0.2 * diffusion - p["shift"] * eye
+            top = anp.concatenate([real, -imaginary], axis=1)
+            bottom = anp.concatenate([imaginary, real], axis=1)
+            data = anp.concatenate([anp.ravel(u), 0.0 * anp.ravel(u)])
+            x = anp.linalg.solve(anp.concatenate([top, bottom], axis=0), data)
+            return anp.reshape(x[: len(eye)] + 0.5 * x[len(eye) :], box.shape)
 
         return act
 

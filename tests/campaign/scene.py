@@ -48,7 +48,7 @@ class Scene:
     layout : str
         How the field lies in memory, a key of `LAYOUTS`.
     bridge : str
-        "none", or the library that differentiates the loss: "torch".
+        "none", or the library that differentiates the loss: "torch" or "jax".
     """
 
     box: Box
@@ -297,6 +297,8 @@ def compare(scene):
             check_gradient(scene, "hvp", entries(product, names), wanted_product, values)
             outcome.compared.append("hvp")
 
+    if scene.bridge == "jax":
+        attempt(scene, outcome, "jax", lambda: compare_by_jax(scene, loss, values, twin, outcome))
     if scene.bridge == "torch":
         attempt(scene, outcome, "torch", lambda: compare_by_torch(scene, loss, values, twin, wanted_product, outcome))
 
@@ -328,6 +330,19 @@ def compare_by_torch(scene, loss, values, twin, wanted_product, outcome):
             found = torch.autograd.grad(slope, list(tensors.values()), allow_unused=True)
             check_gradient(scene, "hvp by torch", of_tensors(tensors, found, values), wanted_product, arrays)
             outcome.compared.append("hvp by torch")
+
+
+def compare_by_jax(scene, loss, values, twin, outcome):
+    """Compare value and gradient that JAX computes of the loss, compiled."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    bridged = dp.interop.to_jax(lambda moving: loss(TREES[scene.tree][0](moving)))
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    value, found = jax.jit(jax.value_and_grad(bridged))(arrays)
+    check_close(scene, "value by JAX", value, twin.value, twin.value_scale)
+    check_gradient(scene, "gradient by JAX", found, twin.gradient, arrays)
+    outcome.compared.append("gradient by JAX")
 
 
 def of_tensors(tensors, found, values):

@@ -12,10 +12,11 @@ from campaign.operators import matrix, total
 from campaign.scene import LAYOUTS, LOSSES, TREES, Scene
 from sparsedp.kernels import compiled
 
-BRIDGES = ["torch"] if find_spec("torch") else []
+BRIDGES = [name for name in ("torch", "jax") if find_spec(name)]
 SEEDS = st.integers(0, 999)
 SIDES = st.sampled_from(["neumann", "dirichlet", (2.0, 0.5), (1.0, 2.0)])
 WORDS = st.sampled_from(["no_slip", "free_slip"])
+FLOW_WORDS = st.sampled_from(["no_slip", "free_slip", "outflow"])
 SOLIDS = st.one_of(st.none(), SEEDS)
 
 
@@ -39,7 +40,7 @@ def sides_of(draw, box, sides=SIDES):
 
 
 def flow_sides(box):
-    return sides_of(box, WORDS)
+    return sides_of(box, FLOW_WORDS)
 
 
 # ---- operators -----------------------------------------------------------------------------------------------------
@@ -165,7 +166,8 @@ def transports(draw, box, of):
     scheme = draw(st.sampled_from(["upwind", "van_leer"]))
     sides = draw(sides_of(box, st.sampled_from(["neumann", "dirichlet"])))
     velocity, form = draw(st.sampled_from(["faces", "cells"])), draw(st.sampled_from(["flux", "advective"]))
-    return parts.Transport(scheme, sides, velocity, of, form, draw(st.booleans()), draw(SEEDS))
+    solid = draw(SOLIDS) if (scheme, velocity, of) == ("upwind", "faces", "cells") else None
+    return parts.Transport(scheme, sides, velocity, of, form, draw(st.booleans()), draw(SEEDS), solid)
 
 
 @st.composite
@@ -186,7 +188,7 @@ def simple(draw, box, source, batched, complex_field):
         if source == "cells":
             choices += ["spectral"]
         if source == "cells" and not batched:
-            choices += ["law", "fields", "waves"] + ["network"] * (box.dim < 3)
+            choices += ["law", "fields", "waves", "adaptive", "damped"] + ["network"] * (box.dim < 3)
             choices += ["elliptic", "elliptic", "entries", "root", "adopted"]
     name = draw(st.sampled_from(choices))
     if name == "linear":
@@ -249,6 +251,11 @@ def physical(draw, name, box, source):
     if name == "waves":
         memory = draw(st.sampled_from([None, 6000, "1 MB"] if flag else [None, "reverse", "1 MB"]))
         return physics.Waves(flag, memory, draw(st.integers(1, 6)), seed)
+    if name == "adaptive":
+        method = draw(st.sampled_from(["heun", "ssprk3", "rk4", "tr_bdf2", "radau"]))
+        return physics.Adaptive(method, draw(sides_of(box)), seed)
+    if name == "damped":
+        return physics.Damped(draw(sides_of(box)), draw(st.sampled_from(["auto", "direct", "krylov"])), seed)
     if name == "spectral":
         return physics.Spectral(draw(sides_of(box)), draw(st.sampled_from(["exponential", "power", "function"])))
     padding = draw(st.sampled_from(["periodic", "zero", "replicate"]))
@@ -269,7 +276,8 @@ def rollouts(draw, box, source, batched, complex_field):
         chain.append(part if part.target == source else parts.Linear(("identity", source), 0.5, source, source))
     n = draw(st.integers(1, 9))
     numbers_kept = draw(st.sets(st.integers(0, n), min_size=1))
-    keep = draw(st.sampled_from(["last", "last", "all", tuple(sorted(numbers_kept))]))
+    keep = draw(st.sampled_from(["last", "last", "all", tuple(sorted(numbers_kept)), "function"]))
+    keep = "all" if keep == "function" and complex_field else keep
     memory = draw(st.sampled_from([None, None, 3, 5, 7, "1 MB"]))
     truncate = draw(st.sampled_from([None, None, None, 1, 2, 3]))
     inputs = draw(st.booleans()) and not complex_field
@@ -312,5 +320,5 @@ def scenes(draw):
         draw(SEEDS),
         draw(st.sampled_from([0, 0, 0, 0, 2, 3])),
         draw(st.sampled_from(["C", "C", *layouts])),
-        draw(st.sampled_from(["none"] * 7 + BRIDGES)),
+        draw(st.sampled_from(["none"] * 14 + BRIDGES)),
     )
