@@ -14,7 +14,7 @@ import hypothesis
 import numpy as np
 import pytest
 from campaign import ingredients as parts
-from campaign import script
+from campaign import physics, script
 from campaign.boxes import Box
 from campaign.ingredients import Discarded
 from campaign.scene import (
@@ -104,7 +104,11 @@ def test_many_scenes(number, record_property):
 # ---- scenes that once failed, as they were shrunk ------------------------------------------------------------------
 
 LINE = Box(shape=(1,), periodic=(True,), stretched=(False,))
+COLUMN = Box(shape=(2, 1), periodic=(False, True), stretched=(True, False), seed=3)
 FOUND = {
+    "a complex number as the shift of an elliptic solve": Scene(
+        COLUMN, (physics.Damped((("dirichlet", "neumann"), None), "auto", seed=4),)
+    ),
     "a Hessian product in single precision, behind a rule without a JVP": Scene(
         LINE,
         (parts.Rule("cells", forward=False, seed=0), parts.TimeStep("euler", (None,), seed=0)),

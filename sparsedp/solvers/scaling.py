@@ -81,7 +81,7 @@ def in_range(size):
 
 def largest(x):
     """Largest magnitude of a real or imaginary part; NaN when there is one."""
-    x = x.view(float) if x.dtype.kind == "c" else x
+    x = _real_and_imaginary(x) if x.dtype.kind == "c" else x
     top = float(x.max(initial=0.0))
     return top if np.isnan(top) else max(top, -float(x.min(initial=0.0)))
 
@@ -89,10 +89,15 @@ def largest(x):
 def shifted(x, exponent):
     """x * 2^exponent, one for all or one for each, exact unless it leaves the range of floats; always a fresh array."""
     if x.dtype.kind == "c":
-        each = np.repeat(exponent, 2) if np.ndim(exponent) else exponent  # for the real part and for the imaginary one
-        return shifted(x.reshape(-1).view(float), each).view(complex).reshape(x.shape)  # a number has no view
+        each = np.repeat(exponent, 2, axis=-1) if np.ndim(exponent) else exponent
+        return shifted(_real_and_imaginary(x), each).view(complex).reshape(x.shape)
     with np.errstate(over="ignore", under="ignore"):  # what overflows is found by the caller
         return x * 2.0**exponent if np.max(np.abs(exponent)) < 1000 else np.ldexp(x, exponent)
+
+
+def _real_and_imaginary(x):
+    """Complex array -> its real and imaginary parts in turn along the last axis; a number becomes an array of two."""
+    return np.ascontiguousarray(x).view(float)
 
 
 def inverted(values, out=None):

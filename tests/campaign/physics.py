@@ -532,7 +532,7 @@ class Adaptive(OnCells):
     sides: tuple
     seed: int
     batched = False
-    tolerance = 1e-4
+    tolerance = 1e-3
 
     @property
     def order(self):
@@ -556,7 +556,7 @@ class Adaptive(OnCells):
         def rate(u, p):
             return p["nu"] * L(u) + reaction(u, p)
 
-        return dp.stepper(self.method, rate, time_step_of, tolerance=1e-7 if self.method in SHARP else 1e-6)
+        return dp.stepper(self.method, rate, time_step_of, tolerance=1e-6 if self.method in SHARP else 1e-5)
 
     def twin(self, box):
         A = matrix(box, self._expression())

@@ -10,7 +10,7 @@ import numpy as np
 
 import sparsedp as dp
 from campaign.boxes import Box, numbers
-from campaign.ingredients import Discarded
+from campaign.ingredients import Discarded, constant_part
 
 SMALLEST = 1e-3  # numbers of a scene are about 1: what is smaller than this may be what cancellation leaves
 
@@ -100,8 +100,8 @@ class Scene:
             result[name] = float(tangent) if isinstance(value, float) else tangent
         return result
 
-    def _composed(self, parts):
-        """Return loss(values by name)."""
+    def _composed(self, parts, bounded=False):
+        """Return loss(values by name). bounded: whether fields that grow discard the scene."""
         measure, seed = LOSSES[self.loss], 6000 + self.seed
 
         def loss(values):
@@ -113,6 +113,8 @@ class Scene:
                     if place == str(number):
                         mine[own_name] = value
                 u = part(u, mine)
+                if bounded:
+                    check_range(constant_part(u))
             return measure(u, in_precision(numbers(seed, anp.shape(u)), self.dtype))
 
         return loss
@@ -133,7 +135,7 @@ class Scene:
 
     def twin(self):
         """Return the loss of a dict of all values, in plain autograd.numpy."""
-        loss = self._composed([part.twin(self.box) for part in self.chain])
+        loss = self._composed([part.twin(self.box) for part in self.chain], bounded=True)
         if not self.ensemble:
             return loss
 
@@ -254,7 +256,7 @@ def compare(scene):
     Raises
     ------
     Discarded
-        If the numbers of the twin grow beyond 1e5.
+        If the numbers of the twin grow beyond 1e4.
     Mismatch
         If a quantity differs by more than the tolerance, has another dtype or shape, or changes when it is computed
         twice; if an argument is modified; or if the library refuses what it should accept.
@@ -398,9 +400,9 @@ class Twin:
 
 
 def check_range(*values):
-    """Discard a scene whose numbers grow beyond 1e5."""
+    """Discard a scene whose numbers grow beyond 1e4."""
     for value in values:
-        if not np.all(np.abs(value) < 1e5):
+        if not np.all(np.abs(value) < 1e4):
             raise Discarded
 
 
