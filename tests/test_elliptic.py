@@ -322,6 +322,17 @@ def test_coefficients_of_any_magnitude(kind, shape, exponent, rng):
         assert np.allclose(np.ldexp(gradient, exponent), dp.grad(loss)(k, b), rtol=1e-7)
 
 
+@pytest.mark.parametrize("exponent", [-900, 0, 900])
+def test_a_complex_shift_of_any_magnitude(exponent, rng):
+    """The shift is one complex number."""
+    grid = dp.Grid((6, 5), size=1.0)
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
+    k, b, shift = rng.uniform(1, 2, grid.faces.size), rng.standard_normal(grid.shape), -3.0 + 2.0j
+    factor = 2.0**exponent
+    exact = np.linalg.solve(dense(solve, k, shift), b.ravel()).reshape(b.shape)
+    assert np.allclose(solve(factor * k, factor * b, factor * shift), exact, rtol=1e-9)
+
+
 def test_coefficients_whose_entries_would_overflow():
     grid = dp.Grid((6, 5), size=1.0)
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))

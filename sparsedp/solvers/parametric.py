@@ -84,7 +84,8 @@ class ParametricSolver(Remade):
         if known is not None:
             return known
         exponent = _exponent_out_of_range(k, shift)
-        op = self._operator(shifted(k, -exponent) if exponent else k.copy(), shifted(shift, -exponent))
+        scaled_shift = shifted(np.atleast_1d(shift), -exponent).reshape(np.shape(shift))
+        op = self._operator(shifted(k, -exponent) if exponent else k.copy(), scaled_shift)
         inverse = build(op, name=self.name, log=self.info, solves="few", **self._settings)
         inverse.solver.system.exponent += exponent  # solutions are scaled back by it
         return self._cache.put((k, shift), inverse)
