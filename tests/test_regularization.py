@@ -110,6 +110,46 @@ def test_admm_keeps_bounds_and_takes_another_prox():
     np.testing.assert_allclose(best.x, np.maximum(y, 0), atol=1e-6)
 
 
+def test_admm_of_complex_unknowns(rng):
+    """At the minimum the gradient is -weight x / |x|, and of magnitude <= weight where x is 0."""
+    matrix = rng.normal(size=(6, 5)) + 1j * rng.normal(size=(6, 5))
+    data = rng.normal(size=6) + 1j * rng.normal(size=6)
+    for weight in (1.0, 12.0):
+        best = dp.minimize(
+            lambda x: 0.5 * anp.sum(anp.abs(anp.dot(matrix, x) - data) ** 2), np.zeros(5, complex), "admm",
+            weight=weight, tolerance=1e-6, maxiter=500,
+        )  # fmt: skip
+        slope = matrix.conj().T @ (matrix @ best.x - data)
+        zero = np.abs(best.x) < 1e-6
+        assert best.converged
+        assert np.allclose(slope[~zero], -weight * (best.x / np.abs(best.x))[~zero], atol=1e-5)
+        assert np.all(np.abs(slope[zero]) <= weight * (1 + 1e-6))
+
+
+def test_admm_of_a_complex_operator(rng):
+    """The transpose of the residuals is conjugate: K turns phases, and changes no magnitude."""
+    phases = np.exp(1j * rng.uniform(0, 6, 5))
+    goal = rng.normal(size=5) + 1j * rng.normal(size=5)
+    misfit = lambda x: 0.5 * anp.sum(anp.abs(x - goal) ** 2)
+    turned = dp.minimize(
+        misfit, np.zeros(5, complex), "admm", weight=0.5, tolerance=1e-9, maxiter=500, operator=lambda x: phases * x
+    )
+    size = np.abs(goal)
+    assert turned.converged and np.allclose(turned.x, goal / size * np.maximum(size - 0.5, 0.0), atol=1e-7)
+
+
+def test_admm_converges_to_zero():
+    """K x and its copy both go to 0: their difference relative to themselves does not."""
+    best = dp.minimize(lambda x: 0.5 * anp.sum((x - 1.0) ** 2), np.full(3, 5.0), "admm", weight=3.0, tolerance=1e-6)
+    assert best.converged and np.allclose(best.x, 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e-170, 1e170])
+def test_admm_refuses_a_penalty_that_is_no_float(size):
+    with pytest.raises(ValueError, match="rho of admm, the weight divided by the size of K x"):
+        dp.minimize(lambda x: anp.sum((x / size - 1.0) ** 2), np.full(2, size), "admm", weight=1.0 / size)
+
+
 def test_admm_stops_when_asked():
     loss, seen = lambda x: anp.sum((x - 1) ** 2), []
     best = dp.minimize(loss, np.zeros(3), "admm", maxiter=3, tolerance=0.0, weight=0.1)

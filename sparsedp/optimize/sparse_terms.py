@@ -42,7 +42,7 @@ def admm(
         raise TypeError("admm with a function as inner does not use bounds; leave them out, or keep to them in inner")
     K = (lambda x: 1.0 * x) if operator is None else operator
     penalty = weight if prox is None else 0.0  # what another prox belongs to is not said
-    prox = (lambda v, t: np.sign(v) * np.maximum(np.abs(v) - t, 0.0)) if prox is None else prox
+    prox = soft_threshold if prox is None else prox
     check_function("admm, as operator,", K, "lambda x: ...")
     check_function("admm, as prox,", prox, "lambda v, t: ...")
     clock, solves, evaluations = time.perf_counter(), thread.solves, 0
@@ -57,7 +57,12 @@ def admm(
 
     def searched(target, rho, x):
         """The x of a round, from that of the last one, and the evaluations it took."""
-        split = lambda x: loss(x) + 0.5 * rho * anp.sum((K(x) - target) ** 2)
+        root = np.sqrt(rho)
+
+        def split(x):
+            difference = root * (K(x) - target)
+            return loss(x) + 0.5 * anp.sum(anp.real(difference * anp.conj(difference)))
+
         best = search(split, x, maxiter=inner, bounds=bounds, tolerance=1e-6)
         if best.message == "interrupted":
             raise KeyboardInterrupt
@@ -88,19 +93,33 @@ def admm(
     )  # fmt: skip
 
 
+def soft_threshold(v, t):
+    """Return the minimum over z of t |z| + |z - v|^2 / 2, real or complex."""
+    size = np.abs(v)
+    return v / np.where(size > 0, size, 1.0) * np.maximum(size - t, 0.0)
+
+
 def _rounds(minimized, x, K, z, weight, rho, prox):
     """Round after round: x, the evaluations it took, K x, and both residuals, relative to their terms."""
-    w = np.zeros(z.shape)
+    w, largest = np.zeros(z.shape), norm(z)
     if rho is None:  # so that the threshold is a typical entry, or 1 where all are 0
-        rho = weight / (float(np.mean(np.abs(z))) or 1.0)
+        with np.errstate(over="ignore"):
+            rho = float(weight / np.float64(np.mean(np.abs(z)) or 1.0))
     for number in count():
+        if not 0 < rho < np.inf:
+            raise ValueError(
+                f"rho of admm, the weight divided by the size of K x, is {rho:g} here; rescale x or write rho="
+            )
         x, spent = minimized(z - w, rho, x)
         image, pull = pullback(K, x)
         check_shape("what the operator of admm gives", image, z.shape, "; it must not change from call to call")
         before, z = z, prox(image + w, weight / rho)
         w = w + image - z
-        primal = norm(image - z) / (max(norm(image), norm(z)) or 1.0)
-        dual = norm(pull(z - before)) / (norm(pull(w)) or 1.0)
+        largest = max(largest, norm(image))
+        # Where K x goes to 0 its own size is no measure: that of the terms before, and of the multiplier, are.
+        size = max(norm(image), norm(z)) if np.any(z) else min(largest, norm(w))
+        primal = norm(image - z) / (size or 1.0)
+        dual = norm(pull(np.conj(z - before))) / (norm(pull(np.conj(w))) or 1.0)
         yield x, spent, image, primal, dual
         if number < SETTLED and max(primal, dual) > BALANCE * min(primal, dual):
             factor = STEP if primal > dual else 1 / STEP
