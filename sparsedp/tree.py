@@ -29,10 +29,15 @@ __all__ = [
     "paired",
     "placed",
     "power_of_two",
+    "safe_unit",
     "subscript",
 ]
 
 DEEPEST = 100  # containers in containers: recursions over deeper trees would leave Python's limit
+
+
+SMALL, LARGE = 2.0**-200, 2.0**200  # between these, products of four numbers and a few more are floats
+MOST_EXPONENT = 1023  # of a power of two that is a float
 
 
 def flatten(tree):
@@ -290,8 +295,13 @@ def norm(tree):
 
 
 def power_of_two(value):
-    """The power of two next above, so that dividing by it changes no digits."""
-    return 2.0 ** float(np.clip(np.frexp(value)[1], -900, 900)) if value > 0 else 1.0
+    """Return the next larger power of two that is a float; dividing by it changes no digits. 1 for 0."""
+    return float(np.ldexp(1.0, min(np.frexp(value)[1], MOST_EXPONENT))) if value > 0 else 1.0
+
+
+def safe_unit(size):
+    """Return a power of two near a size whose square may underflow or overflow; 1 where it does not."""
+    return 1.0 if SMALL < size < LARGE else power_of_two(size)
 
 
 def keys(tree):

@@ -67,6 +67,25 @@ WRONG = [
         "project(x): expected one array or number, got a tuple of length 2; return a tree like start",
     ),
     (
+        run(project=lambda x: anp.clip(x, 0.5, 1.0)), ValueError,
+        "project must be a projection onto a linear or affine space, but it is not affine near the start; with other "
+        "maps a search may stop where the loss has no minimum. Write bounds=(lower, upper) to keep x in a box",
+    ),
+    (
+        run(project=lambda x: x, bounds=(0.0, None)), ValueError,
+        "project and bounds cannot be used together: a projected point may be outside of the bounds; leave one of "
+        "them out",
+    ),
+    (
+        lambda: run(maxiter=0)().covariance, ValueError,
+        "the covariance is not known: it is that of least-squares problems; give minimize the residuals and "
+        "method='levenberg_marquardt'",
+    ),
+    (
+        run(lambda x: anp.sum((1e170 * x) ** 2), (1e-170,), "admm", weight=1e200), ValueError,
+        "rho of admm, the weight divided by the size of K x, is inf here; rescale x or write rho=",
+    ),
+    (
         run(method="newton_cg", inner=0), ValueError,
         "inner of newton_cg must be a whole number >= 1, got 0; the default is 200",
     ),

@@ -3,7 +3,8 @@
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from scipy.optimize import minimize, rosen_der
+from autograd import grad
+from scipy.optimize import lsq_linear, minimize, rosen_der
 
 import sparsedp as dp
 from benchmarks.bounded import PROBLEMS, compared
@@ -117,3 +118,85 @@ def test_a_real_bound_on_a_complex_leaf_bounds_both_parts():
     assert np.allclose(best.x["z"], [1.0 + 1.0j, 0.25j])
     best = dp.minimize(lambda z: anp.sum(anp.abs(z - goal) ** 2), np.zeros(2, complex), bounds=(0.0, 1.0 + 2.0j))
     assert np.allclose(best.x, [1.0 + 2.0j, 0.25j])
+
+
+# ---- least squares inside bounds -----------------------------------------------------------------------------------
+
+
+def bounded_problem(seed):
+    """Random residuals, bounds (some infinite, some equal) and a start inside; every third start is on bounds."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 8))
+    matrix, data = rng.normal(size=(n + 3, n)) * np.exp(rng.normal(size=n)), 3 * rng.normal(size=n + 3)
+    corner = rng.integers(-1, 2, n).astype(float)
+    residuals = [
+        lambda x: anp.dot(matrix, x) - data,
+        lambda x: anp.dot(matrix[: n - 1], x) - data[: n - 1],  # more unknowns than residuals
+        lambda x: anp.dot(matrix, x - corner),  # the minimum is a corner, with multipliers of 0
+        lambda x: anp.concatenate([10 * (x[1:] - x[:-1] ** 2), 1 - x[:-1]]),
+        lambda x: anp.concatenate([anp.dot(matrix, x) - data, 0.3 * anp.dot(x, x) * np.ones(1) - 4]),
+    ][seed % 5]
+    lower = rng.uniform(-1.5, 0.2, n)
+    upper = lower + rng.uniform(0.1, 2.5, n)
+    if seed % 5 == 2:
+        lower, upper = -np.ones(n), np.ones(n)
+    kind = rng.integers(0, 5, n)
+    lower[kind == 0], upper[kind == 1] = -np.inf, np.inf
+    upper[kind == 2] = lower[kind == 2]
+    start = np.clip(rng.normal(size=n) * (5 if seed % 3 == 0 else 1), lower, upper)
+    return residuals, lower, upper, start
+
+
+def projected_gradient(residuals, x, lower, upper):
+    slope = grad(lambda x: 0.5 * anp.sum(residuals(x) ** 2))(x)
+    return np.linalg.norm(x - np.clip(x - slope, lower, upper))
+
+
+METHODS = [
+    ("gauss_newton", {}), ("gauss_newton", {"dense": False}), ("levenberg_marquardt", {}),
+    ("levenberg_marquardt", {"dense": False}), ("lbfgs", {}), ("newton_cg", {}), ("gd", {}), ("adam", {"rate": 0.02}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("method, options", METHODS)
+def test_random_bounded_problems_end_where_scipy_does(method, options):
+    squares = method in ("gauss_newton", "levenberg_marquardt")
+    first_order = method in ("gd", "adam")
+    for seed in range(4 if first_order else 15):
+        residuals, lower, upper, start = bounded_problem(seed)
+        half_square = lambda x, r=residuals: 0.5 * anp.sum(r(x) ** 2)
+        best = dp.minimize(
+            residuals if squares else half_square, start, method, bounds=(lower, upper),
+            maxiter=400 if first_order else 200, **options,
+        )  # fmt: skip
+        known = minimize(
+            half_square, start, jac=grad(half_square), bounds=np.c_[lower, upper], method="L-BFGS-B",
+            options={"maxiter": 2000, "ftol": 1e-15, "gtol": 1e-9},
+        )  # fmt: skip
+        assert np.all((lower <= best.x) & (best.x <= upper))
+        size = max(projected_gradient(residuals, start, lower, upper), 1e-3)
+        if best.converged:
+            assert projected_gradient(residuals, best.x, lower, upper) <= 1e-5 * size
+            assert best.value <= known.fun * (1 + 1e-5) + 1e-8
+        assert best.converged or first_order
+
+
+def test_gauss_newton_with_large_residuals_is_damped(rng):
+    """It took steps of 2^-7 of their length, and stopped after 300 iterations short of the minimum."""
+    residuals = lambda x: anp.concatenate([10 * (x[1:] - x[:-1] ** 2), 1 - x[:-1]])
+    lower = np.array([-1.4, -1.4659497, -0.07, -0.5, -1.1])
+    upper = np.array([0.45, -1.4659497, 0.98, np.inf, np.inf])
+    start = np.array([-0.36, -1.4659497, 0.03, -0.5, 0.6])
+    best = dp.minimize(residuals, start, "gauss_newton", bounds=(lower, upper), maxiter=300)
+    known = dp.minimize(lambda x: 0.5 * anp.sum(residuals(x) ** 2), start, bounds=(lower, upper))
+    assert best.converged and best.evaluations < 400
+    assert np.allclose(best.x, known.x, atol=1e-5)
+
+
+def test_a_linear_problem_in_a_box_takes_one_step(rng):
+    """The step is the minimum inside the bounds, whichever of them hold: exact for linear residuals."""
+    for _ in range(20):
+        matrix, data = rng.normal(size=(30, 20)), 5 * rng.normal(size=30)
+        best = dp.minimize(lambda x, a=matrix, d=data: a @ x - d, np.zeros(20), "gauss_newton", bounds=(-0.3, 0.4))
+        known = lsq_linear(matrix, data, bounds=(-0.3, 0.4), tol=1e-14)
+        assert best.converged and len(best.history) <= 3 and np.allclose(best.x, known.x, atol=1e-8)

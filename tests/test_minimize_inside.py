@@ -123,6 +123,47 @@ def test_a_projection_is_kept(method):
     assert np.allclose(best.x, target - 3) and abs(np.sum(best.x)) < 1e-12
 
 
+NOT_PROJECTIONS = {
+    "a clip to a box": (lambda x: anp.clip(x, 0.5, 1.0), "not affine near the start"),
+    "a clip from below": (lambda x: anp.maximum(x, 0.0), "not affine near the start"),
+    "a sphere": (lambda x: x / anp.sqrt(anp.sum(x**2)), "not affine near the start"),
+    "a wide box": (lambda x: anp.clip(x, -1e4, 1e4), "not affine near the start"),
+    "no projection": (lambda x: 2 * x, r"project\(project\(x\)\) is not project\(x\)"),
+}
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "half_inverse"])
+@pytest.mark.parametrize("kind", NOT_PROJECTIONS)
+def test_what_is_no_projection_onto_an_affine_space_is_refused(kind, method):
+    """Searches stopped at the start, where the derivative of the clip is 0, and called it converged."""
+    project, reason = NOT_PROJECTIONS[kind]
+    loss = (lambda x: x) if method in ("gauss_newton", "half_inverse") else lambda x: anp.sum(x**2)
+    with pytest.raises(ValueError, match=f"{reason}.*Write bounds="):
+        dp.minimize(loss, np.ones(2), method, project=project)
+
+
+def test_a_projection_that_is_not_affine_only_near_the_result_is_refused():
+    project = lambda x: anp.where(anp.abs(x - 3.0) < 0.5, 2.5 + 0 * x, x)
+    with pytest.raises(ValueError, match="not affine near the result"):
+        dp.minimize(lambda x: anp.sum((x - 3.0) ** 2), np.array([1.0, 1.5]), "gd", rate=0.5, project=project)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "gd", "newton_cg", "gauss_newton", "levenberg_marquardt"])
+def test_an_affine_projection_and_a_gradient_of_the_user(method):
+    """The gradient of the user is that of the loss; with project it was taken at x, and not projected."""
+    target, mean_two = np.array([1.0, 2.0, 6.0]), lambda x: x - anp.mean(x) + 2.0
+    squares = method in ("gauss_newton", "levenberg_marquardt")
+    loss = (lambda x: x - target) if squares else lambda x: anp.sum((x - target) ** 2)
+    options = {} if squares or method == "newton_cg" else {"gradient": lambda x: 2 * (x - target)}
+    best = dp.minimize(loss, np.array([5.0, 1.0, 1.0]), method, project=mean_two, **options)
+    assert best.converged and np.allclose(best.x, target - 1.0, atol=1e-7)
+
+
+def test_a_projection_and_bounds_are_not_taken_together():
+    with pytest.raises(ValueError, match="project and bounds cannot be used together"):
+        dp.minimize(lambda x: anp.sum(x**2), np.ones(2), project=lambda x: x - anp.mean(x), bounds=(0.0, 1.0))
+
+
 def test_history_counts_forward_and_adjoint_solves(tmp_path):
     solve, target = dp.inverse(-dp.laplacian(dp.Grid((6, 5)), dp.dirichlet)), np.arange(30.0).reshape(6, 5)
 

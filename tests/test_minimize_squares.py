@@ -108,11 +108,60 @@ def test_covariance_where_it_is_not_known(rng):
     )
     assert np.all(np.isinf(run(matrix[:, [0, 1, 1]]).covariance))
     assert np.all(np.isinf(run(matrix * [1.0, 1.0, 0.0]).covariance))
-    assert run(rng.standard_normal((10, 10))).covariance is None  # no residual is left over
-    assert run(matrix, dense=False).covariance is None
-    assert dp.minimize(lambda x: anp.sum(x**2), np.ones(2)).covariance is None
+    square = rng.standard_normal((10, 10))
+    many = lambda x: anp.sum(x) * np.ones(5001) - 1.0
+    unknown = [
+        (run(square), "10 residuals of 10 unknowns leave none .* absolute_sigma=True"),
+        (
+            run(matrix, dense=False),
+            r"the Jacobian is not formed \(dense=False.*dp.vjp\(residuals, x\).*cg.*dense=True forms it",
+        ),
+        (run(np.zeros((1, 5000)), many, maxiter=0), "there are 5000 unknowns, and it is formed for up to 4000"),
+        (dp.minimize(lambda x: anp.sum(x**2), np.ones(2)), "give minimize the residuals"),
+        (dp.minimize(lambda x, _: x, np.ones(2), "half_inverse", batches=[0], maxiter=1), "without batches"),
+    ]
+    for best, reason in unknown:
+        with pytest.raises(ValueError, match=f"the covariance is not known: .*{reason}"):
+            best.covariance
+    exact = run(square, absolute_sigma=True).covariance
+    assert np.allclose(exact, np.linalg.inv(square.T @ square), rtol=1e-6)
+    assert np.all(np.isinf(run(square[:3], lambda x: square[:3] @ x - 1.0, absolute_sigma=True).covariance))
     known = run(matrix).covariance
     assert np.allclose(known, np.linalg.inv(matrix.T @ matrix) * least_squares(
         lambda x: matrix @ x - data, np.zeros(3)).cost * 2 / 7)  # fmt: skip
     copies = lambda x: anp.sum(matrix * x, axis=-1) - data
     assert np.allclose(run(matrix, copies, apart=True).covariance, known)
+
+
+@pytest.mark.parametrize("method", [*METHODS, "half_inverse"])
+def test_absolute_sigma_is_that_of_curve_fit(rng, method):
+    """Residuals divided by known standard deviations: the posterior covariance of a linear model is exact."""
+    matrix, sigma = rng.standard_normal((20, 3)), rng.uniform(0.5, 2.0, 20)
+    data = matrix @ np.array([1.0, -2.0, 0.5]) + sigma * rng.standard_normal(20)
+    weighted = matrix / sigma[:, None]
+    run = lambda **options: dp.minimize(lambda x: anp.dot(weighted, x) - data / sigma, np.zeros(3), method, **options)
+    model = lambda _, *x: matrix @ np.array(x)
+    known = curve_fit(model, np.arange(20), data, np.zeros(3), sigma, absolute_sigma=True)[1]
+    found = run(absolute_sigma=True).covariance
+    assert np.allclose(found, known, rtol=1e-5)
+    assert np.allclose(found, np.linalg.inv(weighted.T @ weighted), rtol=1e-9)
+    if method != "half_inverse":  # it ends short of the minimum
+        known = curve_fit(model, np.arange(20), data, np.zeros(3), sigma, absolute_sigma=False)[1]
+        assert np.allclose(run().covariance, known, rtol=1e-5)
+    with pytest.raises(ValueError, match="absolute_sigma must be one of True, False, got 1"):
+        run(absolute_sigma=1)
+
+
+@pytest.mark.parametrize("exponent", [-1000, -700, 500])
+def test_covariance_of_residuals_of_any_magnitude(rng, exponent):
+    """The covariance does not depend on a factor of the residuals, and with absolute_sigma on its square."""
+    matrix, data = rng.standard_normal((10, 3)), rng.standard_normal(10)
+    factor = 2.0**exponent
+    run = lambda factor, **options: dp.minimize(
+        lambda x: factor * (anp.dot(matrix, x) - data), np.zeros(3), "levenberg_marquardt", **options
+    )
+    assert np.allclose(run(factor).covariance, run(1.0).covariance, rtol=1e-9)
+    if exponent == 500:
+        assert np.allclose(
+            run(factor, absolute_sigma=True).covariance * factor * factor, np.linalg.inv(matrix.T @ matrix)
+        )

@@ -50,9 +50,21 @@ class Box:
         if not np.all((self.lower <= self.upper) & (self.lower < np.inf) & (self.upper > -np.inf)):  # nor NaN
             raise ValueError("bounds must be numbers with lower <= upper; write None for a side without a bound")
 
+    @property
+    def bounded(self):
+        """Whether there are any bounds."""
+        return bool(np.any(self.lower > -np.inf) or np.any(self.upper < np.inf))
+
     def inside(self, vector):
         """The nearest point of the box."""
         return np.clip(vector, self.lower, self.upper)
+
+    def moved(self, vector, step):
+        """Return the point of the box nearest to vector + step, on a bound where it differs from it by rounding."""
+        point = self.inside(vector + step)
+        rounding = ULPS * np.abs(vector)
+        point = np.where(point - self.lower <= rounding, self.lower, point)
+        return np.where(self.upper - point <= rounding, self.upper, point)
 
     def free(self, vector, slope):
         """Which entries can go downhill: not those at which the gradient pushes against a bound."""

@@ -14,7 +14,7 @@ from sparsedp.tree import flatten, leaves, norm
 
 __all__ = ["Checkpoint"]
 
-FORMAT = "sparsedp optimization 4"
+FORMAT = "sparsedp optimization 5"
 KEPT = 2
 NEAR = 1e-6  # share of value and gradient at the start that a loss may be off where another number of ranks adds up
 SHARE = 0.1  # a state is written when that takes at most this share of the time since the last one
@@ -71,15 +71,16 @@ class Checkpoint:
                 return True
             return others and norm(now - then) <= NEAR * abs(size)
 
-        same_norm = same(norm(trials.downhill(start)), size, size)
-        self._check("loss at the start", same_norm and same(start.value, value, value))
+        same_norm = same(trials.as_given(norm(trials.downhill(start))), size, size)
+        self._check("loss at the start", same_norm and same(trials.as_given(start.value), value, value))
         state = flatten(template)[1](content["state"])
         trials.iteration = content["iteration"]
         again, last = trials(state.trial.vector), state.trial
-        same_value = same(again.value, last.value, value)
-        self._check("loss at the last point", same_value and same(again.slope, last.slope, size))
+        same_value = same(again.value, last.value, start.value)
+        same_slope = same(again.slope, last.slope, norm(trials.downhill(start)))
+        self._check("loss at the last point", same_value and same_slope)
         trials.best, trials.count = Trial(*content["best"]), content["evaluations"]
-        watch.resume(history)
+        watch.resume(history, start, last)
         return state
 
     def _load(self):

@@ -18,12 +18,17 @@ HALVINGS = 60
 
 
 class DescentState(NamedTuple):
-    """State of gradient descent: the point, the last step, the rate of the next one and the share to try first."""
+    """State of gradient descent: the point, the last step, the rate of the next one and the share to try first.
+
+    The rate belongs to the gradient divided by `height`: a power of two where the rate is searched for, so that the
+    quotient of a length and a gradient is a float at any scale of x and the loss; 1 where the rate is given.
+    """
 
     trial: Trial
     velocity: np.ndarray
     rate: float
     share: float
+    height: float
 
 
 class Descent:
@@ -51,21 +56,26 @@ class Descent:
 
     def begin(self, first):
         """State at the start."""
-        rate = first_length(first) / (norm(first.slope) or 1.0) if self.rate is None else self.rate
-        return DescentState(first, np.zeros_like(first.vector), rate, 1.0)
+        height, rate = 1.0, self.rate
+        if rate is None:
+            height = power_of_two(norm(first.slope))
+            rate = first_length(first) / (norm(first.slope / height) or 1.0)
+        return DescentState(first, np.zeros_like(first.vector), rate, 1.0, height)
 
     def advance(self, state, trials):
         """One iteration. Raises Stuck when no admissible point is found."""
-        slope = trials.downhill(state.trial)
+        slope = trials.downhill(state.trial) / state.height
         step = self.momentum * state.velocity - state.rate * slope
         if not self.searches:
             trial, share, larger = admissible(state.trial.vector, step, state.share, trials)
-            return DescentState(trial, share * step, state.rate, larger)
+            return state._replace(trial=trial, velocity=share * step, share=larger)
         if np.dot(step, slope) >= 0:
             step = -state.rate * slope  # momentum that goes uphill is dropped
         # Halve the step until the loss falls; a full step that does is tried at twice the length next time.
-        trial, share = backtracked(state.trial, step, trials, "the gradient")
-        return DescentState(trial, share * step, state.rate * (share if share < 1 else 2.0), 1.0)
+        along = "the projected gradient" if trials.box.bounded else "the gradient"
+        trial, share, _ = backtracked(state.trial, step, trials, along)
+        factor = share if share < 1 else 2.0
+        return state._replace(trial=trial, velocity=share * step, rate=state.rate * factor)
 
 
 def first_length(first):
@@ -75,8 +85,11 @@ def first_length(first):
     return min((length for length in lengths if 0 < length < np.inf), default=1.0)
 
 
-def backtracked(here, step, trials, along):
-    """The first trial along a step, halved again and again, that is lower by enough, and the share of the step.
+def backtracked(here, step, trials, along, most=HALVINGS):
+    """Return the first trial along a step, halved again and again, that is lower by enough.
+
+    Also the share of the step, and the share of the fall that the gradient predicted, which is 1/2 at the minimum of a
+    parabola. `most` is the number of lengths that are tried.
 
     Raises
     ------
@@ -85,13 +98,13 @@ def backtracked(here, step, trials, along):
     """
 
     def halved():
-        for count in range(HALVINGS):
+        for count in range(most):
             share = 0.5**count
-            point = trials.box.inside(here.vector + share * step)
+            point = trials.box.moved(here.vector, share * step)
             yield point, float(np.dot(here.vector - point, here.slope)), share
 
-    trial, _, share = trials.lower(here, halved(), f"no lower point along {along}")
-    return trial, share
+    trial, gain, share = trials.lower(here, halved(), f"no lower point along {along}")
+    return trial, share, gain
 
 
 def admissible(point, step, share, trials):

@@ -9,25 +9,34 @@ import numpy as np
 import scipy.linalg
 from scipy.sparse.linalg import LinearOperator, lsmr
 
-from sparsedp.fields import check_number
+from sparsedp.fields import check_choice, check_number
+from sparsedp.optimize.bounded_squares import BoundedProblem
 from sparsedp.optimize.directions import Family, form_of
 from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked
-from sparsedp.optimize.result import Trial
-from sparsedp.tree import norm
+from sparsedp.optimize.result import Stuck, Trial
+from sparsedp.solvers.scaling import largest
+from sparsedp.tree import norm, power_of_two, safe_unit
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 
 ROUNDING = 1e-12  # singular values below this share of the largest are taken for 0
+LENGTHS = 2  # of an undamped step that are tried: all of it and half of it
+POOR = 0.1  # share of the fall predicted by the gradient, 1/2 for a parabola, below which the next step is damped
+FIRST_DAMPING, LAST_DAMPING = 1e-3, 1e-6  # of Gauss-Newton, relative to the largest diagonal entry of J^T J
 FORCING, CONDITION = 1e-10, 1e14  # of LSMR: relative accuracy, and where it gives up
 EXACT = 1e-9  # damping relative to |J|^2 above which the Gram matrix, with rounding 1e-16, gives 6 digits of the step
 
 
 class SquaresState(NamedTuple):
-    """State of the least-squares methods: the point, the damping, the share to try first."""
+    """State of the least-squares methods: the point, the damping, the share to try first, the unit of the Jacobian.
+
+    The damping is that of the Jacobian divided by `unit`, a power of two (0: not known), whose square is a float.
+    """
 
     trial: Trial
     damping: float = 0.0
     share: float = 1.0
+    unit: float = 0.0
 
 
 def _backwards(jacobian, r, damping):
@@ -47,7 +56,10 @@ def _backwards(jacobian, r, damping):
 
 
 class GaussNewton:
-    """Gauss-Newton: the step that solves the linearised problem, halved until the loss falls.
+    """Gauss-Newton: the step that solves the linearised problem inside the bounds.
+
+    Where neither the step nor half of it lowers the loss, or by far less than predicted, steps are damped as those of
+    Levenberg-Marquardt until the linearised problem predicts well again.
 
     Parameters
     ----------
@@ -56,20 +68,32 @@ class GaussNewton:
     dense : bool or None
         Whether J is formed, by products forward or in reverse, whichever are fewer; None: when it has at most 3e7
         entries and 4000 rows or columns. Else LSMR on products with J and J^T.
+    absolute_sigma : bool
+        Whether the residuals are divided by their standard deviations, so that the covariance is (J^T J)^(-1).
     """
 
     residuals, searches = True, True
 
-    def __init__(self, apart=False, dense=None):
-        self.apart, self.dense = bool(apart), dense
+    def __init__(self, apart=False, dense=None, absolute_sigma=False):
+        check_choice("absolute_sigma", absolute_sigma, (True, False), "; the default is False")
+        self.apart, self.dense, self.absolute_sigma = bool(apart), dense, bool(absolute_sigma)
 
-    def step(self, linearised, damping=0.0):
-        """The step to the minimum of |J d + r|^2 + damping |d|^2."""
-        r = linearised.flat
+    def step(self, linearised, r, damping, unit):
+        """Return the minimum d of |J d + r|^2 + damping |unit d|^2."""
         if linearised.dense:
-            return -_backwards(linearised.rows(), r, damping)
-        product = LinearOperator(linearised.shape, linearised.push, linearised.pull, dtype=float)
-        return -lsmr(product, r, damp=np.sqrt(damping), atol=FORCING, btol=FORCING, conlim=CONDITION)[0]
+            jacobian = linearised.rows()
+            return -_backwards(jacobian if unit == 1 else jacobian / unit, r, damping) / unit
+        product = LinearOperator(
+            linearised.shape, lambda v: linearised.push(v / unit), lambda w: linearised.pull(w) / unit, dtype=float
+        )
+        return -lsmr(product, r, damp=np.sqrt(damping), atol=FORCING, btol=FORCING, conlim=CONDITION)[0] / unit
+
+    def bounded_step(self, here, linearised, trials, damping, unit):
+        """Return the minimum d of |J d + r|^2 + damping |unit d|^2 for which the point here + d is inside the box."""
+        if not trials.box.bounded:
+            return self.step(linearised, linearised.flat, damping, unit)
+        problem = BoundedProblem(here, linearised, trials.box, damping, unit)
+        return problem.solved(lambda some, r: self.step(some, r, damping, unit), trials.free(here))
 
     def begin(self, first):
         """State at the start."""
@@ -77,8 +101,60 @@ class GaussNewton:
 
     def advance(self, state, trials):
         """One iteration. Raises Stuck when no lower point is found."""
-        step = self.step(trials.linearised(state.trial))
-        return state._replace(trial=backtracked(state.trial, step, trials, "the Gauss-Newton step")[0])
+        here, linearised = state.trial, trials.linearised(state.trial)
+        unit = state.unit or safe_unit(self.largest(linearised))
+        state = state._replace(unit=unit)
+        if not state.damping:
+            step = self.bounded_step(here, linearised, trials, 0.0, unit)
+            try:
+                trial, _, gain = backtracked(here, step, trials, "the Gauss-Newton step", LENGTHS)
+            except Stuck as stuck:
+                self.check_stuck(stuck, here, linearised, trials)
+            else:
+                if gain < POOR:
+                    state = state._replace(damping=FIRST_DAMPING * (self.largest(linearised) / unit) ** 2)
+                return state._replace(trial=trial)
+        size = (self.largest(linearised) / unit) ** 2
+        if not state.damping:
+            state = state._replace(damping=FIRST_DAMPING * size or 1.0)
+        state = self.damped(state, linearised, trials, "no lower point along the Gauss-Newton step, damped or not")
+        return state if state.damping > LAST_DAMPING * size else state._replace(damping=0.0)
+
+    def damped(self, state, linearised, trials, unless):
+        """Return the state after a step with as much damping as it takes. Raises Stuck(unless) when none is enough."""
+        here, unit = state.trial, state.unit
+
+        def tries():
+            damping, growth = state.damping, 2.0
+            for _ in range(HALVINGS):
+                point = trials.box.moved(here.vector, self.bounded_step(here, linearised, trials, damping, unit))
+                change = linearised.push(point - here.vector)
+                yield point, -float(np.dot(change, linearised.flat + 0.5 * change)), damping
+                damping, growth = damping * growth, 2 * growth
+
+        try:
+            trial, gain, damping = trials.lower(here, tries(), unless)
+        except Stuck as stuck:
+            self.check_stuck(stuck, here, linearised, trials)
+            raise Stuck(unless) from None
+        damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3)
+        return state._replace(trial=trial, damping=damping)
+
+    def check_stuck(self, stuck, here, linearised, trials):
+        """Raise what a search ended with if it is rounding: where the gradient predicts no visible fall either."""
+        if str(stuck) == "rounding":
+            downhill = BoundedProblem(here, linearised, trials.box, 0.0, 1.0).downhill()
+            if not trials.seen_to_fall(here, downhill):
+                raise stuck
+
+    def largest(self, linearised):
+        """Return the norm of the largest column of J; where J is not formed, that of J along the gradient."""
+        if linearised.dense:
+            jacobian = linearised.rows()
+            unit = power_of_two(largest(jacobian))
+            return unit * float(np.max(np.linalg.norm(jacobian / unit, axis=0), initial=0.0))
+        slope = linearised.pull(linearised.flat)
+        return norm(linearised.push(slope / (norm(slope) or 1.0)))
 
 
 class LevenbergMarquardt(GaussNewton):
@@ -88,7 +164,7 @@ class LevenbergMarquardt(GaussNewton):
     ----------
     damping : float
         At the start, relative to the largest diagonal entry of J^T J.
-    apart, dense
+    apart, dense, absolute_sigma
         As for gauss_newton.
 
     Notes
@@ -96,32 +172,19 @@ class LevenbergMarquardt(GaussNewton):
     Source: H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05, 1999.
     """
 
-    def __init__(self, damping=1e-3, apart=False, dense=None):
+    def __init__(self, damping=1e-3, apart=False, dense=None, absolute_sigma=False):
         check_number("damping of levenberg_marquardt", damping, "> 0", "; the default is 1e-3")
-        super().__init__(apart, dense)
+        super().__init__(apart, dense, absolute_sigma)
         self.damping = damping
 
     def advance(self, state, trials):
         """One iteration: one Jacobian, as many dampings as it takes. Raises Stuck when none is large enough."""
-        here, linearised = state.trial, trials.linearised(state.trial)
-
-        def damped():
-            damping, growth = state.damping or self.damping * self.largest(linearised) or 1.0, 2.0
-            for _ in range(HALVINGS):
-                point = trials.box.inside(here.vector + self.step(linearised, damping))
-                change = linearised.push(point - here.vector)
-                yield point, -float(np.dot(change, linearised.flat + 0.5 * change)), damping
-                damping, growth = damping * growth, 2 * growth
-
-        trial, gain, damping = trials.lower(here, damped(), "no damping gives a lower point")
-        return SquaresState(trial, damping * max(1 / 3, 1 - (2 * gain - 1) ** 3))
-
-    def largest(self, linearised):
-        """The largest diagonal entry of J^T J; where J is not formed, that along the gradient."""
-        if linearised.dense:
-            return float(np.max(np.linalg.norm(linearised.rows(), axis=0), initial=0.0)) ** 2
-        slope = linearised.pull(linearised.flat)
-        return norm(linearised.push(slope / (norm(slope) or 1.0))) ** 2
+        linearised = trials.linearised(state.trial)
+        if not state.unit:
+            size = self.largest(linearised)
+            unit = safe_unit(size)
+            state = state._replace(unit=unit, damping=self.damping * (size / unit) ** 2 or 1.0)
+        return self.damped(state, linearised, trials, "no damping gives a lower point")
 
 
 class HalfInverse(GaussNewton):
@@ -132,6 +195,8 @@ class HalfInverse(GaussNewton):
     rate : float
     truncation, rank, apart
         As for dp.update_direction.
+    absolute_sigma
+        As for gauss_newton.
     form : "auto", "dense" or "krylov"
         How the direction is found.
 
@@ -142,14 +207,18 @@ class HalfInverse(GaussNewton):
 
     searches = False
 
-    def __init__(self, rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto"):
+    def __init__(
+        self, rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto", absolute_sigma=False
+    ):
         check_number("rate of half_inverse", rate, "> 0", "; the default is 1")
-        super().__init__(apart, form_of(form))
+        super().__init__(apart, form_of(form), absolute_sigma)
         self.rate, self._family = rate, Family(power, 0.0, truncation, rank)
 
     def advance(self, state, trials):
         """One iteration, on the batch of the present one."""
-        linearised = trials.linearised(state.trial)
-        step = -self.rate * self._family(linearised, linearised.flat).step
+        linearised = trials.linearised(state.trial).among(trials.free(state.trial))
+        # Residuals and J divided by s give a direction divided by s^(2 - 2 power).
+        scale = trials.residual_scale ** (2.0 - 2.0 * self._family.power)
+        step = -self.rate * scale * self._family(linearised, linearised.flat).step
         trial, _, larger = admissible(state.trial.vector, step, state.share, trials)
         return SquaresState(trial, share=larger)

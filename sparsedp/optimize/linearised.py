@@ -19,6 +19,10 @@ DENSE, DENSE_SIDE = 3e7, 4000  # entries of a Jacobian (240 MB), and its shorter
 MOST = 4000  # unknowns of which the covariance is found, 128 MB
 GRADE = 1e-4  # singular values below this share of the largest wait for a Gram matrix of their own
 
+NOT_FORMED = (
+    "{}; the product of its inverse with v is dp.vjp(residuals, x)[1](dp.jvp(residuals, x, v)[1]), and "
+    "scipy.sparse.linalg.cg finds columns of it"
+)
 NOT_APART = (
     "with apart=True every leaf of x gets a leading axis of {} copies, one for each sample, and the outputs do not "
     "follow them; let the function broadcast over it"
@@ -44,8 +48,12 @@ class Linearised:
 
     Attributes
     ----------
-    value, flat : array
-        The outputs, and the same as m doubles.
+    value : array
+        The outputs.
+    flat : (m,) array
+        The outputs divided by `scale`. J, and the products with it, are those of these m numbers.
+    scale : float
+        A power of two, 1 at first: see `rescaled`.
     shape : (m, n)
     dense : bool
         Whether J is formed.
@@ -60,7 +68,7 @@ class Linearised:
 
     def __init__(self, outputs, packing, vector, rest=(), apart=False, dense=None):
         self._outputs, self._packing, self._apart = lambda x: outputs(x, *rest), packing, apart
-        self._tree, self._free = packing.unpack(vector), True
+        self._tree, self._free, self.scale = packing.unpack(vector), True, 1.0
         # With samples a product with J^T is sure to come.
         self.value = self._taped[0] if apart else np.asarray(self._outputs(packing.unpack(vector)))
         if np.ndim(self.value) == 0:
@@ -79,27 +87,32 @@ class Linearised:
         return pullback(self._outputs, self._tree)
 
     def among(self, free):
-        """The same where the unknowns that are not free stand still: their columns of J are 0.
-
-        A step that counts on unknowns which a bound then holds back is no descent for the others.
-        """
+        """Return the same with columns of J set to 0 where the unknowns are not free."""
+        if free.all():
+            return self
         other = copy(self)
         other._free = free
-        return self if free.all() else other
+        return other
+
+    def rescaled(self, scale):
+        """Return the same with the outputs, and so J, divided by a power of two. To be called before J is formed."""
+        other = copy(self)
+        other.scale, other.flat = scale, self.flat / scale
+        return other
 
     def pull(self, w):
         """(m,) -> J^T w, (n,). Columns that are formed anyway spare the tape."""
         if self.dense and self._forward:
             return w @ self.rows()
         g = w.reshape(self.value.shape).astype(self.value.dtype)
-        return self._free * self._packing.pack_gradient(self._taped[1](g))
+        return self._free * (self._packing.pack_gradient(self._taped[1](g)) / self.scale)
 
     def push(self, v):
         """(n,) -> J v, (m,)."""
         if "_jacobian" in vars(self):
             return self._jacobian @ (self._free * v)
         tangents = [leaf if is_variable(leaf) else None for leaf in leaves(self._packing.unpack(self._free * v))]
-        return push(self._outputs, self._tree, tangents)[1].reshape(-1).astype(float)
+        return push(self._outputs, self._tree, tangents)[1].reshape(-1).astype(float) / self.scale
 
     def rows(self):
         """J, m x n."""
@@ -115,21 +128,41 @@ class Linearised:
             return np.array([self.push(unit) for unit in np.eye(columns)]).reshape(columns, rows).T
         return np.array([self.pull(unit) for unit in np.eye(rows)]).reshape(self.shape)
 
-    def covariance(self):
-        """s^2 (J^T J)^(-1), n x n, with s^2 = |outputs|^2 / (m - n); infinite where J has not the rank n.
+    def covariance(self, absolute_sigma):
+        """Return the covariance of the n unknowns as an n x n array, or a sentence that says why it is not formed.
 
-        None where J is not formed, m <= n or n is large.
+        (J^T J)^(-1) with absolute_sigma, else s^2 (J^T J)^(-1) with s^2 = |outputs|^2 / (m - n). Infinite where J has
+        a rank below n.
         """
         rows, columns = self.shape
-        if not self.dense or rows <= columns or columns > MOST:
-            return None
+        if columns > MOST:
+            return NOT_FORMED.format(f"there are {columns} unknowns, and it is formed for up to {MOST}")
+        if not self.dense:
+            reason = "the Jacobian is not formed (dense=False, or it is large)"
+            return NOT_FORMED.format(reason) + "; dense=True forms it"
+        if rows <= columns and not absolute_sigma:
+            return (
+                f"{rows} residuals of {columns} unknowns leave none to estimate their variance from; write "
+                "absolute_sigma=True where the residuals have variance 1"
+            )
         jacobian = self.rows()
-        sizes = np.linalg.norm(jacobian, axis=0)  # in units of its columns no unknown is small beside another
-        vectors, s = singular((jacobian / np.where(sizes > 0, sizes, 1.0)).T)
+        largest_entries = np.max(np.abs(jacobian), axis=0, initial=0.0)
+        largest_entries[largest_entries == 0] = 1.0
+        # In units of the norms of its columns no unknown is small beside another.
+        sizes = largest_entries * np.linalg.norm(jacobian / largest_entries, axis=0)
+        if rows < columns or not np.all(sizes > 0):
+            return np.full((columns, columns), np.inf)
+        vectors, s = singular((jacobian / sizes).T)
         if not s[-1] > rows * EPS * s[0]:
             return np.full((columns, columns), np.inf)
-        inverse = vectors / s / sizes[:, None]
-        return float(np.dot(self.flat, self.flat)) / (rows - columns) * (inverse @ inverse.T)
+        inverse = vectors / s
+        if absolute_sigma:
+            spread = 1 / self.scale
+        else:
+            spread = np.linalg.norm(self.flat) / np.sqrt(rows - columns)
+        inverse = inverse * spread / sizes[:, None]
+        with np.errstate(over="ignore"):  # the square of a large x may be infinite
+            return inverse @ inverse.T
 
     def _rows_apart(self):
         samples = len(self.value)
@@ -145,7 +178,7 @@ class Linearised:
             one_each = np.broadcast_to(unit, (samples, width)).reshape(value.shape)
             slopes = [np.reshape(slope, (samples, -1)) for slope in leaves(pull(one_each)) if slope is not None]
             np.concatenate(slopes, axis=1, out=jacobian[:, column])
-        jacobian = jacobian.reshape(self.shape)
+        jacobian = jacobian.reshape(self.shape) / self.scale
         # A function that looks at one copy alone gives outputs of the right shape and wrong rows.
         probe = np.cos(np.arange(self.shape[0]))
         by_rows, by_tape = self._free * (probe @ jacobian), self.pull(probe)

@@ -11,18 +11,20 @@ from sparsedp.optimize.first_order import Adam, Descent
 from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
 from sparsedp.optimize.newton import NewtonCG
 from sparsedp.optimize.physical import PhysicalGradient
+from sparsedp.optimize.projection import Projection
 from sparsedp.optimize.quasi_newton import Quasi
-from sparsedp.optimize.result import Stuck
+from sparsedp.optimize.result import NO_RESIDUALS, Stuck
 from sparsedp.optimize.sparse_terms import admm
 from sparsedp.optimize.trials import Trials
 from sparsedp.optimize.watch import Watch
 from sparsedp.packing import Packing
 from sparsedp.progress import shown_steps
 from sparsedp.shortcuts import ELSEWHERE, together
-from sparsedp.tree import flatten, leaves, paired
+from sparsedp.tree import leaves
 
 __all__ = ["minimize"]
 
+INTERRUPTED = "minimize was interrupted; call it once more, with start=best.x"
 METHODS = {
     "lbfgs": Quasi,
     "gd": Descent,
@@ -101,8 +103,9 @@ def minimize(
         entries of dicts are paired by key. Points are moved onto the box. half_inverse compares
         no losses and may settle elsewhere on the box than the others.
     project : callable, optional
-        ``project(x)``, a linear projection such as dp.projection(grid): the loss sees project(x), and so does the
-        result. Differentiable.
+        ``project(x)``, a differentiable projection onto a linear or affine space, such as dp.projection(grid): the
+        loss is that of project(x), and the result is project(x). The map is tested at the start and at the result:
+        one that is not affine, as np.clip, or not idempotent is refused. Not together with bounds.
     batches : sequence or callable, optional
         The loss of iteration i is ``loss(x, batches[i % len(batches)])``, or ``loss(x, batches(i))``. For gd with a
         rate, adam and half_inverse; the result is the last point, not the best one.
@@ -112,10 +115,12 @@ def minimize(
     **options
         lbfgs: memory=10, line_search=20. gd: rate=None (found by backtracking), momentum=0.0,
         line_search=None or "backtracking". adam: rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8. newton_cg: inner=200.
-        gauss_newton: apart=False, dense=None. levenberg_marquardt: damping=1e-3, apart, dense.
-        half_inverse: rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto" (J is formed where
-        it is small). physical_gradient: physics, inverse, rate=1.0. apart=True, the fast way for samples: residuals
-        along axis 0 are samples, and the loss takes every leaf of x with a leading axis of copies, one for each (a few
+        gauss_newton: apart=False, dense=None, absolute_sigma=False. levenberg_marquardt: damping=1e-3, apart, dense,
+        absolute_sigma. half_inverse: rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto" (J is
+        formed where it is small), absolute_sigma. absolute_sigma: whether the residuals are divided by their standard
+        deviations; it decides what `covariance` is, as in scipy.optimize.curve_fit. physical_gradient: physics,
+        inverse, rate=1.0. apart=True, the fast way for samples: residuals along axis 0 are samples, and the loss takes
+        every leaf of x with a leading axis of copies, one for each (a few
         products give the whole Jacobian).
         dense: whether the Jacobian is formed; None: when it is small. truncation, rank: see `update_direction`.
         admm: weight (of the sum over entries, not of an integral: few jumps on a uniform grid are asked for by
@@ -129,7 +134,8 @@ def minimize(
     -------
     Minimum
         `.x`, `.value`, `.history` (a record for each iteration), `.message`, `.converged`,
-        `.evaluations`; str() is a table. `.x` is the best point seen. `.covariance` of a least-squares problem.
+        `.evaluations`; str() is a table. `.x` is the best point seen. `.covariance` of a least-squares problem:
+        s^2 (J^T J)^(-1) with s^2 = |r|^2 / (m - n), or (J^T J)^(-1) with absolute_sigma=True.
         Ctrl-C ends the run with the best point so far and the message "interrupted"; a second one stops at once.
 
     Raises
@@ -187,16 +193,24 @@ def minimize(
     packing, batches = Packing(start, "start"), Batches(batches)
     if batches.varied and stepper.searches:
         raise ValueError(f"{method} compares losses and cannot use batches; write method='adam', or give gd a rate")
-    for inner in (getattr(stepper, "rule", None), project):
-        if inner is not None:
-            loss = _composed(loss, inner)
+    if getattr(stepper, "rule", None) is not None:
+        loss = _composed(loss, stepper.rule)
     box = Box(bounds, packing)
+    if project is not None:
+        if box.bounded:
+            raise ValueError(
+                "project and bounds cannot be used together: a projected point may be outside of the bounds; leave one "
+                "of them out"
+            )
+        project = Projection(project, packing, start)
+        loss, gradient = project.loss(loss), gradient and project.gradient(gradient)
     trials = Trials(loss, gradient, packing, box, batches, stepper if stepper.residuals else None)
     settings = {
         "method": method, "set of options": sorted(options.items()), "pair of bounds": (box.lower, box.upper),
         "start": start,
     }  # fmt: skip
-    kept, covariance = Checkpoint(checkpoint, settings), None
+    kept = Checkpoint(checkpoint, settings)
+    covariance = INTERRUPTED if stepper.residuals else NO_RESIDUALS
     watch = Watch(trials, packing, tolerance, callback)
     steps = shown_steps(progress, range(maxiter), "minimize")
     try:
@@ -211,9 +225,8 @@ def minimize(
         kept.write(watch.history)
     x = packing.unpack(trials.best.vector)
     if project is not None:
-        entries = paired(project(x), x, "project(x)", advice="; return a tree like start", shapes=True)
-        x = flatten(x)[1](entries)
-    return watch.minimum(x, method, resumed=kept.resumed, covariance=covariance)
+        x = project.result(trials.best.vector)
+    return watch.minimum(x, method, resumed=kept.resumed, _covariance=covariance)
 
 
 def _run(stepper, trials, watch, kept, start, steps):

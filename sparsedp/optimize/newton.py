@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.fields import check_whole
+from sparsedp.optimize.first_order import first_length
 from sparsedp.optimize.result import Trial
 from sparsedp.tree import norm, power_of_two
 
@@ -15,11 +16,16 @@ SHRINKS = 60
 
 
 class NewtonState(NamedTuple):
-    """State of newton_cg: the point, the radius of the trust region (0: not known), the first gradient's norm."""
+    """State of newton_cg: the point, the radius of the trust region (0: not known), the first gradient's norm.
+
+    Steps and the radius are in units of `length`, a power of two near |x| at the start, and gradients in units of a
+    power of two of their own: no product of two of them leaves the range of floating-point numbers.
+    """
 
     trial: Trial
     radius: float
     size: float
+    length: float
 
 
 class NewtonCG:
@@ -43,7 +49,8 @@ class NewtonCG:
 
     def begin(self, first):
         """State at the start."""
-        return NewtonState(first, 0.0, norm(first.slope))
+        length = power_of_two(norm(first.vector) or first_length(first))
+        return NewtonState(first, 0.0, norm(first.slope), length)
 
     def advance(self, state, trials):
         """One iteration: smaller regions until the loss falls. Raises Stuck when none is small enough."""
@@ -52,11 +59,15 @@ class NewtonCG:
         slope = trials.downhill(here) / height  # of size 1, about
         forcing = min(0.1, np.sqrt(norm(here.slope) / (state.size or 1.0)))
 
+        def scaled_product(direction):
+            return product(state.length * direction) / height
+
         def regions():
             radius = state.radius or np.inf
             for _ in range(SHRINKS):
-                step, fall, edge = steihaug(slope, lambda d: product(d) / height, radius, forcing, self.inner)
-                yield trials.box.inside(here.vector + step), fall * height, (radius, norm(step), edge)
+                step, fall, edge = steihaug(slope, scaled_product, radius, forcing, self.inner)
+                point = trials.box.inside(here.vector + state.length * step)
+                yield point, fall * height * state.length, (radius, norm(step), edge)
                 radius = norm(step) / 4
 
         trial, gain, (radius, length, edge) = trials.lower(here, regions(), "no trust region gives a lower point")

@@ -9,6 +9,7 @@ from sparsedp.recipe import Frozen
 
 __all__ = ["Failure", "Minimum", "Record", "Stuck", "Trial"]
 
+NO_RESIDUALS = "it is that of least-squares problems; give minimize the residuals and method='levenberg_marquardt'"
 SHOWN = 6  # lines of the history at each end
 
 
@@ -44,6 +45,8 @@ class Failure(NamedTuple):
 class Record(NamedTuple):
     """One iteration; number 0 is the start.
 
+    `gradient_norm` is that of the gradient; with bounds of the projected gradient, which is 0 in entries that bounds
+    hold. It and `value` are infinite or 0 where they leave the range of floating-point numbers.
     `seconds`, `evaluations` and `solves` (forward and adjoint, of every inverse, in this thread) count from the start
     of the run; `failed` lists the trial points that the loss refused in this iteration, as (error, message).
     """
@@ -81,10 +84,16 @@ class Minimum(Frozen):
         Evaluations of loss and gradient, refused ones included.
     resumed : str
         What was found in the checkpoint folder; empty without one.
-    covariance : (n, n) array or None
-        Of the n unknowns of a least-squares problem, in the order of the leaves of x: s^2 (J^T J)^(-1) with
-        s^2 = |r|^2 / (m - n) for m residuals r. Infinite where J has not the rank n; bounds are not looked at. None
-        for other methods, with batches, where J is not formed, and when m <= n or n > 4000.
+    covariance : (n, n) array
+        Of the n unknowns of a least-squares problem, in the order of the leaves of x. Of m residuals r with the
+        Jacobian J at x it is
+
+            s^2 (J^T J)^(-1)  with  s^2 = |r|^2 / (m - n),    or  (J^T J)^(-1)  with absolute_sigma=True.
+
+        The first form estimates the variance of the data from the residuals; the second takes residuals that were
+        divided by known standard deviations, and is the posterior covariance for a flat prior. Infinite where J has
+        a rank below n; bounds are ignored. Access raises ValueError where it is not known, and says what to write:
+        for other methods, with batches, where J is not formed, when n > 4000, and when m <= n without absolute_sigma.
     """
 
     x: Any
@@ -95,7 +104,7 @@ class Minimum(Frozen):
     converged: bool
     evaluations: int
     resumed: str = ""
-    covariance: Any = None
+    _covariance: Any = NO_RESIDUALS  # the array, or why there is none
     meant = {
         "fun": "best.value",
         "point": "best.x",
@@ -104,6 +113,13 @@ class Minimum(Frozen):
         "success": "best.converged",
         "status": "best.message",
     }
+
+    @property
+    def covariance(self):
+        """The covariance of the unknowns."""
+        if isinstance(self._covariance, str):
+            raise ValueError(f"the covariance is not known: {self._covariance}")
+        return self._covariance
 
     def __str__(self):
         last = self.history[-1]

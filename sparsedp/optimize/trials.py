@@ -5,12 +5,14 @@ import numpy as np
 from sparsedp.derivative import check_loss, judged, pullback, unwarned, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.optimize.linearised import Linearised
-from sparsedp.optimize.result import Failure, Stuck, Trial
+from sparsedp.optimize.result import NO_RESIDUALS, Failure, Stuck, Trial
 from sparsedp.solvers.cache import Cache
+from sparsedp.tree import norm, safe_unit
 
 __all__ = ["Trials"]
 
 ENOUGH = 1e-4  # share of the predicted fall that is asked for (Armijo)
+SMALLEST = 5e-324  # float: no loss changes by less
 REFUSED = (UnstableStepError, ConvergenceError, NonFiniteError)
 
 
@@ -28,8 +30,9 @@ class Trials:
     batches : Batches
         What the loss is given after x.
     squares : method of least squares, or None
-        With one, the loss returns residuals r, and what falls is |r|^2 / 2; its `apart` and `dense` say how their
-        Jacobian is found.
+        With one, the loss returns residuals r, and what falls is |r / s|^2 / 2 with a power of two s, so that small
+        residuals do not underflow when they are squared, nor large ones overflow; its `apart` and `dense` say how
+        their Jacobian is found.
 
     Attributes
     ----------
@@ -45,6 +48,7 @@ class Trials:
     def __init__(self, loss, gradient, packing, box, batches, squares=None):
         self._loss, self._gradient, self._packing = loss, gradient, packing
         self._squares, self._linearised = squares, Cache(1)
+        self._residual_scale = None  # known from the first residuals on
         self.box, self.batches, self.iteration = box, batches, 0
         self.count, self.failures = 0, []
 
@@ -99,28 +103,41 @@ class Trials:
         hopeless = falls[0] <= 100 * here.rounding and not self.failures
         raise Stuck("rounding" if hopeless else unless)
 
+    def seen_to_fall(self, here, step):
+        """Return whether the gradient predicts that the loss falls along a step by far more than its rounding."""
+        return -float(np.dot(here.slope, step)) > 2000 * here.rounding
+
     def _evaluate(self, vector, below=np.inf):
         self.count += 1
         value, slope = self._both(vector) if self._squares is None else self._summed(vector, below)
         if not np.isfinite(value):
             raise NonFiniteError(f"the loss is {value}; it must be finite at the start, and elsewhere it is avoided")
         rounded = self._packing.pack(self._packing.unpack(vector))  # single-precision leaves round
-        return Trial(rounded, value, slope, self._packing.eps * abs(value), self.iteration)
+        return Trial(rounded, value, slope, max(self._packing.eps * abs(value), SMALLEST), self.iteration)
 
     def _summed(self, vector, below):
-        """Half the sum of squares of the residuals, and its gradient J^T r."""
+        """Return half the sum of squares of the scaled residuals, and its gradient J^T r."""
         here = self._linearise(vector, self.iteration)
         with np.errstate(over="ignore"):  # infinity is refused
             value = 0.5 * float(np.dot(here.flat, here.flat))
         return value, here.pull(here.flat) if value < below else None
 
+    def as_given(self, number):
+        """Return a loss, or the norm of a gradient, in the units of the user's loss: trials have scaled residuals."""
+        scale = self._residual_scale or 1.0
+        return number * scale * scale
+
     def _linearise(self, vector, iteration):
         """The residuals and their Jacobian at a point, on the batch of an iteration; kept for the last point."""
         batch, squares = self.batches.at(iteration), self._squares
         key = vector, iteration if batch else 0
-        return self._linearised.find(key) or self._linearised.put(
-            key, Linearised(self._loss, self._packing, vector, batch, squares.apart, squares.dense)
-        )
+        known = self._linearised.find(key)
+        if known:
+            return known
+        linearised = Linearised(self._loss, self._packing, vector, batch, squares.apart, squares.dense)
+        if self._residual_scale is None:
+            self._residual_scale = safe_unit(norm(linearised.flat))
+        return self._linearised.put(key, linearised.rescaled(self._residual_scale))
 
     def _both(self, vector):
         """Loss and flat gradient, each from a fresh tree."""
@@ -143,14 +160,21 @@ class Trials:
             raise
 
     def linearised(self, trial):
-        """The residuals at a point and their Jacobian in what the bounds leave free, on the batch that saw it."""
-        return self._linearise(trial.vector, trial.iteration).among(self.free(trial))
+        """Return the residuals at a point and their Jacobian, on the batch that saw it."""
+        return self._linearise(trial.vector, trial.iteration)
+
+    @property
+    def residual_scale(self):
+        """The power of two that the residuals are divided by."""
+        return self._residual_scale
 
     def covariance(self, trial):
-        """That of the unknowns of a least-squares problem at a point; None where its Jacobian is not formed."""
-        if self._squares is None or self.batches.varied:
-            return None
-        return self._linearise(trial.vector, trial.iteration).covariance()
+        """Return the covariance at a point as an array, or a sentence that says why there is none."""
+        if self._squares is None:
+            return NO_RESIDUALS
+        if self.batches.varied:
+            return "no batch holds all residuals; call minimize without batches"
+        return self._linearise(trial.vector, trial.iteration).covariance(self._squares.absolute_sigma)
 
     def curvature(self, trial):
         """Function from a flat vector to the Hessian times it, in what the bounds leave free at a point.

@@ -1,0 +1,120 @@
+"""minimize at every magnitude of the loss, the residuals and x, and near kinks: what is called converged is."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+MATRIX = np.array([[2.0, 0.3, 0.0], [0.1, 1.5, 0.2], [0.0, 0.4, 1.0], [0.5, 0.5, 0.5]])
+DATA = np.array([1.0, 2.0, 3.0, 4.0])
+EXPONENTS = [-1000, -550, -520, -300, 300, 520, 550, 1000]
+SQUARES = [
+    ("gauss_newton", {}),
+    ("gauss_newton", {"dense": False}),
+    ("levenberg_marquardt", {}),
+    ("levenberg_marquardt", {"dense": False}),
+]
+
+
+def residuals(x):
+    return anp.concatenate([anp.dot(MATRIX, x) - DATA, 0.3 * (x[1:] - x[:-1] ** 2)])
+
+
+def loss(x):
+    return 0.5 * anp.sum(residuals(x) ** 2)
+
+
+@pytest.mark.parametrize("method, options", SQUARES)
+@pytest.mark.parametrize("bounds", [None, (-1.0, 1.0)])
+def test_residuals_of_any_magnitude(method, options, bounds):
+    """Their squares underflow below 1e-162: the start was called converged, since the gradient was 0."""
+    start = np.array([0.1, 0.0, -0.2])
+    known = dp.minimize(residuals, start, method, bounds=bounds, **options)
+    assert known.converged
+    for exponent in EXPONENTS:
+        factor = 2.0**exponent
+        best = dp.minimize(lambda x, factor=factor: factor * residuals(x), start, method, bounds=bounds, **options)
+        assert best.converged and np.allclose(best.x, known.x, atol=1e-7)
+        assert len(best.history) == len(known.history)
+        with np.errstate(over="ignore"):
+            assert best.value == pytest.approx(np.float64(known.value) * factor * factor, rel=1e-6)
+
+
+@pytest.mark.parametrize("method, options", [*SQUARES, ("lbfgs", {}), ("gd", {}), ("gd", {"momentum": 0.5}),
+                                             ("newton_cg", {})])  # fmt: skip
+@pytest.mark.parametrize("bounds", [None, 1.0])
+def test_unknowns_of_any_magnitude(method, options, bounds):
+    """Also those whose quotients by the gradient, or whose squared Jacobian, are beyond the range of floats."""
+    misfit = residuals if "dense" in options or method in ("gauss_newton", "levenberg_marquardt") else loss
+
+    def run(size):
+        return dp.minimize(
+            lambda x: misfit(x / size), size * np.array([0.1, 0.0, -0.2]), method,
+            bounds=bounds and (-bounds * size, bounds * size), maxiter=300, **options,
+        )  # fmt: skip
+
+    known = run(1.0)
+    assert known.converged
+    for exponent in (-1000, -700, 550, 700, 1000):
+        best = run(2.0**exponent)
+        assert best.converged and np.allclose(best.x / 2.0**exponent, known.x, atol=1e-6)
+
+
+@pytest.mark.parametrize("exponent", [-1000, 1000])
+@pytest.mark.parametrize("method, options", [("gd", {}), ("newton_cg", {}), ("lbfgs", {}), ("adam", {"rate": 0.05})])
+def test_losses_of_any_magnitude(method, options, exponent):
+    factor, start = 2.0**exponent, np.array([0.1, 0.0, -0.2])
+    known = dp.minimize(loss, start, method, maxiter=60, **options)
+    best = dp.minimize(lambda x: factor * loss(x), start, method, maxiter=60, **options)
+    assert np.allclose(best.x, known.x, rtol=1e-9) and best.converged == known.converged
+
+
+@pytest.mark.parametrize("exponent", [-1000, -550, 550])
+def test_half_inverse_depends_on_the_scale_and_claims_nothing(exponent):
+    """Its steps have the square root of the scale of the residuals; a point far from the minimum is not converged."""
+    with np.errstate(over="ignore"):
+        best = dp.minimize(lambda x: 2.0**exponent * residuals(x), np.zeros(3), "half_inverse", maxiter=5)
+    assert not best.converged
+
+
+def test_half_inverse_takes_the_same_steps_beyond_the_range_of_squares():
+    """The direction is the residuals' scale to the power 1/2 times that of residuals near 1."""
+    unit, rate = 2.0**-600, 0.25
+    best = dp.minimize(residuals, np.zeros(3), "half_inverse", rate=rate, maxiter=3)
+    scaled = dp.minimize(
+        lambda x: unit * residuals(x), np.zeros(3), "half_inverse", rate=rate / np.sqrt(unit), maxiter=3
+    )
+    assert np.allclose(scaled.x, best.x, rtol=1e-12)
+
+
+@pytest.mark.parametrize("bounds", [None, (-0.3, 0.5)])
+@pytest.mark.parametrize("method", ["gd", "newton_cg"])
+def test_a_kink_is_no_rounding(method, bounds, rng):
+    """Steps became so short that no change of the loss was seen, far from the minimum."""
+    matrix, data = rng.normal(size=(8, 5)), rng.normal(size=8)
+    matrix[0] *= 30
+    kinked = lambda x: anp.sum(anp.abs(anp.dot(matrix, x) - data)) + 0.5 * anp.sum(x**2)
+    best = dp.minimize(kinked, np.zeros(5), method, maxiter=500, bounds=bounds)
+    assert not best.converged
+    assert "changes the loss by less than its rounding, but the gradient is" in best.message
+
+
+@pytest.mark.parametrize("method", ["gd", "newton_cg", "levenberg_marquardt"])
+def test_a_second_run_from_the_minimum_is_converged(method):
+    squares = method == "levenberg_marquardt"
+    run = lambda start: dp.minimize(residuals if squares else loss, start, method, maxiter=500, tolerance=1e-10)
+    again = run(run(np.zeros(3)).x)
+    assert again.converged
+
+
+def test_the_message_names_the_projected_gradient_where_there_are_bounds():
+    corner = dp.minimize(lambda x: anp.sum(x), np.array([0.3, 0.9]), bounds=(0.1, 1.0))
+    assert corner.message == "converged: the projected gradient is 0"
+    assert dp.minimize(lambda x: anp.sum(x**2), np.zeros(2)).message == "converged: the gradient is 0"
+
+
+def test_the_hint_of_least_squares_sums_the_residuals():
+    wrong = dp.differentiable("wrong", lambda x: 1.0 * x, lambda nums, ans, x: lambda g: (-g,))
+    best = dp.minimize(lambda x: wrong(x) - 2.0, np.zeros(2), "gauss_newton")
+    assert not best.converged and "with loss = lambda x: np.sum(residuals(x) ** 2), dp.check" in best.message
