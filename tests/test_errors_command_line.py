@@ -221,6 +221,7 @@ ENDS = {
     "sys.exit('all is well')": "SystemExit: all is well",
     "exit(0)": "SystemExit: 0",
     "quit()": "SystemExit: None",
+    "os._exit(0)": "SystemExit: os._exit(0)",
     "raise GeneratorExit": "GeneratorExit: ",
     "raise asyncio.CancelledError('late')": "CancelledError: late",
     "raise Odd(0)": "Odd: 0",
@@ -236,7 +237,7 @@ ERRORS = {
     "raise Exception('odd')": "Exception: odd",
 }
 ENDING = """
-import asyncio, sys
+import asyncio, os, sys
 import autograd.numpy as np
 class Odd(BaseException): pass
 start, calls = np.linspace(0.5, 1.5, 4), []
@@ -294,12 +295,39 @@ def test_a_loss_that_raises_is_no_verdict(ending, capsys, end, after):
         assert place in text and ERRORS[end].strip() in text
 
 
-def test_an_exit_as_a_command(ending, tmp_path):
-    ending("sys.exit(0)")
+@pytest.mark.parametrize("end", ["sys.exit(0)", "os._exit(0)"])
+def test_an_exit_as_a_command(ending, tmp_path, end):
+    ending(end)
     arguments = [sys.executable, "-m", "sparsedp", "report", "ends.py"]
     options = {"env": {**os.environ, "PYTHONPATH": str(ROOT)}, "capture_output": True, "text": True, "check": False}
     done = subprocess.run(arguments, cwd=tmp_path, **options)
-    assert done.returncode == 2 and done.stdout == "" and "cannot be audited: SystemExit: 0" in done.stderr
+    assert done.returncode == 2 and done.stdout == "" and f"cannot be audited: {ENDS[end]}" in done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes do not fork here")
+def test_a_child_process_may_end_as_it_likes(ending, capsys):
+    """As those of multiprocessing do."""
+    ending(
+        top="if not (child := os.fork()): os._exit(7)\nassert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7"
+    )
+    end = os._exit
+    assert main(["check", "ends.py"]) == 0
+    assert os._exit is end and "verdict: agrees" in capsys.readouterr().out
+
+
+def test_a_wrong_gradient_behind_a_rollout_is_a_verdict(tmp_path, capsys):
+    """Exit code 1 of both commands; the search for the culprit raises nothing."""
+    (tmp_path / "run.py").write_text(
+        "import autograd.numpy as np\nimport sparsedp as dp\nx = np.linspace(1.0, 2.0, 4)\n"
+        "cube = dp.differentiable('cube', lambda u: u**3, lambda nums, ans, u: lambda g: (3.003 * u**2 * g,))\n"
+        "stress_options = {'only': ['as given']}\n"
+        "def loss(u):\n    return np.sum(cube(dp.rollout(lambda v, p: 0.9 * v, u, None, 3)))\n",
+        encoding="utf-8",
+    )
+    assert main(["check", str(tmp_path / "run.py"), "--quick"]) == 1
+    assert "culprit: cube, its VJP is off by" in capsys.readouterr().out
+    assert main(["report", str(tmp_path / "run.py"), "--out", str(tmp_path / "out")]) == 1
+    assert "culprit: cube" in (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
 
 
 # ---- Ctrl-C, and names that are too long ---------------------------------------------------------------------------

@@ -90,7 +90,7 @@ def audited(name="", file=""):
     name: of its loss. file: it is the file itself that runs.
     """
     try:
-        with contextlib.redirect_stdout(sys.stderr):
+        with contextlib.redirect_stdout(sys.stderr), _exit_is_an_error():
             yield
     except KeyboardInterrupt:
         raise
@@ -100,6 +100,26 @@ def audited(name="", file=""):
         if file:
             raise ValueError(f"{file} does not run: {reason}") from error
         raise ValueError(f"{name} cannot be audited: {reason}") from error
+
+
+@contextlib.contextmanager
+def _exit_is_an_error():
+    """Within the block ``os._exit(0)`` raises SystemExit: the code of the user must not choose the exit code.
+
+    Child processes, which end this way, are left alone.
+    """
+    end, process = os._exit, os.getpid()
+
+    def refused(status):
+        if os.getpid() != process:
+            end(status)
+        raise SystemExit(f"os._exit({status})")
+
+    os._exit = refused
+    try:
+        yield
+    finally:
+        os._exit = end
 
 
 def _of_one(loss, x):
