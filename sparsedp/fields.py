@@ -36,6 +36,7 @@ __all__ = [
     "check_type",
     "check_whole",
     "field_array",
+    "hidden_leaves",
     "is_number",
     "is_whole",
     "number_beside",
@@ -146,35 +147,36 @@ def check_leaves(name, tree, containers=True):
     containers: refuse the latter. A dataclass is one, and a Mapping that is not a dict; their numbers would silently
     count as constants.
     """
-    entries = leaves(tree)
-    for number, leaf in enumerate(entries):
+    if type(tree) is np.ndarray:
+        check_precision(name, tree)
+        return
+    for number, leaf in enumerate(leaves(tree)):
         dtype = getattr(leaf, "dtype", None)
         if dtype is not None:
             if getattr(dtype, "kind", None) in ("f", "c") and dtype.char not in PRECISIONS:
                 check_precision(labels(tree, name)[number], leaf)
-        elif containers and type(leaf) not in PLAIN_LEAVES and _hides_numbers(leaf):
+        elif containers and type(leaf) not in PLAIN_LEAVES and any(map(_is_floating, hidden_leaves(leaf))):
             raise TypeError(
                 f"{labels(tree, name)[number]} is a {type(leaf).__name__}, which is not a tree: its numbers would have "
                 "no derivative; write a dict or a NamedTuple"
             )
 
 
-def _hides_numbers(value):
-    """Whether a value is a container that is not a tree and holds floating numbers."""
+def hidden_leaves(value):
+    """The leaves inside a container that is not a tree: a dataclass, or a Mapping that is not a dict."""
     if isinstance(value, Mapping):
-        return any(map(_is_floating_or_hides, value.values()))
-    if is_dataclass(value) and not isinstance(value, type):
-        return any(_is_floating_or_hides(getattr(value, field.name, None)) for field in fields(value))
-    return False
+        branches = list(value.values())
+    elif is_dataclass(value) and not isinstance(value, type):
+        branches = [getattr(value, field.name, None) for field in fields(value)]
+    else:
+        return []
+    entries = leaves(branches)
+    return entries + [leaf for entry in entries for leaf in hidden_leaves(entry)]
 
 
-def _is_floating_or_hides(branch):
-    """Whether a branch of such a container is floating, or is one itself."""
-    for leaf in leaves(branch):
-        kind = getattr(getattr(leaf, "dtype", None), "kind", None)
-        if kind in ("f", "c") or isinstance(leaf, (float, complex)) or _hides_numbers(leaf):
-            return True
-    return False
+def _is_floating(leaf):
+    """Whether a leaf is a floating number or array, traced or not."""
+    return isinstance(leaf, (float, complex)) or getattr(getattr(leaf, "dtype", None), "kind", None) in ("f", "c")
 
 
 def check_out(op, out, u, dtype, shape):

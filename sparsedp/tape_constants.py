@@ -59,7 +59,8 @@ def constant(value):
         return kind(map(constant, value))
     if isinstance(value, dict):  # it may have an order of its own, or a default
         held = copy(value)
-        held.update({name: constant(one) for name, one in value.items()})
+        for name, one in value.items():  # not by update: that of a Counter adds
+            held[name] = constant(one)
         return held
     return kind(*map(constant, value)) if isinstance(value, tuple) and hasattr(kind, "_fields") else value
 

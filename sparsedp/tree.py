@@ -33,9 +33,8 @@ __all__ = [
     "subscript",
 ]
 
+BRANCHES = tuple, list, dict  # types of what is not a leaf
 DEEPEST = 100  # containers in containers: recursions over deeper trees would leave Python's limit
-
-
 SMALL, LARGE = 2.0**-200, 2.0**200  # between these, products of four numbers and a few more are floats
 MOST_EXPONENT = 1023  # of a power of two that is a float
 
@@ -92,7 +91,7 @@ def mapped(function, tree, *others):
     >>> mapped(max, {"a": 1.0, "b": 5.0}, {"b": 3.0, "a": 2.0})
     {'a': 2.0, 'b': 5.0}
     """
-    if not isinstance(tree, (tuple, list, dict)):
+    if not isinstance(tree, BRANCHES):
         return function(tree, *others)
     return _build(tree, map(function, leaves(tree), *(paired(other, tree, "tree") for other in others)))
 
@@ -205,8 +204,12 @@ def _pair(tree, reference, shapes, prefix):
         raise _MismatchError(f"expected {described(reference)}, got {described(tree)}")
     entries = []
     for name, place in zip(names, _places(tree, reference)):
+        branch, wanted = tree[place], reference[name]
+        if not (shapes or isinstance(branch, BRANCHES) or isinstance(wanted, BRANCHES)):  # most often: quickly
+            entries.append(branch)
+            continue
         try:
-            entries += _pair(tree[place], reference[name], shapes, prefix)
+            entries += _pair(branch, wanted, shapes, prefix)
         except _MismatchError as mismatch:
             mismatch.subscripts.append(subscript(reference, name))
             raise
@@ -216,7 +219,8 @@ def _pair(tree, reference, shapes, prefix):
 def _places(tree, reference):
     """Where a branch holds the entries of a reference branch, in the order of the reference."""
     if isinstance(reference, dict):
-        _check_names("key", tree, reference)
+        if tree.keys() != reference.keys():
+            _check_names("key", tree, reference)
         return reference.keys()
     fields, others = getattr(tree, "_fields", None), getattr(reference, "_fields", None)
     if fields and others and fields != others:

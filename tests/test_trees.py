@@ -651,3 +651,35 @@ def test_whole_messages():
         dp.grad(lambda x: x["k"] ** 2)(MappingProxyType({"k": 2.0}))
     with pytest.raises(DerivativeError, match=r"gradient\['b'\]: expected numbers, got dtype object; return a tree"):
         dp.minimize(loss, START, gradient=lambda x: {"b": None, "a": 1.0})
+
+
+@pytest.mark.parametrize("kind", [lambda k: MappingProxyType({"k": k}), Settings])
+def test_containers_in_a_rollout(kind):
+    """As constants they are handed to the step; traced values inside would be lost."""
+
+    def step(u, p):
+        return u * p["c"]["k"]
+
+    assert dp.rollout(step, 8.0, {"c": kind(0.5)}, 3) == 1.0
+    assert dp.grad(lambda u: dp.rollout(step, u, {"c": kind(0.5)}, 3))(8.0) == 0.125
+    with pytest.raises(
+        DerivativeError,
+        match=r"params\['c'\] of rollout is a .* with a traced value, which is not a tree; "
+        "write a dict or a NamedTuple",
+    ):
+        dp.grad(lambda k: dp.rollout(step, 8.0, {"c": kind(k)}, 3))(0.5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_constants_in_subclasses_of_dict_keep_their_values(kind):
+    """The update of a Counter adds."""
+    params = KINDS[kind]({"k": 0.5, "m": np.full(2, 2.0)})
+
+    def step(u, p):
+        return p["k"] * p["m"] * u * u
+
+    assert dp.grad(lambda u: anp.sum(dp.rollout(step, u, params, 1)))(np.ones(2)).tolist() == [2.0, 2.0]
+    rule = dp.differentiable(
+        "scaled", lambda u, p: p["m"] * u, lambda nums, ans, u, p: lambda g: (p["m"] * g,) * len(nums)
+    )
+    assert dp.grad(lambda u: anp.sum(rule(u, params)))(np.ones(2)).tolist() == [2.0, 2.0]

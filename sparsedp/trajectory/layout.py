@@ -8,7 +8,7 @@ import numpy as np
 
 from sparsedp.derivative import is_finite
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_leaves, check_native
+from sparsedp.fields import check_finite, check_leaves, check_native, hidden_leaves
 from sparsedp.shortcuts import ELSEWHERE, array
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.tape_constants import constant
@@ -69,6 +69,12 @@ class Layout:
         check_native("rollout", *entries)
         self.open = _is_open(tree)
         check_leaves(root, tree, containers=False)
+        for number, leaf in enumerate(entries):
+            if any(map(isbox, hidden_leaves(leaf))):
+                raise DerivativeError(
+                    f"{labels(tree, root)[number]} of rollout is a {type(leaf).__name__} with a traced value, which is "
+                    "not a tree; write a dict or a NamedTuple"
+                )
         variables = [plain(entries[place]) for place in self.places]
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
         self.shapes = [np.shape(leaf) for leaf in variables]
