@@ -348,8 +348,8 @@ def test_a_large_coarsest_level_is_refused():
     op = -dp.laplacian(dp.Grid((60, 60)), dp.dirichlet)
     with pytest.raises(
         ConvergenceError,
-        match="multigrid on <-laplacian: .*> ends at a coarsest level of 3600 unknowns, after 1 of 1 levels; it may have "
-        "2000; write method='direct' or 'krylov', or raise levels",
+        match="multigrid on <-laplacian: .*> ends at a coarsest level of 3600 unknowns, after 1 of 1 levels; it may "
+        "have 2000; write method='direct' or 'krylov', or raise levels",
     ):
         dp.inverse(op, "multigrid", levels=1)
 
@@ -360,3 +360,61 @@ def test_auto_takes_lu_where_multigrid_does_not_coarsen(monkeypatch):
     op = dp.identity(ring.cells) + 0.01 * sum((dp.upwind(ring, axis) for axis in "yz"), dp.upwind(ring, "x"))
     inv = dp.inverse(op)
     assert inv.method == "direct" and "multigrid does not coarsen it" in inv.reason
+
+
+# ---------------------------------------------------------------- blocks
+
+
+def two_fields(shape, signs):
+    """Two fields in the same winds that react with each other: blocks of two unknowns."""
+    flow = sweep(shape, signs).matrix
+    one = sp.eye_array(flow.shape[0])
+    return sp.csr_array(sp.block_array([[flow + one, -0.5 * one], [-0.4 * one, flow + 2 * one]]))
+
+
+def lines(n):
+    """Rings of n cells, each of which reads the one before it."""
+    grid = dp.Grid((9, n), size=1.0, periodic=(False, True))
+    return (dp.upwind(grid, "x", 1, {"x": SIDES[1]}) + dp.upwind(grid, "y") + dp.identity(grid.cells)).matrix
+
+
+def between(rng):
+    """Two large cycles and a sweep between them."""
+    cycle = sp.csr_array(2 * np.eye(70) + 0.5 * np.roll(np.eye(70), 1, 0))
+    flow = sweep((6, 7), (1, -1)).matrix
+    into, out = (sp.random_array(shape, density=0.05, rng=rng) for shape in ((42, 70), (70, 42)))
+    return sp.csr_array(sp.block_array([[cycle, None, None], [into, flow, None], [None, out, cycle]]))
+
+
+@pytest.mark.parametrize("dtype", [float, complex])
+@pytest.mark.parametrize("kind", ["two fields", "rings", "sweep between cycles"])
+def test_blocks_are_factored_one_by_one(kind, dtype, rng):
+    """Nothing is filled in between them, forward and transposed, in any numbering."""
+    matrix = {"two fields": two_fields((9, 8), (1, -1)), "rings": lines(80), "sweep between cycles": between(rng)}[kind]
+    matrix = (matrix * (1 + 0.3j) if dtype is complex else matrix).tocsr()
+    order = rng.permutation(matrix.shape[0])
+    matrix, b = sp.csr_array(matrix[order][:, order]), rng.standard_normal(order.size).astype(dtype)
+    inv = dp.inverse(dp.from_matrix(matrix), "direct")
+    np.testing.assert_allclose(inv(b), np.linalg.solve(matrix.toarray(), b), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(inv.T(b), np.linalg.solve(matrix.toarray().T, b), rtol=1e-11, atol=1e-12)
+    blocks = {"two fields": "LU in block", "rings": "of 9 blocks", "sweep between cycles": "of 3 blocks"}[kind]
+    assert blocks in inv.info.hierarchy and "in block triangular order" in inv.info.hierarchy
+    entries = int(inv.info.hierarchy.split("order, ")[1].split(" entries")[0])
+    assert entries <= 3 * matrix.nnz
+
+
+def test_a_singular_block_is_refused(rng):
+    matrix = between(rng).tolil()
+    matrix[150, :], matrix[151, :] = matrix[152, :], matrix[152, :]
+    with pytest.raises(ConvergenceError, match="is singular and its null space is neither constant"):
+        dp.inverse(dp.from_matrix(matrix.tocsr()), "direct")
+
+
+def test_auto_takes_lu_for_many_small_blocks():
+    """The limits are about the largest block."""
+    matrix = two_fields((160, 161), (1, -1))
+    inv = dp.inverse(dp.from_matrix(matrix))
+    assert inv.method == "direct" and "51520 unknowns without a grid, in blocks of at most 2, one after" in inv.reason
+    x = np.cos(np.arange(51520.0))
+    np.testing.assert_allclose(inv(matrix @ x), x, atol=1e-10)
+    np.testing.assert_allclose(inv.T(matrix.T @ x), x, atol=1e-10)

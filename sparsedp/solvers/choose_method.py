@@ -311,8 +311,11 @@ def _chosen_by_entries(system, solves, dimension, others):
     """
     size, kind = system.unknowns, "coupled " if others else ""
     if system.complex:
-        if size <= COMPLEX_UP_TO[dimension]:
+        limit = COMPLEX_UP_TO[dimension]
+        if size <= limit:
             return "direct", "complex entries" + others, None
+        if _largest_factored(system) <= limit:
+            return "direct", f"complex entries{others}, in blocks of at most {_largest_factored(system)} unknowns", None
         engine = krylov_engine(system, preconditioner="shifted_laplace")
         where = _size_in_words(system, kind + "complex ", dimension) + others
         return "krylov", f"{where}: LU would not fit, GMRES and shifted Laplace do", engine
@@ -325,6 +328,12 @@ def _chosen_by_entries(system, solves, dimension, others):
     limit = DIRECT_UP_TO[solves][dimension]
     if size <= limit:
         return "direct", f"{where}; up to {limit}, for {solves} solves, kept LU factors are fastest", None
+    if (largest := _largest_factored(system)) <= limit:
+        return (
+            "direct",
+            f"{where}, in blocks of at most {largest}, one after the other; up to {limit}, LU is fastest",
+            None,
+        )
     where = f"{where}; {unsuited}; above {limit}, for {solves} solves, LU costs more"
     if not system.sign:
         return "direct", f"{where}; the diagonal has no single sign, which rules multigrid out", None
@@ -333,6 +342,16 @@ def _chosen_by_entries(system, solves, dimension, others):
     except ConvergenceError:
         return "direct", f"{where}; but multigrid does not coarsen it", None
     return "multigrid", f"{where}; the diagonal has one sign", engine
+
+
+def _largest_factored(system):
+    """The number of unknowns of the largest diagonal block of a block triangular matrix."""
+    if system.faces is not None:
+        return system.unknowns
+    from sparsedp.solvers.substitution import largest_block
+
+    largest, triangular = largest_block(system.matrix)
+    return largest if triangular else system.unknowns
 
 
 def _transforms(system, dimension):

@@ -1,7 +1,7 @@
 """Direct solves: factor once, keep the factors, solve with them and with their transpose.
 
 Dense LU up to 64 unknowns, sparse LU (SuperLU) otherwise: on a 1-D chain of 1000 it solves in 20 us, LAPACK for bands
-in 30. A singular system
+in 30. Of a block triangular matrix only the diagonal blocks are factored (see `BlockFactors`). A singular system
 is factored with one unknown of each component pinned. Rounding is left to the contract's refinement, that of factors
 in single precision too: they take half the memory, and a solve with them leaves a hundredth of the residual or less,
 next to an eigenvector more (see MOST_LEFT).
@@ -13,7 +13,7 @@ thread may be solving with the same factors.
 
 import numpy as np
 import scipy.linalg as la
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from sparsedp.errors import ConvergenceError
@@ -21,6 +21,7 @@ from sparsedp.fields import check_choice
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import exponent_of, in_range, largest, norm, shifted
 from sparsedp.solvers.solve import Engine, failure
+from sparsedp.solvers.substitution import BlockFactors
 from sparsedp.solvers.system import System
 from sparsedp.structure.base import probes
 
@@ -189,12 +190,17 @@ def _sparse(matrix, system, single):
     diagonal = matrix.diagonal()
     one_sided = np.all((diagonal * np.conj(np.sum(diagonal))).real > 0)  # of one sign; complex ones of one half plane
     options = dict(permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.001, options=dict(SymmetricMode=True))
+    symmetric_mode = one_sided and system.symmetric
     given, exponent, low = csc_array(matrix), 0, np.complex64 if system.complex else np.float32
     if single:
         exponent = exponent_of(largest(given.data))
         given = csc_array((shifted(given.data, -exponent).astype(low), given.indices, given.indptr), given.shape)
     try:
-        factors = splu(given, **(options if one_sided and system.symmetric else {}))
+        if not (single or symmetric_mode):
+            blocks = BlockFactors.of(csr_array(matrix))
+            if blocks is not None:
+                return blocks.solve, blocks.words
+        factors = splu(given, **(options if symmetric_mode else {}))
     except RuntimeError:  # exactly singular
         return (lambda b, transposed: np.full(b.shape, np.nan, matrix.dtype)), "sparse LU"
     except MemoryError:

@@ -34,8 +34,19 @@ from sparsedp.solvers.scaling import norm, shifted
 from sparsedp.solvers.solve import Engine, failure
 from sparsedp.structure.base import probes, rows_of
 
-__all__ = ["BlockTriangular", "Splitting", "Substitution", "extended_null_space", "split"]
+__all__ = [
+    "SMALL_BLOCK",
+    "BlockFactors",
+    "BlockTriangular",
+    "Splitting",
+    "Substitution",
+    "extended_null_space",
+    "largest_block",
+    "split",
+]
 
+SMALL_BLOCK = 64  # unknowns of a component up to which its factors may be full
+MOST_OF_ALL = 0.9  # share of the unknowns in one component, from which on block substitution saves nothing
 LARGEST_GROWTH = 2.0**49  # |A^-1| |A| beyond this leaves no correct digit in the solution
 
 
@@ -82,11 +93,11 @@ def split(matrix, active):
     """
     size = matrix.shape[0]
     active = np.ones(size, dtype=bool) if active is None else active
-    graph = sp.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
+    graph = _graph(matrix)
     count, labels = connected_components(graph, directed=True, connection="strong")
     alone = np.bincount(labels, minlength=count)[labels] == 1
     alone &= active & (np.diff(matrix.indptr) + np.bincount(matrix.indices, minlength=size) > 0)  # else a null vector
-    if not alone.any() or not _is_topological(graph, labels):
+    if not alone.any() or not _is_topological(graph, labels):  # SciPy numbers them so, but does not promise it
         return None
     without_pivot = np.flatnonzero(alone & (matrix.diagonal() == 0))
     if without_pivot.size:
@@ -99,8 +110,30 @@ def split(matrix, active):
     return Splitting(_in_order(first, labels), _in_order(last, labels), active & ~first & ~last)
 
 
+def largest_block(matrix):
+    """Return the number of unknowns of the largest strongly connected component, and whether components use others."""
+    _, sizes, triangular = _components(matrix)
+    return int(np.max(sizes)), triangular
+
+
+def _components(matrix):
+    """Return the components: their numbers in topological order, their sizes, and whether some use others.
+
+    They are taken for unlinked if the numbers are in no such order: SciPy's are, but it does not promise that.
+    """
+    graph = _graph(matrix)
+    count, labels = connected_components(graph, directed=True, connection="strong")
+    regions, _ = connected_components(graph, directed=False)
+    return labels, np.bincount(labels, minlength=count), count > regions and _is_topological(graph, labels)
+
+
+def _graph(matrix):
+    """The pattern of a csr_array, with ones for entries that may be complex or far from 1."""
+    return sp.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
+
+
 def _is_topological(graph, labels):
-    """Whether no row uses a component of a higher number. SciPy numbers them in that way, but does not promise it."""
+    """Whether no row uses a component of a higher number."""
     return bool(np.all(labels[rows_of(graph)] >= labels[graph.indices]))
 
 
@@ -177,6 +210,65 @@ class Substitution:
         members = np.zeros(self.matrix.shape[0])
         members[self.order] = 1.0
         return members * (abs(self.matrix) @ members)
+
+
+class BlockFactors:
+    """LU factors of the diagonal blocks of a block triangular matrix; what links blocks needs none.
+
+    Components of more than SMALL_BLOCK unknowns have factors of their own. Those between them, one after the other in
+    topological order, are factored together: in reverse order they are block upper triangular, and elimination by
+    columns chooses pivots in the diagonal blocks.
+
+    Parameters
+    ----------
+    matrix : csr_array
+        Square and block lower triangular in `order`.
+    order : int array
+    edges : int array
+        Where stages begin in this order, and the size of the matrix.
+    large : bool array
+        For each stage, whether it is one large component.
+    """
+
+    def __init__(self, matrix, order, edges, large):
+        self.order, self.stages, entries = order, [], 0
+        place = np.empty_like(order)
+        place[order] = np.arange(order.size)
+        for low, high, alone in zip(edges[:-1].tolist(), edges[1:].tolist(), large.tolist(), strict=True):
+            rows = matrix[order[low:high]]
+            columns = place[rows.indices]
+            here, row = columns >= low, rows_of(rows)
+            block = sp.csc_array((rows.data[here], (row[here], columns[here] - low)), shape=(high - low,) * 2)
+            known, column = np.unique(columns[~here], return_inverse=True)
+            links = sp.csr_array((rows.data[~here], (row[~here], column)), shape=(high - low, known.size))
+            factors = splu(block) if alone else splu(sp.csc_array(block[::-1, ::-1]), permc_spec="NATURAL")
+            self.stages.append((slice(low, high), 1 if alone else -1, factors, links, known))
+            entries += factors.nnz
+        blocks = f" of {len(self.stages)} blocks" if len(self.stages) > 1 else ""
+        self.words = f"sparse LU{blocks} in block triangular order, {entries} entries in the factors"
+
+    @classmethod
+    def of(cls, matrix):
+        """Matrix -> BlockFactors, or None where it is one component for the most part, or rows do not use others."""
+        (labels, sizes, triangular), size = _components(matrix), matrix.shape[0]
+        if not triangular or np.max(sizes) > MOST_OF_ALL * size:
+            return None
+        ends = np.cumsum(sizes)
+        is_large = sizes > SMALL_BLOCK
+        edges = np.unique(np.concatenate([[0, size], ends[is_large], (ends - sizes)[is_large]]))
+        return cls(matrix, np.argsort(labels, kind="stable"), edges, np.isin(edges[:-1], (ends - sizes)[is_large]))
+
+    def solve(self, b, transposed):
+        """Substitution block by block."""
+        r, x = b[self.order], np.empty_like(b)
+        for rows, step, factors, links, known in reversed(self.stages) if transposed else self.stages:
+            if transposed:
+                r[rows] = factors.solve(r[rows][::step], trans="T")[::step]
+                r[known] -= links.T @ r[rows]
+            else:
+                r[rows] = factors.solve((r[rows] - links @ r[known])[::step])[::step]
+        x[self.order] = r
+        return x
 
 
 class BlockTriangular(Engine):
