@@ -2,6 +2,7 @@
 
 import json
 
+import autograd.numpy as anp
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -309,3 +310,66 @@ def test_results_are_frozen():
         dp.check.transpose(RIGHT["gradient"]).rows = ()
     with pytest.raises(AttributeError, match="Refinement is frozen; make a new one instead of setting errors"):
         dp.check.order(lambda n: 1 / n).errors = ()
+
+
+# ---- linear over the real numbers only -------------------------------------------------------------------------------
+
+
+def half_spectrum(n, slope=1.0):
+    """The real FFT, with a transpose that is off by a factor: real fields to complex coefficients."""
+    size = n // 2 + 1
+
+    def transpose(g):
+        return slope * np.fft.fft(g, n).real
+
+    return dp.from_functions(lambda u: np.fft.rfft(u), transpose, n, size, name="half spectrum", dtype=complex)
+
+
+def field_of_half_spectrum(n, slope=1.0):
+    """The inverse real FFT: complex coefficients to real fields."""
+    size = n // 2 + 1
+    weights = np.full(size, 2.0)
+    weights[[0, -1]] = 1.0  # n is even; the imaginary parts of these two do not count
+
+    def transpose(g):
+        back = slope * weights / n * np.conj(np.fft.rfft(g.real))
+        back[[0, -1]] = back[[0, -1]].real
+        return back
+
+    return dp.from_functions(lambda v: np.fft.irfft(v, n), transpose, size, n, name="field", dtype=complex)
+
+
+@pytest.mark.parametrize(("make", "side"), [(half_spectrum, "takes real fields"), (field_of_half_spectrum, "are real")])
+def test_an_operator_that_is_linear_over_the_real_numbers(make, side):
+    card = dp.check.operator(make(8))
+    assert card.ok, str(card)
+    assert side in str(card) and "its transpose is compared in real parts" in str(card)
+    assert dp.check.transpose(make(8)).ok
+    assert dp.check.twin(make(8)).verdict == "inconclusive"  # no matrix to compare with
+    off = dp.check.operator(make(8, 1.001))
+    assert off.verdict == "disagrees" and any(name.startswith("transpose") for name in off.failed)
+
+
+@pytest.mark.parametrize("make", [half_spectrum, field_of_half_spectrum])
+def test_the_gradient_through_a_real_linear_operator(make):
+    """The transpose that the check accepts gives right gradients, and one that it refuses is named."""
+    op = make(8)
+    x = np.random.default_rng(0).standard_normal(op.domain.shape)
+    weights = np.arange(1.0, 1.0 + op.codomain.size)
+    loss = lambda act: lambda u: anp.sum(weights * anp.abs(act(u)) ** 2)
+    assert dp.check.gradient(loss(op), x, quick=True)
+    if make is field_of_half_spectrum:
+        assert dp.check.gradient(loss(op), x + 1j * x[::-1], quick=True)
+    found = dp.check.gradient(loss(make(8, 1.001)), x, quick=True)
+    assert found.verdict == "disagrees" and found.culprit == op.name
+
+
+def test_complex_results_of_an_operator_declared_real_are_refused():
+    op = dp.from_functions(np.fft.rfft, lambda g: np.fft.fft(g, 8).real, 8, 5, name="half spectrum")
+    card = dp.check.operator(op)
+    assert not card.ok and "give its operator dtype=complex" in str(card)
+
+
+def test_an_operator_on_complex_numbers_that_is_not_linear_there_fails():
+    conjugate = dp.from_functions(np.conj, np.conj, 6, 6, name="conjugate", dtype=complex)
+    assert dp.check.operator(conjugate).verdict == "disagrees"

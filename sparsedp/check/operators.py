@@ -3,6 +3,7 @@
 Figures are in units of rounding times the size of the operator; each check is a function of random fields, and a row.
 """
 
+import warnings
 from functools import cached_property
 from math import inf, isnan, log10, prod, sqrt
 from typing import Any
@@ -26,6 +27,7 @@ LIMIT = Summary.limit
 DTYPES = ("float64", "complex128", "float32", "complex64")
 LARGEST = 2**21  # unknowns above which no matrix is built for a check
 MOST_COLUMNS = 512  # columns that are computed one application at a time
+ROUGHLY = 1e-6  # share of the result up to which A (i u) is i A u
 POWERS = 8  # products of a power iteration
 DECADES = {"float32": 25, "float64": 290}  # sizes 10^+-d of operators fit into a dtype, with room for the fields
 
@@ -51,6 +53,9 @@ class Probe:
 
     Attributes
     ----------
+    real_linear : "", "domain" or "codomain"
+        Of an operator on complex numbers that is linear over the real numbers only: which of its fields are real. A
+        real FFT has a real domain, its inverse a real codomain.
     listed : bool
         Whether the entries can be listed at a fair price.
     forms : tuple of Operator
@@ -68,7 +73,9 @@ class Probe:
         self.op, self.rng, self.seeds = op.tangent, generator(rng), max(seeds, 1)
         self.real = op.dtype.kind != "c"
         structure, self.tolerance = self.op.structure, tolerance_of(self.op.structure)
-        self.listed = max(op.shape) <= (LARGEST if structure.has_entries else MOST_COLUMNS)
+        self.real_linear = "" if self.real or structure.has_entries else self._real_side()
+        limit = LARGEST if structure.has_entries else MOST_COLUMNS
+        self.listed = max(op.shape) <= limit and not self.real_linear  # a matrix is linear over complex numbers
         entries = self.listed and structure.has_entries
         self.bounds: tuple = (structure.magnitude(), structure.transpose().magnitude()) if entries else ()
         self.size = self._size() if entries else self._norm()
@@ -91,7 +98,10 @@ class Probe:
     def rows(self, name, dtypes=()):
         """A row for each dtype (default: those of KINDS): how far the sides of an identity are apart, at worst."""
         rows: list[Row] = []
-        for dtype in map(np.dtype, dtypes or KINDS.get(name, DTYPES[: 1 if self.real else 2])):
+        dtypes = [np.dtype(dtype) for dtype in dtypes or KINDS.get(name, DTYPES[: 1 if self.real else 2])]
+        for dtype in dtypes:
+            if self.real_linear == "domain" and dtype.kind == "c":
+                continue
             # A clean refusal of complex fields is fine where real fields work.
             optional = dtype.kind == "c" and self.real and rows[0].ok is True
             rows.append(self._row(name, dtype, optional))
@@ -129,10 +139,30 @@ class Probe:
             return self.bounds[transposed](np.abs(u).ravel().astype(float))
         return self.size * norm(u)
 
+    def product(self, a, b):
+        """Sum of a b; its real part where only that is the same for an operator and its transpose."""
+        return np.real(_dot(a, b)) if self.real_linear else _dot(a, b)
+
     def transposed(self, g, real):
         """A^T g by the transposed matrix, or by `.T` when no matrix can be listed; its real part, of real fields."""
         back = (self.matrix.T @ g.ravel()).reshape(self.op.domain.shape) if self.listed else self.op.T.apply(g)
         return back.real if real else back
+
+    def _real_side(self):
+        """Which fields of an operator are real, if it is not linear over the complex numbers."""
+        u = self.domain()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # NumPy may say that it discards imaginary parts
+            straight = self.op.apply(u)
+            try:
+                turned = self.op.apply(1j * u)
+            except Exception:  # a foreign function may refuse complex fields in any way
+                return "domain"
+            if norm(turned - 1j * straight) <= ROUGHLY * norm(straight):
+                return ""
+            if not np.any(turned):
+                return "domain"
+            return "" if np.any(np.imag([straight, turned])) else "codomain"
 
     def _size(self):
         """sqrt(|A|_1 |A|_inf)."""
@@ -147,6 +177,7 @@ class Probe:
             size = max(size, norm(y))
             try:
                 x = self.op.T.apply(y)
+                x = x.real if self.real_linear == "domain" else x
             except DerivativeError:  # it has no transpose
                 x = self.domain()
         return size
@@ -177,7 +208,11 @@ IDENTITIES = {
     ),
     "JVP": lambda p, u, v, g: (pushforward(p.op, u, v)[1], p.op.apply(v), p.bound(v)),
     "VJP": lambda p, u, v, g: (pullback(p.op, u)[1](g), p.transposed(g, u.dtype.kind != "c"), p.bound(g, True)),
-    "transpose": lambda p, u, v, g: (_dot(p.op.apply(u), g), _dot(u, p.op.T.apply(g)), p.size * norm(u) * norm(g)),
+    "transpose": lambda p, u, v, g: (
+        p.product(p.op.apply(u), g),
+        p.product(u, p.op.T.apply(g)),
+        p.size * norm(u) * norm(g),
+    ),
     "second order": lambda p, u, v, g: (
         hvp(lambda x: anp.sum(anp.real(p.op(x) ** 2)) / 2, u, v),
         p.transposed(p.op.apply(v), True),
@@ -237,7 +272,8 @@ def transpose(op, seeds=5, rng=None):
 
     Notes
     -----
-    The products are plain, without conjugation, as `.T` is. The norms come from the entries; without
+    The products are plain, without conjugation, as `.T` is; of an operator that is linear over the real numbers only
+    (see `operator`) their real parts are compared. The norms come from the entries; without
     entries they are lower bounds from products with A, which makes the test stricter. An operator
     that contains a solve is judged by the tolerance of the solve in place of eps.
 
@@ -294,6 +330,8 @@ def twin(op, seeds=3, rng=None):
 
 def _form_rows(probe):
     """Rows: both products in three dtypes, entry by entry."""
+    if probe.real_linear:
+        return [Row("forms", note="one form: given by functions, and no matrix of complex numbers stands for it")]
     rows = [Row("forms", note=_forms(probe.op.structure, probe.listed))]
     for name in FORMS if probe.listed else ():
         rows += probe.rows(name)
@@ -311,7 +349,7 @@ def _forms(structure, listed):
 def fault_of(op, rng):
     """Operator -> what is wrong with its linearity or its transpose, in words; "" if nothing."""
     probe = Probe(op, 1, rng)
-    kinds = DTYPES[:1] if probe.real else DTYPES[1:2]
+    kinds = DTYPES[:1] if probe.real or probe.real_linear == "domain" else DTYPES[1:2]
     failed = [one for name in ("linearity", "transpose") for one in probe.rows(name, kinds) if one.ok is False]
     if not failed:
         return ""
@@ -360,6 +398,10 @@ def operator(op, seeds=3, rng=None):
     rounding; an inverse is judged by the tolerance of its solve, without its check of primal data. Shapes, dtypes,
     integers, batches and memory layouts are the same code for every Operator: no rows.
 
+    An operator with ``dtype=complex`` whose domain or codomain is real (a real FFT, or its inverse) is linear over the
+    real numbers only. Its transpose is right if Re sum(g * A u) = Re sum(A^T g * u) for all complex g, which is what
+    derivatives need; a row says so, and there is no matrix to compare with.
+
     Examples
     --------
     >>> import numpy as np
@@ -380,8 +422,15 @@ def operator(op, seeds=3, rng=None):
         return OperatorSummary(op, probe, _rows(probe))
 
 
+REAL_SIDES = {
+    "domain": "real numbers: it takes real fields only; its transpose is compared in real parts",
+    "codomain": "real numbers: its results are real; its transpose is compared in real parts",
+}
+
+
 def _rows(probe):
-    rows = [one for name in IDENTITIES if name not in FORMS for one in probe.rows(name)]
+    rows = [Row("linear over", note=REAL_SIDES[probe.real_linear])] if probe.real_linear else []
+    rows += [one for name in IDENTITIES if name not in FORMS for one in probe.rows(name)]
     return rows + [one._replace(name=f"twin, {one.name}") for one in _form_rows(probe)]
 
 

@@ -147,7 +147,8 @@ def from_functions(forward, transpose, domain, codomain, name="operator", dtype=
     domain, codomain : Space, int or tuple of int
     name : str
     dtype : float or complex
-        complex when the functions make complex values from real fields.
+        complex when the functions make complex values from real fields, or real ones from complex fields, as a real FFT
+        and its inverse do. The real parts of the two sums are equal then, for all complex g.
 
     Returns
     -------
