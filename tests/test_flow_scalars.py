@@ -147,3 +147,14 @@ def test_refusals():
         step.start(np.zeros(40))
     with pytest.raises(dp.errors.ShapeError, match="flow_step takes a dict of v, p, a, s and r as its state"):
         step({"v": np.zeros(40)})
+
+
+@pytest.mark.parametrize("implicit", [False, True])
+def test_a_wall_does_not_heat_an_obstacle_beside_it(implicit):
+    grid, solid = dp.Grid((4, 3), size=1.0), np.zeros((4, 3), bool)
+    solid[0, 1] = True
+    hot = {"diffusivity": 0.1, "boundary": {"x": dp.dirichlet}, "values": np.array([1.0] * 3 + [0.0] * 11)}
+    step = dp.flow_step(grid, 0.01, 0.1, solid=solid, implicit=implicit, scalars={"heat": hot})
+    end = dp.rollout(step, step.start(np.zeros(grid.faces.size), None, {"heat": np.zeros((4, 3))}), None, 5)
+    heat = end["s"]["heat"]
+    assert heat[0, 1] == 0.0 and np.all(heat[0, [0, 2]] > 0.01)

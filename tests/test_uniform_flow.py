@@ -331,6 +331,21 @@ def test_a_lid_is_the_same_as_a_function_and_as_a_lift():
         np.testing.assert_allclose(*ends, rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("given", [lambda lift, values: lift(values), lambda lift, values: lambda params: values])
+def test_an_obstacle_beside_a_moving_wall(given):
+    """The wall does not drag the faces of the obstacle, from which an implicit viscosity would drag the fluid."""
+    grid, solid = dp.Grid((6, 5), size=1.0), np.zeros((6, 5), bool)
+    solid[2:4, 3:] = True
+    lift = dp.face_lift(grid)
+    walls, ends = given(lift, lift.domain.join(0.0, 0.3, 0.0, 1.0)), []
+    for implicit in (False, True):
+        step = dp.flow_step(grid, 0.01, 0.2, solid=solid, implicit=implicit, convective=False, walls=walls)
+        ends.append(dp.rollout(step, step.start(np.zeros(grid.faces.size)), None, 150)["v"])
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-5)
+    closed = dp.face_lift(grid, solid=solid)(np.ones(lift.domain.size))
+    assert not np.any(closed - dp.interior(grid, solid)(closed))
+
+
 @pytest.mark.parametrize("part", [np.s_[:, :3], np.s_[:, 1:]])
 def test_forces_on_fluid_beside_a_moving_wall(part):
     """Couette flow is steady: no force acts on any part of it, whether the wall at rest or the moving one is near."""

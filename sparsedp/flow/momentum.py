@@ -34,6 +34,7 @@ from sparsedp.operators.stencils import (
     with_ends,
 )  # fmt: skip
 from sparsedp.recipe import Made
+from sparsedp.shortcuts import whole
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.factor import Factor
@@ -93,12 +94,13 @@ def face_laplacian(grid, boundary=no_slip, solid=None, solid_boundary=no_slip):
     array([ 0.,  0., -4., -4.,  0.,  0.,  0.,  0.,  0.,  0.,  0.,  0.])
     """
     sides = resolve(grid, boundary, no_slip)
-    free, whole = Mask(free_faces(grid, sides, solid)), stresses(grid, sides, solid, solid_boundary)
-    structure = compose(free, whole) if solid is None else Matrix(free.explicit() @ whole.explicit())
+    free = Mask(free_faces(grid, sides, solid))
+    stress = stresses(grid, sides, solid, solid_boundary)
+    structure = compose(free, stress) if solid is None else Matrix(free.explicit() @ stress.explicit())
     return Operator(structure, grid.faces, grid.faces, "face_laplacian")
 
 
-def face_lift(grid, boundary=no_slip):
+def face_lift(grid, boundary=no_slip, solid=None):
     """Return the operator from tangential wall velocities to their part of the Laplacian, L(v) + B(values).
 
     Parameters
@@ -106,6 +108,8 @@ def face_lift(grid, boundary=no_slip):
     grid : Grid
     boundary : flow condition or dict
         The same as for `face_laplacian`. Walls that are no_slip and inflows have a velocity along them.
+    solid : bool array, shape `grid.shape`, optional
+        The same as for `face_laplacian`: faces that touch an obstacle get 0.
 
     Returns
     -------
@@ -116,6 +120,8 @@ def face_lift(grid, boundary=no_slip):
 
     Raises
     ------
+    ShapeError
+        If `solid` has another shape than the grid.
     ValueError
         If an axis is named that is periodic or not there.
     TypeError
@@ -129,7 +135,7 @@ def face_lift(grid, boundary=no_slip):
     array([0., 0., 0., 2., 0., 0., 0., 0., 0., 0., 0., 0.])
     """
     sides = resolve(grid, boundary, no_slip)
-    structure = compose(Mask(free_faces(grid, sides, None)), wall_stresses(grid, sides))
+    structure = compose(Mask(free_faces(grid, sides, solid)), wall_stresses(grid, sides))
     return Operator(structure, wall_velocities(grid, sides), grid.faces, "face_lift")
 
 
@@ -317,7 +323,7 @@ def velocities_of(lifted, grid, sides):
     walls = wall_velocities(grid, sides)
     enters = [sides[a][side] == inflow for a, side, _ in _moving_sides(grid, sides)]
     wanted = np.repeat(np.array(enters, bool), np.diff(walls.offsets))
-    values = plain(lifted)
+    values = whole(plain(lifted))
     count = np.diff(matrix.indptr)  # walls that a face touches
     entering = abs(matrix) @ wanted > 0
     if np.any(values[entering & (count > 1)]):

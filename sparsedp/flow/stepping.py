@@ -55,7 +55,7 @@ from sparsedp.flow.projection_setup import faces_that
 from sparsedp.grid import check_grid
 from sparsedp.operator import Operator
 from sparsedp.operators.difference import divergence, gradient, laplacian
-from sparsedp.operators.masks_and_lift import identity, lift, mask
+from sparsedp.operators.masks_and_lift import check_solid, identity, lift, mask
 from sparsedp.operators.transfer import average
 from sparsedp.recipe import Remade
 from sparsedp.solvers.choose_method import inverse
@@ -246,7 +246,7 @@ class FlowStep(Remade):
         self.convect: Any = convection(grid, boundary, solid) if given["convective"] else None
         viscous = partial(face_laplacian, grid, boundary, solid, given["solid_boundary"])
         self.viscous = Diffusion("viscosity", given["viscosity"], viscous, self)
-        self.wall_motion = WallMotion(grid, boundary, setup.sides, given["walls"], self.convect is not None)
+        self.wall_motion = WallMotion(self, boundary, solid, given["walls"])
         self.inflow = given["inflow"]
         self.entering: Any = None if self.inflow is None else self._sides_of_inflow(setup.sides, solid)
         self.scalars = {name: Scalar(name, solid, self, **parts) for name, parts in (given["scalars"] or {}).items()}
@@ -375,12 +375,11 @@ class WallMotion:
 
     Parameters
     ----------
-    grid : Grid
-    boundary, sides
-        Flow conditions, as they are given and as `resolve` returns them.
+    flow : FlowStep
+    boundary, solid
+        As `flow_step` takes them.
     given : callable, array or None
         As `flow_step` takes walls.
-    convective : bool
 
     Attributes
     ----------
@@ -390,18 +389,23 @@ class WallMotion:
         Velocities on the space of `face_lift` that do not change, as convection needs them.
     """
 
-    def __init__(self, grid, boundary, sides, given, convective):
-        self._grid, self._boundary = grid, boundary
+    def __init__(self, flow, boundary, solid, given):
+        self._grid, self._boundary, self._solid = flow.grid, boundary, solid
         self.given = given
         self.changes = callable(given)
         self.constant: Any = None
+        if given is None or self.changes:
+            return
+        # An implicit viscosity would carry what stands on faces that are not free into the fluid.
+        self.given = flow.free(given)
+        sides = flow.project.setup.sides
         enters = any(side == inflow_side for pair in sides for side in pair or ())
-        if given is not None and not self.changes and convective and enters:
-            self.constant = velocities_of(given, grid, sides)
+        if flow.convect is not None and enters:
+            self.constant = velocities_of(given, flow.grid, sides)
 
     @cached_property
     def _lift(self):
-        return face_lift(self._grid, self._boundary)
+        return face_lift(self._grid, self._boundary, self._solid)
 
     def velocities(self, params, dtype):
         """Return the wall velocities that belong to params, in the dtype of the flow; None where all are 0."""
@@ -513,6 +517,8 @@ class Scalar:
         if values is not None:
             slopes, normal = lift(grid, boundary)(values), flow.divergence.T(np.ones(grid.shape))
             self.bend = flow.divergence(slopes)  # what the walls add to the Laplacian
+            if solid is not None:
+                self.bend = mask(grid.cells, ~check_solid(grid, solid))(self.bend)
             self.held = slopes / np.where(slopes != 0, 2 * normal, 1.0)  # the wall's value
         op = partial(laplacian, grid, boundary, solid)
         self.diffused = Diffusion(f"diffusivity of {name!r}", float(diffusivity), op, flow)
