@@ -19,6 +19,7 @@ from sparsedp.recipe import Remade
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
 from sparsedp.tape import Rule, isbox, plain
+from sparsedp.tree import norm
 
 __all__ = ["Adopted", "adopt"]
 
@@ -342,4 +343,4 @@ def change(run, x, y, v):
 
 def typical(x):
     """Root mean square of an array, 1 where that is 0 or the array is empty."""
-    return (np.sqrt(np.mean(x**2)) if x.size else 0.0) or 1.0
+    return norm(x) / np.sqrt(max(x.size, 1)) or 1.0

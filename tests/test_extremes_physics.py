@@ -287,7 +287,9 @@ REFUSED = [
     (lambda: SPLIT(operator=np.eye(3)), TypeError, "admm, as operator, takes a function, got ndarray; write lambda x"),
     (lambda: dp.stepper("radau", lambda u, p: -u, 0.1, tolerance=1e-3, floor=np.inf), ValueError,
      "floor must hold finite numbers >= 0, in the units of u, got inf; write 1e-3"),
-    (lambda: dp.total_variation(GRID, 0.1)(1e200 * np.arange(12.0).reshape(3, 4)), NONFINITE,
+    (lambda: dp.smoothness(GRID)(1e200 * np.arange(12.0).reshape(3, 4)), NONFINITE,
+     "the squared slope in smoothness must be finite, got 12 that are NaN or infinite, the first at (0, 0)"),
+    (lambda: dp.total_variation(GRID, 0.1)(np.full((3, 4), np.nan)), NONFINITE,
      "the squared slope in total_variation must be finite, got 12 that are NaN or infinite, the first at (0, 0)"),
 ]  # fmt: skip
 

@@ -118,3 +118,15 @@ def test_the_hint_of_least_squares_sums_the_residuals():
     wrong = dp.differentiable("wrong", lambda x: 1.0 * x, lambda nums, ans, x: lambda g: (-g,))
     best = dp.minimize(lambda x: wrong(x) - 2.0, np.zeros(2), "gauss_newton")
     assert not best.converged and "with loss = lambda x: np.sum(residuals(x) ** 2), dp.check" in best.message
+
+
+@pytest.mark.parametrize("exponent", [-1000, -550, 550, 1000])
+def test_a_rule_as_tolerance_sees_losses_that_it_can_compare(exponent):
+    """Records of residuals near 1e-300 hold a loss and a gradient of 0: a rule called the start converged."""
+    rule = lambda record, first: record.gradient_norm <= 1e-6 * first.gradient_norm
+    factor, start = 2.0**exponent, np.array([0.1, 0.0, -0.2])
+    with np.errstate(over="ignore"):
+        best = dp.minimize(lambda x: factor * residuals(x), start, "levenberg_marquardt", tolerance=rule)
+    known = dp.minimize(residuals, start, "levenberg_marquardt", tolerance=rule)
+    assert best.converged and len(best.history) == len(known.history) > 2
+    assert np.allclose(best.x, known.x, rtol=1e-9)

@@ -66,6 +66,28 @@ def test_refused_numbers():
         dp.smoothness(3)
 
 
+@pytest.mark.parametrize("exponent", [-480, -200, 200, 480])
+@pytest.mark.parametrize("share", [2.0**-30, 1.0, 2.0**30])
+def test_total_variation_of_slopes_of_any_magnitude(exponent, share, rng):
+    """With eps it scales: their squares underflow or overflow, they themselves do not."""
+    grid, factor = dp.Grid((5, 4), size=1.0), 2.0**exponent
+    u, v = share * rng.normal(size=(2, *grid.shape))
+    tv, scaled = dp.total_variation(grid, 1e-3), dp.total_variation(grid, 1e-3 * factor)
+    assert scaled(factor * u) == factor * tv(u)
+    assert np.array_equal(dp.grad(scaled)(factor * u), dp.grad(tv)(u))
+    assert np.allclose(dp.hvp(scaled, factor * u, factor * v), dp.hvp(tv, u, v), rtol=1e-12, atol=0)
+
+
+def test_total_variation_of_slopes_far_from_eps(rng):
+    """Far above eps it is the integral of the slopes, far below half of that of their squares by eps."""
+    grid = dp.Grid((5, 4), size=1.0)
+    u = rng.normal(size=grid.shape)
+    steep = dp.total_variation(grid, 1.0)(1e200 * u)
+    assert np.isclose(steep, 1e200 * dp.total_variation(grid, 1e-14)(u), rtol=1e-12)
+    flat = dp.total_variation(grid, 1e-140)(1e-170 * u)
+    assert np.isclose(flat, 1e-200 * dp.smoothness(grid)(u), rtol=1e-12)
+
+
 # ---- admm ----
 
 

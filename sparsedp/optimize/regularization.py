@@ -10,10 +10,15 @@ from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.masks_and_lift import interior
 from sparsedp.recipe import Made
+from sparsedp.shortcuts import ELSEWHERE
+from sparsedp.solvers.scaling import largest
 from sparsedp.tape import dtype_of, plain
 from sparsedp.tape_constants import constant
+from sparsedp.tree import power_of_two
 
 __all__ = ["smoothness", "total_variation"]
+
+SQUARED = 2.0**-500  # share of the largest slope above which the square of a slope is far from the largest float
 
 
 def total_variation(grid, eps, solid=None):
@@ -41,7 +46,7 @@ def total_variation(grid, eps, solid=None):
     TypeError
         On use, if u is complex.
     NonFiniteError
-        On use, if a squared slope is NaN or beyond 1.8e308.
+        On use, if a slope is NaN or infinite.
 
     Notes
     -----
@@ -62,8 +67,10 @@ def total_variation(grid, eps, solid=None):
     square, volumes = _square(grid, "total_variation", solid)
 
     def integral(u):
-        g = square(u)  # the quotient is the difference of the formula without its cancellation
-        return anp.sum(volumes * g / (anp.sqrt(g + eps**2) + eps))
+        g, unit = square(u, eps)
+        small = eps / unit
+        # The quotient is the difference of the formula without its cancellation.
+        return unit * anp.sum(volumes * g / (anp.sqrt(g + small**2) + small))
 
     return Made(integral, total_variation, grid, eps, constant(solid))
 
@@ -102,11 +109,15 @@ def smoothness(grid, solid=None):
     8.0
     """
     square, volumes = _square(grid, "smoothness", solid)
-    return Made(lambda u: 0.5 * anp.sum(volumes * square(u)), smoothness, grid, constant(solid))
+    return Made(lambda u: 0.5 * anp.sum(volumes * square(u)[0]), smoothness, grid, constant(solid))
 
 
 def _square(grid, name, solid):
-    """(function from a cell field to its squared slope in the cells, volumes of the cells that count)."""
+    """Return a function of a cell field to its squared slope in the cells, and the volumes of the cells that count.
+
+    The function takes a slope that counts as small, or None, and also returns a power of two that the slopes are
+    divided by before they are squared: near the small slope, or so much larger that no square overflows.
+    """
     check_grid(name, grid)
     slope, inside = gradient(grid), interior(grid, solid)
     beside = sp.coo_array(abs(divergence(grid).matrix) @ inside.matrix != 0)  # the open faces of each cell
@@ -116,11 +127,15 @@ def _square(grid, name, solid):
     mean = from_matrix(matrix, grid.faces, grid.cells, name="mean over faces")
     volumes = grid.volumes if solid is None else np.where(solid, 0.0, grid.volumes)
 
-    def square(u):
+    def square(u, small=None):
         check_native(name, u)
         check_kind(f"u of {name}", dtype_of(u), "real numbers", "; add that of u.real and that of u.imag")
-        g = mean(inside(slope(u)) ** 2)
+        slopes, unit = inside(slope(u)), 1.0
+        if small is not None and type(plain(u)) not in ELSEWHERE:
+            top = largest(np.asarray(plain(slopes)))
+            unit = power_of_two(max(small, top * SQUARED if np.isfinite(top) else 0.0))
+        g = mean((slopes / unit) ** 2) if unit != 1 else mean(slopes**2)
         check_finite(f"the squared slope in {name}", plain(g))
-        return g
+        return g, unit
 
     return square, volumes

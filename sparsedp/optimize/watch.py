@@ -1,6 +1,7 @@
 """Keeps the history of a run and decides when it stops."""
 
 import time
+from math import inf
 from typing import Any
 
 from sparsedp.ledger import thread
@@ -28,7 +29,7 @@ class Watch:
         self._seconds, self._solves = -time.perf_counter(), -thread.solves  # at the start, taken off
         self.history, self.message, self.converged = [], "", False
         self._first_size = 0.0  # of the gradient at the start
-        self._start: Any = None  # the point there
+        self._first: Any = None  # the trial there
         self._last: Any = None  # the last accepted trial
 
     def resume(self, history, first, last):
@@ -38,7 +39,7 @@ class Watch:
         """
         self.history, record = history, history[-1]
         self._seconds, self._solves = self._seconds + record.seconds, record.solves - thread.solves
-        self._first_size, self._start, self._last = self._size(first), first.vector, last
+        self._first_size, self._first, self._last = self._size(first), first, last
         self._judge(self._size(last))
 
     @property
@@ -59,7 +60,7 @@ class Watch:
         )
         self.history.append(record)
         if record.iteration == 0:
-            self._first_size, self._start = size, trial.vector
+            self._first_size, self._first = size, trial
         self._last = trial
         self._judge(size)
         if not self.converged and self._callback is not None and record.iteration > 0:
@@ -75,13 +76,24 @@ class Watch:
         if size == 0:
             met = not self._trials.batches.varied  # a batch may have the gradient 0 alone
         elif callable(self._tolerance):
-            met = self._tolerance(self.history[-1], self.history[0])
+            met = self._tolerance(*self._comparable(size))
         else:
             met = size <= self._tolerance * self._first_size
         if met:
             share = f"{size / (self._first_size or 1.0):.1e} of that at the start" if size else 0
             gradient = "projected gradient" if self._trials.box.bounded else "gradient"
             self.converged, self.message = True, f"converged: the {gradient} is {share}"
+
+    def _comparable(self, size):
+        """Return the last record and the first one, with losses and gradients that can be compared.
+
+        Where those of least squares have left the range of floats, both are in the units of the trials.
+        """
+        ends = self.history[-1], self.history[0]
+        if all(0 < record.gradient_norm < inf for record in ends):
+            return ends
+        values = zip(ends, (self._last, self._first), (size, self._first_size), strict=True)
+        return tuple(record._replace(value=trial.value, gradient_norm=gradient) for record, trial, gradient in values)
 
     def _is_flat(self):
         """Return whether the gradient is small beside that at the start, or beside the loss per length of x.
@@ -90,7 +102,7 @@ class Watch:
         the gradient is not small.
         """
         size, x = self._size(self._last), self._last.vector
-        length = max(norm(x), norm(x - self._start))
+        length = max(norm(x), norm(x - self._first.vector))
         beside_loss = length > 0 and size <= FLAT * (abs(self._last.value) / length)
         return beside_loss or size <= FLAT * self._first_size
 

@@ -24,6 +24,7 @@ from sparsedp.derivative import unwarned, value_and_grad
 from sparsedp.fields import check_number, is_number
 from sparsedp.ledger import recording, thread
 from sparsedp.report.plan import total
+from sparsedp.solvers.scaling import length
 from sparsedp.tree import leaves, norm, paired
 
 __all__ = ["Certificate", "Certified", "certified", "certify", "distance"]
@@ -105,7 +106,7 @@ class RecordedSolves(dict):
             return x + solver.approximate(residual(x) - left, self.share, transposed)
 
         name = solver.name.removesuffix(".jacobian"), "adjoint" if transposed else "forward"
-        facts = float(np.linalg.norm(b)), solver.system.rtol, solver.engine.iterative
+        facts = length(b), solver.system.rtol, solver.engine.iterative
         return self._solved(name, b.size, first, corrected, residual, facts)
 
     def root(self, root, equation, guess, leaves):
@@ -219,7 +220,7 @@ def _row(name, error, sides):
     row = {"solver": name, "rtol": max(solve.rtol for solve in solves), "error": error}
     row["iterative"] = any(solve.iterative for solve in solves)
     for kind, some in sides.items():
-        largest = max((np.linalg.norm(solve.r) / (solve.size or inf) for solve in some), default=0.0)
+        largest = max((length(solve.r) / (solve.size or inf) for solve in some), default=0.0)
         row |= {kind: len(some), f"{kind} residual": float(largest)}
     return row
 

@@ -24,7 +24,7 @@ from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pat
 from sparsedp.space import Space
 from sparsedp.structure.base import rows_of
 from sparsedp.tape import isbox
-from sparsedp.tree import copied
+from sparsedp.tree import copied, norm
 
 __all__ = ["Jacobians", "Linearisation"]
 
@@ -344,7 +344,7 @@ def _key(equation, x, leaves):
 def _points(equation, x, leaves):
     """Points to probe at: near x and at two opposite random ones."""
     rng = np.random.default_rng(0)
-    scale = np.sqrt(np.mean(x**2)) or 1.0
+    scale = norm(x) / np.sqrt(max(x.size, 1)) or 1.0
     far = equation.layout.laid(scale * rng.standard_normal(x.size))
     near = x * (1 + 0.1 * equation.layout.laid(rng.uniform(-1, 1, x.size)))
     points = near, far, -far  # opposite: each side of a switch is met

@@ -23,10 +23,10 @@ from sparsedp.solvers.adjoint import solve_rule, vary
 from sparsedp.solvers.choose_method import check_settings
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation, Layout, Newton
-from sparsedp.solvers.scaling import length
+from sparsedp.solvers.scaling import largest, length
 from sparsedp.solvers.solve import Run, SolveLog
 from sparsedp.tape import Rule, plain
-from sparsedp.tree import mapped
+from sparsedp.tree import mapped, power_of_two
 
 __all__ = ["Root", "implicit", "steady"]
 
@@ -277,7 +277,9 @@ class Root(Remade):
         changed = max(CHANGED, LOOSE * self.rtol)
         if length(F) <= MORE * equation.left:  # as it was left, at a loose tolerance too
             return
-        if not np.vdot(np.abs(y), np.abs(F)) > changed * np.vdot(np.abs(g), np.abs(x)):
+        units = power_of_two(largest(g)), power_of_two(largest(x))  # the products may underflow
+        gap, size = (np.vdot(np.abs(a / units[0]), np.abs(b / units[1])) for a, b in ((y, F), (g, x)))
+        if not gap > changed * size:
             return
         terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1] if leaves else np.zeros(0)
         if length(F) <= CANCELS * length(terms):  # a root near 0, where what it is made of cancels
