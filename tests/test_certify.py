@@ -198,3 +198,13 @@ def test_direct_solves_and_refusals():
         ValueError, match="certified sees the solves of the loss, not of a gradient that is given; leave it out"
     ):
         dp.minimize(lambda u: anp.sum(u**2), X, gradient=lambda u: 2 * u, tolerance=dp.certified())
+
+
+def test_the_error_of_the_value_is_absolute_and_that_of_the_gradient_relative():
+    """A loss times 1000 has a value that is off by 1000 times as much, and the same relative error of the gradient."""
+    solve = dp.inverse(-dp.laplacian(dp.Grid((12, 12)), dp.dirichlet), "krylov", rtol=1e-3)
+    b = np.sin(np.arange(144.0)).reshape(12, 12)
+    one, thousand = (dp.certify(lambda b, size=size: size * anp.sum(solve(b) ** 2), b) for size in (1.0, 1000.0))
+    assert thousand.value_error == pytest.approx(1000 * one.value_error, rel=1e-6)
+    assert thousand.gradient_error == pytest.approx(one.gradient_error, rel=1e-6)
+    assert "(absolute); corrected" in str(one) and "of itself" in str(one)

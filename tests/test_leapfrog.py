@@ -297,6 +297,36 @@ def test_a_way_back_that_loses_the_start_is_refused():
         dp.grad(lambda c: dp.rollout(Wrong(), 1.0, c, 3, memory="reverse"))(1.0)
 
 
+@pytest.mark.parametrize("error", [0.0, 1e-3])
+def test_reversed_steps_in_single_precision(error):
+    """Rounding of float32 is allowed for, and the gradient has its digits; a wrong way back is refused."""
+    grid = dp.Grid(24, size=1.0)
+    D, G = dp.divergence(grid), dp.gradient(grid, dp.dirichlet)
+    leapfrog = dp.stepper("leapfrog", (lambda v, c: -c * D(v), lambda p, c: -G(anp.sin(p))), 0.01)
+
+    class Step:
+        def __call__(self, state, c):
+            return leapfrog(state, c)
+
+        def back(self, state, c):
+            p, v = leapfrog.back(state, c)
+            return p + np.float32(error), v
+
+    def loss(u, memory, kind):
+        state = u, np.zeros(grid.faces.size, kind)
+        return anp.sum(dp.rollout(Step(), state, kind(1.0), 300, memory=memory)[0] ** 2)
+
+    u = np.exp(-50 * (grid.centres()[0] - 0.5) ** 2)
+    single = lambda u: loss(u, "reverse", np.float32)
+    if error:
+        with pytest.raises(dp.errors.DerivativeError, match="away from the first state, beside states of size"):
+            dp.grad(single)(u.astype(np.float32))
+        return
+    found, right = dp.grad(single)(u.astype(np.float32)), dp.grad(lambda u: loss(u, None, np.float64))(u)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, right, rtol=0, atol=1e-4 * np.max(np.abs(right)))
+
+
 class Lossy:
     """Steps whose way back is wrong in a small field beside a large one."""
 

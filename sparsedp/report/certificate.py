@@ -164,9 +164,9 @@ def certify(loss, x, target=TARGET):
     Returns
     -------
     Certificate
-        `.value`, `.gradient` as the loss gives them; `.value_error`, `.gradient_error` (relative, estimated);
-        `.corrected_value`, `.corrected_gradient`; `.causes`: relative error of the gradient from the forward
-        and from the adjoint solves; `.solves`: one dict for each solver; `.advice`: one line. str() is the table.
+        `.value`, `.gradient` as the loss gives them; their estimated errors `.value_error` (absolute, with a sign) and
+        `.gradient_error` (relative to the norm of the gradient); `.corrected_value`, `.corrected_gradient`; `.causes`:
+        relative error of the gradient from the forward and from the adjoint solves; `.solves`: one dict for each solver; `.advice`: one line. str() is the table.
 
     Raises
     ------
@@ -248,11 +248,12 @@ class Certificate(Result):
 
     Attributes
     ----------
-    value, corrected_value, value_error : float
-        The error is estimated and has a sign: corrected value minus value.
+    value, corrected_value : float
+    value_error : float
+        Estimated, absolute, with a sign: corrected value less value.
     gradient, corrected_gradient : trees
     gradient_error : float
-        Estimated, relative, Euclidean.
+        Estimated, relative to the norm of the gradient, Euclidean over all leaves.
     causes : dict
         Relative error of the gradient from forward and from adjoint solves.
     solves, rows : list of dict
@@ -267,7 +268,8 @@ class Certificate(Result):
         """Errors of value and gradient, a row for each solver, the advice."""
         causes = ", ".join(f"{error:.1e} from {name}" for name, error in self.causes.items())
         return [
-            f"value {self.value:.9g}, off by about {self.value_error:.1e}; corrected {self.corrected_value:.12g}",
+            f"value {self.value:.9g}, off by about {self.value_error:.1e} (absolute); "
+            f"corrected {self.corrected_value:.12g}",
             f"gradient off by about {self.gradient_error:.1e} of itself: {causes}",
             table_of(self.solves, SHOWN),
             f"advice: {self.advice}",

@@ -44,7 +44,8 @@ def rollout(
         is left goes to the tapes of the steps (with None 256 MB): such a step runs once, not twice. Not counted:
         what one step needs by itself, and what `keep` hands out; with keep="all" no state is run again.
         "reverse" keeps the last state alone, and goes back by ``step.back(state, params)``, the step turned round: for
-        leapfrog without damping. Rounding makes the gradient a little off; more than 1e-8 is refused.
+        leapfrog without damping. Rounding makes the gradient a little off; where reversed steps miss the first state by
+        more than 1e-8 of its size, 1e-4 in single precision, it is refused.
     keep : "last", "all", list of int or callable
         What is handed out: the last state; all n + 1, or those after so many steps (rising, 0 is the first state),
         each array with a new first axis, of a field on ranks a tuple; or the tuple of what ``keep(index, state)``

@@ -8,7 +8,7 @@ import numpy as np
 
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.fields import advise
-from sparsedp.tape import Recorder, boxed, new_trace, plain, traces_of, untaped_root
+from sparsedp.tape import Recorder, boxed, dtype_of, new_trace, plain, traces_of, untaped_root
 from sparsedp.tape_constants import frozen
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.trajectory.record import largest
@@ -16,7 +16,8 @@ from sparsedp.tree import copied, flatten, leaves
 
 __all__ = ["State", "Steps"]
 
-DRIFT = 1e-8  # of the size of each field: a gradient by reversed steps has about as many digits
+# Of the size of each field, in double and in single precision: a gradient by reversed steps has about as many digits.
+DRIFT, SINGLE_DRIFT = 1e-8, 1e-4
 _REMEDY = {
     "state": "return another dict or list",
     "params": "make what changes a part of the state",
@@ -194,7 +195,8 @@ class Steps:
         for values in zip(state.values, self.first.values, last.values, strict=True):  # a large one hides no other
             back, first, end = map(plain, values)
             off, size = largest([back - first]), largest([first, end])
-            if not off <= DRIFT * size:
+            single = np.finfo(dtype_of(first)).eps > np.finfo(float).eps
+            if not off <= (SINGLE_DRIFT if single else DRIFT) * size:
                 raise DerivativeError(
                     f"reversed steps end {off:.1e} away from the first state, beside states of size {size:.1e}: "
                     "rounding grew on the way; give rollout a memory in bytes"
