@@ -1,6 +1,7 @@
 """How the pages are made; building.md says what to type. Sphinx reads this file."""
 
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
@@ -33,7 +34,8 @@ html_math_renderer = "mathml"  # formulas.py: no script, no fonts to fetch
 
 # The API, from docstrings.
 default_role = "code"
-autodoc_mock_imports = ["jax", "torch", "xarray"]  # the bridges have pages without them
+# The bridges have pages without their libraries. One that is installed is imported: other libraries look at it.
+autodoc_mock_imports = [name for name in ("jax", "torch", "xarray") if find_spec(name) is None]
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 napoleon_custom_sections = ["Source"]
@@ -85,5 +87,6 @@ def setup(app):
     gallery_scripts.stage()
     gallery_scripts.let_processes_in()
     app.connect("autodoc-process-docstring", docstrings.rewrite, priority=400)  # before napoleon
+    app.connect("viewcode-follow-imported", docstrings.defined_in)
     app.connect("builder-inited", gallery_scripts.thumbnails, priority=900)  # after sphinx-gallery has run the examples
     app.connect("builder-inited", gallery_scripts.measured, priority=910)

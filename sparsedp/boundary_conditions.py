@@ -9,7 +9,7 @@ to the wall and h its width, the wall value and the slope follow from (u_w - u_c
 What a fluid does at a wall implies conditions of its velocity along the wall and of the pressure: FlowCondition.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from sparsedp.fields import check_number, check_type
 from sparsedp.grid import AXES, Grid
@@ -42,8 +42,9 @@ class Condition(Value):
     a: float
     b: float
 
-    def __init__(self, a, b):
-        super().__init__(a=a, b=b)
+    def __init__(self, a, b, description=None):
+        documented = {} if description is None else {"__doc__": description}
+        super().__init__(a=a, b=b, **documented)
 
     @property
     def _key(self):
@@ -56,8 +57,38 @@ class Condition(Value):
         return {(1.0, 0.0): "dirichlet", (0.0, 1.0): "neumann"}.get(self._key, f"robin({self.a:g}, {self.b:g})")
 
 
-dirichlet = Condition(1.0, 0.0)
-neumann = Condition(0.0, 1.0)
+dirichlet = Condition(
+    1.0,
+    0.0,
+    """Fix the value at a wall: u = value.
+
+    In an operator the value is 0; `lift` brings in others. In `transport` it is what the wind brings in. The field is
+    odd across the wall: the slope there is (value - u) / (h / 2), with u in the cell next to the wall and h its width.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sparsedp as dp
+    >>> dp.gradient(dp.Grid(2), dp.dirichlet)(np.ones(2))
+    array([ 2.,  0., -2.])
+    """,
+)
+neumann = Condition(
+    0.0,
+    1.0,
+    """Fix the slope at a wall: du/dn = value, n pointing outwards.
+
+    In an operator the slope is 0, a tight or insulated wall; `lift` brings in others. It is the condition of walls that
+    are not named.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sparsedp as dp
+    >>> dp.gradient(dp.Grid(2), dp.neumann)(np.array([1.0, 3.0]))
+    array([0., 2., 0.])
+    """,
+)
 
 
 def robin(a, b):
@@ -118,16 +149,79 @@ class FlowCondition:
     closed: bool
     along: Condition
     pressure: Condition
+    description: str = field(default="", repr=False, compare=False)
     choices = "no_slip, free_slip, inflow, outflow"  # no annotation: the same for all
+
+    def __post_init__(self):
+        if self.description:
+            object.__setattr__(self, "__doc__", self.description)
 
     def __repr__(self):
         return self.name
 
 
-no_slip = FlowCondition("no_slip", True, dirichlet, neumann)  # the fluid sticks to it; `face_lift` moves it
-free_slip = FlowCondition("free_slip", True, neumann, neumann)  # the fluid glides along it
-inflow = FlowCondition("inflow", False, dirichlet, neumann)  # what passes is given: what the face field has there
-outflow = FlowCondition("outflow", False, neumann, dirichlet)  # open: what passes is found, the pressure is 0
+no_slip = FlowCondition(
+    "no_slip",
+    True,
+    dirichlet,
+    neumann,
+    """Let the fluid stick to a wall: nothing passes, and the velocity along the wall is that of the wall.
+
+    A wall moves with the values of `face_lift` (a lid), else it rests. It is the condition of flow on walls that are
+    not named. The pressure has slope 0 there.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> box = dp.projection(dp.Grid((4, 3), size=1.0), boundary=dp.no_slip)
+    """,
+)
+free_slip = FlowCondition(
+    "free_slip",
+    True,
+    neumann,
+    neumann,
+    """Let the fluid glide along a wall: nothing passes, and the wall exerts no friction.
+
+    The slope of the velocity along the wall is 0, as in a plane of symmetry. The pressure has slope 0 there.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> L = dp.face_laplacian(dp.Grid((4, 3), size=1.0), {"y": (dp.no_slip, dp.free_slip)})
+    """,
+)
+inflow = FlowCondition(
+    "inflow",
+    False,
+    dirichlet,
+    neumann,
+    """Prescribe what passes a side: the velocity across it is what the face field holds there.
+
+    A projection leaves these entries as they are, so set them in the start. The velocity along the side is that of
+    `face_lift`, by default 0. The pressure has slope 0 there. A region with an inflow needs an outflow.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> channel = dp.projection(dp.Grid((4, 3), size=1.0), boundary={"x": (dp.inflow, dp.outflow)})
+    """,
+)
+outflow = FlowCondition(
+    "outflow",
+    False,
+    neumann,
+    dirichlet,
+    """Open a side: what passes is found, and the pressure is 0 there.
+
+    The slope of the velocity along the side is 0. Flow may also enter through it.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> channel = dp.projection(dp.Grid((4, 3), size=1.0), boundary={"x": (dp.inflow, dp.outflow)})
+    """,
+)
 
 
 def resolve(grid, boundary, default=neumann):

@@ -543,6 +543,10 @@ def vjp(fun, *x):
     NonFiniteGradientWarning
         If a result of `pull` holds NaN or infinity; it names the call whose derivative is not finite.
 
+    Notes
+    -----
+    Complex numbers: cotangents are dL/dRe - i dL/dIm, see "Complex numbers" in docs/ideas.md.
+
     Examples
     --------
     >>> value, pull = vjp(lambda u, v: u * v, 2.0, 5.0)
@@ -634,6 +638,7 @@ def value_and_grad(loss, argnum=0):
 
     Notes
     -----
+    Complex numbers: the gradient in a complex leaf is dL/dRe - i dL/dIm, see "Complex numbers" in docs/ideas.md.
     `x` and the constant arrays that the loss uses in calls may be written into at once after a call (``work[:] = c`` in
     a loop): what the backward pass needs is copied. An array that is read-only with all its memory is not copied;
     ``mask.flags.writeable = False`` saves the time, that of one product with the mask for each call. Other objects,

@@ -1,7 +1,9 @@
 """What a public docstring must have, and nothing about style: first line, parameters, result, errors, an example."""
 
 import ast
+import doctest
 import inspect
+import pickle
 import re
 import textwrap
 from importlib.util import find_spec
@@ -10,6 +12,9 @@ import pytest
 from sources import FUNCTION, modules
 
 import sparsedp
+from sparsedp.optimize.loop import METHODS
+from sparsedp.optimize.sparse_terms import admm
+from sparsedp.solvers.choose_method import METHODS as ENGINES
 
 EXTRAS = {"torch": "torch", "jax": "jax", "xarray": "xarray"}  # what the names of dp.interop that end so need
 SECTION = r"(?m)^\s*(?:{numpydoc})\s*\n\s*-{{3,}}\s*$|^\s*{short}\s*:"
@@ -96,6 +101,57 @@ def test_public_methods_have_docstrings(name):
             k: v for k, v in vars(thing).items() if not k.startswith("_") and (callable(v) or isinstance(v, property))
         }
         assert not [k for k, v in own.items() if not inspect.getdoc(v)]
+
+
+CONDITIONS = ("dirichlet", "neumann", "no_slip", "free_slip", "inflow", "outflow")
+
+
+def test_conditions_have_docstrings_of_their_own():
+    docs = {name: inspect.getdoc(getattr(sparsedp, name)) for name in (*CONDITIONS, "robin")}
+    assert len({doc.splitlines()[0] for doc in docs.values()}) == len(docs)
+    for name in CONDITIONS:
+        condition = getattr(sparsedp, name)
+        again = pickle.loads(pickle.dumps(condition))
+        assert again == condition and again.__doc__ == condition.__doc__ and repr(again) == name
+        examples = doctest.DocTestParser().get_doctest(docs[name], {}, name, None, None)
+        assert examples.examples and not doctest.DocTestRunner(verbose=False).run(examples).failed, name
+
+
+def options_in_the_table(function):
+    """Method -> option -> default, as the table of options in a docstring says."""
+    found: dict = {}
+    for line in inspect.getdoc(function).splitlines():
+        cells = re.split(r"  +", line.strip(), maxsplit=3)
+        if len(cells) == 4:
+            method, options, default, _ = cells
+            found.setdefault(method, {}).update(dict.fromkeys(options.split(", "), default))
+    return found
+
+
+def options_of(makers, position):
+    """Method -> option -> default, as the signatures say."""
+    parameters = {method: list(inspect.signature(make).parameters.values()) for method, make in makers.items()}
+    return {method: {p.name: p.default for p in found[position(method) :]} for method, found in parameters.items()}
+
+
+def check_options(table, options):
+    for method, wanted in options.items():
+        assert set(table.get(method, {})) == set(wanted), method
+        for option, default in wanted.items():
+            told = table[method][option]
+            if told == "required":
+                assert default in (inspect.Parameter.empty, None)
+            elif told not in ("same", "see right"):
+                assert ast.literal_eval(told) == default, (method, option)
+
+
+def test_options_of_minimize_are_those_of_its_table():
+    options = options_of({**METHODS, "admm": admm}, lambda method: 7 if method == "admm" else 0)
+    check_options(options_in_the_table(sparsedp.minimize), options)
+
+
+def test_options_of_inverse_are_those_of_its_table():
+    check_options(options_in_the_table(sparsedp.inverse), options_of(ENGINES, lambda method: 1))
 
 
 def test_every_module_says_what_it_is():

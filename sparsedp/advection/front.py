@@ -54,13 +54,18 @@ def transport(
     ----------
     grid : Grid
     scheme : "upwind", "van_leer", "semi_lagrangian" or "maccormack"
-        upwind: donor cell, first order, linear in u, derivatives of every order; CFL number at most 1.
-        van_leer: limited slopes and two stages, second order where the field is smooth and has no extremum,
-        first derivatives; the sum of the CFL numbers at most 1/2.
-        semi_lagrangian: each point takes the value of the place its content comes from; any dt, linear in u,
-        keeps constants, does not conserve sums. maccormack: a step there and back, and half of what that
-        misses added, second order; in time too, where v is the mean of the velocities at both ends of the step, and
-        first where it is that of one end. Both on cells of any width, first derivatives (in u alone any).
+        ===============  =====  ======================  ===========================================================
+        scheme           order  time step               properties
+        ===============  =====  ======================  ===========================================================
+        upwind           1      CFL number at most 1    linear in u, conserves the sum, derivatives of every order
+        van_leer         2      CFL numbers sum to 1/2  limited slopes, two stages; 1 at extrema; first derivatives
+        semi_lagrangian  1      any                     linear in u, keeps constants, does not conserve the sum
+        maccormack       2      any                     semi_lagrangian and back, half of the error added
+        ===============  =====  ======================  ===========================================================
+
+        semi_lagrangian takes the value of the place that the content of a point comes from. maccormack is of order 2 in
+        time too where v is the mean of the velocities at both ends of the step, and of order 1 where it is that of one
+        end. Both work on cells of any width, with first derivatives (in u alone of every order).
     boundary : condition, or dict of conditions
         Where the velocity points inwards: dirichlet brings in `inflow`, neumann the value of the
         point at the wall. Outwards the field leaves in both cases. A closed wall is a velocity of 0 there.

@@ -51,7 +51,8 @@ def to_torch(f):
     -----
     Tensors and arrays share their memory; a result is copied where f may know its memory. f runs once for a value and
     its gradient, and once more for a gradient of the gradient (``create_graph=True``), which is right to every order:
-    f must give the same for the same arguments. ``torch.func`` and forward mode do not look through it, torch says so.
+    f must give the same for the same arguments. Gradients in complex numbers are torch's, dL/dRe + i dL/dIm, see
+    "Complex numbers" in docs/ideas.md. ``torch.func`` and forward mode do not look through it, torch says so.
 
     Examples
     --------

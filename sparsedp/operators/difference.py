@@ -238,7 +238,7 @@ def upwind(grid, axis=0, direction=1, boundary=neumann):
     direction : 1 or -1
         Sign of the velocity: 1 takes (u[i] - u[i - 1]) / d, -1 takes (u[i + 1] - u[i]) / d.
     boundary : condition, or dict of conditions
-        Says what the slope on a wall face is.
+        Says what the slope on a wall face is. Values on the walls enter by `lift`, see its example.
 
     Returns
     -------

@@ -48,6 +48,16 @@ def lift(grid, boundary):
     >>> from sparsedp import Grid, dirichlet
     >>> lift(Grid(3), dirichlet)(np.array([1.0, 5.0]))
     array([-2.,  0.,  0., 10.])
+
+    With `upwind`, whose slope in a cell is that of its face on the side of the wind, the wall value enters through
+    these faces. Here du/dx = 1 with u = 2 at the lower end:
+
+    >>> from sparsedp import inverse, neumann, upwind
+    >>> grid, sides = Grid(4, size=1.0), {"x": (dirichlet, neumann)}
+    >>> B = lift(grid, sides)
+    >>> x_faces = grid.split(B(B.domain.join(2.0, 0.0)))[0]
+    >>> inverse(upwind(grid, "x", 1, sides))(np.ones(4) - x_faces[:-1])
+    array([2.125, 2.375, 2.625, 2.875])
     """
     parts: list[tuple[int, ...]] = []
     blocks = {}

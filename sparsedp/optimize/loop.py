@@ -113,22 +113,51 @@ def minimize(
         A folder that keeps the last two states. The same call goes on from the last one, to the same bits, when the
         run was killed, interrupted, stopped by its callback or by maxiter; a new problem needs a new folder.
     **options
-        lbfgs: memory=10, line_search=20. gd: rate=None (found by backtracking), momentum=0.0,
-        line_search=None or "backtracking". adam: rate=1e-3, betas=(0.9, 0.999), epsilon=1e-8. newton_cg: inner=200.
-        gauss_newton: apart=False, dense=None, absolute_sigma=False. levenberg_marquardt: damping=1e-3, apart, dense,
-        absolute_sigma. half_inverse: rate=1.0, truncation=1e-10, power=0.75, rank=None, apart=False, form="auto" (J is
-        formed where it is small), absolute_sigma. absolute_sigma: whether the residuals are divided by their standard
-        deviations; it decides what `covariance` is, as in scipy.optimize.curve_fit. physical_gradient: physics,
-        inverse, rate=1.0. apart=True, the fast way for samples: residuals along axis 0 are samples, and the loss takes
-        every leaf of x with a leading axis of copies, one for each (a few
-        products give the whole Jacobian).
-        dense: whether the Jacobian is formed; None: when it is small. truncation, rank: see `update_direction`.
-        admm: weight (of the sum over entries, not of an integral: few jumps on a uniform grid are asked for by
-        operator=dp.gradient(grid) and a weight times the volume of a cell), operator=None (K, linear, from x to an
-        array; None for x itself, which is one array then), rho=None (the penalty at first), inner=10 (steps of lbfgs in
-        a round, or ``inner(target, rho, x)`` -> the x that minimizes loss(x) + rho/2 |K x - target|^2; without bounds),
-        prox=None (``prox(v, t)`` instead of the soft threshold; the values are then those of the loss alone). Its
-        iterations are rounds, and a tolerance of 1e-4 is usual.
+        Of the method; any other option is refused.
+
+        ===================  ==============  ============  =============================================================
+        method               option          default       meaning
+        ===================  ==============  ============  =============================================================
+        lbfgs                memory          10            steps that the curvature is taken from
+        lbfgs                line_search     20            most trial points in one line search
+        gd                   rate            None          step per gradient; None: found by backtracking
+        gd                   momentum        0.0           share of the last step that is added, from 0 to below 1
+        gd                   line_search     None          "backtracking": halve the step until the loss falls
+        adam                 rate            1e-3          size of a step in every entry
+        adam                 betas           (0.9, 0.999)  memory of the mean of the gradient and of its square
+        adam                 epsilon         1e-8          least root mean square, relative to the first gradient
+        newton_cg            inner           200           most products with the Hessian in one iteration
+        gauss_newton         apart           False         whether residuals along axis 0 are samples, see below
+        gauss_newton         dense           None          whether the Jacobian is formed; None: if it is small
+        gauss_newton         absolute_sigma  False         whether residuals are in standard deviations, see below
+        levenberg_marquardt  damping         1e-3          at the start, relative to the largest diagonal entry of J^T J
+        levenberg_marquardt  apart, dense    same          as for gauss_newton
+        levenberg_marquardt  absolute_sigma  False         as for gauss_newton
+        half_inverse         rate            1.0           factor of the step
+        half_inverse         power           0.75          p of the step J^T (J J^T)^-p r
+        half_inverse         truncation      1e-10         see `update_direction`
+        half_inverse         rank            None          see `update_direction`
+        half_inverse         apart           False         as for gauss_newton
+        half_inverse         form            "auto"        "dense", "krylov"; "auto" forms the Jacobian if it is small
+        half_inverse         absolute_sigma  False         as for gauss_newton
+        physical_gradient    physics         required      the simulator, as for `physical_gradient`
+        physical_gradient    inverse         required      its inverse
+        physical_gradient    rate            1.0           factor of the step
+        admm                 weight          required      of the sum of absolute entries (not of an integral)
+        admm                 operator        None          K, linear, from x to an array; None: x itself, one array
+        admm                 rho             None          first penalty; None: found from the data
+        admm                 inner           10            steps of lbfgs in a round, or a function, see below
+        admm                 prox            None          ``prox(v, t)`` in place of the soft threshold
+        ===================  ==============  ============  =============================================================
+
+        apart=True is the fast way for samples: the loss takes every leaf of x with a leading axis of copies, one for
+        each sample, and a few products give the whole Jacobian.
+        absolute_sigma: whether the residuals are divided by their standard deviations; it decides what `covariance` is,
+        as in scipy.optimize.curve_fit.
+        weight: few jumps on a uniform grid are asked for by operator=dp.gradient(grid) and a weight times the volume
+        of a cell. inner: ``inner(target, rho, x)`` returns the x that minimizes loss(x) plus rho / 2 times the sum of
+        (K x - target)^2; then without bounds. With prox the values are those of the loss alone. Iterations of admm are
+        rounds, and a tolerance of 1e-4 is usual.
 
     Returns
     -------

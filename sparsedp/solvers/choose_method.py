@@ -93,10 +93,21 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     nullspace : "raise" or "project"
         What to do with data outside the range of a singular operator: refuse it, or take that part out.
     **options
-        multigrid: cycle="V" or "W", strength=0.25, sweeps, levels=25.
-        krylov: preconditioner=None, "jacobi", "shifted_laplace" (for waves), an Operator or a function;
-        diff="implicit" or "unrolled"; iterations=None. structured and direct: precision="auto", "single" or "double".
-        separable has none.
+        Of the method. separable has none; auto takes those of all.
+
+        ==========  ==============  ==========  =================================================================
+        method      option          default     meaning
+        ==========  ==============  ==========  =================================================================
+        multigrid   cycle           "V"         "V" or "W", which costs more and needs fewer iterations
+        multigrid   strength        0.25        share of the largest entry of a row from which one is strong
+        multigrid   sweeps          see right   Gauss-Seidel sweeps, (('forward',), ('backward',)): before, after
+        multigrid   levels          25          most levels
+        krylov      preconditioner  None        "jacobi", "shifted_laplace" (for waves), Operator or function
+        krylov      diff            "implicit"  "unrolled": derivatives go through the iterations
+        krylov      iterations      None        exactly so many, whatever the residual
+        structured  precision       "auto"      "single" or "double", of the cycle
+        direct      precision       "auto"      "single" or "double", of the factors
+        ==========  ==============  ==========  =================================================================
 
     Returns
     -------
