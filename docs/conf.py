@@ -71,11 +71,11 @@ html_show_sphinx = False
 html_copy_source = False
 html_show_sourcelink = False
 html_show_search_summary = False  # a page that is opened from disk may not fetch others
-html_sidebars = {"index": [], "start": [], "ideas": [], "numbers": [], "compare": [], "building": []}
+html_sidebars = {"index": [], "start": [], "ideas": [], "numbers": [], "compare": [], "building": [], "gallery/**": []}
 html_theme_options = {
     "navbar_align": "left",
     "show_prev_next": False,
-    "secondary_sidebar_items": ["page-toc"],
+    "secondary_sidebar_items": {"**": ["page-toc"], "gallery/**": []},  # code needs the width
     "footer_start": ["copyright"],
     "footer_end": [],
     "header_links_before_dropdown": 7,

@@ -136,9 +136,10 @@ def let_processes_in():
 
 
 def pictures(block, block_vars, gallery_conf):
-    """The pictures and films that a script wrote with --out, for its page."""
+    """The pictures and films that a script wrote with --out, for its page. The first one, no film, is the thumbnail."""
     paths = block_vars["image_path_iterator"]
-    found = sorted((DRAWN / Path(block_vars["src_file"]).stem).glob("*.[pg][ni][gf]"))
+    drawn = (DRAWN / Path(block_vars["src_file"]).stem).glob("*.[pg][ni][gf]")
+    found = sorted(drawn, key=lambda path: (path.suffix == ".gif", path))
     names = []
     for path in found:
         names.append(str(Path(next(paths)).with_suffix(path.suffix)))

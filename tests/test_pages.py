@@ -190,6 +190,8 @@ LOOK = """() => ({
     over: document.documentElement.scrollWidth - document.documentElement.clientWidth,
     broken: [...document.images].filter(i => i.complete && !i.naturalWidth).map(i => i.src),
     flat: [...document.querySelectorAll("article math")].filter(m => m.getBoundingClientRect().height < 5).length,
+    cut: [...document.querySelectorAll(".wide, article .highlight pre")].filter(e => e.scrollWidth > e.clientWidth + 1)
+        .map(e => e.textContent.slice(0, 60)),
 })"""
 
 
@@ -238,7 +240,7 @@ def test_the_report_in_a_browser(tmp_path, browser, width):
     tab, wrong = opened(browser, width)
     tab.goto((tmp_path / "report.html").as_uri())
     seen = tab.evaluate(LOOK)
-    assert seen["over"] <= 0 and not seen["broken"] and not wrong, (seen, wrong)
+    assert seen["over"] <= 0 and not seen["broken"] and not seen["cut"] and not wrong, (seen, wrong)
     assert tab.locator("body > *").nth(1).inner_text().startswith("agrees")
     assert not tab.locator("details li").first.is_visible()
     tab.locator("summary").first.click()

@@ -19,11 +19,22 @@ th { cursor: pointer; white-space: nowrap; }
 th[aria-sort=ascending]::after { content: " \\2191"; } th[aria-sort=descending]::after { content: " \\2193"; }
 figure { margin: 1rem 0; } img, svg { max-width: 100%; height: auto; } img { background: white; width: 44rem; }
 figcaption { font-size: 0.9rem; }
+.stacked thead tr { display: flex; flex-wrap: wrap; }
+.stacked tbody tr { display: block; padding: 0.5rem 0; border-bottom: 1px solid #8884; }
+.stacked td { display: flex; border: 0; white-space: normal; overflow-wrap: anywhere; }
+.stacked td::before { content: attr(data-name); flex: 0 0 35%; padding-right: 0.6rem; opacity: 0.75; }
+.stacked td:empty { display: none; }
+.stacked, .stacked tbody { display: block; }
 """
 
-# A click on the name of a column sorts its table by it: numbers by size, words by letters, what is empty last.
+# A click on the name of a column sorts its table by it: numbers by size, words by letters, what is empty last. Tables
+# that are too wide for the window are stacked.
 SORTING = """
 for (const table of document.querySelectorAll("table")) {
+  const names = [...table.querySelectorAll("th")].map(head => head.textContent);
+  for (const row of table.tBodies[0].rows) {
+    [...row.cells].forEach((cell, column) => { cell.dataset.name = names[column] || ""; });
+  }
   table.querySelectorAll("th").forEach((head, column) => {
     head.tabIndex = 0;
     const sort = () => {
@@ -43,6 +54,17 @@ for (const table of document.querySelectorAll("table")) {
     head.addEventListener("keydown", event => { if (event.key === "Enter") sort(); });
   });
 }
+// A table that is wider than the window has its cells below each other.
+const fit = () => {
+  for (const box of document.querySelectorAll(".wide")) {
+    for (const table of box.querySelectorAll("table")) {
+      table.classList.remove("stacked");
+      table.classList.toggle("stacked", table.scrollWidth > box.clientWidth);
+    }
+  }
+};
+window.addEventListener("resize", fit);
+fit();
 """
 
 
