@@ -75,7 +75,7 @@ html_sidebars = {"index": [], "start": [], "ideas": [], "numbers": [], "compare"
 html_theme_options = {
     "navbar_align": "left",
     "show_prev_next": False,
-    "secondary_sidebar_items": {"**": ["page-toc"], "gallery/**": []},  # code needs the width
+    "secondary_sidebar_items": {"*": ["page-toc"], "gallery/**": [], "api/**": []},  # code and tables need the width
     "footer_start": ["copyright"],
     "footer_end": [],
     "header_links_before_dropdown": 7,

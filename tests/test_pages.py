@@ -198,13 +198,13 @@ LOOK = """() => ({
 @pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
 def test_in_a_browser(site, browser, width):
-    """No error, no picture missing, no formula without a height, nothing wider than the window."""
+    """No error, no picture missing, no formula without a height, no code cut, nothing wider than the window."""
     tab, wrong = opened(browser, width)
     found = []
     for path in pages(site):
         tab.goto(path.as_uri())
         seen = tab.evaluate(LOOK)
-        found += [f"{path.relative_to(site)}: {what}" for what in (*wrong, *seen["broken"])]
+        found += [f"{path.relative_to(site)}: {what}" for what in (*wrong, *seen["broken"], *seen["cut"])]
         found += [f"{path.relative_to(site)}: {key} {seen[key]}" for key in ("over", "flat") if seen[key] > 0]
         wrong.clear()
     tab.close()
