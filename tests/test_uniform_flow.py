@@ -331,6 +331,36 @@ def test_a_lid_is_the_same_as_a_function_and_as_a_lift():
         np.testing.assert_allclose(*ends, rtol=0, atol=1e-14)
 
 
+def test_an_array_as_walls_says_how_flow_enters():
+    """What `face_lift` makes of velocities that differ along the inflow, with the same value and gradient."""
+    grid = dp.Grid((4, 3), size=1.0)
+    lift = dp.face_lift(grid, CHANNEL)
+    wind, speeds = grid.join(1.0, 0.0), np.cos(np.arange(float(lift.domain.size)))
+
+    def loss(speeds, walls):
+        step = dp.flow_step(grid, 0.02, 0.05, boundary=CHANNEL, walls=walls(speeds))
+        state = step.start(wind, speeds)
+        for _ in range(3):
+            state = step(state, speeds)
+        return anp.sum(state["v"] ** 3)
+
+    (one, slope), (two, wanted) = (
+        dp.value_and_grad(lambda speeds, walls=walls: loss(speeds, walls))(speeds)
+        for walls in (lift, lambda speeds: lambda params: params)
+    )
+    assert one == pytest.approx(two, rel=1e-13)
+    np.testing.assert_allclose(slope, wanted, rtol=0, atol=1e-12)
+
+
+def test_a_batch_of_velocities_and_of_walls(rng):
+    grid = dp.Grid((4, 3))
+    convect = dp.convection(grid, CHANNEL)
+    v = rng.standard_normal((2, grid.faces.size))
+    walls = rng.standard_normal((2, dp.face_lift(grid, CHANNEL).domain.size))
+    each = [convect(v[k], v[k], walls[k]) for k in range(2)]
+    np.testing.assert_array_equal(convect(v, v, walls), each)
+
+
 @pytest.mark.parametrize("given", [lambda lift, values: lift(values), lambda lift, values: lambda params: values])
 def test_an_obstacle_beside_a_moving_wall(given):
     """The wall does not drag the faces of the obstacle, from which an implicit viscosity would drag the fluid."""

@@ -83,6 +83,10 @@ def burgers_speed(u, params, axis):
     return anp.max(anp.abs(params * u), axis=0)
 
 
+def sliding(params):
+    return params * np.ones(dp.face_lift(GRID).domain.size)
+
+
 def push(v, params):
     return -params * v
 
@@ -263,12 +267,20 @@ def travellers():
     yield "smoothness", "", dp.smoothness(GRID, SOLID), lambda h1: bits(h1, numbers(GRID.shape))
     law = dp.conservation_law(BOX, burgers_flux, burgers_speed, source=push)
     yield "conservation_law", "", law, lambda law: bits(law, numbers((2, *BOX.shape)), 0.3)
+    law = dp.conservation_law(
+        LINE, burgers_flux, burgers_speed, boundary=(dp.inflow, dp.free_slip), momentum=0, inflow=np.array([1.0, 2.0])
+    )
+    yield "conservation_law", "walls and inflow", law, lambda law: bits(law, numbers((2, 12)), 0.3)
+    channel = {"x": (dp.inflow, dp.outflow), "y": dp.no_slip}
+    lift = dp.face_lift(GRID, channel)
+    yield "face_lift", "", lift, lambda lift: bits(lift, numbers(lift.domain.size))
     yield "flow_step", "", dp.flow_step(GRID, 0.01, 0.1, push, solid=SOLID), of_flow
     yield "flow_step", "implicit", dp.flow_step(BOX, 0.01, 0.1, implicit=True, convective=False), of_flow
     yield "flow_step", "friction", dp.flow_step(GRID, 0.01, friction=numbers(GRID.faces.size) ** 2), of_flow
     lid = dp.face_lift(GRID)
     lid = lid(lid.domain.join(0.0, 0.0, 0.0, 1.0))
     yield "flow_step", "lid", dp.flow_step(GRID, 0.01, half, walls=lid), of_flow
+    yield "flow_step", "walls of params", dp.flow_step(GRID, 0.01, half, walls=sliding), of_flow
     v, w = numbers((2, GRID.faces.size))
     yield "convection", "", dp.convection(GRID, {"x": dp.free_slip}, SOLID), lambda c: bits(c, v, w)
     on = dp.forces(GRID, SOLID, {"x": dp.free_slip}, about=0.2)

@@ -294,7 +294,7 @@ class ConservationLaw(Remade):
         """Return the speed of the fastest wave along an axis in each cell, with those that enter it at a side."""
         speeds = np.max(np.abs(self._speeds(axis.number, u, params)), axis=0)
         for side, edge in ((0, slice(0, 1)), (1, slice(-1, None))):
-            if axis.sides[side] is inflow_side:
+            if axis.sides[side] == inflow_side:
                 entering = plain(axis.ghosts_beyond(u, params, side))
                 beyond = np.max(np.abs(self._speeds(axis.number, entering, params)), axis=0)
                 cells = axis.at(edge)
@@ -364,10 +364,10 @@ class Axis:
     def ghosts_beyond(self, u, params, upper, flows=True):
         """What stands beyond an end."""
         ghosts, side = u[self.at(self.ghosts[upper])], self.sides[upper]
-        if side is free_slip:  # the momentum changes its sign
+        if side == free_slip:  # the momentum changes its sign
             signs = 1.0 - 2.0 * (np.arange(len(u)) == self.momentum)
             return -ghosts if u.ndim == self.dim else ghosts * self._fields(signs)
-        if side is not inflow_side or not flows:
+        if side != inflow_side or not flows:
             return ghosts
         value = self.inflow(params, self.number, upper) if callable(self.inflow) else self.inflow
         if np.ndim(value) == 1 and u.ndim > self.dim:

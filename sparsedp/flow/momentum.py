@@ -307,8 +307,9 @@ def wall_velocities(grid, sides):
 
 
 def check_walls(name, walls, space):
-    """Refuse wall velocities of another shape than their space."""
-    check_on(f"{name}, as walls,", walls, space, "; write face_lift(grid, boundary).domain.join(...)")
+    """Refuse wall velocities, one array or a batch of them, of another shape than their space."""
+    if np.shape(walls)[-1:] != space.shape:
+        check_on(f"{name}, as walls,", walls, space, "; write face_lift(grid, boundary).domain.join(...)")
 
 
 def velocities_of(lifted, grid, sides):
@@ -354,7 +355,7 @@ def _moving_sides(grid, sides):
         for a in range(grid.dim)
         for side, condition in enumerate(sides[a] or ())
         for c in range(grid.dim)
-        if c != a and condition.along is dirichlet
+        if c != a and condition.along == dirichlet
     ]
 
 
