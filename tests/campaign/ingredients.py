@@ -312,7 +312,7 @@ POINTWISE = {
     "tanh": lambda u, p: anp.tanh(p["a"] * u) + 0.5 * u,
     "product": lambda u, p: u * p["a"] + p["a"] ** 2,
     "quotient": lambda u, p: u / (1 + p["a"] ** 2) + 0.1 * anp.exp(-(u**2)),
-    "where": lambda u, p: anp.where(u > 0, u**2 + u, anp.sin(u)),
+    "where": lambda u, p: anp.where(u > 0, u + 0.2 * u**2 / (1 + u**2), anp.sin(u)),
     "stacked": lambda u, p: anp.sum(anp.stack([u, u**2 * p["a"], anp.cos(u)]) * 0.5, axis=0),
     "moved": lambda u, p: 0.5 * u + p["a"] * anp.concatenate([u[..., 1:], u[..., :1]], axis=-1) * u,
 }
@@ -409,7 +409,7 @@ class BlackBox(OnCells):
 
 @dataclass(frozen=True)
 class Diffusion(OnCells):
-    """u -> u + D((1 + A(u)^2) k G(u)) / scale."""
+    """u -> u + D((1 + sin(A(u))^2) k G(u)) / scale."""
 
     sides: tuple
     solid: int | None
@@ -424,14 +424,15 @@ class Diffusion(OnCells):
     def library(self, box):
         grid, sides, scale = box.grid(), boundary(box, self.sides), self._scale(box)
         D, G, A = dp.divergence(grid), dp.gradient(grid, sides, obstacle(box, self.solid)), dp.average(grid, sides)
-        return lambda u, p: u + D((1 + A(u) ** 2) * p["k"] * G(u)) / scale
+        return lambda u, p: u + D((1 + anp.sin(A(u)) ** 2) * p["k"] * G(u)) / scale
 
     def twin(self, box):
         table, scale, faces = dense(box, self.sides, self.solid), self._scale(box), box.field_shape("faces")
         D, G, A = table.divergence() / scale, table.gradient(), table.average()
 
         def act(u, p):
-            flow = (1 + flat_product(A, u, box.shape, faces) ** 2) * p["k"] * flat_product(G, u, box.shape, faces)
+            flow = (1 + anp.sin(flat_product(A, u, box.shape, faces)) ** 2) * p["k"]
+            flow = flow * flat_product(G, u, box.shape, faces)
             return u + flat_product(D, flow, faces, box.shape)
 
         return act
@@ -843,7 +844,7 @@ class Root(OnCells):
 
 @dataclass(frozen=True)
 class Sum(Ingredient):
-    """u -> the sum, or the product, of two ingredients of the same field."""
+    """u -> a weighted sum of two ingredients of the same field, or one times the sine of the other."""
 
     one: Ingredient
     other: Ingredient
@@ -883,7 +884,7 @@ class Sum(Ingredient):
     def _combined(self, one, other):
         def act(u, p):
             left, right = one(u, part_of(p, "one")), other(u, part_of(p, "other"))
-            return left * right if self.multiplied else left + right
+            return anp.sin(left) * right if self.multiplied else 0.7 * (left + right)
 
         return act
 
@@ -953,6 +954,7 @@ class Rollout(Ingredient):
             values.update(prefixed(f"part {number}", part, box))
         if self.inputs:
             values["inputs"] = 0.1 * numbers(self.seed, (self.n, *box.field_shape(self.source)))
+            values["scales"] = 0.1 * numbers(self.seed, self.n)
         return values
 
     def _weights(self):
@@ -971,7 +973,7 @@ class Rollout(Ingredient):
         if not isinstance(self.memory, int):
             return self.memory
         beside = sum(constant_part(value).nbytes for value in p.values() if anp.ndim(value))
-        beside += 0 if inputs is None else constant_part(inputs).nbytes
+        beside += sum(constant_part(value).nbytes for value in (inputs or {}).values())
         return self.memory * constant_part(u).nbytes + 2 * beside + 200
 
     def _advance(self, parts):
@@ -997,12 +999,14 @@ class Rollout(Ingredient):
             u = state["field"] if self.tree else state
             u = advance(u, p)
             if added:
-                u = u + added[0]
+                u = u + added[0]["inputs"] * added[0]["scales"]
             return {"time": state["time"] + 0.5, "field": u, "name": "ink"} if self.tree else u
 
         def act(u, p):
             p = dict(p)
-            inputs = p.pop("inputs", None)
+            inputs = None
+            if self.inputs:
+                inputs = {"scales": p.pop("scales"), "inputs": p.pop("inputs")}
             state = {"field": u, "time": 0.0, "name": "ink"} if self.tree else u
             memory = self._budget(u, p, inputs)
             end = dp.rollout(step, state, p, self.n, inputs, memory=memory, keep=keep, truncate=self.truncate)
@@ -1023,7 +1027,7 @@ class Rollout(Ingredient):
                     u = constant_part(u)
                 u = advance(u, p)
                 if self.inputs:
-                    u = u + p["inputs"][step]
+                    u = u + p["inputs"][step] * p["scales"][step]
                 states.append(u)
             if self.keep == "last":
                 return u

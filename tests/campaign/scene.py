@@ -49,6 +49,12 @@ class Scene:
         How the field lies in memory, a key of `LAYOUTS`.
     bridge : str
         "none", or the library that differentiates the loss: "torch" or "jax".
+    number : str
+        What parameters that are numbers are, a key of `FORMS_OF_NUMBERS`.
+    shared : bool
+        Whether parameters that may have any value are the same array as the field, where it fits.
+    unused : bool
+        Whether there is an array that the loss does not use.
     """
 
     box: Box
@@ -61,6 +67,9 @@ class Scene:
     ensemble: int = 0
     layout: str = "C"
     bridge: str = "none"
+    number: str = "float"
+    shared: bool = False
+    unused: bool = False
 
     @property
     def order(self):
@@ -85,10 +94,18 @@ class Scene:
     def leaves(self):
         """Return the values by name: the field, and the parameters of each ingredient."""
         shape = (*self.batch, *self.box.field_shape(self.chain[0].source))
-        values = {"u": LAYOUTS[self.layout](numbers(5000 + self.seed, shape, self.dtype))}
+        u = LAYOUTS[self.layout](numbers(5000 + self.seed, shape, self.dtype))
+        values = {"u": u}
         for number, part in enumerate(self.chain):
             for name, value in part.parameters(self.box).items():
-                values[f"{number} {name}"] = in_precision(value, self.dtype)
+                value = in_precision(value, self.dtype)
+                if isinstance(value, float):
+                    value = FORMS_OF_NUMBERS[self.number](value)
+                elif self.shared and self.dtype != "complex128" and name in SHARABLE and value.shape == u.shape:
+                    value = u
+                values[f"{number} {name}"] = value
+        if self.unused:
+            values["unused"] = in_precision(np.ones((2, 3)), self.dtype)
         return values
 
     def tangents(self):
@@ -97,7 +114,7 @@ class Scene:
         result = {}
         for number, (name, value) in reversed(list(enumerate(names))):
             tangent = numbers(7000 + self.seed + number, np.shape(value), np.asarray(value).dtype)
-            result[name] = float(tangent) if isinstance(value, float) else tangent
+            result[name] = type(value)(tangent) if isinstance(value, float) else tangent
         return result
 
     def _composed(self, parts, bounded=False):
@@ -157,6 +174,10 @@ def in_precision(value, dtype):
     if isinstance(value, float):
         return value
     return np.asarray(value, "float32" if dtype == "float32" else "float64")
+
+
+SHARABLE = ("f", "v", "w", "push")  # parameters that may have any value
+FORMS_OF_NUMBERS = {"float": float, "array": np.asarray, "scalar": np.float64}
 
 
 # ---- layouts in memory --------------------------------------------------------------------------------------------
@@ -339,8 +360,13 @@ def compare_by_jax(scene, loss, values, twin, outcome):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    bridged = dp.interop.to_jax(lambda moving: loss(TREES[scene.tree][0](moving)))
     arrays = {name: np.asarray(value) for name, value in values.items()}
+
+    def of_dict(moving):  # JAX sorts the entries of dicts
+        return loss(TREES[scene.tree][0]({name: moving[name] for name in values}))
+
+    number = np.zeros((), "float32" if scene.dtype == "float32" else "float64")
+    bridged = dp.interop.to_jax(of_dict, like=number)
     value, found = jax.jit(jax.value_and_grad(bridged))(arrays)
     check_close(scene, "value by JAX", value, twin.value, twin.value_scale)
     check_gradient(scene, "gradient by JAX", found, twin.gradient, arrays)
