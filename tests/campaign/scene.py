@@ -50,7 +50,7 @@ class Scene:
     bridge : str
         "none", or the library that differentiates the loss: "torch" or "jax".
     number : str
-        What parameters that are numbers are, a key of `FORMS_OF_NUMBERS`.
+        What parameters that are numbers are: "float", "array" or "scalar".
     shared : bool
         Whether parameters that may have any value are the same array as the field, where it fits.
     unused : bool
@@ -100,7 +100,7 @@ class Scene:
             for name, value in part.parameters(self.box).items():
                 value = in_precision(value, self.dtype)
                 if isinstance(value, float):
-                    value = FORMS_OF_NUMBERS[self.number](value)
+                    value = self._as_number(value)
                 elif self.shared and self.dtype != "complex128" and name in SHARABLE and value.shape == u.shape:
                     value = u
                 values[f"{number} {name}"] = value
@@ -108,13 +108,18 @@ class Scene:
             values["unused"] = in_precision(np.ones((2, 3)), self.dtype)
         return values
 
+    def _as_number(self, value):
+        """Return a number of Python, or an array or scalar of NumPy in the precision of the scene."""
+        precise = np.asarray(value, "float32" if self.dtype == "float32" else "float64")
+        return {"float": value, "array": precise, "scalar": precise[()]}[self.number]
+
     def tangents(self):
         """Return a direction by name; its entries are in another order than those of `leaves`."""
         names = list(self.leaves().items())
         result = {}
         for number, (name, value) in reversed(list(enumerate(names))):
             tangent = numbers(7000 + self.seed + number, np.shape(value), np.asarray(value).dtype)
-            result[name] = type(value)(tangent) if isinstance(value, float) else tangent
+            result[name] = tangent if isinstance(value, np.ndarray) else type(value)(tangent)
         return result
 
     def _composed(self, parts, bounded=False):
@@ -177,7 +182,6 @@ def in_precision(value, dtype):
 
 
 SHARABLE = ("f", "v", "w", "push")  # parameters that may have any value
-FORMS_OF_NUMBERS = {"float": float, "array": np.asarray, "scalar": np.float64}
 
 
 # ---- layouts in memory --------------------------------------------------------------------------------------------
