@@ -253,3 +253,29 @@ def test_half_inverse_losses_as_with_a_dense_svd(rng):
         x = x - 0.1 * reference(np.stack(rows), value.ravel(), 0.75)
     assert losses[-1] < 0.9 * losses[0]
     assert np.allclose([record.value for record in best.history], losses, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("method", ["dense", "krylov"])
+@pytest.mark.parametrize("power", [0.5, 0.75, 1.0])
+@pytest.mark.parametrize("exponent", [-1000, -550, 550, 1000])
+def test_outputs_of_any_magnitude(method, power, exponent, rng):
+    """Squares of the singular values leave the range of floats: directions were NaN or 0."""
+    matrix, data, factor = rng.standard_normal((6, 4)), rng.standard_normal(6), 2.0**exponent
+    run = lambda factor: dp.update_direction(
+        lambda x: factor * (anp.dot(matrix, x) - data), np.ones(4), method=method, power=power
+    )
+    known, scaled = run(1.0), run(factor)
+    assert np.allclose(scaled.step, known.step * factor ** (2.0 - 2.0 * power), rtol=1e-9)  # J^T (J J^T)^-p r
+    assert np.allclose(scaled.spectrum, factor * known.spectrum, rtol=1e-9) and scaled.kept == known.kept
+
+
+@pytest.mark.parametrize("method", ["dense", "krylov"])
+@pytest.mark.parametrize("exponent", [-500, 500])
+def test_damped_steps_of_unknowns_of_any_magnitude(method, exponent, rng):
+    """Of unknowns times f J is divided by f, the damping by f^2, and the step is times f."""
+    matrix, data, factor = rng.standard_normal((6, 4)), rng.standard_normal(6), 2.0**exponent
+    run = lambda factor: dp.update_direction(
+        lambda x: anp.dot(matrix, x / factor) - data, factor * np.ones(4), method=method, power=1.0,
+        damping=0.25 / factor / factor,
+    )  # fmt: skip
+    assert np.allclose(run(factor).step, factor * run(1.0).step, rtol=1e-9)

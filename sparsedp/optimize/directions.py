@@ -12,6 +12,9 @@ import numpy as np
 from sparsedp.fields import check_choice, check_finite, check_function, check_number, check_shape, check_whole
 from sparsedp.optimize.linearised import Linearised, singular
 from sparsedp.packing import Packing
+from sparsedp.solvers.scaling import largest
+from sparsedp.solvers.scaling import length as length_of
+from sparsedp.tree import safe_unit
 
 __all__ = ["Direction", "Family", "form_of", "update_direction"]
 
@@ -75,10 +78,14 @@ class Family:
     def dense(self, jacobian, g):
         """Direction from J itself, m x n: (J^T J + damping)^(-power) J^T g, or with J J^T where that is smaller."""
         wide = len(jacobian) <= jacobian.shape[1]
+        unit, height = safe_unit(largest(jacobian)), safe_unit(largest(g))
+        jacobian = jacobian if unit == 1 else jacobian / unit
+        g = g if height == 1 else g / height
         vectors, s = singular(jacobian if wide else jacobian.T)
-        shares, kept = self._shares(s)
+        shares, kept = self._shares(s, unit)
         weights = vectors @ (shares * ((g if wide else g @ jacobian) @ vectors))
-        return Direction(weights @ jacobian if wide else weights, s, kept, "dense")
+        step = weights @ jacobian if wide else weights
+        return Direction(self._in_units(step, unit, height), unit * s, kept, "dense")
 
     def krylov(self, linearised, g):
         """Direction from products with J and J^T.
@@ -101,7 +108,7 @@ class Family:
             if len(sizes) == 2 * look:
                 before, weights = weights, self._small(length, sizes)[0]
                 moved = weights - np.pad(before, (0, look - len(before)))
-                if np.linalg.norm(moved) <= SETTLED * np.linalg.norm(weights):
+                if length_of(moved) <= SETTLED * length_of(weights):
                     break
                 look += max(LOOK, look // 8)
         weights, s, kept = self._small(length, sizes)
@@ -111,16 +118,23 @@ class Family:
         """The direction in the basis Q, the singular values of B, and how many of them were kept."""
         place, steps = np.arange(len(sizes)), (len(sizes) + 1) // 2
         small = np.zeros((steps + 1, steps))
-        small[(place + 1) // 2, place // 2] = sizes
+        unit = safe_unit(max(sizes, default=0.0))
+        small[(place + 1) // 2, place // 2] = np.divide(sizes, unit)
         left, s, right = np.linalg.svd(small, full_matrices=False)
-        shares, kept = self._shares(s)
-        return length * (shares * s * left[0]) @ right, s, kept
+        shares, kept = self._shares(s, unit)
+        return self._in_units((shares * s * left[0]) @ right, unit, length), unit * s, kept
 
-    def _shares(self, s):
-        """(s^2 + damping)^(-power), 0 for the singular values that are left out; how many are not."""
+    def _in_units(self, step, unit, height):
+        """Return the direction for J times unit and g times height, given that for J and g."""
+        return step * height * unit ** (1.0 - 2.0 * self.power)
+
+    def _shares(self, s, unit):
+        """Return (s^2 + damping / unit^2)^(-power), 0 for the singular values that are left out; how many are not."""
         kept = (s > self.truncation * np.max(s, initial=0.0)) & (s > 0)
         shares = np.zeros_like(s)
-        shares[kept] = np.hypot(s[kept], np.sqrt(self.damping)) ** (-2 * self.power)
+        with np.errstate(over="ignore"):  # a damping that is large beside J leaves no step
+            damping = np.sqrt(self.damping) / np.float64(unit)
+        shares[kept] = np.hypot(s[kept], damping) ** (-2 * self.power)
         return shares, int(np.count_nonzero(kept))
 
 
@@ -137,11 +151,11 @@ class _Rows:
     def add(self, vector):
         """Append the direction of what of a vector is orthogonal to the rows; the length of that."""
         rest = vector - (self.rows @ vector) @ self.rows
-        if np.linalg.norm(rest) <= CANCELLED * np.linalg.norm(vector):  # twice, so that rounding stays out
+        if length_of(rest) <= CANCELLED * length_of(vector):  # twice, so that rounding stays out
             rest = rest - (self.rows @ rest) @ self.rows
         if self._count == len(self._memory):
             self._memory = np.concatenate([self._memory, np.empty((BLOCK, vector.size))])
-        size = float(np.linalg.norm(rest))
+        size = length_of(rest)
         self._memory[self._count] = self.last = rest / (size or 1.0)
         self._count += 1
         return size

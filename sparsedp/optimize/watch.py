@@ -102,9 +102,10 @@ class Watch:
         the gradient is not small.
         """
         size, x = self._size(self._last), self._last.vector
+        if size <= FLAT * self._first_size:
+            return True
         length = max(norm(x), norm(x - self._first.vector))
-        beside_loss = length > 0 and size <= FLAT * (abs(self._last.value) / length)
-        return beside_loss or size <= FLAT * self._first_size
+        return length > 0 and size <= FLAT * (abs(self._last.value) / length)
 
     def minimum(self, x, method, **more):
         """What the run comes to."""
