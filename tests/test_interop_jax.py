@@ -246,6 +246,35 @@ def test_constants_may_be_reused_and_results_written_to():
     f(np.ones(2), np.ones(2))[:] = 0.0
 
 
+def test_forward_mode_is_refused_and_the_hessian_is_reverse_over_reverse(doubles):
+    cube = to_jax(lambda u: anp.sum(u**3))
+    x = jnp.arange(1.0, 4.0)
+    assert close(jax.jacrev(jax.grad(cube))(x), jnp.diag(6.0 * x))
+    for forward in (
+        jax.hessian(cube),
+        jax.jacfwd(cube),
+        lambda x: jax.jvp(cube, (x,), (x,)),
+        jax.jit(jax.hessian(cube)),
+    ):
+        with pytest.raises(
+            dp.errors.DerivativeError,
+            match=r"a function of to_jax has reverse-mode derivatives only, and jax.hessian, jax.jacfwd and "
+            r"jax.jvp ask for forward-mode ones; write jax.jacrev\(jax.grad\(f\)\) for the Hessian, jax.jacrev\(f\) "
+            "for the Jacobian, or dp.jvp and dp.hvp with arrays of NumPy",
+        ):
+            forward(x)
+
+
+def test_errors_of_type_of_the_function_itself_are_left_alone():
+    def refuse(u):
+        if np.all(u == 1.0):
+            return u
+        raise TypeError("only ones")
+
+    with pytest.raises(TypeError, match="only ones"):
+        to_jax(refuse)(jnp.arange(3.0))
+
+
 def test_refusals_of_jax_functions():
     with pytest.raises(TypeError, match="^from_jax takes a function, got str; write dp.interop.from_jax"):
         from_jax("net")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from sparsedp.errors import ShapeError
+from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.fields import check_function, check_precision
 from sparsedp.interop.recording import owned, parts, recorded
 from sparsedp.recipe import Made
@@ -52,8 +52,9 @@ def to_jax(f, like=None):
     -----
     JAX calls back: f runs in Python, on the CPU, and must give the same for the same arguments. What it raises is
     raised as it is, and by jit inside an error of JAX. vmap runs f for one entry of a batch after the other. Only what
-    JAX asks for is differentiated, in reverse mode to every order; JAX refuses forward mode. JAX cannot keep what f
-    recorded, so the way back runs f once more.
+    JAX asks for is differentiated, in reverse mode to every order. There is no forward mode, as in ``jax.hessian``,
+    ``jacfwd`` and ``jvp``: the Hessian is ``jax.jacrev(jax.grad(f))``. JAX cannot keep what f recorded, so the way back
+    runs f once more.
 
     Examples
     --------
@@ -72,7 +73,7 @@ def to_jax(f, like=None):
         if key not in nodes:
             nodes[key] = _called(f, structure, like)
         node, result = nodes[key]
-        entries = node.call(*arrays)  # the first call finds the structure
+        entries = node.applied(*arrays)  # the first call finds the structure
         return jax.tree.unflatten(result.structure, entries)
 
     return Made(call, to_jax, f, like)
@@ -164,6 +165,19 @@ class _Node:
         self.call = jax.custom_vjp(self._run)
         self.call.defvjp(self._forward, self._backward, symbolic_zeros=True)
 
+    def applied(self, *values):
+        """Call the function of JAX; say what to write where JAX refuses forward mode."""
+        try:
+            return self.call(*values)
+        except TypeError as error:
+            if "forward-mode" not in str(error) or "custom_vjp" not in str(error):
+                raise
+            raise DerivativeError(
+                "a function of to_jax has reverse-mode derivatives only, and jax.hessian, jax.jacfwd and jax.jvp "
+                "ask for forward-mode ones; write jax.jacrev(jax.grad(f)) for the Hessian, jax.jacrev(f) for "
+                "the Jacobian, or dp.jvp and dp.hvp with arrays of NumPy"
+            ) from error
+
     def _run(self, *values):
         """At once, or by a call back when JAX runs what it traces."""
         if not any(isinstance(value, jax.core.Tracer) for value in values):
@@ -174,7 +188,7 @@ class _Node:
 
     def _forward(self, *primals):
         values, marks = [primal.value for primal in primals], [() if primal.perturbed else None for primal in primals]
-        return [*self.call(*values)], (values, marks)
+        return [*self.applied(*values)], (values, marks)
 
     def _backward(self, kept, cotangents):
         values, marks = kept
@@ -182,7 +196,7 @@ class _Node:
         key = tuple(mark is not None for mark in marks), tuple(given)
         if key not in self._pulls:
             self._pulls[key] = self._pull(*key)
-        slopes = iter(self._pulls[key].call(*values, *compress(cotangents, given)))
+        slopes = iter(self._pulls[key].applied(*values, *compress(cotangents, given)))
         return tuple(next(slopes) if moves else None for moves in key[0])
 
     def _pull(self, moving, given):

@@ -166,7 +166,8 @@ def certify(loss, x, target=TARGET):
     Certificate
         `.value`, `.gradient` as the loss gives them; their estimated errors `.value_error` (absolute, with a sign) and
         `.gradient_error` (relative to the norm of the gradient); `.corrected_value`, `.corrected_gradient`; `.causes`:
-        relative error of the gradient from the forward and from the adjoint solves; `.solves`: one dict for each solver; `.advice`: one line. str() is the table.
+        relative error of the gradient from the forward and from the adjoint solves; `.solves`: one dict for each
+        solver; `.advice`: one line. str() is the table.
 
     Raises
     ------
