@@ -178,7 +178,7 @@ def paired(tree, reference, name, owner="", advice="", shapes=False, prefix=None
 
 def is_uniform(leaf):
     """Whether a leaf is one number or None, which may stand for a whole branch."""
-    return leaf is None or np.ndim(leaf) == 0
+    return leaf is None or (np.ndim(leaf) == 0 and np.asarray(leaf).dtype.kind in "biufc")
 
 
 class _MismatchError(Exception):

@@ -34,6 +34,16 @@ class Other(NamedTuple):
     c: Any
 
 
+@dataclass
+class Settings:
+    """A container that is no tree."""
+
+    k: Any
+
+    def __getitem__(self, name):
+        return getattr(self, name)
+
+
 def loss(x):
     return (x["a"] - 1.0) ** 2 + 10 * (x["b"] - 2.0) ** 2
 
@@ -207,6 +217,16 @@ def test_bounds_of_nested_trees_and_of_other_named_tuples():
 def test_other_bounds_are_refused(bounds, words):
     with pytest.raises(ShapeError, match=words):
         dp.minimize(loss, START, bounds=bounds)
+
+
+def test_bounds_that_are_no_numbers_are_refused():
+    for bound in (Settings(1.0), "0.5", np.array([None, 1.0])):
+        with pytest.raises(
+            TypeError, match=r"bounds\[1\]: expected numbers, got dtype .*; write -np.inf or np.inf for none"
+        ):
+            dp.minimize(square, np.zeros(2), bounds=(None, bound))
+    with pytest.raises(ShapeError, match=r"bounds\[1\]: expected a dict of a, b, got Settings; write one number, None"):
+        dp.minimize(loss, START, bounds=(None, Settings(1.0)))
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "gd"])
@@ -610,16 +630,6 @@ def test_constants_of_other_precision_are_rounded(dtype):
 
 
 # ---- containers that are no trees ------------------------------------------------------------------------------------
-
-
-@dataclass
-class Settings:
-    """A container that is no tree."""
-
-    k: Any
-
-    def __getitem__(self, name):
-        return getattr(self, name)
 
 
 @pytest.mark.parametrize("kind", [lambda k: MappingProxyType({"k": k}), Settings, lambda k: Settings([Settings(k)])])

@@ -83,6 +83,9 @@ def _side(side, without, packing, name):
 
 def _full(x, bound, name, place):
     """A bound for every entry of x; a real one bounds both parts of a complex entry."""
+    kind = np.asarray(bound).dtype
+    if kind.kind not in "biufc":
+        raise TypeError(f"{name}: expected numbers, got dtype {kind}; write -np.inf or np.inf for none")
     if np.iscomplexobj(x) and not np.iscomplexobj(bound):
         bound = bound * (1 + 1j)
     try:
