@@ -110,8 +110,8 @@ def expressions(draw, box, source, target, depth=2):
 
 
 @st.composite
-def linears(draw, box, source):
-    target = draw(st.sampled_from([source, source, "cells", "faces"]))
+def linears(draw, box, source, same):
+    target = source if same else draw(st.sampled_from([source, source, "cells", "faces"]))
     keep = draw(st.sampled_from([0.0, 1.0])) if source == target else 0.0
     return parts.Linear(draw(expressions(box, source, target)), keep, source, target)
 
@@ -171,9 +171,9 @@ def transports(draw, box, of):
 
 
 @st.composite
-def simple(draw, box, source, batched, complex_field):
-    """One ingredient that is no composition."""
-    choices = ["linear", "linear", "solve"]
+def simple(draw, box, source, batched, complex_field, same=False):
+    """One ingredient that is no composition; same: with a result of the kind of its argument."""
+    choices = ["linear", "solve"]
     if not complex_field:
         choices += ["pointwise", "pointwise", "rule"]
         if source == "cells":
@@ -192,7 +192,7 @@ def simple(draw, box, source, batched, complex_field):
             choices += ["elliptic", "elliptic", "entries", "root", "adopted"]
     name = draw(st.sampled_from(choices))
     if name == "linear":
-        return draw(linears(box, source))
+        return draw(linears(box, source, same))
     if name == "solve":
         return draw(solves(box, source))
     if name == "pointwise":
@@ -279,8 +279,7 @@ def rollouts(draw, box, source, batched, complex_field, nested=True):
             chain.append(draw(rollouts(box, source, batched, complex_field, nested=False)))
             most = 4
             continue
-        part = draw(simple(box, source, batched, complex_field))
-        chain.append(part if part.target == source else parts.Linear(("identity", source), 0.5, source, source))
+        chain.append(draw(simple(box, source, batched, complex_field, same=True)))
     n = draw(st.integers(1, most))
     numbers_kept = draw(st.sets(st.integers(0, n), min_size=1))
     keep = draw(st.sampled_from(["last", "last", "all", tuple(sorted(numbers_kept)), "function"]))
@@ -294,10 +293,10 @@ def rollouts(draw, box, source, batched, complex_field, nested=True):
 @st.composite
 def scenes(draw):
     """A whole scene."""
-    dtype = draw(st.sampled_from(["float64"] * 5 + ["float32", "complex128"]))
+    dtype = draw(st.sampled_from(["float64"] * 7 + ["float32", "complex128"]))
     complex_field = dtype == "complex128"
     box = draw(boxes())
-    batch = draw(st.sampled_from([(), (), (), (2,), (3,), (2, 2)]))
+    batch = draw(st.sampled_from([(), (), (), (), (), (2,), (3,), (2, 2)]))
     kind = draw(st.sampled_from(["cells", "cells", "faces"]))
     chain = []
     for _ in range(draw(st.integers(1, 4))):
@@ -308,7 +307,7 @@ def scenes(draw):
             continue
         part = draw(simple(box, source, bool(batch), complex_field))
         if form == "sum":
-            other = draw(simple(box, source, bool(batch), complex_field))
+            other = draw(simple(box, source, bool(batch), complex_field, same=part.target == source))
             if part.target == other.target:
                 multiplied = draw(st.booleans()) and not complex_field
                 part = parts.Sum(part, other, multiplied)
