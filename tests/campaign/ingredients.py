@@ -727,7 +727,38 @@ def etdrk4(equation, u, h):
     return anp.dot(whole, u) + h * change
 
 
+def radau(equation, u, h):
+    """Three stages U_i = u + h sum of a_ij f(U_j), the last of which is the new state (Hairer and Wanner)."""
+    root = np.sqrt(6.0)
+    weights = np.array([
+        [(88 - 7 * root) / 360, (296 - 169 * root) / 1800, (-2 + 3 * root) / 225],
+        [(296 + 169 * root) / 1800, (88 + 7 * root) / 360, (-2 - 3 * root) / 225],
+        [(16 - root) / 36, (16 + root) / 36, 1 / 9],
+    ])  # fmt: skip
+    size = len(equation.A)
+
+    def residual(stages, of):
+        parts = [stages[i * size : (i + 1) * size] for i in range(3)]
+        rates = [equation.rate(stage, of) for stage in parts]
+        found = []
+        for i in range(3):
+            change = sum(weights[i, j] * rates[j] for j in range(3))
+            found.append(parts[i] - of(u) - of(h) * change)
+        return anp.concatenate(found)
+
+    def jacobian(stages, of):
+        slopes = [equation.slope(stages[i * size : (i + 1) * size], of) for i in range(3)]
+        rows = []
+        for i in range(3):
+            rows.append(anp.concatenate([-of(h) * weights[i, j] * slopes[j] for j in range(3)], axis=1))
+        return np.eye(3 * size) + anp.concatenate(rows, axis=0)
+
+    start = np.concatenate([constant_part(u)] * 3)
+    return newton(residual, jacobian, start)[2 * size :]
+
+
 TIME_STEPS = {
+    "radau": radau,
     "euler": euler,
     "heun": heun,
     "ssprk3": ssprk3,
@@ -757,16 +788,35 @@ class TimeStep(OnCells):
     def batched(self):
         return self.method in ("euler", "heun", "ssprk3", "rk4")
 
+    @property
+    def order(self):
+        return 1 if self.method == "radau" else 2
+
+    @property
+    def refusals(self):
+        if self.method != "radau":
+            return ()
+        return (
+            (dp.errors.DerivativeError, "first derivatives only|radau"),
+            (dp.errors.ConvergenceError, "does not converge in a step of .*; take a smaller dt"),
+        )
+
     def _expression(self):
         return ("laplacian", self.sides, None, "neumann")
 
     def parameters(self, box):
         size = bound(box, self._expression())
         f = numbers(self.seed, box.shape)
-        return {"nu": 0.4 / size, "r": 0.8, "f": f, "dt": 0.3}
+        return {"nu": 0.4 / size, "r": 0.8, "f": f, "dt": 0.1 if self.method == "radau" else 0.3}
 
     def library(self, box):
         L = operator(box, self._expression())
+        if self.method == "radau":
+
+            def rate(u, p):
+                return p["nu"] * L(u) + reaction(u, p)
+
+            return dp.stepper("radau", rate, time_step_of, rtol=1e-12)
         return dp.stepper(self.method, reaction, time_step_of, linear=(L, viscosity_of), rtol=1e-12)
 
     def twin(self, box):

@@ -575,6 +575,103 @@ SHARP = ("rk4", "ssprk3", "radau")
 
 
 @dataclass(frozen=True)
+class Switched(OnCells):
+    """u -> the state after an interval in which a source is switched off, beside the closed form.
+
+    u' = -k u + f until the time `off`, u' = -k u after it.
+    """
+
+    method: str
+    seed: int
+    batched = False
+    tolerance = 1e-4
+
+    @property
+    def order(self):
+        return 1 if self.method == "radau" else 2
+
+    @property
+    def refusals(self):
+        coarse = (dp.errors.DerivativeError, "tolerance")
+        return (*FIRST_ORDER, coarse) if self.method == "radau" else (coarse,)
+
+    def parameters(self, box):
+        return {"k": 0.9, "f": 1 + 0.3 * np.sin(numbers(self.seed, box.shape)), "off": 0.23}
+
+    def library(self, box):
+        def rate(u, p, t):
+            return -p["k"] * u + p["f"] * np.where(t < p["off"], 1.0, 0.0)
+
+        step = dp.stepper(self.method, rate, 0.6, tolerance=1e-8, breaks=switch_of)
+        return lambda u, p: step((u, 0.0), p)[0]
+
+    def twin(self, box):
+        def act(u, p):
+            k, off = p["k"], p["off"]
+            at_switch = u * anp.exp(-k * off) + p["f"] / k * (1 - anp.exp(-k * off))
+            return at_switch * anp.exp(-k * (0.6 - off))
+
+        return act
+
+
+def switch_of(p):
+    return [p["off"]]
+
+
+@dataclass(frozen=True)
+class Ball(OnCells):
+    """u -> u h + v of a ball that bounces once, started from a height that depends on the mean of u."""
+
+    method: str
+    batched = False
+    tolerance = 1e-4
+
+    @property
+    def order(self):
+        return 1 if self.method == "radau" else 2
+
+    @property
+    def refusals(self):
+        coarse = (dp.errors.DerivativeError, "tolerance")
+        return (*FIRST_ORDER, coarse) if self.method == "radau" else (coarse,)
+
+    def parameters(self, box):
+        return {"g": 9.81, "e": 0.8}
+
+    def _start(self, u):
+        return 0.5 + 0.1 * anp.tanh(anp.mean(u)), 0.3 * anp.sin(anp.sum(u))
+
+    def library(self, box):
+        def rate(state, p):
+            return anp.stack([state[1], -p["g"] + 0.0 * state[1]])
+
+        def touches(state, p):
+            return state[0]
+
+        def bounced(state, p):
+            return anp.stack([0.0 * state[0], -p["e"] * state[1]])
+
+        touches.direction = -1
+        step = dp.stepper(self.method, rate, 0.6, tolerance=1e-8, events=(touches, bounced))
+
+        def act(u, p):
+            end = step((anp.stack(self._start(u)), 0.0), p)[0]
+            return u * end[0] + end[1]
+
+        return act
+
+    def twin(self, box):
+        def act(u, p):
+            height, speed = self._start(u)
+            impact = anp.sqrt(speed**2 + 2 * p["g"] * height)
+            rest = 0.6 - (speed + impact) / p["g"]
+            after = p["e"] * impact
+            return u * (after * rest - 0.5 * p["g"] * rest**2) + after - p["g"] * rest
+
+        return act
+
+
+@dataclass(frozen=True)
 class Damped(OnCells):
     """u -> real and imaginary parts of x of (shift - D k G) x = u, k and the shift complex."""
 

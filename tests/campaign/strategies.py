@@ -188,7 +188,7 @@ def simple(draw, box, source, batched, complex_field, same=False):
         if source == "cells":
             choices += ["spectral"]
         if source == "cells" and not batched:
-            choices += ["law", "fields", "waves", "adaptive", "damped"] + ["network"] * (box.dim < 3)
+            choices += ["law", "fields", "waves", "adaptive", "damped", "switched"] + ["network"] * (box.dim < 3)
             choices += ["elliptic", "elliptic", "entries", "root", "adopted"]
     name = draw(st.sampled_from(choices))
     if name == "linear":
@@ -202,7 +202,7 @@ def simple(draw, box, source, batched, complex_field, same=False):
         return parts.Rule(source, draw(st.booleans()), draw(SEEDS))
     if name == "step":
         methods = list(parts.TIME_STEPS)
-        methods = methods[:4] if batched else methods
+        methods = ["euler", "heun", "ssprk3", "rk4"] if batched else methods
         return parts.TimeStep(draw(st.sampled_from(methods)), draw(sides_of(box)), draw(SEEDS))
     if name == "diffusion":
         return parts.Diffusion(draw(sides_of(box)), draw(SOLIDS), draw(SEEDS))
@@ -254,6 +254,9 @@ def physical(draw, name, box, source):
     if name == "adaptive" and draw(st.booleans()):  # it takes seconds
         method = draw(st.sampled_from(["ssprk3", "rk4", "tr_bdf2", "radau"]))
         return physics.Adaptive(method, draw(sides_of(box)), seed)
+    if name == "switched":
+        method = draw(st.sampled_from(["ssprk3", "rk4", "radau"]))
+        return draw(st.sampled_from([physics.Switched(method, seed), physics.Ball(method)]))
     if name == "damped":
         return physics.Damped(draw(sides_of(box)), draw(st.sampled_from(["auto", "direct", "krylov"])), seed)
     if name == "spectral":
