@@ -334,6 +334,15 @@ def test_the_choice_is_about_the_coupled_unknowns():
     assert "30 coupled unknowns" in plan
 
 
+def test_refusals_name_the_operator_that_was_given():
+    """And not the part of it that is solved for."""
+    matrix = sp.block_diag([chain(3), np.array([[2.0, 1.0], [1.0, -2.0]])])
+    with pytest.raises(
+        ValueError, match="of one sign; <matrix: space.5. -> space.5., explicit> has -2.0e.00 and 2.0e.00"
+    ):
+        dp.inverse(dp.from_matrix(matrix), "multigrid")
+
+
 def test_options_are_checked_for_triangular_systems():
     op = dp.from_matrix(chain(5))
     with pytest.raises(ValueError, match="precision must be one of auto, single, double, got 'half'"):

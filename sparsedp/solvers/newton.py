@@ -361,7 +361,8 @@ class Newton:
 
     def _lean(self, solver):
         """Jacobians to come shall try the LU of this one."""
-        if solver.system.size >= NEAR_FROM and solver.engine.method == "direct" and not self.steps:
+        factored = getattr(solver.engine, "inner", solver.engine) is not None  # else substitution solves all of it
+        if factored and solver.system.size >= NEAR_FROM and solver.engine.method == "direct" and not self.steps:
             self.near = solver.engine
 
     def _linearise(self):

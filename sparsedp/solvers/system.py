@@ -324,7 +324,7 @@ class System:
         """The System of the unknowns that substitution does not find."""
         keep = Operator(Mask(self.splitting.coupled), self.op.domain, self.op.domain, "mask")
         system = System(self.op @ keep, self.rtol, self.maxiter)
-        system.splitting = None
+        system.given, system.splitting = self.given, None  # messages name what was given
         return system
 
     @cached_property
