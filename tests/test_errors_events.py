@@ -150,8 +150,8 @@ TABLE = [
         lambda: thrown(np.sqrt(2 * 9.81) * (1 + 1e-9), "radau"),
         DerivativeError,
         "events[0] of stepper(radau) grazes its surface at t = 0.451503687: its rate of change there, 0.000198, is "
-        "zero to the tolerance 1e-06, so that its time has no derivative; give another event or parameter, or a smaller "
-        "tolerance",
+        "zero to the tolerance 1e-06, so that its time has no derivative; give another event or parameter, or a "
+        "smaller tolerance",
     ),
 ]
 
