@@ -132,13 +132,18 @@ def check_precision(name, value):
     settings, such as dt, and derivatives that a user's own function returns are rounded to double precision instead.
     """
     dtype: Any = getattr(value, "dtype", None)
-    if getattr(dtype, "name", None) == "bfloat16" or (
-        getattr(dtype, "kind", None) in ("f", "c") and dtype.char not in PRECISIONS
-    ):
+    if _is_other_precision(dtype):
         kind = "complex" if dtype.kind == "c" else "float"
         raise TypeError(
             f"{name} must be float32, float64, complex64 or complex128, got {dtype}; write np.asarray(x, {kind})"
         )
+
+
+def _is_other_precision(dtype):
+    """Whether a dtype of NumPy holds floating numbers that are neither of single nor of double precision."""
+    if not isinstance(dtype, np.dtype):
+        return False
+    return dtype.name == "bfloat16" or (dtype.kind in "fc" and dtype.char not in PRECISIONS)
 
 
 def check_leaves(name, tree, containers=True):
@@ -153,7 +158,7 @@ def check_leaves(name, tree, containers=True):
     for number, leaf in enumerate(leaves(tree)):
         dtype = getattr(leaf, "dtype", None)
         if dtype is not None:
-            if getattr(dtype, "kind", None) in ("f", "c") and dtype.char not in PRECISIONS:
+            if _is_other_precision(dtype):
                 check_precision(labels(tree, name)[number], leaf)
         elif containers and type(leaf) not in PLAIN_LEAVES and any(map(_is_floating, hidden_leaves(leaf))):
             raise TypeError(
@@ -164,14 +169,27 @@ def check_leaves(name, tree, containers=True):
 
 def hidden_leaves(value):
     """The leaves inside a container that is not a tree: a dataclass, or a Mapping that is not a dict."""
-    if isinstance(value, Mapping):
-        branches = list(value.values())
-    elif is_dataclass(value) and not isinstance(value, type):
-        branches = [getattr(value, field.name, None) for field in fields(value)]
-    else:
-        return []
-    entries = leaves(branches)
-    return entries + [leaf for entry in entries for leaf in hidden_leaves(entry)]
+    found: list = []
+    pending = [value]
+    seen = set()  # a dataclass may hold itself
+    while pending:
+        container = pending.pop()
+        if id(container) in seen:
+            continue
+        seen.add(id(container))
+        inside = leaves(_entries_of(container))
+        found += inside
+        pending += inside
+    return found
+
+
+def _entries_of(container):
+    """What a container that is not a tree holds; nothing of anything else."""
+    if isinstance(container, Mapping):
+        return list(container.values())
+    if is_dataclass(container) and not isinstance(container, type):
+        return [getattr(container, field.name, None) for field in fields(container)]
+    return []
 
 
 def _is_floating(leaf):

@@ -643,6 +643,10 @@ def test_containers_that_are_no_trees_are_refused_by_name(kind):
     ):
         with pytest.raises(TypeError, match=words):
             call()
+    circle = Settings(None)
+    circle.k = [circle, 2.0]
+    with pytest.raises(TypeError, match="is a Settings, which is not a tree"):
+        dp.grad(lambda x: x.k[1])(circle)
     words_only = MappingProxyType({"name": "scene", "n": 3})  # nothing to differentiate
     assert dp.grad(lambda x: x["u"] ** x["m"]["n"])({"u": 2.0, "m": words_only}) == {"u": 12.0, "m": None}
 
