@@ -130,3 +130,26 @@ def test_a_rule_as_tolerance_sees_losses_that_it_can_compare(exponent):
     known = dp.minimize(residuals, start, "levenberg_marquardt", tolerance=rule)
     assert best.converged and len(best.history) == len(known.history) > 2
     assert np.allclose(best.x, known.x, rtol=1e-9)
+
+
+@pytest.mark.parametrize("as_function", [False, True])
+@pytest.mark.parametrize("resumed", [False, True])
+def test_one_batch_with_a_small_gradient_is_not_converged(as_function, resumed, tmp_path):
+    """The second batch is nearly constant: all of them have to be small in turn."""
+    weights = [1.0, 1e-12, 0.5]
+    batches = (lambda number: weights[number % 3]) if as_function else weights
+    target = np.array([2.0, -1.0])
+
+    def run(maxiter, **more):
+        return dp.minimize(
+            lambda x, weight: weight * anp.sum((x - target) ** 2), np.zeros(2), "gd", rate=0.3, batches=batches,
+            maxiter=maxiter, **more,
+        )  # fmt: skip
+
+    if resumed:
+        assert not run(20, checkpoint=tmp_path).converged
+    best = run(300, **({"checkpoint": tmp_path} if resumed else {}))
+    assert best.converged and np.allclose(best.x, target, atol=1e-7)
+    period = 10 if as_function else 3
+    assert best.message.startswith(f"converged: the gradients of the last {period} batches are ")
+    assert len(best.history) == len(run(300).history)

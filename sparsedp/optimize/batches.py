@@ -5,6 +5,8 @@ from functools import lru_cache
 
 __all__ = ["Batches"]
 
+FEW = 10  # batches of a function, whose number is not known
+
 
 class Batches:
     """Batches by number of iteration, so that a run that is resumed sees the same ones.
@@ -18,6 +20,8 @@ class Batches:
     ----------
     varied : bool
         Whether two iterations may see two losses.
+    period : int
+        Number of iterations that the gradient must be small in: the length of a sequence, 10 for a function.
 
     Raises
     ------
@@ -34,6 +38,7 @@ class Batches:
         if isinstance(given, Sequence) and not given:
             raise ValueError("batches is empty; leave it out, and the loss is called with x alone")
         self.varied = given is not None
+        self.period = len(given) if isinstance(given, Sequence) else FEW
         self._batch = lru_cache(maxsize=2)(given if callable(given) else lambda number: given[number % len(given)])
 
     def at(self, iteration):

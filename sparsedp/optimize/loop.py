@@ -108,7 +108,8 @@ def minimize(
         one that is not affine, as np.clip, or not idempotent is refused. Not together with bounds.
     batches : sequence or callable, optional
         The loss of iteration i is ``loss(x, batches[i % len(batches)])``, or ``loss(x, batches(i))``. For gd with a
-        rate, adam and half_inverse; the result is the last point, not the best one.
+        rate, adam and half_inverse; the result is the last point, not the best one. Converged when the gradient has
+        been small in as many iterations on end as there are batches, 10 for a function.
     checkpoint : path, optional
         A folder that keeps the last two states. The same call goes on from the last one, to the same bits, when the
         run was killed, interrupted, stopped by its callback or by maxiter; a new problem needs a new folder.

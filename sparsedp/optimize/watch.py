@@ -73,8 +73,11 @@ class Watch:
 
     def _judge(self, size):
         """Decide by the size of the last gradient; that of its record may have left the range of floats."""
+        if self._trials.batches.varied:
+            self._judge_batches()
+            return
         if size == 0:
-            met = not self._trials.batches.varied  # a batch may have the gradient 0 alone
+            met = True
         elif callable(self._tolerance):
             met = self._tolerance(*self._comparable(size))
         else:
@@ -83,6 +86,22 @@ class Watch:
             share = f"{size / (self._first_size or 1.0):.1e} of that at the start" if size else 0
             gradient = "projected gradient" if self._trials.box.bounded else "gradient"
             self.converged, self.message = True, f"converged: the {gradient} is {share}"
+
+    def _judge_batches(self):
+        """Decide by the last pass over the batches: one of them alone may have a small gradient."""
+        first, recent = self.history[0], self.history[-self._trials.batches.period :]
+        if self._first_size > 0 and not 0 < first.gradient_norm < inf:
+            return  # the gradients of the records have left the range of floats and cannot be compared
+        if callable(self._tolerance):
+            met = all(self._tolerance(record, first) for record in recent)
+        else:
+            met = all(record.gradient_norm <= self._tolerance * first.gradient_norm for record in recent)
+        if met and len(recent) == self._trials.batches.period:
+            share = max(record.gradient_norm for record in recent) / (first.gradient_norm or 1.0)
+            self.converged = True
+            self.message = (
+                f"converged: the gradients of the last {len(recent)} batches are {share:.1e} of that at the start"
+            )
 
     def _comparable(self, size):
         """Return the last record and the first one, with losses and gradients that can be compared.
