@@ -229,7 +229,7 @@ def with_controlled_steps(error):
     return lambda rate: anp.sum(cube(CONTROLLED(np.array([1.0, 0.4]), rate)))
 
 
-@pytest.mark.parametrize("error", [0.0, 1e-3, 0.1])
+@pytest.mark.parametrize("error", [0.0, 1e-3, pytest.param(0.1, marks=pytest.mark.whole)])
 def test_what_the_tolerance_of_steps_leaves_is_inconclusive(error):
     """The gap is below the tolerance; a wrong rule of the same size is found by itself."""
     found = dp.check.gradient(with_controlled_steps(error), RATE, directions=1, quick=True)
@@ -240,6 +240,7 @@ def test_what_the_tolerance_of_steps_leaves_is_inconclusive(error):
         assert "the steps' tolerance of 0.001 leaves this, tighten it" in found.reason
 
 
+@pytest.mark.whole
 def test_a_given_gradient_behind_controlled_steps():
     """Ten tolerances are the limit where no call can be examined."""
     loss = with_controlled_steps(0.0)

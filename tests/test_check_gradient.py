@@ -228,3 +228,22 @@ def test_trial_points_that_refuse():
     assert nowhere.verdict == "inconclusive" and "UnstableStepError: too far" in nowhere.reason
     with pytest.raises(dp.errors.UnstableStepError, match="too far"):
         AUDIT(loss(-1.0), X, gradient=lambda u: 3 * u**2)
+
+
+# ---- detection limits ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [1e-1, 1e-3, 1e-5, 1e-6, pytest.param(1e-8, marks=pytest.mark.whole)])
+@pytest.mark.parametrize("wrong", ["all", "one entry", "one leaf"])
+def test_small_errors_of_a_gradient_are_found(wrong, share):
+    weight = np.ones(20) if wrong != "one entry" else 1.0 * (np.arange(20) == 7)
+
+    def derivative(p):
+        error = share * weight
+        return {"u": 3 * p["u"] ** 2 * (1 + error), "v": 2 * p["v"] * (1 + (share if wrong == "all" else 0.0))}
+
+    loss = lambda p: np.sum(p["u"] ** 3) + np.sum(p["v"] ** 2)
+    x = {"u": X, "v": X[:3]}
+    assert AUDIT(loss, x, gradient=derivative, directions=1).verdict == "disagrees"
+    share = 0.0
+    assert AUDIT(loss, x, gradient=derivative, directions=1).verdict == "agrees"
