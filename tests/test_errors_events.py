@@ -143,8 +143,8 @@ TABLE = [
         lambda: thrown(np.sqrt(2 * 9.81)),
         DerivativeError,
         "events[0] of stepper(rk4) grazes its surface at t = 0.451523632: its rate of change there, 9.05e-08, is zero "
-        "to the tolerance 1e-06, so that its time has no derivative; give another event or parameter, or a smaller "
-        "tolerance",
+        "to the tolerance 1e-06, so that its time has no derivative; give another event or parameter, or a "
+        "smaller tolerance",
     ),
     (
         lambda: thrown(np.sqrt(2 * 9.81) * (1 + 1e-9), "radau"),
