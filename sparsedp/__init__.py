@@ -18,7 +18,6 @@ _WINDOW = {
     "space": "Space",
     "boundary_conditions": "dirichlet free_slip inflow neumann no_slip outflow robin",
     "tape": "differentiable",
-    "errors": "NonFiniteGradientWarning",
     "derivative": "grad hvp jvp value_and_grad vjp",
     "packing": "flatten",
     "operator": "Operator",

@@ -17,7 +17,6 @@ from .derivative import hvp as hvp
 from .derivative import jvp as jvp
 from .derivative import value_and_grad as value_and_grad
 from .derivative import vjp as vjp
-from .errors import NonFiniteGradientWarning as NonFiniteGradientWarning
 from .flow.finite_volumes import conservation_law as conservation_law
 from .flow.momentum import convection as convection
 from .flow.momentum import face_laplacian as face_laplacian

@@ -657,16 +657,18 @@ def value_and_grad(loss, argnum=0):
         if len(args) <= argnum:
             raise TypeError(f"the gradient in argument {argnum} of the loss needs it, got {len(args)} arguments")
         with growing():  # until the tape is gone: a search for cyclic garbage in between would walk all of it
-            return together("the loss", args, both, *args)
-
-    def both(*args):
-        value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
-        check_loss(value)
-        gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
-        _warn_unless_finite("value_and_grad", gradient, lambda: both(*args))
-        return value if isbox(value) else float(value), gradient
+            return together("the loss", args, _value_and_gradient, loss, argnum, args)
 
     return Made(evaluate, value_and_grad, loss, argnum)
+
+
+def _value_and_gradient(loss, argnum, args):
+    """Return the value of a loss, and its gradient in one of its arguments."""
+    value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
+    check_loss(value)
+    gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
+    _warn_unless_finite("value_and_grad", gradient, lambda: _value_and_gradient(loss, argnum, args))
+    return value if isbox(value) else float(value), gradient
 
 
 def check_loss(value):

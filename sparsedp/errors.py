@@ -50,7 +50,7 @@ class NonFiniteGradientWarning(UserWarning):
     """A derivative that is returned holds NaN or infinity; the message names the call it comes from.
 
     `grad`, `value_and_grad`, `vjp`, `jvp` and `hvp` warn. Turn it into an error by
-    ``warnings.filterwarnings("error", category=sparsedp.NonFiniteGradientWarning)``.
+    ``warnings.filterwarnings("error", category=sparsedp.errors.NonFiniteGradientWarning)``.
     """
 
 

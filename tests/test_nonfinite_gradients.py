@@ -35,22 +35,22 @@ DERIVATIVES = {
 
 @pytest.mark.parametrize("name", DERIVATIVES)
 def test_the_call_is_named(name):
-    with pytest.warns(dp.NonFiniteGradientWarning, match=ROOT_AT_ZERO) as seen:
+    with pytest.warns(dp.errors.NonFiniteGradientWarning, match=ROOT_AT_ZERO) as seen:
         DERIVATIVES[name]()
-    assert len([one for one in seen if one.category is dp.NonFiniteGradientWarning]) == 1
+    assert len([one for one in seen if one.category is dp.errors.NonFiniteGradientWarning]) == 1
     assert seen[-1].filename == __file__
 
 
 @pytest.mark.parametrize("name", DERIVATIVES)
 def test_it_can_be_an_error(name):
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", category=dp.NonFiniteGradientWarning)
-        with pytest.raises(dp.NonFiniteGradientWarning, match="the derivative of sqrt"):
+        warnings.filterwarnings("error", category=dp.errors.NonFiniteGradientWarning)
+        with pytest.raises(dp.errors.NonFiniteGradientWarning, match="the derivative of sqrt"):
             DERIVATIVES[name]()
 
 
 def test_the_norm_at_zero():
-    with pytest.warns(dp.NonFiniteGradientWarning, match=NORM_AT_ZERO):
+    with pytest.warns(dp.errors.NonFiniteGradientWarning, match=NORM_AT_ZERO):
         value, gradient = dp.value_and_grad(anp.linalg.norm)(np.zeros(3))
     assert value == 0.0 and np.all(np.isnan(gradient))
 
@@ -58,7 +58,8 @@ def test_the_norm_at_zero():
 def test_a_second_derivative():
     """The gradient of u^1.5 is finite at 0, its Hessian is not."""
     with pytest.warns(
-        dp.NonFiniteGradientWarning, match="the derivative returned by hvp holds NaN or infinity: the derivative of "
+        dp.errors.NonFiniteGradientWarning,
+        match="the derivative returned by hvp holds NaN or infinity: the derivative of ",
     ):
         dp.hvp(power, X, np.ones(2))
 
@@ -66,11 +67,11 @@ def test_a_second_derivative():
 def test_a_function_that_cannot_run_twice_is_not_named():
     runs = iter([chosen_root])
     reason = "the derivative returned by value_and_grad holds NaN or infinity: dp.check.gradient"
-    with pytest.warns(dp.NonFiniteGradientWarning, match=reason):
+    with pytest.warns(dp.errors.NonFiniteGradientWarning, match=reason):
         dp.grad(lambda u: next(runs)(u))(X)
 
 
-@pytest.mark.filterwarnings("error::sparsedp.NonFiniteGradientWarning")
+@pytest.mark.filterwarnings("error::sparsedp.errors.NonFiniteGradientWarning")
 def test_who_refuses_does_not_warn():
     """Nor do finite derivatives, and those of an argument that is not finite."""
     assert np.allclose(dp.grad(chosen_root)(X + 1.0), 0.5 / np.sqrt(X + 1.0), rtol=1e-15)

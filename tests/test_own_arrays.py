@@ -2,6 +2,7 @@
 
 import pickle
 from copy import deepcopy
+from types import ModuleType
 
 import autograd.numpy as anp
 import numpy as np
@@ -252,6 +253,7 @@ def test_every_builder_is_here():
     shown = "animate plot convergence v_curve update_direction save load from_image"
     public = {name for name in dir(dp) if callable(getattr(dp, name)) and name.islower() and name[0] != "_"}
     public -= {"dirichlet", "neumann"}  # a call of them is refused with advice
+    public -= {name for name in public if isinstance(getattr(dp, name), ModuleType)}  # so is a call of these
     here = {name.split(",")[0].split(" ")[0] for name in BUILDERS}
     assert public - here == set(f"{unbuilt} {calls} {shown}".split()) - here
 
