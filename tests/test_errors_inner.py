@@ -183,7 +183,7 @@ def test_forces_and_walls_of_another_shape_are_refused():
         dp.errors.ShapeError,
         match="flow_step, as walls, takes a "
         r"field on faces\(2, 2\) of shape \(12,\), got an array of shape \(3,\); "
-        r"write face_lift\(grid, boundary\)\(values\)",
+        r"write walls=lambda params: values, or face_lift\(grid, boundary\)\(values\)",
     ):
         dp.flow_step(grid, 0.1, walls=np.zeros(3))
     by_number, by_field = (dp.flow_step(grid, 0.1, force=lambda v, g: g).start(rest, g) for g in (1.0, np.ones(12)))

@@ -97,8 +97,8 @@ BUGS = {
     ),
     "a force that forgets the momentum that arrives": Bug(
         "flow",
-        "+ self.pressure(p) - momentum",
-        "+ self.pressure(p) - 0 * momentum",
+        "total = stress - momentum",
+        "total = stress - 0 * momentum",
         "tests/test_forces.py",
     ),
     "a flux that enters through one side": Bug(

@@ -214,8 +214,9 @@ class Forces(Remade):
     @public("dp.forces(grid, solid)")
     def __call__(self, v, p, viscosity, walls=None):
         check_number("the viscosity of forces", plain(viscosity), ">= 0")  # an array would be spread over the torque
+        stress = viscosity * self.viscous(v) + self.pressure(p)
         momentum = self.gain(self.fluxes.carried(v, walls) * self.fluxes.carrier(v, walls))
-        total = viscosity * self.viscous(v) + self.pressure(p) - momentum
+        total = stress - momentum
         if walls is not None:
             total = total + viscosity * self.dragged(walls)
         check_finite("what forces finds", plain(total))
