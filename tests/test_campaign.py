@@ -107,6 +107,12 @@ def test_many_scenes(number, record_property):
 LINE = Box(shape=(1,), periodic=(True,), stretched=(False,))
 COLUMN = Box(shape=(2, 1), periodic=(False, True), stretched=(True, False), seed=3)
 FOUND = {
+    "a length of a step of radau as an array, whose value differed by a rounding where it was differentiated": Scene(
+        Box((1, 1, 3), (False, False, True), (False, False, False)),
+        (parts.TimeStep("radau", (("neumann", "neumann"), ("neumann", "neumann"), None), seed=0),),
+        loss="first",
+        number="array",
+    ),
     "a complex number as the shift of an elliptic solve": Scene(
         COLUMN, (physics.Damped((("dirichlet", "neumann"), None), "auto", seed=4),)
     ),
@@ -121,7 +127,9 @@ FOUND = {
 
 @pytest.mark.parametrize("name", FOUND)
 def test_a_scene_that_once_failed(name):
-    assert "hvp" in compare(FOUND[name]).compared
+    compared = compare(FOUND[name]).compared
+    assert {"value", "gradient", "jvp"} <= set(compared)
+    assert FOUND[name].order == 1 or "hvp" in compared
 
 
 # ---- the campaign itself -------------------------------------------------------------------------------------------

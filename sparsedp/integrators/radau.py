@@ -292,6 +292,7 @@ class Radau(Adaptive):
         return J
 
     def _newton(self, v, t, h):
+        h = float(h)  # complex numbers of Python and of NumPy divide with other roundings
         if self.held != h:
             solves = (dense_lu(value / h * np.eye(v.size) - self.J)[0] for value in (REAL, COMPLEX))
             self.held, (self.real, self.complex) = h, solves

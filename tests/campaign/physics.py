@@ -593,7 +593,8 @@ class Switched(OnCells):
     @property
     def refusals(self):
         coarse = (dp.errors.DerivativeError, "tolerance")
-        return (*FIRST_ORDER, coarse) if self.method == "radau" else (coarse,)
+        single = (ValueError, "cannot meet the tolerance 1e-08 with a state of float32")
+        return (*FIRST_ORDER, coarse, single) if self.method == "radau" else (coarse, single)
 
     def parameters(self, box):
         return {"k": 0.9, "f": 1 + 0.3 * np.sin(numbers(self.seed, box.shape)), "off": 0.23}
@@ -633,7 +634,8 @@ class Ball(OnCells):
     @property
     def refusals(self):
         coarse = (dp.errors.DerivativeError, "tolerance")
-        return (*FIRST_ORDER, coarse) if self.method == "radau" else (coarse,)
+        single = (ValueError, "cannot meet the tolerance 1e-08 with a state of float32")
+        return (*FIRST_ORDER, coarse, single) if self.method == "radau" else (coarse, single)
 
     def parameters(self, box):
         return {"g": 9.81, "e": 0.8}
