@@ -266,6 +266,7 @@ def save_zarr(path):
             "File name too long; shorten the name, most file systems take up to",
         ),
     ],
+    ids=lambda value: "long name" if value == LONG else None,
 )
 def test_a_path_that_cannot_be_used(write, name, advice, tmp_path):
     (tmp_path / "file").write_text("")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp.check.summary import Row, Summary
 from sparsedp.errors import ConvergenceError, UnstableStepError
 from sparsedp.fields import check_number, number_beside
 
@@ -101,3 +102,8 @@ def test_a_ratio_of_distances_just_too_large():
 def test_an_order_just_outside():
     result = dp.check.order(lambda n: n**-2.1001, expected=2.0)
     assert result.verdict == "disagrees" and result.reason == "expected 1.9 to 2.1, got 2.1001"
+
+
+def test_a_figure_of_a_check_just_above_its_limit():
+    result = Summary("a check", [Row("linearity", 10.004, 10.0, False), Row("transpose", 9.99, 10.0, True)])
+    assert re.search(r"linearity +10\.004 +<= 10 +FAILS", str(result))

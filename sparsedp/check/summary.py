@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparsedp.check.table import Table, table_of
+from sparsedp.fields import number_beside
 from sparsedp.markup import Markup, curves, folded, paragraphs
 from sparsedp.recipe import Frozen
 
@@ -144,10 +145,17 @@ class Summary(Result):
         """The verdict, and the rows."""
         words = {True: "ok", False: "FAILS", None: "-"}
         cells = [
-            (row.name, row.figure, "" if row.limit is None else f"<= {row.limit:g}", words[row.ok], row.note)
+            (row.name, _figure(row), "" if row.limit is None else f"<= {row.limit:g}", words[row.ok], row.note)
             for row in self.rows
         ]
         return [f"{self.title}: {self.verdict}", Table(("property", "figure", "limit", "", ""), cells)]
+
+
+def _figure(row):
+    """The figure of a row; as text where it fails and its first digits are those of the limit."""
+    if row.ok is False and row.limit is not None and f"{row.figure:.2g}" == f"{row.limit:.2g}":
+        return number_beside(row.figure, row.limit, digits=2)
+    return row.figure
 
 
 def error_text(error):
