@@ -33,6 +33,16 @@ def closed(u, p, t):
     return 1.0
 
 
+def faster(u, p):
+    """A rate that jumps with the state."""
+    return anp.where(u < 0.5, 1.0, 2.0) * p
+
+
+def layer(u, s, t):
+    """A rate that is smooth and steep."""
+    return anp.tanh((t - s) / 4e-3) - 0.5 * u
+
+
 TABLE = [
     (lambda: HEAT(breaks=[1.0]), TypeError, "breaks needs steps with error control; write tolerance=1e-6"),
     (lambda: HEAT(max_step=1.0), TypeError, "max_step needs steps with error control; write tolerance=1e-6"),
@@ -138,6 +148,24 @@ TABLE = [
         lambda: dp.stepper("rk4", closed, 1.0, tolerance=1e-6, events=lambda u, p: u - 0.55)((0.0, 0.0)),
         ConvergenceError,
         "stepper(rk4): no step leads to events[0] near t = 0.156",
+    ),
+    (
+        lambda: value_and_grad(first(HEAT(tolerance=1e-4)))(0.98),
+        DerivativeError,
+        "the rate of stepper(rk4) jumps at t = 0.98, and the derivative of steps across it lacks the term of the jump; "
+        "write breaks=[0.98], or breaks=lambda params: [...] where it moves",
+    ),
+    (
+        lambda: value_and_grad(lambda p: dp.stepper("rk4", faster, 1.0, tolerance=1e-4)(np.zeros(1), p)[0])(1.0),
+        DerivativeError,
+        "the rate of stepper(rk4) jumps at t = 0.5, and the derivative of steps across it lacks the term of the jump; "
+        "write events=lambda u, params, t: ... with a function that is 0 there",
+    ),
+    (
+        lambda: value_and_grad(first(dp.stepper("ssprk3", layer, 2.0, tolerance=1e-3)))(0.98),
+        DerivativeError,
+        "the rate of stepper(ssprk3) changes near t = 0.946 faster than steps with the tolerance 0.001 resolve, and "
+        "the derivative would miss a part of it; give a smaller tolerance or max_step, or breaks= where it jumps",
     ),
     (
         lambda: thrown(np.sqrt(2 * 9.81)),

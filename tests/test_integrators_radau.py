@@ -12,7 +12,7 @@ from sparsedp.derivative import pushforward, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
 from sparsedp.integrators import jacobians
 from sparsedp.integrators.problem import untraced
-from sparsedp.integrators.radau import A, C, Flat
+from sparsedp.integrators.radau import A, C, Flat, Radau
 
 RATES = np.array([0.04, 1e4, 3e7])
 SMALL = {"Robertson": np.array([1e-6, 1e-11, 1e-2])}
@@ -55,7 +55,7 @@ def test_order_five():
 
 
 @pytest.mark.parametrize("stiffness", [1e2, 1e6])
-def test_prothero_robinson(stiffness):
+def test_prothero_robinson(stiffness, monkeypatch):
     """u' = -k (u - cos t) - sin t, whose solution is cos t: at every tolerance, and better with the tolerance."""
     calls = []
 
@@ -67,7 +67,9 @@ def test_prothero_robinson(stiffness):
     for tolerance in tolerances:
         calls.clear()
         step = dp.stepper("radau", rate, 5.0, tolerance=tolerance)
-        errors.append(abs(step((1.0, 0.0), stiffness)[0] - np.cos(5.0)))
+        with monkeypatch.context() as patch:
+            patch.setattr(Radau, "inspector", lambda self, known: None)  # calls of Newton's method alone are counted
+            errors.append(abs(step((1.0, 0.0), stiffness)[0] - np.cos(5.0)))
         assert len(calls) < 10 * len(step.taken)  # 11 to 42 with an error of the start in every trial from it
         forced = dp.stepper("radau", lambda u, p, t: p * rate(u / p, stiffness, t), 5.0, tolerance=tolerance)
         slope = value_and_grad(lambda p: forced((1.0, 0.0), p)[0])(1.0)[1]  # of p cos t

@@ -16,7 +16,9 @@ error norm, a half step of length h from the state u gets h + d,
 
 where u* is the same state as data: d is 0, and its derivative takes the state back to the plane through u* across the
 flow. The sum of all d so far is given back, in proportion to the lengths, over a last stretch of the interval that is
-as long as its speed allows. No choice of d changes what the derivative converges to.
+as long as its speed allows. For a rate that is continuous no choice of d changes what the derivative converges to.
+Where it jumps, at a time or with the state, all of them converge to a derivative without the term of the jump: see
+discontinuities.py, which refuses these, and interruptions.py, which has the term.
 
 Two shadows take the same states. The first has the derivative of f + (w - e) (f - w), a little less extrapolated than
 the steps that count: where both meet, their difference is e times what extrapolation took away. What enters the second
@@ -40,10 +42,11 @@ import numpy as np
 from sparsedp.derivative import push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import number_beside
+from sparsedp.integrators.discontinuities import Inspector
 from sparsedp.integrators.problem import combine, later, unsided, untraced
-from sparsedp.integrators.runge_kutta import Scheme
+from sparsedp.integrators.runge_kutta import Explicit, Scheme
 from sparsedp.ledger import note, thread
-from sparsedp.shortcuts import on_every_rank
+from sparsedp.shortcuts import elsewhere, on_every_rank
 from sparsedp.space import Space
 from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
 from sparsedp.tape_constants import constant
@@ -61,6 +64,12 @@ CAREFUL = 1e-3  # most that is tried first where the rate takes the time: it may
 MOST = 100_000  # trials in one interval
 WINDOW, FAR = 1000, 10  # trials at a pace that would need FAR * MOST for the rest: no use to go on
 
+QUADRATURE = {  # by order
+    1: ((0.5,), (1.0,)),
+    2: ((0.0, 0.5, 1.0), (1 / 6, 4 / 6, 1 / 6)),
+    3: ((0.0, 0.25, 0.5, 0.75, 1.0), (3 / 42, 16 / 42, 4 / 42, 16 / 42, 3 / 42)),
+    4: ((0.0, 0.25, 0.5, 0.75, 1.0), (7 / 90, 32 / 90, 12 / 90, 32 / 90, 7 / 90)),
+}
 SLACK = 0.05  # relative change of the state in a half step that has it follow the flow by half
 EPSILON = 1e-3  # share of the shadows
 LESS = 0.0, EPSILON, 0.0  # how much less the steps that count and both shadows are extrapolated
@@ -141,13 +150,70 @@ class Adaptive(Scheme):
         """
         crossing, taken = None, []
         path: deque = deque(maxlen=None if whole else 1)
-        for step in self._steps(*known):
+        inspector = self.inspector(known)
+        u, params, t, h = known
+        for step in self._steps(u, params, t, h, inspector):
+            if whole and inspector:
+                inspector.search(step)
             crossing = watch and watch.crossing(self, step, known)
             path.append(crossing.step if crossing else step)
             taken.append(path[-1].length)
             if crossing:
-                return [*path], crossing.event, taken
-        return [*path], None, taken
+                break
+        if whole and inspector:
+            if inspector.found:
+                self._refuse_jump(*inspector.found[0])
+            place = inspector.unresolved()
+            if place is not None:
+                self._refuse_layer(path[place], known)
+        return [*path], crossing and crossing.event, taken
+
+    @property
+    def timed(self):
+        """Whether the right-hand side depends on the time."""
+        return self.scheme.problem.driven or self.scheme.problem.moving
+
+    @property
+    def quadrature(self):
+        """Nodes and weights that an extrapolated step gives to a rate that depends on the time alone."""
+        if not self.weight:
+            return (0.0, 0.5, 1.0), (0.25, 0.5, 0.25)
+        return QUADRATURE[self.compared]
+
+    def _refuse_layer(self, step, known):
+        time = (known[2] or 0.0) + (step.done + 0.5 * step.length) * known[3]
+        raise DerivativeError(
+            f"the rate of {self.name} changes near t = {time:.6g} faster than steps with the tolerance "
+            f"{self.tolerance:g} resolve, and the derivative would miss a part of it; give a smaller tolerance or "
+            "max_step, or breaks= where it jumps"
+        )
+
+    @property
+    def follows_path(self):
+        """Whether the rate along the steps tells how far they go: not where it is stiff."""
+        return isinstance(self.scheme, Explicit)
+
+    def inspector(self, known):
+        """What looks for jumps of the rate; None where it has none: an operator, and a source that is constant.
+
+        Also on ranks, whose fields it would have to gather.
+        """
+        problem = self.scheme.problem
+        smooth = problem.rate is None and not problem.moving
+        return None if smooth or elsewhere(leaves(known[0])) is not None else Inspector(self, *known[1:])
+
+    def inner_state(self, step):
+        """A state inside a step as the steps hold it, and the share at which it is."""
+        return step.middle, 0.5
+
+    def _refuse_jump(self, time, in_time):
+        cure = f"breaks=[{time:.6g}], or breaks=lambda params: [...] where it moves"
+        if not in_time:
+            cure = "events=lambda u, params, t: ... with a function that is 0 there"
+        raise DerivativeError(
+            f"the rate of {self.name} jumps at t = {time:.9g}, and the derivative of steps across it lacks the term of "
+            f"the jump; write {cure}"
+        )
 
     def interval(self, u, params, t, h):
         """What crosses an interval: a scheme, and what it is given."""
@@ -213,7 +279,7 @@ class Adaptive(Scheme):
                     f"rounding is {rounding:.1e}; take a larger tolerance or write u.astype(float)"
                 )
 
-    def _steps(self, u, params, t, h):
+    def _steps(self, u, params, t, h, inspector):
         """The steps over the interval, one after the other."""
         length, done, count, mark = self._first(u, params, t, h), 0.0, 0, 0.0
         before, most, power = None, LARGEST, -1 / (self.compared + 1)
@@ -221,9 +287,14 @@ class Adaptive(Scheme):
         for trial in range(1, MOST + 1):
             left = 1.0 - done
             length = self._allowed(min(length, longest), left)
-            middle, new, error = self._trial(u, params, later(t, done * h), length, h)
+            middle, new, error = self._trial(u, params, later(t, done * h), length, h, inspector)
             change = SAFETY * max(error, 1e-10) ** power
-            if error <= 1:
+            accepted = error <= 1
+            if accepted and inspector:
+                shorter = inspector.shortened(Taken(length, done, u, middle, new))
+                if shorter is not None:
+                    accepted, change = False, shorter
+            if accepted:
                 yield Taken(length, done, u, middle, new)
                 count += 1
                 u, done, error = new, done + length if length < left else 1.0, max(error, QUIET)
@@ -232,8 +303,8 @@ class Adaptive(Scheme):
                 if before is not None:  # errors go on growing as they did
                     change = min(change, change * length / before[0] * (error / before[1]) ** power)
                 before = length, error
-            length *= float(np.clip(change, SMALLEST, most))
-            most = LARGEST if error <= 1 else 1.0  # the step after a refused one is not made longer
+            length *= float(np.clip(change, SMALLEST if accepted or error > 1 else 0.0, most))
+            most = LARGEST if accepted else 1.0  # the step after a refused one is not made longer
             turn = trial % self.window == 0
             if length < max(LEAST * done, TINY) or turn and (1.0 - done) * self.window > FAR * MOST * (done - mark):
                 break
@@ -263,14 +334,23 @@ class Adaptive(Scheme):
             return left if length > 0.99 * left else min(length, 0.5 * left) if length > 0.5 * left else length
         return 2.0 ** float(np.floor(np.log2(min(length, left))))
 
-    def _trial(self, u, params, t, length, h):
+    def _trial(self, u, params, t, length, h, inspector=None):
         """The state between two half steps, the new state, and the error of the halves in units of the tolerance."""
         half = 0.5 * length * h
+        scheme = self.scheme
+        # An inspector needs the rates at the start and in the middle, too: explicit steps begin with them.
+        shared = inspector is not None and isinstance(scheme, Explicit)
         try:
             with np.errstate(all="ignore"):  # a step that is too long is refused, whatever it gave
-                middle = self.scheme(u, params, t, half)
-                fine = self.scheme(middle, params, later(t, half), half)
-                whole = self.scheme(u, params, t, half + half)
+                if shared:
+                    first = inspector.once(u, t)
+                    middle = scheme(u, params, t, half, first)
+                    fine = scheme(middle, params, later(t, half), half, inspector.once(middle, later(t, half)))
+                    whole = scheme(u, params, t, half + half, first)
+                else:
+                    middle = scheme(u, params, t, half)
+                    fine = scheme(middle, params, later(t, half), half)
+                    whole = scheme(u, params, t, half + half)
                 error = self._error(u, fine, whole)
                 new = self.joined(fine, whole, self.weight)
         except (UnstableStepError, NonFiniteError, ConvergenceError):

@@ -104,7 +104,9 @@ def stepper(
         Whether rate or source takes the time; default: by its number of arguments.
     tolerance : float, optional
         Error control: dt is an interval, crossed in as many steps as keep the relative error of each below
-        this; `step.taken` lists them. Derivatives are controlled too: right to about this, or refused.
+        this; `step.taken` lists them. Derivatives are controlled too: right to about this, or refused. Jumps of the
+        rate are looked for; values across them meet the tolerance, and derivatives are refused without `breaks` or
+        `events`.
     floor : number or tree like u, optional
         Errors are relative to |u| + floor. Default: a tenth of the largest entry of each array. What dies out with
         all of its array is then followed down to nothing, in many steps: give the size below which it no longer
@@ -157,7 +159,8 @@ def stepper(
     ConvergenceError
         On use, if a solve fails, or no step meets the tolerance, or an event occurs again and again at one time.
     DerivativeError
-        On use of a derivative, if the tolerance is too coarse for it; if an event grazes its surface, so that its time
+        On use of a derivative, if the tolerance is too coarse for it; if the rate jumps where there is neither a break
+        nor an event, or changes faster than the steps resolve; if an event grazes its surface, so that its time
         has no derivative; if two differentiated breaks coincide.
 
     Notes
@@ -166,7 +169,9 @@ def stepper(
     b_bar = y, z_bar = y . L x with (1 - z L)^T y = g; a nonlinear one is a root, see `implicit`.
     A coefficient of 0 leaves the state as it is, bit for bit, without set-up or solve.
     With a tolerance each step is extrapolated from two half steps and a whole one (not crank_nicolson), and its length
-    follows a jump whose time moves with the params. The derivative is that of these steps; what extrapolation takes
+    follows fast changes of a continuous rate whose time moves with the params. The rate is also evaluated at the ends
+    and in the middle of each step, and if it takes the time, at about 200 times in an interval at most: a step across a
+    jump or a pulse is shortened. The derivative is that of these steps; what extrapolation takes
     away from it, relative to the params and to its largest entry, must stay below 6 tolerance^(p / (p + 1)), p the
     order (crank_nicolson: below 10 tolerance). Derivatives that are small because terms cancel may be refused, too.
     radau compares with an embedded formula instead (p = 3 in that bound), and has first derivatives only.

@@ -37,6 +37,7 @@ import numpy as np
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.fields import check_shape
 from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Moving, Taken, relative
+from sparsedp.integrators.discontinuities import Inspector
 from sparsedp.integrators.jacobians import jacobians_of
 from sparsedp.integrators.problem import Sided, combine, like, unsided, untraced
 from sparsedp.integrators.runge_kutta import Scheme, as_matrix
@@ -221,9 +222,21 @@ class Radau(Adaptive):
         if self.tolerance is not None:
             self.check_tolerance(u)
 
-    def _steps(self, v, params, t, h):
+    follows_path = False
+    quadrature = tuple(C), tuple(A[2])
+
+    def inspector(self, known):
+        """As of `Adaptive`; with the params of the interval."""
+        if self.tolerance is None or self.problem.problem.rate is None and not self.problem.problem.moving:
+            return None
+        return Inspector(self, self.params, *known[2:])
+
+    def inner_state(self, step):
+        return step.u + step.middle[1], C[1]
+
+    def _steps(self, v, params, t, h, inspector=None):
         if self.tolerance is not None:
-            return super()._steps(v, self.params, t, h)
+            return super()._steps(v, self.params, t, h, inspector)
         self._first(v, self.params, t, h)  # refuses what is not finite
         with np.errstate(all="ignore"):
             z = self.stages(v, t, h)
@@ -234,7 +247,7 @@ class Radau(Adaptive):
             )
         return [Taken(1.0, 0.0, v, z, v + z[2])]
 
-    def _trial(self, v, params, t, length, h):
+    def _trial(self, v, params, t, length, h, inspector=None):
         """The stages, the new state, and the error of the embedded formula in units of the tolerance."""
         h, again = length * h, v is self.v
         with np.errstate(all="ignore"):  # a step that is too long is refused, whatever it gave

@@ -122,8 +122,9 @@ class Explicit(Scheme):
         self.table = EXPLICIT[name]
         super().__init__(problem, name, self.table.order)
 
-    def __call__(self, u, params, t, h):
-        rates = [self.problem(u, params, t)]
+    def __call__(self, u, params, t, h, first=None):
+        """The state after a step; `first`: the rate at its start, where it is known."""
+        rates = [self.problem(u, params, t) if first is None else first]
         for row in self.table.stages:
             rates.append(self.problem(_ahead(u, h, row, rates), params, later(t, sum(row) * h)))
         return _ahead(u, h, self.table.weights, rates)
