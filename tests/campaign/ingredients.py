@@ -861,15 +861,17 @@ class Root(OnCells):
 
     def library(self, box):
         L = operator(box, self._expression())
-        guess = np.zeros(box.shape)
+
+        def guess(u):  # a root has the dtype of its guess
+            return np.zeros(box.shape, constant_part(u).dtype)
 
         def residual(x, u, p):
             return x - p["nu"] * L(x) + p["r"] * x**3 - u
 
         if self.entry == "steady":
-            return lambda u, p: dp.steady(residual, guess, u, p, method=self.method, rtol=1e-12)
+            return lambda u, p: dp.steady(residual, guess(u), u, p, method=self.method, rtol=1e-12)
         root = dp.implicit(residual, method=self.method, rtol=1e-12)
-        return lambda u, p: root(guess, u, p)
+        return lambda u, p: root(guess(u), u, p)
 
     def twin(self, box):
         A = matrix(box, self._expression())
