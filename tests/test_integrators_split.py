@@ -174,3 +174,24 @@ def test_growth_of_the_gradient_is_the_lyapunov_exponent():
     with pytest.warns(UserWarning, match="the cotangent grew by"):
         value_and_grad(lambda u: anp.sum(weights * dp.rollout(step, u, None, 15000, record=runs.append)))(start)
     assert 0.75 * 0.043 <= runs[-1].growth / 0.1 <= 1.25 * 0.05
+
+
+def test_a_field_that_blows_up_is_reported_in_its_step():
+    """The state before the step is finite: the rate overflows in it, or a stage does."""
+    step = dp.stepper("imex", lambda u, p: u**2, 0.2, linear=(dp.laplacian(dp.Grid(8, size=1.0), dp.neumann), 0.01))
+    start = np.ones(8)
+    states = [start]
+    with np.errstate(over="ignore", invalid="ignore"), pytest.raises(dp.errors.NonFiniteError) as caught:
+        while True:
+            states.append(step(states[-1]))
+    last = len(states) - 1
+    assert np.all(np.isfinite(states[-1])) and "got NaN or infinity from a finite state with dt = 0.2" in str(
+        caught.value
+    )
+    with (
+        np.errstate(over="ignore", invalid="ignore"),
+        pytest.raises(
+            dp.errors.NonFiniteError, match=f"in step {last} of rollout: .*got NaN or infinity from a finite state"
+        ),
+    ):
+        dp.rollout(step, start, None, 40)

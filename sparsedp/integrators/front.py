@@ -376,18 +376,18 @@ class Step(Remade):
             if self.interrupted:
                 new, end = new
             new = like(new, u)
-        except NonFiniteError:  # a solver on the way may have met it: name the argument
+        except NonFiniteError as error:  # a solver on the way may have met it: name the argument
             self._blame(state, params)
+            # What a solve was given is a rate or a stage of this step: the state that the step was given is finite.
+            if str(error).startswith(f"{self.name} takes finite numbers"):
+                raise NonFiniteError(self._overflow(h)) from error
             raise
         except TypeError as error:
             advise(error, params, "step(state, params)")
             raise
         if not all(is_finite(leaf) for leaf in leaves(new) if is_variable(leaf)):
             self._blame(state, params)
-            raise NonFiniteError(
-                f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
-                "take smaller steps or an implicit method"
-            )
+            raise NonFiniteError(self._overflow(h))
         if self.method == "leapfrog" and self.given["unstable"] == "raise":
             self.scheme.check_stable(u, params, h, known)
         if not self.problem.timed:
@@ -405,6 +405,12 @@ class Step(Remade):
         self.check_reversible()
         params = (params, *inputs) if inputs else params
         return like(self.scheme.back(state, params, self._length(params)), state)
+
+    def _overflow(self, h):
+        return (
+            f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
+            "take smaller steps or an implicit method"
+        )
 
     def _length(self, params):
         return number(self.dt(params), "dt", "> 0") if callable(self.dt) else self.dt
