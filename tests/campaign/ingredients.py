@@ -1026,7 +1026,7 @@ class Rollout(Ingredient):
             return self.memory
         beside = sum(constant_part(value).nbytes for value in p.values() if anp.ndim(value))
         beside += sum(constant_part(value).nbytes for value in (inputs or {}).values())
-        return self.memory * constant_part(u).nbytes + 2 * beside + 200
+        return self.memory * constant_part(u).nbytes + 2 * beside + 800
 
     def _advance(self, parts):
         def advance(u, p):
