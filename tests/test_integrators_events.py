@@ -1,6 +1,8 @@
 """Located events: value, gradient, tangent and Hessian product beside closed forms, and what is refused."""
 
 import pickle
+import sys
+from pathlib import Path
 
 import autograd.numpy as anp
 import numpy as np
@@ -211,3 +213,14 @@ def test_a_stepper_with_events_is_pickled():
 
 def level(u, g):
     return u[0]
+
+
+@pytest.mark.whole
+def test_errors_stay_near_the_tolerance():
+    """The rows of a benchmark: errors of value, gradient and Hessian product are at most ten tolerances."""
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from benchmarks.events import table
+
+    for _, _, tolerance, found in table({"heun": (1e-3,), "rk4": (1e-3,), "radau": (1e-6,)}):
+        assert all(error is None or error <= 10 * tolerance for error in found)
+        assert found[1] is not None

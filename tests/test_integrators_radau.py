@@ -120,6 +120,15 @@ def test_stiff_problems_with_their_gradients(name):
     )  # the reference is good to 3e-8
 
 
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
+def test_moved_rates_with_the_default_floor(tolerance):
+    """Robertson's system with rates 10 % larger: the reference is SciPy's Radau with its variational equation."""
+    step = dp.stepper("radau", robertson, 73.0, tolerance=tolerance)
+    value, g = value_and_grad(lambda p: step(np.array([1.0, 0.0, 0.0]), p)[2])(1.1 * RATES)
+    assert value == pytest.approx(0.358133418, rel=1e-7)
+    assert 1.1 * RATES * g == pytest.approx([0.1968827, -0.17206365, 0.08603297], rel=1e-6)
+
+
 def test_one_step_against_a_root():
     """The value and gradient of a fixed step are those of the stage equations by `implicit`."""
     p, u = np.array([2.0, 0.5]), np.array([1.0, -0.5, 0.3])
