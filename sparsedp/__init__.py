@@ -144,7 +144,7 @@ _MEANT = {  # names of the first edition and of other libraries: what to write i
     "zeros": "numpy.zeros(grid.shape): fields are plain arrays",
 }
 _ROOMS = ("check", "errors", "interop", "network", "report")
-_PACKAGES = ("advection", "optimize")  # not public; a call of one tells what to write
+_PACKAGES = ("advection", "optimize")  # not public; the error of a call of one says what to write
 _HOME = {name: module for module, names in _WINDOW.items() for name in names.split()}
 
 __all__ = sorted([*_HOME, *_ROOMS])

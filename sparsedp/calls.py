@@ -8,10 +8,13 @@ import sys
 from difflib import get_close_matches
 from functools import wraps
 from inspect import Parameter, signature
+from pathlib import Path
 from types import FunctionType, ModuleType, TracebackType
+from typing import Any
 
-__all__ = ["advice_near", "describe_module", "public", "public_name", "shortened"]
+__all__ = ["advice_near", "describe_module", "frames_inside", "nearest", "public", "public_name", "shortened"]
 
+PACKAGE = Path(__file__).parent
 # Packages whose frames stand between a user's call and the error: the library, and what runs its code.
 HIDDEN = ("sparsedp", "autograd", "functools", "contextlib", "scipy", "pyamg")
 # Keyword arguments of other libraries: the parameters that take their place, the first that a function has.
@@ -39,7 +42,7 @@ SYNONYMS = {
     "workers": ("executor",),
     "x0": ("start", "guess", "x"),
 }
-# Calls whose required parameters alone do not tell what to write.
+# What to write for calls that need more explanation than a list of their required parameters.
 EXAMPLES = {
     "dp.ensemble": "dp.ensemble(loss, scenes), and executor=concurrent.futures.ProcessPoolExecutor(2) for processes",
     "dp.hvp": "dp.hvp(loss, x, tangent)",
@@ -49,11 +52,17 @@ EXAMPLES = {
 }
 
 
-def advice_near(word, words):
-    """Advice to write the one of some words that is most like one which is none of them; empty if none is."""
+def nearest(word, words):
+    """Return the one of some words that is most similar to a word which is none of them; None if none is similar."""
     word = str(word).lower()
-    near = [one for one in words if word and one.startswith(word)] or get_close_matches(word, words)
-    return f"; write {near[0]!r}" if near else ""
+    similar = [one for one in words if word and one.startswith(word)] or get_close_matches(word, words)
+    return similar[0] if similar else None
+
+
+def advice_near(word, words):
+    """Return the end of a message that proposes the most similar of some words; empty if none is similar."""
+    near = nearest(word, words)
+    return f"; write {near!r}" if near else ""
 
 
 def public(written, advice=None):
@@ -110,6 +119,7 @@ def _call_error(error, function, written, advice, args, options):
 
 
 def _misfit(form, written, advice, args, options):
+    """Return the TypeError for arguments that do not fit a signature."""
     parameters = {name: parameter for name, parameter in form.parameters.items() if name != "self"}
     given = args[1:] if "self" in form.parameters else args
     example = advice(*given, **options) if advice else None
@@ -130,16 +140,16 @@ def _misfit(form, written, advice, args, options):
 
 
 def _instead(name, parameters):
-    """What to write for a keyword argument that a function does not have, or None."""
+    """Return what to write for a keyword argument that a function does not have, or None."""
     for synonym in SYNONYMS.get(name.lower(), ()):
         if synonym in parameters:
             return f"{synonym}=..."
-    near = advice_near(name, list(parameters)).removeprefix("; write ").strip("'")
+    near = nearest(name, list(parameters))
     return f"{near}=..." if near else None
 
 
 def _example(written, parameters):
-    """A call with the required arguments."""
+    """Return a call with the required arguments."""
     return f"{written}({', '.join(name for name, parameter in parameters.items() if _is_required(parameter))})"
 
 
@@ -170,6 +180,7 @@ def shortened(error):
 
 
 def _without_internal_frames(traceback):
+    """Return a traceback with the frames of the user's code and the last one."""
     entries = []
     while traceback is not None:
         entries.append(traceback)
@@ -185,20 +196,33 @@ def _is_of_the_user(frame):
     return frame.f_globals.get("__name__", "").partition(".")[0] not in HIDDEN
 
 
+def frames_inside():
+    """Return how many frames of this package lie between the caller of this function, included, and the user's code.
+
+    A warning with one more as its `stacklevel` names the line of the user.
+    """
+    frame: Any = sys._getframe(1)
+    count = 0
+    while frame is not None and Path(frame.f_code.co_filename).is_relative_to(PACKAGE):
+        frame = frame.f_back
+        count += 1
+    return count
+
+
 class _CallableModule(ModuleType):
-    """A public module that tells what to write when it is called like a function."""
+    """A public module whose error says what to write if it is called like a function."""
 
     def __call__(self, *args, **options):
         raise TypeError(f"{self.__name__} is a module; write {self._example}")
 
     def __getattr__(self, name):
-        if "__getattr__" in vars(self):  # the module's own, which has been asked in vain: its error is the answer
+        if "__getattr__" in vars(self):  # of the module itself, which raised an AttributeError: raise it again
             return vars(self)["__getattr__"](name)
         raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}{advice_near(name, self.__all__)}")
 
 
 def describe_module(name, example):
-    """Let calls of a module, and of its public functions, tell what to write.
+    """Let the errors of calls of a module, and of its public functions, say what to write.
 
     Parameters
     ----------

@@ -1,18 +1,16 @@
 """Derivatives of whole programs: any function of a tree of arrays, forward and backward."""
 
 import gc
-import sys
 import threading
 import warnings
 from contextlib import contextmanager
 from numbers import Number
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.calls import public
+from sparsedp.calls import frames_inside, public
 from sparsedp.errors import DerivativeError, NonFiniteError, NonFiniteGradientWarning, ShapeError, SparsedpError
 from sparsedp.fields import (
     advise,
@@ -56,7 +54,6 @@ __all__ = [
 NO_JVP = (DerivativeError, NotImplementedError)
 SPREAD = ": autograd's np.where does not add up what it spreads; multiply by the condition instead, a * c + b * (1 - c)"
 
-PACKAGE = Path(__file__).parent
 LARGE = 1e100  # a cotangent that makes others overflow, through derivatives that do not
 SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
 _lock = threading.Lock()
@@ -256,17 +253,8 @@ def _warn_unless_finite(name, derivative, again):
             pass
     warnings.warn(
         NonFiniteGradientWarning(f"the derivative returned by {name} holds NaN or infinity: {reason}"),
-        stacklevel=_frames_inside() + 1,
+        stacklevel=frames_inside() + 1,
     )
-
-
-def _frames_inside():
-    """How many frames of this package lie between this function's caller and the user's code."""
-    frame: Any = sys._getframe(1)
-    count = 0
-    while frame is not None and Path(frame.f_code.co_filename).is_relative_to(PACKAGE):
-        frame, count = frame.f_back, count + 1
-    return count
 
 
 def name_of(subject):

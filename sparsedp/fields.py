@@ -18,7 +18,6 @@ __all__ = [
     "BLOCK",
     "EPS",
     "PRECISIONS",
-    "advice_near",
     "advise",
     "check_choice",
     "check_finite",
@@ -38,6 +37,7 @@ __all__ = [
     "field_array",
     "hidden_leaves",
     "is_number",
+    "is_other_precision",
     "is_whole",
     "number_beside",
     "place",
@@ -71,7 +71,7 @@ def field_array(op, u, batch=False):
         raise ShapeError(
             f"{op.name} takes a field on {op.domain.described}, got an array of shape {u.shape}{_in_shape(op, u)}"
         )
-    if u.dtype.char not in "dfDF":
+    if u.dtype.char not in PRECISIONS:
         if u.dtype.kind not in "biu":
             raise TypeError(f"{op.name} takes float or complex numbers, got dtype {u.dtype}; write u.astype(float)")
         u = u.astype(float)
@@ -87,7 +87,7 @@ def _is_batch(shape, field_shape):
 
 
 def _in_shape(op, u):
-    """Advice for an array whose shape is not that of the field, but tells what it is."""
+    """Return advice for an array of a wrong shape from which its meaning can be inferred; else an empty text."""
     space = op.domain
     if u.ndim == 0:
         return f"; write np.full({space.shape}, {u})"
@@ -132,25 +132,35 @@ def check_precision(name, value):
     settings, such as dt, and derivatives that a user's own function returns are rounded to double precision instead.
     """
     dtype: Any = getattr(value, "dtype", None)
-    if _is_other_precision(dtype):
+    if is_other_precision(dtype):
         kind = "complex" if dtype.kind == "c" else "float"
         raise TypeError(
             f"{name} must be float32, float64, complex64 or complex128, got {dtype}; write np.asarray(x, {kind})"
         )
 
 
-def _is_other_precision(dtype):
-    """Whether a dtype of NumPy holds floating numbers that are neither of single nor of double precision."""
+def is_other_precision(dtype):
+    """Return whether a dtype of NumPy holds floating numbers that are neither of single nor of double precision."""
     if not isinstance(dtype, np.dtype):
         return False
     return dtype.name == "bfloat16" or (dtype.kind in "fc" and dtype.char not in PRECISIONS)
 
 
 def check_leaves(name, tree, containers=True):
-    """Refuse leaves that are arrays of another precision, or containers that are no trees and hold floating numbers.
+    """Refuse leaves that are arrays of half or extended precision, or containers that are not trees.
 
-    containers: refuse the latter. A dataclass is one, and a Mapping that is not a dict; their numbers would silently
-    count as constants.
+    Parameters
+    ----------
+    name : str
+        Root of the paths in messages.
+    tree : tree
+    containers : bool
+        Whether a leaf is refused that is a dataclass, or a Mapping that is not a dict, and holds floating numbers:
+        these would silently be constants.
+
+    Raises
+    ------
+    TypeError
     """
     if type(tree) is np.ndarray:
         check_precision(name, tree)
@@ -158,7 +168,7 @@ def check_leaves(name, tree, containers=True):
     for number, leaf in enumerate(leaves(tree)):
         dtype = getattr(leaf, "dtype", None)
         if dtype is not None:
-            if _is_other_precision(dtype):
+            if is_other_precision(dtype):
                 check_precision(labels(tree, name)[number], leaf)
         elif containers and type(leaf) not in PLAIN_LEAVES and any(map(_is_floating, hidden_leaves(leaf))):
             raise TypeError(
@@ -168,7 +178,7 @@ def check_leaves(name, tree, containers=True):
 
 
 def hidden_leaves(value):
-    """The leaves inside a container that is not a tree: a dataclass, or a Mapping that is not a dict."""
+    """Return the leaves inside a container that is not a tree: a dataclass, or a Mapping that is not a dict."""
     found: list = []
     pending = [value]
     seen = set()  # a dataclass may hold itself
@@ -184,7 +194,7 @@ def hidden_leaves(value):
 
 
 def _entries_of(container):
-    """What a container that is not a tree holds; nothing of anything else."""
+    """Return the entries of a dataclass or Mapping as a list, which is empty for all other values."""
     if isinstance(container, Mapping):
         return list(container.values())
     if is_dataclass(container) and not isinstance(container, type):

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import PRECISIONS, check_finite, check_function, check_kind, check_plain, check_type
+from sparsedp.fields import check_finite, check_function, check_kind, check_plain, check_type, is_other_precision
 from sparsedp.operator import Operator
 from sparsedp.space import Space
 from sparsedp.structure.base import Matrix
@@ -62,7 +62,7 @@ def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
             f"{name} needs a 2-D matrix, got an array of shape {entries.shape}; write matrix[None] for a row"
         )
     check_kind(name, entries.dtype, "numbers", "; write matrix.astype(float)")
-    if entries.dtype.kind in "fc" and entries.dtype.char not in PRECISIONS:
+    if is_other_precision(entries.dtype):
         entries = entries.astype(complex if entries.dtype.kind == "c" else float)
     structure = Matrix(sp.csr_array(entries, copy=True))
     rows, columns = structure.matrix.indptr, structure.matrix.indices

@@ -3,7 +3,8 @@
 import inspect
 from math import inf
 
-from sparsedp.fields import advice_near, check_choice, check_function, check_number, check_whole, is_number
+from sparsedp.calls import advice_near
+from sparsedp.fields import check_choice, check_function, check_number, check_whole, is_number
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.checkpoint import Checkpoint

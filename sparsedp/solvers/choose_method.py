@@ -8,10 +8,9 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.calls import public
+from sparsedp.calls import advice_near, public
 from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
 from sparsedp.fields import (
-    advice_near,
     check_choice,
     check_finite,
     check_native,
@@ -169,7 +168,9 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
         word, reason, engine = "petsc", str(op.layout), None
     else:
         system = System(op, rtol, maxiter)
-        word, reason, engine = _as_asked(system, method) if method != "auto" else _chosen(system, solves)
+        if method in ("krylov", "separable"):
+            system.splitting = None  # these solve for all unknowns, without looking at the entries
+        word, reason, engine = (method, "as asked", None) if method != "auto" else _chosen(system, solves)
         _check_options(word, options)
     if system.complex and word not in ("direct", "krylov"):
         raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct' or 'krylov'")
@@ -225,13 +226,6 @@ def _check_options(word, options):
         if name not in known:
             near = advice_near(name, [*known, "rtol", "maxiter", "method", "nullspace"])
             raise TypeError(f"method {word} takes the options {', '.join(known) or '(none)'}, got {name!r}{near}")
-
-
-def _as_asked(system, method):
-    """The word of the method that the user wrote, the reason, and no engine."""
-    if method in ("krylov", "separable"):
-        system.splitting = None  # these solve for all unknowns, without looking at the entries
-    return method, "as asked", None
 
 
 def _engine(system, word, options, suited=None, near=None):
@@ -302,13 +296,13 @@ def _chosen(system, solves):
 
 
 def _size_in_words(system, kind, dimension):
-    """The number of unknowns of some kind, and the dimension of the grid."""
+    """Return the number of unknowns of some kind and the dimension of the grid in words."""
     where = f"in {dimension}-D" if dimension else "without a grid"
     return f"{system.unknowns} {kind}unknowns {where}"
 
 
 def _splitting(system):
-    """The Splitting of a system, or None; also where it is singular, which is refused when the engine is built."""
+    """Return the Splitting of a system or None; None for a singular one, which is refused when the engine is built."""
     try:
         return system.splitting
     except ArithmeticError:
@@ -325,8 +319,9 @@ def _chosen_by_entries(system, solves, dimension, others):
         limit = COMPLEX_UP_TO[dimension]
         if size <= limit:
             return "direct", "complex entries" + others, None
-        if _largest_factored(system) <= limit:
-            return "direct", f"complex entries{others}, in blocks of at most {_largest_factored(system)} unknowns", None
+        largest = _largest_factored(system)
+        if largest <= limit:
+            return "direct", f"complex entries{others}, in blocks of at most {largest} unknowns", None
         engine = krylov_engine(system, preconditioner="shifted_laplace")
         where = _size_in_words(system, kind + "complex ", dimension) + others
         return "krylov", f"{where}: LU would not fit, GMRES and shifted Laplace do", engine
@@ -339,7 +334,8 @@ def _chosen_by_entries(system, solves, dimension, others):
     limit = DIRECT_UP_TO[solves][dimension]
     if size <= limit:
         return "direct", f"{where}; up to {limit}, for {solves} solves, kept LU factors are fastest", None
-    if (largest := _largest_factored(system)) <= limit:
+    largest = _largest_factored(system)
+    if largest <= limit:
         return (
             "direct",
             f"{where}, in blocks of at most {largest}, one after the other; up to {limit}, LU is fastest",
@@ -356,7 +352,7 @@ def _chosen_by_entries(system, solves, dimension, others):
 
 
 def _largest_factored(system):
-    """The number of unknowns of the largest diagonal block of a block triangular matrix."""
+    """Return the number of unknowns of the largest block that LU factors take together."""
     if system.faces is not None:
         return system.unknowns
     from sparsedp.solvers.substitution import largest_block

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 
+from sparsedp.calls import frames_inside
 from sparsedp.errors import BudgetWarning, DerivativeError, ShapeError
 from sparsedp.fields import check_function, check_takes, check_whole
 from sparsedp.ledger import thread
@@ -178,7 +179,7 @@ def _warn_of_repeats(memory, size, n, beside):
                 f"rollout runs {n} steps {many:.3g} times each within memory={memory!r}, and {few:.3g} times with "
                 f"more; write memory={more}"
             ),
-            stacklevel=4,  # the caller of the public function, which is wrapped once
+            stacklevel=frames_inside() + 1,
         )
 
 
