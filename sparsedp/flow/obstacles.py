@@ -206,7 +206,7 @@ class Forces(Remade):
         self._sides = sides
 
     @cached_property
-    def dragged(self):
+    def wall_friction(self):
         """Operator from tangential wall velocities to their part of the viscous force, for viscosity 1."""
         grid = self.total.domain.grid
         return self.total @ Operator(wall_stresses(grid, self._sides), self.walls, grid.faces, "wall stresses")
@@ -218,7 +218,7 @@ class Forces(Remade):
         momentum = self.gain(self.fluxes.carried(v, walls) * self.fluxes.carrier(v, walls))
         total = stress - momentum
         if walls is not None:
-            total = total + viscosity * self.dragged(walls)
+            total = total + viscosity * self.wall_friction(walls)
         check_finite("what forces finds", plain(total))
         return total
 

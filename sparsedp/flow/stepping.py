@@ -284,7 +284,11 @@ class FlowStep(Remade):
 
     @public("dp.flow_step(grid, dt)")
     def __call__(self, state, params=None):
-        parts = ["v", "p", "a", *(["s", "r"] if self.scalars else []), *(["walls"] if self.wall_motion.changes else [])]
+        parts = ["v", "p", "a"]
+        if self.scalars:
+            parts += ["s", "r"]
+        if self.wall_motion.changes:
+            parts += ["walls"]
         if not isinstance(state, dict) or state.keys() != set(parts):
             words = f"{', '.join(parts[:-1])} and {parts[-1]}"
             raise ShapeError(f"flow_step takes a dict of {words} as its state; make it with step.start")
@@ -466,7 +470,7 @@ class Diffusion:
             self._check_stable(number)
 
     def added(self, rate, u, params, held):
-        """A rate and nu (L u + held()), where that is explicit; held: a function that returns an array or None."""
+        """Return a rate plus nu (L u + held()) if that is explicit; `held` is a function to an array or None."""
         if self.op is None or self.relax is not None:
             return rate
         number = self.number
@@ -474,7 +478,7 @@ class Diffusion:
             number = number(params)
             check_number("the viscosity of flow_step", plain(number), ">= 0")
             self._check_stable(float(plain(number)))
-        return rate + number * self._bent(u, held())
+        return rate + number * self._laplacian(u, held())
 
     def relaxed(self, ahead, u, held):
         """The new field of the trapezoidal rule.
@@ -486,10 +490,10 @@ class Diffusion:
         held : array or None
             What walls add to L u at the beginning and at the end of the step, in sum.
         """
-        return self.relax(ahead + (0.5 * self.flow.dt * self.number) * self._bent(u, held))
+        return self.relax(ahead + (0.5 * self.flow.dt * self.number) * self._laplacian(u, held))
 
-    def _bent(self, u, held):
-        """L u and what walls add to it."""
+    def _laplacian(self, u, held):
+        """Return L u and what walls add to it."""
         return self.op(u) if held is None else self.op(u) + held
 
     def _check_stable(self, number):
@@ -513,12 +517,14 @@ class Scalar:
 
     def __init__(self, name, solid, flow, diffusivity=0.0, boundary=neumann, values=None, source=None):
         grid, self.name, self.flow, self.source = flow.grid, name, flow, source
-        self.mean, self.held, self.bend = average(grid, boundary), 0.0, None  # type: Any, Any, Any
+        self.mean = average(grid, boundary)
+        self.held: Any = 0.0
+        self.of_walls: Any = None  # their part of the Laplacian
         if values is not None:
             slopes, normal = lift(grid, boundary)(values), flow.divergence.T(np.ones(grid.shape))
-            self.bend = flow.divergence(slopes)  # what the walls add to the Laplacian
+            self.of_walls = flow.divergence(slopes)
             if solid is not None:
-                self.bend = mask(grid.cells, ~check_solid(grid, solid))(self.bend)
+                self.of_walls = mask(grid.cells, ~check_solid(grid, solid))(self.of_walls)
             self.held = slopes / np.where(slopes != 0, 2 * normal, 1.0)  # the wall's value
         op = partial(laplacian, grid, boundary, solid)
         self.diffused = Diffusion(f"diffusivity of {name!r}", float(diffusivity), op, flow)
@@ -535,7 +541,7 @@ class Scalar:
                     f"{np.shape(plain(source))}; write one number for each cell"
                 )
             rate = rate + source
-        rate = self.diffused.added(rate, u, params, lambda: self.bend)
+        rate = self.diffused.added(rate, u, params, lambda: self.of_walls)
         check_finite(f"the rate of {self.name!r}", plain(rate))
         return rate
 
@@ -544,7 +550,7 @@ class Scalar:
         ahead = u + self.flow.dt * (1.5 * rate - 0.5 * before)
         if self.diffused.relax is None:
             return ahead
-        return self.diffused.relaxed(ahead, u, None if self.bend is None else 2.0 * self.bend)
+        return self.diffused.relaxed(ahead, u, None if self.of_walls is None else 2.0 * self.of_walls)
 
 
 def _growth(courant, damping, implicit):

@@ -1,5 +1,7 @@
 """Evaluations of a loss and its gradient: counted, refused ones kept apart, the best one remembered."""
 
+from typing import Any
+
 import numpy as np
 
 from sparsedp.derivative import check_loss, judged, pullback, unwarned, value_and_grad
@@ -41,6 +43,8 @@ class Trials:
     best : Trial
     count : int
         Evaluations so far.
+    residual_scale : float or None
+        The power of two that residuals are divided by; None until the first residuals are known.
     """
 
     best: Trial
@@ -48,7 +52,7 @@ class Trials:
     def __init__(self, loss, gradient, packing, box, batches, squares=None):
         self._loss, self._gradient, self._packing = loss, gradient, packing
         self._squares, self._linearised = squares, Cache(1)
-        self._residual_scale = None  # known from the first residuals on
+        self.residual_scale: Any = None
         self.box, self.batches, self.iteration = box, batches, 0
         self.count, self.failures = 0, []
 
@@ -124,7 +128,7 @@ class Trials:
 
     def as_given(self, number):
         """Return a loss, or the norm of a gradient, in the units of the user's loss: trials have scaled residuals."""
-        scale = self._residual_scale or 1.0
+        scale = self.residual_scale or 1.0
         return number * scale * scale
 
     def _linearise(self, vector, iteration):
@@ -135,9 +139,9 @@ class Trials:
         if known:
             return known
         linearised = Linearised(self._loss, self._packing, vector, batch, squares.apart, squares.dense)
-        if self._residual_scale is None:
-            self._residual_scale = safe_unit(norm(linearised.flat))
-        return self._linearised.put(key, linearised.rescaled(self._residual_scale))
+        if self.residual_scale is None:
+            self.residual_scale = safe_unit(norm(linearised.flat))
+        return self._linearised.put(key, linearised.rescaled(self.residual_scale))
 
     def _both(self, vector):
         """Loss and flat gradient, each from a fresh tree."""
@@ -162,11 +166,6 @@ class Trials:
     def linearised(self, trial):
         """Return the residuals at a point and their Jacobian, on the batch that saw it."""
         return self._linearise(trial.vector, trial.iteration)
-
-    @property
-    def residual_scale(self):
-        """The power of two that the residuals are divided by."""
-        return self._residual_scale
 
     def covariance(self, trial):
         """Return the covariance at a point as an array, or a sentence that says why there is none."""
