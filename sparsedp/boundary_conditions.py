@@ -293,13 +293,14 @@ def _sides(axis, entry, kind):
 
 
 def _instead(sides, kind):
-    """Advice for what is not a condition of a kind."""
+    """Return advice for what is not a condition of a kind; empty if there is none."""
     first = sides[0] if isinstance(sides, (tuple, list)) and sides else sides
     if isinstance(first, str):
-        names = [word for word in kind.choices.split(", ") if word == first]
-        if names:
-            return f"; write dp.{names[0]}"
-        return "; write dp.Grid(shape, periodic=True) and no condition" if first == "periodic" else ""
+        if first in kind.choices.split(", "):
+            return f"; write dp.{first}"
+        if first == "periodic":
+            return "; write dp.Grid(shape, periodic=True) and no condition"
+        return ""
     if isinstance(first, FlowCondition):
         return f"; {first} belongs to dp.projection and dp.flow_step, write dp.{first.along} here"
     return EXAMPLE if "function robin" in repr(first) else ""

@@ -75,9 +75,11 @@ def path_errors(path, reading=False):
     try:
         yield
     except OSError as error:
-        if error.errno is not None:  # else of a library, with its own sentence
-            advice = PATH_ADVICE.get(error.errno, "")
-            if advice not in (error.strerror or "") and not (reading and error.errno == errno.ENOENT):
+        if error.errno is not None:  # else it was raised by a library, with a sentence of its own
+            advice = PATH_ADVICE.get(error.errno)
+            if reading and error.errno == errno.ENOENT:  # a new folder does not help
+                advice = None
+            if advice and advice not in (error.strerror or ""):  # an inner block may have added it
                 error.strerror = f"{error.strerror}; {advice}"
             error.filename = str(path)
             del error.filename2

@@ -135,12 +135,11 @@ class Arguments(Point):
 
     def __init__(self, node):
         super().__init__(node.values)
-        labels = dict(zip(range(len(node.values)), node.places, strict=True))
-        several = len(labels) > 1
-        self.names = [
-            re.sub(r"^x\[(\d+)\]", lambda found: f"argument {labels[int(found[1])]}" if several else "argument", name)
-            for name in self.names
-        ]
+
+        def argument(match):
+            return f"argument {node.places[int(match[1])]}" if len(node.places) > 1 else "argument"
+
+        self.names = [re.sub(r"^x\[(\d+)\]", argument, name) for name in self.names]
 
 
 def _entries_of_rule(node, trials, judged, worst, weights, spaces):

@@ -89,7 +89,7 @@ def largest_gaps(gap_along, shapes, most=MOST_ENTRIES, noise=0.0):
 
 
 class _Search:
-    """Bisection for entries with large gaps; those that were found are left out of what follows."""
+    """Bisection for entries with large gaps; entries that were found are excluded from later searches."""
 
     def __init__(self, gap_along, shapes, noise):
         rng = np.random.default_rng(0)
@@ -98,7 +98,7 @@ class _Search:
         self.largest = 0.0
 
     def total(self):
-        """Gap of all entries that are left."""
+        """Gap of all entries that have not been found yet."""
         return self.gap_along(self.weights)
 
     def block_gap(self, leaf, block):
@@ -114,9 +114,9 @@ class _Search:
         )
 
     def next(self, total):
-        """Find one entry by the gap of all entries that are left, and leave it out of what follows.
+        """Find one entry, given the gap of all entries not found yet, and exclude it from later searches.
 
-        None where noise leads to an entry that was found before.
+        Return None where noise leads to an entry that was found before.
         """
         leaf, _, gap, _ = self._bisect(len(self.shapes), self.leaves_gap, total)
         block = [slice(None)] * len(self.shapes[leaf])
@@ -149,7 +149,12 @@ class _Search:
         return region if abs(of_leaf - gap) <= NEGLIGIBLE * abs(of_leaf) else None
 
     def _bisect(self, length, gap_of, gap):
-        """(low, high, gap between them, size of the gaps beside) of the half of the half ... with the larger gap."""
+        """Halve a range again and again, and keep the half with the larger gap.
+
+        Returns
+        -------
+        (low, high, gap between them, root of the sum of squares of the gaps of all other halves)
+        """
         low, high, beside = 0, length, 0.0
         while high - low > 1 and abs(gap) > self.noise:
             middle = (low + high) // 2
@@ -252,8 +257,12 @@ def subscript(index, shape):
     parts = []
     for part, length in zip(index, shape, strict=True):
         low, high, _ = part.indices(length)
-        whole = (low, high) == (0, length) and length > 1
-        parts.append(":" if whole else f"{low}" if high - low == 1 else f"{low}:{high}")
+        if (low, high) == (0, length) and length > 1:
+            parts.append(":")
+        elif high - low == 1:
+            parts.append(f"{low}")
+        else:
+            parts.append(f"{low}:{high}")
     return f"[{', '.join(parts)}]" if parts else ""
 
 
@@ -268,7 +277,10 @@ def where(index, shape, spaces):
 
 
 def _place(space, block):
-    grid, prefix, component = space.grid, "", 0
+    """Return in words where a block of a field on a space lies; empty if it cannot be said."""
+    grid = space.grid
+    prefix = ""
+    component = 0
     if space.kind in ("faces", "edges"):
         low, high, _ = block[0].indices(space.size)
         if high - low != 1:
@@ -285,7 +297,8 @@ def _place(space, block):
     on_nodes = node_axes(kind, component, grid.dim)
     if on_nodes is None:
         return ""
-    walls, coordinates = [], []
+    walls = []
+    coordinates = []
     for axis, part in enumerate(block):
         places = grid.coordinates(axis, "nodes" if axis in on_nodes else "cells")
         low, high, _ = part.indices(len(places))
@@ -296,5 +309,8 @@ def _place(space, block):
             walls.append(f"the {'upper' if low else 'lower'} {name} wall")
         else:
             coordinates.append(f"{name} = {places[low]:.4g}")
-    words = [f"at {' and '.join(walls)}"] if walls else [f"at {', '.join(coordinates)}"] if coordinates else []
-    return prefix + "".join(words)
+    if walls:
+        return f"{prefix}at {' and '.join(walls)}"
+    if coordinates:
+        return f"{prefix}at {', '.join(coordinates)}"
+    return prefix

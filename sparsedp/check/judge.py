@@ -362,7 +362,8 @@ def looked_at(trials, count, rng, wanted=None):
         ("unsound", not np.array_equal(vector, again, equal_nan=True),
          "two evaluations of the gradient differ: it is not deterministic"),
         ("unsound", 0 < change < UNDERFLOW, f"the loss changes by less than {UNDERFLOW:g}: it underflows, scale it"),
-        *(("broken", not np.all(np.isfinite(values)), f"the gradient of {name} holds NaN or infinity{_first(values)}")
+        *(("broken", not np.all(np.isfinite(values)),
+           f"the gradient of {name} holds NaN or infinity{_first_non_finite(values)}")
           for name, values in zip(point.names, point.arrays(vector))),
     ]  # fmt: skip
     doubts = [(word, reason) for word, holds, reason in evidence if holds]
@@ -377,8 +378,8 @@ def looked_at(trials, count, rng, wanted=None):
     return judged, doubts
 
 
-def _first(values):
-    """Where the first number of an array is that is not finite, in words; nothing for a single number."""
+def _first_non_finite(values):
+    """Return in words where the first NaN or infinity of an array is; empty for a single number."""
     finite = np.isfinite(values)
     return f", the first at {place(int(np.argmin(finite)), finite.shape)}" if finite.ndim else ""
 

@@ -100,7 +100,10 @@ class _Call(torch.autograd.Function):
         outputs = _tensors([values[k] if made[k] else np.array(values[k]) for k in places], arrays)
         result += values, places, rebuild
         form = rebuild(range(len(values)))  # a second run may return a dict in another order
-        again = lambda arrays: paired(fun(arrays), form, "result of to_torch", advice=SAME)
+
+        def again(arrays):
+            return paired(fun(arrays), form, "result of to_torch", advice=SAME)
+
         ctx.kept = again, moving, gradients, places, len(values)
         ctx.save_for_backward(*tensors, *outputs)  # torch refuses what has been changed in place since
         ctx.set_materialize_grads(False)

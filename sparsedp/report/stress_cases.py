@@ -250,10 +250,14 @@ def _against_differences(scene, other, out):
 
 def _directions(point, gradient):
     """Names and displacements: random in each leaf, or in all where they are many, and the gradient itself."""
-    wanted = lambda name: name.startswith("random in") or name == "gradient"
-    found = point.directions(gradient, 0, generator(SEED), wanted)
-    alone = any(name != "gradient" for name, _ in found)
-    return found if alone else [("random", point.random(generator(SEED))), *found]
+
+    def is_wanted(name):
+        return name.startswith("random in") or name == "gradient"
+
+    directions = point.directions(gradient, 0, generator(SEED), is_wanted)
+    if any(name != "gradient" for name, _ in directions):
+        return directions
+    return [("random", point.random(generator(SEED))), *directions]
 
 
 def _smallest_gap(line, largest):
@@ -269,8 +273,9 @@ def _smallest_gap(line, largest):
         gap = min(gaps, default=inf)
         if gap <= GOOD and scale:
             return gap
-    hidden = line.silent and abs(line.slope) <= UNSEEN * abs(line.base)
-    return 0.0 if hidden else gap if scale else inf
+    if line.silent and abs(line.slope) <= UNSEEN * abs(line.base):
+        return 0.0  # rounding of the loss hides the derivative
+    return gap if scale else inf
 
 
 # ---------------------------------------------------------------- cases: (scene, name, x) -> case, other x, judge
