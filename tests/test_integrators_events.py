@@ -205,6 +205,48 @@ def test_an_event_at_the_start_is_left():
     assert np.array_equal(rest((np.zeros(2), 0.0), 9.81)[0], np.zeros(2))
 
 
+@pytest.mark.parametrize("method", ["heun", "radau"])
+def test_events_at_the_ends_of_intervals(method):
+    """Two balls land at t = count dt to rounding, each once, and the gravity of one moves its bounce alone."""
+    rate = lambda u, g, t: {"a": falling(u["a"], 10.0, t), "b": falling(u["b"], g, t)}
+    events = [
+        (lambda u, g: u["a"][0], lambda u, g: {**u, "a": bounce(u["a"], g)}),
+        (lambda u, g: u["b"][0], lambda u, g: {**u, "b": bounce(u["b"], g)}),
+    ]
+    step = dp.stepper(method, rate, 0.25, tolerance=1e-3, events=events)
+    for count in (1, 2, 3, 4):
+        time = 0.25 * count
+        start = {name: np.array([5.0 * time**2, 0.0]) for name in "ab"}
+        loss = lambda g: dp.rollout(step, (start, 0.0), g, count + 1)[0]["b"][0]
+        value, slope = value_and_grad(loss)(10.0)
+        assert value == pytest.approx(0.8 * 10 * time * 0.25 - 5.0 * 0.25**2, rel=1e-9)
+        # With landing time s = c / sqrt(g) and its slope -s / (2 g): b = 0.8 g s (end - s) - g (end - s)^2 / 2.
+        rest, by_g = 0.25, -time / 20
+        exact = 0.8 * time * rest + 8 * by_g * (rest - time) - 0.5 * rest**2 + 10 * rest * by_g
+        assert slope == pytest.approx(exact, rel=1e-9, abs=1e-11)
+
+
+def test_a_terminal_event_in_single_precision_ends_one_interval():
+    """The state that is handed out lies on the surface to its own rounding."""
+    ends = event(lambda u, p, t: u[0], terminal=True)
+    step = dp.stepper(
+        "tr_bdf2", lambda u, p, t: anp.array([u[1], -10.0 + 0.0 * u[1]]), 1.0, tolerance=1e-4, events=ends
+    )
+    u, t = step(step((np.array([3.3, 0.0], np.float32), np.float32(0.0))))
+    assert t == pytest.approx(np.sqrt(0.66) + 1.0, rel=1e-5) and u[0] < -10.0
+
+
+@pytest.mark.parametrize("method", ["rk4", "radau"])
+def test_a_jump_before_the_end_of_a_step_takes_back_what_lay_behind_it(method):
+    """A point that turns round at t = 0.4 neither reaches 0.5, nor crosses it upward."""
+    level = event(lambda u, p, t: u[0] - 0.5, direction=1)
+    turn = (lambda u, p, t: t - 0.4, lambda u, p: anp.array([u[0], -u[1]]))
+    rate = lambda u, p, t: anp.array([u[1], 0.0 * u[0]])
+    step = dp.stepper(method, rate, 1.0, tolerance=1e-6, events=[level, turn])
+    assert step((np.array([1.0, -1.0]), 0.0))[0] == pytest.approx([1.2, 1.0])
+    assert len(step.t_events[0]) == 0 and step.t_events[1] == pytest.approx([0.4])
+
+
 def test_a_stepper_with_events_is_pickled():
     step = dp.stepper("rk4", falling, 0.6, tolerance=1e-6, events=(level, bounce), breaks=[0.3])
     again, start = pickle.loads(pickle.dumps(step)), (np.array([1.0, 0.0]), 0.0)

@@ -471,12 +471,16 @@ class Adaptive(Scheme):
         u, new = self.tree(step.u), self.tree(step.new)
         of_state, of_time = event.gradient(u, unsided(params), t)
         before = of_time + inner(of_state, self.tree(self.rate(step.u, params, t)))
-        sizes = self.tree(flatten(step.u)[1](self.sizes(step.u)))
-        of_state, _ = event.gradient(new, unsided(params), t + length)
+        self.check_steep(event, new, params, t + length, change, (change - before) / length)
+
+    def check_steep(self, event, u, params, t, change, bend):
+        """Refuse an event whose rate of change, with the derivative `bend`, is zero to the tolerance."""
+        of_state, _ = event.gradient(u, unsided(params), t)
+        sizes = flatten(u)[1](Adaptive.sizes(self, u))
         uncertain = self.tolerance * inner(mapped(_magnitude, of_state), sizes)
-        if change == 0 or abs(change - before) / length * uncertain > STEEP * change**2:
+        if change == 0 or abs(bend) * uncertain > STEEP * change**2:
             raise DerivativeError(
-                f"{event.name} of {self.name} grazes its surface at t = {t + length:.9g}: its rate of change there, "
+                f"{event.name} of {self.name} grazes its surface at t = {t:.9g}: its rate of change there, "
                 f"{change:.3g}, is zero to the tolerance {self.tolerance:g}, so that its time has no derivative; "
                 "give another event or parameter, or a smaller tolerance"
             )

@@ -20,6 +20,9 @@ its derivative is that of the implicit function theorem for this equation,
 On the tape it is one iteration l <- l - g / (g_u S_l + g_t) with a constant denominator for each order of
 differentiation: each one makes the next order exact.
 
+An event within rounding of the end of an interval belongs to this interval: the next one would take its zero for one
+that it starts from.
+
 References: Brent, Algorithms for Minimization without Derivatives (1973), ch. 4; Hairer, Norsett, Wanner, Solving
 Ordinary Differential Equations I (1993), II.6.
 """
@@ -31,13 +34,13 @@ import autograd.numpy as anp
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
-from sparsedp.derivative import pullback
+from sparsedp.derivative import pullback, push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
 from sparsedp.fields import check_function, check_number, check_takes
 from sparsedp.integrators.adaptive import Adaptive, Moving, relative
-from sparsedp.integrators.problem import Side, Sided, combine, of_fields, takes, untraced
+from sparsedp.integrators.problem import Side, Sided, combine, of_fields, takes, unsided, untraced
 from sparsedp.integrators.runge_kutta import Scheme
-from sparsedp.tape import dtype_of, is_variable, isbox, linear, plain
+from sparsedp.tape import dtype_of, is_variable, isbox, linear, plain, traces_of
 from sparsedp.tree import flatten, leaves
 
 __all__ = ["Crossing", "Event", "Interrupted", "break_times", "event_list"]
@@ -263,6 +266,7 @@ class Watch:
 
     def __init__(self, events, problem, u, params, t, h):
         self.events, self.problem, self.params, self.h = events, problem, params, h
+        self.eps = max([EPS, *(float(np.finfo(dtype_of(leaf)).eps) for leaf in leaves(u) if is_variable(leaf))])
         self.signs = [self._sign(event, u, t) for event in events]
         self.last = 0.0  # sign of the last event that was found, before it
 
@@ -281,7 +285,7 @@ class Watch:
             if row is not None:
                 change = change + float(np.sum(np.real(row * rate)))
                 scale = scale + float(np.sum(np.abs(row) * (np.abs(leaf) + self.h * np.abs(rate))))
-        if abs(value) > rounding + 64 * EPS * scale:
+        if abs(value) > rounding + 64 * self.eps * scale:
             return float(np.sign(value))
         return float(np.sign(change))
 
@@ -298,12 +302,21 @@ class Watch:
                 if values[0] != values[1] and np.sign(values[1]) != self.signs[place]:
                     self.signs[place] = self._sign(other, after, t)
 
+    def pending(self, u, t):
+        """An event at the end of an interval that the next interval would take for one before its start, or None."""
+        for place, event in enumerate(self.events):
+            sign = self.signs[place]
+            if event.located(sign) and self._sign(event, u, t) == -sign:
+                self.last = sign
+                return event
+        return None
+
     def crossing(self, scheme, step, known):
         """The first event in a step, or None; `known`: what the scheme was given, plain."""
         t, h = known[2:]
         start = t + step.done * h
         between, share = scheme.between(step)
-        first = None
+        first, changed = None, []
         for place, event in enumerate(self.events):
             values = [
                 event.number(scheme.tree(step.u), self.params, start),
@@ -312,7 +325,7 @@ class Watch:
             ]
             sign = self.signs[place]
             if sign == 0:
-                self.signs[place] = float(np.sign(values[2]))
+                changed.append(place)
                 continue
             inside = sign * np.array(values)
             if inside[1] < 0:
@@ -325,13 +338,17 @@ class Watch:
                 continue
             lower = 0.0
             if not event.located(sign):  # only a crossing back, later in this step, counts
+                changed.append(place)
                 if length == step.length or inside[2] < 0:
-                    self.signs[place] = -sign
                     continue
                 sign, lower, length = -sign, length, step.length
             found = self._located(scheme, step, known, event, sign, lower, length)
             if found is not None and (first is None or found.step.length < first.step.length):
                 first = found
+        last = step if first is None else first.step
+        for place in changed:  # the signs where the next step begins
+            value = self.events[place].number(scheme.tree(last.new), self.params, start + last.length * h)
+            self.signs[place] = float(np.sign(value)) or self.signs[place]
         if first is not None:
             self.last = first.sign
         return first
@@ -473,12 +490,36 @@ class Interrupted(Scheme):
             (u, Sided(one, piece.side), t, piece.length if piece.event else stop - t)
             for (u, t), one, stop in zip(states, params, stops, strict=True)
         ]
+        if not piece.path and piece.event:
+            return [self._event_here(piece.event, *start) for start in given]
         if not piece.path:
             return [(_short(self.problem, *start), stop) for start, stop in zip(given, stops, strict=True)]
         ends = self.scheme.rerun(piece.path, given, piece.event)
         if not piece.event:
             return [(new, stop) for (new, _), stop in zip(ends, stops, strict=True)]
         return [(piece.event.after(new, one, time), time) for (new, time), one in zip(ends, params, strict=True)]
+
+    def _event_here(self, event, u, params, t, _):
+        """The state and the time after an event that occurs where a piece begins, to rounding."""
+
+        def value(point, length):
+            u, params, t = point
+            return event.value(_short(self.problem, u, params, t, length), unsided(params), t + length)
+
+        point = u, params, t
+        known = untraced(point)
+
+        def slope(length):
+            return push(lambda more: 1.0 * value(known, more), length, [1.0])[1]
+
+        change, bend = (float(number) for number in push(slope, 0.0, [1.0]))
+        self.scheme.check_steep(event, known[0], known[1], known[2], change, bend)
+        length = 0.0
+        for _ in traces_of(leaves(point)):  # as for an event at the end of a step
+            found = value(point, length)
+            length = length - (found - plain(found)) / change
+        time = t + length
+        return event.after(_short(self.problem, u, params, t, length), unsided(params), time), time
 
 
 def _short(problem, u, params, t, length):
@@ -538,6 +579,8 @@ class _Run:
             length = stop - self.t
             side = Side(earliest, latest, self.watch.surfaces() if self.watch else ())
             event = self._piece(place, side, length)
+            if event is None and place < 0:
+                event = self._at_the_end(side, stop)
             if event is None:
                 self.t = stop
                 return False
@@ -555,11 +598,19 @@ class _Run:
                 return True
             self.watch.passed(event, state, self.u, self.t)
 
+    def _at_the_end(self, side, stop):
+        """An event within rounding of the end of the interval, or None."""
+        event = self.watch.pending(self.u, stop) if self.watch else None
+        if event is not None:
+            self.crossed = stop - self.t
+            self.pieces.append(Piece([], side, -1, event, 0.0))
+        return event
+
     def _piece(self, place, side, length):
         """Cross a piece; the event that ended it, or None."""
         given = self.u, Sided(self.params, side), self.t, length
         empty = not any(np.size(leaf) for leaf in leaves(self.u))
-        if empty or length <= 4 * EPS * max(abs(self.t), abs(self.t + length), self.h):
+        if empty or length <= 64 * EPS * max(abs(self.t), abs(self.t + length), self.h):
             self.u = _short(self.parent.problem, *given)
             self.pieces.append(Piece([], side, place, None, length))
             return None
