@@ -141,9 +141,9 @@ def check_precision(name, value):
 
 def is_other_precision(dtype):
     """Return whether a dtype of NumPy holds floating numbers that are neither of single nor of double precision."""
-    if not isinstance(dtype, np.dtype):
+    if not isinstance(dtype, np.dtype) or dtype.char in PRECISIONS:
         return False
-    return dtype.name == "bfloat16" or (dtype.kind in "fc" and dtype.char not in PRECISIONS)
+    return dtype.kind in "fc" or dtype.name == "bfloat16"
 
 
 def check_leaves(name, tree, containers=True):
