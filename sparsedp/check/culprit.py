@@ -143,51 +143,68 @@ class Arguments(Point):
 
 
 def _entries_of_rule(node, trials, judged, worst, weights, spaces):
-    """Where in its arguments and results the VJP of a call is wrong, in words.
-
-    For weights w of the results and a direction d of the arguments the gap <w, J d> - <VJP(w), d> is linear in w.
-    """
-    point, direction = trials.point, worst.line.direction
-    found = gaps_along_entries(trials, judged, 1)
-    words = [f"largest gap in its {one}" for one in listed(found, point, trials.gradient, spaces, "its VJP")]
+    """Return in words where in its arguments and results the VJP of a call is wrong."""
+    point = trials.point
+    in_arguments = gaps_along_entries(trials, judged, 1)
+    words = [f"largest gap in its {one}" for one in listed(in_arguments, point, trials.gradient, spaces, "its VJP")]
     shapes = [np.shape(weight) for weight in weights.values()]
-    real = not (point.complex or any(map(np.iscomplexobj, weights.values())))
-    if real and sum(map(prod, shapes)) > 1:
-        step = worst.step if worst.step > 0 else DEFAULT_STEP
-        places = [point.unpack(point.vector + side * direction) for side in (step, -step)]
-        ahead, behind = ([np.asarray(y) for y in _results(node, node.again(place))] for place in places)
-        slopes = [(ahead[k] - behind[k]) / (2 * step) for k in weights]
-        moving = [True] * len(leaves(node.values))
-        values, _, pull = linearised(lambda values: _results(node, node.again(values)), point.fresh(), moving)
-
-        def gap_along(parts):
-            cotangents: list = [None] * len(values)
-            gap = 0.0
-            for (k, weight), part, slope in zip(weights.items(), parts, slopes, strict=True):
-                cotangents[k] = np.asarray(weight * part, np.asarray(values[k]).dtype)[()]
-                gap += float(np.sum(cotangents[k] * slope))
-            backs = [np.zeros(x.shape) if back is None else back for back, x in zip(pull(cotangents), point.values)]
-            return gap - float(np.concatenate([np.ravel(back) for back in backs]) @ direction)
-
-        for one in largest_gaps(gap_along, shapes, 1):
+    is_complex = point.complex or any(map(np.iscomplexobj, weights.values()))
+    if not is_complex and sum(map(prod, shapes)) > 1:
+        for one in largest_gaps(_gap_of_results(node, point, worst, weights), shapes, 1):
             name = f"result {one.leaf}" if len(shapes) > 1 else "result"
             words.append(f"in its {_named(name, one, shapes[one.leaf], spaces)}")
     return "".join(f"; {word}" for word in words)
 
 
+def _gap_of_results(node, point, worst, weights):
+    """Return ``gap_along(parts)`` of a call, <w, J d> - <VJP(w), d> with w = weights * parts.
+
+    d is the direction of the arguments in which the VJP is worst, J d a central difference. The gap is linear in parts.
+    """
+    direction = worst.line.direction
+    step = worst.step if worst.step > 0 else DEFAULT_STEP
+
+    def results_at(values):
+        return _results(node, node.again(values))
+
+    ahead = results_at(point.unpack(point.vector + step * direction))
+    behind = results_at(point.unpack(point.vector - step * direction))
+    slopes = [(np.asarray(ahead[k]) - np.asarray(behind[k])) / (2 * step) for k in weights]
+    moving = [True] * len(leaves(node.values))
+    values, _, pull = linearised(results_at, point.fresh(), moving)
+
+    def gap_along(parts):
+        cotangents: list = [None] * len(values)
+        gap = 0.0
+        for (k, weight), part, slope in zip(weights.items(), parts, slopes, strict=True):
+            cotangents[k] = np.asarray(weight * part, np.asarray(values[k]).dtype)[()]
+            gap += float(np.sum(cotangents[k] * slope))
+        backs = [np.zeros(x.shape) if back is None else back for back, x in zip(pull(cotangents), point.values)]
+        return gap - float(np.concatenate([np.ravel(back) for back in backs]) @ direction)
+
+    return gap_along
+
+
 def _entries_of_operator(op, rng):
-    """Where in its argument and result the transpose of a real Operator is wrong, in words."""
+    """Return in words where in its argument and result the transpose of a real Operator is wrong."""
     if op.dtype.kind == "c":
         return ""
     op = op.tangent
-    u, g = field(rng, op.domain.shape, float), field(rng, op.codomain.shape, float)
-    forward, backward = op.apply(u), op.T.apply(g)
-    in_argument = largest_gaps(
-        lambda parts: float(np.sum(op.apply(parts[0] * u) * g) - np.sum(parts[0] * u * backward)), [u.shape], 1
-    )
-    in_result = largest_gaps(
-        lambda parts: float(np.sum(forward * parts[0] * g) - np.sum(u * op.T.apply(parts[0] * g))), [g.shape], 1
-    )
+    u = field(rng, op.domain.shape, float)
+    g = field(rng, op.codomain.shape, float)
+    forward = op.apply(u)
+    backward = op.T.apply(g)
+
+    def gap_in_argument(parts):
+        part = parts[0] * u
+        return float(np.sum(op.apply(part) * g) - np.sum(part * backward))
+
+    def gap_in_result(parts):
+        part = parts[0] * g
+        return float(np.sum(forward * part) - np.sum(u * op.T.apply(part)))
+
+    in_argument = largest_gaps(gap_in_argument, [u.shape], 1)
+    in_result = largest_gaps(gap_in_result, [g.shape], 1)
     words = ""
     for name, found, space in (("argument", in_argument, op.domain), ("result", in_result, op.codomain)):
         spaces = [space] if space.grid is not None and space.layout is None else []
@@ -196,7 +213,7 @@ def _entries_of_operator(op, rng):
 
 
 def _named(name, one, shape, spaces):
-    """An entry, or the region that holds the whole gap, and its place."""
+    """Return an entry, or the region that holds the whole gap, and its place in words."""
     block = one.block if one.region is None else one.region
     return f"{name}{subscript(block, shape)}{where(block, shape, spaces)}"
 
