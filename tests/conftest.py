@@ -73,7 +73,7 @@ def drawn(request):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Print what a campaign of random scenes came to: scenes, comparisons, and refusals by reason."""
+    """Print the totals of a campaign of random scenes: scenes, comparisons, and refusals by reason."""
     total, reasons = Counter(), Counter()
     for report in terminalreporter.getreports("passed"):
         for name, tally in report.user_properties:
