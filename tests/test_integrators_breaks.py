@@ -113,6 +113,17 @@ def test_two_breaks_of_one_param():
     assert g == pytest.approx([part, part / 100], rel=1e-5)
 
 
+def test_breaks_that_are_adjacent_numbers_coincide():
+    """There is no time between them at which the rate could be evaluated: the derivative would be wrong."""
+    rate = lambda u, p, t: anp.where(t < p[0], 0.0, 1.0) + anp.where(t < p[1], 0.0, 3.0)
+    step = dp.stepper("rk4", rate, 1.0, tolerance=1e-6, breaks=lambda p: p)
+    loss = lambda p: step((0.0, 0.0), p)[0]
+    near = np.nextafter(0.7, 1.0)
+    with pytest.raises(dp.errors.DerivativeError, match="coincide at t = 0.7"):
+        value_and_grad(loss)(np.array([0.7, near]))
+    assert value_and_grad(loss)(np.array([0.7, np.nextafter(near, 1.0)]))[1] == pytest.approx([-1.0, -3.0], rel=1e-6)
+
+
 @pytest.mark.whole
 def test_a_linear_problem_with_a_source():
     """u' = L u + s(t), by solves: in halves of halves of each piece."""

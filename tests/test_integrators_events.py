@@ -247,6 +247,14 @@ def test_a_jump_before_the_end_of_a_step_takes_back_what_lay_behind_it(method):
     assert len(step.t_events[0]) == 0 and step.t_events[1] == pytest.approx([0.4])
 
 
+@pytest.mark.parametrize("level", [0.49, 0.6, 0.73, 0.89])
+def test_an_event_of_a_smooth_rate_does_not_look_like_a_layer(level):
+    """u' = -p u has the derivative -exp(-1) after t = 1, with an event or without."""
+    step = dp.stepper("heun", lambda u, p, t: -p * u, 1.0, tolerance=1e-4, events=lambda u, p: u[0] - level)
+    slope = value_and_grad(lambda p: step((np.ones(2), 0.0), p)[0][0])(1.0)[1]
+    assert slope == pytest.approx(-np.exp(-1.0), rel=1e-3)
+
+
 def test_a_stepper_with_events_is_pickled():
     step = dp.stepper("rk4", falling, 0.6, tolerance=1e-6, events=(level, bounce), breaks=[0.3])
     again, start = pickle.loads(pickle.dumps(step)), (np.array([1.0, 0.0]), 0.0)

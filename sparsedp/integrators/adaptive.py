@@ -153,10 +153,10 @@ class Adaptive(Scheme):
         inspector = self.inspector(known)
         u, params, t, h = known
         for step in self._steps(u, params, t, h, inspector):
-            if whole and inspector:
-                inspector.search(step)
             crossing = watch and watch.crossing(self, step, known)
             path.append(crossing.step if crossing else step)
+            if whole and inspector:  # beyond an event the rate is that at its surface
+                inspector.search(path[-1])
             taken.append(path[-1].length)
             if crossing:
                 break
