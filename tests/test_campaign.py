@@ -37,7 +37,6 @@ SEED = int(os.environ.get("SPARSEDP_SEED", 0))
 FOLDER = Path(os.environ.get("SPARSEDP_FAILURES", ROOT / ".pytest_cache" / "campaign"))
 PER_TEST = 50
 PER_SEARCH = 10  # a longer search of Hypothesis repeats parts of its scenes
-QUICK = 30
 
 
 def run(count, seed, before=0):
@@ -88,9 +87,10 @@ def run(count, seed, before=0):
     return tally
 
 
-def test_a_few_scenes():
-    tally = run(QUICK, seed=0)
-    assert tally["scenes"] > QUICK // 2
+@pytest.mark.parametrize("count", [10, pytest.param(40, marks=pytest.mark.slow)])
+def test_a_few_scenes(count):
+    tally = run(count, seed=0)
+    assert tally["scenes"] > count // 2
 
 
 @pytest.mark.campaign
@@ -135,6 +135,7 @@ def test_a_scene_that_once_failed(name):
 # ---- the campaign itself -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_scene_as_a_program_that_stands_alone(tmp_path):
     """It runs without the folder of tests, from another directory."""
     sides = (("dirichlet", "neumann"), ("neumann", "neumann"))

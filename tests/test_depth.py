@@ -36,6 +36,7 @@ def test_the_deepest_operators_work_in_every_way():
     assert op.name in str(op)
 
 
+@pytest.mark.slow
 def test_sums_and_products_of_many_operators_are_not_nested():
     many_terms, many_factors = LAPLACIAN, ONE
     for _ in range(300):

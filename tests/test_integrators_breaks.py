@@ -24,7 +24,7 @@ def first(step, start=0.0):
 @pytest.mark.parametrize(
     "method, tolerance, near",
     [
-        ("heun", 1e-3, 1e-3),
+        pytest.param("heun", 1e-3, 1e-3, marks=pytest.mark.slow),
         ("rk4", 1e-6, 1e-5),
         ("radau", 1e-6, 1e-6),
         pytest.param("ssprk3", 1e-5, 1e-5, marks=pytest.mark.whole),
