@@ -160,15 +160,15 @@ GRID_OF_ROWS = dp.Grid((4, 3))
 DECAY = dp.identity(GRID_OF_ROWS.cells) - 0.1 * dp.laplacian(GRID_OF_ROWS, dp.dirichlet)
 IN_FRONT = {  # what stands before the wrong rule, and where it is examined
     "rollout": (run_of, LINE),
-    "rollout, all states": (lambda u: run_of(u, keep="all"), LINE),
     "rollout, memory": (lambda u: run_of(u, n=12, memory=300), LINE),
-    "rollout, inputs": (lambda u: dp.rollout(lambda v, p, x: 0.9 * v + x, u[0], None, 5, inputs=u), LINE),
     "rollout, dict": (lambda u: run_of({"a": u, "b": 2 * u}, swapped)["a"], LINE),
     "rk4": (stepped("rk4"), LINE),
     "inverse": (dp.inverse(DECAY), ROWS),
-    "ensemble": (lambda u: dp.ensemble(lambda p, scale: anp.sum(p**2) * scale, [1.0, 2.0])(u), LINE),
 }
 MORE = {
+    "rollout, all states": (lambda u: run_of(u, keep="all"), LINE),
+    "rollout, inputs": (lambda u: dp.rollout(lambda v, p, x: 0.9 * v + x, u[0], None, 5, inputs=u), LINE),
+    "ensemble": (lambda u: dp.ensemble(lambda p, scale: anp.sum(p**2) * scale, [1.0, 2.0])(u), LINE),
     "rollout, some states": (lambda u: run_of(u, keep=[1, 3]), LINE),
     "rollout, a function of states": (lambda u: run_of(u, keep=lambda i, v: anp.sum(v**2))[2], LINE),
     "rollout, params": (lambda u: run_of(u, lambda v, p: 0.9 * v + p, u), LINE),

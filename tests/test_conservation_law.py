@@ -154,7 +154,9 @@ def settled(law, lake, flow, end):
     return dp.rollout(dp.stepper("ssprk3", law, dt), lake, None, int(end / dt))
 
 
-@pytest.mark.parametrize(("flow", "n"), [(1.0, 25), pytest.param(4.42, 60, marks=pytest.mark.whole)])
+@pytest.mark.parametrize(
+    ("flow", "n"), [pytest.param(1.0, 25, marks=pytest.mark.slow), pytest.param(4.42, 60, marks=pytest.mark.whole)]
+)
 def test_a_river_over_a_lake_at_rest(flow, n):
     """The inflow acts beside an equilibrium: the discharge is that of the inflow, and Bernoulli's head the same all
     along: 2.249 m for 4.42."""

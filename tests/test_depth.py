@@ -23,6 +23,7 @@ def horner(depth, base=ONE):
     return op
 
 
+@pytest.mark.slow
 def test_the_deepest_operators_work_in_every_way():
     op, u = horner(99), np.ones(GRID.shape)
     v = u

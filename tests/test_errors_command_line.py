@@ -399,9 +399,10 @@ LONG = "a" * 5000
         (["check", f"scene.py:loss:{LONG}"], r"scene.py has no 'a+\.\.\. the point; write scene.py:loss:NAME"),
         (["report", f"{LONG}/{LONG}.py"], r"there is no file a+\.\.\. name one that is there"),
         (["report", "scene.py", "--out", LONG], r"a+\.\.\. cannot be made a folder: File name too long; name another "),
-        (
+        pytest.param(
             ["report", f"scene.py:{'b' * 255}"],
             r".*b+\.\.\. cannot be written: File name too long; shorten the name, most file systems take up to 255 b",
+            marks=pytest.mark.slow,
         ),
         (["demo", "--out", LONG], r"a+\.\.\. cannot be made a folder: File name too long; name another with --out"),
         (["demo", "--input", f"{LONG}.npy"], r"a+\.\.\. is not there or is no plain file; give the path of a .npy, "),

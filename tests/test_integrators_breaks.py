@@ -90,6 +90,7 @@ def test_a_break_in_a_rollout_under_a_budget(count):
     assert again == (value, g) and runs[-1].recomputed > 0
 
 
+@pytest.mark.slow
 def test_the_order_and_the_range_of_breaks():
     """Unsorted, repeated constants, outside of the interval, at its start: none changes the result."""
     rate = lambda u, p, t: anp.where(t < 0.3, p, 0.0) + anp.where(t >= 0.7, 2.0, 0.0) * u
