@@ -30,6 +30,7 @@ def test_a_library_that_is_not_installed(library, extra, monkeypatch):
     for module in (f"interop.{library}_bridge", "storage.labelled"):
         monkeypatch.delitem(sys.modules, f"sparsedp.{module}", raising=False)
     monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(vars(dp.interop), f"to_{library}", raising=False)  # kept since its first use
     with pytest.raises(ImportError, match=r"^dp.interop.to_.* needs .*; install sparsedp\[.*\]$") as found:
         getattr(dp.interop, f"to_{library}")
     assert str(found.value) == f"dp.interop.to_{library} needs {library}; install sparsedp[{extra}]"
