@@ -255,6 +255,17 @@ def test_an_event_of_a_smooth_rate_does_not_look_like_a_layer(level):
     assert slope == pytest.approx(-np.exp(-1.0), rel=1e-3)
 
 
+def test_radau_locates_an_event_in_a_step_with_a_large_error():
+    """The second error estimate, of a first step, evaluates the rate with the params that were given."""
+    step = dp.stepper(
+        "radau", lambda u, p, t: anp.array([u[1], -p * u[0]]), 2.0, tolerance=1e-4, events=lambda u, p: u[0] - 0.5
+    )
+    step((np.array([0.9, 0.3]), 0.0), 1.25)
+    f = np.sqrt(1.25)
+    size, phase = np.hypot(0.9, 0.3 / f), np.arctan2(0.3 / f, 0.9)
+    assert step.t_events[0] == pytest.approx([(phase + np.arccos(0.5 / size)) / f], rel=1e-3)
+
+
 def test_a_stepper_with_events_is_pickled():
     step = dp.stepper("rk4", falling, 0.6, tolerance=1e-6, events=(level, bounce), breaks=[0.3])
     again, start = pickle.loads(pickle.dumps(step)), (np.array([1.0, 0.0]), 0.0)

@@ -198,7 +198,7 @@ class Radau(Adaptive):
     def partial(self, step, known, length):
         goal, most, self.goal, self.most = self.goal, self.most, ROUNDING, 2 * ITERATIONS
         try:
-            return super().partial(step, known, length)
+            return super().partial(step, (known[0], self.params, *known[2:]), length)
         finally:
             self.goal, self.most = goal, most
 
