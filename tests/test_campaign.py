@@ -87,7 +87,7 @@ def run(count, seed, before=0):
     return tally
 
 
-@pytest.mark.parametrize("count", [10, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [10, pytest.param(40, marks=pytest.mark.whole)])
 def test_a_few_scenes(count):
     tally = run(count, seed=0)
     assert tally["scenes"] > count // 2
@@ -135,7 +135,7 @@ def test_a_scene_that_once_failed(name):
 # ---- the campaign itself -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_a_scene_as_a_program_that_stands_alone(tmp_path):
     """It runs without the folder of tests, from another directory."""
     sides = (("dirichlet", "neumann"), ("neumann", "neumann"))

@@ -229,9 +229,7 @@ def with_controlled_steps(error):
     return lambda rate: anp.sum(cube(CONTROLLED(np.array([1.0, 0.4]), rate)))
 
 
-@pytest.mark.parametrize(
-    "error", [0.0, pytest.param(1e-3, marks=pytest.mark.slow), pytest.param(0.1, marks=pytest.mark.whole)]
-)
+@pytest.mark.parametrize("error", [0.0, *(pytest.param(share, marks=pytest.mark.whole) for share in (1e-3, 0.1))])
 def test_what_the_tolerance_of_steps_leaves_is_inconclusive(error):
     """The gap is below the tolerance; a wrong rule of the same size is found by itself."""
     found = dp.check.gradient(with_controlled_steps(error), RATE, directions=1, quick=True)

@@ -155,7 +155,7 @@ def settled(law, lake, flow, end):
 
 
 @pytest.mark.parametrize(
-    ("flow", "n"), [pytest.param(1.0, 25, marks=pytest.mark.slow), pytest.param(4.42, 60, marks=pytest.mark.whole)]
+    ("flow", "n"), [pytest.param(1.0, 25, marks=pytest.mark.whole), pytest.param(4.42, 60, marks=pytest.mark.whole)]
 )
 def test_a_river_over_a_lake_at_rest(flow, n):
     """The inflow acts beside an equilibrium: the discharge is that of the inflow, and Bernoulli's head the same all
@@ -303,7 +303,7 @@ FRONTS = {
 }
 
 
-@pytest.mark.parametrize("name", ["Burgers", *(pytest.param(name, marks=pytest.mark.slow) for name in [*FRONTS][1:])])
+@pytest.mark.parametrize("name", ["Burgers", *(pytest.param(name, marks=pytest.mark.whole) for name in [*FRONTS][1:])])
 def test_a_front_that_runs_into_zero_has_a_gradient(name):
     """Ahead of the front the waves are 1e-170 fast: their square underflows in the derivative of a quotient."""
     grid = dp.Grid(60, size=1.0)

@@ -124,7 +124,7 @@ def test_recovered_field(finished):
     assert found.shape == (16, 14) and np.all(np.isfinite(found))
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_a_second_run_writes_beside_the_first(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(dp.check, "gradient", audit("agrees"))
     monkeypatch.setitem(sys.modules, "matplotlib", None)

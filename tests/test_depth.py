@@ -23,7 +23,7 @@ def horner(depth, base=ONE):
     return op
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_the_deepest_operators_work_in_every_way():
     op, u = horner(99), np.ones(GRID.shape)
     v = u
@@ -37,7 +37,7 @@ def test_the_deepest_operators_work_in_every_way():
     assert op.name in str(op)
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_sums_and_products_of_many_operators_are_not_nested():
     many_terms, many_factors = LAPLACIAN, ONE
     for _ in range(300):

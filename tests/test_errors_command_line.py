@@ -295,7 +295,7 @@ def test_a_loss_that_raises_is_no_verdict(ending, capsys, end, after):
         assert place in text and ERRORS[end].strip() in text
 
 
-@pytest.mark.parametrize("end", [pytest.param("sys.exit(0)", marks=pytest.mark.slow), "os._exit(0)"])
+@pytest.mark.parametrize("end", [pytest.param("sys.exit(0)", marks=pytest.mark.whole), "os._exit(0)"])
 def test_an_exit_as_a_command(ending, tmp_path, end):
     ending(end)
     arguments = [sys.executable, "-m", "sparsedp", "report", "ends.py"]
@@ -315,7 +315,7 @@ def test_a_child_process_may_end_as_it_likes(ending, capsys):
     assert os._exit is end and "verdict: agrees" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_a_wrong_gradient_behind_a_rollout_is_a_verdict(tmp_path, capsys):
     """Exit code 1 of both commands; the search for the culprit raises nothing."""
     (tmp_path / "run.py").write_text(
@@ -402,7 +402,7 @@ LONG = "a" * 5000
         pytest.param(
             ["report", f"scene.py:{'b' * 255}"],
             r".*b+\.\.\. cannot be written: File name too long; shorten the name, most file systems take up to 255 b",
-            marks=pytest.mark.slow,
+            marks=pytest.mark.whole,
         ),
         (["demo", "--out", LONG], r"a+\.\.\. cannot be made a folder: File name too long; name another with --out"),
         (["demo", "--input", f"{LONG}.npy"], r"a+\.\.\. is not there or is no plain file; give the path of a .npy, "),

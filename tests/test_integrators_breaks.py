@@ -24,7 +24,7 @@ def first(step, start=0.0):
 @pytest.mark.parametrize(
     "method, tolerance, near",
     [
-        pytest.param("heun", 1e-3, 1e-3, marks=pytest.mark.slow),
+        pytest.param("heun", 1e-3, 1e-3, marks=pytest.mark.whole),
         ("rk4", 1e-6, 1e-5),
         ("radau", 1e-6, 1e-6),
         pytest.param("ssprk3", 1e-5, 1e-5, marks=pytest.mark.whole),
@@ -90,7 +90,7 @@ def test_a_break_in_a_rollout_under_a_budget(count):
     assert again == (value, g) and runs[-1].recomputed > 0
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_the_order_and_the_range_of_breaks():
     """Unsorted, repeated constants, outside of the interval, at its start: none changes the result."""
     rate = lambda u, p, t: anp.where(t < 0.3, p, 0.0) + anp.where(t >= 0.7, 2.0, 0.0) * u

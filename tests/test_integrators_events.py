@@ -205,7 +205,7 @@ def test_an_event_at_the_start_is_left():
     assert np.array_equal(rest((np.zeros(2), 0.0), 9.81)[0], np.zeros(2))
 
 
-@pytest.mark.parametrize("method", [pytest.param("heun", marks=pytest.mark.slow), "radau"])
+@pytest.mark.parametrize("method", [pytest.param("heun", marks=pytest.mark.whole), "radau"])
 def test_events_at_the_ends_of_intervals(method):
     """Two balls land at t = count dt to rounding, each once, and the gravity of one moves its bounce alone."""
     rate = lambda u, g, t: {"a": falling(u["a"], 10.0, t), "b": falling(u["b"], g, t)}

@@ -37,7 +37,7 @@ def test_a_pulse_is_seen(method, tolerance):
     assert step((np.ones(1), 0.0))[0][0] == pytest.approx(0.505060, abs=max(tolerance, 1e-6))
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_a_narrow_bell_is_seen():
     bell = lambda u, p, t: anp.exp(-(((t - 1.0) / 0.01) ** 2)) - u
     step = dp.stepper("rk4", bell, 2.0, tolerance=1e-6)

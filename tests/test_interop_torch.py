@@ -316,7 +316,7 @@ def test_refusals_of_torch_functions():
         from_torch("net")
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_the_audit_examines_a_function_of_torch():
     """A wrong rule behind it is named: the function is run again at other values."""
     act = from_torch(lambda x: {"a": torch.sin(x), "b": x})

@@ -297,7 +297,7 @@ def test_a_way_back_that_loses_the_start_is_refused():
         dp.grad(lambda c: dp.rollout(Wrong(), 1.0, c, 3, memory="reverse"))(1.0)
 
 
-@pytest.mark.parametrize("error", [0.0, pytest.param(1e-3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("error", [0.0, pytest.param(1e-3, marks=pytest.mark.whole)])
 def test_reversed_steps_in_single_precision(error):
     """Rounding of float32 is allowed for, and the gradient has its digits; a wrong way back is refused."""
     grid = dp.Grid(24, size=1.0)

@@ -132,7 +132,7 @@ def test_admm_keeps_bounds_and_takes_another_prox():
     np.testing.assert_allclose(best.x, np.maximum(y, 0), atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_admm_of_complex_unknowns(rng):
     """At the minimum the gradient is -weight x / |x|, and of magnitude <= weight where x is 0."""
     matrix = rng.normal(size=(6, 5)) + 1j * rng.normal(size=(6, 5))

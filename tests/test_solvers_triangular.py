@@ -148,7 +148,7 @@ def test_a_sweep_takes_no_longer_than_that_of_scipy(shape):
     assert min(ours) <= 3 * min(theirs) and min(adjoint) <= 3 * min(theirs)
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_a_long_pipe_in_an_implicit_step():
     pipe = dp.Grid((2200, 3, 3), size=(10.0, 0.1, 0.1))
     wind = dp.upwind(pipe, "x", 1, {"x": SIDES[1]})

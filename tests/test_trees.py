@@ -337,7 +337,7 @@ def decay(u, p):
 FIELDS = {"fast": np.array([1.0, 2.0]), "slow": np.array([3.0])}
 
 
-@pytest.mark.parametrize("method", ["euler", "rk4", "heun", pytest.param("tr_bdf2", marks=pytest.mark.slow), "radau"])
+@pytest.mark.parametrize("method", ["euler", "rk4", "heun", pytest.param("tr_bdf2", marks=pytest.mark.whole), "radau"])
 def test_a_floor_in_another_order(method):
     options = dict(tolerance=1e-4) if method != "euler" else dict(tolerance=1e-2)
     one = dp.stepper(method, decay, 1.0, floor={"fast": 1e-3, "slow": 10.0}, **options)

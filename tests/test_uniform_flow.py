@@ -49,7 +49,7 @@ class Uniform:
 
 WHOLE = pytest.mark.whole
 KINDS = [pytest.param(shape, False, id=str(shape)) for shape in [(5,), (4, 5), (1, 4), (1, 1, 3)]]
-KINDS += [pytest.param((3, 4, 2), False, id="(3, 4, 2)", marks=pytest.mark.slow)]
+KINDS += [pytest.param((3, 4, 2), False, id="(3, 4, 2)", marks=pytest.mark.whole)]
 KINDS += [pytest.param(shape, True, id=f"{shape}-all", marks=WHOLE) for shape in SHAPES]
 BOTH = [False, pytest.param(True, marks=WHOLE)]
 
@@ -101,7 +101,7 @@ def test_transport_of_faces(shape, every):
 
 
 STEPPING = [pytest.param((4, 5), False, name, id=name) for name in STEPS]
-STEPPING += [pytest.param((3, 4, 2), False, "implicit", id="three axes", marks=pytest.mark.slow)]
+STEPPING += [pytest.param((3, 4, 2), False, "implicit", id="three axes", marks=pytest.mark.whole)]
 STEPPING += [pytest.param(shape, True, name, id=f"{shape}-{name}", marks=WHOLE) for shape in SHAPES for name in STEPS]
 
 
@@ -283,7 +283,7 @@ def blown(t):
     return {"turn": 0.3 * np.sin(3.0 * t), "blow": 0.5 + 0.3 * np.cos(2.0 * t), "lid": np.sin(2.0 * t)}
 
 
-@pytest.mark.parametrize("implicit", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("implicit", [False, pytest.param(True, marks=pytest.mark.whole)])
 def test_wall_velocities_that_change_keep_the_second_order_in_time(implicit):
     answers = []
     for n in (10, 20, 40, 80):
