@@ -203,7 +203,7 @@ class Adaptive(Scheme):
         return None if smooth or elsewhere(leaves(known[0])) is not None else Inspector(self, *known[1:])
 
     def inner_state(self, step):
-        """A state inside a step as the steps hold it, and the share at which it is."""
+        """Return a state inside a step, in the form that steps have, and the share of the step at which it is."""
         return step.middle, 0.5
 
     def _refuse_jump(self, time, in_time):
@@ -245,10 +245,6 @@ class Adaptive(Scheme):
     def rate(self, u, params, t):
         """The rate at a state of a step."""
         return self.problem(u, params, t)
-
-    def between(self, step):
-        """A state inside a step, and the share of the step at which it is."""
-        return step.middle, 0.5
 
     def partial(self, step, known, length):
         """The step from the same state with another length, as a share of the interval; None where there is none."""

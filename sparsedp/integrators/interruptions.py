@@ -1,7 +1,7 @@
 """Steps with error control that stop at given times (breaks) and at zero crossings (events).
 
 The interval of a step is cut into pieces. A piece ends at the next break, at the next event, or at the end of the
-interval. Inside a piece the rate is smooth, and at both ends it is evaluated on the side of the piece (see sides.py).
+interval. Inside a piece the rate is smooth, and at both ends it is evaluated on the side of the piece (see `Side` in problem.py).
 
 The derivative with respect to a break b follows from the lengths of both pieces, which are traced: with the rate f_- at
 the end of the first piece and f_+ at the start of the second,
@@ -36,7 +36,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 from sparsedp.derivative import pullback, push
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import check_function, check_number, check_takes
+from sparsedp.fields import EPS, check_function, check_number, check_takes
 from sparsedp.integrators.adaptive import Adaptive, Moving, relative
 from sparsedp.integrators.problem import Side, Sided, combine, of_fields, takes, unsided, untraced
 from sparsedp.integrators.runge_kutta import Scheme
@@ -45,7 +45,6 @@ from sparsedp.tree import flatten, leaves
 
 __all__ = ["Crossing", "Event", "Interrupted", "break_times", "event_list"]
 
-EPS = float(np.finfo(float).eps)
 MOST_EVENTS = 10_000  # in one interval
 REPEATS = 8  # of one event within rounding of the time: it never ends
 SHIFTS = 12  # attempts to move a state to the right side of a surface
@@ -153,7 +152,7 @@ def event_list(events):
 
 
 def _is_pair(events):
-    """Whether two entries are a function and its jump: two functions of which none is an event with attributes."""
+    """Return whether two entries are an event function and its jump, which may be None."""
     function, jump = events
     return callable(function) and (jump is None or callable(jump))
 
@@ -315,12 +314,12 @@ class Watch:
         """The first event in a step, or None; `known`: what the scheme was given, plain."""
         t, h = known[2:]
         start = t + step.done * h
-        between, share = scheme.between(step)
+        middle, share = scheme.inner_state(step)
         first, changed = None, []
         for place, event in enumerate(self.events):
             values = [
                 event.number(scheme.tree(step.u), self.params, start),
-                event.number(between, self.params, start + share * step.length * h),
+                event.number(scheme.tree(middle), self.params, start + share * step.length * h),
                 event.number(scheme.tree(step.new), self.params, start + step.length * h),
             ]
             sign = self.signs[place]

@@ -191,10 +191,6 @@ class Radau(Adaptive):
     def rounded(self, v):
         return self.problem.layout.rounded(v)
 
-    def between(self, step):
-        """A state inside a step, and the share of the step at which it is."""
-        return self.tree(step.u + step.middle[1]), C[1]
-
     def partial(self, step, known, length):
         goal, most, self.goal, self.most = self.goal, self.most, ROUNDING, 2 * ITERATIONS
         try:
@@ -232,6 +228,7 @@ class Radau(Adaptive):
         return Inspector(self, self.params, *known[2:])
 
     def inner_state(self, step):
+        """Return the second stage, and the share of the step at which it is."""
         return step.u + step.middle[1], C[1]
 
     def _steps(self, v, params, t, h, inspector=None):
