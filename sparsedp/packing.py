@@ -141,15 +141,15 @@ class Packing:
         return self.names_under(self.root)
 
     def names_under(self, root):
-        """The same of a tree of the same structure with another name."""
+        """Return the names of the floating leaves of a tree of the same structure with another name."""
         return list(compress(labels(self.form, root), self._floating))
 
     def floating(self, tree, name="tree", **options):
-        """Tree of the same structure -> its leaves in the places of the floating ones, paired as `paired` does."""
+        """Return the leaves of a tree of the same structure in the places of the floating ones, see `paired`."""
         return list(compress(paired(tree, self.form, name, **options), self._floating))
 
     def pack(self, tree):
-        """Tree of the same structure -> flat vector of doubles."""
+        """Return a tree of the same structure as a flat vector of doubles."""
         return joined(self.floating(tree))
 
     def slopes(self, gradient):

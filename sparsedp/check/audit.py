@@ -198,9 +198,10 @@ def _audit(trials, taped, count, rng, quick):
 
 
 def look_beside(trials, judged):
-    """At several kinks at once a derivative may lie outside the one-sided ones and follow a convention all the same.
+    """Judge directions that look wrong at kinks once more, at a point beside the kinks.
 
-    What is wrong beside the kinks as well is wrong.
+    Where several kinks meet, a derivative may lie outside the one-sided ones and still follow a convention. It is wrong
+    if it is wrong beside the kinks as well. Nothing is done without kinks or without a function for the gradient.
     """
     if not (at_kinks(judged) and callable(trials.slope)):
         return

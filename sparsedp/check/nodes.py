@@ -30,7 +30,7 @@ class Node:
     values : list
         The arguments that are differentiated.
     places : list of int
-        Their numbers among the arguments that the user gives.
+        Their positions among the arguments that the user passes.
     plain : bool
         Whether no argument belongs to an outer trace.
     inner : list of Node
@@ -58,7 +58,7 @@ class Node:
 
 
 def _as_new(argument):
-    """An argument for another run of a call: one that holds the results of a run tells how it was before."""
+    """Return an argument for another run of a call; one that keeps the results of its run has `as_new`."""
     return argument.as_new() if hasattr(argument, "as_new") else argument
 
 

@@ -1,7 +1,8 @@
 """Steps with error control that stop at given times (breaks) and at zero crossings (events).
 
 The interval of a step is cut into pieces. A piece ends at the next break, at the next event, or at the end of the
-interval. Inside a piece the rate is smooth, and at both ends it is evaluated on the side of the piece (see `Side` in problem.py).
+interval. Inside a piece the rate is smooth, and at both ends it is evaluated on the side of the piece: see
+`Side` in problem.py.
 
 The derivative with respect to a break b follows from the lengths of both pieces, which are traced: with the rate f_- at
 the end of the first piece and f_+ at the start of the second,

@@ -53,8 +53,8 @@ def to_jax(f, like=None):
     JAX calls back: f runs in Python, on the CPU, and must give the same for the same arguments. What it raises is
     raised as it is, and by jit inside an error of JAX. vmap runs f for one entry of a batch after the other. Only what
     JAX asks for is differentiated, in reverse mode to every order. There is no forward mode, as in ``jax.hessian``,
-    ``jacfwd`` and ``jvp``: the Hessian is ``jax.jacrev(jax.grad(f))``. JAX cannot keep what f recorded, so the way back
-    runs f once more.
+    ``jacfwd`` and ``jvp``: the Hessian is ``jax.jacrev(jax.grad(f))``. JAX cannot keep what f recorded, so the backward
+    pass runs f once more.
 
     Examples
     --------

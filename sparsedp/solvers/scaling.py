@@ -96,7 +96,7 @@ def shifted(x, exponent):
 
 
 def _real_and_imaginary(x):
-    """Complex array -> its real and imaginary parts in turn along the last axis; a number becomes an array of two."""
+    """Return real and imaginary parts in turn along the last axis; a 0-d array becomes an array of two."""
     return np.ascontiguousarray(x).view(float)
 
 

@@ -249,8 +249,9 @@ class BlockFactors:
 
     @classmethod
     def of(cls, matrix):
-        """Matrix -> BlockFactors, or None where it is one component for the most part, or rows do not use others."""
-        (labels, sizes, triangular), size = _components(matrix), matrix.shape[0]
+        """Return the factors of a matrix; None if one component is most of it, or components do not use others."""
+        labels, sizes, triangular = _components(matrix)
+        size = matrix.shape[0]
         if not triangular or np.max(sizes) > MOST_OF_ALL * size:
             return None
         ends = np.cumsum(sizes)
@@ -259,7 +260,7 @@ class BlockFactors:
         return cls(matrix, np.argsort(labels, kind="stable"), edges, np.isin(edges[:-1], (ends - sizes)[is_large]))
 
     def solve(self, b, transposed):
-        """Substitution block by block."""
+        """Solve A x = b, or A^T x = b, block by block."""
         r, x = b[self.order], np.empty_like(b)
         for rows, step, factors, links, known in reversed(self.stages) if transposed else self.stages:
             if transposed:
