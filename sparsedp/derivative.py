@@ -242,19 +242,31 @@ def _warn_unless_finite(name, derivative, again):
     found = [leaf for leaf in leaves(derivative) if is_variable(leaf)]
     if thread.quiet or any(map(isbox, found)) or all(map(is_finite, found)):
         return
-    reason = "dp.check.gradient(loss, x) shows where it comes from"
-    if ranks() == 1:
-        try:
-            with unwarned(), judged():
-                again()
-        except NonFiniteError as error:
-            reason = str(error)
-        except Exception:  # a function that cannot run twice
-            pass
+    reason = _cause_of_non_finite(again) or "dp.check.gradient(loss, x) shows where it comes from"
     warnings.warn(
         NonFiniteGradientWarning(f"the derivative returned by {name} holds NaN or infinity: {reason}"),
         stacklevel=frames_inside() + 1,
     )
+
+
+def _cause_of_non_finite(again):
+    """Name the first call whose own derivative is not finite; None if there is no such call, or on ranks.
+
+    Parameters
+    ----------
+    again : callable
+        ``again()`` computes the derivative once more in reverse mode.
+    """
+    if ranks() > 1:
+        return None
+    try:
+        with unwarned(), judged():
+            again()
+    except NonFiniteError as error:
+        return str(error)
+    except Exception:  # a function that cannot run twice
+        pass
+    return None
 
 
 def name_of(subject):
@@ -654,8 +666,18 @@ def _value_and_gradient(loss, argnum, args):
     """Return the value of a loss, and its gradient in one of its arguments."""
     value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
     check_loss(value)
-    gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
-    _warn_unless_finite("value_and_grad", gradient, lambda: _value_and_gradient(loss, argnum, args))
+
+    def again():
+        return _value_and_gradient(loss, argnum, args)
+
+    try:
+        gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
+    except NonFiniteError as error:  # a call refused a cotangent, as of a forward argument that the user looks for
+        cause = None if thread.quiet or isbox(value) else _cause_of_non_finite(again)
+        if cause is not None and cause != str(error):
+            error.args = (f"{error}, in the backward pass: {cause}",)
+        raise
+    _warn_unless_finite("value_and_grad", gradient, again)
     return value if isbox(value) else float(value), gradient
 
 

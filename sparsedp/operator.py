@@ -238,9 +238,15 @@ class Operator(Frozen, Remade):
     def __neg__(self):
         return self * -1.0
 
+    def _refuse_traced_factor(self):
+        raise DerivativeError(
+            f"a traced number cannot scale an operator; write nu * {self.name}(u), and to solve a system with it "
+            "dp.implicit(residual)"
+        )
+
     def __mul__(self, factor):
         if isbox(factor):
-            raise DerivativeError(f"a traced number cannot scale an operator; write nu * {self.name}(u)")
+            self._refuse_traced_factor()
         if isinstance(factor, Operator):
             raise TypeError(f"{self.name} * {factor.name} is not defined; write A @ B to compose operators")
         if not _is_scalar(factor):
@@ -271,7 +277,7 @@ class Operator(Frozen, Remade):
     def __array_ufunc__(self, ufunc, method, *inputs, **options):
         """Let NumPy numbers scale an operator, and name the mistake when anything else is tried."""
         if any(map(isbox, inputs)):
-            raise DerivativeError(f"a traced number cannot scale an operator; write nu * {self.name}(u)")
+            self._refuse_traced_factor()
         if method == "__call__" and ufunc is np.multiply and np.shape(inputs[0]) == ():
             return self * inputs[0]
         if ufunc is np.matmul:

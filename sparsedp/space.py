@@ -157,7 +157,10 @@ class Space(Value, Uncached):
             If the number of components or a shape does not fit.
         """
         if len(parts) != len(self.parts):
-            raise ShapeError(f"join on {self} takes {len(self.parts)} components, got {len(parts)}")
+            shapes = ", ".join(map(str, self.parts)) or "none"
+            raise ShapeError(
+                f"join on {self} takes {len(self.parts)} components, got {len(parts)}; their shapes are {shapes}"
+            )
         check_plain("join", *parts)
         if self.layout is not None and self.layout.holds(*parts):
             return self.layout.join(self, parts)

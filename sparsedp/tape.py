@@ -555,9 +555,12 @@ def _call_vjp(argnums, ans, args, kwargs):
 
     def checked_pull(g, *sums):
         backs = timed(rule.name, "vjp", pull, g, *sums)
-        if not isinstance(backs, (tuple, list)) or len(backs) != len(nums):  # autograd would accept it silently
+        several = isinstance(backs, (tuple, list))
+        if not several or len(backs) != len(nums):  # autograd would accept it silently
+            returned = len(backs) if several else type(backs).__name__
             raise DerivativeError(
-                f"{rule.name} must return one derivative for each of the {len(nums)} values asked for"
+                f"{rule.name} must return one derivative for each of the {len(nums)} values asked for, "
+                f"got {returned}; return a tuple"
             )
         return [fit(rule.name, values[num], back, g) for num, back in zip(nums, backs, strict=True)]
 

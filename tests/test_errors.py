@@ -98,7 +98,11 @@ TABLE = [
         SHAPE,
         "split takes a field on faces(3) of shape (4,), got an array of shape (3,)",
     ),
-    (lambda: BOX.join(np.ones(3)), SHAPE, "join on faces(2, 2) takes 2 components, got 1"),
+    (
+        lambda: BOX.join(np.ones(3)),
+        SHAPE,
+        "join on faces(2, 2) takes 2 components, got 1; their shapes are (3, 2), (2, 3)",
+    ),
     (
         lambda: BOX.join(np.ones(7), 1.0),
         SHAPE,
@@ -220,12 +224,14 @@ TABLE = [
     (
         traced(lambda u: (u[0] * dp.laplacian(LINE))(u)),
         DERIVATIVE,
-        "a traced number cannot scale an operator; write nu * laplacian(u)",
+        "a traced number cannot scale an operator; write nu * laplacian(u), and to solve a system with it "
+        "dp.implicit(residual)",
     ),
     (
         traced(lambda u: (dp.laplacian(LINE) * u[0])(u)),
         DERIVATIVE,
-        "a traced number cannot scale an operator; write nu * laplacian(u)",
+        "a traced number cannot scale an operator; write nu * laplacian(u), and to solve a system with it "
+        "dp.implicit(residual)",
     ),
     (lambda: dp.laplacian(LINE) / 0, FINITE, "laplacian can be divided by a finite number other than 0 only, got 0"),
     (

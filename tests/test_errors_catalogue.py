@@ -84,6 +84,12 @@ TABLE = [
         "curl needs a 2-D or 3-D grid, got Grid(3 cells, size 3); a 1-D slope is gradient(grid)",
     ),
     (lambda: dp.upwind(LINE, direction=0), VALUE, "upwind needs direction 1 or -1, got 0"),
+    (
+        lambda: dp.upwind(LINE, direction=np.ones(3)),
+        VALUE,
+        "upwind needs direction 1 or -1, got an array of shape (3,); for a wind w write "
+        "np.maximum(w, 0) * upwind(grid, axis, 1)(u) + np.minimum(w, 0) * upwind(grid, axis, -1)(u)",
+    ),
     (lambda: dp.diagonal(LINE.cells, np.ones(2)), SHAPE, "diagonal on cells(3) needs values of shape (3,), got (2,)"),
     (
         lambda: dp.diagonal(LINE.cells, [1.0, np.nan, np.inf]),
@@ -101,7 +107,8 @@ TABLE = [
     (
         traced(lambda u: dp.diagonal(LINE.cells, u)(u)),
         DERIVATIVE,
-        "diagonal needs constant values, got traced ones; write values * u instead",
+        "diagonal needs constant values, got traced ones; write values * u instead, and to solve a system with them "
+        "dp.implicit(residual)",
     ),
     (
         traced(lambda u: dp.mask(LINE.cells, u)(u)),

@@ -194,3 +194,12 @@ def test_messages(act, kind, message):
     with pytest.raises(kind) as caught:
         act()
     assert numberless(str(caught.value)) == numberless(message)
+
+
+def test_a_jump_in_time_close_to_a_state_of_zero_mentions_breaks():
+    """The state is 0 until the jump, so that a jump in time and one with the state look alike."""
+    rate = lambda u, p, t: anp.where(t < 0.537, 0.0, 1.0) - p * u
+    step = dp.stepper("rk4", rate, 0.1, tolerance=1e-5)
+    loss = lambda p: anp.sum(dp.rollout(step, (np.zeros(3), 0.0), p, 20)[0])
+    with pytest.raises(DerivativeError, match=r"breaks=\[0.537\]"):
+        value_and_grad(loss)(0.8)

@@ -91,8 +91,16 @@ TABLE = [
         DERIVATIVE,
         "bad returned a complex derivative of a real value; take its real part",
     ),
-    (wrong(lambda g: (g, g)), DERIVATIVE, "bad must return one derivative for each of the 1 values asked for"),
-    (wrong(lambda g: g), DERIVATIVE, "bad must return one derivative for each of the 1 values asked for"),
+    (
+        wrong(lambda g: (g, g)),
+        DERIVATIVE,
+        "bad must return one derivative for each of the 1 values asked for, got 2; return a tuple",
+    ),
+    (
+        wrong(lambda g: g),
+        DERIVATIVE,
+        "bad must return one derivative for each of the 1 values asked for, got ndarray; return a tuple",
+    ),
     (
         wrong(lambda g: (g.astype(np.float32),)),
         DERIVATIVE,

@@ -265,6 +265,18 @@ def test_no_step_meets_the_tolerance():
         step(np.ones(1))
 
 
+@pytest.mark.parametrize("method", ["heun", "tr_bdf2", "radau"])
+def test_a_rate_that_sets_in_from_a_state_of_zero_advises_a_floor(method):
+    """Errors are relative to a state of 0 until the rate sets in; with a floor the value is 2 - 0.53."""
+    sets_in = lambda u, p, t: np.where(t < 0.53, 0.0, 1.0) + 0.0 * u
+    with pytest.raises(
+        dp.errors.ConvergenceError, match="an array of the state is 0 there.*; write floor=.* or breaks="
+    ):
+        dp.stepper(method, sets_in, 2.0, tolerance=1e-6)((np.zeros(2), 0.0))
+    with_floor = dp.stepper(method, sets_in, 2.0, tolerance=1e-6, floor=1.0)
+    np.testing.assert_allclose(with_floor((np.zeros(2), 0.0))[0], 1.47, rtol=1e-5)
+
+
 @pytest.mark.parametrize("method", ["rk4", "backward_euler"])
 def test_a_rate_that_writes_into_the_state_is_named_when_only_params_are_traced(method):
     def rate(u, p):
@@ -336,8 +348,9 @@ def test_a_stage_without_a_root_says_what_to_change():
     [
         (
             lambda: dp.stepper("rk4", lambda u, p: -u, 0.5, tolerence=1e-10),
-            "method auto takes the options .*, got 'tolerence'",
+            "rk4 does not use tolerence; write 'tolerance'",
         ),
+        (lambda: dp.stepper("rk4", lambda u, p: -u, 0.5, t_events=[]), "rk4 does not use t_events; write 'events'"),
         (lambda: dp.stepper("tr_bdf2", lambda u, p: -u, 0.5, tolerence=1e-10), "method auto takes the options"),
         (
             lambda: dp.stepper("rk4", lambda u, p: -u, 0.5, jacobian=lambda u, p: L),

@@ -44,17 +44,17 @@ WRONG = [
     ),
     (
         run(bounds=(2.0, 1.0)), ValueError,
-        "bounds must be numbers with lower <= upper; write None for "
+        "bounds must be numbers with lower <= upper, got 2.0 and 1.0; write None for "
         "a side without a bound",
     ),
     (
         run(bounds=(np.inf, None)), ValueError,
-        "bounds must be numbers with lower <= upper; write None for "
+        "bounds must be numbers with lower <= upper, got inf and inf; write None for "
         "a side without a bound",
     ),
     (
         run(bounds=(np.nan, 1.0)), ValueError,
-        "bounds must be numbers with lower <= upper; write None for "
+        "bounds must be numbers with lower <= upper, got nan and 1.0; write None for "
         "a side without",
     ),
     (

@@ -81,3 +81,11 @@ def test_who_refuses_does_not_warn():
     assert dp.check.gradient(chosen_root, X).verdict == "disagrees"
     assert dp.stress(chosen_root, X, only=["as given"]).counts["FAILED"]
     assert dp.explain(chosen_root, X).value == dp.certify(chosen_root, X).value == 1.0
+
+
+def test_an_adjoint_solve_that_refuses_a_cotangent_names_the_call_at_fault():
+    """The solution is 0, where the square root has no derivative; the right-hand side of the user is finite."""
+    grid = dp.Grid(4)
+    solve = dp.inverse(-dp.laplacian(grid, dp.dirichlet))
+    with pytest.raises(dp.errors.NonFiniteError, match="inverse.*, in the backward pass: " + ROOT_AT_ZERO):
+        dp.grad(lambda b: anp.sum(anp.sqrt(solve(b))))(np.zeros(4))

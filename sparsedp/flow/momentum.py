@@ -107,7 +107,8 @@ def face_lift(grid, boundary=no_slip, solid=None):
     ----------
     grid : Grid
     boundary : flow condition or dict
-        The same as for `face_laplacian`. Walls that are no_slip and inflows have a velocity along them.
+        The same as for `face_laplacian`. Walls that are no_slip and inflows have a velocity along them; sides of
+        free_slip and outflow have none, and no entry in the domain.
     solid : bool array, shape `grid.shape`, optional
         The same as for `face_laplacian`: faces that touch an obstacle get 0.
 

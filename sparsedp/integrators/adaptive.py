@@ -210,6 +210,8 @@ class Adaptive(Scheme):
         cure = f"breaks=[{time:.6g}], or breaks=lambda params: [...] where it moves"
         if not in_time:
             cure = "events=lambda u, params, t: ... with a function that is 0 there"
+            if self.timed:  # close to a state of 0 the two are hard to tell apart
+                cure += f", or breaks=[{time:.6g}] if it jumps at that time in every state"
         raise DerivativeError(
             f"the rate of {self.name} jumps at t = {time:.9g}, and the derivative of steps across it lacks the term of "
             f"the jump; write {cure}"
@@ -280,6 +282,7 @@ class Adaptive(Scheme):
         length, done, count, mark = self._first(u, params, t, h), 0.0, 0, 0.0
         before, most, power = None, LARGEST, -1 / (self.compared + 1)
         longest = self.max_step / h
+        left_zero = None  # the place at which a step that was refused would have changed an array that is 0
         for trial in range(1, MOST + 1):
             left = 1.0 - done
             length = self._allowed(min(length, longest), left)
@@ -290,6 +293,8 @@ class Adaptive(Scheme):
                 shorter = inspector.shortened(Taken(length, done, u, middle, new))
                 if shorter is not None:
                     accepted, change = False, shorter
+            if not accepted and new is not None and self._leaves_zero(u, new):
+                left_zero = done
             if accepted:
                 yield Taken(length, done, u, middle, new)
                 count += 1
@@ -305,11 +310,25 @@ class Adaptive(Scheme):
             if length < max(LEAST * done, TINY) or turn and (1.0 - done) * self.window > FAR * MOST * (done - mark):
                 break
             mark = done if turn else mark
+        cure = "take a larger tolerance, a method for stiff problems, or an interval that ends before the solution does"
+        if left_zero is not None and done - left_zero < 1e-3:
+            cure = (
+                "an array of the state is 0 there, and errors are relative to it; write floor=, the size below which "
+                "it does not matter, or breaks= with the times at which its rate sets in"
+            )
         raise ConvergenceError(
             f"{self.name} found no step that meets the tolerance {self.tolerance:g} at {done:.3g} of its interval "
-            f"after {count} steps; take a larger tolerance, a method for stiff problems, or an interval "
-            "that ends before the solution does"
+            f"after {count} steps; {cure}"
         )
+
+    def _leaves_zero(self, u, new):
+        """Whether a step starts to change an array that is 0, whose errors are relative to its size alone."""
+        arrays = zip(leaves(u), leaves(new), self._floors(u), strict=True)
+        for before, after, floor in arrays:
+            still, moved = (np.max(np.abs(leaf), initial=0.0) for leaf in (before, after))
+            if floor is None and still == 0 and moved != 0:
+                return True
+        return False
 
     def _first(self, u, params, t, h):
         """A first length from the size of the rate: one that changes the state by a hundredth."""

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.sparse.linalg import ArpackError, eigsh
 
-from sparsedp.calls import public
+from sparsedp.calls import advice_near, public
 from sparsedp.derivative import is_finite
 from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.fields import (
@@ -217,8 +217,12 @@ def stepper(
     check_choice("method", method, METHODS, "; write stepper('rk4', rate, dt)" if callable(method) else "")
     check_choice("unstable", unstable, ("raise", "allow"))
     known = {word: value for word, value in options.items() if word != "sparsity"}  # which `implicit` takes
+    for word in options:
+        if method not in IMPLICIT:
+            near = advice_near(word, [name for name in given if name not in ("options", *UNUSED[method])])
+            raise TypeError(f"{method} does not use {word}{near or '; leave it out'}")
     settings = check_settings(solver, rtol, maxiter, "raise", known) | dict(options=given["options"])
-    unused = [word for word in UNUSED[method] if given[word] is not None] + [*options] * (method not in IMPLICIT)
+    unused = [word for word in UNUSED[method] if given[word] is not None]
     if method == "radau" and solver not in ("auto", "direct"):
         unused.append("solver")  # full systems are solved by LU
     if unused:

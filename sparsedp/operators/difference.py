@@ -259,6 +259,11 @@ def upwind(grid, axis=0, direction=1, boundary=neumann):
     """
     check_grid("upwind", grid)
     axis = grid.axis(axis)
+    if np.ndim(direction) > 0:
+        raise ValueError(
+            f"upwind needs direction 1 or -1, got an array of shape {np.shape(direction)}; for a wind w write "
+            "np.maximum(w, 0) * upwind(grid, axis, 1)(u) + np.minimum(w, 0) * upwind(grid, axis, -1)(u)"
+        )
     if direction not in (1, -1):
         raise ValueError(f"upwind needs direction 1 or -1, got {direction!r}")
     sides = resolve(grid, boundary)[axis]

@@ -183,7 +183,10 @@ def diagonal(space, values):
     array([2., 3.])
     """
     if isbox(values):
-        raise DerivativeError("diagonal needs constant values, got traced ones; write values * u instead")
+        raise DerivativeError(
+            "diagonal needs constant values, got traced ones; write values * u instead, and to solve a system with "
+            "them dp.implicit(residual)"
+        )
     _check_space(space, "diagonal")
     check_plain("diagonal", values)
     values = np.asarray(values)

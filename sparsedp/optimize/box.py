@@ -48,7 +48,12 @@ class Box:
         self.lower = _side(lower, -np.inf, packing, "bounds[0]")
         self.upper = _side(upper, np.inf, packing, "bounds[1]")
         if not np.all((self.lower <= self.upper) & (self.lower < np.inf) & (self.upper > -np.inf)):  # nor NaN
-            raise ValueError("bounds must be numbers with lower <= upper; write None for a side without a bound")
+            lower, upper = np.broadcast_arrays(self.lower, self.upper)
+            first = np.argmin((lower <= upper) & (lower < np.inf) & (upper > -np.inf))
+            raise ValueError(
+                f"bounds must be numbers with lower <= upper, got {float(lower.flat[first])} and "
+                f"{float(upper.flat[first])}; write None for a side without a bound"
+            )
 
     @property
     def bounded(self):
