@@ -110,7 +110,8 @@ def stepper(
     floor : number or tree like u, optional
         Errors are relative to |u| + floor. Default: a tenth of the largest entry of each array. What dies out with
         all of its array is then followed down to nothing, in many steps: give the size below which it no longer
-        matters. Where entries of very different size matter (species of 1 and 1e-5), give one for each. In a tree
+        matters. Where entries of very different size matter (species of 1 and 1e-5), give one for each. An array that
+        stays 0 until its rate sets in needs a floor, or that time in `breaks`. In a tree
         entries of dicts are paired by key, and a number or None may stand for a whole branch.
     max_step : float, optional
         Longest step that error control may take. Shorten it where something brief (a pulse, a spike of the rate) could

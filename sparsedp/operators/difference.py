@@ -256,6 +256,17 @@ def upwind(grid, axis=0, direction=1, boundary=neumann):
     >>> from sparsedp import Grid
     >>> upwind(Grid(3, periodic=True))(np.array([1.0, 2.0, 4.0]))
     array([-3.,  1.,  2.])
+
+    A steady sweep w du/dx = 1 in a wind w that differs from cell to cell, with the derivative in the wind:
+
+    >>> from sparsedp import dirichlet, grad, implicit, neumann
+    >>> slope = upwind(Grid(3), boundary={"x": (dirichlet, neumann)})
+    >>> sweep = implicit(lambda u, w: w * slope(u) - 1.0)
+    >>> wind = np.array([2.0, 2.0, 1.0])
+    >>> sweep(np.zeros(3), wind)
+    array([0.25, 0.75, 1.75])
+    >>> grad(lambda w: sweep(np.zeros(3), w)[2])(wind)
+    array([-0.125, -0.25 , -1.   ])
     """
     check_grid("upwind", grid)
     axis = grid.axis(axis)
