@@ -139,3 +139,8 @@ def test_the_result_is_frozen_and_shares_nothing():
     assert not np.may_share_memory(best.x, x) and best.x.flags.writeable
     with pytest.raises(AttributeError, match="Minimum is frozen; make a new one instead of setting x"):
         best.x = 1
+
+
+def test_admm_without_a_weight():
+    with pytest.raises(TypeError, match="admm needs the weight of the sum of absolute values; write weight=0.1"):
+        dp.minimize(lambda x: anp.sum(x**2), np.ones(2), "admm")

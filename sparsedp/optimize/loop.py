@@ -213,6 +213,8 @@ def minimize(
             if given:
                 raise TypeError(f"admm does not use {name}; leave it out")
         _check_options(method, options, list(inspect.signature(admm).parameters)[7:])
+        if "weight" not in options:
+            raise TypeError("admm needs the weight of the sum of absolute values; write weight=0.1")
         return admm(minimize, loss, start, maxiter, tolerance, callback, bounds, **options)
     if hasattr(tolerance, "inside"):  # it takes part in the evaluations
         if checkpoint is not None:
