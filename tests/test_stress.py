@@ -179,6 +179,16 @@ def test_a_right_gradient_at_a_kink_does_not_fail(loss, x):
     assert not [row for row in result.failures if row["case"] != "last digits of x changed"]
 
 
+def test_a_gradient_below_the_smallest_numbers_does_not_fail():
+    """The loss is 1e-300 and dt is 1e30, so that the derivative in dt is 0 in double precision."""
+    loss = lambda p: anp.mean((p["u"] / (1.0 + p["dt"]) ** 5) ** 2)
+    result = dp.stress(loss, {"u": START + 1.5, "dt": 1.0}, only=["scaling"])
+    rows = {row["case"]: row for row in result.rows if row["parameter"] == "dt"}
+    assert rows["times 2^100"]["outcome"] == "degraded"
+    assert "below the smallest numbers" in rows["times 2^100"]["note"]
+    assert all(row["outcome"] != "FAILED" for row in rows.values())
+
+
 def test_a_refusal_names_the_field_or_the_place():
     """NaN in a scene of the library is refused with its place; "something is wrong" is no help."""
     solve = dp.inverse(-L)

@@ -239,6 +239,8 @@ def _against_differences(scene, other, out):
     word, reason = verdict(judged, doubts)
     if word == "disagrees" and out.flagged:
         return DEGRADED, gap, "the gradient grows without bound on its way back"
+    if word == "disagrees" and _underflows(point, out.value):
+        return DEGRADED, gap, "the gradient is below the smallest numbers of its precision"
     if word == "disagrees":
         lost = not np.any(trials.gradient)
         return FAILED, gap, "the gradient is 0, the differences are not" if lost else f"{WRONG} {reason}"
@@ -246,6 +248,19 @@ def _against_differences(scene, other, out):
     if word == "agrees" or met or unseen:
         return PASSED, 0.0 if unseen else gap, "the gradient is smaller than differences can see" if unseen else ""
     return DEGRADED, gap, f"the differences do not settle on the gradient: {reason}"
+
+
+def _underflows(point, value):
+    """Whether the smallest positive numbers, to which a gradient is rounded, are no longer small for some leaf.
+
+    A leaf of size s has a derivative of about value / s. It is rounded to a multiple of the smallest positive number,
+    which changes the value by s times this number over a displacement of the size of the leaf.
+    """
+    for leaf in point.values:
+        largest = float(np.max(np.abs(leaf), initial=0.0))
+        if float(np.finfo(leaf.dtype).smallest_subnormal) * largest > GOOD * abs(value):
+            return True
+    return False
 
 
 def _directions(point, gradient):

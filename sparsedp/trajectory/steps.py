@@ -192,11 +192,12 @@ class Steps:
 
     def check_start(self, state, last):
         """Refuse a way back by reversed steps, from the last state, that did not end where the way forward began."""
+        precisions = [np.finfo(dtype_of(plain(value))).eps for value in self.first.values]
+        drift = SINGLE_DRIFT if max(precisions, default=0.0) > np.finfo(float).eps else DRIFT
         for values in zip(state.values, self.first.values, last.values, strict=True):  # a large one hides no other
             back, first, end = map(plain, values)
             off, size = largest([back - first]), largest([first, end])
-            single = np.finfo(dtype_of(first)).eps > np.finfo(float).eps
-            if not off <= (SINGLE_DRIFT if single else DRIFT) * size:
+            if not off <= drift * size:
                 raise DerivativeError(
                     f"reversed steps end {off:.1e} away from the first state, beside states of size {size:.1e}: "
                     "rounding grew on the way; give rollout a memory in bytes"
