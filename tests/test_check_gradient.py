@@ -233,7 +233,15 @@ def test_trial_points_that_refuse():
 # ---- detection limits ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("share", [1e-1, 1e-3, 1e-5, 1e-6, pytest.param(1e-7, marks=pytest.mark.whole)])
+SHARES = [1e-1, 1e-3, 1e-5, 1e-6, pytest.param(1e-7, marks=pytest.mark.whole)]
+
+
+@pytest.mark.whole
+def test_an_error_in_all_entries_is_found_at_the_documented_limit():
+    test_small_errors_of_a_gradient_are_found("all", 1e-8)
+
+
+@pytest.mark.parametrize("share", SHARES)
 @pytest.mark.parametrize("wrong", ["all", "one entry", "one leaf"])
 def test_small_errors_of_a_gradient_are_found(wrong, share):
     weight = np.ones(20) if wrong != "one entry" else 1.0 * (np.arange(20) == 7)
