@@ -11,6 +11,7 @@ import pytest
 import sparsedp as dp
 from sparsedp.derivative import pullback, pushforward
 from sparsedp.errors import GrowthWarning
+from sparsedp.tape import plain
 from sparsedp.tree import leaves
 
 U = np.array([0.3, -0.5, 0.8])
@@ -308,6 +309,22 @@ def test_numbers_as_state_and_inputs():
     loss = lambda x: dp.rollout(step, (x[0], 0.5, 0), x[1], 4, inputs={"push": x[2], "more": np.arange(4)})
     assert isinstance(loss((1.0, 2.0, push))[0], float) and loss((1.0, 2.0, push))[2] == 6
     assert dp.check.gradient(lambda x: loss(x)[0] ** 2 + loss(x)[1], (1.0, 2.0, push), quick=True)
+
+
+def test_numbers_of_python_keep_a_float32_state_in_nested_rollouts():
+    """A step gets a number of Python as such: as float64 it would widen the state of the inner rollout."""
+    u, p = np.ones(3, np.float32), {"rate": 0.5}
+    types = []
+
+    def step(u, p):
+        types.append(type(plain(p["rate"])))
+        return u * p["rate"]
+
+    outer = lambda u, p: dp.rollout(step, u, p, 2)
+    assert dp.rollout(outer, u, p, 2).dtype == np.float32
+    assert set(types) == {float}
+    slope = dp.grad(lambda p: anp.sum(dp.rollout(outer, u, p, 2)))(p)["rate"]
+    assert slope == pytest.approx(4 * 3 * 0.5**3)
 
 
 @pytest.mark.parametrize("memory", [None, 200])

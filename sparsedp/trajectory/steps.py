@@ -8,7 +8,7 @@ import numpy as np
 
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.fields import advise
-from sparsedp.tape import Recorder, boxed, dtype_of, new_trace, plain, traces_of, untaped_root
+from sparsedp.tape import Recorder, boxed, dtype_of, isbox, new_trace, plain, traces_of, untaped_root
 from sparsedp.tape_constants import frozen
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.trajectory.record import largest
@@ -169,7 +169,15 @@ class Steps:
         return self._untaped
 
     def _params(self, roots):
-        return self.loop.params.build(boxed(map(frozen, self.p), roots, self.number))
+        """Return the params of a step. Numbers of Python stay such: as float64 they would widen a state of float32."""
+        layout = self.loop.params
+        values = []
+        for value, is_python_float in zip(self.p, layout.floats, strict=True):
+            if is_python_float and not isbox(value):
+                values.append(float(value))
+            else:
+                values.append(frozen(value))
+        return layout.build(boxed(values, roots, self.number))
 
     def _given(self, state):
         """The variables of state and inputs that a step gets: constants where the derivative is cut."""
