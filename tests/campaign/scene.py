@@ -111,7 +111,7 @@ class Scene:
     def _as_number(self, value):
         """Return a number of Python, or an array or scalar of NumPy in the precision of the scene."""
         precise = np.asarray(value, "float32" if self.dtype == "float32" else "float64")
-        return {"float": value, "array": precise, "scalar": precise[()]}[self.number]
+        return {"float": float(value), "array": precise, "scalar": precise[()]}[self.number]
 
     def tangents(self):
         """Return a direction by name; its entries are in another order than those of `leaves`."""
@@ -340,13 +340,13 @@ def compare_by_torch(scene, loss, values, twin, wanted_product, outcome):
     import torch
 
     arrange = TREES[scene.tree][0]
-    tensors = {name: torch.tensor(np.array(value), requires_grad=True) for name, value in values.items()}
+    arrays = arrays_of(scene, values)
+    tensors = {name: torch.tensor(np.array(value), requires_grad=True) for name, value in arrays.items()}
     bridged = dp.interop.to_torch(loss)
     value = bridged(arrange(tensors))
     check_close(scene, "value by torch", value.detach(), twin.value, twin.value_scale)
     found = torch.autograd.grad(value, list(tensors.values()), create_graph=scene.order > 1, allow_unused=True)
-    arrays = {name: np.asarray(value) for name, value in values.items()}
-    check_gradient(scene, "gradient by torch", of_tensors(tensors, found, values), twin.gradient, arrays)
+    check_gradient(scene, "gradient by torch", of_tensors(tensors, found, arrays), twin.gradient, arrays)
     outcome.compared.append("gradient by torch")
     if scene.order > 1:
         slope = 0.0
@@ -355,7 +355,7 @@ def compare_by_torch(scene, loss, values, twin, wanted_product, outcome):
                 slope = slope + torch.sum(gradient * torch.tensor(np.array(tangent)))
         if not isinstance(slope, float):
             found = torch.autograd.grad(slope, list(tensors.values()), allow_unused=True)
-            check_gradient(scene, "hvp by torch", of_tensors(tensors, found, values), wanted_product, arrays)
+            check_gradient(scene, "hvp by torch", of_tensors(tensors, found, arrays), wanted_product, arrays)
             outcome.compared.append("hvp by torch")
 
 
@@ -363,7 +363,7 @@ def compare_by_jax(scene, loss, values, twin, outcome):
     """Compare value and gradient that JAX computes of the loss, compiled."""
     import jax
 
-    arrays = {name: np.asarray(value) for name, value in values.items()}
+    arrays = arrays_of(scene, values)
 
     def of_dict(moving):  # JAX sorts the entries of dicts
         return loss(TREES[scene.tree][0]({name: moving[name] for name in values}))
@@ -375,6 +375,14 @@ def compare_by_jax(scene, loss, values, twin, outcome):
         check_close(scene, "value by JAX", value, twin.value, twin.value_scale)
         check_gradient(scene, "gradient by JAX", found, twin.gradient, arrays)
     outcome.compared.append("gradient by JAX")
+
+
+def arrays_of(scene, values):
+    """Return the values as arrays; what was a number of Python, which has no precision, has that of the scene."""
+    arrays = {}
+    for name, value in values.items():
+        arrays[name] = in_precision(np.asarray(value), scene.dtype) if isinstance(value, float) else np.asarray(value)
+    return arrays
 
 
 def of_tensors(tensors, found, values):

@@ -14,6 +14,7 @@ from sparsedp.kernels import compiled
 
 BRIDGES = [name for name in ("torch", "jax") if find_spec(name)]
 SEEDS = st.integers(0, 999)
+MOST_STEPS_OF_A_MEMBER = 4  # of an ensemble: a few scenes with more would take half the time of a campaign
 SIDES = st.sampled_from(["neumann", "dirichlet", (2.0, 0.5), (1.0, 2.0)])
 WORDS = st.sampled_from(["no_slip", "free_slip"])
 FLOW_WORDS = st.sampled_from(["no_slip", "free_slip", "outflow"])
@@ -274,15 +275,17 @@ def readings(draw, source):
 
 
 @st.composite
-def rollouts(draw, box, source, batched, complex_field, nested=True):
+def rollouts(draw, box, source, batched, complex_field, nested=True, most=9):
+    """A rollout of at most `most` steps."""
     chain = []
-    most = 9 if nested else 2
     for _ in range(draw(st.integers(1, 2))):
         if nested and most > 4 and draw(st.integers(0, 7)) == 7:
-            chain.append(draw(rollouts(box, source, batched, complex_field, nested=False)))
+            chain.append(draw(rollouts(box, source, batched, complex_field, nested=False, most=2)))
             most = 4
             continue
         chain.append(draw(simple(box, source, batched, complex_field, same=True)))
+    if any(isinstance(part, physics.Lagrangian) for part in chain):
+        most = 2  # the second derivative of its twin takes seconds
     n = draw(st.integers(1, most))
     numbers_kept = draw(st.sets(st.integers(0, n), min_size=1))
     keep = draw(st.sampled_from(["last", "last", "all", tuple(sorted(numbers_kept)), "function"]))
@@ -302,11 +305,15 @@ def scenes(draw):
     batch = draw(st.sampled_from([(), (), (), (), (), (2,), (3,), (2, 2)]))
     kind = draw(st.sampled_from(["cells", "cells", "faces"]))
     chain = []
+    steps = 0
     for _ in range(draw(st.integers(1, 4))):
         source = chain[-1].target if chain else kind
         form = draw(st.sampled_from(["simple", "simple", "simple", "rollout", "sum"]))
         if form == "rollout":
-            chain.append(draw(rollouts(box, source, bool(batch), complex_field)))
+            most = 9 if steps == 0 else 3
+            part = draw(rollouts(box, source, bool(batch), complex_field, most=most))
+            steps += part.n
+            chain.append(part)
             continue
         part = draw(simple(box, source, bool(batch), complex_field))
         if form == "sum":
@@ -318,6 +325,9 @@ def scenes(draw):
     if draw(st.integers(0, 4)) == 4:
         chain.append(draw(readings(chain[-1].target)))
     loss = "squares" if complex_field else draw(st.sampled_from(sorted(LOSSES)))
+    members = draw(st.sampled_from([0, 0, 0, 0, 2, 3]))
+    if steps > MOST_STEPS_OF_A_MEMBER or "Lagrangian(" in repr(chain):
+        members = 0
     layouts = sorted(set(LAYOUTS) - (set() if batch else {"broadcast"}))
     return Scene(
         box,
@@ -327,7 +337,7 @@ def scenes(draw):
         loss,
         draw(st.sampled_from(sorted(TREES))),
         draw(SEEDS),
-        draw(st.sampled_from([0, 0, 0, 0, 2, 3])),
+        members,
         draw(st.sampled_from(["C", "C", *layouts])),
         draw(st.sampled_from(["none"] * 14 + BRIDGES)),
         draw(st.sampled_from(["float", "float", "array", "scalar"])),
