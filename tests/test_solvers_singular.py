@@ -238,6 +238,62 @@ def test_systems_that_cannot_be_solved(matrix, status, words):
     assert caught.value.info.status == status
 
 
+UNUSED = np.array([[2.0, -1.0, 0.0], [-1.0, 2.0, 0.0], [1.0, 1.0, 0.0]])  # no row uses unknown 2, and row 2 has entries
+
+
+@pytest.mark.parametrize("method", ["auto", "direct", "krylov", "multigrid", "structured", "separable"])
+@pytest.mark.parametrize("nullspace", ["raise", "project"])
+def test_an_equation_whose_own_unknown_is_not_used_is_refused(method, nullspace):
+    """Its unknown is no unknown of the solve, and its row would not be tested."""
+    words = "row 2 of .* has entries, but unknown 2 is used in no row"
+    with pytest.raises(dp.errors.ConvergenceError, match=words) as caught:
+        dp.inverse(dp.from_matrix(UNUSED), method, nullspace=nullspace)
+    assert caught.value.info.status == "empty_column"
+
+
+def test_unused_unknowns_of_other_operators():
+    complex_entries, single = UNUSED.astype(complex), UNUSED.astype(np.float32)
+    scaled = dp.from_matrix([[1.0, 0.0], [1.0, 1.0]]) @ dp.diagonal(dp.from_matrix(np.eye(2)).domain, [1e200, 1e-200])
+    wind = dp.upwind(dp.Grid(5), "x").T
+    for op in (dp.from_matrix(complex_entries), dp.from_matrix(single), -1e10 * scaled, wind):
+        with pytest.raises(dp.errors.ConvergenceError, match="is used in no row"):
+            dp.inverse(op)
+    solve = dp.matrix_solver(np.ones((3, 3)))
+    b = np.array([1.0, 0.3, 0.0])
+    with pytest.raises(dp.errors.ConvergenceError, match="is used in no row"):
+        value_and_grad(lambda data: anp.sum(solve(data, b)))(UNUSED.ravel())
+
+
+def test_an_equation_is_left_out_by_a_mask():
+    """With the row or the column masked, x solves the other two equations: (2 * 1 + 0.3, 1 + 2 * 0.3) / 3."""
+    used = UNUSED.copy()
+    used[:, 2] = 1.0
+    keep = np.array([True, True, False])
+    space = dp.from_matrix(used).domain
+    b, g = np.array([1.0, 0.3, 0.0]), np.array([1.0, -2.0, 5.0])
+    rows = dp.mask(space, keep) @ dp.from_matrix(UNUSED)
+    for op in (rows, dp.from_matrix(used) @ dp.mask(space, keep), rows @ dp.mask(space, keep)):
+        inv = dp.inverse(op)
+        assert inv(b) == pytest.approx([2.3 / 3, 1.6 / 3, 0.0])
+        assert inv.T(g) == pytest.approx([0.0, -1.0, 0.0], abs=1e-14)
+
+
+@GENERAL
+def test_a_masked_laplacian_leaves_out_the_masked_cells(method, rng):
+    grid = stretched(20, 18)
+    keep = np.ones(grid.shape, dtype=bool)
+    keep[5:8, 6:12] = False
+    op = -dp.laplacian(grid, dp.dirichlet)
+    mask = dp.mask(grid.cells, keep)
+    small = op.matrix.toarray()[keep.ravel()][:, keep.ravel()]
+    b = np.where(keep, rng.standard_normal(grid.shape), 0.0)
+    expected = np.zeros(grid.shape)
+    expected[keep] = np.linalg.solve(small, b[keep])
+    declared_by_diagonal = op @ dp.diagonal(grid.cells, keep.astype(float))
+    for masked in (op @ mask, mask @ op @ mask, 2.0 * op @ (0.5 * mask), declared_by_diagonal):
+        assert dp.inverse(masked, method)(b) == pytest.approx(expected, rel=1e-8, abs=1e-10)
+
+
 def test_a_singular_sparse_matrix():
     """The scaled Laplacian has a null vector that is neither ones nor volumes."""
     matrix = dp.laplacian(dp.Grid((20, 20))).matrix

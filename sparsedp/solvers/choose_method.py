@@ -157,10 +157,11 @@ def inverse(op, method="auto", rtol=1e-10, maxiter=None, nullspace="raise", **op
     return together("inverse", (op,), lambda: build(op, **settings))
 
 
-def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, solves="many", near=None):
+def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, solves="many", near=None, all_rows=True):
     """The set-up behind `inverse`, for callers that name it, keep its log, or expect "few" solves of it.
 
-    `near`: the engine of a matrix nearby, whose LU may do.
+    `near`: the engine of a matrix nearby, whose LU may do. `all_rows`: refuse an operator with a row whose
+    own unknown no row uses; False if the caller tests the residual of such rows itself, or leaves them out on purpose.
     """
     clock = perf_counter()
     if op.layout is not None:
@@ -174,9 +175,11 @@ def build(op, method, rtol, maxiter, nullspace, options, name=None, log=None, so
         _check_options(word, options)
     if system.complex and word not in ("direct", "krylov"):
         raise ValueError(f"{word} takes real operators, {op} is complex; write method='direct' or 'krylov'")
+    if all_rows:
+        _check_unknowns(system)
     engine = _engine(system, word, options, engine, near)
     name = name or f"inverse({op.name})"
-    made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves)
+    made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves, None, all_rows)
     solver = Solver(system, engine, nullspace, log or SolveLog(), name, made, reason)
     return Inverse(Solution(_set_up(solver, clock)))
 
@@ -226,6 +229,18 @@ def _check_options(word, options):
         if name not in known:
             near = advice_near(name, [*known, "rtol", "maxiter", "method", "nullspace"])
             raise TypeError(f"method {word} takes the options {', '.join(known) or '(none)'}, got {name!r}{near}")
+
+
+def _check_unknowns(system):
+    """Refuse an operator with an unknown that no row uses, while its own row has entries."""
+    number = system.unused_unknown
+    if number is not None:
+        raise ConvergenceError(
+            f"row {number} of {system.given} has entries, but unknown {number} is used in no row, so that this "
+            "equation would be ignored; use the unknown in a row, or leave the equation out: "
+            "dp.mask(A.codomain, keep) @ A",
+            info=failure("empty_column"),
+        )
 
 
 def _engine(system, word, options, suited=None, near=None):

@@ -162,7 +162,7 @@ class Jacobians:
             solver = self._matrices.find(key)
             if not solver and op.shape[0] <= DENSE_UP_TO and settings["method"] in ("auto", "direct"):
                 solver = build_dense(op, settings["rtol"], settings["nullspace"], settings["name"])
-        solver = solver or build(op, **settings, solves="few", near=near).solver
+        solver = solver or build(op, **settings, solves="few", near=near, all_rows=False).solver
         return self._matrices.put(key, solver) if key else solver
 
     def suspected(self, known):

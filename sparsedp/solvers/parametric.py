@@ -55,6 +55,7 @@ class ParametricSolver(Remade):
     """
 
     name: str
+    all_rows = True  # refuse an operator with an equation that no unknown can satisfy: see `build`
     _operator: Any
 
     def __init__(self, D, G, settings):
@@ -86,7 +87,7 @@ class ParametricSolver(Remade):
         exponent = _exponent_out_of_range(k, shift)
         scaled_shift = shifted(np.atleast_1d(shift), -exponent).reshape(np.shape(shift))
         op = self._operator(shifted(k, -exponent) if exponent else k.copy(), scaled_shift)
-        inverse = build(op, name=self.name, log=self.info, solves="few", **self._settings)
+        inverse = build(op, name=self.name, log=self.info, solves="few", all_rows=self.all_rows, **self._settings)
         inverse.solver.system.exponent += exponent  # solutions are scaled back by it
         return self._cache.put((k, shift), inverse)
 
@@ -289,6 +290,7 @@ class TensorSolver(ParametricSolver):
     """As the EllipticSolver `front`, with D and G that meet at the corners of cells: they are multiplied out."""
 
     name = "elliptic_solver"
+    all_rows = False  # the rows of obstacles hold the flux into them, and its explicit matrix no longer shows that
 
     def __init__(self, front):
         D, G, grid = front.D, front.G, front.D.codomain.grid

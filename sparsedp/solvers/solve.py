@@ -339,6 +339,7 @@ STATUS_WORDS = (  # from good to bad: of two solves that share a record, the lat
     "indefinite_operator",
     "incompatible_rhs",
     "empty_row",
+    "empty_column",
     "nonfinite_input",
     "nonfinite_output",
     "not_representable",

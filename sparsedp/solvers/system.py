@@ -15,7 +15,7 @@ from sparsedp.solvers.nullspace import NullSpace, find_null_space
 from sparsedp.solvers.scaling import exponent_of, largest, norm, remainder
 from sparsedp.structure.base import Matrix
 from sparsedp.structure.kronecker import Kronecker
-from sparsedp.structure.lazy import Mask
+from sparsedp.structure.lazy import Chain, Diagonal, Mask, Sum
 
 __all__ = ["System"]
 
@@ -184,6 +184,21 @@ class System:
         return self.number_of_largest(empty) if self.largest(empty) else None
 
     @cached_property
+    def unused_unknown(self):
+        """The first unknown that no row uses although its own row has entries, or None.
+
+        Its equation would be left out of the solve. That is right where a factor of the operator sets the unknown to 0,
+        as the mask in `L @ mask` and the obstacles of a gradient do: those unknowns are not returned.
+        """
+        if self.active is None:
+            return None
+        unused = ~self.active & (self.sums[False] > 0)
+        if self.largest(unused):
+            op = Operator(_without_zero_factors(self.op.structure), self.op.domain, self.op.codomain, self.op.name)
+            unused &= self.structure_of(op.T).magnitude()(np.ones(self.here)) == 0
+        return self.number_of_largest(unused.astype(float)) if self.largest(unused) else None
+
+    @cached_property
     def components(self):
         """(labels, count) of the connected components of the unknowns; labels None: one, everywhere.
 
@@ -325,6 +340,7 @@ class System:
         keep = Operator(Mask(self.splitting.coupled), self.op.domain, self.op.domain, "mask")
         system = System(self.op @ keep, self.rtol, self.maxiter)
         system.given, system.splitting = self.given, None  # messages name what was given
+        system.unused_unknown = None
         return system
 
     @cached_property
@@ -345,6 +361,19 @@ class System:
     def rounding(self, x, data, transposed=False):
         """The residual that rounding leaves, row by row: well below the bound with |A|_inf on stretched grids."""
         return EPS * (self.size_of(self.magnitude(np.abs(x), transposed)) + data)
+
+
+def _without_zero_factors(structure, leftmost=True):
+    """Replace zeros of diagonal factors by ones, except in the leftmost factor, which removes rows, not unknowns."""
+    if isinstance(structure, Chain):
+        members = [_without_zero_factors(member, False) for member in structure.members]
+        return Chain([structure.members[0], *members[1:]] if leftmost else members)
+    if isinstance(structure, Sum):
+        members = [m if isinstance(m, Diagonal) else _without_zero_factors(m, leftmost) for m in structure.members]
+        return Sum(members)
+    if isinstance(structure, Diagonal) and not leftmost:
+        return Diagonal(np.where(structure.values == 0, 1.0, structure.values))
+    return structure
 
 
 def _check_underflow(op, scaled):
