@@ -8,6 +8,7 @@ import time
 import autograd.numpy as anp
 import numpy as np
 import pytest
+from checkpoints_0_2 import CHECKPOINTS, write_checkpoint_0_2
 
 import sparsedp as dp
 from sparsedp.tree import leaves
@@ -236,6 +237,38 @@ def test_a_tolerance_with_a_memory_takes_no_checkpoint(tmp_path):
         "number",
     ):
         dp.minimize(valley, START, tolerance=dp.certified(), checkpoint=tmp_path)
+
+
+OPTIONS_0_2 = {
+    "lbfgs": {"bounds": (-2.0, 0.9)},
+    "adam": {"rate": 0.05},
+    "half_inverse": {"rate": 0.1, "batches": [0.0, 1e-3, 2e-3]},
+}
+LOSSES_0_2 = {
+    "levenberg_marquardt": residuals,
+    "levenberg_marquardt, large": lambda x: 1e70 * residuals(x),
+    "half_inverse": residuals,
+}
+
+
+@pytest.mark.parametrize("name", CHECKPOINTS)
+def test_resumes_a_checkpoint_of_version_0_2(tmp_path, name):
+    """The run goes on along the iterations of a run from the start."""
+    write_checkpoint_0_2(tmp_path, name)
+    loss, method = LOSSES_0_2.get(name, valley), name.partition(",")[0]
+    run = {"method": method, "maxiter": 6, "tolerance": 0, **OPTIONS_0_2.get(name, {})}
+    whole = dp.minimize(loss, np.array([-1.2, 1.0]), **run)
+    best = dp.minimize(loss, np.array([-1.2, 1.0]), checkpoint=tmp_path, **run)
+    assert best.resumed == f"resumed from iteration 2 in {tmp_path}"
+    assert best.evaluations == whole.evaluations
+    values, expected = ([record.value for record in run.history] for run in (best, whole))
+    np.testing.assert_allclose(values, expected, rtol=1e-9)
+
+
+def test_a_checkpoint_of_version_0_2_with_another_loss_is_refused(tmp_path):
+    write_checkpoint_0_2(tmp_path, "gd")
+    with pytest.raises(ValueError, match="another loss at the start"):
+        dp.minimize(lambda x: 1.001 * valley(x), np.array([-1.2, 1.0]), "gd", checkpoint=tmp_path)
 
 
 SCRIPT = """

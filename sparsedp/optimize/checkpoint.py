@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sparsedp.files import UNFINISHED, load_tree, path_errors, save_tree
+from sparsedp.optimize.checkpoint_upgrade import FORMAT_0_2, upgraded
 from sparsedp.optimize.result import Failure, Record, Trial
 from sparsedp.shortcuts import ranks, whole
 from sparsedp.tree import flatten, leaves, norm
@@ -16,7 +17,7 @@ __all__ = ["Checkpoint"]
 
 FORMAT = "sparsedp optimization 5"
 KEPT = 2
-NEAR = 1e-6  # share of value and gradient at the start that a loss may be off where another number of ranks adds up
+NEAR = 1e-6  # share of loss and gradient at the start by which other ranks or another version may differ
 SHARE = 0.1  # a state is written when that takes at most this share of the time since the last one
 
 
@@ -63,23 +64,27 @@ class Checkpoint:
         for name, setting in self._settings.items():
             self._check(name, setting == content["settings"].get(name))
         history, start = [_record(row) for row in content["history"]], template.trial
-        value, size, others = history[0].value, history[0].gradient_norm, content["ranks"] != ranks()
+        value, size = history[0].value, history[0].gradient_norm
+        rounds_alike = content["ranks"] == ranks() and content["format"] == FORMAT
 
         def same(now, then, size):
-            """Whether two numbers or vectors agree: bit for bit, on other ranks up to rounding of a size."""
+            """Whether two numbers or vectors agree bit for bit; with other ranks or versions up to rounding."""
             if np.array_equal(now, then):
                 return True
-            return others and norm(now - then) <= NEAR * abs(size)
+            return not rounds_alike and norm(now - then) <= NEAR * abs(size)
 
         same_norm = same(trials.as_given(norm(trials.downhill(start))), size, size)
         self._check("loss at the start", same_norm and same(trials.as_given(start.value), value, value))
-        state = flatten(template)[1](content["state"])
+        if content["format"] == FORMAT_0_2:
+            state, best = upgraded(content["state"], content["best"], template, trials.residual_scale)
+        else:
+            state, best = flatten(template)[1](content["state"]), Trial(*content["best"])
         trials.iteration = content["iteration"]
         again, last = trials(state.trial.vector), state.trial
         same_value = same(again.value, last.value, start.value)
         same_slope = same(again.slope, last.slope, norm(trials.downhill(start)))
         self._check("loss at the last point", same_value and same_slope)
-        trials.best, trials.count = Trial(*content["best"]), content["evaluations"]
+        trials.best, trials.count = best, content["evaluations"]
         watch.resume(history, start, last)
         return state
 
@@ -87,9 +92,10 @@ class Checkpoint:
         """The newest state that is whole, empty without one, and words on files that were skipped."""
         skipped = [f"; skipped {path.name}: an unfinished write" for path in self._folder.glob(f"*{UNFINISHED}")]
         for path in self._states():
-            content = load_tree(path, FORMAT)
-            if content:
-                return content[0], "".join(skipped)
+            for version in (FORMAT, FORMAT_0_2):
+                content = load_tree(path, version)
+                if content:
+                    return {**content[0], "format": version}, "".join(skipped)
             skipped.append(f"; skipped {path.name}: damaged, or not a state of sparsedp")
         return {}, "".join(skipped)
 
