@@ -12,35 +12,59 @@ from pathlib import Path
 from types import FunctionType, ModuleType, TracebackType
 from typing import Any
 
-__all__ = ["advice_near", "describe_module", "frames_inside", "nearest", "public", "public_name", "shortened"]
+__all__ = [
+    "advice_near",
+    "describe_module",
+    "foreign_keyword_advice",
+    "frames_inside",
+    "nearest",
+    "public",
+    "public_name",
+    "shortened",
+]
 
 PACKAGE = Path(__file__).parent
 # Packages whose frames stand between a user's call and the error: the library, and what runs its code.
 HIDDEN = ("sparsedp", "autograd", "functools", "contextlib", "scipy", "pyamg")
-# Keyword arguments of other libraries: the parameters that take their place, the first that a function has.
-SYNONYMS = {
-    "argnums": ("argnum",),
-    "bc": ("boundary",),
-    "bcs": ("boundary",),
-    "boundaries": ("boundary",),
-    "boundary_conditions": ("boundary",),
-    "fun": ("loss", "fun"),
-    "jac": ("gradient", "jacobian"),
-    "max_iter": ("maxiter",),
-    "max_iterations": ("maxiter",),
-    "max_workers": ("executor",),
-    "n_jobs": ("executor",),
-    "n_steps": ("n",),
-    "num_steps": ("n",),
-    "order": ("scheme", "method"),
-    "parameters": ("params",),
-    "solver": ("method",),
-    "steps": ("n",),
-    "timestep": ("dt",),
-    "tol": ("tolerance", "rtol"),
-    "u0": ("start",),
-    "workers": ("executor",),
-    "x0": ("start", "guess", "x"),
+# Keyword arguments of other libraries: what to write instead, by the first of these parameters that a function has.
+FOREIGN_KEYWORDS = {
+    "args": {"batches": "loss=lambda x: loss(x, *args)"},
+    "argnums": {"argnum": "argnum=..."},
+    "bc": {"boundary": "boundary=..."},
+    "bcs": {"boundary": "boundary=..."},
+    "boundaries": {"boundary": "boundary=..."},
+    "boundary_conditions": {"boundary": "boundary=..."},
+    "constraints": {"bounds": "bounds=(lower, upper), project= for linear equations, or a penalty added to the loss"},
+    "epochs": {"maxiter": "maxiter=..."},
+    "fun": {"loss": "loss=...", "fun": "fun=..."},
+    "grad": {"gradient": "gradient=function, or omit it: it is computed in reverse mode"},
+    "hess": {"batches": "method='newton_cg', which computes products with the Hessian"},
+    "hessp": {"batches": "method='newton_cg', which computes products with the Hessian"},
+    "iterations": {"maxiter": "maxiter=..."},
+    "jac": {
+        "gradient": "gradient=function, or omit it: it is computed in reverse mode",
+        "jacobian": "jacobian=...",
+    },
+    "learning_rate": {"batches": "method='adam', rate=..."},
+    "lr": {"batches": "method='adam', rate=..."},
+    "max_iter": {"maxiter": "maxiter=..."},
+    "max_iterations": {"maxiter": "maxiter=..."},
+    "max_workers": {"executor": "executor=..."},
+    "n_iter": {"maxiter": "maxiter=..."},
+    "n_jobs": {"executor": "executor=..."},
+    "n_steps": {"n": "n=..."},
+    "num_steps": {"n": "n=..."},
+    "optimizer": {"batches": "method='adam'"},
+    "options": {"batches": "the options themselves as keyword arguments, as in memory=20"},
+    "order": {"scheme": "scheme=...", "method": "method=..."},
+    "parameters": {"params": "params=..."},
+    "solver": {"method": "method=..."},
+    "steps": {"n": "n=...", "maxiter": "maxiter=..."},
+    "timestep": {"dt": "dt=..."},
+    "tol": {"tolerance": "tolerance=...", "rtol": "rtol=..."},
+    "u0": {"start": "start=..."},
+    "workers": {"executor": "executor=..."},
+    "x0": {"start": "start=...", "guess": "guess=...", "x": "x=..."},
 }
 # What to write for calls that need more explanation than a list of their required parameters.
 EXAMPLES = {
@@ -139,11 +163,27 @@ def _misfit(form, written, advice, args, options):
     return TypeError(f"{written} was given an argument twice, by position and by name; write {example}")
 
 
+def foreign_keyword_advice(name, parameters):
+    """Return what to write for a keyword argument that other libraries have, or None.
+
+    Parameters
+    ----------
+    name : str
+        The keyword argument.
+    parameters : container of str
+        The parameters of the function that does not have it.
+    """
+    for parameter, advice in FOREIGN_KEYWORDS.get(name.lower(), {}).items():
+        if parameter in parameters:
+            return advice
+    return None
+
+
 def _instead(name, parameters):
     """Return what to write for a keyword argument that a function does not have, or None."""
-    for synonym in SYNONYMS.get(name.lower(), ()):
-        if synonym in parameters:
-            return f"{synonym}=..."
+    advice = foreign_keyword_advice(name, parameters)
+    if advice:
+        return advice
     near = nearest(name, list(parameters))
     return f"{near}=..." if near else None
 

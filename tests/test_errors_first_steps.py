@@ -96,7 +96,7 @@ WRONG = [
     ),
     (
         lambda: dp.minimize(lambda x: x**2, 1.0, jac=True), TypeError,
-        "lbfgs has no option 'jac'; it has memory, line_search; write gradient=function, or leave it out: it is "
+        "lbfgs has no option 'jac'; it has memory, line_search; write gradient=function, or omit it: it is "
         "computed in reverse mode",
     ),
     (

@@ -3,7 +3,7 @@
 import inspect
 from math import inf
 
-from sparsedp.calls import advice_near
+from sparsedp.calls import advice_near, foreign_keyword_advice
 from sparsedp.fields import check_choice, check_function, check_number, check_whole, is_number
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
@@ -35,26 +35,6 @@ METHODS = {
     "levenberg_marquardt": LevenbergMarquardt,
     "half_inverse": HalfInverse,
     "physical_gradient": PhysicalGradient,
-}
-
-
-# Options of scipy.optimize.minimize and of optimizers in torch and optax: what to write in their place.
-ELSEWHERE_CALLED = {
-    "args": "loss=lambda x: loss(x, *args)",
-    "constraints": "bounds=(lower, upper), project= for linear equations, or a penalty added to the loss",
-    "epochs": "maxiter=...",
-    "grad": "gradient=function, or leave it out: it is computed in reverse mode",
-    "hess": "method='newton_cg', which computes products with the Hessian",
-    "hessp": "method='newton_cg', which computes products with the Hessian",
-    "iterations": "maxiter=...",
-    "jac": "gradient=function, or leave it out: it is computed in reverse mode",
-    "learning_rate": "method='adam', rate=...",
-    "lr": "method='adam', rate=...",
-    "n_iter": "maxiter=...",
-    "optimizer": "method='adam'",
-    "options": "the options themselves as keyword arguments, as in memory=20",
-    "steps": "maxiter=...",
-    "tol": "tolerance=...",
 }
 
 
@@ -296,11 +276,14 @@ def _stepper(method, options):
 
 
 def _check_options(method, options, names):
+    """Refuse options that a method does not have."""
+    parameters = [parameter for parameter in inspect.signature(minimize).parameters if parameter != "options"]
     for name in options:
-        if name not in names:
-            if name in ELSEWHERE_CALLED:
-                near = f"; write {ELSEWHERE_CALLED[name]}"
-            else:
-                parameters = [word for word in inspect.signature(minimize).parameters if word != "options"]
-                near = advice_near(name, [*names, *parameters])
-            raise TypeError(f"{method} has no option {name!r}; it has {', '.join(names)}{near}")
+        if name in names:
+            continue
+        advice = foreign_keyword_advice(name, parameters)
+        if advice:
+            advice = f"; write {advice}"
+        else:
+            advice = advice_near(name, [*names, *parameters])
+        raise TypeError(f"{method} has no option {name!r}; it has {', '.join(names)}{advice}")
