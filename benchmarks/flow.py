@@ -16,7 +16,7 @@ from scipy.fft import dctn, idctn
 
 import sparsedp as dp
 from sparsedp import kernels
-from sparsedp.ledger import recording
+from sparsedp._utils.counters import recording
 
 LIMIT = 1.2  # value and gradient, over the prototype
 SIZES = (128, 256, 512)

@@ -14,9 +14,10 @@ import numpy as np
 import sparsedp as dp
 from benchmarks.triad import best_times
 from sparsedp import network
+from sparsedp._utils import pytree
+from sparsedp.autodiff.flattening import Packing
 from sparsedp.optimize.directions import Family
 from sparsedp.optimize.linearised import Linearised
-from sparsedp.packing import Packing
 
 SIZES = (64, 64), (64, 128), (128, 64), (64, 64)  # 24896 weights
 
@@ -39,7 +40,7 @@ def poisson(rng, samples):
 
 def flat(tree):
     """All numbers of a tree."""
-    return np.concatenate([leaf.ravel() for leaf in dp.tree.leaves(tree)])
+    return np.concatenate([leaf.ravel() for leaf in pytree.leaves(tree)])
 
 
 def measured(misses, weights, options):

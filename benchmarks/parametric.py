@@ -19,7 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 
 import sparsedp as dp
-from sparsedp.derivative import pushforward, value_and_grad
+from sparsedp.autodiff.derivative import pushforward, value_and_grad
 
 STEPS = 2.0 ** -np.arange(3, 14)
 

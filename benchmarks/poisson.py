@@ -19,7 +19,7 @@ import sparsedp as dp
 from benchmarks.scenes import ANISOTROPIC, JUMPS, VARIABLE, WINDS
 from benchmarks.solves import HEAD, Ours, PyAMG, row
 from sparsedp import kernels
-from sparsedp.ledger import recording
+from sparsedp._utils.counters import recording
 
 MEMORY = {(4096, 4096): 8, (256, 256, 256): 14}  # unknowns: GB for set-up, forward and adjoint solve
 

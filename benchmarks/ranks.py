@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 
 import sparsedp as dp
-from sparsedp.ledger import recording
+from sparsedp._utils.counters import recording
 
 STEPS, REPEATS = 10, 7
 WORDS = {"exchange": "exchanges", "sent": "bytes", "reduction": "reductions"}

@@ -37,7 +37,7 @@ The first ten are a course. The others stand by topic.
 
 def size(name):
     """The size that the tests run an example with."""
-    tree = ast.parse((ROOT / "tests" / "scripts.py").read_text(encoding="utf-8"))
+    tree = ast.parse((ROOT / "tests" / "helpers" / "scripts.py").read_text(encoding="utf-8"))
     [small] = [ast.literal_eval(n.value) for n in tree.body if isinstance(n, ast.Assign) and n.targets[0].id == "SMALL"]
     return small.get(name, "16")
 

@@ -14,13 +14,13 @@ from importlib import import_module as _import_module
 from types import FunctionType as _FunctionType
 
 _WINDOW = {
-    "grid": "Grid",
-    "space": "Space",
-    "boundary_conditions": "dirichlet free_slip inflow neumann no_slip outflow robin",
-    "tape": "differentiable",
-    "derivative": "grad hvp jvp value_and_grad vjp",
-    "packing": "flatten",
-    "operator": "Operator",
+    "grid.grid": "Grid",
+    "grid.space": "Space",
+    "grid.boundary_conditions": "dirichlet free_slip inflow neumann no_slip outflow robin",
+    "autodiff.tape": "differentiable",
+    "autodiff.derivative": "grad hvp jvp value_and_grad vjp",
+    "autodiff.flattening": "flatten",
+    "operators.operator": "Operator",
     "operators.given": "from_functions from_linear_operator from_matrix",
     "operators.difference": "curl divergence flux gradient laplacian upwind",
     "operators.transfer": "average component prolong restrict sample",
@@ -32,28 +32,28 @@ _WINDOW = {
     "solvers.roots": "implicit steady",
     "solvers.spectral": "exponential function power",
     "flow.momentum": "convection face_laplacian face_lift",
-    "advection.front": "transport",
+    "advection.transport": "transport",
     "flow.finite_volumes": "conservation_law",
     "flow.obstacles": "brinkman forces",
     "flow.pressure_projection": "projection",
-    "flow.stepping": "flow_step",
-    "integrators.front": "stepper",
+    "flow.flow_step": "flow_step",
+    "integrators.stepper": "stepper",
     "integrators.leapfrog": "sponge",
-    "trajectory.front": "rollout",
+    "trajectory.rollout": "rollout",
     "optimize.directions": "update_direction",
-    "optimize.loop": "minimize",
+    "optimize.minimize": "minimize",
     "optimize.physical": "physical_gradient",
     "kernels": "set_threads",
     "report.plots": "animate convergence plot v_curve",
     "report.certificate": "certified certify",
     "report.stress_table": "stress",
     "report.work_precision": "workprec",
-    "report.plan": "explain",
-    "blackbox": "adopt",
-    "storage.archive": "load save",
-    "storage.pictures": "from_image",
+    "report.explain": "explain",
+    "interop.blackbox": "adopt",
+    "io.archive": "load save",
+    "io.pictures": "from_image",
     "parallel.scenes": "ensemble",
-    "parallel.front": "distribute gather",
+    "parallel.distribute": "distribute gather",
 }
 _SPARSE = "scipy.sparse.linalg.{0}; SciPy takes an Operator as a LinearOperator on flat arrays"
 _STEP = "dp.stepper('rk4', rate, dt), and dp.rollout(step, start, params, n) for n steps"
@@ -68,7 +68,6 @@ _MEANT = {  # names of the first edition and of other libraries: what to write i
     "adam": "dp.minimize(loss, start, method='adam', rate=0.01)",
     "advect": "dp.transport(grid)",
     "array": "numpy.array: fields are plain arrays",
-    "autodiff": "dp.grad(loss)(x) or dp.value_and_grad(loss)(x)",
     "backward": "dp.value_and_grad(loss)(x)",
     "cg": "dp.inverse(op, 'krylov')(b), which is differentiable, or " + _SPARSE.format("cg(op, b.ravel())"),
     "check_grad": "dp.check.gradient(loss, x)",
@@ -154,7 +153,7 @@ def __getattr__(name):
     if name in _HOME:
         value = getattr(_import_module(f"{__name__}.{_HOME[name]}"), name)
         if type(value) is _FunctionType:
-            value = _import_module(f"{__name__}.calls").public_name(value, __name__, name)
+            value = _import_module(f"{__name__}._utils.calls").public_name(value, __name__, name)
     elif name in (*_ROOMS, *_PACKAGES):
         value = _import_module(f"{__name__}.{name}")
     elif name == "__version__":
@@ -164,7 +163,7 @@ def __getattr__(name):
         except metadata.PackageNotFoundError:
             value = "0+unknown"  # run from a tree that was never installed
     else:
-        near = _import_module(f"{__name__}.calls").advice_near
+        near = _import_module(f"{__name__}._utils.calls").advice_near
         hint = f"; write {_MEANT[name]}" if name in _MEANT else near(name, __all__)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
     globals()[name] = value  # the next look-up does not come here

@@ -103,8 +103,8 @@ def run_report(options):
 def run_compile(_):
     """The command `compile` -> exit code: 1 where a loop does not compile."""
     from sparsedp import kernels
+    from sparsedp._utils.progress import bar
     from sparsedp.kernels import team
-    from sparsedp.progress import bar
 
     if not kernels.compiled():
         return refuse("there is nothing to compile: numba is not installed or switched off; install sparsedp[fast]")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.files import save_tree
+from sparsedp.io.atomic_files import save_tree
 
 __all__ = ["CHECKPOINTS", "write_checkpoint_0_2"]
 

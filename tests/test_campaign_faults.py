@@ -35,7 +35,7 @@ FAULTS = {
         "solvers", "            total = total - push(varied, chosen, tangents[-len(places) :])[1]\n", "", ""
     ),
     "the cotangent of one field for a batch of them": Bug(
-        "derivative.py", "cotangent = anp.sum(cotangent, axis=0)", "cotangent = cotangent[0]", ""
+        "autodiff/derivative.py", "cotangent = anp.sum(cotangent, axis=0)", "cotangent = cotangent[0]", ""
     ),
     "inputs whose cotangents go to the step before": Bug(
         "trajectory", "rows[state.i] = sums.pop(root)[0]", "rows[state.i - 1] = sums.pop(root)[0]", ""
@@ -50,13 +50,13 @@ FAULTS = {
         "trajectory", "range(n - truncate, 0, -truncate)", "range(n - truncate - 1, 0, -truncate)", ""
     ),
     "a gradient in another precision than its argument": Bug(
-        "derivative.py",
+        "autodiff/derivative.py",
         'return _as_given(fit("the gradient", leaf, cotangent, cotangent), leaf)',
         "return _as_given(cotangent, leaf)",
         "",
     ),
     "entries of dicts paired by their place": Bug(
-        "tree.py",
+        "_utils/pytree.py",
         '        _check_names("key", tree, reference)\n        return reference.keys()\n',
         '        _check_names("key", tree, reference)\n        return tree.keys()\n',
         "",

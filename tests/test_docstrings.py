@@ -12,7 +12,7 @@ import pytest
 from sources import FUNCTION, modules
 
 import sparsedp
-from sparsedp.optimize.loop import METHODS
+from sparsedp.optimize.minimize import METHODS
 from sparsedp.optimize.sparse_terms import admm
 from sparsedp.solvers.choose_method import METHODS as ENGINES
 

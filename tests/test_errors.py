@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.derivative import value_and_grad
+from sparsedp.autodiff.derivative import value_and_grad
 
 LINE, BOX, RING = dp.Grid(3), dp.Grid((2, 2)), dp.Grid(3, periodic=True)
 SHAPE, TYPE, VALUE = dp.errors.ShapeError, TypeError, ValueError

@@ -18,8 +18,8 @@ from extremes import (  # isort: skip
 )  # fmt: skip
 
 import sparsedp as dp
-from sparsedp.derivative import pullback
-from sparsedp.fields import place
+from sparsedp._utils.validation import place
+from sparsedp.autodiff.derivative import pullback
 
 NONFINITE, SHAPE, DERIVATIVE = dp.errors.NonFiniteError, dp.errors.ShapeError, dp.errors.DerivativeError
 

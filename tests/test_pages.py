@@ -93,8 +93,8 @@ def site(tmp_path_factory):
     copy = tmp_path_factory.mktemp("site")
     shutil.copytree(DOCS, copy / "docs", ignore=shutil.ignore_patterns("_build", "gallery", "api", "__pycache__"))
     shutil.copytree(ROOT / "examples", copy / "examples")
-    (copy / "tests").mkdir()
-    shutil.copy(ROOT / "tests" / "scripts.py", copy / "tests")
+    (copy / "tests" / "helpers").mkdir(parents=True)
+    shutil.copy(ROOT / "tests" / "helpers" / "scripts.py", copy / "tests" / "helpers")
     options = ["-W", "--keep-going", "-q", "-D", f"sphinx_gallery_conf.filename_pattern={QUICK}"]
     done = subprocess.run(
         [sys.executable, "-m", "sphinx", *options, str(copy / "docs"), str(copy / "html")],

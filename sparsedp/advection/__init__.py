@@ -1,6 +1,6 @@
 """Transport of a field by a velocity: one differentiable rule for each scheme."""
 
-from sparsedp.calls import describe_module
+from sparsedp._utils.calls import describe_module
 
 __all__: list[str] = []
 

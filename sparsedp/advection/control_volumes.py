@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sparsedp import kernels
-from sparsedp.boundary_conditions import neumann
-from sparsedp.fields import place
+from sparsedp._utils.validation import place
+from sparsedp.grid.boundary_conditions import neumann
 from sparsedp.kernels.fluxes import ITSELF, ROUND, TILE, UNEVEN
 
 __all__ = ["Component", "Sides", "components", "place_words"]

@@ -22,15 +22,15 @@ from math import isfinite
 
 import numpy as np
 
-from sparsedp import results
+from sparsedp._utils import buffers
+from sparsedp._utils.validation import check_finite
 from sparsedp.advection.law import FIELD, INFLOW, VELOCITY, Law
 from sparsedp.advection.loops import Loops, able
 from sparsedp.advection.reference import Reference
 from sparsedp.advection.stability import check_numbers, check_weights
 from sparsedp.advection.values import NOTHING
-from sparsedp.fields import check_finite
+from sparsedp.autodiff.tape import isbox
 from sparsedp.kernels.fluxes import SCHEMES
-from sparsedp.tape import isbox
 
 __all__ = ["Eulerian"]
 
@@ -54,7 +54,7 @@ class Eulerian(Law):
         if able():
             w = self.velocity(v)
             for keep in self.scheme.stages:
-                x, out = out, results.empty(u.shape, float)
+                x, out = out, buffers.empty(u.shape, float)
                 wrong += self.loops.stage(x, self.loops.slopes(x, inflow, False), w, dt, inflow, u, keep, out)
         else:
             with np.errstate(all="ignore"):
@@ -80,7 +80,7 @@ class Eulerian(Law):
         w, field = self.velocity(v), FIELD in nums or INFLOW in nums
         gw, fresh = NOTHING if VELOCITY not in nums else into, into is None
         if gw is None:
-            gw = results.empty(w.shape, float)
+            gw = buffers.empty(w.shape, float)
         of_field, of_inflow, wrong = self._stages_vjp(np.ascontiguousarray(g), u, w, dt, inflow, gw, field, fresh)
         found = {FIELD: of_field, INFLOW: of_inflow, VELOCITY: self.velocity_vjp(gw) if gw.size else None}
         seen = self.adds and not (self.scheme.limiter and field) and isfinite(of_inflow.sum())
@@ -95,7 +95,7 @@ class Eulerian(Law):
         for keep in self.scheme.stages:
             x = u
             if known:
-                x = results.empty(u.shape, float)
+                x = buffers.empty(u.shape, float)
                 self.loops.stage(*known[-1][:2], w, dt, inflow, u, known[-1][2], x)
             known.append((x, self.loops.slopes(x, inflow, True), keep))
         ginflow, rest = np.zeros(inflow.size), None
@@ -103,7 +103,7 @@ class Eulerian(Law):
             x, slopes, keep = known.pop()
             if keep:  # a share of the cotangent goes to the first field
                 rest, g = (keep * g if rest is None else rest + keep * g), (1.0 - keep) * g
-            gu = results.empty(u.shape, float) if known or field else NOTHING
+            gu = buffers.empty(u.shape, float) if known or field else NOTHING
             wrong = self.loops.vjp(g, x, slopes, w, dt, inflow, gu, ginflow, gw, fresh)
             g, fresh = gu, False
         if rest is not None and field:

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.advection.law import wall_space
-from sparsedp.boundary_conditions import dirichlet
+from sparsedp.grid.boundary_conditions import dirichlet
 from sparsedp.kernels.departure_samples import PAD
 from sparsedp.operators.stencils import cell_beside
 

@@ -14,8 +14,8 @@ Beyond a wall the points go on at the distance of the width of the last cell.
 
 import numpy as np
 
-from sparsedp import results
-from sparsedp.fields import EPS, number_beside
+from sparsedp._utils import buffers
+from sparsedp._utils.validation import EPS, number_beside
 
 __all__ = ["Coordinates"]
 
@@ -47,7 +47,7 @@ class Coordinates:
         """
         if not self.lines:
             return m, self.rates * step, ()
-        found = results.empty((2 if self.lines[0].cubic else 3, *m.shape), float)
+        found = buffers.empty((2 if self.lines[0].cubic else 3, *m.shape), float)
         for start in range(0, m.shape[1], BLOCK):
             some = np.arange(start, min(start + BLOCK, m.shape[1]))
             for axis, (line, points) in enumerate(zip(self.lines, np.unravel_index(some, self.shape), strict=True)):

@@ -5,10 +5,10 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp import results
+from sparsedp._utils import buffers
+from sparsedp._utils.validation import EPS
 from sparsedp.advection.ghost_cells import filling, ghost_origins
 from sparsedp.advection.index_coordinates import Coordinates
-from sparsedp.fields import EPS
 from sparsedp.kernels import departure_samples
 from sparsedp.kernels.departure_samples import PAD
 
@@ -43,7 +43,7 @@ class Interpolant:
     def pad(self, u, inflow):
         """Component, inflow values -> samples: the field with its ghost cells, and after them the inflow values."""
         cells = self.points.samples
-        samples = results.empty((cells + inflow.size,), float)
+        samples = buffers.empty((cells + inflow.size,), float)
         samples[:cells].reshape(self.points.padded)[self.inside] = u.reshape(self.points.shape)
         samples[cells:] = inflow
         samples[self.ghosts] = samples[self.origins]
@@ -72,7 +72,7 @@ class Pass:
 
     def value(self, out=None, bounds=departure_samples.NO_BOUNDS):
         """Values at the departure points; least and greatest sample of the cells around them -> bounds."""
-        out = results.empty((self.points.size,), float) if out is None else out
+        out = buffers.empty((self.points.size,), float) if out is None else out
         return departure_samples.interpolate(self.points, self.samples, *self.departure, out, bounds=bounds)
 
     def vjp(self, g, into, of_w, clamped=None):
@@ -81,7 +81,7 @@ class Pass:
         That of the velocity is written to `of_w`; None leaves a part out. `clamped`: samples, and their cotangents.
         """
         if into is not None:
-            samples = results.empty((self.points.samples + self.inflow.size,), float)
+            samples = buffers.empty((self.points.samples + self.inflow.size,), float)
             samples[:] = 0.0
             if clamped is not None:
                 np.add.at(samples, *clamped)
@@ -99,7 +99,7 @@ class Pass:
         nudge = 32 * EPS * max(self.points.shape) * (sides[0] != sides[-1])  # to the side that is meant
         total = 0.0
         for slope, shift in zip(sides, (-nudge, nudge)):
-            found = results.empty(out.shape, float)
+            found = buffers.empty(out.shape, float)
             total += slope * departure_samples.interpolate(
                 self.points, self.samples, displacement + shift, scale, found, g
             )

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.validation import place
 from sparsedp.advection.velocities import interpolation
-from sparsedp.fields import place
+from sparsedp.grid.space import Space
 from sparsedp.operators.masks_and_lift import solid_faces
-from sparsedp.space import Space
 
 __all__ = ["FIELD", "INFLOW", "STEP", "VELOCITY", "Law", "Setting"]
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from sparsedp import kernels, results
+from sparsedp import kernels
+from sparsedp._utils import buffers
 from sparsedp.advection.stability import ROUNDING
 from sparsedp.kernels import fluxes
 
@@ -36,7 +37,7 @@ class Loops:
 
     def _empty(self, part, cells, partials):
         shapes = (len(part.axes), self.many, cells), (len(part.axes), self.many, 2, cells * partials)
-        return [results.empty(shape, float) for shape in shapes]
+        return [buffers.empty(shape, float) for shape in shapes]
 
     def _given(self, part, u, inflow, w, slopes, dt):
         """What the loops over fields and velocities begin with."""

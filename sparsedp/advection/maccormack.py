@@ -14,7 +14,7 @@ Source: A. Selle, R. Fedkiw, B. Kim, Y. Liu, J. Rossignac, J. Scientific Computi
 
 import numpy as np
 
-from sparsedp import results
+from sparsedp._utils import buffers
 from sparsedp.advection.interpolant import Pass
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.kernels import departure_samples
@@ -27,7 +27,7 @@ class Corrected:
 
     def __init__(self, back, ahead, u, inflow):
         self.first, self.clamp = Pass(back, u, inflow), back.component.setting.clamp
-        self.bounds = results.empty((2, u.size), float) if self.clamp else departure_samples.NO_BOUNDS
+        self.bounds = buffers.empty((2, u.size), float) if self.clamp else departure_samples.NO_BOUNDS
         f = self.first.value(bounds=self.bounds)
         self.second = Pass(ahead, f, inflow)
         self.new = self.second.value()  # what comes back, and then the new value before it is clamped
@@ -50,13 +50,13 @@ class Corrected:
 
     def vjp(self, g, into, of_w):
         """See `Pass`."""
-        own, of_f, clamped = results.empty(g.shape, float), results.empty(g.shape, float), None
+        own, of_f, clamped = buffers.empty(g.shape, float), buffers.empty(g.shape, float), None
         own[:] = g
         if self.clamp:
             some, free, index, shares = self._clamps()
             own[some] *= free
             clamped = index, shares * g[some]
-        of_b, ahead = np.multiply(-0.5, own, out=self.new), None if of_w is None else results.empty(of_w.shape, float)
+        of_b, ahead = np.multiply(-0.5, own, out=self.new), None if of_w is None else buffers.empty(of_w.shape, float)
         self.second.vjp(of_b, (of_f, into[1] if into else np.zeros_like(self.first.inflow)), ahead)
         of_f += own
         self.first.vjp(of_f, into, of_w, clamped)

@@ -18,11 +18,11 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp._utils.pytree import placed
 from sparsedp.advection.control_volumes import components
-from sparsedp.derivative import pullback, pushforward
+from sparsedp.autodiff.derivative import pullback, pushforward
+from sparsedp.autodiff.tape import isbox, linear, plain
 from sparsedp.kernels.fluxes import OWN
-from sparsedp.tape import isbox, linear, plain
-from sparsedp.tree import placed
 
 __all__ = ["Reference"]
 

@@ -3,11 +3,11 @@
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.validation import check_finite, surely_finite
 from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY
 from sparsedp.advection.values import FLOAT, LETTERS, prepare, raised, result_like, unflatten
+from sparsedp.autodiff.tape import Rule, dtype_of, isbox, linear, plain
 from sparsedp.errors import DerivativeError
-from sparsedp.fields import check_finite, surely_finite
-from sparsedp.tape import Rule, dtype_of, isbox, linear, plain
 
 __all__ = ["rule_of"]
 

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp import results
+from sparsedp._utils import buffers
+from sparsedp._utils.validation import surely_finite
 from sparsedp.advection.departure_points import Trajectory
 from sparsedp.advection.interpolant import Interpolant, Pass
 from sparsedp.advection.law import FIELD, INFLOW, VELOCITY, Law
 from sparsedp.advection.stability import check_numbers
-from sparsedp.fields import surely_finite
 
 __all__ = ["SemiLagrangian"]
 
@@ -67,7 +67,7 @@ class SemiLagrangian(Law):
         """The advected field."""
         if not all(map(surely_finite, (u, v, inflow))):
             check_numbers(self.setting, u, v, inflow)  # names the first one; the trajectories would hide it
-        out = results.empty(u.shape, float)
+        out = buffers.empty(u.shape, float)
         for span, passage in self._passes(u, v, dt, inflow):
             passage.value(out[span])
         return self._keep_solid(out, u)
@@ -76,8 +76,8 @@ class SemiLagrangian(Law):
         """Cotangent of the advected field -> those of the arguments `nums`."""
         field, speed, g = FIELD in nums or INFLOW in nums, VELOCITY in nums, np.ascontiguousarray(g)
         moved = g if self.solid is None else np.where(self.solid, 0.0, g)
-        of_u, of_inflow = results.empty((u.size if field else 0,), float), np.zeros(inflow.size)
-        of_w = results.empty((u.size * self.setting.grid.dim if speed else 0,), float)
+        of_u, of_inflow = buffers.empty((u.size if field else 0,), float), np.zeros(inflow.size)
+        of_w = buffers.empty((u.size * self.setting.grid.dim if speed else 0,), float)
         for (span, passage), change in zip(self._passes(u, v, dt, inflow), self._by_component(of_w), strict=True):
             passage.vjp(moved[span], (of_u[span], of_inflow) if field else None, change if speed else None)
         if field and self.solid is not None:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from sparsedp._utils.validation import EPS, check_finite, number_beside, rounded_down
 from sparsedp.advection.control_volumes import place_words
 from sparsedp.errors import UnstableStepError
-from sparsedp.fields import EPS, check_finite, number_beside, rounded_down
 
 __all__ = ["ROUNDING", "check_numbers", "check_weights"]
 

@@ -3,10 +3,10 @@
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.validation import check_number, check_plain
 from sparsedp.advection.law import INFLOW, STEP
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, plain
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_number, check_plain
-from sparsedp.tape import cast, dtype_of, isbox, plain
 
 __all__ = [
     "FLOAT",

@@ -8,12 +8,12 @@ widths: then constants are kept by a flow without divergence, on stretched grids
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.boundary_conditions import neumann
-from sparsedp.operator import Operator
+from sparsedp.grid.boundary_conditions import neumann
+from sparsedp.grid.space import Space
+from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import cell_beside, mean_of_faces, means, with_ends
-from sparsedp.space import Space
-from sparsedp.structure.factor import Factor
-from sparsedp.structure.kronecker import Kronecker, Term
+from sparsedp.operators.structure.factor import Factor
+from sparsedp.operators.structure.kronecker import Kronecker, Term
 
 __all__ = ["interpolation"]
 

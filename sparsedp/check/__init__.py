@@ -4,7 +4,7 @@ Nothing else in the package imports it. Every check returns a value with `.verdi
 inconclusive), is true only when it agrees, and prints its table.
 """
 
-from sparsedp.calls import describe_module
+from sparsedp._utils.calls import describe_module
 from sparsedp.check.audit import gradient
 from sparsedp.check.operators import operator, transpose, twin
 from sparsedp.check.refinement import order

@@ -7,6 +7,9 @@ from math import inf, isinf, isnan
 
 import numpy as np
 
+from sparsedp._utils.progress import bar
+from sparsedp._utils.validation import check_function, check_whole
+from sparsedp.autodiff.derivative import grad, hvp, unwarned
 from sparsedp.check.culprit import culprit_of
 from sparsedp.check.entries import MOST_ENTRIES, gaps_along_entries, listed, spaces_of
 from sparsedp.check.judge import (
@@ -20,9 +23,6 @@ from sparsedp.check.judge import (
 from sparsedp.check.summary import Result
 from sparsedp.check.sweep import POINTS, QUICK, REFUSALS, Point, Trials, generator
 from sparsedp.check.table import Table, table_of
-from sparsedp.derivative import grad, hvp, unwarned
-from sparsedp.fields import check_function, check_whole
-from sparsedp.progress import bar
 
 __all__ = ["Audit", "gradient", "look_beside"]
 

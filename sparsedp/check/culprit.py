@@ -10,19 +10,19 @@ from math import prod
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.counters import recording
+from sparsedp._utils.pytree import leaves
+from sparsedp.autodiff.derivative import grad, linearised
+from sparsedp.autodiff.tape import is_variable
 from sparsedp.check.entries import DEFAULT_STEP, gaps_along_entries, largest_gaps, listed, subscript, where
 from sparsedp.check.judge import forward_mode, looked_at
 from sparsedp.check.nodes import calls_seen, in_order
 from sparsedp.check.operators import fault_of, field
 from sparsedp.check.summary import error_text
 from sparsedp.check.sweep import Point, Trials, generator
-from sparsedp.derivative import grad, linearised
 from sparsedp.errors import DerivativeError
-from sparsedp.ledger import recording
-from sparsedp.operator import Operator
+from sparsedp.operators.operator import Operator
 from sparsedp.solvers.choose_method import Inverse
-from sparsedp.tape import is_variable
-from sparsedp.tree import leaves
 
 __all__ = ["culprit_of"]
 

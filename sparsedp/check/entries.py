@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.counters import recording
 from sparsedp.check.sweep import REFUSALS, SAME, Line
-from sparsedp.grid import node_axes
-from sparsedp.ledger import recording
+from sparsedp.grid.grid import node_axes
 
 __all__ = [
     "MOST_ENTRIES",

@@ -20,10 +20,10 @@ from math import inf, isfinite, nan
 
 import numpy as np
 
+from sparsedp._utils.validation import place
+from sparsedp.autodiff.derivative import NO_JVP, pushforward
 from sparsedp.check.summary import Result
 from sparsedp.check.sweep import REFUSALS, Line, noise_of
-from sparsedp.derivative import NO_JVP, pushforward
-from sparsedp.fields import place
 
 __all__ = ["PROVED", "at_kinks", "curvature", "forward_mode", "judgement", "looked_at", "verdict"]
 

@@ -7,9 +7,9 @@ from types import CellType, FunctionType, MethodType
 
 import numpy as np
 
-from sparsedp.derivative import name_of, witnessed
-from sparsedp.shortcuts import ELSEWHERE
-from sparsedp.tape import called, isbox, through
+from sparsedp.autodiff.derivative import name_of, witnessed
+from sparsedp.autodiff.fast_derivatives import ELSEWHERE
+from sparsedp.autodiff.tape import called, isbox, through
 
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
 

@@ -11,15 +11,15 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.pytree import norm
+from sparsedp._utils.validation import EPS
+from sparsedp.autodiff.derivative import hvp, pullback, pushforward, unwarned
 from sparsedp.check.properties import facts_of
 from sparsedp.check.summary import Row, Summary, error_text
 from sparsedp.check.sweep import generator
-from sparsedp.derivative import hvp, pullback, pushforward, unwarned
 from sparsedp.errors import DerivativeError
-from sparsedp.fields import EPS
 from sparsedp.operators.given import check_operator
-from sparsedp.structure.base import Matrix
-from sparsedp.tree import norm
+from sparsedp.operators.structure.base import Matrix
 
 __all__ = ["OperatorSummary", "fault_of", "field", "layouts", "operator", "transpose", "twin"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse.linalg import ArpackError, eigs, eigsh
 
-from sparsedp.space import fits
+from sparsedp.grid.space import fits
 
 __all__ = ["facts_of"]
 

@@ -5,9 +5,9 @@ from statistics import linear_regression
 
 import numpy as np
 
+from sparsedp._utils.validation import check_function, number_beside
 from sparsedp.check.summary import Result
 from sparsedp.check.table import Table
-from sparsedp.fields import check_function, number_beside
 
 __all__ = ["Refinement", "order"]
 

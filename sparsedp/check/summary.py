@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.html import Markup, curves, folded, paragraphs
+from sparsedp._utils.reconstruction import Frozen
+from sparsedp._utils.validation import number_beside
 from sparsedp.check.table import Table, table_of
-from sparsedp.fields import number_beside
-from sparsedp.markup import Markup, curves, folded, paragraphs
-from sparsedp.recipe import Frozen
 
 __all__ = ["Result", "Row", "Summary", "error_text"]
 

@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.counters import recording, thread
+from sparsedp._utils.pytree import copied, mapped, norm
+from sparsedp._utils.validation import advise, check_finite
+from sparsedp.autodiff.derivative import check_loss
+from sparsedp.autodiff.fast_derivatives import whole
+from sparsedp.autodiff.flattening import Packing, joined
 from sparsedp.check.summary import error_text
-from sparsedp.derivative import check_loss
 from sparsedp.errors import SparsedpError
-from sparsedp.fields import advise, check_finite
-from sparsedp.ledger import recording, thread
-from sparsedp.packing import Packing, joined
-from sparsedp.shortcuts import whole
-from sparsedp.tree import copied, mapped, norm
 
 __all__ = [
     "POINTS",

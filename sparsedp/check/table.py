@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from sparsedp import markup
+from sparsedp._utils import html as markup
 
 __all__ = ["Table", "table_of"]
 

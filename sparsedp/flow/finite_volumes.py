@@ -27,12 +27,10 @@ the user's flux, speed and source. The limiter is one rule, with the derivatives
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.boundary_conditions import free_slip, outflow, resolve
-from sparsedp.boundary_conditions import inflow as inflow_side
-from sparsedp.calls import public
-from sparsedp.derivative import entrywise
-from sparsedp.errors import ShapeError
-from sparsedp.fields import (
+from sparsedp._utils.calls import public
+from sparsedp._utils.pytree import mapped
+from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.validation import (
     check_choice,
     check_finite,
     check_function,
@@ -42,12 +40,14 @@ from sparsedp.fields import (
     field_array,
     is_whole,
 )
-from sparsedp.grid import AXES, check_grid
+from sparsedp.autodiff.derivative import entrywise
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, plain
+from sparsedp.autodiff.tape_constants import constant, frozen
+from sparsedp.errors import ShapeError
+from sparsedp.grid.boundary_conditions import free_slip, outflow, resolve
+from sparsedp.grid.boundary_conditions import inflow as inflow_side
+from sparsedp.grid.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
-from sparsedp.recipe import Remade
-from sparsedp.tape import cast, dtype_of, isbox, plain
-from sparsedp.tape_constants import constant, frozen
-from sparsedp.tree import mapped
 
 __all__ = ["ConservationLaw", "conservation_law"]
 

@@ -2,7 +2,7 @@
 
 Every component lives on its own faces. Along its own axis it is a field on nodes, and the wall faces
 hold the wall values; along the other axes it is a field between walls half a cell away, with the
-condition that what the fluid does there implies (`along` of boundary_conditions.py).
+condition that what the fluid does there implies (`along` of grid/boundary_conditions.py).
 
 The velocity of a wall therefore has two parts. Its normal component stands on the faces of the wall. Its tangential
 components are the wall velocities, a flat array on ``face_lift(grid, boundary).domain``: those of walls that move along
@@ -16,13 +16,18 @@ from itertools import product
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.boundary_conditions import dirichlet, free_slip, inflow, no_slip, outflow, resolve
-from sparsedp.fields import check_on
+from sparsedp._utils.pytree import copied
+from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.validation import check_on
+from sparsedp.autodiff.fast_derivatives import whole
+from sparsedp.autodiff.tape import plain
 from sparsedp.flow.projection_setup import faces_that
-from sparsedp.grid import Grid
-from sparsedp.operator import Operator
+from sparsedp.grid.boundary_conditions import dirichlet, free_slip, inflow, no_slip, outflow, resolve
+from sparsedp.grid.grid import Grid
+from sparsedp.grid.space import Space
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.masks_and_lift import check_solid, solid_faces
+from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import (
     along,
     differences,
@@ -33,15 +38,10 @@ from sparsedp.operators.stencils import (
     wall_slopes,
     with_ends,
 )  # fmt: skip
-from sparsedp.recipe import Made
-from sparsedp.shortcuts import whole
-from sparsedp.space import Space
-from sparsedp.structure.base import Matrix
-from sparsedp.structure.factor import Factor
-from sparsedp.structure.kronecker import Kronecker
-from sparsedp.structure.lazy import Mask, compose, total
-from sparsedp.tape import plain
-from sparsedp.tree import copied
+from sparsedp.operators.structure.base import Matrix
+from sparsedp.operators.structure.factor import Factor
+from sparsedp.operators.structure.kronecker import Kronecker
+from sparsedp.operators.structure.lazy import Mask, compose, total
 
 __all__ = [
     "MomentumFluxes",

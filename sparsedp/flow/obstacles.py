@@ -22,9 +22,11 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.boundary_conditions import no_slip, resolve
-from sparsedp.calls import public
-from sparsedp.fields import check_finite, check_kind, check_number, field_array
+from sparsedp._utils.calls import public
+from sparsedp._utils.pytree import copied
+from sparsedp._utils.reconstruction import Made, Remade
+from sparsedp._utils.validation import check_finite, check_kind, check_number, field_array
+from sparsedp.autodiff.tape import plain
 from sparsedp.flow.momentum import (
     MomentumFluxes,
     face_laplacian,
@@ -33,17 +35,15 @@ from sparsedp.flow.momentum import (
     wall_velocities,
 )
 from sparsedp.flow.projection_setup import pressure_conditions
-from sparsedp.grid import check_grid, numbers_per_axis
-from sparsedp.operator import Operator
+from sparsedp.grid.boundary_conditions import no_slip, resolve
+from sparsedp.grid.grid import check_grid, numbers_per_axis
+from sparsedp.grid.space import Space
 from sparsedp.operators.difference import gradient
 from sparsedp.operators.masks_and_lift import check_solid, mask, region_of, solid_faces
+from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import along, kronecker_operator
-from sparsedp.recipe import Made, Remade
-from sparsedp.space import Space
-from sparsedp.structure.base import Matrix
-from sparsedp.structure.factor import Factor
-from sparsedp.tape import plain
-from sparsedp.tree import copied
+from sparsedp.operators.structure.base import Matrix
+from sparsedp.operators.structure.factor import Factor
 
 __all__ = ["Forces", "brinkman", "forces"]
 

@@ -9,8 +9,8 @@ from math import sqrt
 import numpy as np
 
 from sparsedp import kernels
+from sparsedp.operators.structure.lazy import face_entries
 from sparsedp.solvers.scaling import norm
-from sparsedp.structure.lazy import face_entries
 
 __all__ = ["Passes", "Products"]
 

@@ -14,12 +14,12 @@ from functools import cached_property
 
 import numpy as np
 
-from sparsedp.boundary_conditions import no_slip
 from sparsedp.flow.projection_setup import Setup
-from sparsedp.grid import check_grid
-from sparsedp.operator import Operator
+from sparsedp.grid.boundary_conditions import no_slip
+from sparsedp.grid.grid import check_grid
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.base import Turning
 from sparsedp.solvers.choose_method import check_settings
-from sparsedp.structure.base import Turning
 
 __all__ = ["Projection", "projection"]
 
@@ -108,7 +108,7 @@ class Projection(Operator):
         vars(self)["setup"] = setup
 
     def recipe(self):
-        """The call that makes it again: see recipe.py."""
+        """The call that makes it again: see _utils/reconstruction.py."""
         return Projection, (self.setup,)
 
     @property

@@ -13,14 +13,14 @@ from functools import cached_property
 
 import numpy as np
 
-from sparsedp.boundary_conditions import inflow, no_slip, resolve
+from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.validation import check_finite, place
 from sparsedp.errors import NonFiniteError
-from sparsedp.fields import check_finite, place
 from sparsedp.flow.passes import Products, compiled
-from sparsedp.grid import Grid
+from sparsedp.grid.boundary_conditions import inflow, no_slip, resolve
+from sparsedp.grid.grid import Grid
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.masks_and_lift import check_solid, diagonal, solid_faces
-from sparsedp.recipe import Remade
 from sparsedp.solvers.choose_method import build
 from sparsedp.solvers.scaling import exponent_of, in_range, largest, shifted
 

@@ -39,18 +39,18 @@ from typing import Any, NamedTuple
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import push
+from sparsedp._utils.counters import note, thread
+from sparsedp._utils.pytree import flatten, is_uniform, labels, leaves, mapped, paired
+from sparsedp._utils.validation import number_beside
+from sparsedp.autodiff.derivative import push
+from sparsedp.autodiff.fast_derivatives import elsewhere, on_every_rank
+from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
+from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import number_beside
+from sparsedp.grid.space import Space
 from sparsedp.integrators.discontinuities import Inspector
 from sparsedp.integrators.problem import combine, later, unsided, untraced
 from sparsedp.integrators.runge_kutta import Explicit, Scheme
-from sparsedp.ledger import note, thread
-from sparsedp.shortcuts import elsewhere, on_every_rank
-from sparsedp.space import Space
-from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
-from sparsedp.tape_constants import constant
-from sparsedp.tree import flatten, is_uniform, labels, leaves, mapped, paired
 
 __all__ = ["Adaptive", "Moving", "Taken", "inner", "relative"]
 

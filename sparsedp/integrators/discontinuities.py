@@ -19,8 +19,8 @@ from collections import deque
 
 import numpy as np
 
+from sparsedp._utils.pytree import flatten, leaves
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
-from sparsedp.tree import flatten, leaves
 
 __all__ = ["Inspector"]
 

@@ -29,15 +29,15 @@ import numpy as np
 from numpy.polynomial import Polynomial as Line
 from scipy.special import hyp1f1
 
-from sparsedp.fields import check_finite
+from sparsedp._utils.pytree import mapped
+from sparsedp._utils.validation import check_finite
+from sparsedp.autodiff.fast_derivatives import refuse_elsewhere
+from sparsedp.grid.space import Space
 from sparsedp.integrators.problem import combine, later
 from sparsedp.integrators.runge_kutta import Scheme, family
-from sparsedp.operator import Operator
 from sparsedp.operators.masks_and_lift import identity
-from sparsedp.shortcuts import refuse_elsewhere
+from sparsedp.operators.operator import Operator
 from sparsedp.solvers.separable import SpectralFunction, diagonalised
-from sparsedp.space import Space
-from sparsedp.tree import mapped
 
 __all__ = ["Exponential", "Function", "PhiFunctions", "phi"]
 

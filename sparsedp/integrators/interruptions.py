@@ -35,14 +35,14 @@ import autograd.numpy as anp
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
-from sparsedp.derivative import pullback, push
+from sparsedp._utils.pytree import flatten, leaves
+from sparsedp._utils.validation import EPS, check_function, check_number, check_takes
+from sparsedp.autodiff.derivative import pullback, push
+from sparsedp.autodiff.tape import dtype_of, is_variable, isbox, linear, plain, traces_of
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
-from sparsedp.fields import EPS, check_function, check_number, check_takes
 from sparsedp.integrators.adaptive import Adaptive, Moving, relative
 from sparsedp.integrators.problem import Side, Sided, combine, of_fields, takes, unsided, untraced
 from sparsedp.integrators.runge_kutta import Scheme
-from sparsedp.tape import dtype_of, is_variable, isbox, linear, plain, traces_of
-from sparsedp.tree import flatten, leaves
 
 __all__ = ["Crossing", "Event", "Interrupted", "break_times", "event_list"]
 

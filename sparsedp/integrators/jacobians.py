@@ -8,11 +8,11 @@ Where a call is not known here its cotangents go back one after the other, and i
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import taped
-from sparsedp.operator import Operator
-from sparsedp.shortcuts import ARRAY, FLOAT, ITEM, REAL, Part, by_entry
-from sparsedp.tape import added, autograd_rules, called, dtype_of
-from sparsedp.tree import leaves
+from sparsedp._utils.pytree import leaves
+from sparsedp.autodiff.derivative import taped
+from sparsedp.autodiff.fast_derivatives import ARRAY, FLOAT, ITEM, REAL, Part, by_entry
+from sparsedp.autodiff.tape import added, autograd_rules, called, dtype_of
+from sparsedp.operators.operator import Operator
 
 __all__ = ["jacobians_of"]
 

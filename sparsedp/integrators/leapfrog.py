@@ -25,17 +25,17 @@ from math import log
 import numpy as np
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
-from sparsedp.derivative import push
+from sparsedp._utils.pytree import flatten, is_uniform, leaves, mapped, paired
+from sparsedp._utils.validation import check_function, check_number, is_whole, number_beside, rounded_down
+from sparsedp.autodiff.derivative import push
+from sparsedp.autodiff.fast_derivatives import on_every_rank
+from sparsedp.autodiff.tape import is_variable, plain
 from sparsedp.errors import UnstableStepError
-from sparsedp.fields import check_function, check_number, is_whole, number_beside, rounded_down
-from sparsedp.grid import AXES, check_grid
+from sparsedp.grid.grid import AXES, check_grid
 from sparsedp.integrators.adaptive import Moving
 from sparsedp.integrators.problem import combine, of_fields, pair, untraced
 from sparsedp.integrators.runge_kutta import Scheme
-from sparsedp.shortcuts import on_every_rank
 from sparsedp.solvers.cache import Cache
-from sparsedp.tape import is_variable, plain
-from sparsedp.tree import flatten, is_uniform, leaves, mapped, paired
 
 __all__ = ["Leapfrog", "sponge"]
 

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.pytree import branches_mapped, copied, flatten, keys, leaves, mapped, paired, subscript
+from sparsedp._utils.validation import check_function, check_number, check_takes
+from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, plain
+from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_function, check_number, check_takes
-from sparsedp.operator import Operator
-from sparsedp.space import fits
-from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
-from sparsedp.tape_constants import frozen
-from sparsedp.tree import branches_mapped, copied, flatten, keys, leaves, mapped, paired, subscript
+from sparsedp.grid.space import fits
+from sparsedp.operators.operator import Operator
 
 __all__ = [
     "Problem", "Side", "Sided", "combine", "later", "like", "number", "of_fields", "pair", "takes", "unsided",

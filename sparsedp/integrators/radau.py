@@ -34,19 +34,19 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.pytree import leaves
+from sparsedp._utils.validation import check_shape
+from sparsedp.autodiff.fast_derivatives import refuse_elsewhere
+from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
+from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_shape
 from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Moving, Taken, relative
 from sparsedp.integrators.discontinuities import Inspector
 from sparsedp.integrators.jacobians import jacobians_of
 from sparsedp.integrators.problem import Sided, combine, like, unsided, untraced
 from sparsedp.integrators.runge_kutta import Scheme, as_matrix
-from sparsedp.shortcuts import refuse_elsewhere
 from sparsedp.solvers.direct import dense_lu
 from sparsedp.solvers.newton import Layout
-from sparsedp.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
-from sparsedp.tape_constants import constant
-from sparsedp.tree import leaves
 
 __all__ = ["Radau"]
 

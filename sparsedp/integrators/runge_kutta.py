@@ -44,19 +44,19 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.derivative import of_argument
+from sparsedp._utils.counters import note
+from sparsedp.autodiff.derivative import of_argument
+from sparsedp.autodiff.tape import Rule
 from sparsedp.errors import ConvergenceError, UnstableStepError
 from sparsedp.integrators.problem import Sided, combine, later, unsided, untraced
-from sparsedp.ledger import note
-from sparsedp.operator import Operator
 from sparsedp.operators.given import from_matrix
+from sparsedp.operators.operator import Operator
 from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.choose_method import build
 from sparsedp.solvers.nullspace import Projector
 from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
-from sparsedp.tape import Rule
 
 __all__ = [
     "EXPLICIT",

@@ -2,21 +2,21 @@
 
 to_torch, from_torch     torch_bridge.py, the extra `torch`
 to_jax, from_jax         jax_bridge.py, the extra `jax`
-to_xarray, from_xarray   fields with coordinates: ../storage/labelled.py, the extra `files`
+to_xarray, from_xarray   fields with coordinates: ../io/labelled.py, the extra `files`
 
 A library is imported when one of its two names is first used.
 """
 
 from importlib import import_module
 
-from sparsedp.calls import describe_module, public_name
+from sparsedp._utils.calls import describe_module, public_name
 
 __all__ = ["from_jax", "from_torch", "from_xarray", "to_jax", "to_torch", "to_xarray"]
 
 EXTRAS = {  # of each library, and the module with its two functions
     "torch": ("torch", "sparsedp.interop.torch_bridge"),
     "jax": ("jax", "sparsedp.interop.jax_bridge"),
-    "xarray": ("files", "sparsedp.storage.labelled"),
+    "xarray": ("files", "sparsedp.io.labelled"),
 }
 
 

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
+from sparsedp._utils.pytree import placed
+from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.validation import check_function, check_precision
+from sparsedp.autodiff.tape import Rule, dtype_of, plain
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_function, check_precision
 from sparsedp.interop.recording import owned, parts, recorded
-from sparsedp.recipe import Made
-from sparsedp.tape import Rule, dtype_of, plain
-from sparsedp.tree import placed
 
 __all__ = ["from_jax", "to_jax"]
 

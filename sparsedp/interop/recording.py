@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sparsedp.derivative import gradient_of, growing, linearised
-from sparsedp.fields import check_precision
+from sparsedp._utils.validation import check_precision
+from sparsedp.autodiff.derivative import gradient_of, growing, linearised
 
 __all__ = ["owned", "parts", "recorded"]
 

@@ -8,13 +8,13 @@ import autograd.numpy as anp
 import numpy as np
 import torch
 
+from sparsedp._utils.pytree import flatten, leaves, paired, placed
+from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.validation import check_function, check_leaves
+from sparsedp.autodiff.tape import Rule, dtype_of, is_variable, isbox
+from sparsedp.autodiff.tape_constants import constant, frozen
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_function, check_leaves
 from sparsedp.interop.recording import owned, parts, recorded
-from sparsedp.recipe import Made
-from sparsedp.tape import Rule, dtype_of, is_variable, isbox
-from sparsedp.tape_constants import constant, frozen
-from sparsedp.tree import flatten, leaves, paired, placed
 
 __all__ = ["from_torch", "to_torch"]
 

@@ -4,7 +4,7 @@ A layer is ``layer(p, x)`` with p a dict of arrays; a network is a Python functi
 are any nesting of such dicts, and minimize takes them as they are.
 """
 
-from sparsedp.calls import describe_module
+from sparsedp._utils.calls import describe_module
 from sparsedp.network.filters import convolution
 from sparsedp.network.layers import dense, relu, residual_block, softplus, tanh
 from sparsedp.network.weights import convolution_weights, dense_weights, load, residual_weights, save

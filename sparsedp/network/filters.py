@@ -13,10 +13,10 @@ and the derivatives of each of the three are the other two.
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.validation import check_choice
+from sparsedp.autodiff.tape import Rule, plain
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_choice
 from sparsedp.network.correlation import MODES, correlate, fold, pad, weigh
-from sparsedp.tape import Rule, plain
 
 __all__ = ["check_widths", "convolution"]
 

@@ -3,9 +3,9 @@
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.autodiff.tape import Rule, plain
 from sparsedp.errors import ShapeError
 from sparsedp.network.filters import convolution, weight_and_bias
-from sparsedp.tape import Rule, plain
 
 __all__ = ["dense", "relu", "residual_block", "softplus", "tanh"]
 

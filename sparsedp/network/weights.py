@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.files import load_tree, save_tree
+from sparsedp.io.atomic_files import load_tree, save_tree
 from sparsedp.network.filters import check_widths
 
 __all__ = ["convolution_weights", "dense_weights", "load", "residual_weights", "save"]

@@ -5,14 +5,14 @@ from functools import reduce
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.boundary_conditions import check_condition, neumann, resolve
-from sparsedp.grid import check_grid
-from sparsedp.operator import Operator
+from sparsedp.grid.boundary_conditions import check_condition, neumann, resolve
+from sparsedp.grid.grid import check_grid
+from sparsedp.grid.space import Space
 from sparsedp.operators.masks_and_lift import check_solid, region_of, solid_faces
+from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import along, differences, kronecker_operator, one_sided, pick, slopes, to_faces
-from sparsedp.space import Space
-from sparsedp.structure.base import Matrix
-from sparsedp.structure.lazy import Mask, compose, total
+from sparsedp.operators.structure.base import Matrix
+from sparsedp.operators.structure.lazy import Mask, compose, total
 
 __all__ = ["curl", "divergence", "flux", "gradient", "laplacian", "upwind"]
 

@@ -5,12 +5,19 @@ from functools import partial
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp._utils.validation import (
+    check_finite,
+    check_function,
+    check_kind,
+    check_plain,
+    check_type,
+    is_other_precision,
+)
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_function, check_kind, check_plain, check_type, is_other_precision
-from sparsedp.operator import Operator
-from sparsedp.space import Space
-from sparsedp.structure.base import Matrix
-from sparsedp.structure.lazy import Functions
+from sparsedp.grid.space import Space
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.base import Matrix
+from sparsedp.operators.structure.lazy import Functions
 
 __all__ = ["check_operator", "from_functions", "from_linear_operator", "from_matrix"]
 

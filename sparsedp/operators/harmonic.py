@@ -11,13 +11,13 @@ Fluid Flow, 1980). Where both are 0 the ratios are taken as 1, their value on k_
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import entrywise
-from sparsedp.fields import check_finite, check_kind, check_native, check_on
-from sparsedp.grid import check_grid
+from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.validation import check_finite, check_kind, check_native, check_on
+from sparsedp.autodiff.derivative import entrywise
+from sparsedp.autodiff.fast_derivatives import array
+from sparsedp.autodiff.tape import plain
+from sparsedp.grid.grid import check_grid
 from sparsedp.operators.stencils import cell_beside, to_faces
-from sparsedp.recipe import Made
-from sparsedp.shortcuts import array
-from sparsedp.tape import plain
 
 __all__ = ["harmonic_average"]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.fields import EPS, number_beside
+from sparsedp._utils.validation import EPS, number_beside
 
 __all__ = ["linear_weights"]
 

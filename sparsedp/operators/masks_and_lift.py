@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from sparsedp.boundary_conditions import resolve
+from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain, check_type
+from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_kind, check_on, check_plain, check_type
-from sparsedp.grid import check_grid
-from sparsedp.operator import Operator
+from sparsedp.grid.boundary_conditions import resolve
+from sparsedp.grid.grid import check_grid
+from sparsedp.grid.space import Space
+from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import along, kronecker_operator, wall_slopes
-from sparsedp.space import Space
-from sparsedp.structure.kronecker import Kronecker
-from sparsedp.structure.lazy import Diagonal, Mask
-from sparsedp.tape import isbox
+from sparsedp.operators.structure.kronecker import Kronecker
+from sparsedp.operators.structure.lazy import Diagonal, Mask
 
 __all__ = ["diagonal", "identity", "interior", "lift", "mask"]
 

@@ -3,9 +3,9 @@
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.operator import Operator
-from sparsedp.structure.factor import Factor
-from sparsedp.structure.kronecker import Kronecker, Term
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.factor import Factor
+from sparsedp.operators.structure.kronecker import Kronecker, Term
 
 __all__ = [
     "along", "cell_beside", "differences", "kronecker_operator", "mean_of_faces", "means", "one_sided", "pick",

@@ -17,12 +17,12 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.fields import EPS, check_finite, check_shape, place
+from sparsedp._utils.validation import EPS, check_finite, check_shape, place
+from sparsedp.autodiff.tape import plain
+from sparsedp.grid.space import Space
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.stencils import along, pick
-from sparsedp.space import Space
-from sparsedp.structure.kronecker import Kronecker
-from sparsedp.tape import plain
+from sparsedp.operators.structure.kronecker import Kronecker
 
 __all__ = ["check_tensor", "corners"]
 

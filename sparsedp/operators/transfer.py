@@ -5,17 +5,17 @@ from itertools import product
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.boundary_conditions import neumann, resolve
+from sparsedp._utils.validation import check_choice, check_finite, is_whole
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_choice, check_finite, is_whole
-from sparsedp.grid import Grid, check_grid, per_axis, real_numbers
-from sparsedp.operator import Operator
+from sparsedp.grid.boundary_conditions import neumann, resolve
+from sparsedp.grid.grid import Grid, check_grid, per_axis, real_numbers
+from sparsedp.grid.space import Space
 from sparsedp.operators.interpolation import linear_weights
+from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import along, kronecker_operator, means, to_faces
-from sparsedp.space import Space
-from sparsedp.structure.base import Matrix
-from sparsedp.structure.factor import Factor
-from sparsedp.structure.kronecker import Term
+from sparsedp.operators.structure.base import Matrix
+from sparsedp.operators.structure.factor import Factor
+from sparsedp.operators.structure.kronecker import Term
 
 __all__ = ["average", "component", "prolong", "restrict", "sample"]
 

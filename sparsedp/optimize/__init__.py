@@ -1,6 +1,6 @@
 """Optimization over any nesting of arrays: minimize() and its methods."""
 
-from sparsedp.calls import describe_module
+from sparsedp._utils.calls import describe_module
 
 __all__: list[str] = []
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsedp.tree import norm
+from sparsedp._utils.pytree import norm
 
 __all__ = ["BoundedProblem"]
 

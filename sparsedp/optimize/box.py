@@ -4,10 +4,10 @@ from reprlib import repr as shortened
 
 import numpy as np
 
+from sparsedp._utils.pytree import is_uniform
+from sparsedp._utils.validation import EPS
+from sparsedp.autodiff.flattening import joined
 from sparsedp.errors import ShapeError
-from sparsedp.fields import EPS
-from sparsedp.packing import joined
-from sparsedp.tree import is_uniform
 
 __all__ = ["Box"]
 

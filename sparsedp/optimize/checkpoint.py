@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.files import UNFINISHED, load_tree, path_errors, save_tree
+from sparsedp._utils.pytree import flatten, leaves, norm
+from sparsedp.autodiff.fast_derivatives import ranks, whole
+from sparsedp.io.atomic_files import UNFINISHED, load_tree, path_errors, save_tree
 from sparsedp.optimize.checkpoint_upgrade import FORMAT_0_2, upgraded
 from sparsedp.optimize.result import Failure, Record, Trial
-from sparsedp.shortcuts import ranks, whole
-from sparsedp.tree import flatten, leaves, norm
 
 __all__ = ["Checkpoint"]
 

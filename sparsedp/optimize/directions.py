@@ -9,12 +9,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.fields import check_choice, check_finite, check_function, check_number, check_shape, check_whole
+from sparsedp._utils.pytree import safe_unit
+from sparsedp._utils.validation import (
+    check_choice,
+    check_finite,
+    check_function,
+    check_number,
+    check_shape,
+    check_whole,
+)
+from sparsedp.autodiff.flattening import Packing
 from sparsedp.optimize.linearised import Linearised, singular
-from sparsedp.packing import Packing
 from sparsedp.solvers.scaling import largest
 from sparsedp.solvers.scaling import length as length_of
-from sparsedp.tree import safe_unit
 
 __all__ = ["Direction", "Family", "form_of", "update_direction"]
 

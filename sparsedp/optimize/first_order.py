@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.fields import check_choice, check_number, is_number
+from sparsedp._utils.pytree import norm, power_of_two
+from sparsedp._utils.validation import check_choice, check_number, is_number
 from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.solvers.scaling import largest
-from sparsedp.tree import norm, power_of_two
 
 __all__ = ["Adam", "AdamState", "Descent", "DescentState"]
 

@@ -9,13 +9,13 @@ import numpy as np
 import scipy.linalg
 from scipy.sparse.linalg import LinearOperator, lsmr
 
-from sparsedp.fields import check_choice, check_number
+from sparsedp._utils.pytree import norm, power_of_two, safe_unit
+from sparsedp._utils.validation import check_choice, check_number
 from sparsedp.optimize.bounded_squares import BoundedProblem
 from sparsedp.optimize.directions import Family, form_of
 from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked
 from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.solvers.scaling import largest
-from sparsedp.tree import norm, power_of_two, safe_unit
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 

@@ -6,12 +6,12 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 
-from sparsedp.derivative import pullback, push
+from sparsedp._utils.pytree import leaves, mapped, power_of_two
+from sparsedp._utils.validation import EPS, check_finite
+from sparsedp.autodiff.derivative import pullback, push
+from sparsedp.autodiff.tape import is_variable
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import EPS, check_finite
 from sparsedp.solvers.scaling import largest
-from sparsedp.tape import is_variable
-from sparsedp.tree import leaves, mapped, power_of_two
 
 __all__ = ["Linearised", "singular"]
 

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsedp.fields import check_whole
+from sparsedp._utils.pytree import norm, power_of_two
+from sparsedp._utils.validation import check_whole
 from sparsedp.optimize.first_order import first_length
 from sparsedp.optimize.result import Trial
-from sparsedp.tree import norm, power_of_two
 
 __all__ = ["NewtonCG", "NewtonState"]
 

@@ -2,9 +2,9 @@
 
 import autograd.numpy as anp
 
-from sparsedp.fields import check_number, check_shape
+from sparsedp._utils.validation import check_number, check_shape
+from sparsedp.autodiff.tape import differentiable, plain
 from sparsedp.optimize.first_order import Descent
-from sparsedp.tape import differentiable, plain
 
 __all__ = ["PhysicalGradient", "physical_gradient"]
 
@@ -52,7 +52,7 @@ def physical_gradient(physics, inverse, rate=1.0, name="physical gradient"):
     Examples
     --------
     >>> cube = physical_gradient(lambda x: x**3, lambda y, x: anp.sign(y) * abs(y) ** (1 / 3))
-    >>> from sparsedp.derivative import value_and_grad
+    >>> from sparsedp.autodiff.derivative import value_and_grad
     >>> loss = lambda x: 0.5 * (cube(x) - 8.0) ** 2
     >>> value, update = value_and_grad(loss)(1.0)
     >>> round(1.0 - update, 12)  # x - update is the solution

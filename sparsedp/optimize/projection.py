@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sparsedp.derivative import vjp
-from sparsedp.tree import flatten, norm, paired
+from sparsedp._utils.pytree import flatten, norm, paired
+from sparsedp.autodiff.derivative import vjp
 
 __all__ = ["Projection"]
 

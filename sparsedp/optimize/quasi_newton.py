@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import LbfgsInvHessProduct
 
-from sparsedp.fields import check_whole
+from sparsedp._utils.pytree import norm, power_of_two
+from sparsedp._utils.validation import check_whole
 from sparsedp.optimize.first_order import first_length
 from sparsedp.optimize.result import Stuck, Trial
 from sparsedp.optimize.wolfe import line_search
-from sparsedp.tree import norm, power_of_two
 
 __all__ = ["Quasi", "QuasiState", "two_loops"]
 

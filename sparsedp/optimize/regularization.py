@@ -4,17 +4,17 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.fields import check_finite, check_kind, check_native, is_number
-from sparsedp.grid import check_grid
+from sparsedp._utils.pytree import power_of_two
+from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.validation import check_finite, check_kind, check_native, is_number
+from sparsedp.autodiff.fast_derivatives import ELSEWHERE
+from sparsedp.autodiff.tape import dtype_of, plain
+from sparsedp.autodiff.tape_constants import constant
+from sparsedp.grid.grid import check_grid
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.masks_and_lift import interior
-from sparsedp.recipe import Made
-from sparsedp.shortcuts import ELSEWHERE
 from sparsedp.solvers.scaling import largest
-from sparsedp.tape import dtype_of, plain
-from sparsedp.tape_constants import constant
-from sparsedp.tree import power_of_two
 
 __all__ = ["smoothness", "total_variation"]
 

@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp.markup import curves, facts
-from sparsedp.recipe import Frozen
+from sparsedp._utils.html import curves, facts
+from sparsedp._utils.reconstruction import Frozen
 
 __all__ = ["Failure", "Minimum", "Record", "Stuck", "Trial"]
 

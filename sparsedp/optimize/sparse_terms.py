@@ -18,11 +18,11 @@ from itertools import count, islice
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import pullback
-from sparsedp.fields import check_function, check_number, check_shape, check_whole
-from sparsedp.ledger import thread
+from sparsedp._utils.counters import thread
+from sparsedp._utils.pytree import flatten, norm, paired
+from sparsedp._utils.validation import check_function, check_number, check_shape, check_whole
+from sparsedp.autodiff.derivative import pullback
 from sparsedp.optimize.result import Minimum, Record
-from sparsedp.tree import flatten, norm, paired
 
 __all__ = ["admm"]
 

@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp.derivative import check_loss, judged, pullback, unwarned, value_and_grad
+from sparsedp._utils.pytree import norm, safe_unit
+from sparsedp.autodiff.derivative import check_loss, judged, pullback, unwarned, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.optimize.linearised import Linearised
 from sparsedp.optimize.result import NO_RESIDUALS, Failure, Stuck, Trial
 from sparsedp.solvers.cache import Cache
-from sparsedp.tree import norm, safe_unit
 
 __all__ = ["Trials"]
 

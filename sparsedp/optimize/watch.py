@@ -4,9 +4,9 @@ import time
 from math import inf
 from typing import Any
 
-from sparsedp.ledger import thread
+from sparsedp._utils.counters import thread
+from sparsedp._utils.pytree import norm
 from sparsedp.optimize.result import Minimum, Record
-from sparsedp.tree import norm
 
 __all__ = ["Watch"]
 

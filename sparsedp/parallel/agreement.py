@@ -23,10 +23,10 @@ from zlib import crc32
 import numpy as np
 from mpi4py import MPI
 
-from sparsedp.ledger import count
-from sparsedp.tape import plain
+from sparsedp._utils.counters import count
+from sparsedp._utils.pytree import labels, leaves
+from sparsedp.autodiff.tape import plain
 from sparsedp.trajectory.layout import folded
-from sparsedp.tree import labels, leaves
 
 __all__ = ["Agreement", "course", "end_all"]
 

@@ -13,15 +13,15 @@ from math import prod
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.grid.space import components
+from sparsedp.operators.structure.base import Matrix, Structure, Turning, rows_of
+from sparsedp.operators.structure.factor import Factor
+from sparsedp.operators.structure.kronecker import Kronecker, Term
+from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
 from sparsedp.parallel.exchange import Exchange, of_boxes
 from sparsedp.parallel.partition import lengths, slices
 from sparsedp.solvers.choose_method import Solution
 from sparsedp.solvers.nullspace import Projector
-from sparsedp.space import components
-from sparsedp.structure.base import Matrix, Structure, Turning, rows_of
-from sparsedp.structure.factor import Factor
-from sparsedp.structure.kronecker import Kronecker, Term
-from sparsedp.structure.lazy import Chain, Diagonal, Mask, Sum
 
 __all__ = ["Columns", "OwnRows", "Rows", "localized", "reads"]
 

@@ -6,10 +6,10 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from sparsedp import results
-from sparsedp.ledger import count
+from sparsedp._utils import buffers
+from sparsedp._utils.counters import count
+from sparsedp.operators.structure.kronecker import components
 from sparsedp.parallel.partition import lengths, slices
-from sparsedp.structure.kronecker import components
 
 __all__ = ["Exchange", "hold", "of_boxes"]
 
@@ -93,7 +93,7 @@ def _copied(flat, given, made):
     pieces = [part[window] for part, window in zip(components(flat, shapes), windows)]
     if len(pieces) == 1 and pieces[0].size == size and pieces[0].flags.c_contiguous:
         return pieces[0].reshape(-1)
-    out = results.empty((size,), flat.dtype)
+    out = buffers.empty((size,), flat.dtype)
     if sum(piece.size for piece in pieces) < size:
         out[:] = 0
     for piece, part, place in zip(pieces, components(out, others), places):

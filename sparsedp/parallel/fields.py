@@ -12,11 +12,11 @@ from operator import attrgetter
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.pytree import leaves
+from sparsedp.autodiff.fast_derivatives import BOX, ELSEWHERE
+from sparsedp.autodiff.tape import VSpace, autograd_rules, isbox, linear, plain
 from sparsedp.errors import ShapeError
 from sparsedp.parallel.agreement import course
-from sparsedp.shortcuts import BOX, ELSEWHERE
-from sparsedp.tape import VSpace, autograd_rules, isbox, linear, plain
-from sparsedp.tree import leaves
 
 __all__ = ["DistributedField", "alike", "block", "everywhere", "total"]
 

@@ -5,9 +5,11 @@ from operator import add
 
 import numpy as np
 
+from sparsedp._utils.validation import field_array
+from sparsedp.autodiff.tape import linear, plain
 from sparsedp.errors import ShapeError
-from sparsedp.fields import field_array
-from sparsedp.grid import node_axes
+from sparsedp.grid.grid import node_axes
+from sparsedp.grid.space import Space
 from sparsedp.parallel.cut import localized
 from sparsedp.parallel.exchange import hold
 from sparsedp.parallel.fields import DistributedField, block, everywhere
@@ -15,8 +17,6 @@ from sparsedp.parallel.partition import Partition
 from sparsedp.parallel.solve import RanksSystem
 from sparsedp.parallel.stencil import stencil_of
 from sparsedp.parallel.transport import Carry
-from sparsedp.space import Space
-from sparsedp.tape import linear, plain
 
 __all__ = ["Layout"]
 

@@ -12,8 +12,8 @@ from math import prod
 
 import numpy as np
 
+from sparsedp.operators.structure.kronecker import components
 from sparsedp.parallel.agreement import Agreement
-from sparsedp.structure.kronecker import components
 
 __all__ = ["Partition"]
 

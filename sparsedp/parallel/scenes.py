@@ -12,14 +12,14 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.calls import public
-from sparsedp.derivative import check_loss, grad, jvp, unwarned, value_and_grad, zero_like
-from sparsedp.fields import check_finite, check_function, check_leaves, check_shape, check_whole, is_whole
-from sparsedp.progress import shown_steps
-from sparsedp.recipe import Remade
-from sparsedp.tape import Rule, isbox
-from sparsedp.tape_constants import frozen
-from sparsedp.tree import copied, flatten, leaves, mapped, placed
+from sparsedp._utils.calls import public
+from sparsedp._utils.progress import shown_steps
+from sparsedp._utils.pytree import copied, flatten, leaves, mapped, placed
+from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.validation import check_finite, check_function, check_leaves, check_shape, check_whole, is_whole
+from sparsedp.autodiff.derivative import check_loss, grad, jvp, unwarned, value_and_grad, zero_like
+from sparsedp.autodiff.tape import Rule, isbox
+from sparsedp.autodiff.tape_constants import frozen
 
 __all__ = ["Ensemble", "ensemble"]
 

@@ -6,17 +6,17 @@ The unknowns are a vector of PETSc: of a field its blocks, of what every rank kn
 import numpy as np
 from petsc4py import PETSc
 
-from sparsedp.derivative import unwarned, value_and_grad
-from sparsedp.fields import check_finite
+from sparsedp._utils.pytree import labels, leaves, mapped
+from sparsedp._utils.validation import check_finite
+from sparsedp.autodiff.derivative import unwarned, value_and_grad
+from sparsedp.autodiff.flattening import FINITE, Packing
+from sparsedp.autodiff.tape import is_variable
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.result import Trial
 from sparsedp.optimize.trials import Trials
 from sparsedp.optimize.watch import Watch
-from sparsedp.packing import FINITE, Packing
 from sparsedp.parallel.fields import DistributedField
-from sparsedp.tape import is_variable
-from sparsedp.tree import labels, leaves, mapped
 
 __all__ = ["minimized"]
 

@@ -10,11 +10,11 @@ from sysconfig import get_path
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.boundary_conditions import dirichlet
-from sparsedp.derivative import value_and_grad
-from sparsedp.grid import Grid
+from sparsedp.autodiff.derivative import value_and_grad
+from sparsedp.grid.boundary_conditions import dirichlet
+from sparsedp.grid.grid import Grid
 from sparsedp.operators.difference import laplacian
-from sparsedp.parallel.front import distribute
+from sparsedp.parallel.distribute import distribute
 from sparsedp.solvers.choose_method import inverse
 
 __all__ = ["report"]

@@ -13,12 +13,12 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 from scipy.sparse.csgraph import connected_components
 
+from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
 from sparsedp.parallel.cut import Rows
 from sparsedp.parallel.fields import DistributedField
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.solve import Engine
 from sparsedp.solvers.system import System
-from sparsedp.structure.lazy import Chain, Diagonal, Mask, Sum
 
 __all__ = ["PetscEngine", "RanksSystem"]
 

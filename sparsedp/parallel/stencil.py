@@ -12,12 +12,12 @@ from itertools import product as combinations
 
 import numpy as np
 
-from sparsedp.operator import Operator
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.base import Matrix
 from sparsedp.parallel.cut import Columns, OwnRows, Rows, reads
 from sparsedp.parallel.fields import DistributedField
 from sparsedp.parallel.partition import lengths
 from sparsedp.solvers.sparsity import WIDEST, Coloured, entries_at, lattice, pattern_of, places, probes, steps_to
-from sparsedp.structure.base import Matrix
 
 __all__ = ["Stencil", "stencil_of"]
 

@@ -14,18 +14,18 @@ from math import floor, isfinite, prod
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
-from sparsedp.advection.front import Transport
 from sparsedp.advection.law import wall_space
 from sparsedp.advection.stability import check_numbers, check_weights
+from sparsedp.advection.transport import Transport
 from sparsedp.advection.values import check_given, check_step
-from sparsedp.boundary_conditions import neumann
+from sparsedp.autodiff.tape import Rule, isbox, linear, plain
 from sparsedp.errors import NonFiniteError, UnstableStepError
-from sparsedp.grid import Grid
+from sparsedp.grid.boundary_conditions import neumann
+from sparsedp.grid.grid import Grid
+from sparsedp.grid.space import Space, components
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.parallel.exchange import of_boxes
 from sparsedp.parallel.fields import DistributedField, block
-from sparsedp.space import Space, components
-from sparsedp.tape import Rule, isbox, linear, plain
 
 __all__ = ["Carry"]
 

@@ -1,6 +1,6 @@
 """Side room: pictures, certificates, measurements, and the demo.
 
-plan.py              explain: what one gradient computes, and the work that was skipped
+explain.py           explain: what one gradient computes, and the work that was skipped
 certificate.py       certify, certified: the error that solves leave, from recorded solves
 work_precision.py    workprec: error against run time
 stress_table.py      stress: one word for each extreme case
@@ -13,7 +13,7 @@ demo/                the command `demo`
 It may import every floor; only __main__ and the shop window open it.
 """
 
-from sparsedp.calls import describe_module
+from sparsedp._utils.calls import describe_module
 from sparsedp.report.plots import animate, convergence, plot, v_curve
 
 __all__ = ["animate", "convergence", "plot", "v_curve"]

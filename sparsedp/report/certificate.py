@@ -18,14 +18,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.counters import recording, thread
+from sparsedp._utils.pytree import leaves, norm, paired
+from sparsedp._utils.validation import check_number, is_number
+from sparsedp.autodiff.derivative import unwarned, value_and_grad
 from sparsedp.check.summary import Result
 from sparsedp.check.table import table_of
-from sparsedp.derivative import unwarned, value_and_grad
-from sparsedp.fields import check_number, is_number
-from sparsedp.ledger import recording, thread
-from sparsedp.report.plan import total
+from sparsedp.report.explain import total
 from sparsedp.solvers.scaling import length
-from sparsedp.tree import leaves, norm, paired
 
 __all__ = ["Certificate", "Certified", "certified", "certify", "distance"]
 

@@ -2,7 +2,7 @@
 
 import base64
 
-from sparsedp.markup import cell, curves, folded
+from sparsedp._utils.html import cell, curves, folded
 
 __all__ = ["page", "section"]
 

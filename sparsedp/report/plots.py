@@ -7,13 +7,13 @@ from importlib import import_module
 
 import numpy as np
 
+from sparsedp._utils.validation import check_choice, check_kind, check_type
+from sparsedp.autodiff.tape import plain
 from sparsedp.check.audit import Audit
 from sparsedp.errors import ShapeError
-from sparsedp.fields import check_choice, check_kind, check_type
-from sparsedp.files import write_file
-from sparsedp.grid import check_grid
+from sparsedp.grid.grid import check_grid
+from sparsedp.io.atomic_files import write_file
 from sparsedp.optimize.result import Minimum
-from sparsedp.tape import plain
 
 __all__ = [
     "animate", "convergence", "current", "curves", "figure", "opened", "plot", "sample_data", "stability_chart",

@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 
 from sparsedp import check
 from sparsedp.check.summary import Result, error_text
-from sparsedp.files import write_file
+from sparsedp.io.atomic_files import write_file
 from sparsedp.report import plots
 from sparsedp.report.certificate import certify
+from sparsedp.report.explain import explain
 from sparsedp.report.html_page import page, section
-from sparsedp.report.plan import explain
 from sparsedp.report.stress_table import stress
 from sparsedp.report.work_precision import workprec
 

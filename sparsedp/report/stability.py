@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.counters import thread
+from sparsedp._utils.pytree import mapped, norm
+from sparsedp.autodiff.derivative import jvp
 from sparsedp.check.summary import Result
 from sparsedp.check.sweep import Point
 from sparsedp.check.table import Table
-from sparsedp.derivative import jvp
 from sparsedp.errors import SparsedpError
-from sparsedp.ledger import thread
-from sparsedp.tree import mapped, norm
 
 __all__ = ["SEED", "STEADY", "Growth", "StabilityMap", "growth_of", "stability_map"]
 

@@ -10,18 +10,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.counters import thread
+from sparsedp._utils.pytree import copied, leaves, norm
+from sparsedp._utils.validation import EPS
+from sparsedp.autodiff.derivative import value_and_grad
 from sparsedp.check.audit import look_beside
 from sparsedp.check.judge import NEGLIGIBLE, looked_at, verdict
 from sparsedp.check.operators import layouts
 from sparsedp.check.summary import error_text
 from sparsedp.check.sweep import Line, Point, Trials, generator, rms
-from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
-from sparsedp.fields import EPS
-from sparsedp.ledger import thread
 from sparsedp.report.certificate import distance
 from sparsedp.report.stability import SEED, STEADY, growth_of
-from sparsedp.tree import copied, leaves, norm
 
 __all__ = ["FAILED", "GROUPS", "WORDS", "Scene", "cases", "run"]
 

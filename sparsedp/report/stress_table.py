@@ -4,10 +4,10 @@ import warnings
 
 import numpy as np
 
+from sparsedp._utils.validation import check_choice, check_function
+from sparsedp.autodiff.derivative import unwarned
 from sparsedp.check.summary import Result
 from sparsedp.check.table import table_of
-from sparsedp.derivative import unwarned
-from sparsedp.fields import check_choice, check_function
 from sparsedp.report import plots
 from sparsedp.report.stability import stability_map
 from sparsedp.report.stress_cases import FAILED, GROUPS, WORDS, Scene, cases

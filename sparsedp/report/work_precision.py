@@ -16,18 +16,18 @@ from timeit import repeat, timeit
 
 import numpy as np
 
+from sparsedp._utils.counters import recording
+from sparsedp._utils.pytree import leaves
+from sparsedp._utils.validation import check_function, check_whole
+from sparsedp.autodiff.derivative import value_and_grad
+from sparsedp.autodiff.fast_derivatives import ranks
 from sparsedp.check.summary import Result
 from sparsedp.check.table import table_of
-from sparsedp.derivative import value_and_grad
 from sparsedp.errors import SparsedpError
-from sparsedp.fields import check_function, check_whole
-from sparsedp.files import path_errors, write_file
-from sparsedp.ledger import recording
+from sparsedp.io.atomic_files import path_errors, write_file
 from sparsedp.report import plots
 from sparsedp.report.certificate import distance
-from sparsedp.report.plan import total
-from sparsedp.shortcuts import ranks
-from sparsedp.tree import leaves
+from sparsedp.report.explain import total
 
 __all__ = ["COLUMNS", "Rows", "workprec"]
 

@@ -12,10 +12,10 @@ from functools import partial
 
 import numpy as np
 
-from sparsedp.derivative import of_argument, push
-from sparsedp.fields import check_finite
-from sparsedp.tape import Rule, plain
-from sparsedp.tree import placed
+from sparsedp._utils.pytree import placed
+from sparsedp._utils.validation import check_finite
+from sparsedp.autodiff.derivative import of_argument, push
+from sparsedp.autodiff.tape import Rule, plain
 
 __all__ = ["solve_rule", "vary"]
 

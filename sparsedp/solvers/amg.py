@@ -14,8 +14,8 @@ import scipy.linalg as la
 from scipy.sparse import csr_array, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from sparsedp._utils.validation import check_choice, check_number, check_whole
 from sparsedp.errors import ConvergenceError
-from sparsedp.fields import check_choice, check_number, check_whole
 from sparsedp.solvers.krylov import Krylov
 from sparsedp.solvers.scaling import exponent_of
 from sparsedp.solvers.solve import failure

@@ -8,9 +8,11 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.calls import advice_near, public
-from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
-from sparsedp.fields import (
+from sparsedp._utils.calls import advice_near, public
+from sparsedp._utils.counters import count, spent
+from sparsedp._utils.html import facts
+from sparsedp._utils.pytree import copied
+from sparsedp._utils.validation import (
     check_choice,
     check_finite,
     check_native,
@@ -19,11 +21,13 @@ from sparsedp.fields import (
     check_whole,
     field_array,
 )
-from sparsedp.ledger import count, spent
-from sparsedp.markup import facts
-from sparsedp.operator import Operator
+from sparsedp.autodiff.fast_derivatives import together
+from sparsedp.autodiff.tape import plain
+from sparsedp.errors import ConvergenceError, NonFiniteError, ShapeError
+from sparsedp.grid.space import fits
 from sparsedp.operators.given import check_operator
-from sparsedp.shortcuts import together
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.base import Structure
 from sparsedp.solvers.amg import check_multigrid_options, multigrid_engine
 from sparsedp.solvers.direct import DenseSystem, check_precision, dense_engine, direct_engine
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
@@ -31,10 +35,6 @@ from sparsedp.solvers.preconditioners import Near, krylov_engine
 from sparsedp.solvers.separable import eigenbasis, separable_engine, transforming
 from sparsedp.solvers.solve import EmptySystem, SolveLog, Solver, failure, merged
 from sparsedp.solvers.system import System
-from sparsedp.space import fits
-from sparsedp.structure.base import Structure
-from sparsedp.tape import plain
-from sparsedp.tree import copied
 
 __all__ = ["Inverse", "METHODS", "build", "build_dense", "check_settings", "inverse"]
 
@@ -465,7 +465,7 @@ class Inverse(Operator):
         return Inverse(structure)
 
     def recipe(self):
-        """The call that makes it again: see recipe.py."""
+        """The call that makes it again: see _utils/reconstruction.py."""
         return Inverse, (self.structure,)
 
     @property

@@ -16,14 +16,14 @@ import scipy.linalg as la
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
+from sparsedp._utils.validation import check_choice
 from sparsedp.errors import ConvergenceError
-from sparsedp.fields import check_choice
+from sparsedp.operators.structure.base import probes
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import exponent_of, in_range, largest, norm, shifted
 from sparsedp.solvers.solve import Engine, failure
 from sparsedp.solvers.substitution import BlockFactors
 from sparsedp.solvers.system import System
-from sparsedp.structure.base import probes
 
 __all__ = ["DENSE_UP_TO", "DenseSystem", "check_precision", "dense_engine", "dense_lu", "direct_engine"]
 

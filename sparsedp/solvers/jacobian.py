@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.derivative import NO_JVP, pushforward
+from sparsedp._utils.counters import count, recording
+from sparsedp._utils.pytree import copied, norm
+from sparsedp._utils.validation import check_kind, check_shape
+from sparsedp.autodiff.derivative import NO_JVP, pushforward
+from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import ConvergenceError, DerivativeError
-from sparsedp.fields import check_kind, check_shape
-from sparsedp.ledger import count, recording
-from sparsedp.operator import Operator
+from sparsedp.grid.space import Space
 from sparsedp.operators.given import from_functions, from_matrix
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.base import rows_of
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose_method import Inverse, Solution, build, build_dense
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.solve import failure
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
-from sparsedp.space import Space
-from sparsedp.structure.base import rows_of
-from sparsedp.tape import isbox
-from sparsedp.tree import copied, norm
 
 __all__ = ["Jacobians", "Linearisation"]
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
 
+from sparsedp.autodiff.tape import plain
+from sparsedp.operators.structure.base import probes
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import dot, norm
 from sparsedp.solvers.solve import Engine
-from sparsedp.structure.base import probes
-from sparsedp.tape import plain
 
 __all__ = ["Krylov"]
 

@@ -34,18 +34,18 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import pullback, push
+from sparsedp._utils.counters import note
+from sparsedp._utils.pytree import flatten, keys, leaves, paired, placed
+from sparsedp._utils.validation import check_finite, check_leaves, check_plain, check_precision, number_beside
+from sparsedp.autodiff.derivative import pullback, push
+from sparsedp.autodiff.fast_derivatives import array, elsewhere, on_every_rank
+from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, plain
+from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.fields import check_finite, check_leaves, check_plain, check_precision, number_beside
-from sparsedp.ledger import note
-from sparsedp.shortcuts import array, elsewhere, on_every_rank
+from sparsedp.grid.space import Space
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import length
-from sparsedp.space import Space
-from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain
-from sparsedp.tape_constants import constant
-from sparsedp.tree import flatten, keys, leaves, paired, placed
 
 __all__ = ["Equation", "Layout", "Newton"]
 

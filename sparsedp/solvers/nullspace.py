@@ -11,9 +11,9 @@ import numpy as np
 from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 
-from sparsedp.fields import EPS
+from sparsedp._utils.validation import EPS
+from sparsedp.operators.structure.base import Turning
 from sparsedp.solvers.scaling import dot, norm
-from sparsedp.structure.base import Turning
 
 __all__ = ["NullSpace", "Projector", "find_null_space"]
 

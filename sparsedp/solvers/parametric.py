@@ -15,26 +15,26 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.calls import public
-from sparsedp.derivative import of_argument
+from sparsedp._utils.calls import public
+from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.validation import check_finite, check_kind, check_plain, check_shape, check_type
+from sparsedp.autodiff.derivative import of_argument
+from sparsedp.autodiff.fast_derivatives import array, in_dtype, whole
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, plain
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_kind, check_plain, check_shape, check_type
-from sparsedp.operator import Operator
+from sparsedp.grid.space import Space, fits
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.masks_and_lift import identity
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.base import Matrix, compact, rows_of
+from sparsedp.operators.structure.lazy import Chain, Diagonal, Sum
 from sparsedp.operators.tensor import check_tensor, corners
-from sparsedp.recipe import Remade
-from sparsedp.shortcuts import array, in_dtype, whole
 from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.choose_method import build, check_settings
 from sparsedp.solvers.scaling import exponent_of, shifted
 from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.sparsity import pattern_like
-from sparsedp.space import Space, fits
-from sparsedp.structure.base import Matrix, compact, rows_of
-from sparsedp.structure.lazy import Chain, Diagonal, Sum
-from sparsedp.tape import cast, dtype_of, isbox, plain
 
 __all__ = ["Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]
 
@@ -180,7 +180,7 @@ class EllipticSolver(ParametricSolver):
     name = "elliptic_solver"
 
     def recipe(self):
-        """The call that makes it again: see recipe.py."""
+        """The call that makes it again: see _utils/reconstruction.py."""
         return EllipticSolver, (self.D, self.G, self._settings)  # what is cached is set up again
 
     @public("dp.elliptic_solver(D, G)")
@@ -483,7 +483,7 @@ class MatrixSolver(ParametricSolver):
         super().__init__(self._picking(self.rows, -1.0).T, self._picking(self.columns, 1.0), settings)
 
     def recipe(self):
-        """The call that makes it again: see recipe.py."""
+        """The call that makes it again: see _utils/reconstruction.py."""
         return MatrixSolver, (self._pattern, self.domain, self._settings, self.assembly)
 
     def _picking(self, place, sign):

@@ -12,21 +12,21 @@ from threading import get_ident
 
 import numpy as np
 
-from sparsedp.calls import public
-from sparsedp.derivative import pullback, push
+from sparsedp._utils.calls import public
+from sparsedp._utils.counters import note, thread
+from sparsedp._utils.pytree import mapped, power_of_two
+from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.validation import check_function, check_takes, check_whole
+from sparsedp.autodiff.derivative import pullback, push
+from sparsedp.autodiff.fast_derivatives import on_every_rank, together
+from sparsedp.autodiff.tape import Rule, plain
 from sparsedp.errors import DerivativeError
-from sparsedp.fields import check_function, check_takes, check_whole
-from sparsedp.ledger import note, thread
-from sparsedp.recipe import Remade
-from sparsedp.shortcuts import on_every_rank, together
 from sparsedp.solvers.adjoint import solve_rule, vary
 from sparsedp.solvers.choose_method import check_settings
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation, Layout, Newton
 from sparsedp.solvers.scaling import largest, length
 from sparsedp.solvers.solve import Run, SolveLog
-from sparsedp.tape import Rule, plain
-from sparsedp.tree import mapped, power_of_two
 
 __all__ = ["Root", "implicit", "steady"]
 
@@ -192,7 +192,7 @@ class Root(Remade):
         self._solution = Rule(self.name, self._newton, self._vjp, self._jvp)
 
     def recipe(self):
-        """The call that makes it again: see recipe.py."""
+        """The call that makes it again: see _utils/reconstruction.py."""
         given, sparsity = self._jacobians.given, self._jacobians.sparsity
         return Root, (self.residual, given, sparsity, self.maxiter, self._settings)
 

@@ -6,8 +6,8 @@ does not wake its threads for so few numbers: they would stall those of compiled
 
 import numpy as np
 
-from sparsedp.fields import BLOCK
-from sparsedp.shortcuts import ELSEWHERE
+from sparsedp._utils.validation import BLOCK
+from sparsedp.autodiff.fast_derivatives import ELSEWHERE
 
 __all__ = [
     "dot",

@@ -23,14 +23,14 @@ import scipy.fft as fft
 import scipy.linalg
 
 from sparsedp import kernels
-from sparsedp.fields import EPS, check_type
-from sparsedp.operator import Operator
+from sparsedp._utils.validation import EPS, check_type
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.base import Turning
+from sparsedp.operators.structure.kronecker import Kronecker
+from sparsedp.operators.structure.lazy import Chain, Diagonal, Sum
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import inverted
 from sparsedp.solvers.solve import Engine
-from sparsedp.structure.base import Turning
-from sparsedp.structure.kronecker import Kronecker
-from sparsedp.structure.lazy import Chain, Diagonal, Sum
 
 __all__ = [
     "Separable",

@@ -40,14 +40,14 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.counters import count, thread, timed
+from sparsedp._utils.html import facts, table
+from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.validation import EPS, check_finite, number_beside, place
+from sparsedp.autodiff.tape import plain
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
-from sparsedp.fields import EPS, check_finite, number_beside, place
-from sparsedp.ledger import count, thread, timed
-from sparsedp.markup import facts, table
-from sparsedp.recipe import Remade
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import exponent_of, in_range, norm, shifted
-from sparsedp.tape import plain
 
 __all__ = ["STATUS_WORDS", "Engine", "Run", "SolveInfo", "SolveLog", "Solver", "failure", "merged"]
 

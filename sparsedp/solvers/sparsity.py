@@ -31,8 +31,8 @@ from math import prod
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.operators.structure.base import rows_of
 from sparsedp.solvers.amg import coloured_graph
-from sparsedp.structure.base import rows_of
 
 __all__ = [
     "WIDEST", "Coloured", "colour", "dense_pattern", "entries_at", "find_pattern", "lattice", "pattern_like",

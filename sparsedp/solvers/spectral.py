@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sparsedp.fields import check_finite, check_function, check_kind, check_number, check_shape
-from sparsedp.operator import Operator
+from sparsedp._utils.validation import check_finite, check_function, check_kind, check_number, check_shape
+from sparsedp.operators.operator import Operator
 from sparsedp.solvers.separable import SpectralFunction, diagonalised
 
 __all__ = ["exponential", "function", "power"]

@@ -29,10 +29,10 @@ from scipy.sparse.linalg import splu
 
 from sparsedp import kernels
 from sparsedp.errors import ConvergenceError
+from sparsedp.operators.structure.base import probes, rows_of
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import norm, shifted
 from sparsedp.solvers.solve import Engine, failure
-from sparsedp.structure.base import probes, rows_of
 
 __all__ = [
     "SMALL_BLOCK",

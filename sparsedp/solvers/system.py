@@ -7,15 +7,15 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
+from sparsedp._utils.validation import EPS
 from sparsedp.errors import NonFiniteError
-from sparsedp.fields import EPS
-from sparsedp.grid import Grid
-from sparsedp.operator import Operator
+from sparsedp.grid.grid import Grid
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.base import Matrix
+from sparsedp.operators.structure.kronecker import Kronecker
+from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
 from sparsedp.solvers.nullspace import NullSpace, find_null_space
 from sparsedp.solvers.scaling import exponent_of, largest, norm, remainder
-from sparsedp.structure.base import Matrix
-from sparsedp.structure.kronecker import Kronecker
-from sparsedp.structure.lazy import Chain, Diagonal, Mask, Sum
 
 __all__ = ["System"]
 

@@ -1,9 +1,9 @@
 """The backward pass over all steps of a loop."""
 
-from sparsedp.derivative import zero_like
-from sparsedp.ledger import count
-from sparsedp.progress import shown_steps
-from sparsedp.tape import backward, fit
+from sparsedp._utils.counters import count
+from sparsedp._utils.progress import shown_steps
+from sparsedp.autodiff.derivative import zero_like
+from sparsedp.autodiff.tape import backward, fit
 from sparsedp.trajectory.layout import refuse_lost, stacked
 from sparsedp.trajectory.memory_budget import stride
 from sparsedp.trajectory.record import growth, largest

@@ -6,13 +6,13 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.derivative import is_finite
+from sparsedp._utils.pytree import described, flatten, keys, labels, leaves, paired
+from sparsedp._utils.validation import check_finite, check_leaves, check_native, hidden_leaves
+from sparsedp.autodiff.derivative import is_finite
+from sparsedp.autodiff.fast_derivatives import ELSEWHERE, array
+from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
+from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.fields import check_finite, check_leaves, check_native, hidden_leaves
-from sparsedp.shortcuts import ELSEWHERE, array
-from sparsedp.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
-from sparsedp.tape_constants import constant
-from sparsedp.tree import described, flatten, keys, labels, leaves, paired
 
 __all__ = [
     "Layout", "dense", "fingerprint", "folded", "owned", "refuse_lost", "refuse_mask", "stacked",

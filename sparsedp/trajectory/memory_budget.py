@@ -17,7 +17,7 @@ import re
 from bisect import bisect_left
 from math import comb
 
-from sparsedp.fields import is_number
+from sparsedp._utils.validation import is_number
 
 __all__ = [
     "advances",

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.counters import thread
+from sparsedp.autodiff.tape import plain
 from sparsedp.errors import GrowthWarning
-from sparsedp.ledger import thread
-from sparsedp.tape import plain
 
 __all__ = ["APART", "Record", "SAMPLES", "growth", "largest"]
 

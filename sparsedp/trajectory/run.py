@@ -10,11 +10,11 @@ from operator import is_
 
 import numpy as np
 
-from sparsedp.derivative import is_finite, judged, zero_like
+from sparsedp._utils.counters import count
+from sparsedp._utils.progress import shown_steps
+from sparsedp.autodiff.derivative import is_finite, judged, zero_like
+from sparsedp.autodiff.tape import Rule, innermost, through
 from sparsedp.errors import DerivativeError, NonFiniteError
-from sparsedp.ledger import count
-from sparsedp.progress import shown_steps
-from sparsedp.tape import Rule, innermost, through
 from sparsedp.trajectory.backward_pass import go_back
 from sparsedp.trajectory.memory_budget import checkpoints
 from sparsedp.trajectory.record import APART, SAMPLES, Record

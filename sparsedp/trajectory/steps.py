@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from sparsedp._utils.pytree import copied, flatten, leaves
+from sparsedp._utils.validation import advise
+from sparsedp.autodiff.tape import Recorder, boxed, dtype_of, isbox, new_trace, plain, traces_of, untaped_root
+from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
-from sparsedp.fields import advise
-from sparsedp.tape import Recorder, boxed, dtype_of, isbox, new_trace, plain, traces_of, untaped_root
-from sparsedp.tape_constants import frozen
 from sparsedp.trajectory.layout import fingerprint, owned
 from sparsedp.trajectory.record import largest
-from sparsedp.tree import copied, flatten, leaves
 
 __all__ = ["State", "Steps"]
 

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from mpi4py.futures import MPICommExecutor
 
 import sparsedp as dp
-from sparsedp.tree import leaves
+from sparsedp._utils.pytree import leaves
 
 GRID = dp.Grid((6, 5), size=1.0)
 SOLVE = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))

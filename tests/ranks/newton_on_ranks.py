@@ -14,9 +14,9 @@ import numpy as np
 from flow_on_ranks import COMM, close, derivatives, lying, on_both, refused
 
 import sparsedp as dp
+from sparsedp.autodiff.tape import plain
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation, Layout
-from sparsedp.tape import plain
 
 PLAIN = dp.Grid((9, 8), size=(1.0, 2.0))
 GRIDS = [

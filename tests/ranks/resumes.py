@@ -14,8 +14,8 @@ import numpy as np
 from mpi4py import MPI
 
 import sparsedp as dp
+from sparsedp._utils.pytree import leaves
 from sparsedp.optimize import checkpoint
-from sparsedp.tree import leaves
 
 checkpoint.SHARE = np.inf  # every state is written down
 COMM = MPI.COMM_WORLD

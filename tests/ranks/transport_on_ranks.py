@@ -12,7 +12,7 @@ from fields_on_ranks import close
 from mpi4py import MPI
 
 import sparsedp as dp
-from sparsedp.ledger import recording
+from sparsedp._utils.counters import recording
 
 COMM = MPI.COMM_WORLD
 LINE = dp.Grid(13, spacing=0.5, periodic=True)

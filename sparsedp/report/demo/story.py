@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 import sparsedp as dp
+from sparsedp._utils.counters import recording
 from sparsedp.check.table import table_of
-from sparsedp.files import write_file
-from sparsedp.ledger import recording
+from sparsedp.io.atomic_files import write_file
 from sparsedp.report import plots
 from sparsedp.report.certificate import distance
 from sparsedp.report.demo.scene import NOISE, Ground, Survey, objective, regulariser, survey
 from sparsedp.report.demo.terrain import Terrain, hidden_ground, remap
-from sparsedp.report.plan import total
+from sparsedp.report.explain import total
 from sparsedp.report.scene_report import claim
 
 __all__ = ["FILES", "Study", "grids_for", "prepare", "tell"]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import sparsedp as dp
-from sparsedp.fields import check_finite
+from sparsedp._utils.validation import check_finite
 from sparsedp.report import plots
 from sparsedp.report.demo.scene import centres_of
 

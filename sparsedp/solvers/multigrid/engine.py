@@ -11,7 +11,7 @@ import threading
 import numpy as np
 
 from sparsedp import kernels
-from sparsedp.fields import EPS
+from sparsedp._utils.validation import EPS
 from sparsedp.solvers.direct import check_precision
 from sparsedp.solvers.multigrid.stencil import Unfit, components, stencil_of
 from sparsedp.solvers.nullspace import NullSpace

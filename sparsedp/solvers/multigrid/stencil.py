@@ -6,9 +6,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sparsedp.fields import EPS
+from sparsedp._utils.validation import EPS
+from sparsedp.operators.structure.base import Matrix
 from sparsedp.solvers.scaling import exponent_of
-from sparsedp.structure.base import Matrix
 
 __all__ = ["Stencil", "Unfit", "components", "faces_of", "stencil_of"]
 

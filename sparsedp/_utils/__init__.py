@@ -1,0 +1,1 @@
+"""Utilities without physics: argument validation, pytrees, counters, buffers, HTML, progress."""

@@ -1,0 +1,288 @@
+"""Calls of public functions: advice for calls that do not fit the signature, and tracebacks without internal frames.
+
+``SPARSEDP_TRACEBACK=full`` in the environment keeps every frame.
+"""
+
+import os
+import sys
+from difflib import get_close_matches
+from functools import wraps
+from inspect import Parameter, signature
+from pathlib import Path
+from types import FunctionType, ModuleType, TracebackType
+from typing import Any
+
+__all__ = [
+    "advice_near",
+    "describe_module",
+    "foreign_keyword_advice",
+    "frames_inside",
+    "nearest",
+    "public",
+    "public_name",
+    "shortened",
+]
+
+PACKAGE = Path(__file__).parent.parent
+# Packages whose frames stand between a user's call and the error: the library, and what runs its code.
+HIDDEN = ("sparsedp", "autograd", "functools", "contextlib", "scipy", "pyamg")
+# Keyword arguments of other libraries: what to write instead, by the first of these parameters that a function has.
+FOREIGN_KEYWORDS = {
+    "args": {"batches": "loss=lambda x: loss(x, *args)"},
+    "argnums": {"argnum": "argnum=..."},
+    "bc": {"boundary": "boundary=..."},
+    "bcs": {"boundary": "boundary=..."},
+    "boundaries": {"boundary": "boundary=..."},
+    "boundary_conditions": {"boundary": "boundary=..."},
+    "constraints": {"bounds": "bounds=(lower, upper), project= for linear equations, or a penalty added to the loss"},
+    "epochs": {"maxiter": "maxiter=..."},
+    "fun": {"loss": "loss=...", "fun": "fun=..."},
+    "grad": {"gradient": "gradient=function, or omit it: it is computed in reverse mode"},
+    "hess": {"batches": "method='newton_cg', which computes products with the Hessian"},
+    "hessp": {"batches": "method='newton_cg', which computes products with the Hessian"},
+    "iterations": {"maxiter": "maxiter=..."},
+    "jac": {
+        "gradient": "gradient=function, or omit it: it is computed in reverse mode",
+        "jacobian": "jacobian=...",
+    },
+    "learning_rate": {"batches": "method='adam', rate=..."},
+    "lr": {"batches": "method='adam', rate=..."},
+    "max_iter": {"maxiter": "maxiter=..."},
+    "max_iterations": {"maxiter": "maxiter=..."},
+    "max_workers": {"executor": "executor=..."},
+    "n_iter": {"maxiter": "maxiter=..."},
+    "n_jobs": {"executor": "executor=..."},
+    "n_steps": {"n": "n=..."},
+    "num_steps": {"n": "n=..."},
+    "optimizer": {"batches": "method='adam'"},
+    "options": {"batches": "the options themselves as keyword arguments, as in memory=20"},
+    "order": {"scheme": "scheme=...", "method": "method=..."},
+    "parameters": {"params": "params=..."},
+    "solver": {"method": "method=..."},
+    "steps": {"n": "n=...", "maxiter": "maxiter=..."},
+    "timestep": {"dt": "dt=..."},
+    "tol": {"tolerance": "tolerance=...", "rtol": "rtol=..."},
+    "u0": {"start": "start=..."},
+    "workers": {"executor": "executor=..."},
+    "x0": {"start": "start=...", "guess": "guess=...", "x": "x=..."},
+}
+# What to write for calls that need more explanation than a list of their required parameters.
+EXAMPLES = {
+    "dp.ensemble": "dp.ensemble(loss, scenes), and executor=concurrent.futures.ProcessPoolExecutor(2) for processes",
+    "dp.hvp": "dp.hvp(loss, x, tangent)",
+    "dp.rollout": "dp.rollout(step, start, params, n), with params=None if the step has none",
+    "dp.save": "dp.save('run.npz', grid, u=u)",
+    "dp.stepper": "dp.stepper('rk4', rate, dt)",
+}
+
+
+def nearest(word, words):
+    """Return the one of some words that is most similar to a word which is none of them; None if none is similar."""
+    word = str(word).lower()
+    similar = [one for one in words if word and one.startswith(word)] or get_close_matches(word, words)
+    return similar[0] if similar else None
+
+
+def advice_near(word, words):
+    """Return the end of a message that proposes the most similar of some words; empty if none is similar."""
+    near = nearest(word, words)
+    return f"; write {near!r}" if near else ""
+
+
+def public(written, advice=None):
+    """Decorate a public function: add advice to calls that do not fit, and remove internal frames from tracebacks.
+
+    Parameters
+    ----------
+    written : str
+        What a user writes in front of the parentheses, such as ``"dp.rollout"``.
+    advice : callable, optional
+        ``advice(*args, **options)`` returns what to write in place of a wrong call, or None for the default. It is
+        called with the arguments of that call.
+
+    Returns
+    -------
+    callable
+        The decorator. What it returns has the signature, docstring and name of the function.
+
+    Examples
+    --------
+    >>> @public("dp.plot")
+    ... def plot(grid, u): ...
+    >>> plot(1)
+    Traceback (most recent call last):
+        ...
+    TypeError: dp.plot needs the argument 'u'; write dp.plot(grid, u)
+    """
+
+    def decorate(function):
+        @wraps(function)
+        def call(*args, **options):
+            try:
+                return function(*args, **options)
+            except Exception as error:
+                error = _call_error(error, function, written, advice, args, options)
+                raise shortened(error)  # noqa: B904 SPARSEDP_TRACEBACK=full keeps all frames
+
+        return call
+
+    return decorate
+
+
+def _call_error(error, function, written, advice, args, options):
+    """Return a TypeError with advice if the arguments do not fit the signature of a function, else the error."""
+    raised_by_the_call = error.__traceback__.tb_next is None
+    if not (isinstance(error, TypeError) and raised_by_the_call):
+        return error
+    form = signature(function)
+    try:
+        form.bind(*args, **options)
+    except TypeError:
+        return _misfit(form, written, advice, args, options).with_traceback(error.__traceback__)
+    return error
+
+
+def _misfit(form, written, advice, args, options):
+    """Return the TypeError for arguments that do not fit a signature."""
+    parameters = {name: parameter for name, parameter in form.parameters.items() if name != "self"}
+    given = args[1:] if "self" in form.parameters else args
+    example = advice(*given, **options) if advice else None
+    example = example or EXAMPLES.get(written) or _example(written, parameters)
+    takes_any_keyword = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values())
+    for name in options:
+        if name not in parameters and not takes_any_keyword:
+            return TypeError(f"{written} has no argument {name!r}; write {_instead(name, parameters) or example}")
+    by_position = Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD
+    positional = [parameter for parameter in parameters.values() if parameter.kind in by_position]
+    if len(given) > len(positional):
+        return TypeError(f"{written} takes {len(positional)} by position, got {len(given)}; write {example}")
+    for name, parameter in parameters.items():
+        filled = name in options or parameter in positional[: len(given)]
+        if _is_required(parameter) and not filled:
+            return TypeError(f"{written} needs the argument {name!r}; write {example}")
+    return TypeError(f"{written} was given an argument twice, by position and by name; write {example}")
+
+
+def foreign_keyword_advice(name, parameters):
+    """Return what to write for a keyword argument that other libraries have, or None.
+
+    Parameters
+    ----------
+    name : str
+        The keyword argument.
+    parameters : container of str
+        The parameters of the function that does not have it.
+    """
+    for parameter, advice in FOREIGN_KEYWORDS.get(name.lower(), {}).items():
+        if parameter in parameters:
+            return advice
+    return None
+
+
+def _instead(name, parameters):
+    """Return what to write for a keyword argument that a function does not have, or None."""
+    advice = foreign_keyword_advice(name, parameters)
+    if advice:
+        return advice
+    near = nearest(name, list(parameters))
+    return f"{near}=..." if near else None
+
+
+def _example(written, parameters):
+    """Return a call with the required arguments."""
+    return f"{written}({', '.join(name for name, parameter in parameters.items() if _is_required(parameter))})"
+
+
+def _is_required(parameter):
+    return parameter.default is Parameter.empty and parameter.kind not in (
+        Parameter.VAR_POSITIONAL,
+        Parameter.VAR_KEYWORD,
+    )
+
+
+def shortened(error):
+    """Remove internal frames from the traceback of an error and of its causes; the frame that raised it stays.
+
+    Returns
+    -------
+    Exception
+        The same object.
+    """
+    if os.environ.get("SPARSEDP_TRACEBACK") == "full":
+        return error
+    seen: set = set()
+    link = error
+    while link is not None and id(link) not in seen:
+        seen.add(id(link))
+        link.__traceback__ = _without_internal_frames(link.__traceback__)
+        link = link.__cause__ or link.__context__
+    return error
+
+
+def _without_internal_frames(traceback):
+    """Return a traceback with the frames of the user's code and the last one."""
+    entries = []
+    while traceback is not None:
+        entries.append(traceback)
+        traceback = traceback.tb_next
+    kept = [entry for entry in entries[:-1] if _is_of_the_user(entry.tb_frame)] + entries[-1:]
+    following = None
+    for entry in reversed(kept):
+        following = TracebackType(following, entry.tb_frame, entry.tb_lasti, entry.tb_lineno)
+    return following
+
+
+def _is_of_the_user(frame):
+    return frame.f_globals.get("__name__", "").partition(".")[0] not in HIDDEN
+
+
+def frames_inside():
+    """Return how many frames of this package lie between the caller of this function, included, and the user's code.
+
+    A warning with one more as its `stacklevel` names the line of the user.
+    """
+    frame: Any = sys._getframe(1)
+    count = 0
+    while frame is not None and Path(frame.f_code.co_filename).is_relative_to(PACKAGE):
+        frame = frame.f_back
+        count += 1
+    return count
+
+
+class _CallableModule(ModuleType):
+    """A public module whose error says what to write if it is called like a function."""
+
+    def __call__(self, *args, **options):
+        raise TypeError(f"{self.__name__} is a module; write {self._example}")
+
+    def __getattr__(self, name):
+        if "__getattr__" in vars(self):  # of the module itself, which raised an AttributeError: raise it again
+            return vars(self)["__getattr__"](name)
+        raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}{advice_near(name, self.__all__)}")
+
+
+def describe_module(name, example):
+    """Let the errors of calls of a module, and of its public functions, say what to write.
+
+    Parameters
+    ----------
+    name : str
+        Of the module, such as ``"sparsedp.check"``.
+    example : str
+        What to write in place of a call of the module.
+    """
+    module = sys.modules[name]
+    module.__class__ = _CallableModule
+    vars(module)["_example"] = example
+    for word in module.__all__:
+        function = vars(module).get(word)  # some modules import a function when it is first used
+        if type(function) is FunctionType:
+            setattr(module, word, public_name(function, name, word))
+
+
+def public_name(function, module, name):
+    """Wrap a function for the public module that shows it under a name."""
+    written = f"{module.replace('sparsedp', 'dp', 1)}.{name}"
+    wrapped = public(written)(function)
+    wrapped.__module__ = module  # pickle looks for the function there
+    return wrapped

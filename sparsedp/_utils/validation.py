@@ -1,0 +1,402 @@
+"""What may be given: the checks of fields, of numbers and of reused result arrays."""
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from decimal import ROUND_FLOOR, Context
+from inspect import CO_VARARGS
+from math import isfinite
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+
+from sparsedp._utils.calls import advice_near
+from sparsedp._utils.pytree import labels, leaves
+from sparsedp.errors import NonFiniteError, ShapeError
+
+__all__ = [
+    "BLOCK",
+    "EPS",
+    "PRECISIONS",
+    "advise",
+    "check_choice",
+    "check_finite",
+    "check_function",
+    "check_kind",
+    "check_leaves",
+    "check_native",
+    "check_number",
+    "check_on",
+    "check_out",
+    "check_plain",
+    "check_precision",
+    "check_shape",
+    "check_takes",
+    "check_type",
+    "check_whole",
+    "field_array",
+    "hidden_leaves",
+    "is_number",
+    "is_other_precision",
+    "is_whole",
+    "number_beside",
+    "place",
+    "rounded_down",
+    "surely_finite",
+]
+
+FLOAT = np.dtype(float)
+EPS = np.finfo(float).eps  # between 1 and the next number; what is `ROUNDING` to whom stands there
+WRAP = "{0}; wrap what is computed in dp.interop.to_{0}(f), which keeps gradients"
+# By the package that the type of an array comes from: which library that is, and what to write instead.
+LIBRARIES = {
+    "torch": WRAP.format("torch"), "jax": WRAP.format("jax"), "jaxlib": WRAP.format("jax"),
+    "xarray": "xarray, whose coordinates would be lost; write dp.interop.from_xarray(grid, u)",
+}  # fmt: skip
+PRECISIONS = "fdFD"  # characters of the dtypes that fields and trees may have, see `check_precision`
+PLAIN_LEAVES = {float, complex, int, bool, str, type(None)}
+BLOCK = 8192  # numbers of which one product of BLAS is taken: it uses one thread up to 10000, and wakes no others
+
+
+def field_array(op, u, batch=False):
+    """Argument of an operator -> contiguous native array of float32, float64 or a complex kind.
+
+    batch: leading axes are allowed, one field for each of their entries.
+    """
+    if type(u) is not np.ndarray:
+        check_plain(op.name, u)
+        u = _array(op, u)
+    shape = op.domain.shape
+    if u.shape != shape and not (batch and _is_batch(u.shape, shape)):
+        raise ShapeError(
+            f"{op.name} takes a field on {op.domain.described}, got an array of shape {u.shape}{_in_shape(op, u)}"
+        )
+    if u.dtype.char not in PRECISIONS:
+        if u.dtype.kind not in "biu":
+            raise TypeError(f"{op.name} takes float or complex numbers, got dtype {u.dtype}; write u.astype(float)")
+        u = u.astype(float)
+    if not u.flags.c_contiguous or not u.dtype.isnative:
+        u = np.ascontiguousarray(u, dtype=u.dtype.newbyteorder("="))
+    return u
+
+
+def _is_batch(shape, field_shape):
+    """Return whether the last axes are those of a field. A 0-d field has none, so every shape is a batch of it."""
+    lead = len(shape) - len(field_shape)
+    return lead >= 0 and shape[lead:] == field_shape
+
+
+def _in_shape(op, u):
+    """Return advice for an array of a wrong shape from which its meaning can be inferred; else an empty text."""
+    space = op.domain
+    if u.ndim == 0:
+        return f"; write np.full({space.shape}, {u})"
+    if u.shape == (space.size,):
+        return f"; write op(u.reshape{space.shape}), or op @ u for a flat array"
+    if u.ndim == 2 and u.shape[0] == space.size:
+        return "; for the columns of a matrix, as lobpcg of SciPy gives them, write op.to_scipy()"
+    return ""
+
+
+def _array(op, u):
+    try:
+        return np.asarray(u)
+    except ValueError:  # a list of arrays of different shapes
+        parts = "grid.join(*parts)" if op.domain.kind == "faces" else "op.domain.join(*parts)"
+        raise ShapeError(
+            f"{op.name} takes one array on {op.domain.described}, got {len(u)} parts; write {parts}"
+        ) from None
+
+
+def check_plain(name, *values):
+    """Refuse masked arrays: NumPy would drop the mask without a word; and those of torch, jax and xarray."""
+    if any(isinstance(value, np.ma.MaskedArray) for value in values):
+        raise TypeError(f"{name} takes plain arrays, got a masked array; fill it first")
+    check_native(name, *values)
+
+
+def check_native(name, *values):
+    """Refuse tensors of torch and arrays of jax: NumPy would drop their gradients, or they ours."""
+    for value in values:
+        kind = type(value)
+        if kind is not np.ndarray and (library := kind.__module__.partition(".")[0]) in LIBRARIES:
+            raise TypeError(f"{name} needs arrays of NumPy, got a {kind.__name__} of {LIBRARIES[library]}")
+
+
+def check_precision(name, value):
+    """Refuse arrays of half and of extended precision.
+
+    The library computes with float32, float64, complex64 and complex128. Fields and trees of other precisions
+    (float16, longdouble, clongdouble) are refused by name, where they are given: a longdouble would lose its digits
+    silently, and its bytes cannot be viewed as doubles. Integers and booleans are not concerned. Numbers that are
+    settings, such as dt, and derivatives that a user's own function returns are rounded to double precision instead.
+    """
+    dtype: Any = getattr(value, "dtype", None)
+    if is_other_precision(dtype):
+        kind = "complex" if dtype.kind == "c" else "float"
+        raise TypeError(
+            f"{name} must be float32, float64, complex64 or complex128, got {dtype}; write np.asarray(x, {kind})"
+        )
+
+
+def is_other_precision(dtype):
+    """Return whether a dtype of NumPy holds floating numbers that are neither of single nor of double precision."""
+    if not isinstance(dtype, np.dtype) or dtype.char in PRECISIONS:
+        return False
+    return dtype.kind in "fc" or dtype.name == "bfloat16"
+
+
+def check_leaves(name, tree, containers=True):
+    """Refuse leaves that are arrays of half or extended precision, or containers that are not trees.
+
+    Parameters
+    ----------
+    name : str
+        Root of the paths in messages.
+    tree : tree
+    containers : bool
+        Whether a leaf is refused that is a dataclass, or a Mapping that is not a dict, and holds floating numbers:
+        these would silently be constants.
+
+    Raises
+    ------
+    TypeError
+    """
+    if type(tree) is np.ndarray:
+        check_precision(name, tree)
+        return
+    for number, leaf in enumerate(leaves(tree)):
+        dtype = getattr(leaf, "dtype", None)
+        if dtype is not None:
+            if is_other_precision(dtype):
+                check_precision(labels(tree, name)[number], leaf)
+        elif containers and type(leaf) not in PLAIN_LEAVES and any(map(_is_floating, hidden_leaves(leaf))):
+            raise TypeError(
+                f"{labels(tree, name)[number]} is a {type(leaf).__name__}, which is not a tree: its numbers would have "
+                "no derivative; write a dict or a NamedTuple"
+            )
+
+
+def hidden_leaves(value):
+    """Return the leaves inside a container that is not a tree: a dataclass, or a Mapping that is not a dict."""
+    found: list = []
+    pending = [value]
+    seen = set()  # a dataclass may hold itself
+    while pending:
+        container = pending.pop()
+        if id(container) in seen:
+            continue
+        seen.add(id(container))
+        inside = leaves(_entries_of(container))
+        found += inside
+        pending += inside
+    return found
+
+
+def _entries_of(container):
+    """Return the entries of a dataclass or Mapping as a list, which is empty for all other values."""
+    if isinstance(container, Mapping):
+        return list(container.values())
+    if is_dataclass(container) and not isinstance(container, type):
+        return [getattr(container, field.name, None) for field in fields(container)]
+    return []
+
+
+def _is_floating(leaf):
+    """Whether a leaf is a floating number or array, traced or not."""
+    return isinstance(leaf, (float, complex)) or getattr(getattr(leaf, "dtype", None), "kind", None) in ("f", "c")
+
+
+def check_out(op, out, u, dtype, shape):
+    """Refuse a result array of another shape or dtype, or one that shares memory with `u`."""
+    wanted = f"out=np.empty({shape}, {dtype.name!r})"
+    check_type(f"{op.name}, as out,", out, np.ndarray, "an array", wanted)
+    if out.shape != shape:
+        raise ShapeError(f"{op.name} gives a field on {op.codomain}, got out of shape {out.shape}; write {wanted}")
+    if out.dtype != dtype:
+        raise TypeError(f"{op.name} gives {dtype} here, got out of dtype {out.dtype}; write {wanted}")
+    if not out.flags.c_contiguous or not out.flags.writeable or np.may_share_memory(out, u):
+        raise ValueError(f"{op.name} needs an out that is contiguous, writeable and apart from u; write {wanted}")
+
+
+def check_finite(name, values, needs="must be finite", where=None, advice=""):
+    """Refuse NaN and infinity in plain numbers: say how many there are, where the first one is, and what to do.
+
+    `where` turns the number of a flat entry into words; default: its index in `values`.
+    """
+    finite = np.isfinite(values)
+    if np.all(finite):
+        return
+    if finite.ndim == 0:
+        raise NonFiniteError(f"{name} {needs}, got {values}; write a finite number")
+    index, many = int(np.argmin(finite)), finite.size - np.count_nonzero(finite)
+    first = place(index, finite.shape) if where is None else where(index)
+    raise NonFiniteError(f"{name} {needs}, got {many} that are NaN or infinite, the first at {first}{advice}")
+
+
+def surely_finite(value):
+    """One pass without a temporary array; False also when a finite sum is too large."""
+    if type(value) is np.float64:
+        return isfinite(value)
+    if type(value) is np.ndarray and value.size <= BLOCK and value.dtype == FLOAT and value.flags.c_contiguous:
+        flat = value.reshape(-1)
+        if isfinite(np.vdot(flat, flat)):  # one cheap call; a square may overflow where the value does not
+            return True
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(np.sum(value)))
+
+
+def place(index, shape):
+    """Number of an entry in C order -> its index: a number in 1-D, else a tuple."""
+    indices = tuple(map(int, np.unravel_index(index, shape)))
+    return indices[0] if len(indices) == 1 else indices
+
+
+def check_function(name, thing, example, count=None):
+    """Refuse what cannot be called, or does not take this many arguments."""
+    if not callable(thing):
+        raise TypeError(f"{name} takes a function, got {type(thing).__name__}; write {example}")
+    if count is not None:
+        check_takes(name, thing, count, example)
+
+
+def check_type(name, thing, kind, wanted, example):
+    """Refuse what is not of a type; `wanted`: the type with its article."""
+    if not isinstance(thing, kind):
+        raise TypeError(f"{name} takes {wanted}, got {type(thing).__name__}; write {example}")
+
+
+def check_shape(what, given, shape, advice=""):
+    """Refuse what has another shape."""
+    if np.shape(given) != shape:
+        raise ShapeError(f"{what} must have shape {shape}, got {np.shape(given)}{advice}")
+
+
+def check_on(name, given, space, advice=""):
+    """Refuse what is no field on a space."""
+    if np.shape(given) != space.shape:
+        raise ShapeError(f"{name} takes a field on {space.described}, got an array of shape {np.shape(given)}{advice}")
+
+
+KINDS = {"numbers": "biufc", "real numbers": "biuf", "integers": "iu", "True or False": "b"}
+
+
+def check_kind(what, dtype, needs, advice=""):
+    """Refuse arrays of a dtype that does not hold what is needed, in the words of `KINDS`."""
+    if dtype.kind not in KINDS[needs]:
+        raise TypeError(f"{what} must hold {needs}, got dtype {dtype}{advice}")
+
+
+def check_choice(name, word, choices, advice=""):
+    """Refuse what is none of some words; where these are True and False, 1 is none of them."""
+    if not any(isinstance(word, type(one)) and word == one for one in choices):
+        words = ", ".join(str(one) for one in choices if one is not None)
+        advice = advice or advice_near(word, words.split(", "))
+        raise ValueError(f"{name} must be {'one of ' if ', ' in words else ''}{words}, got {_shown(word)}{advice}")
+
+
+def advise(error, params=(), example="rollout(step, start, params, n)"):
+    """Add to the words of an error what to write, where a list or the params None met arithmetic."""
+    said = str(error)
+    if isinstance(error, TypeError) and "; write" not in said:
+        if "'list'" in said or "multiply sequence" in said:
+            error.args = (f"{said}; write np.asarray(x) for an array: a list is a tree of numbers",)
+        elif params is None and "NoneType" in said:
+            error.args = (f"{said}; write {example}: the params given are None",)
+
+
+def check_takes(name, fun, count, example):
+    """Refuse a function written in Python that does not take this many arguments."""
+    if type(fun) is not FunctionType or fun.__code__.co_flags & CO_VARARGS:
+        return
+    most = fun.__code__.co_argcount
+    if not most - len(fun.__defaults__ or ()) <= count <= most:
+        raise TypeError(f"{name} calls a function with {count} arguments, got one that takes {most}; write {example}")
+
+
+RANGES = {
+    "": lambda value: True,
+    "> 0": lambda value: value > 0,
+    ">= 0": lambda value: value >= 0,
+    "between 0 and 1": lambda value: 0 < value < 1,
+    "from 0 to 1": lambda value: 0 <= value <= 1,
+    "from 0 to below 1": lambda value: 0 <= value < 1,
+}
+
+
+def check_number(name, value, needs="", advice="", kind=""):
+    """One finite real number -> a float. Refuse all else, and what is not in the range that is needed, in words.
+
+    `advice`: what to write where the number is out of range; `kind`: where it is no number.
+    """
+    if not is_number(value):
+        raise TypeError(f"{name} must be one real number, got {_shown(value)}{kind}")
+    if not isfinite(value):
+        raise NonFiniteError(f"{name} must be finite, got {value}")
+    if not RANGES[needs](value):
+        limits = [float(word) for word in needs.split() if word.isdigit()]
+        raise ValueError(f"{name} must be {needs}, got {number_beside(value, *limits)}{advice}")
+    return float(value)
+
+
+def _shown(value):
+    """An argument in a message: an array by its shape."""
+    return f"an array of shape {value.shape}" if isinstance(value, np.ndarray) else repr(value)
+
+
+def check_whole(name, value, least, advice=""):
+    """One whole number from `least` on -> an int; all else is refused."""
+    if not is_whole(value, least):
+        raise ValueError(f"{name} must be a whole number >= {least}, got {_shown(value)}{advice}")
+    return int(value)
+
+
+def is_number(value):
+    """Whether a value is one real number, NaN and infinity included; a flag is none."""
+    if type(value) is float:
+        return True
+    array = np.asarray(value)
+    return array.ndim == 0 and array.dtype.kind in "iuf"
+
+
+def is_whole(value, least):
+    """Whether a value is a whole number from `least` on; 2.0 counts."""
+    return bool(is_number(value) and value % 1 == 0 and value >= least)  # the rest of NaN and infinity is NaN
+
+
+def number_beside(number, *limits, digits=6, style="g"):
+    """Format a number with enough digits to show on which side of some limits it lies.
+
+    Parameters
+    ----------
+    number : float
+    *limits : float
+        Other numbers of the same message, which are printed with the format ``:g``.
+    digits : int
+        Least precision of the format.
+    style : "g" or "e"
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> number_beside(1.5, 0.0, 1.0), number_beside(1 + 1e-12, 0.0, 1.0)
+    ('1.5', '1.000000000001')
+    >>> number_beside(1.01e-10, 1e-10, digits=1, style="e")
+    '1.01e-10'
+    """
+    bounds = [*limits, *(float(f"{limit:g}") for limit in limits)]
+    for precision in range(digits, 17):
+        text = f"{number:.{precision}{style}}"
+        shown = float(text)
+        if all((shown > bound) == (number > bound) and (shown < bound) == (number < bound) for bound in bounds):
+            return text
+    return repr(float(number))
+
+
+def rounded_down(number):
+    """A bound > 0 as a text of six digits that keeps it: rounded to nearest it would be refused when it is written."""
+    near = float(number) * (1 + 4 * EPS)
+    return f"{float(Context(prec=6, rounding=ROUND_FLOOR).create_decimal(near)):.6g}"

@@ -1,0 +1,1 @@
+"""Automatic differentiation: the tape, derivative rules, grad, vjp, jvp and hvp."""

@@ -1,0 +1,713 @@
+"""Derivatives of whole programs: any function of a tree of arrays, forward and backward."""
+
+import gc
+import threading
+import warnings
+from contextlib import contextmanager
+from numbers import Number
+from typing import Any, NamedTuple
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp._utils.calls import frames_inside, public
+from sparsedp._utils.counters import thread
+from sparsedp._utils.pytree import copied, described, flatten, labels, leaves, mapped, paired
+from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.validation import (
+    advise,
+    check_function,
+    check_leaves,
+    check_native,
+    check_precision,
+    check_shape,
+    check_whole,
+    surely_finite,
+)
+from sparsedp.autodiff.fast_derivatives import ELSEWHERE, alike, ranks, together
+from sparsedp.autodiff.tape import (
+    Recorder,
+    Rule,
+    backward,
+    boxed,
+    called,
+    cast,
+    dtype_of,
+    fit,
+    forward_root,
+    is_variable,
+    isbox,
+    new_trace,
+    plain,
+    split_boxes,
+)  # fmt: skip
+from sparsedp.autodiff.tape_constants import is_fixed
+from sparsedp.errors import DerivativeError, NonFiniteError, NonFiniteGradientWarning, ShapeError, SparsedpError
+
+__all__ = [
+    "NO_JVP", "check_loss", "entrywise", "grad", "gradient_of", "growing", "hvp", "is_finite", "judged",
+    "jvp", "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "taped", "traced",
+    "unwarned", "value_and_grad", "vjp", "witnessed", "zero_like",
+]  # fmt: skip
+
+# What `pushforward` raises where one of our rules, or of autograd's, has none.
+NO_JVP = (DerivativeError, NotImplementedError)
+SPREAD = ": autograd's np.where does not add up what it spreads; multiply by the condition instead, a * c + b * (1 - c)"
+
+LARGE = 1e100  # a cotangent that makes others overflow, through derivatives that do not
+SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
+_lock = threading.Lock()
+_growing: list[tuple] = []  # thresholds to go back to, one for each tape that grows
+
+
+@contextmanager
+def growing():
+    """While a tape grows: it has no cycles, and every search for cyclic garbage would walk all of it."""
+    with _lock:
+        before = gc.get_threshold()
+        _growing.append(_growing[0] if _growing else before)
+        if 0 < before[0] < SELDOM:
+            gc.set_threshold(SELDOM, *before[1:])
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _growing.pop()
+            if not _growing:
+                gc.set_threshold(*before)
+
+
+def pullback(fun, x):
+    """Function of a tree -> its value, and the function from a cotangent to the VJP.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(x) -> array``.
+    x : tree of arrays
+        Leaves that are not floating (int, None, str) are passed through and get None.
+
+    Returns
+    -------
+    value : array
+    pull : callable
+        ``pull(g)`` has the structure of `x`; `g` has the shape of `value`.
+
+    Raises
+    ------
+    DerivativeError
+        If no leaf of `x` is a floating array or number, or the value of `fun` is not one array.
+    ShapeError
+        On use of `pull`, if `g` has another shape than the value.
+
+    Notes
+    -----
+    The caller may write into `x`, the value, `g` and the results: the tape and they share no memory.
+
+    Examples
+    --------
+    >>> value, pull = pullback(lambda x: x[0] * x[1], (2.0, 5.0))
+    >>> pull(1.0)
+    (5.0, 2.0)
+    """
+    entries, rebuild = flatten(x)
+    moving = list(map(is_variable, entries))
+    check_native("a gradient", *entries)
+    check_leaves("x", x)
+    if not any(moving):
+        kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in entries})
+        raise DerivativeError(
+            f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write np.asarray(x, float)"
+        )
+    entries = [_apart_from_caller(leaf) if moves else leaf for leaf, moves in zip(entries, moving, strict=True)]
+
+    def one_array(x):
+        result = fun(x)
+        if not _is_array(result):
+            raise DerivativeError(
+                f"the function must return one array or number, got {type(result).__name__}; sum or join it"
+            )
+        return result
+
+    (value,), _, back = linearised(one_array, rebuild(entries), moving)
+
+    def pull(g):
+        check_shape("the cotangent", g, np.shape(value), "; give one like the value")
+        slopes = zip(entries, moving, back([g]), strict=True)
+        return rebuild(_apart([gradient_of(leaf, slope) if moves else None for leaf, moves, slope in slopes], g))
+
+    return _apart_from_caller(value), pull
+
+
+def linearised(fun, tree, moving):
+    """A function at a tree, of whose leaves some move -> (leaves of its result, how to build it, pull).
+
+    ``pull(cotangents)``: of the leaves of the result -> of the leaves of the tree; None where there is none.
+    """
+    tape = taped(fun, tree, moving)
+
+    def pull(cotangents):
+        sums: dict = {}
+        backward(tape.nodes, tape.ends, cotangents, sums)
+        return [sums.get(root, (None,))[0] for root in tape.roots]
+
+    return tape.values, tape.rebuild, pull
+
+
+class Tape(NamedTuple):
+    """A function at a tree: leaves of its result, how to build it, their nodes; all calls; roots of leaves."""
+
+    values: list
+    rebuild: Any
+    ends: list
+    nodes: list
+    roots: list
+
+
+def taped(fun, tree, moving, *witnesses):
+    """A function at a tree, of whose leaves some move -> Tape, whose calls the witnesses see."""
+    recorder = Recorder(*witnesses)
+    roots = [recorder.root() if moves else None for moves in moving]
+    try:
+        values, ends, rebuild = traced(fun, tree, roots)
+    finally:  # a witness that keeps nodes would be a circle
+        nodes, recorder.ended, recorder.witnesses = recorder.taken(), True, ()
+    return Tape(values, rebuild, ends, nodes, roots)
+
+
+@contextmanager
+def witnessed(see):
+    """A `with` block in which ``see(node, function, value, arguments, options, numbers)`` gets each node of a tape.
+
+    Nodes of every reverse-mode trace, when they are made; `numbers`: those of the arguments that are differentiated.
+    """
+
+    thread.witnesses.append(see)
+    try:
+        yield
+    finally:
+        thread.witnesses.remove(see)
+
+
+@contextmanager
+def judged():
+    """A `with` block in which a call is refused by name whose own derivative is NaN or infinite.
+
+    Not one whose cotangent is LARGE or NaN. For a second run, when a gradient was not finite.
+    """
+
+    def see(node, fun, value, args, options, nums):
+        pull, name = node.vjp, name_of(called(fun, args))
+
+        def checked(g, *held):
+            backs = list(pull(g, *held))
+            if all(np.all(np.abs(plain(part)) < LARGE) for part in leaves(g)):
+                for num, back in zip(nums, backs, strict=True):
+                    if is_variable(back) and not np.all(finite := np.isfinite(plain(back))):
+                        met = np.ravel(plain(args[num]))[np.argmin(finite)]
+                        raise NonFiniteError(
+                            f"the derivative of {name} is NaN or infinite where its argument is {met:.6g}; "
+                            "keep it away from there"
+                        )
+            return backs
+
+        node.vjp = checked
+
+    with witnessed(see), np.errstate(all="ignore"):
+        yield
+
+
+@contextmanager
+def unwarned():
+    """Within the block derivatives that are not finite raise no warning: the caller refuses them itself."""
+    thread.quiet += 1
+    try:
+        yield
+    finally:
+        thread.quiet -= 1
+
+
+def _warn_unless_finite(name, derivative, again):
+    """Warn of NaN or infinity in a derivative, with the name of the call it comes from.
+
+    Parameters
+    ----------
+    name : str
+        Of the public function that returns the derivative.
+    derivative : tree
+        Traced ones belong to an outer derivative, which is examined itself.
+    again : callable
+        ``again()`` computes the derivative once more in reverse mode.
+    """
+    found = [leaf for leaf in leaves(derivative) if is_variable(leaf)]
+    if thread.quiet or any(map(isbox, found)) or all(map(is_finite, found)):
+        return
+    reason = _cause_of_non_finite(again) or "dp.check.gradient(loss, x) shows where it comes from"
+    warnings.warn(
+        NonFiniteGradientWarning(f"the derivative returned by {name} holds NaN or infinity: {reason}"),
+        stacklevel=frames_inside() + 1,
+    )
+
+
+def _cause_of_non_finite(again):
+    """Name the first call whose own derivative is not finite; None if there is no such call, or on ranks.
+
+    Parameters
+    ----------
+    again : callable
+        ``again()`` computes the derivative once more in reverse mode.
+    """
+    if ranks() > 1:
+        return None
+    try:
+        with unwarned(), judged():
+            again()
+    except NonFiniteError as error:
+        return str(error)
+    except Exception:  # a function that cannot run twice
+        pass
+    return None
+
+
+def name_of(subject):
+    """How the user knows a rule, an Operator or a function of autograd."""
+    return getattr(subject, "name", None) or getattr(subject, "__name__", type(subject).__name__)
+
+
+def traced(fun, tree, roots):
+    """fun(tree) with a box for every root -> (leaves of the result, their nodes or None, how to build it).
+
+    With a word of advice where NumPy, math or Python refuse a traced value.
+    """
+    entries, rebuild = flatten(tree)
+    number = new_trace()
+    try:
+        ends, build = flatten(fun(rebuild(boxed(entries, roots, number))))
+        return *split_boxes(ends, number), build
+    except (TypeError, ValueError, AttributeError) as error:
+        said = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
+        if isinstance(error, SparsedpError) or not any("ArrayBox" in words for words in said):
+            advise(error)
+            raise
+        raise DerivativeError(
+            f"a traced value was refused ({error}); write the function with autograd.numpy, without float(), item() "
+            "and u[i] = ..., or take foreign code in by dp.adopt or dp.differentiable"
+        ) from error
+
+
+def _apart(gradients, g):
+    """autograd hands one array to both terms of a sum, and g on; a caller may write into the one without the other."""
+    seen = {id(_owner(g))}
+    for number, back in enumerate(gradients):
+        if isinstance(back, np.ndarray) and (id(_owner(back)) in seen or not back.flags.writeable):
+            gradients[number] = back.copy()
+        seen.add(id(_owner(back)))
+    return gradients
+
+
+def _apart_from_caller(value):
+    """An array as it is now: pullbacks need it, and the caller may write into it before they run."""
+    return value if not isinstance(value, np.ndarray) or is_fixed(value) else value.copy("K")
+
+
+def _owner(value):
+    """The array whose memory an array shows."""
+    return _owner(value.base) if isinstance(value, np.ndarray) and value.base is not None else value
+
+
+def gradient_of(leaf, cotangent):
+    """The gradient in a leaf: of its shape and dtype, zero where no cotangent arrived."""
+    if cotangent is None:
+        return 0.0 if isinstance(leaf, float) else anp.zeros_like(plain(leaf))
+    check_shape("the gradient", cotangent, np.shape(leaf), SPREAD)
+    return _as_given(fit("the gradient", leaf, cotangent, cotangent), leaf)
+
+
+def _as_given(derivative, leaf):
+    """A derivative of a number of Python as such a number, where it is not traced."""
+    return float(derivative) if isinstance(leaf, float) and not isbox(derivative) else derivative
+
+
+def pushforward(fun, x, tangent):
+    """`jvp` in forward mode alone: raises one of NO_JVP where a part of `fun` has no forward derivative.
+
+    The results are not copied.
+
+    Examples
+    --------
+    >>> value, slope = pushforward(lambda x: x[0] * x[1], (2.0, 5.0), (1.0, 0.0))
+    >>> float(value), float(slope)
+    (10.0, 5.0)
+    """
+    return forward(fun, x, _directions(x, tangent))
+
+
+def forward(fun, x, tangents):
+    """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants)."""
+    roots = [None if tangent is None else forward_root(tangent) for tangent in tangents]
+    values, nodes, rebuild = traced(fun, x, roots)
+    slopes = [tangent_of(value, node and node.g) for value, node in zip(values, nodes, strict=True)]
+    return rebuild(values), rebuild(slopes)
+
+
+def tangent_of(value, slope):
+    """The tangent of a result: of its dtype; 0 where it does not depend on what moves; None where it has none."""
+    if not is_variable(value):
+        return None
+    return zero_like(value) if slope is None else fit("a rule", value, slope, slope)
+
+
+def is_finite(value):
+    """Whether an array or number, plain or traced, holds neither NaN nor infinity."""
+    value = plain(value)
+    return surely_finite(value) or bool(np.all(np.isfinite(value)))
+
+
+def zero_like(value):
+    """A plain zero of the shape and dtype of a value, traced or not."""
+    return np.zeros(np.shape(plain(value)), dtype_of(value))[()]
+
+
+def _random_like(value):
+    """Plain numbers of the shape and dtype of a value, the same in every run."""
+    return np.asarray(np.random.default_rng(0).uniform(0.5, 1.5, np.shape(plain(value))), dtype_of(value))[()]
+
+
+def _directions(x, tangent):
+    """The tangent of each leaf of `x`, None where it is not floating."""
+    entries = leaves(x)
+    tangents = paired(tangent, x, "tangent", advice="; give a tangent like x")
+    for number, leaf in enumerate(entries):
+        if not is_variable(leaf):
+            tangents[number] = None
+            continue
+        given = tangents[number]
+        if not (_is_array(given) and np.shape(given) == np.shape(leaf)):
+            place = labels(x, "tangent")[number]
+            raise ShapeError(f"{place}: expected {described(leaf)}, got {described(given)}; give a tangent like x")
+    return tangents
+
+
+def _is_array(value):
+    """Whether a value is one array or number, traced or not."""
+    return isbox(value) or isinstance(value, (np.ndarray, Number)) or type(value) in ELSEWHERE
+
+
+def jvp(fun, x, tangent):
+    """Function of a tree -> its value and its directional derivative.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(x)``; its result may be a tree.
+    x, tangent : trees of arrays of the same structure
+        The tangent of a leaf that is not floating is ignored.
+
+    Returns
+    -------
+    (value, tangent of value)
+
+    Raises
+    ------
+    TypeError
+        If `fun` is not a function.
+    ShapeError
+        If the tangent has another structure than `x`, or a leaf of it another shape.
+
+    Warns
+    -----
+    NonFiniteGradientWarning
+        If the derivative holds NaN or infinity; it names the call whose derivative is not finite.
+
+    Notes
+    -----
+    Forward mode; by two reverse passes where a part of `fun` has no forward derivative.
+
+    Examples
+    --------
+    >>> value, slope = jvp(lambda x: x[0] * x[1], (2.0, 5.0), (1.0, 0.0))
+    >>> float(value), float(slope)
+    (10.0, 5.0)
+    """
+    check_function("jvp", fun, "lambda u: ...")
+    return _jvp("jvp", fun, x, tangent)
+
+
+def _jvp(name, fun, x, tangent):
+    """Value and directional derivative, with a warning where the derivative is not finite."""
+    check_native("jvp", *leaves((x, tangent)))
+    check_leaves("x", x)
+    check_leaves("tangent", tangent)
+    tangents = _directions(x, tangent)
+    results = together("jvp", (x, tangent), push, fun, x, tangents)
+
+    def again():
+        values, _, pull = linearised(fun, x, [direction is not None for direction in tangents])
+        pull([np.ones_like(value) if is_variable(value) else None for value in values])
+
+    if all(is_finite(direction) for direction in tangents if direction is not None):
+        _warn_unless_finite(name, results[1], again)
+    return copied(results)  # the caller may write into x, the tangent and the results
+
+
+def hvp(loss, x, tangent):
+    """Scalar loss of a tree, a direction -> the Hessian of the loss times the direction.
+
+    Parameters
+    ----------
+    loss : callable
+        ``loss(x) -> real scalar``.
+    x, tangent : trees of arrays of the same structure
+        The tangent of a leaf that is not floating is ignored.
+
+    Returns
+    -------
+    tree like x
+        None at leaves that are not floating.
+
+    Raises
+    ------
+    TypeError, ShapeError, DerivativeError
+        As `jvp` and `value_and_grad`.
+
+    Warns
+    -----
+    NonFiniteGradientWarning
+        If the product holds NaN or infinity; it names the call whose derivative is not finite.
+
+    Examples
+    --------
+    >>> hvp(lambda x: x[0] ** 2 * x[1], (2.0, 5.0), (1.0, 0.0))
+    (10.0, 4.0)
+    """
+    return mapped(_as_given, _jvp("hvp", grad(loss), x, tangent)[1], x)
+
+
+def push(fun, tree, tangents):
+    """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants).
+
+    Forward, or by two reverse passes where a part of `fun` has no JVP.
+    """
+    try:
+        return forward(fun, tree, tangents)
+    except NO_JVP:
+        if any(dtype_of(t).kind == "c" for t in tangents if t is not None):
+            raise
+        return _twice_reverse(fun, tree, tangents)
+
+
+def _twice_reverse(fun, tree, tangents):
+    """The pullback z -> J^T z is linear, so the gradient in z of <J^T z, tangent> is J tangent.
+
+    It is taken at random z: a rule may branch on a cotangent of zero, and then has no derivative there.
+    """
+    values, rebuild, pull = linearised(fun, tree, [tangent is not None for tangent in tangents])
+    moving = list(map(is_variable, values))
+
+    def paired(z):
+        pairs = zip(pull(z), tangents, strict=True)
+        return sum((anp.sum(back * tangent) for back, tangent in pairs if back is not None), 0.0)
+
+    z = [_random_like(value) if moves else None for value, moves in zip(values, moving, strict=True)]
+    slopes = linearised(paired, z, moving)[2]([1.0])
+    return rebuild(values), rebuild(map(tangent_of, values, slopes))
+
+
+def vjp(fun, *x):
+    """Function and its arguments -> its value, and the function from a cotangent to the VJP.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(*x) -> array``.
+    *x : trees of arrays
+        Leaves that are not floating (int, None, str) are passed through and get None.
+
+    Returns
+    -------
+    value : array
+    pull : callable
+        ``pull(g)``, with g of the shape of `value`: a cotangent like x; a tuple where there are several arguments.
+
+    Raises
+    ------
+    TypeError
+        If `fun` is not a function.
+    DerivativeError
+        If no leaf of `x` is a floating array or number, or the value of `fun` is not one array.
+    ShapeError
+        On use of `pull`, if `g` has another shape than the value.
+
+    Warns
+    -----
+    NonFiniteGradientWarning
+        If a result of `pull` holds NaN or infinity; it names the call whose derivative is not finite.
+
+    Notes
+    -----
+    Complex numbers: cotangents are dL/dRe - i dL/dIm, see "Complex numbers" in docs/ideas.md.
+
+    Examples
+    --------
+    >>> value, pull = vjp(lambda u, v: u * v, 2.0, 5.0)
+    >>> pull(1.0)
+    (5.0, 2.0)
+    """
+    check_function("vjp", fun, "lambda u: ...")
+    value, pull = together("vjp", x, pullback, lambda parts: fun(*parts), x)
+
+    def back(g):
+        check_precision("the cotangent", g)
+        slopes = together("the function of vjp", (g,), pull, g)
+        if is_finite(g):
+            _warn_unless_finite("vjp", slopes, lambda: pullback(lambda parts: fun(*parts), x)[1](g))
+        return slopes[0] if len(x) == 1 else slopes
+
+    return value, public("pull")(back)
+
+
+def grad(loss, argnum=0):
+    """Scalar loss of a tree -> function that returns the gradient; see `value_and_grad`.
+
+    Parameters
+    ----------
+    loss : callable
+    argnum : int
+        Which of its arguments is `x`.
+
+    Returns
+    -------
+    callable
+        ``f(*args) -> gradient``, with the structure of the argument.
+
+    Raises
+    ------
+    TypeError
+        If `loss` is not a function.
+    ValueError
+        If `argnum` is no whole number >= 0.
+    ShapeError, DerivativeError
+        On use, as `value_and_grad`.
+
+    Warns
+    -----
+    NonFiniteGradientWarning
+        If the gradient holds NaN or infinity; it names the call whose derivative is not finite.
+
+    Examples
+    --------
+    >>> grad(lambda x: x**2)(3.0)
+    6.0
+    """
+    both = value_and_grad(loss, argnum)
+    return Made(lambda *args: both(*args)[1], grad, loss, argnum)
+
+
+def value_and_grad(loss, argnum=0):
+    """Scalar loss of a tree -> function that returns the value and the gradient.
+
+    Parameters
+    ----------
+    loss : callable
+        ``loss(x, *rest) -> real scalar``; `x` is any nesting of arrays, tuples, lists and dicts.
+    argnum : int
+        Which of its arguments is `x`; default: the first.
+
+    Returns
+    -------
+    callable
+        ``f(*args) -> (value, gradient)``. The gradient has the structure of `x`, each leaf the
+        shape and dtype of its twin. Leaves that are not floating (int, bool, None, str) are passed
+        to the loss unchanged; their place in the gradient holds None.
+
+    Raises
+    ------
+    TypeError
+        If `loss` is not a function; on use, if there is no such argument.
+    ValueError
+        If `argnum` is no whole number >= 0.
+    ShapeError
+        If the loss is not a scalar.
+    DerivativeError
+        If the loss is complex, or `x` holds no floating value.
+
+    Warns
+    -----
+    NonFiniteGradientWarning
+        If the gradient holds NaN or infinity; it names the call whose derivative is not finite.
+
+    Notes
+    -----
+    Complex numbers: the gradient in a complex leaf is dL/dRe - i dL/dIm, see "Complex numbers" in docs/ideas.md.
+    `x` and the constant arrays that the loss uses in calls may be written into at once after a call (``work[:] = c`` in
+    a loop): what the backward pass needs is copied. An array that is read-only with all its memory is not copied;
+    ``mask.flags.writeable = False`` saves the time, that of one product with the mask for each call. Other objects,
+    sparse matrices too, must stay as they are until the gradient is there.
+
+    Examples
+    --------
+    >>> value_and_grad(lambda x: x["a"] ** 2 * x["n"])({"a": 3.0, "n": 2})
+    (18.0, {'a': 12.0, 'n': None})
+    """
+    check_function("value_and_grad", loss, "lambda x: np.sum(x**2)")
+    advice = "; write 0 for the first argument, and value_and_grad(loss)(x) for the gradient at x"
+    argnum = check_whole("argnum of value_and_grad", argnum, 0, advice)
+
+    def evaluate(*args):
+        if len(args) <= argnum:
+            raise TypeError(f"the gradient in argument {argnum} of the loss needs it, got {len(args)} arguments")
+        with growing():  # until the tape is gone: a search for cyclic garbage in between would walk all of it
+            return together("the loss", args, _value_and_gradient, loss, argnum, args)
+
+    return Made(evaluate, value_and_grad, loss, argnum)
+
+
+def _value_and_gradient(loss, argnum, args):
+    """Return the value of a loss, and its gradient in one of its arguments."""
+    value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
+    check_loss(value)
+
+    def again():
+        return _value_and_gradient(loss, argnum, args)
+
+    try:
+        gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
+    except NonFiniteError as error:  # a call refused a cotangent, as of a forward argument that the user looks for
+        cause = None if thread.quiet or isbox(value) else _cause_of_non_finite(again)
+        if cause is not None and cause != str(error):
+            error.args = (f"{error}, in the backward pass: {cause}",)
+        raise
+    _warn_unless_finite("value_and_grad", gradient, again)
+    return value if isbox(value) else float(value), gradient
+
+
+def check_loss(value):
+    """Refuse what a loss returned, traced or not, if it is not one real number."""
+    if isinstance(value, (tuple, list, dict)):
+        raise ShapeError(f"the loss must be a scalar, got a {type(value).__name__}; return one number")
+    if np.shape(plain(value)) != ():
+        raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(plain(value))}; sum it")
+    if dtype_of(value).kind == "c":
+        raise DerivativeError("the loss must be real, got a complex number; take its real part or its absolute value")
+
+
+def of_argument(cotangent, value):
+    """What a product of fields gives for an argument: summed over batches, and for a real argument the real part."""
+    cotangent = alike(cotangent, value)
+    while np.ndim(cotangent) > np.ndim(value):
+        cotangent = anp.sum(cotangent, axis=0)
+    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent
+
+
+def entrywise(name, value, slopes):
+    """Name, ``value(a, b)`` entry by entry, ``slopes(a, b)``: its derivatives in both, on the tape too -> a rule."""
+
+    def vjp(nums, ans, a, b):
+        pair = slopes(a, b)
+        return lambda g: tuple(g * pair[num] for num in nums)
+
+    def jvp(nums, tangents, ans, a, b):
+        pair = slopes(a, b)
+        return sum(pair[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
+
+    return Rule(name, value, vjp, jvp)

@@ -1,0 +1,1 @@
+"""Grids, the spaces of their fields, and boundary conditions."""

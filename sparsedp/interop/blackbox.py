@@ -1,0 +1,346 @@
+"""A simulator without derivatives becomes differentiable: sparse Jacobians by coloured differences."""
+
+import warnings
+from contextlib import contextmanager, suppress
+from itertools import product
+from threading import RLock
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp._utils.calls import public
+from sparsedp._utils.counters import count
+from sparsedp._utils.pytree import norm
+from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.validation import EPS, check_choice, check_finite, check_function, check_precision, check_shape
+from sparsedp.autodiff.tape import Rule, isbox, plain
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.operators.given import from_matrix
+from sparsedp.solvers.cache import Cache
+from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
+
+__all__ = ["Adopted", "adopt"]
+
+STEP, DIFFERENCES = "complex step", "central differences"
+WAYS = {"auto": "", "complex": STEP, "difference": DIFFERENCES}
+COMPLEX = 1e-30  # step of the complex step: no difference is taken, so nothing cancels
+CENTRAL = EPS ** (1 / 3)  # step of central differences, relative to x
+SHARES = 1.0, 1e-2  # of the step of central differences: Jacobians and probes
+MOST = {STEP: (1e-9, 1e-12), DIFFERENCES: (1e-4, 1e-4)}  # what a row may lack of a probe: of itself, of the largest row
+GROWS = 1e-5  # what it may lack of a difference if that grows with the step: rounding does not
+REFUSED = ValueError, ArithmeticError, RuntimeError  # what foreign code raises where it has no result
+SMALLER = 1.0, -1.0, 1e-2, -1e-2, 1e-4, -1e-4  # shares of a move, until the code takes the point
+TIMES = 2, 5, 11  # steps at which what a row lacks is looked at again
+
+
+def adopt(f, sparsity=None, derivative="auto", name=None):
+    """Any NumPy function of an array -> the same function, differentiable.
+
+    Parameters
+    ----------
+    f : callable
+        ``f(x) -> y``, real arrays of any shapes; it must give the same y for the same x.
+    sparsity : sparse matrix or array, optional
+        (y.size, x.size), not 0 where y_i may depend on x_j. Default: what three cells touch, moved over the grid, if
+        each row of the Jacobian agrees with a derivative along a random direction; else found by changing random parts
+        of x, a little and by a tenth. Where a later point takes another branch it is found again, and grows. An entry
+        below 1e-9 (differences: 1e-5) of its row may be missed.
+    derivative : "auto", "complex" or "difference"
+        complex: f(x + i h v), to rounding, for code that is analytic and takes complex numbers. difference: central
+        differences, about ten digits. auto: complex where it is found to agree with differences.
+    name : str, optional
+        Appears in errors and counts; default: that of f.
+
+    Returns
+    -------
+    Adopted
+        ``adopted(x)``; `.jacobian(x)` is the csr_array dy/dx, `.runs` the number of runs so far; str() tells how many
+        runs one Jacobian takes.
+
+    Raises
+    ------
+    TypeError
+        If f is no function.
+    ValueError
+        If `derivative` is not known.
+    ShapeError
+        If the sparsity or a later x has another shape.
+    DerivativeError
+        If f is not deterministic or has changed since it was run, or no Jacobian agrees with a difference along a
+        random direction: a sparsity that lacks entries, a point where f has no derivative; on derivatives of second
+        order.
+    NonFiniteError
+        If f is NaN or infinite near x.
+
+    Notes
+    -----
+    Cost: one run for each colour of the pattern (two for central differences), one at x, and two or three that probe
+    the Jacobian row by row along a direction which is another one at each x. Where only a few rows miss something, at
+    a branch of code that takes no complex step there, they are taken by central differences. At a kink the derivative
+    is the mean of both sides, next to it that of its own side.
+    Source: A. R. Curtis, M. J. D. Powell, J. K. Reid, IMA J. Appl. Math. 13, 1974 (colouring); W. Squire, G. Trapp,
+    SIAM Rev. 40, 1998 (complex step).
+
+    Examples
+    --------
+    >>> shift = adopt(lambda x: np.roll(x, 1) ** 2)
+    >>> from sparsedp.autodiff.derivative import value_and_grad
+    >>> import autograd.numpy as anp
+    >>> value_and_grad(lambda x: anp.sum(shift(x)))(np.array([1.0, 2.0, 3.0]))
+    (14.0, array([2., 4., 6.]))
+    """
+    check_function("adopt", f, "dp.adopt(lambda x: ...)")
+    check_choice("derivative", derivative, WAYS)
+    return Adopted(f, sparsity, derivative, name or getattr(f, "__name__", "simulator"))
+
+
+class Adopted(Remade):
+    """A foreign function with a sparse Jacobian, kept for the last two points. Made by `adopt`.
+
+    Attributes
+    ----------
+    runs : int
+        Runs of the function so far.
+    way : str
+        STEP or DIFFERENCES; empty where the first derivative is to tell.
+    """
+
+    _shapes: Any
+    _coloured: Any
+
+    def __init__(self, f, sparsity, derivative, name, jacobian=(None, "", None)):
+        self._f, self._derivative, self.name = f, derivative, name
+        self._sparsity = None if sparsity is None else pattern_like(sparsity)
+        self._shapes, self.way, self._coloured = jacobian
+        self.way = self.way or WAYS[derivative]
+        self.runs = 0
+        self._points, self._alone = Cache(), RLock()  # foreign code may work in arrays of its own: one thread at a time
+        self._rule = Rule(
+            name,
+            self._run,
+            lambda nums, y, x: lambda g: (self._operator(x, y).T(g),),
+            lambda nums, tangents, y, x: self._operator(x, y)(tangents[0]),
+        )
+
+    def recipe(self):
+        """The call that makes it again: see _utils/reconstruction.py."""
+        # The pattern found so far travels too: it took many runs.
+        jacobian = self._shapes, self.way, self._coloured
+        return Adopted, (self._f, self._sparsity, self._derivative, self.name, jacobian)
+
+    @public("dp.adopt(f)")
+    def __call__(self, x):
+        return self._rule(x)
+
+    def __str__(self):
+        if self._coloured is None:
+            return f"{self.name}: no derivative asked for yet, {self.runs} runs"
+        each = self._coloured.count * (1 if self.way == STEP else 2)
+        rows, columns = self._coloured.pattern.shape
+        return (
+            f"{self.name}: Jacobian {rows} x {columns} with {self._coloured.pattern.nnz} entries from {each} runs "
+            f"instead of {columns}, by {self.way}; {self.runs} runs so far"
+        )
+
+    __repr__ = __str__
+
+    def _run(self, x):
+        """One run on plain values; a copy, for foreign code may return the array that it will write into next."""
+        check_precision(f"the argument of {self.name}", x)
+        count(f"{self.name}.run", "forward")
+        with self._alone:
+            self.runs += 1
+            y = np.array(self._f(np.array(x)))
+        if y.dtype.kind not in "biuf" and np.asarray(x).dtype.kind != "c":
+            raise TypeError(f"{self.name} must return real numbers, got dtype {y.dtype}; take the real part")
+        check_precision(f"the result of {self.name}", y)
+        return y.astype(float) if y.dtype.kind in "biu" else y
+
+    def _operator(self, x, y):
+        """The Jacobian as an Operator, at the argument of a run with the result y."""
+        if isbox(x):
+            raise DerivativeError(
+                f"{self.name} is adopted: its Jacobian is known, its second derivative is not; use a method with "
+                "first derivatives, or write the function with autograd.numpy"
+            )
+        matrix, again = self._at(x)
+        if not np.array_equal(again, plain(y) if x.dtype == float else self._run(x.astype(float))):
+            raise DerivativeError(
+                f"{self.name} gives another result for the same argument than before; it must depend on its argument "
+                "only, so what changes from call to call must be a part of it"
+            )
+        inputs, outputs = self._shapes
+        return from_matrix(matrix, inputs, outputs, f"{self.name}.J")
+
+    def jacobian(self, x):
+        """dy/dx at a point, csr_array; kept for the last two points.
+
+        Parameters
+        ----------
+        x : array
+
+        Returns
+        -------
+        csr_array, (y.size, x.size)
+        """
+        return self._at(plain(x))[0]
+
+    def _at(self, x):
+        """The Jacobian at a point, and the result there."""
+        x = np.asarray(x, dtype=float)
+        with self._alone:
+            return self._points.find((x,)) or self._points.put((x,), self._made(x))
+
+    def _made(self, x):
+        check_finite(f"the argument of {self.name}", x)
+        y = self._run(x)
+        check_finite(f"{self.name} near x", y, "must be finite to be differentiated")
+        if self._shapes not in (None, (x.shape, y.shape)):
+            raise ShapeError(
+                f"{self.name} was adopted from {self._shapes[0]} to {self._shapes[1]}, got {x.shape} to {y.shape}; "
+                "adopt it again"
+            )
+        self._shapes = x.shape, y.shape
+        for coloured in self._patterns(x.reshape(-1), y.reshape(-1)):
+            self._coloured = coloured
+            matrix, wrong = self._probed(coloured, x.reshape(-1))
+            if not wrong.any():
+                return matrix, y
+        raise DerivativeError(
+            f"the Jacobian of {self.name} by {self.way or STEP} misses in row {np.argmax(wrong)} what a difference "
+            "along a random direction sees; its sparsity lacks entries, or it has a kink at x: leave sparsity and "
+            "derivative out, or move x a little"
+        )
+
+    def _flat(self, x):
+        """A run from flat numbers to flat numbers."""
+        return self._run(x.reshape(self._shapes[0])).reshape(-1)
+
+    # ------------------------------------------------------------ the pattern
+
+    def _patterns(self, x, y):
+        """Patterns to be tried at x, coloured, the cheapest first; each has the entries known from earlier points."""
+        rows, columns, earlier = y.size, x.size, self._sparsity
+        shapes = [self._shapes[0]] if self._shapes[0] == self._shapes[1] else None
+        if self._coloured is not None:
+            yield self._coloured
+            earlier = self._coloured.pattern
+        elif earlier is not None:
+            check_shape(f"the sparsity of {self.name}", earlier, (rows, columns))
+            yield Coloured(earlier, shapes)
+        elif not np.array_equal(self._flat(x), y):
+            raise DerivativeError(f"{self.name} gives two results for one argument; fix its random state first")
+        if self._sparsity is not None:
+            return
+        step = self._steps(x)
+        products = [  # exactly 0 in a row that does not depend on the columns; far moves see the other side of branches
+            lambda v: self._flat(x + step * v) - y,
+            lambda v: change(self._flat, x, y, v),
+        ]
+
+        def coloured(pattern):
+            return Coloured(pattern if earlier is None else pattern_like(pattern + earlier), shapes)
+
+        guess = None if shapes is None else stencil_pattern(products, shapes)
+        if guess is not None:
+            yield coloured(guess)
+        sparse = find_pattern(products, rows, columns)
+        yield coloured(dense_pattern(rows, columns) if sparse is None else sparse)
+
+    # ------------------------------------------------------------ one Jacobian
+
+    def _steps(self, x):
+        return CENTRAL * np.maximum(np.abs(x), typical(x))
+
+    def _product(self, x, way):
+        if way == STEP:
+            return lambda v: self._flat(x + 1j * COMPLEX * v).imag / COMPLEX
+        return lambda v: (self._flat(x + v) - self._flat(x - v)) / 2
+
+    def _by_colours(self, coloured, x, way, share):
+        steps = np.ones_like(x) if way == STEP else share * self._steps(x)
+        along = self._product(x, way)
+        matrix = coloured.matrix(lambda v: along(steps * v))
+        matrix.data /= steps[matrix.indices]
+        check_finite(f"what differences of {self.name} close to x give", matrix.data, advice="; move x a little")
+        return matrix
+
+    def _probed(self, coloured, x):
+        """The Jacobian on a pattern, and the rows in which it misses what probes see.
+
+        Rows that the complex step does not get right are taken by central differences, then by shorter ones: next to a
+        kink these see one side of it, and at a kink the mean of both. What no short probe agrees with, as in code with
+        noise, may agree with a longer one. What all rows agree with at the first point is the way at later ones.
+        """
+        ways = [(STEP, 1.0)] if self.way != DIFFERENCES else []
+        ways += [(DIFFERENCES, share) for share in SHARES] if self._derivative != "complex" else []
+        made: dict = {}
+        matrix, wrong, judged = coloured.pattern, np.ones(coloured.pattern.shape[0], dtype=bool), False
+        for share, way in product(reversed(SHARES), ways):
+            try:
+                with _strict():
+                    made[way] = made[way] if way in made else self._by_colours(coloured, x, *way)
+                    matrix = _with_rows(matrix, made[way], wrong)
+                    wrong &= self._misses(matrix, x, way[0], share)
+            except MemoryError:
+                raise
+            except Exception as error:  # the code takes no complex numbers here, or nothing so far from x
+                trouble = error
+                continue
+            judged = True
+            if not wrong.any():
+                self.way = self.way or way[0]
+                break
+        if not judged:
+            raise trouble
+        return matrix, wrong
+
+    def _misses(self, matrix, x, way, share):
+        """Rows in which a Jacobian misses what its own way and a difference see along a direction of this point."""
+        v = share * self._steps(x) * np.random.default_rng(crc32(x.tobytes())).standard_normal(x.shape)
+        return np.any([_lacks(matrix, v, self._product(x, one), one) for one in {way, DIFFERENCES}], axis=0)
+
+
+@contextmanager
+def _strict():
+    """What is cast to real has lost the derivative."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("error", np.exceptions.ComplexWarning)
+        yield
+
+
+def _with_rows(matrix, other, rows):
+    """A matrix with these rows from another one on the same pattern."""
+    entries = np.repeat(rows, np.diff(matrix.indptr))
+    return sp.csr_array((np.where(entries, other.data, matrix.data), matrix.indices, matrix.indptr), matrix.shape)
+
+
+def _lacks(matrix, v, along, way):
+    """Rows in which a matrix lacks something of the product along v."""
+    lacks, size = along(v) - matrix @ v, abs(matrix) @ np.abs(v)
+    share, floor = MOST[way]
+    wrong = ~(np.abs(lacks) <= share * size + floor * np.max(size, initial=0.0))
+    doubtful = ~wrong & (np.abs(lacks) > GROWS * size)
+    if way == DIFFERENCES and doubtful.any():
+        # Entries, however small, lack something in proportion to the step, and what rounding makes does not. A row may
+        # be far smaller than the largest, as one of other units is.
+        gaps = [along(times * v) - times * (matrix @ v + lacks) for times in TIMES]
+        wrong |= doubtful & (lacks != 0) & ~np.any(np.abs(gaps) > 0.1 * np.abs(lacks), axis=0)
+    return wrong
+
+
+def change(run, x, y, v):
+    """How much run(x), which is y, changes when x moves along v by a tenth of its size; less where that is refused."""
+    for share in SMALLER:
+        with suppress(*REFUSED):
+            moved = run(x + 0.1 * share * typical(x) * v)
+            if np.all(np.isfinite(moved)):
+                return moved - y
+    return np.zeros_like(y)
+
+
+def typical(x):
+    """Root mean square of an array, 1 where that is 0 or the array is empty."""
+    return norm(x) / np.sqrt(max(x.size, 1)) or 1.0

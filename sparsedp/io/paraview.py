@@ -1,0 +1,74 @@
+"""Fields as .vti, .vtr and .pvd files for ParaView. The only file that imports pyevtk (extra `files`)."""
+
+import re
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from pyevtk.hl import gridToVTK, imageToVTK
+
+from sparsedp.grid.grid import node_axes
+from sparsedp.io.atomic_files import path_errors, write_file, write_through
+
+__all__ = ["write_grid", "write_series"]
+
+
+def write_series(path, grid, times, content):
+    """Fields at each time -> a file in the folder that is called as `path` without .pvd, and then `path` itself."""
+    folder = Path(path).with_suffix("")
+    with path_errors(path):
+        folder.mkdir(exist_ok=True)
+    entries = []
+    for number, time in enumerate(times):
+        place = f"{folder.name}/{number:04}.vtr"
+        write_grid(
+            folder.parent / place, grid, {name: (kind, values[number]) for name, (kind, values) in content.items()}
+        )
+        entries.append(f'<DataSet timestep="{time}" file={quoteattr(place)}/>\n')
+    write_file(path, f'<VTKFile type="Collection"><Collection>\n{"".join(entries)}</Collection></VTKFile>\n')
+    for old in folder.glob("*.vtr"):  # of a longer series that was there
+        if re.fullmatch("[0-9]{4,}", old.stem) and int(old.stem) >= len(entries):
+            old.unlink()
+
+
+def write_grid(path, grid, content):
+    """Fields by name, as `check_fields` gives them -> a .vti file of a uniform grid, or a .vtr file of any."""
+    cells: dict = {}
+    points: dict = {}
+    for field, (space, values) in content.items():
+        (points if space.kind == "nodes" else cells).update(_arrays(field, space, values))
+    missing = 3 - grid.dim  # axes, along which the file is as thick as the first cell is wide
+    lines = [grid.coordinates(axis, "ends") for axis in range(grid.dim)]
+    lines += [np.append(0.0, grid.widths[0][:1])] * missing
+
+    def write(part):
+        stem = str(part.with_suffix(""))
+        if part.suffix == ".vtr":
+            gridToVTK(stem, *lines, cells, points)
+        else:
+            spacing = [float(widths[0]) for widths in grid.widths + grid.widths[:1] * missing]
+            imageToVTK(stem, grid.origin + (0.0,) * missing, spacing, cells or None, points or None)
+
+    write_through(path, write)
+
+
+def _arrays(field, space, values):
+    """Names and arrays of a field, or of each entry of a batch: numbers, or three components, in cells or on nodes."""
+    grid, kind, flat = space.grid, space.kind, (1,) * (3 - space.grid.dim)
+    for index in np.ndindex(values.shape[: values.ndim - len(space.shape)]):
+        parts = [part.reshape(part.shape + flat) for part in space.split(values[index])]
+        if kind == "nodes":  # in the file the last node of a periodic axis is one of its own
+            parts = [np.pad(parts[0], [(0, int(more)) for more in grid.periodic + flat], mode="wrap")]
+        elif kind != "cells":
+            parts = [_means(part, node_axes(kind, number, grid.dim), grid.shape) for number, part in enumerate(parts)]
+            parts += [np.zeros_like(parts[0])] * len(flat)
+        blocks = tuple(map(np.ascontiguousarray, parts))
+        yield "_".join(map(str, (field, *index))), blocks if len(blocks) == 3 else blocks[0]
+
+
+def _means(part, on_nodes, shape):
+    """A component of faces or edges -> the means of those around each cell."""
+    part = part.astype(np.result_type(part, np.float32))
+    for axis in on_nodes:
+        part = 0.5 * part + 0.5 * np.roll(part, -1, axis)
+    return part[tuple(map(slice, shape))]  # the last face of a bounded axis has none beyond it

@@ -1,0 +1,60 @@
+"""Pictures as fields. Pillow comes with the extra `plot`."""
+
+import numpy as np
+
+from sparsedp.io.atomic_files import path_errors
+
+__all__ = ["from_image"]
+
+SHADES = {"1": 1, "L": 255, "P": 255, "RGB": 255, "I;16": 65535, "I;16L": 65535, "I;16B": 65535}  # what counts as white
+
+
+def from_image(path):
+    """Picture -> array from 0 (black) to 1 (white), its axes turned: axis 0 is x, to the right, axis 1 is y, up.
+
+    Parameters
+    ----------
+    path : str or path
+        Of a .png, .jpg or any other format that Pillow reads; grey, coloured or of two colours.
+
+    Returns
+    -------
+    array, shape (width, height), or (3, width, height) of a coloured picture: a batch of red, green and blue
+        Write ``dp.Grid(u.shape[-2:])`` for a grid of its pixels.
+
+    Raises
+    ------
+    ValueError
+        If the picture has transparent parts, or numbers whose white is not known.
+    ImportError
+        If Pillow is missing; the extra `plot` brings it.
+    OSError
+        If there is no such file, or it is no picture.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> path = Path(tempfile.mkdtemp(), "corner.pgm")
+    >>> _ = path.write_bytes(b"P5 3 2 255 " + bytes([0, 0, 255, 0, 0, 0]))  # white: the upper right corner
+    >>> from_image(path)
+    array([[0., 0.],
+           [0., 0.],
+           [0., 1.]])
+    """
+    try:
+        from PIL import Image, ImageOps
+    except ImportError as error:
+        raise ImportError("from_image needs Pillow; install sparsedp[plot]") from error
+    with path_errors(path, reading=True):
+        picture = Image.open(path)
+    with picture as stored:
+        image = ImageOps.exif_transpose(stored)
+        if image.mode not in SHADES or "transparency" in image.info:
+            raise ValueError(
+                f"from_image takes grey or RGB pictures without transparency, {path} has mode {image.mode}; "
+                "save it as RGB"
+            )
+        white = SHADES[image.mode]
+        pixels = np.asarray(image.convert("RGB") if image.mode == "P" else image)
+    return np.moveaxis(pixels[::-1], (0, 1), (-1, -2)) / white

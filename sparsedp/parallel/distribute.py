@@ -1,0 +1,101 @@
+"""distribute: a grid whose fields lie on the ranks of a communicator. gather: a field as one array again."""
+
+import os
+import sys
+
+import numpy as np
+
+from sparsedp.errors import ShapeError
+from sparsedp.grid.grid import check_grid
+
+__all__ = ["distribute", "gather"]
+
+SIZES = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE"  # what launchers tell: how many processes there are
+
+
+def distribute(grid, comm=None):
+    """Grid -> the same grid, its fields laid out over the processes that run this program.
+
+    Parameters
+    ----------
+    grid : Grid
+    comm : mpi4py.MPI.Comm, optional
+        Default: all processes that ``mpirun -n 64 python -m mpi4py scene.py`` has started.
+
+    Returns
+    -------
+    Grid
+        Where there is one process, the grid itself, and nothing is imported. Else every rank holds a block of each
+        field: arithmetic is local, sums, means, maxima and norms are those of the whole field, with the same bits
+        on every rank, and all else is refused by name. A plain array of the whole shape is a field that every rank
+        knows; its gradient is one too.
+
+    Raises
+    ------
+    ImportError
+        If there are several processes, and mpi4py or petsc4py is missing.
+    RuntimeError
+        If mpi4py belongs to another MPI than the one that started the processes.
+    TypeError
+        If `comm` is no communicator.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid
+    >>> distribute(Grid((4, 3)))
+    Grid(4 x 3 cells, size 4 x 3)
+    """
+    check_grid("distribute", grid)
+    told = max(int(os.environ.get(name, "1")) for name in SIZES)
+    if comm is None and told == 1 and "mpi4py.MPI" not in sys.modules:
+        return grid
+    try:
+        from mpi4py import MPI
+
+        if comm is None and told == MPI.COMM_WORLD.size == 1:
+            return grid
+        from sparsedp.parallel.agreement import end_all
+        from sparsedp.parallel.layout import laid
+    except ImportError as error:
+        raise ImportError(
+            f"distribute on several processes needs mpi4py and petsc4py ({error}); install them, or start one process"
+        ) from error
+    if not isinstance(comm, (MPI.Comm, type(None))):
+        raise TypeError(f"distribute takes a communicator, got {type(comm).__name__}; write mpi4py.MPI.COMM_WORLD")
+    if told > 1 and MPI.COMM_WORLD.size == 1:
+        raise RuntimeError(
+            f"{told} processes were started, and mpi4py sees one: it belongs to another MPI; install it for this one"
+        )
+    if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
+        sys.excepthook = end_all
+    return laid(grid, MPI.COMM_WORLD if comm is None else comm)
+
+
+def gather(u):
+    """Field, on ranks or not -> one plain array, which every rank has: for pictures and small files.
+
+    Parameters
+    ----------
+    u : field
+
+    Returns
+    -------
+    array
+        `u` itself where it is a plain array.
+
+    Raises
+    ------
+    ShapeError
+        If `u` is neither a field nor an array.
+
+    Examples
+    --------
+    >>> gather(np.array([1.0, 2.0]))
+    array([1., 2.])
+    """
+    if hasattr(u, "gather"):
+        return u.gather()
+    try:
+        return np.asarray(u)
+    except ValueError:
+        raise ShapeError(f"gather takes one field, got {type(u).__name__}; gather them one by one") from None

@@ -1,0 +1,130 @@
+"""The schemes of transport once more, with slices in autograd.numpy: slow, plain, and differentiated by the tape."""
+
+import autograd.numpy as anp
+
+import sparsedp as dp
+from sparsedp.grid.boundary_conditions import resolve
+
+
+def cut(x, axis, start, stop):
+    return x[tuple(slice(start, stop) if a == axis else slice(None) for a in range(anp.ndim(x)))]
+
+
+def line(x, axis, dim):
+    return anp.reshape(x, [-1 if a == axis else 1 for a in range(dim)])
+
+
+def to_nodes(x, grid, axis, shared):
+    """Cells -> nodes: linear between centres, or the mean weighted with the widths."""
+    h = line(grid.widths[axis], axis, grid.dim)
+    if grid.periodic[axis]:
+        x, h = (anp.concatenate([cut(y, axis, -1, None), y], axis) for y in (x, h))
+    low, high, hl, hh = cut(x, axis, 0, -1), cut(x, axis, 1, None), cut(h, axis, 0, -1), cut(h, axis, 1, None)
+    inner = (low * hl + high * hh) / (hl + hh) if shared else (low * hh + high * hl) / (hl + hh)
+    return inner if grid.periodic[axis] else anp.concatenate([cut(x, axis, 0, 1), inner, cut(x, axis, -1, None)], axis)
+
+
+def inside(x, grid, axis, nodes):
+    """Nodes (or cells) -> interfaces between the nodes of an axis: the cell centres, and the walls."""
+    if grid.periodic[axis]:
+        x = anp.concatenate([x, cut(x, axis, 0, 1)], axis) if nodes else x
+        middle = 0.5 * (cut(x, axis, 0, -1) + cut(x, axis, 1, None)) if nodes else x
+        return anp.concatenate([cut(middle, axis, -1, None), cut(middle, axis, 0, -1)], axis)
+    middle = 0.5 * (cut(x, axis, 0, -1) + cut(x, axis, 1, None)) if nodes else x
+    return anp.concatenate([cut(x, axis, 0, 1), middle, cut(x, axis, -1, None)], axis)
+
+
+def carrying_speeds(grid, v, velocity, form, own):
+    """The velocity along each axis where component `own` (None: cells) needs it."""
+    parts = (
+        grid.split(v) if velocity == "faces" else [anp.reshape(v, (grid.dim, *grid.shape))[a] for a in range(grid.dim)]
+    )
+    found = []
+    for axis, part in enumerate(parts):
+        if velocity == "cells" and form == "advective":
+            found.append(part if own is None else to_nodes(part, grid, own, False))
+        elif axis == own:
+            found.append(inside(part, grid, axis, velocity == "faces"))
+        else:
+            part = part if velocity == "faces" else to_nodes(part, grid, axis, False)
+            found.append(part if own is None else to_nodes(part, grid, own, True))
+    return found
+
+
+class Line:
+    """One axis of a component: its widths and distances, and what stands outside."""
+
+    def __init__(self, grid, axis, own, sides, walls):
+        self.axis, self.periodic, self.sides, self.walls = axis, grid.periodic[axis], sides, walls
+        cells, between = grid.widths[axis], grid.spacings(axis)
+        h = between if own == axis else cells
+        if self.periodic:
+            gaps = anp.roll(cells, 1) if own == axis else between
+            gaps = anp.append(gaps, gaps[:1])
+        else:
+            gaps = anp.concatenate([h[:1], cells if own == axis else between[1:-1], h[-1:]])
+        self.half = gaps * anp.where(anp.arange(gaps.size) % (gaps.size - 1) == 0, 1.0 if self.periodic else 0.5, 1.0)
+        self.h, self.gaps, self.half = (line(x, axis, grid.dim) for x in (h, gaps, self.half))
+
+    def around(self, u, low=None, high=None):
+        """The values below and above each interface, walls and both ends of a periodic axis included."""
+        low, high = u if low is None else low, u if high is None else high
+        first, last = cut(u, self.axis, 0, 1), cut(u, self.axis, -1, None)
+        before, after = cut(low, self.axis, -1, None), cut(high, self.axis, 0, 1)
+        if not self.periodic:
+            before, after = (
+                edge if side == dp.neumann else wall for edge, side, wall in zip((first, last), self.sides, self.walls)
+            )
+        return anp.concatenate([before, low], self.axis), anp.concatenate([high, after], self.axis)
+
+    def slope(self, u):
+        """Van Leer's limited difference from the point to its face."""
+        below, above = self.around(u)
+        a, b = u - cut(below, self.axis, 0, -1), cut(above, self.axis, 1, None) - u
+        c, e = (2 * cut(self.half, self.axis, i, j) / self.h for i, j in ((0, -1), (1, None)))
+        same = a * b > 0
+        a, b = anp.where(same, a, 1.0), anp.where(same, b, 1.0)
+        top = a * b * (a * e**2 + b * c**2)
+        return anp.where(same, top / (a**2 * e**2 + (c + e - 2) * c * e * a * b + b**2 * c**2), 0.0)
+
+    def rate(self, u, w, form, points, limited):
+        slope = self.slope(u) if limited else 0.0
+        below, above = self.around(u, u + slope, u - slope)
+        lower, upper = (lambda x: cut(x, self.axis, 0, -1)), (lambda x: cut(x, self.axis, 1, None))
+        if points:
+            p, m = anp.maximum(w, 0.0), anp.minimum(w, 0.0)
+            back, ahead = (self.h, self.h) if limited else (lower(self.gaps), upper(self.gaps))
+            return -p * (upper(below) - lower(below)) / back - m * (upper(above) - lower(above)) / ahead
+        w = anp.concatenate([w, cut(w, self.axis, 0, 1)], self.axis) if self.periodic else w
+        flux = anp.maximum(w, 0.0) * below + anp.minimum(w, 0.0) * above
+        rate = -(upper(flux) - lower(flux)) / self.h
+        return rate + u * (upper(w) - lower(w)) / self.h if form == "advective" else rate
+
+
+def component(grid, own, u, w, dt, walls, sides, form, points, scheme):
+    lines = []
+    for axis in range(grid.dim):
+        outside = [next(walls) for _ in sides[axis] or ()]
+        lines.append(Line(grid, axis, own, sides[axis], outside))
+    rate = lambda u: sum(one.rate(u, w[a], form, points, scheme == "van_leer") for a, one in enumerate(lines))
+    first = u + dt * rate(u)
+    return first if scheme == "upwind" else 0.5 * (u + first + dt * rate(first))
+
+
+def twin(grid, scheme, boundary, velocity, of, form):
+    """The function that ``dp.transport(...)`` with the same arguments is."""
+    sides = resolve(grid, boundary)
+    space, points = grid.cells if of == "cells" else grid.faces, velocity == "cells" and form == "advective"
+    walls = dp.transport(grid, scheme, boundary, velocity, of, form=form).walls
+
+    def move(u, v, dt, inflow):
+        values = iter(walls.split(inflow * anp.ones(walls.size)))
+        parts = [u] if of == "cells" else space.split(u)
+        moved = []
+        for number, part in enumerate(parts):
+            own = None if of == "cells" else number
+            w = carrying_speeds(grid, v, velocity, form, own)
+            moved.append(component(grid, own, part, w, dt, values, sides, form, points, scheme))
+        return moved[0] if of == "cells" else space.join(*moved)
+
+    return move
