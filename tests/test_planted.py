@@ -268,9 +268,9 @@ BUGS = {
     ),
     "a checkpoint that misses a vector of the optimizer": Bug(
         "optimize",
-        '        state = flatten(template)[1](content["state"])',
-        '        state = flatten(template)[1](content["state"])\n'
-        "        state = state._replace(**{state._fields[1]: template[1]})",
+        '            state = flatten(template)[1](content["state"])',
+        '            state = flatten(template)[1](content["state"])\n'
+        "            state = state._replace(**{state._fields[1]: template[1]})",
         "tests/optimize/test_resume.py",
     ),
     "a tolerance that the adjoint ignores": Bug(

@@ -78,7 +78,8 @@ class Checkpoint:
         if content["format"] == FORMAT_0_2:
             state, best = upgraded(content["state"], content["best"], template, trials.residual_scale)
         else:
-            state, best = flatten(template)[1](content["state"]), Trial(*content["best"])
+            state = flatten(template)[1](content["state"])
+            best = Trial(*content["best"])
         trials.iteration = content["iteration"]
         again, last = trials(state.trial.vector), state.trial
         same_value = same(again.value, last.value, start.value)
