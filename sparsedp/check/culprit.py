@@ -235,5 +235,5 @@ def _wrong_rule(node, rng, spaces):
         if one.word == "disagrees":
             words = f"its VJP is {one.note}" if one.note.startswith("off") else one.note
             return words + _entries_of_rule(node, trials, judged, one, weights, spaces)
-    gap, allowed = forward_mode(loss, judged[:DIRECTIONS]) or (0.0, 0.0)
-    return "" if gap <= allowed else f"its JVP differs from its VJP by {gap:.1e}, and its VJP is right"
+    gap, allowed, hidden = forward_mode(loss, judged[:DIRECTIONS]) or (0.0, 0.0, False)
+    return "" if gap <= allowed or hidden else f"its JVP differs from its VJP by {gap:.1e}, and its VJP is right"

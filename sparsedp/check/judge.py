@@ -85,7 +85,7 @@ def words(e):
     """
     return (
         ("constant", e.silent and e.slope == 0, "the loss does not change along this direction"),
-        ("disagrees", e.silent and abs(e.slope) * e.silent > 2 * FAR * e.line.trials.eps * abs(e.line.base),
+        ("disagrees", e.silent and abs(e.slope) * e.silent > 2 * FAR * e.smallest_change,
          "the loss does not change along this direction, the gradient says it does"),
         ("noise", e.silent, "the rounding of the loss hides the derivative"),
         ("few", e.used < LEVELS, "{e.used} usable steps, at least 4 are needed ({e.refusals})"),
@@ -126,7 +126,7 @@ VERDICTS = (
     (("broken",), "disagrees"),
     (("ripple",), "inconclusive"),
     (("disagrees", "outside"), "disagrees"),
-    (("open", "kink", "rough", "noise", "masked", "few", "loose steps"), "inconclusive"),
+    (("open", "hidden modes", "kink", "rough", "noise", "masked", "few", "loose steps"), "inconclusive"),
 )
 
 
@@ -209,6 +209,10 @@ def judgement(line):
     notes = "; ".join(sorted({level.note for level in line.levels} - {""})) or "the sweep has too few steps"
     evidence = {"line": line, "direction": line.name, "slope": line.slope, "used": len(line.usable), "refusals": notes}
     evidence |= {"silent": max(line.silent, default=0.0), "scale": np.float64(max(abs(line.slope), line.typical))}
+    evidence["smallest_change"] = line.trials.eps * abs(line.base)
+    if abs(line.base) <= FAR * line.trials.deviation:
+        # The loss is 0 to rounding: its noise along other directions, which grows with x, is the measure.
+        evidence["smallest_change"] = line.trials.deviation * max(1.0, evidence["silent"])
     if len(line.usable) >= LEVELS:
         evidence |= _read(line)
         evidence |= _estimate(**evidence)
@@ -371,7 +375,10 @@ def looked_at(trials, count, rng, wanted=None):
         return [], doubts
     directions = point.directions(vector, count, rng, wanted)
     lines = [Line(name, direction, trials) for name, direction in directions]
-    trials.noise = max(map(noise_of, lines[:1] + lines[1:][-1:]), default=0.0)
+    for line in lines[:1] + lines[1:][-1:]:
+        noise, deviation = noise_of(line)
+        trials.noise = max(trials.noise, noise)
+        trials.deviation = max(trials.deviation, deviation)
     judged = [measured(line, line is lines[0]) for line in lines]
     for one in judged if callable(trials.slope) else ():
         explained(one)
@@ -407,21 +414,38 @@ def _bent(result):
 
 
 def forward_mode(loss, judged):
-    """How far forward mode is from reverse mode along some directions -> (gap, allowed); None where a rule has no JVP.
+    """Compare forward mode with reverse mode along some directions; return None where a rule has no JVP.
 
-    They may differ by rounding, by SOLVED where the ledger shows a solve or the loss is noisy.
+    Returns
+    -------
+    gap : float
+        Largest difference of the two, as a share of the derivative.
+    allowed : float
+        What rounding explains: MODES, or SOLVED where the ledger shows a solve or the loss is noisy.
+    hidden : bool
+        Whether all larger gaps lie along directions where differences prove nothing, and below their error bars: the
+        derivative may be rounding itself, as that of a loss whose terms cancel.
     """
-    gaps, allowed = [0.0], MODES
+    largest_gap = 0.0
+    allowed = MODES
+    gaps_in_noise = []
     for one in judged:
-        line, point = one.line, one.line.point
+        point = one.line.point
         try:
             with np.errstate(all="ignore"):
-                slope = float(pushforward(loss, point.fresh(), point.unpack(line.direction))[1])
+                slope = float(pushforward(loss, point.fresh(), point.unpack(one.line.direction))[1])
         except NO_JVP:
             return None
-        gaps.append(abs(slope - one.slope) / one.scale if slope != one.slope else 0.0)
-        allowed = max(allowed, 300 * point.eps, SOLVED * (one.jitter > ROUNDING or line.trials.solved))
-    return float(np.max(gaps)), allowed
+        noisy = one.jitter > ROUNDING or one.line.trials.solved
+        allowed = max(allowed, 300 * point.eps, SOLVED * noisy)
+        difference = abs(slope - one.slope)
+        if difference == 0:
+            continue
+        gap = difference / one.scale if one.scale else inf
+        largest_gap = float(np.maximum(largest_gap, gap))  # NaN stays NaN
+        if not gap <= allowed:
+            gaps_in_noise.append(one.word not in PROVED and difference <= FAR * one.bar)
+    return largest_gap, allowed, all(gaps_in_noise)
 
 
 # ------------------------------------------------------------ more steps where the first leave it open

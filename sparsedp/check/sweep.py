@@ -159,6 +159,8 @@ class Trials:
         At the point.
     noise : float
         Noise of the loss in units of its rounding, where a table of differences has shown it; else 0.
+    deviation : float
+        The same in units of the loss.
     count : int
         Evaluations.
     solved : bool
@@ -177,6 +179,7 @@ class Trials:
         self.base = self.gradient = np.nan  # until it is started
         self.count, self.solved, self.tolerance, self.noise = 0, False, 0.0, 0.0
         self.step_tolerance = 0.0
+        self.deviation = 0.0
         self.eps = eps_of(float)
 
     def value(self, tree):
@@ -303,7 +306,15 @@ MOST = 4  # distances tried
 
 
 def noise_of(line):
-    """Line -> how much the loss varies where it should not, in units of its rounding; 0 where nothing varies.
+    """Measure how much the loss varies where it should not.
+
+    Returns
+    -------
+    (float, float)
+        Standard deviation, in units of the rounding of the loss and in those of the loss; 0 where nothing varies.
+
+    Notes
+    -----
 
     Values at equal distances, so close that a smooth loss is a straight line there. The k-th differences of a line
     are 0; those of independent errors of standard deviation s have the variance s^2 (2k)! / (k!)^2. The distance is
@@ -317,10 +328,11 @@ def noise_of(line):
         # On one side: a kink at x is no noise.
         values, changes, notes = zip(*(line.end(place * distance) for place in range(1, POINTS + 1)))
         if any(notes):
-            return 0.0
+            return 0.0, 0.0
         if np.count_nonzero(np.diff(values)) > POINTS // 2:
             size = max(*map(abs, values), abs(line.base), np.finfo(float).tiny)
             rests = np.array(values) - line.base - changes
-            return norm(np.diff(rests, ORDER)) / math.sqrt((POINTS - ORDER) * VARIANCE) / (line.trials.eps * size)
+            deviation = norm(np.diff(rests, ORDER)) / math.sqrt((POINTS - ORDER) * VARIANCE)
+            return deviation / (line.trials.eps * size), deviation
         distance *= GROWTH
-    return 0.0
+    return 0.0, 0.0

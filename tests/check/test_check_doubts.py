@@ -89,6 +89,49 @@ def test_a_point_where_every_line_is_straight_but_no_derivative_exists():
     assert AUDIT(loss, zero, gradient=lambda u: slope(u) + 0.1).verdict == "disagrees"
 
 
+# ---- losses that are 0 to rounding -----------------------------------------------------------------------------------
+
+PERIODIC_LAPLACIAN = dp.laplacian(dp.Grid((6, 5), periodic=True))
+WAVES = np.sin(np.arange(30.0)).reshape(6, 5)
+
+
+def cancelled(u):
+    """Sum of a Laplacian on a periodic grid: 0 up to rounding, and so is each derivative."""
+    return 1e-9 * anp.sum(PERIODIC_LAPLACIAN(u))
+
+
+@pytest.mark.parametrize("gradient", [None, dp.grad(cancelled)])
+@pytest.mark.parametrize("x", [WAVES, np.ones((6, 5))])
+def test_a_loss_and_a_gradient_that_are_rounding_are_inconclusive(x, gradient):
+    """At ones the loss is exactly 0 and does not change along the constant, and the gradient is not exactly 0."""
+    found = AUDIT(cancelled, x, gradient, directions=1)
+    assert abs(found.value) < 1e-22 and found.verdict == "inconclusive", found
+    assert gradient is not None or "the derivative may be rounding" in found.reason
+
+
+def wrong_cube(vjp_error, jvp_error):
+    return dp.differentiable(
+        "cube",
+        lambda u: u**3,
+        lambda nums, ans, u: lambda g: (3 * (1 + vjp_error) * u**2 * g,),
+        lambda nums, tangents, ans, u: 3 * (1 + jvp_error) * u**2 * tangents[0],
+    )
+
+
+@pytest.mark.parametrize("errors", [(1e-3, 0.0), (0.0, 1e-3), (1e-6, 1e-6)])
+def test_a_wrong_gradient_of_a_tiny_loss_is_found(errors):
+    cube = wrong_cube(*errors)
+    found = AUDIT(lambda u: 1e-20 * anp.sum(cube(u)), X)
+    assert found.verdict == "disagrees" and found.culprit == "cube"
+    assert AUDIT(lambda u: 1e-20 * anp.sum(u**3), X, gradient=3.003e-20 * X**2).verdict == "disagrees"
+    assert AUDIT(lambda u: 0.0 * anp.sum(u**3), X, gradient=3e-23 * X**2).verdict == "disagrees"
+
+
+def test_a_wrong_rule_that_a_large_constant_hides_is_found_by_itself():
+    found = AUDIT(lambda u: 1e15 + anp.sum(wrong_cube(0.0, 1e-2)(u)), X)
+    assert found.verdict == "disagrees" and found.culprit == "cube"
+
+
 # ---- ripples --------------------------------------------------------------------------------------------------------
 
 
