@@ -35,7 +35,7 @@ def robertson(tolerance):
 def swift_hohenberg(n):
     """Amplitude of rolls close to the threshold: 2 sqrt(r / 3) (Cross and Hohenberg, Rev. Mod. Phys. 65, 1993)."""
     grid = dp.Grid((n, n), size=4 * np.pi, periodic=True)
-    L = dp.function(dp.laplacian(grid), lambda e: -((1 + e) ** 2))
+    L = dp.matrix_function(dp.laplacian(grid), lambda e: -((1 + e) ** 2))
     step = dp.stepper("etdrk4", lambda u, r: r * u - u**3, 8.0, linear=L)
     start = 0.1 * np.cos(grid.centres()[0])
     return lambda r: np.sqrt(2 * np.mean(dp.rollout(step, start, r, 150) ** 2)), 0.01

@@ -5,8 +5,8 @@ Gradients through code that has none
 A simulator in plain NumPy, its sparse Jacobian from a dozen runs, and a gradient that is checked.
 
 Somebody has written a step of a simulation, and it works. Nobody wants to write it again for the sake of a gradient.
-`dp.adopt` takes it as it is, finds out which results depend on which values, and makes a function with derivatives
-of it.
+`dp.from_blackbox` takes it as it is, finds out which results depend on which values, and makes a function with
+derivatives of it.
 
 Run it: ``python examples/adopt_a_simulator.py [cells] [--out FOLDER]``
 """
@@ -77,7 +77,7 @@ def start(n):
 
 print("unknowns  entries of J  runs to find them  seconds  runs for each J  seconds  instead of")
 for n in (options.cells, 4 * options.cells):
-    step = dp.adopt(foreign)
+    step = dp.from_blackbox(foreign)
     x = start(n)
 
     clock = perf_counter()
@@ -103,7 +103,7 @@ print(step, "\n")
 #
 # The check does not trust the colours: it compares the gradient with differences of the loss itself.
 
-step = dp.adopt(foreign)
+step = dp.from_blackbox(foreign)
 x = start(options.cells)
 
 
@@ -139,7 +139,7 @@ print(f"\nloss {value:.4f}; its gradient in {x.size} unknowns took {step.runs - 
 #    the check still agree?
 # 2. Feed the mean of the whole plane, `0.04 * (1 - u.mean())`, on 8 cells. How many runs does a Jacobian take now, and
 #    why?
-# 3. Write the step with `autograd.numpy` and without `dp.adopt`. Compare the seconds of a gradient.
+# 3. Write the step with `autograd.numpy` and without `dp.from_blackbox`. Compare the seconds of a gradient.
 
 if options.out:
     from matplotlib import pyplot

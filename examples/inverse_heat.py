@@ -34,7 +34,7 @@ options = parser.parse_args()
 
 SIDE = 64
 grid = dp.Grid((SIDE, SIDE), periodic=True)
-heat = dp.exponential(dp.laplacian(grid), 8.0)
+heat = dp.matrix_exponential(dp.laplacian(grid), 8.0)
 
 # %%
 # On such a plate every wave :math:`k` is damped by a factor of its own, :math:`\hat y_k = \varphi_k \hat x_k`. The

@@ -142,12 +142,12 @@ print(f"drift of the mean {drift:.0e} (0), largest rise of energy {rise:.0e} (be
 # Waves of length :math:`2 \pi` grow, all others die out or lag behind. A single wave :math:`a \cos x` is steady when
 # :math:`r a = \frac{3}{4} a^3`, so the root mean square of :math:`u` is :math:`\sqrt{2 r / 3}`.
 #
-# `dp.function` makes an operator of a function of the eigenvalues of another one.
+# `dp.matrix_function` makes an operator of a function of the eigenvalues of another one.
 
 wide = dp.Grid((n, n), spacing=np.pi / 5, periodic=True)
 L = dp.laplacian(wide)
 
-convect = dp.stepper("etdrk4", lambda u, r: r * u - u**3, 0.5, linear=dp.function(L, lambda e: -((1 + e) ** 2)))
+convect = dp.stepper("etdrk4", lambda u, r: r * u - u**3, 0.5, linear=dp.matrix_function(L, lambda e: -((1 + e) ** 2)))
 rolls = report("Swift-Hohenberg", convect, 0.1 * noise, 0.1, 1000)
 
 frequencies = np.fft.fftfreq(n, np.pi / 5)

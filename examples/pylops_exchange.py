@@ -35,7 +35,7 @@ cells = options.cells
 grid = dp.Grid((cells, cells), size=1.0)
 x, y = grid.centres()
 blocks = 1.0 * (abs(x - 0.35) < 0.15) * (abs(y - 0.6) < 0.2) + 0.5 * (abs(x - 0.7) < 0.1) * (abs(y - 0.35) < 0.12)
-heat = dp.exponential(dp.laplacian(grid, dp.dirichlet), 3e-4)
+heat = dp.matrix_exponential(dp.laplacian(grid, dp.dirichlet), 3e-4)
 
 Heat = pylops.LinearOperator(Op=heat.to_scipy())
 pylops.utils.dottest(Heat, *Heat.shape, rtol=1e-12)

@@ -7,7 +7,8 @@
 shows how they work together, examples/ what they are for.
 
 Every name is imported when it is first used: ``import sparsedp`` loads nothing else.
-A new public name is one word in ``_WINDOW`` and one in ``__init__.pyi``, the copy that type checkers read.
+A new public name is one word in ``_WINDOW`` and one in ``__init__.pyi``, the copy that type checkers read. A renamed
+one also gets a line in ``_DEPRECATED`` and an alias in ``__init__.pyi``.
 """
 
 from importlib import import_module as _import_module
@@ -30,7 +31,7 @@ _WINDOW = {
     "solvers.choose_method": "inverse",
     "solvers.parametric": "elliptic_solver matrix_solver",
     "solvers.roots": "implicit steady",
-    "solvers.spectral": "exponential function power",
+    "solvers.spectral": "matrix_exponential matrix_function matrix_power",
     "flow.momentum": "convection face_laplacian face_lift",
     "advection.transport": "transport",
     "flow.finite_volumes": "conservation_law",
@@ -49,11 +50,17 @@ _WINDOW = {
     "report.stress_table": "stress",
     "report.work_precision": "workprec",
     "report.explain": "explain",
-    "interop.blackbox": "adopt",
+    "interop.blackbox": "from_blackbox",
     "io.archive": "load save",
     "io.pictures": "from_image",
     "parallel.scenes": "ensemble",
     "parallel.distribute": "distribute gather",
+}
+_DEPRECATED = {  # an old name: the name that replaces it, and the version that removes the old one
+    "adopt": ("from_blackbox", "0.5"),
+    "exponential": ("matrix_exponential", "0.5"),
+    "function": ("matrix_function", "0.5"),
+    "power": ("matrix_power", "0.5"),
 }
 _SPARSE = "scipy.sparse.linalg.{0}; SciPy takes an Operator as a LinearOperator on flat arrays"
 _STEP = "dp.stepper('rk4', rate, dt), and dp.rollout(step, start, params, n) for n steps"
@@ -150,6 +157,10 @@ __all__ = sorted([*_HOME, *_ROOMS])
 
 
 def __getattr__(name):
+    if name in _DEPRECATED:
+        new, removal = _DEPRECATED[name]
+        _import_module(f"{__name__}._utils.calls").warn_deprecated(f"{__name__}.{name}", f"{__name__}.{new}", removal)
+        return getattr(_import_module(__name__), new)  # not stored: each use warns
     if name in _HOME:
         value = getattr(_import_module(f"{__name__}.{_HOME[name]}"), name)
         if type(value) is _FunctionType:

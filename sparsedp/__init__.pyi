@@ -30,7 +30,7 @@ from .grid.grid import Grid as Grid
 from .grid.space import Space as Space
 from .integrators.leapfrog import sponge as sponge
 from .integrators.stepper import stepper as stepper
-from .interop.blackbox import adopt as adopt
+from .interop.blackbox import from_blackbox as from_blackbox
 from .io.archive import load as load
 from .io.archive import save as save
 from .io.pictures import from_image as from_image
@@ -78,9 +78,15 @@ from .solvers.parametric import elliptic_solver as elliptic_solver
 from .solvers.parametric import matrix_solver as matrix_solver
 from .solvers.roots import implicit as implicit
 from .solvers.roots import steady as steady
-from .solvers.spectral import exponential as exponential
-from .solvers.spectral import function as function
-from .solvers.spectral import power as power
+from .solvers.spectral import matrix_exponential as matrix_exponential
+from .solvers.spectral import matrix_function as matrix_function
+from .solvers.spectral import matrix_power as matrix_power
 from .trajectory.rollout import rollout as rollout
 
 __version__: str
+
+# deprecated names
+adopt = from_blackbox
+exponential = matrix_exponential
+function = matrix_function
+power = matrix_power

@@ -290,7 +290,7 @@ def filled(u):
 
 REFUSE = (
     "a traced value was refused ({}); write the function with autograd.numpy, without float(), item() and "
-    "u[i] = ..., or take foreign code in by dp.adopt or dp.differentiable"
+    "u[i] = ..., or take foreign code in by dp.from_blackbox or dp.differentiable"
 )
 
 

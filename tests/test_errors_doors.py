@@ -106,14 +106,14 @@ TABLE = [
         "value_and_grad takes a function, got float; write lambda x: np.sum(x**2)",
     ),
     (
-        lambda: dp.exponential(LAP, "a"),
+        lambda: dp.matrix_exponential(LAP, "a"),
         TYPE,
-        "time of exponential must be one real number, got 'a'",
+        "time of matrix_exponential must be one real number, got 'a'",
     ),
     (
-        lambda: dp.power(LAP, [1, 2]),
+        lambda: dp.matrix_power(LAP, [1, 2]),
         TYPE,
-        "exponent of power must be one real number, got [1, 2]",
+        "exponent of matrix_power must be one real number, got [1, 2]",
     ),
     (
         lambda: dp.rollout(None, U, None, 3),
@@ -178,9 +178,9 @@ TABLE = [
     *(
         (make, TYPE, f"{name} takes an Operator, got csr_array; write dp.from_matrix(...) first")
         for name, make in {
-            "exponential": lambda: dp.exponential(dp.laplacian(GRID).matrix),
-            "power": lambda: dp.power(dp.laplacian(GRID).matrix, 2),
-            "function": lambda: dp.function(dp.laplacian(GRID).matrix, np.exp),
+            "matrix_exponential": lambda: dp.matrix_exponential(dp.laplacian(GRID).matrix),
+            "matrix_power": lambda: dp.matrix_power(dp.laplacian(GRID).matrix, 2),
+            "matrix_function": lambda: dp.matrix_function(dp.laplacian(GRID).matrix, np.exp),
         }.items()
     ),
 ]

@@ -187,6 +187,6 @@ def test_code_that_drops_the_imaginary_part_is_no_reason_to_warn(recwarn):
         y[:] = x**2
         return y
 
-    adopted = dp.adopt(squares)
+    adopted = dp.from_blackbox(squares)
     slope = dp.value_and_grad(lambda x: anp.sum(adopted(x)))(np.arange(4.0))[1]
     assert np.allclose(slope, 2 * np.arange(4.0)) and adopted.way == "central differences" and not recwarn.list

@@ -39,7 +39,7 @@ def fields(method):
 
     def make(grid):
         L = dp.laplacian(grid)
-        linear = {"u": (L, 0.1), "v": dp.function(L, lambda e: -(e**2) - e)}
+        linear = {"u": (L, 0.1), "v": dp.matrix_function(L, lambda e: -(e**2) - e)}
         step = dp.stepper(method, lambda x, p: {"u": -p * x["u"], "v": p * x["u"]}, 0.1, linear=linear)
 
         def run(u, v, p):

@@ -364,18 +364,49 @@ def can_be_found(name):
 
 def test_stub_and_window_agree():
     stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
-    found = {
+    imported = {
         alias.asname: f"{node.module or ''}"
         for node in ast.walk(stub)
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
-    assert found == {**sparsedp._HOME, **dict.fromkeys(sparsedp._ROOMS, "")}
+    assert imported == {**sparsedp._HOME, **dict.fromkeys(sparsedp._ROOMS, "")}
+    aliases = {
+        ast.unparse(node.targets[0]): ast.unparse(node.value) for node in stub.body if isinstance(node, ast.Assign)
+    }
+    assert aliases == {old: new for old, (new, _) in sparsedp._DEPRECATED.items()}
 
 
 def test_unknown_name():
     with pytest.raises(AttributeError, match="module 'sparsedp' has no attribute 'nonsense'"):
         sparsedp.nonsense
+
+
+@pytest.mark.parametrize("old", sparsedp._DEPRECATED)
+def test_deprecated_names_work_and_warn(old):
+    new, removal = sparsedp._DEPRECATED[old]
+    message = f"sparsedp.{old} is deprecated and will be removed in version {removal}; write sparsedp.{new}"
+    for _ in range(2):  # each use warns, and names the line of the user
+        with pytest.warns(DeprecationWarning, match=re.escape(message)) as warned:
+            assert getattr(sparsedp, old) is getattr(sparsedp, new)
+        assert [warning.filename for warning in warned] == [__file__]
+    assert old not in dir(sparsedp) and new in dir(sparsedp)
+
+
+def test_deprecated_names_warn_where_they_are_imported():
+    with pytest.warns(DeprecationWarning, match="write sparsedp.from_blackbox") as warned:
+        from sparsedp import adopt
+    assert adopt is sparsedp.from_blackbox
+    assert {warning.filename for warning in warned} == {__file__}
+
+
+def test_deprecated_names_are_removed_in_time():
+    """An alias works for two minor releases, and is removed in the third."""
+    version = tuple(int(part) for part in re.findall(r"\d+", sparsedp.__version__)[:2])
+    overdue = [
+        old for old, (_, removal) in sparsedp._DEPRECATED.items() if version >= tuple(map(int, removal.split(".")))
+    ]
+    none(f"sparsedp.{old}: remove it" for old in overdue)
 
 
 @pytest.mark.parametrize(("name", "hint"), sparsedp._MEANT.items())

@@ -5,6 +5,7 @@
 
 import os
 import sys
+import warnings
 from difflib import get_close_matches
 from functools import wraps
 from inspect import Parameter, signature
@@ -14,6 +15,7 @@ from typing import Any
 
 __all__ = [
     "advice_near",
+    "deprecated_attribute",
     "describe_module",
     "foreign_keyword_advice",
     "frames_inside",
@@ -21,6 +23,7 @@ __all__ = [
     "public",
     "public_name",
     "shortened",
+    "warn_deprecated",
 ]
 
 PACKAGE = Path(__file__).parent.parent
@@ -286,3 +289,42 @@ def public_name(function, module, name):
     wrapped = public(written)(function)
     wrapped.__module__ = module  # pickle looks for the function there
     return wrapped
+
+
+def warn_deprecated(old: str, new: str, removal: str) -> None:
+    """Warn the user's code that a name is deprecated.
+
+    Parameters
+    ----------
+    old, new : str
+        The deprecated name and the one that replaces it, as a user writes them.
+    removal : str
+        Version in which the old name stops working.
+    """
+    message = f"{old} is deprecated and will be removed in version {removal}; write {new}"
+    warnings.warn(message, DeprecationWarning, stacklevel=frames_inside() + 1)
+
+
+def deprecated_attribute(old: str, new: str, removal: str) -> property:
+    """Return a property that reads a renamed attribute and warns.
+
+    Parameters
+    ----------
+    old, new : str
+        The deprecated name of the attribute and the one that replaces it.
+    removal : str
+        Version in which the old name stops working.
+
+    Examples
+    --------
+    >>> class Plan:
+    ...     skipped = ("velocity",)
+    ...     left_out = deprecated_attribute("left_out", "skipped", "0.5")
+    """
+
+    def read(self: Any) -> Any:
+        kind = type(self).__name__
+        warn_deprecated(f"{kind}.{old}", f"{kind}.{new}", removal)
+        return getattr(self, new)
+
+    return property(read, doc=f"Deprecated name of `{new}`.")

@@ -291,7 +291,7 @@ def traced(fun, tree, roots):
             raise
         raise DerivativeError(
             f"a traced value was refused ({error}); write the function with autograd.numpy, without float(), item() "
-            "and u[i] = ..., or take foreign code in by dp.adopt or dp.differentiable"
+            "and u[i] = ..., or take foreign code in by dp.from_blackbox or dp.differentiable"
         ) from error
 
 

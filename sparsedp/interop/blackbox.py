@@ -21,7 +21,7 @@ from sparsedp.operators.given import from_matrix
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
 
-__all__ = ["Adopted", "adopt"]
+__all__ = ["Adopted", "from_blackbox"]
 
 STEP, DIFFERENCES = "complex step", "central differences"
 WAYS = {"auto": "", "complex": STEP, "difference": DIFFERENCES}
@@ -35,7 +35,7 @@ SMALLER = 1.0, -1.0, 1e-2, -1e-2, 1e-4, -1e-4  # shares of a move, until the cod
 TIMES = 2, 5, 11  # steps at which what a row lacks is looked at again
 
 
-def adopt(f, sparsity=None, derivative="auto", name=None):
+def from_blackbox(f, sparsity=None, derivative="auto", name=None):
     """Any NumPy function of an array -> the same function, differentiable.
 
     Parameters
@@ -85,19 +85,19 @@ def adopt(f, sparsity=None, derivative="auto", name=None):
 
     Examples
     --------
-    >>> shift = adopt(lambda x: np.roll(x, 1) ** 2)
+    >>> shift = from_blackbox(lambda x: np.roll(x, 1) ** 2)
     >>> from sparsedp.autodiff.derivative import value_and_grad
     >>> import autograd.numpy as anp
     >>> value_and_grad(lambda x: anp.sum(shift(x)))(np.array([1.0, 2.0, 3.0]))
     (14.0, array([2., 4., 6.]))
     """
-    check_function("adopt", f, "dp.adopt(lambda x: ...)")
+    check_function("from_blackbox", f, "dp.from_blackbox(lambda x: ...)")
     check_choice("derivative", derivative, WAYS)
     return Adopted(f, sparsity, derivative, name or getattr(f, "__name__", "simulator"))
 
 
 class Adopted(Remade):
-    """A foreign function with a sparse Jacobian, kept for the last two points. Made by `adopt`.
+    """A foreign function with a sparse Jacobian, kept for the last two points. Made by `from_blackbox`.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ class Adopted(Remade):
         jacobian = self._shapes, self.way, self._coloured
         return Adopted, (self._f, self._sparsity, self._derivative, self.name, jacobian)
 
-    @public("dp.adopt(f)")
+    @public("dp.from_blackbox(f)")
     def __call__(self, x):
         return self._rule(x)
 

@@ -234,7 +234,7 @@ class Operator(Frozen, Remade):
         return self + other  # refused with advice
 
     def __pow__(self, exponent):
-        raise TypeError(f"{self.name} ** {exponent!r} is not defined; write A @ A, or dp.power(A, exponent)(u)")
+        raise TypeError(f"{self.name} ** {exponent!r} is not defined; write A @ A, or dp.matrix_power(A, exponent)(u)")
 
     def __neg__(self):
         return self * -1.0

@@ -6,10 +6,10 @@ from sparsedp._utils.validation import check_finite, check_function, check_kind,
 from sparsedp.operators.operator import Operator
 from sparsedp.solvers.separable import SpectralFunction, diagonalised
 
-__all__ = ["exponential", "function", "power"]
+__all__ = ["matrix_exponential", "matrix_function", "matrix_power"]
 
 
-def exponential(op, time=1.0):
+def matrix_exponential(op, time=1.0):
     """Separable operator -> the operator exp(time * op): exact diffusion over a time, at any size of step.
 
     Parameters
@@ -40,19 +40,19 @@ def exponential(op, time=1.0):
     Examples
     --------
     >>> from sparsedp import Grid, laplacian
-    >>> spread = exponential(laplacian(Grid(2)), 1e9)
+    >>> spread = matrix_exponential(laplacian(Grid(2)), 1e9)
     >>> print(np.round(spread(np.array([1.0, 3.0])), 6))
     [2. 2.]
     """
-    axes, values = diagonalised(op, "exponential")
-    check_number("time of exponential", time)
+    axes, values = diagonalised(op, "matrix_exponential")
+    check_number("time of matrix_exponential", time)
     with np.errstate(over="ignore"):
         weights = np.exp(time * values)
     name = f"exp({time:g} * {op.name})"
     return _function(op, axes, weights, name, "; take a shorter time or the other sign")
 
 
-def power(op, exponent):
+def matrix_power(op, exponent):
     """Separable operator -> the operator op^exponent, such as a square root or a smoothing power.
 
     Parameters
@@ -83,12 +83,12 @@ def power(op, exponent):
     Examples
     --------
     >>> from sparsedp import Grid, laplacian
-    >>> root = power(-laplacian(Grid(3)), 0.5)
+    >>> root = matrix_power(-laplacian(Grid(3)), 0.5)
     >>> print(np.round(root(root(np.array([1.0, 2.0, 4.0]))), 6))
     [-1. -1.  2.]
     """
-    axes, values = diagonalised(op, "power")
-    check_number("exponent of power", exponent)
+    axes, values = diagonalised(op, "matrix_power")
+    check_number("exponent of matrix_power", exponent)
     if exponent != int(exponent) and np.any(values < 0):
         raise ValueError(f"{op.name} has eigenvalues down to {values.min():.1e}; a fractional power needs them >= 0")
     zero = values == 0
@@ -97,7 +97,7 @@ def power(op, exponent):
     return _function(op, axes, weights, f"({op.name})^{exponent:g}", "; rescale the operator")
 
 
-def function(op, f):
+def matrix_function(op, f):
     """Separable operator -> the operator f(op): f of its eigenvalues, such as a polynomial in a Laplacian.
 
     Parameters
@@ -131,17 +131,17 @@ def function(op, f):
     --------
     >>> from sparsedp import Grid, laplacian
     >>> L = laplacian(Grid(3))
-    >>> swift_hohenberg = function(L, lambda e: 0.1 - (1 + e) ** 2)
+    >>> swift_hohenberg = matrix_function(L, lambda e: 0.1 - (1 + e) ** 2)
     >>> u = np.array([1.0, 2.0, 4.0])
     >>> print(np.round(swift_hohenberg(u) - (0.1 * u - u - 2 * L(u) - L(L(u))), 12) + 0.0)
     [0. 0. 0.]
     """
-    check_function("function", f, "lambda e: -e**2 - e")
-    axes, values = diagonalised(op, "function")
+    check_function("matrix_function", f, "lambda e: -e**2 - e")
+    axes, values = diagonalised(op, "matrix_function")
     with np.errstate(all="ignore"):  # NaN is refused below
         weights = np.asarray(f(values.copy()))
-    check_shape("f(e) of function", weights, values.shape, "; give a number for each eigenvalue")
-    check_kind("f(e) of function", weights.dtype, "real numbers")
+    check_shape("f(e) of matrix_function", weights, values.shape, "; give a number for each eigenvalue")
+    check_kind("f(e) of matrix_function", weights.dtype, "real numbers")
     return _function(op, axes, weights.astype(float), f"f({op.name})", "; check f there")
 
 

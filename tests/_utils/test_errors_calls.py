@@ -13,6 +13,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import eigsh, lobpcg
 
 import sparsedp as dp
+from sparsedp._utils.calls import deprecated_attribute
 from sparsedp.errors import ShapeError
 
 GRID = dp.Grid((4, 3))
@@ -93,7 +94,7 @@ TABLE = [
     (lambda: M - L, TypeError, ADD),
     (lambda: L @ M, TypeError,
      "laplacian @ a sparse matrix is not defined; write A @ dp.from_matrix(M, A.domain, A.codomain)"),
-    (lambda: L**2, TypeError, "laplacian ** 2 is not defined; write A @ A, or dp.power(A, exponent)(u)"),
+    (lambda: L**2, TypeError, "laplacian ** 2 is not defined; write A @ A, or dp.matrix_power(A, exponent)(u)"),
     (lambda: L(U.ravel()), ShapeError,
      "laplacian takes a field on cells(4, 3), got an array of shape (12,); write op(u.reshape(4, 3)), or op @ u for a "
      "flat array"),
@@ -280,3 +281,14 @@ def test_a_file_that_is_not_there_keeps_pythons_words(tmp_path):
     with pytest.raises(FileNotFoundError) as caught:
         dp.load(tmp_path / "u.npz")
     assert caught.value.strerror == "No such file or directory"
+
+
+def test_a_deprecated_attribute_works_and_warns():
+    class Plan:
+        skipped = ("velocity",)
+        left_out = deprecated_attribute("left_out", "skipped", "0.5")
+
+    message = "Plan.left_out is deprecated and will be removed in version 0.5; write Plan.skipped"
+    with pytest.warns(DeprecationWarning, match=message) as warned:
+        assert Plan().left_out == ("velocity",)
+    assert warned[0].filename == __file__

@@ -59,27 +59,31 @@ TABLE = [
         VALUE,
         "separable needs a sum of 1-D factors that can be diagonalised, got <matrix: space(3) -> space(3), explicit>",
     ),
-    (lambda: dp.exponential(dp.laplacian(LINE), np.nan), FINITE, "time of exponential must be finite, got nan"),
     (
-        lambda: dp.exponential(-dp.laplacian(LINE), 1e4),
+        lambda: dp.matrix_exponential(dp.laplacian(LINE), np.nan),
+        FINITE,
+        "time of matrix_exponential must be finite, got nan",
+    ),
+    (
+        lambda: dp.matrix_exponential(-dp.laplacian(LINE), 1e4),
         FINITE,
         "exp(10000 * -laplacian) must be finite at the eigenvalues, got 2 that are NaN or infinite, the first "
         "at 1; take a shorter time or the other sign",
     ),
     (
-        lambda: dp.exponential(dp.gradient(LINE)),
+        lambda: dp.matrix_exponential(dp.gradient(LINE)),
         VALUE,
-        "exponential needs a separable operator that can be diagonalised, "
+        "matrix_exponential needs a separable operator that can be diagonalised, "
         "got <gradient: cells(3) -> faces(3), explicit>",
     ),
-    (lambda: dp.power(dp.laplacian(LINE), np.inf), FINITE, "exponent of power must be finite, got inf"),
+    (lambda: dp.matrix_power(dp.laplacian(LINE), np.inf), FINITE, "exponent of matrix_power must be finite, got inf"),
     (
-        lambda: dp.power(dp.laplacian(LINE), 0.5),
+        lambda: dp.matrix_power(dp.laplacian(LINE), 0.5),
         VALUE,
         "laplacian has eigenvalues down to -3.0e+00; a fractional power needs them >= 0",
     ),
     (
-        lambda: dp.power(-dp.laplacian(LINE), 1000),
+        lambda: dp.matrix_power(-dp.laplacian(LINE), 1000),
         FINITE,
         "(-laplacian)^1000 must be finite at the eigenvalues, got 1 that are NaN or infinite, the first at 2; "
         "rescale the operator",

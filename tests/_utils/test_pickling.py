@@ -33,7 +33,7 @@ def test_same_bits_here(one):
     fresh = pickle.dumps(thing)
     twin = pickle.loads(fresh)
     assert use(twin) == use(thing)
-    assert len(pickle.dumps(thing)) <= 1.2 * len(fresh) + 5000 or one[0] == "adopt", "a cache travels"
+    assert len(pickle.dumps(thing)) <= 1.2 * len(fresh) + 5000 or one[0] == "from_blackbox", "a cache travels"
 
 
 @pytest.mark.whole
@@ -101,7 +101,7 @@ UNNAMED = [
     (dp.implicit(travellers.cubic, lambda x, p: 3 * x**2), "implicit(cubic)"),
     (dp.value_and_grad(lambda x: x**2), "value_and_grad"),
     (dp.flow_step(travellers.BOX, 0.1, force=lambda v, p: v), "FlowStep"),
-    (dp.adopt(lambda x: x, name="copy"), "copy"),
+    (dp.from_blackbox(lambda x: x, name="copy"), "copy"),
     (dp.differentiable("copy", lambda x: x), "copy"),
     (dp.differentiable("copy", travellers.cube, lambda nums, y, x: lambda g: (g,)), "copy"),
     (dp.physical_gradient(travellers.cube, lambda y, x: y), "physical gradient"),
@@ -133,7 +133,7 @@ def test_the_message_whole():
         match="adopted cannot be pickled with test_the_message_whole.<locals>.doubled, which other processes cannot "
         "import; write it as a def at the top level of a module",
     ):
-        pickle.dumps(dp.adopt(doubled, name="adopted"))
+        pickle.dumps(dp.from_blackbox(doubled, name="adopted"))
     with pytest.raises(TypeError, match="cannot be pickled with .*LinearOperator with dtype=float64"):
         pickle.dumps(dp.from_linear_operator(scipys))
 

@@ -118,7 +118,7 @@ def test_compositions_and_functions(check):
         some = dp.from_functions(
             lambda u: stack @ u.ravel(), lambda g: (stack.T @ g).reshape(7, 6), GRID.cells, 42, "some"
         )
-        works = [through(op) for op in (some, L @ L + 2 * L, dp.power(-L, 0.5), dp.exponential(0.1 * L))]
+        works = [through(op) for op in (some, L @ L + 2 * L, dp.matrix_power(-L, 0.5), dp.matrix_exponential(0.1 * L))]
         return lambda number: [work(number) for work in works]
 
     check(make)
@@ -345,7 +345,7 @@ def test_adopted_simulators_that_write_into_a_buffer(check):
         return buffer
 
     def make():
-        simulate = dp.adopt(foreign, derivative="difference")
+        simulate = dp.from_blackbox(foreign, derivative="difference")
         return lambda number: slope(lambda u: np.sum(simulate(u) ** 2), numbers(number, 30, 1.0, 2.0))
 
     check(make, 1)

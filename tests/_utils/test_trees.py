@@ -562,7 +562,7 @@ ENTRANCES = {
     "guess of implicit": lambda x: dp.implicit(lambda x, p: x**2 - p)(x + 1, X),
     "params of implicit": lambda x: dp.implicit(lambda x, p: x**2 - p)(X, x),
     "guess of steady": lambda x: dp.steady(lambda x: x - 1.0, x),
-    "argument of adopt": lambda x: dp.adopt(lambda x: x**2)(x),
+    "argument of adopt": lambda x: dp.from_blackbox(lambda x: x**2)(x),
     "ensemble": lambda x: dp.ensemble(lambda x, scene: anp.sum(abs(x)), [1])(x),
     "certify": lambda x: dp.certify(square, x),
     "stress": lambda x: dp.stress(square, x),
@@ -596,7 +596,7 @@ def test_other_precisions_are_refused_by_name(entrance, dtype):
 def test_adopted_functions_of_other_precision_are_refused(dtype):
     """Differences of half precision would give a derivative of 0."""
     with pytest.raises(TypeError, match="the result of <lambda> must be float32, float64, complex64 or complex128"):
-        dp.adopt(lambda u: (u**2).astype(dtype))(X)
+        dp.from_blackbox(lambda u: (u**2).astype(dtype))(X)
 
 
 def test_derivatives_of_other_precision_are_rounded():

@@ -106,13 +106,13 @@ BUILDERS = {
         lambda scenes, weights: dp.ensemble(misfit_of, scenes, weights=weights),
         lambda total: value_and_grad(total)(CELLS),
     ),
-    "adopt": (
+    "from_blackbox": (
         (sp.csr_array(np.eye(12) + np.roll(np.eye(12), -1, 1)),),
-        lambda s: dp.adopt(squares, s),
+        lambda s: dp.from_blackbox(squares, s),
         lambda f: value_and_grad(lambda x: anp.sum(f(x)))(np.arange(12.0)),
     ),
-    "exponential": ((np.array(0.3),), lambda t: dp.exponential(L, t), cells),
-    "power": ((np.array(0.5),), lambda t: dp.power(-L, t), cells),
+    "matrix_exponential": ((np.array(0.3),), lambda t: dp.matrix_exponential(L, t), cells),
+    "matrix_power": ((np.array(0.5),), lambda t: dp.matrix_power(-L, t), cells),
     "face_laplacian": ((SOLID, walls("flow")), lambda s, b: dp.face_laplacian(GRID, b, s), applied),
     "face_lift": ((walls("flow"),), lambda b: dp.face_lift(GRID, b), lambda op: op(np.ones(op.domain.shape))),
     "convection": ((SOLID, walls("flow")), lambda s, b: dp.convection(GRID, b, s), lambda f: f(K, K)),
@@ -248,8 +248,8 @@ def test_every_builder_is_here():
     unbuilt += (
         "sponge identity divergence curl upwind component prolong harmonic_average from_functions from_linear_operator"
     )
-    calls = "function adopt minimize certify certified explain stress workprec rollout grad value_and_grad vjp jvp hvp"
-    calls += " differentiable set_threads steady distribute gather"
+    calls = "matrix_function from_blackbox minimize certify certified explain stress workprec rollout"
+    calls += " grad value_and_grad vjp jvp hvp differentiable set_threads steady distribute gather"
     shown = "animate plot convergence v_curve update_direction save load from_image"
     public = {name for name in dir(dp) if callable(getattr(dp, name)) and name.islower() and name[0] != "_"}
     public -= {"dirichlet", "neumann"}  # a call of them is refused with advice

@@ -47,7 +47,7 @@ def steep_matrix(x):
 @pytest.mark.parametrize("derivative", ["auto", "complex", "difference"])
 def test_adopted_code(rng, derivative):
     x, g = rng.standard_normal((2, N))
-    f = dp.adopt(reusing(steep), derivative=derivative)
+    f = dp.from_blackbox(reusing(steep), derivative=derivative)
     y, pull = pullback(f, x)
     assert np.allclose(pull(g), steep_matrix(x).T @ g, rtol=1e-7)
     assert np.array_equal(y, steep(x)) and np.allclose(pushforward(f, x, g)[1], steep_matrix(x) @ g, rtol=1e-7)
@@ -61,7 +61,7 @@ def test_adopted_code_that_works_in_its_argument(rng):
         return x[::-1]
 
     x = rng.standard_normal(N)
-    f = dp.adopt(inside)
+    f = dp.from_blackbox(inside)
     known = (np.eye(N) + np.diag(2 * x[:-1], -1))[::-1]
     assert np.allclose(f.jacobian(x).toarray(), known, rtol=1e-12)
     two = f(x), f(2 * x)

@@ -176,7 +176,7 @@ MORE = {
     "rollout in rollout": (lambda u: run_of(u, lambda v, p: run_of(v, n=2)), LINE),
     "leapfrog, reversed": (waves, LINE),
     "euler": (stepped("euler"), LINE),
-    "adopt": (dp.adopt(np.sin), LINE),
+    "adopt": (dp.from_blackbox(np.sin), LINE),
     "transport": (lambda u: dp.transport(GRID_OF_ROWS)(u, np.full(GRID_OF_ROWS.faces.size, 0.1), 0.1), ROWS),
     "implicit": (lambda u: dp.implicit(lambda x, p: x + x**3 - p)(u, u), LINE),
     "implicit, dict": (root_of_a_tree, LINE),

@@ -224,9 +224,9 @@ def operators():
             yield f"{entry.builder} {number}", entry.make(grid, entry.conditions([dp.robin(1, 2)])[0])
     yield "from_functions", dp.from_functions(mix, unmix, 12, 12)
     yield "from_linear_operator", dp.from_linear_operator(aslinearoperator(sp.csr_array(BAND)))
-    yield "exponential", dp.exponential(dp.laplacian(GRID, dp.dirichlet), 0.1)
-    yield "function", dp.function(dp.laplacian(BOX), np.cos)
-    yield "power", dp.power(-dp.laplacian(BOX, dp.dirichlet), 0.5)
+    yield "matrix_exponential", dp.matrix_exponential(dp.laplacian(GRID, dp.dirichlet), 0.1)
+    yield "matrix_function", dp.matrix_function(dp.laplacian(BOX), np.cos)
+    yield "matrix_power", dp.matrix_power(-dp.laplacian(BOX, dp.dirichlet), 0.5)
     yield "projection", dp.projection(GRID, SOLID, {"x": (dp.no_slip, dp.outflow)})
     yield "projection by transforms", dp.projection(BOX)
     yield "pressure", dp.projection(GRID).pressure
@@ -291,7 +291,7 @@ def travellers():
     yield "grad", "", dp.grad(loss), lambda f: [f(numbers(7)).tobytes()]
     yield "differentiable", "", dp.differentiable("cube", cube, cube_vjp, cube_jvp), lambda f: bits(f, numbers(7))
     yield "physical_gradient", "", dp.physical_gradient(cube, root_of_cube), of_physical
-    yield "adopt", "", dp.adopt(foreign), of_adopted
+    yield "from_blackbox", "", dp.from_blackbox(foreign), of_adopted
     yield "ensemble", "", dp.ensemble(misfit_of, [1.0, 2.0], weights=[1, 3], chunk=2), of_total
     yield "certified", "", dp.certified(0.2), of_certified
     net = dp.network

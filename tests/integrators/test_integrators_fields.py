@@ -163,13 +163,13 @@ def test_set_ups_are_shared(coefficients, count):
 
 # ---- functions of an operator --------------------------------------------------------------------------------------
 
-F = dp.function(L, lambda e: 0.3 - (1 + e) ** 2)
+F = dp.matrix_function(L, lambda e: 0.3 - (1 + e) ** 2)
 OPERATORS = [
     L @ L * -1.0,
     -2.0 * L - L @ L,
     F,
-    F - dp.power(L, 2),
-    -1.0 * dp.power(-L, 1.5),
+    F - dp.matrix_power(L, 2),
+    -1.0 * dp.matrix_power(-L, 1.5),
     dp.diagonal(GRID.cells, -(U**2)),
     dp.diagonal(GRID.cells, U) - 2 * dp.diagonal(GRID.cells, V**2),
 ]
@@ -194,7 +194,9 @@ def test_functions_of_an_operator(op):
         assert dp.check.gradient(loss, nu, quick=True).verdict == "agrees"
 
 
-@pytest.mark.parametrize("op", [-1.0 * L @ L, dp.function(L, lambda e: -(e**2) - e)], ids=["product", "function"])
+@pytest.mark.parametrize(
+    "op", [-1.0 * L @ L, dp.matrix_function(L, lambda e: -(e**2) - e)], ids=["product", "function"]
+)
 @pytest.mark.parametrize("method", ["imex", "etdrk4"])
 def test_the_mean_stays_under_fourth_order_terms(op, method):
     grid = GRID
@@ -273,7 +275,7 @@ def test_trees_travel():
 @pytest.mark.parametrize("method", ["imex", "etdrk4"])
 def test_thin_and_empty_grids(method, shape):
     lap, u = dp.laplacian(dp.Grid(shape)), np.cos(np.arange(shape[0] * shape[1])).reshape(shape)
-    for op in (-1.0 * lap @ lap, dp.function(lap, lambda e: -(e**2))):
+    for op in (-1.0 * lap @ lap, dp.matrix_function(lap, lambda e: -(e**2))):
         step = dp.stepper(method, lambda x, p: {"b": -p * x["b"], "a": p * x["b"]}, 0.1, linear={"a": op, "b": None})
         end = step({"a": u, "b": u}, 0.5)
         assert end["a"].shape == shape and np.sum(end["a"] + end["b"]) == pytest.approx(2 * np.sum(u), rel=1e-12)

@@ -86,7 +86,7 @@ def test_phi_against_the_integral(x):
 def test_functions_against_the_dense_matrix(power):
     grid = dp.Grid((4, 5), size=1.0, periodic=(True, False))
     op = dp.laplacian(grid, dp.dirichlet)
-    op = dp.power(op, 2) if power else op
+    op = dp.matrix_power(op, 2) if power else op
     dense = np.array([op(unit.reshape(4, 5)).ravel() for unit in np.eye(20)]).T
     f = PhiFunctions(op, "f")
     z, u = (-1e-4 if power else 0.01), np.random.default_rng(0).standard_normal((4, 5))

@@ -37,7 +37,7 @@ def traced(x):
 )
 def test_a_step_of_foreign_code(rng, f, way, runs, digits):
     x, g = rng.random((2, 64, 64)), rng.standard_normal((2, 64, 64))
-    step = dp.adopt(f)
+    step = dp.from_blackbox(f)
     slope = dp.value_and_grad(lambda x: anp.sum(g * step(x)))(x)[1]
     known = dp.value_and_grad(lambda x: anp.sum(g * traced(x)))(x)[1]
     assert np.linalg.norm(slope - known) <= digits * np.linalg.norm(known)
@@ -50,7 +50,7 @@ def test_a_step_of_foreign_code(rng, f, way, runs, digits):
 
 def test_the_audit_agrees_and_jvps_fit(rng):
     x = rng.random((2, 6, 7))
-    step = dp.adopt(reaction)
+    step = dp.from_blackbox(reaction)
     assert dp.check.gradient(lambda x: anp.sum(anp.sin(3 * step(x))), x, quick=True).verdict == "agrees"
     v, g = rng.standard_normal((2, *x.shape))
     forward = derivative.pushforward(step, x, v)[1]
@@ -59,18 +59,18 @@ def test_the_audit_agrees_and_jvps_fit(rng):
 
 def test_runs_are_counted_and_kept_for_the_last_two_points(rng):
     x, y = rng.random((2, 2, 4, 4))
-    step = dp.adopt(reaction)
+    step = dp.from_blackbox(reaction)
     both = dp.value_and_grad(lambda x: anp.sum(step(x) ** 2))
     both(x), both(y)
     with recording() as calls:
         both(x), both(y)
     assert calls["reaction.run", "forward"] == 2
-    assert str(dp.adopt(reaction)) == "reaction: no derivative asked for yet, 0 runs"
+    assert str(dp.from_blackbox(reaction)) == "reaction: no derivative asked for yet, 0 runs"
 
 
 def test_as_the_jacobian_of_implicit(rng):
     """A backward step of foreign code."""
-    step = dp.adopt(reaction)
+    step = dp.from_blackbox(reaction)
     start = rng.random((2, 4, 4))
     root = dp.implicit(lambda x, b: 1.1 * x - 0.1 * step(x) - b)
     x = root(start, start)
@@ -81,7 +81,7 @@ def test_as_the_jacobian_of_implicit(rng):
 def test_a_given_sparsity_saves_the_probing(rng):
     x = rng.standard_normal(50)
     pattern = np.eye(50) + np.eye(50, k=1) + np.eye(50, k=-49)
-    f = dp.adopt(lambda x: x * np.roll(x, -1), sparsity=pattern, name="pairs")
+    f = dp.from_blackbox(lambda x: x * np.roll(x, -1), sparsity=pattern, name="pairs")
     jacobian = f.jacobian(x)
     assert np.allclose(jacobian.toarray(), np.diag(np.roll(x, -1)) + np.diag(x[:-1], 1) + np.diag(x[-1:], -49))
     assert f.runs < 12
@@ -90,13 +90,13 @@ def test_a_given_sparsity_saves_the_probing(rng):
 @pytest.mark.parametrize("shape", [(1,), (0,), (3, 1)])
 def test_small_and_empty(shape):
     x = np.full(shape, 2.0)
-    f = dp.adopt(lambda x: x**3)
+    f = dp.from_blackbox(lambda x: x**3)
     assert np.allclose(dp.value_and_grad(lambda x: anp.sum(f(x)))(x)[1], 12.0)
 
 
 def test_outputs_of_another_shape_and_a_full_jacobian(rng):
     matrix = rng.standard_normal((3, 30))
-    f = dp.adopt(lambda x: matrix @ np.sin(x), name="sensors")
+    f = dp.from_blackbox(lambda x: matrix @ np.sin(x), name="sensors")
     x = rng.standard_normal(30)
     assert np.allclose(f.jacobian(x).toarray(), matrix * np.cos(x), rtol=1e-12)
     assert f(x.astype(np.float32)).shape == (3,)
@@ -122,7 +122,7 @@ def far(x):
 )
 def test_a_stencil_is_found_from_a_few_cells(rng, f, shape, most):
     """And where the field is not the same everywhere the whole pattern is searched for."""
-    x, step = rng.standard_normal(shape), dp.adopt(f)
+    x, step = rng.standard_normal(shape), dp.from_blackbox(f)
     jacobian = step.jacobian(x)
     assert step.runs <= most
     v = 1e-6 * rng.standard_normal(shape)
@@ -145,7 +145,7 @@ def test_small_rows_keep_what_no_stencil_has(rng, size):
         x = np.asarray(x).real
         return sizes * (np.roll(x, 1) - 2 * x + 0.1 * x**2 + np.where(sizes < 1, np.sum(x), 0.0))
 
-    small = dp.adopt(f, derivative="difference").jacobian(x).toarray()[[37, 101]]
+    small = dp.from_blackbox(f, derivative="difference").jacobian(x).toarray()[[37, 101]]
     assert np.all(small != 0) and np.max(np.abs(small[0, 200:] / size - 1)) < 1e-6
 
 
@@ -157,5 +157,5 @@ def test_code_that_refuses_what_is_near(limit, answer):
             raise ValueError("too large")
         return np.where(np.max(np.abs(x)) > limit, np.nan, x * np.roll(x, 1))
 
-    jacobian = dp.adopt(picky).jacobian(np.full(300, 1.0))
+    jacobian = dp.from_blackbox(picky).jacobian(np.full(300, 1.0))
     assert jacobian.nnz == 600 and np.allclose(jacobian.sum(axis=1), 2.0)

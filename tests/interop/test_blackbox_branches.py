@@ -139,7 +139,7 @@ def test_the_other_side_is_met_later(f, seed):
     """The first point sees one side of every branch; the ones that follow turn a few, and then all."""
     rng = np.random.default_rng(seed)
     for code in (f, real(f)) if f in REAL else (f,):
-        adopted, x = dp.adopt(code), 2 + rng.random(2 * N)
+        adopted, x = dp.from_blackbox(code), 2 + rng.random(2 * N)
         for turned in (0, 3, 10, 2 * N):
             x = np.where(np.isin(np.arange(2 * N), rng.choice(2 * N, turned, replace=False)), -x, x)
             g, v = rng.standard_normal((2, 2 * N))
@@ -153,7 +153,7 @@ def test_the_other_side_is_met_later(f, seed):
 @pytest.mark.parametrize("f", [relu, relu_of_real, real(relu)], ids=lambda f: f.__name__)
 def test_at_a_kink_and_near_it(f):
     """Exactly at a kink the derivative is the mean of both sides; next to it that of its side."""
-    adopted, x = dp.adopt(f), np.linspace(1.0, 2.0, 300)
+    adopted, x = dp.from_blackbox(f), np.linspace(1.0, 2.0, 300)
     adopted.jacobian(x)
     x[::3], x[1::30], x[2::30] = 0.0, 1e-6, -1e-6
     known = np.where(x > 0, 1.0, np.where(x < 0, 0.0, 0.5))
@@ -162,7 +162,7 @@ def test_at_a_kink_and_near_it(f):
 
 def test_a_kink_without_a_derivative_is_refused():
     """Three equal numbers: no linear map is the derivative of the largest of three."""
-    largest = dp.adopt(lambda x: np.array([np.max(x.real)]), name="largest")
+    largest = dp.from_blackbox(lambda x: np.array([np.max(x.real)]), name="largest")
     assert np.allclose(largest.jacobian(np.array([1.0, 3.0, 2.0])).toarray(), [[0, 1, 0]])
     with pytest.raises(DerivativeError, match=r"the Jacobian of largest .* in row 0"):
         largest.jacobian(np.ones(3))
@@ -173,7 +173,7 @@ def test_a_kink_without_a_derivative_is_refused():
 def test_a_sparsity_that_lacks_entries(f, derivative, rng):
     """What is given is not searched for: it is right, or refused, at the first point and at later ones."""
     x = 2 + rng.random(2 * N)
-    adopted = dp.adopt(f, sparsity=CODES[f](x) != 0, derivative=derivative)
+    adopted = dp.from_blackbox(f, sparsity=CODES[f](x) != 0, derivative=derivative)
     for turned in (0, 3, 10, 2 * N):
         x = np.where(np.arange(2 * N) < turned, -x, x)
         try:
@@ -193,7 +193,7 @@ def test_code_that_refuses_every_probe():
         return z**2
 
     with pytest.raises(ValueError, match="outside of the table"):
-        dp.adopt(narrow, sparsity=np.eye(2), derivative="complex").jacobian(x)
+        dp.from_blackbox(narrow, sparsity=np.eye(2), derivative="complex").jacobian(x)
 
 
 @pytest.mark.parametrize("place", [2, 4, 9])
@@ -209,7 +209,7 @@ def test_no_memory_is_no_branch_of_the_code(place):
 
     for trouble in (MemoryError(), KeyboardInterrupt()):
         calls.clear()
-        adopted = dp.adopt(full)
+        adopted = dp.from_blackbox(full)
         with pytest.raises(type(trouble)):
             adopted.jacobian(x)
         assert np.allclose(adopted.jacobian(x).toarray(), np.diag(2 * x), rtol=1e-12)
@@ -221,7 +221,7 @@ def test_never_a_wrong_number(seed):
     rng = np.random.default_rng(seed)
     parts = [rng.choice([relu, upwind, sort, leader, distance, mixed, tiny_rows]) for _ in range(2)]
     f = lambda x: parts[1](parts[0](x))
-    adopted = dp.adopt(f)
+    adopted = dp.from_blackbox(f)
     for _ in range(4):
         x = rng.standard_normal(2 * N)
         known = CODES[parts[1]](parts[0](x)) @ CODES[parts[0]](x)

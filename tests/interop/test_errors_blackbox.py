@@ -17,24 +17,24 @@ def drifting(x):
 
 def first(f, x=(1.0, 2.0), **options):
     """The first derivative of an adopted function."""
-    return lambda: dp.value_and_grad(lambda x: anp.sum(dp.adopt(f, **options)(x)))(np.array(x))
+    return lambda: dp.value_and_grad(lambda x: anp.sum(dp.from_blackbox(f, **options)(x)))(np.array(x))
 
 
 def other_shape():
-    f = dp.adopt(np.sin)
+    f = dp.from_blackbox(np.sin)
     f.jacobian(np.ones(2)), f.jacobian(np.ones(3))
 
 
 def second():
-    f = dp.adopt(np.sin)
+    f = dp.from_blackbox(np.sin)
     slope = lambda x: anp.sum(dp.value_and_grad(lambda y: anp.sum(f(y) ** 2))(x)[1])
     return dp.value_and_grad(slope)(np.ones(2))
 
 
 WRONG = [
     (
-        lambda: dp.adopt(3.0), TypeError,
-        r"adopt takes a function, got float; write dp.adopt\(lambda x: ...\)",
+        lambda: dp.from_blackbox(3.0), TypeError,
+        r"from_blackbox takes a function, got float; write dp.from_blackbox\(lambda x: ...\)",
     ),
     (first(np.sin, derivative="exact"), ValueError, "derivative must be one of auto, complex, difference, got 'exact'"),
     (first(drifting), DerivativeError, "drifting gives two results for one argument; fix its random state first"),

@@ -25,11 +25,11 @@ def root_with_jacobian(work):
 
 
 def adopted(work):
-    return dp.adopt(lambda x: work * x**2)
+    return dp.from_blackbox(lambda x: work * x**2)
 
 
 def adopted_with_sparsity(work):
-    return dp.adopt(lambda x: work * x**2, sparsity=np.eye(6))
+    return dp.from_blackbox(lambda x: work * x**2, sparsity=np.eye(6))
 
 
 @pytest.mark.parametrize("make", [implicit_root, root_with_jacobian, adopted, adopted_with_sparsity])
@@ -81,7 +81,7 @@ def test_a_number_at_a_fixed_point_sees_the_rate_of_today(method):
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 def test_adopted_code_that_changes_between_gradients_is_refused(kind):
     share, x = [1.0], np.arange(1, 5).astype(kind)
-    act = dp.adopt(lambda x: share[0] * x**2)
+    act = dp.from_blackbox(lambda x: share[0] * x**2)
     loss = value_and_grad(lambda x: anp.sum(act(x)))
     assert np.array_equal(loss(x)[1], 2 * x)
     share[0] = 3.0
@@ -96,7 +96,7 @@ def test_adopted_code_with_a_counter_is_refused():
         runs[0] += 1
         return x**2 * (1 + 0.01 * runs[0])
 
-    act = dp.adopt(simulator, sparsity=np.eye(6))
+    act = dp.from_blackbox(simulator, sparsity=np.eye(6))
     with pytest.raises(DerivativeError, match="another result|misses"):
         value_and_grad(lambda x: anp.sum(act(x)))(START)
 

@@ -400,7 +400,7 @@ class BlackBox(OnCells):
         def plain(u):
             return np.roll(u, 1, axis=0) ** 2 * 0.3 + np.sin(u)
 
-        adopted = dp.adopt(plain, derivative=self.derivative)
+        adopted = dp.from_blackbox(plain, derivative=self.derivative)
         return lambda u, p: adopted(u)
 
     def twin(self, box):

@@ -733,11 +733,11 @@ class Spectral(OnCells):
     def library(self, box):
         scaled = (1 / bound(box, self._expression())) * operator(box, self._expression())
         if self.kind == "exponential":
-            acts = dp.exponential(scaled, 0.7)
+            acts = dp.matrix_exponential(scaled, 0.7)
         elif self.kind == "power":
-            acts = dp.power(dp.identity(box.grid().cells) - scaled, 0.5)
+            acts = dp.matrix_power(dp.identity(box.grid().cells) - scaled, 0.5)
         else:
-            acts = dp.function(scaled, np.cos)
+            acts = dp.matrix_function(scaled, np.cos)
         return lambda u, p: acts(u)
 
     def twin(self, box):
