@@ -13,6 +13,7 @@ from sources import (
     PACKAGE,
     ROOT,
     Module,
+    definitions,
     exported,
     imports,
     jitted,
@@ -310,6 +311,62 @@ def test_the_table_of_places_is_true():
             path,
             name,
         )
+
+
+# ---- types ---------------------------------------------------------------------------------------------------------
+
+# Packages whose public functions are not all annotated yet: the list only gets shorter.
+NOT_ANNOTATED = {
+    "__main__",
+    "_utils",
+    "advection",
+    "autodiff",
+    "check",
+    "flow",
+    "grid",
+    "integrators",
+    "interop",
+    "io",
+    "kernels",
+    "network",
+    "operators",
+    "optimize",
+    "parallel",
+    "report",
+    "solvers",
+    "trajectory",
+}
+
+
+def public_functions(module):
+    """Return the functions and methods without an underscore in their name, or in that of their class."""
+    found = []
+    for node in definitions(module):
+        if isinstance(node, FUNCTION):
+            found.append(node)
+        else:
+            found += [one for one in node.body if isinstance(one, FUNCTION) and not one.name.startswith("_")]
+    return found
+
+
+def is_annotated(function):
+    arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    annotations = [one.annotation for one in arguments if one.arg not in ("self", "cls")]
+    return None not in annotations and function.returns is not None
+
+
+def test_public_functions_are_annotated():
+    none(
+        f"{m.place}:{node.lineno} {node.name} needs types for its parameters and its result"
+        for m in modules()
+        if room(m.name) not in NOT_ANNOTATED
+        for node in public_functions(m)
+        if not is_annotated(node)
+    )
+
+
+def test_packages_that_are_not_annotated_exist():
+    assert {room(m.name) for m in modules()} >= NOT_ANNOTATED
 
 
 # ---- the shop window -----------------------------------------------------------------------------------------------
