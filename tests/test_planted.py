@@ -394,8 +394,8 @@ BUGS = {
     ),
     "what the weights miss of the constant, with the wrong sign": Bug(
         "solvers",
-        "y = self.scale * self.extra - self.apply(",
-        "y = self.scale * self.extra + self.apply(",
+        "image = self.inverse_root * self.extra - self.apply_scaled(",
+        "image = self.inverse_root * self.extra + self.apply_scaled(",
         "tests/solvers/test_multigrid_loops.py::test_the_coarse_matrix_is_that_of_galerkin",
         compiled=True,
     ),

@@ -95,9 +95,9 @@ class System:
         """The stencil of all cells, where the operator is one and no entries are needed to see that; else None."""
         if self.grid is None or self.grid.dim == 1:
             return None
-        from sparsedp.solvers.multigrid.stencil import faces_of
+        from sparsedp.solvers.multigrid.stencil import stencil_without_entries
 
-        return faces_of(self.op, self.grid)
+        return stencil_without_entries(self.op, self.grid)
 
     @cached_property
     def complex(self):

@@ -42,8 +42,8 @@ def matrix_of(function, rows, columns):
 
 def dense(level, extras=True):
     """Level -> its matrix."""
-    cells = level.layout.cells
-    number = np.arange(cells(level.extra).size).reshape(level.layout.shape)
+    cells = level.grid.cells
+    number = np.arange(cells(level.extra).size).reshape(level.grid.shape)
     matrix = np.diag(cells(level.extra).reshape(-1)) if extras else np.zeros((number.size,) * 2)
     for links, step in zip(cells(level.links), level.steps, strict=True):
         there = np.roll(number, [-d for d in step], range(number.ndim))
@@ -55,15 +55,15 @@ def dense(level, extras=True):
 
 def prolongation(level):
     """The weights of black-box interpolation as a matrix."""
-    from sparsedp.solvers.multigrid.cycle import Transfer, interpolated
+    from sparsedp.solvers.multigrid.cycle import Transfer, interpolation_weights
 
-    layout, coarse = level.layout, level.layout.coarse()
-    transfer = Transfer(layout, coarse, interpolated(level))
+    layout, coarse = level.grid, level.grid.coarse()
+    transfer = Transfer(layout, coarse, interpolation_weights(level))
 
     def interpolated_field(values):
         field = coarse.zeros()
         coarse.cells(field)[...] = values
-        return layout.cells(transfer.prolong(coarse.wrap(field), layout.zeros()))
+        return layout.cells(transfer.prolong(coarse.fill_ghosts(field), layout.zeros()))
 
     return matrix_of(interpolated_field, layout.shape, coarse.shape), transfer
 
@@ -75,7 +75,7 @@ def test_the_coarse_matrix_is_that_of_galerkin(shape, periodic, rng):
     for _ in range(2):
         P, _ = prolongation(level)
         wanted = P.T @ dense(level, extras=False) @ P
-        extra = level.layout.cells(level.extra).reshape(-1)
+        extra = level.grid.cells(level.extra).reshape(-1)
         level, _ = level.coarsened()
         wanted += np.diag(P.T @ (extra * P.sum(axis=1)))
         assert np.max(np.abs(dense(level) - wanted)) <= 1e-13 * np.max(np.abs(wanted))
@@ -84,12 +84,12 @@ def test_the_coarse_matrix_is_that_of_galerkin(shape, periodic, rng):
 @pytest.mark.parametrize("shape, periodic", GRIDS)
 def test_restriction_is_the_transpose_of_interpolation(shape, periodic, rng):
     level = engine_of(shape, periodic, rng).level
-    (P, transfer), layout, coarse = prolongation(level), level.layout, level.layout.coarse()
+    (P, transfer), layout, coarse = prolongation(level), level.grid, level.grid.coarse()
 
     def restricted(values):
         field = layout.zeros()
         layout.cells(field)[...] = values
-        return coarse.cells(transfer.restrict(layout.wrap(field), coarse.zeros()))
+        return coarse.cells(transfer.restrict(layout.fill_ghosts(field), coarse.zeros()))
 
     assert np.max(np.abs(matrix_of(restricted, coarse.shape, layout.shape) - P.T)) <= 1e-14
 
@@ -97,13 +97,13 @@ def test_restriction_is_the_transpose_of_interpolation(shape, periodic, rng):
 @pytest.mark.parametrize("shape, periodic", GRIDS)
 def test_the_cycle_is_symmetric_and_positive(shape, periodic, rng):
     engine = engine_of(shape, periodic, rng)
-    fine, layout = engine.fine, engine.layout
-    held = layout.cells(engine.level.root).reshape(-1) > 0.0
+    fine, layout = engine.finest, engine.padded_grid
+    held = layout.cells(engine.level.root_diagonal).reshape(-1) > 0.0
 
     def cycle(field):
         fine.b[...] = 0.0
         layout.cells(fine.b)[...] = field
-        layout.wrap(fine.b)
+        layout.fill_ghosts(fine.b)
         fine.cycle()
         return layout.cells(fine.x)
 
@@ -114,13 +114,13 @@ def test_the_cycle_is_symmetric_and_positive(shape, periodic, rng):
 
 @pytest.mark.parametrize("shape", [(5, 4), (5, 4, 3)])
 def test_every_neighbour_is_where_the_layout_says(shape, rng):
-    from sparsedp.solvers.multigrid.loops import Layout
+    from sparsedp.solvers.multigrid.loops import PaddedGrid
 
     for periodic in product((False, True), repeat=len(shape)):
-        layout, values = Layout(shape, periodic), rng.standard_normal(shape)
+        layout, values = PaddedGrid(shape, periodic), rng.standard_normal(shape)
         field = layout.zeros()
         layout.cells(field)[...] = values
-        layout.wrap(field)
+        layout.fill_ghosts(field)
         for step in product((-1, 0, 1), repeat=len(shape)):
             wanted = np.roll(values, [-d for d in step], range(len(shape)))
             for axis, (n, d, flag) in enumerate(zip(shape, step, periodic, strict=True)):

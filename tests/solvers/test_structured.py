@@ -191,7 +191,7 @@ REFUSED = [
     (lambda: dp.upwind(SQUARE, 0, 1.0) - dp.laplacian(SQUARE), "it is not a symmetric 5- or 7-point stencil"),
     (
         lambda: dp.from_functions(lambda u: u, lambda u: u, SQUARE.cells, SQUARE.cells),
-        "it is not made of differences over single faces",
+        "it is not a sum of differences between neighbouring cells",
     ),
     (lambda: dp.from_matrix(FAR, SQUARE.cells, SQUARE.cells), "a row reaches beyond the neighbours"),
     (
@@ -210,14 +210,14 @@ def test_what_it_does_not_take(make, reason):
     method = "direct" if "of the wrong sign" in reason and "face" in reason else "multigrid"
     if not op.structure.has_entries:
         method = "krylov"
-    assert str(caught.value) == f"structured does not take {op}: {reason}; write method={method!r}"
+    assert str(caught.value) == f"structured cannot solve {op}: {reason}; write method={method!r}"
     dp.inverse(op, method)  # takes it
 
 
 def test_the_whole_message_of_a_refusal():
     with pytest.raises(
         ValueError,
-        match="structured does not take <-laplacian: cells.9. -> cells.9., explicit>: the grid is 1-D; "
+        match="structured cannot solve <-laplacian: cells.9. -> cells.9., explicit>: the grid is 1-D; "
         "write method='multigrid'",
     ):
         dp.inverse(-dp.laplacian(dp.Grid(9), dp.dirichlet), "structured")

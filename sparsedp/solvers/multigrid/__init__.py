@@ -1,7 +1,7 @@
-"""Structured multigrid: on the grid itself, compiled, for symmetric 5- and 7-point operators that no transform solves.
+"""Structured multigrid: compiled, on the cells of a grid, for symmetric 5- and 7-point operators.
 
-- `engine`: what the contract calls: conjugate gradients with the cycle as preconditioner.
-- `stencil`: an operator as a stencil, read off its products.
-- `cycle`: the levels, black-box interpolation between them, and the cycle.
-- `loops`: the compiled functions.
+- `engine`: the solver engine, conjugate gradients with one V-cycle as preconditioner.
+- `stencil`: recognition of an operator as a stencil by a few products.
+- `cycle`: the levels, black-box interpolation between them, and the V-cycle.
+- `loops`: the compiled loops.
 """

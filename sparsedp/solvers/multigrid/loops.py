@@ -1,106 +1,150 @@
-"""Compiled loops of the structured multigrid over long rows; see `Layout` for the order of the cells.
+"""Compiled loops of the structured multigrid; see `PaddedGrid` for the order of the cells.
 
-Matrices have a unit diagonal: A = 1 - c, and c has a field of links for each of the `steps`, to the cell at that
-distance; the links of the other direction are those of the other cell. `sizes` are those of `Layout`, `start` and
-`stop` are planes; threads have planes of their own. Sums are kept plane by plane: the bits are the same for every
-number of threads.
+Matrices have a unit diagonal, A = I - C. The array `links` holds one field of entries of C for each of the steps
+from a cell to a neighbour; C is symmetric, so the entry in the opposite direction is read at the neighbour.
+`steps` holds the distances of these neighbours in a flat field, and `sizes` is `PaddedGrid.sizes`. Each loop works on
+the planes from `start` to `stop`, so that threads can share it. Sums are stored plane by plane: the result has the
+same bits for every number of threads.
 """
 
+from __future__ import annotations
+
 import itertools
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit
 
 from sparsedp.kernels.team import INNER, kernel
 
-__all__ = ["GHOST", "Layout", "direct", "image", "prolong", "restrict", "smooth", "steps_around", "update"]
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
-GHOST = 3  # ghost planes in front and behind; along the other axes there is one ghost cell
+    from numpy.typing import DTypeLike, NDArray
+
+    from sparsedp.kernels.team import Kernel
+
+    Reals = NDArray[Any]
+    Numbers = NDArray[np.int64]
+
+__all__ = [
+    "GHOST_PLANES",
+    "PaddedGrid",
+    "apply_matrix",
+    "neighbour_steps",
+    "prolong",
+    "restrict",
+    "smooth",
+    "update_direction",
+    "update_solution",
+]
+
+GHOST_PLANES = 3  # before and after the planes of the grid; along the other axes there is one ghost cell at each end
 
 
-def steps_around(dim):
-    """Steps to a cell itself, in the middle of the list, and to all around it."""
+def neighbour_steps(dim: int) -> list[tuple[int, ...]]:
+    """List the steps from a cell to all cells of the 3^dim block around it; the zero step is in the middle."""
     return list(itertools.product((-1, 0, 1), repeat=dim))
 
 
-class Layout:
-    """A grid in natural order with ghost cells around, so that every loop over it is one long row.
+class PaddedGrid:
+    """A grid in natural order with ghost cells around it, so that every loop runs along contiguous memory.
 
-    A neighbour of a cell lies at a distance in the flat array that is the same for all cells. So a product with a
-    matrix, of 5 points or of 27, in 2-D or in 3-D, is a sum of products of shifted flat arrays, whole planes at a time.
-    Ghost cells hold zeros, or what a periodic axis repeats there. A plane is what has the same first index: a row in
-    2-D.
+    The neighbour of a cell in a given direction lies at the same distance in the flat array for all cells. Hence a
+    product with a matrix of 5 to 27 points, in 2-D or in 3-D, is a sum of products of shifted flat arrays.
+    Ghost cells hold zeros, or the values of the opposite end of a periodic axis. A *plane* is the set of cells with
+    the same first index; in 2-D it is one line.
 
     Parameters
     ----------
-    shape : tuple of 2 or 3
+    shape : tuple of 2 or 3 int
     periodic : tuple of bool
     threads : int
-        Of the loops.
+        Number of threads of the loops.
 
     Attributes
     ----------
-    pitch : int64 array
-        Distance of neighbours along each axis in the flat array.
-    sizes : int64 array
-        What the compiled loops need to know: length of a plane, and of a line in it; planes; lines of a plane, and
-        where the first begins; cells of a line; which axes are periodic. In 2-D a plane is one line.
+    ghosts : tuple of int
+        Number of ghost cells at each end of each axis.
+    padded_shape : tuple of int
+        Shape of a field with its ghost cells.
+    strides : int64 array, shape (dim,)
+        Distance in the flat array of neighbours along each axis.
+    sizes : int64 array, shape (9,)
+        What the compiled loops need: length of a plane, length of a line, number of planes, lines of a plane, offset
+        of the first line in its plane, cells of a line, and for the first, middle and last axis whether it is periodic.
     """
 
-    def __init__(self, shape, periodic, threads=1):
-        self.shape, self.periodic, self.dim, self.threads = tuple(shape), tuple(periodic), len(shape), threads
-        self.before = (GHOST,) + (1,) * (self.dim - 1)  # ghost cells of each axis
-        self.padded = tuple(n + 2 * ghosts for n, ghosts in zip(self.shape, self.before))
-        plane, width = int(np.prod(self.padded[1:])), self.padded[-1]
-        self.pitch = np.array([plane, width, 1] if self.dim == 3 else [plane, 1])
-        lines, flag, lead = (shape[1], periodic[1], width) if self.dim == 3 else (1, False, 0)
-        self.sizes = np.array(
-            [plane, width, shape[0], lines, lead, shape[-1], periodic[0], flag, periodic[-1]], np.int64
-        )
+    def __init__(self, shape: Sequence[int], periodic: Sequence[bool], threads: int = 1) -> None:
+        self.shape = tuple(shape)
+        self.periodic = periodic
+        self.dim = len(shape)
+        self.threads = threads
+        self.ghosts = (GHOST_PLANES,) + (1,) * (self.dim - 1)
+        self.padded_shape = tuple(n + 2 * ghosts for n, ghosts in zip(self.shape, self.ghosts))
+        line_length = self.padded_shape[-1]
+        plane_length = int(np.prod(self.padded_shape[1:]))
+        if self.dim == 3:
+            self.strides = np.array([plane_length, line_length, 1])
+            lines, middle_periodic, first_line = shape[1], periodic[1], line_length
+        else:
+            self.strides = np.array([plane_length, 1])
+            lines, middle_periodic, first_line = 1, False, 0
+        lengths = [plane_length, line_length, shape[0], lines, first_line, shape[-1]]
+        self.sizes = np.array([*lengths, periodic[0], middle_periodic, periodic[-1]], np.int64)
 
-    def zeros(self, *count, dtype=float):
-        """Fields."""
-        return np.zeros((*count, *self.padded), dtype)
+    def zeros(self, *count: int, dtype: DTypeLike = float) -> NDArray[Any]:
+        """Return an array of zeros for one field, or for as many as `count` says."""
+        return np.zeros((*count, *self.padded_shape), dtype)
 
-    def cells(self, fields, step=(0, 0, 0), every=1):
-        """Fields -> their values at a step from the cells of the grid, or from those with even indices. A view."""
-        places = zip(self.before, step, self.shape)
-        return fields[(..., *(slice(ghosts + d, ghosts + d + n, every) for ghosts, d, n in places))]
+    def cells(self, fields: NDArray[Any], step: Sequence[int] = (0, 0, 0), every: int = 1) -> NDArray[Any]:
+        """Return a view of the values at `step` from the cells of the grid, or from each `every`-th cell of an axis."""
+        index: list[Any] = [...]
+        for ghosts, d, n in zip(self.ghosts, step, self.shape):
+            index.append(slice(ghosts + d, ghosts + d + n, every))
+        return fields[tuple(index)]
 
-    def coarse(self):
-        """The layout of the cells with even indices."""
-        return Layout([(n + 1) // 2 for n in self.shape], self.periodic, self.threads)
+    def coarse(self) -> PaddedGrid:
+        """Return the grid of the cells whose indices are all even."""
+        return PaddedGrid([(n + 1) // 2 for n in self.shape], self.periodic, self.threads)
 
-    def wrap(self, fields):
-        """Fill the ghost cells of fields along periodic axes. The fields themselves."""
-        for axis, (n, ghosts, flag) in enumerate(zip(self.shape, self.before, self.periodic)):
-            lines = np.moveaxis(fields, fields.ndim - self.dim + axis, 0)
-            if flag:
-                lines[:ghosts] = lines[ghosts + np.arange(-ghosts, 0) % n]
-                lines[ghosts + n :] = lines[ghosts + np.arange(ghosts) % n]
+    def fill_ghosts(self, fields: NDArray[Any]) -> NDArray[Any]:
+        """Fill all ghost cells of fields along periodic axes in place, and return the fields."""
+        for axis, (n, ghosts, periodic) in enumerate(zip(self.shape, self.ghosts, self.periodic)):
+            if not periodic:
+                continue
+            planes = np.moveaxis(fields, fields.ndim - self.dim + axis, 0)
+            planes[:ghosts] = planes[ghosts + np.arange(-ghosts, 0) % n]
+            planes[ghosts + n :] = planes[ghosts + np.arange(ghosts) % n]
         return fields
 
-    def fill(self, field):
-        """Fill the ghost cells of a field of numbers along periodic axes, as far as a product with a matrix reads."""
+    def fill_ghosts_compiled(self, field: NDArray[Any]) -> None:
+        """Fill those ghost cells of one field of floats that a product with a matrix reads."""
         if any(self.periodic):
-            self.run(fill, self.sizes, field)
+            self.run(fill_ghost_cells, self.sizes, field)
 
-    def run(self, loop, *given):
-        """A loop over all planes, in the precision of its second array. Fields are long rows to it."""
-        loop = loop.single if given[1].dtype == np.float32 else loop
-        rows = (a.reshape(*a.shape[: -self.dim], -1) if getattr(a, "ndim", 0) >= self.dim else a for a in given)
-        loop.run(self.shape[0], given[0].size, self.threads, *rows)
+    def run(self, loop: Kernel, *arguments: Any) -> None:
+        """Run a compiled loop over all planes, in the precision of its second array, on flattened fields."""
+        if arguments[1].dtype == np.float32:
+            loop = loop.single
+        flattened = []
+        for argument in arguments:
+            if getattr(argument, "ndim", 0) >= self.dim:
+                argument = argument.reshape(*argument.shape[: -self.dim], -1)
+            flattened.append(argument)
+        loop.run(self.shape[0], arguments[0].size, self.threads, *flattened)
 
 
-TILE, WINDOW = 2048, 16384  # cells that are worked on together: what is written is in cache for what follows
-FAST = {"reassoc", "contract", "nsz"}  # a sum may be taken in any order; NaN and infinity stay what they are
+TILE = 2048  # cells of a row that `combine` works on together: its sums stay in the first-level cache
+WINDOW = 16384  # cells that `smooth` works on together: the first step is in cache when the second one reads it
+FAST = {"reassoc", "contract", "nsz"}  # a sum may be taken in any order; NaN and infinity are preserved
 
 helper = njit(cache=True, **INNER)
 
 
 @helper
-def ghosts(field, place, planes, sizes):
-    """Fill the ghost cells of planes along periodic axes but the first."""
+def fill_ghost_lines(field: Reals, place: int, planes: int, sizes: Numbers) -> None:
+    """Fill the ghost cells of planes along all periodic axes but the first."""
     plane, width, _, lines, lead, n, _, around, along = sizes
     for first in range(place, place + planes * plane, plane):
         if around:
@@ -115,11 +159,12 @@ def ghosts(field, place, planes, sizes):
 
 
 @njit(cache=True, fastmath=FAST, **INNER)
-def add_up(sums, a, b, start, stop, sizes):
-    """The scalar products of the cells of planes."""
+def plane_products(sums: Reals, a: Reals, b: Reals, start: int, stop: int, sizes: Numbers) -> None:
+    """Store the scalar product of the cells of a and b in `sums`, plane by plane."""
     _, width, _, lines, lead, n = sizes[:6]
     for g in range(start, stop):
-        first, total = (GHOST + g) * sizes[0] + lead + 1, 0.0
+        first = (GHOST_PLANES + g) * sizes[0] + lead + 1
+        total = 0.0
         for at in range(first, first + lines * width, width):
             left, right = a[at : at + n], b[at : at + n]
             for k in range(n):
@@ -128,13 +173,29 @@ def add_up(sums, a, b, start, stop, sizes):
 
 
 @helper
-def combine(out, there, n, c, at, x, place, b, steps, own, rest, share):
-    """out = own x + rest b + share c x on n cells. Where they begin: `there` in out, `at` in c and b, `place` in x."""
+def combine(
+    out: Reals,
+    out_start: int,
+    n: int,
+    c: Reals,
+    start: int,
+    x: Reals,
+    x_start: int,
+    b: Reals,
+    steps: Numbers,
+    x_factor: float,
+    b_factor: float,
+    product_factor: float,
+) -> None:
+    """Set out = x_factor x + b_factor b + product_factor C x on n cells, C given by the links c.
+
+    The first of these cells has the number `out_start` in out, `start` in c and b, and `x_start` in x.
+    """
     odd = steps.size % 2
     for left in range(0, n, TILE):
-        row = out[there + left : there + min(left + TILE, n)]
-        f, h = at + left, place + left  # the first cell in c and b, and in x
-        for k in range(row.size):  # a slice would not be vectorised
+        row = out[out_start + left : out_start + min(left + TILE, n)]
+        f, h = start + left, x_start + left  # numbers of the first cell in c and b, and in x
+        for k in range(row.size):  # a slice assignment would not be vectorised
             row[k] = 0.0
         for m in range(odd):
             d = steps[m]
@@ -148,78 +209,107 @@ def combine(out, there, n, c, at, x, place, b, steps, own, rest, share):
             for k in range(row.size):
                 one = forward[k] * ahead[k] + backward[k] * behind[k]
                 row[k] += one + (upward[k] * above[k] + downward[k] * below[k])
-        given, right = x[h : h + row.size], b[f : f + row.size]
+        x_row, b_row = x[h : h + row.size], b[f : f + row.size]
         for k in range(row.size):
-            row[k] = own * given[k] + rest * right[k] + share * row[k]
+            row[k] = x_factor * x_row[k] + b_factor * b_row[k] + product_factor * row[k]
 
 
 # ---- the loops -----------------------------------------------------------------------------------------------------
 #
-# Their arrays are the package's own. Those that are only read are declared as written too: the functions above are
-# compiled once for each kind of arguments, and an array that may not be written is another kind.
+# All their arrays belong to the package. Arrays that are only read are declared as "write" too: the functions above
+# are compiled for each type of their arguments, and a read-only array is another type.
 
 # ---- conjugate gradients -------------------------------------------------------------------------------------------
 
 
 @kernel("write2 ~write1 write1 index1 index1 write1")
-def image(c, x, out, steps, sizes, sums, start, stop):
-    """out = A x; x . out to sums."""
-    at = (GHOST + start) * sizes[0]
+def apply_matrix(
+    c: Reals, x: Reals, out: Reals, steps: Numbers, sizes: Numbers, sums: Reals, start: int, stop: int
+) -> None:
+    """Set out = A x, and store the scalar products x . out in `sums`."""
+    at = (GHOST_PLANES + start) * sizes[0]
     combine(out, at, (stop - start) * sizes[0], c, at, x, at, x, steps, 1.0, 0.0, -1.0)
-    add_up(sums, x, out, start, stop, sizes)
+    plane_products(sums, x, out, start, stop, sizes)
 
 
 @kernel("~write1 ~write1 index1 real")
-def direct(p, z, sizes, beta, start, stop):
-    """p = z + beta p."""
-    at, end = (GHOST + start) * sizes[0], (GHOST + stop) * sizes[0]
-    row, given = p[at:end], z[at:end]
-    for k in range(row.size):
-        row[k] = given[k] + beta * row[k]
+def update_direction(p: Reals, z: Reals, sizes: Numbers, beta: float, start: int, stop: int) -> None:
+    """Set p = z + beta p."""
+    at, end = (GHOST_PLANES + start) * sizes[0], (GHOST_PLANES + stop) * sizes[0]
+    direction, preconditioned = p[at:end], z[at:end]
+    for k in range(direction.size):
+        direction[k] = preconditioned[k] + beta * direction[k]
 
 
 @kernel("write1 ~write1 write1 write1 ~write1 ~write1 index1 write1 real", fastmath=FAST)
-def update(x, p, r, q, light, gauge, sizes, sums, alpha, start, stop):
-    """x += alpha p; r -= alpha q, and the same in the precision of the cycle; the sum of (gauge r)^2 to sums."""
+def update_solution(
+    x: Reals,
+    p: Reals,
+    r: Reals,
+    q: Reals,
+    rounded: Reals,
+    gauge: Reals,
+    sizes: Numbers,
+    sums: Reals,
+    alpha: float,
+    start: int,
+    stop: int,
+) -> None:
+    """Set x += alpha p and r -= alpha q; store r in the precision of the cycle, and |gauge r|^2 in `sums`."""
     plane = sizes[0]
     for g in range(start, stop):
-        at, total = (GHOST + g) * plane, 0.0
+        at = (GHOST_PLANES + g) * plane
+        total = 0.0
         solution, direction = x[at : at + plane], p[at : at + plane]
-        row, change = r[at : at + plane], q[at : at + plane]
-        short, weight = light[at : at + plane], gauge[at : at + plane]
+        residual, change = r[at : at + plane], q[at : at + plane]
+        rounded_residual, weight = rounded[at : at + plane], gauge[at : at + plane]
         for k in range(plane):
             solution[k] += alpha * direction[k]
-            value = row[k] - alpha * change[k]
-            row[k] = value
-            short[k] = value
+            value = residual[k] - alpha * change[k]
+            residual[k] = value
+            rounded_residual[k] = value
             total += (weight[k] * value) ** 2
         sums[g] = total
 
 
 @kernel("index1 ~write1")
-def fill(sizes, field, start, stop):
-    """Fill the ghost cells of planes, and the two planes beyond a periodic axis that repeat them."""
+def fill_ghost_cells(sizes: Numbers, field: Reals, start: int, stop: int) -> None:
+    """Fill the ghost cells of planes, and the two ghost planes at each end of a periodic first axis."""
     plane, n = sizes[0], sizes[2]
-    ghosts(field, (GHOST + start) * plane, stop - start, sizes)
+    fill_ghost_lines(field, (GHOST_PLANES + start) * plane, stop - start, sizes)
     for g in (-2, -1, n, n + 1):
         if sizes[6] and start <= g % n < stop:
             for k in range(plane):
-                field[(GHOST + g) * plane + k] = field[(GHOST + g % n) * plane + k]
+                field[(GHOST_PLANES + g) * plane + k] = field[(GHOST_PLANES + g % n) * plane + k]
 
 
 # ---- levels --------------------------------------------------------------------------------------------------------
 
 
 @kernel("~write2 ~write1 ~write1 ~write1 ~write1 ~write1 index1 index1 write1")
-def smooth(c, x, b, between, out, factors, steps, sizes, sums, start, stop):
-    """y = f x + g b + h c x, out = f y + g b + h c y with f, g, h twice in factors; b . out to sums if there are any.
+def smooth(
+    c: Reals,
+    x: Reals,
+    b: Reals,
+    between: Reals,
+    out: Reals,
+    factors: Reals,
+    steps: Numbers,
+    sizes: Numbers,
+    sums: Reals,
+    start: int,
+    stop: int,
+) -> None:
+    """Set y = f0 x + f1 b + f2 C x and out = f3 y + f4 b + f5 C y, with the factors f.
 
-    y is made one plane ahead, in a window that begins two planes before `first`, and kept if `between` has room.
+    Store the scalar products b . out in `sums` if it has room, and y in `between` if that has.
+
+    y is computed one plane ahead, in a window whose first plane lies two planes before `first`.
     """
     plane = sizes[0]
     step = max(2, WINDOW // plane)
     y = np.empty((step + 4) * plane, out.dtype)
-    for k in range(y.size):  # what ghost cells hold must be finite
+    for k in range(y.size):  # ghost cells must hold finite numbers
         y[k] = 0.0
     for first in range(start, stop, step):
         last, begin = min(first + step, stop), first - 1
@@ -227,29 +317,31 @@ def smooth(c, x, b, between, out, factors, steps, sizes, sums, start, stop):
             begin = first + 1
             for k in range(plane, 3 * plane):
                 y[k] = y[step * plane + k]
-        at, there, planes = (GHOST + begin) * plane, (begin - first + 2) * plane, last + 1 - begin
+        at, there, planes = (GHOST_PLANES + begin) * plane, (begin - first + 2) * plane, last + 1 - begin
         combine(y, there, planes * plane, c, at, x, at, b, steps, factors[0], factors[1], factors[2])
-        ghosts(y, there, planes, sizes)
-        at, n = (GHOST + first) * plane, (last - first) * plane
+        fill_ghost_lines(y, there, planes, sizes)
+        at, n = (GHOST_PLANES + first) * plane, (last - first) * plane
         for k in range(n if between.size else 0):
             between[at + k] = y[2 * plane + k]
         combine(out, at, n, c, at, y, 2 * plane, b, steps, factors[3], factors[4], factors[5])
         if sums.size:
-            add_up(sums, b, out, first, last, sizes)
+            plane_products(sums, b, out, first, last, sizes)
 
 
 @kernel("~write2 ~write1 ~write1 index1 index1 index1")
-def restrict(weights, r, out, steps, fine, coarse, start, stop):
-    """out = the weighted sum of the fine cells around each coarse one, which are that many steps away."""
+def restrict(
+    weights: Reals, r: Reals, out: Reals, steps: Numbers, fine: Numbers, coarse: Numbers, start: int, stop: int
+) -> None:
+    """Set out to the weighted sum of r over the fine cells around each coarse cell; `steps` lead to them."""
     n = coarse[5]
     for g in range(start, stop):
         for j in range(coarse[3]):
-            at = (GHOST + g) * coarse[0] + coarse[4] + j * coarse[1] + 1
-            place = (GHOST + 2 * g) * fine[0] + fine[4] + 2 * j * fine[1] + 1
+            at = (GHOST_PLANES + g) * coarse[0] + coarse[4] + j * coarse[1] + 1
+            place = (GHOST_PLANES + 2 * g) * fine[0] + fine[4] + 2 * j * fine[1] + 1
             row = out[at : at + n]
             for k in range(n):
                 row[k] = 0.0
-            for m in range(0, steps.size, 3):  # those of a fine line
+            for m in range(0, steps.size, 3):  # three neighbours on one fine line
                 below, same, above = weights[m, at:], weights[m + 1, at:], weights[m + 2, at:]
                 line = r[place + steps[m] :]
                 for k in range(n):
@@ -257,19 +349,19 @@ def restrict(weights, r, out, steps, fine, coarse, start, stop):
 
 
 @kernel("~write2 ~write1 ~write1 index1 index1")
-def prolong(weights, e, x, fine, coarse, start, stop):
-    """x += the transpose of `restrict`. Between two coarse lines, or planes, a line takes from both."""
+def prolong(weights: Reals, e: Reals, x: Reals, fine: Numbers, coarse: Numbers, start: int, stop: int) -> None:
+    """Add P e to x, P the transpose of `restrict`; a fine line between two coarse lines or planes takes from both."""
     half, rows = coarse[5], weights.shape[0] // 3
     for g in range(start, stop):
         for j in range(fine[3]):
-            first = (GHOST + g) * fine[0] + fine[4] + j * fine[1] + 1
-            line = x[first : first + 2 * half]  # the last may be a ghost cell
+            first = (GHOST_PLANES + g) * fine[0] + fine[4] + j * fine[1] + 1
+            line = x[first : first + 2 * half]  # the last cell may be a ghost cell
             for a in range(g // 2, (g + 1) // 2 + 1):
                 for b in range(j // 2, (j + 1) // 2 + 1):
-                    at = (GHOST + a) * coarse[0] + coarse[4] + b * coarse[1] + 1
+                    at = (GHOST_PLANES + a) * coarse[0] + coarse[4] + b * coarse[1] + 1
                     m = (g - 2 * a + 1) * rows + (j - 2 * b + rows // 9) * 3
                     same, above, below = weights[m + 1, at:], weights[m + 2, at:], weights[m, at + 1 :]
-                    here, there = e[at : at + half], e[at + 1 :]
+                    current, following = e[at : at + half], e[at + 1 :]
                     for k in range(half):
-                        line[2 * k] += same[k] * here[k]
-                        line[2 * k + 1] += above[k] * here[k] + below[k] * there[k]
+                        line[2 * k] += same[k] * current[k]
+                        line[2 * k + 1] += above[k] * current[k] + below[k] * following[k]

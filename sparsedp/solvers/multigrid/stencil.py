@@ -1,6 +1,8 @@
-"""Stencil: a symmetric 5- or 7-point matrix on the cells of a grid; read off the products of an operator."""
+"""Symmetric 5- and 7-point stencils on the cells of a grid, identified by products with an operator."""
 
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -10,39 +12,46 @@ from sparsedp._utils.validation import EPS
 from sparsedp.operators.structure.base import Matrix
 from sparsedp.solvers.scaling import exponent_of
 
-__all__ = ["Stencil", "Unfit", "components", "faces_of", "stencil_of"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-CLEAN = 16 * EPS  # what is left of a diagonal is 0 below this share of the links at it
-MOST_EXPONENT = 1000  # of a power of two that scales: 2^1024 is infinite
-AGREES = 1e-12  # relative difference to the operator on a random field that is taken for rounding
+    from sparsedp.grid.grid import Grid
+    from sparsedp.operators.operator import Operator
+
+__all__ = ["Stencil", "UnsuitableOperator", "component_labels", "stencil_of_system", "stencil_without_entries"]
+
+ROW_SUM_ROUNDING = 16 * EPS  # a row sum below this share of the magnitudes in its row is 0
+LARGEST_EXPONENT = 1000  # of a power of two that scales: 2^1024 is infinite
+AGREEMENT = 1e-12  # largest relative difference between stencil and operator that counts as rounding
 
 
-class Unfit(Exception):
-    """An operator is not a stencil; the message is the reason in words."""
+class UnsuitableOperator(Exception):
+    """An operator is not a symmetric 5- or 7-point stencil; the message says why."""
 
 
 class Stencil(NamedTuple):
-    """S = scale V A, with V the cell volumes: (S x)_i = sum over neighbours of c (x_i - x_j) + extra_i x_i.
+    """S = scale V A, V the cell volumes: (S x)_i = sum over neighbours j of c_ij (x_i - x_j) + extra_i x_i.
 
     Attributes
     ----------
     grid : Grid
-        2-D or 3-D. Its lengths may be those of the user up to powers of two.
+        2-D or 3-D. Its lengths may differ from those of the user's grid by powers of two.
     links : list of arrays, one for each axis, shape `grid.shape`
-        c >= 0 between each cell and the next one along the axis; in the last cell 0, or the link to the first one.
+        c >= 0 between each cell and the next one along the axis. The last cell holds 0, or, along a periodic axis,
+        the link to the first one.
     extra : array, shape `grid.shape`
-        >= 0: conductance to walls and Dirichlet obstacles, shift times volume.
+        Row sums, >= 0: conductance to walls and Dirichlet obstacles, and shift times volume.
     scale : float
-        A power of two, or minus one.
+        A power of two, or minus a power of two.
     """
 
-    grid: Any
-    links: list
-    extra: np.ndarray
+    grid: Grid
+    links: list[NDArray[Any]]
+    extra: NDArray[Any]
     scale: float = 1.0
 
-    def apply(self, x):
-        """S x, for a field x."""
+    def apply(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Return S x for a field x."""
         out = self.extra * x
         for axis, c in enumerate(self.links):
             flux = c * (np.roll(x, -1, axis) - x)
@@ -50,100 +59,161 @@ class Stencil(NamedTuple):
         return out
 
     @property
-    def connected(self):
+    def connected(self) -> bool:
         """Whether every cell is linked to all of its neighbours."""
-        size, grid = self.extra.size, self.grid
-        whole = sum(size if flag and n > 1 else size - size // n for n, flag in zip(grid.shape, grid.periodic))
-        return size > 1 and sum(map(np.count_nonzero, self.links)) == whole
+        size = self.extra.size
+        if size <= 1:
+            return False
+        possible_links = 0
+        for n, periodic in zip(self.grid.shape, self.grid.periodic):
+            possible_links += size if periodic and n > 1 else size - size // n
+        return sum(map(np.count_nonzero, self.links)) == possible_links
 
-    def within(self, exponent):
-        """Whether |A|_inf is certainly between 2^-exponent and 2^exponent; where it is known to be near 1."""
-        low, high = (abs(self.scale) * bound(self.grid.volumes) for bound in (np.max, np.min))
-        return 0.5 / low > 2.0**-exponent and (4 * self.grid.dim + 1) / high < 2.0**exponent
+    def within(self, exponent: int) -> bool:
+        """Whether |A|_inf certainly lies between 2^-exponent and 2^exponent; for a stencil scaled by `scaled`."""
+        largest_factor = abs(self.scale) * np.max(self.grid.volumes)
+        smallest_factor = abs(self.scale) * np.min(self.grid.volumes)
+        largest_row_sum = 4 * self.grid.dim + 1
+        return 0.5 / largest_factor > 2.0**-exponent and largest_row_sum / smallest_factor < 2.0**exponent
 
-    def checked(self):
-        """The stencil times the number that makes it positive and near 1; refuses what multigrid cannot smooth."""
-        values = np.array([array.flat[np.argmax(np.abs(array))] for array in (*self.links, self.extra) if array.size])
-        sign = -1.0 if np.all(values <= 0) and np.any(values) else 1.0
-        exponent = exponent_of(np.max(np.abs(values), initial=0.0))
-        factor = sign * 2.0 ** -np.clip(exponent, -MOST_EXPONENT, MOST_EXPONENT)  # of subnormals: as near as it gets
-        links, extra = [factor * c for c in self.links], factor * self.extra
+    def scaled(self) -> Stencil:
+        """Return the stencil times the power of two, of either sign, that makes it positive and near 1.
+
+        Raises
+        ------
+        UnsuitableOperator
+            If coefficients differ in sign: multigrid cannot smooth such an operator.
+        """
+        coefficients = (*self.links, self.extra)
+        largest = np.array([array.flat[np.argmax(np.abs(array))] for array in coefficients if array.size])
+        sign = -1.0 if np.all(largest <= 0) and np.any(largest) else 1.0
+        exponent = exponent_of(np.max(np.abs(largest), initial=0.0))
+        # Subnormal coefficients cannot be scaled up to 1 by one power of two.
+        factor = sign * 2.0 ** -np.clip(exponent, -LARGEST_EXPONENT, LARGEST_EXPONENT)
+        links = [factor * c for c in self.links]
+        extra = factor * self.extra
         if any(np.any(c < 0) for c in links):
-            raise Unfit("a face has a coefficient of the wrong sign")
+            raise UnsuitableOperator("a face has a coefficient of the wrong sign")
         if np.any(extra < 0):
-            raise Unfit("a row sums to less than 0: a shift of the wrong sign")
+            raise UnsuitableOperator("a row sums to less than 0: a shift of the wrong sign")
         return Stencil(self.grid, links, extra, factor * self.scale)
 
 
-def components(stencil):
-    """(labels, count) of the connected components; what is not active is linked to nothing. One: labels None."""
+def component_labels(stencil: Stencil) -> tuple[NDArray[Any] | None, int]:
+    """Find the connected components of the cells.
+
+    Parameters
+    ----------
+    stencil : Stencil
+
+    Returns
+    -------
+    labels : int array, shape (cells,), or None
+        None where there is one component.
+    count : int
+    """
     number = np.arange(stencil.extra.size).reshape(stencil.extra.shape)
-    pairs = [(number[c > 0], np.roll(number, -1, axis)[c > 0]) for axis, c in enumerate(stencil.links)]
-    one, two = map(np.concatenate, zip(*pairs))
-    graph = coo_array((np.ones(one.size), (one, two)), shape=(number.size, number.size))
+    cells = []
+    neighbours = []
+    for axis, c in enumerate(stencil.links):
+        is_linked = c > 0
+        cells.append(number[is_linked])
+        neighbours.append(np.roll(number, -1, axis)[is_linked])
+    row = np.concatenate(cells)
+    column = np.concatenate(neighbours)
+    graph = coo_array((np.ones(row.size), (row, column)), shape=(number.size, number.size))
     count, labels = connected_components(graph, directed=False)
-    return (None, 1) if count == 1 else (labels, count)
+    if count == 1:
+        return None, 1
+    return labels, count
 
 
-def stencil_of(system):
-    """System -> Stencil; raises Unfit with the reason in words."""
+def stencil_of_system(system: Any) -> Stencil:
+    """Return the stencil of the operator of a `System`.
+
+    Raises
+    ------
+    UnsuitableOperator
+        If the operator is not a symmetric 5- or 7-point stencil.
+    """
     grid = system.grid
     if grid is None:
-        raise Unfit("it does not act on the cells of a grid")
+        raise UnsuitableOperator("it does not act on the cells of a grid")
     if grid.dim == 1:
-        raise Unfit("the grid is 1-D")
+        raise UnsuitableOperator("the grid is 1-D")
     if system.faces is not None:
         return system.faces
     if not system.op.structure.has_entries or system.complex:
-        raise Unfit("it is not made of differences over single faces")
+        raise UnsuitableOperator("it is not a sum of differences between neighbouring cells")
     active = True if system.active is None else system.active.reshape(grid.shape)
-    return _probed(system.product, grid, active)
+    return _probe(system.product, grid, active)
 
 
-def faces_of(op, grid):
-    """The Stencil of an operator that takes less to apply than to assemble; else, or if it is none, None."""
+def stencil_without_entries(op: Operator, grid: Grid) -> Stencil | None:
+    """Return the stencil of an operator that is cheaper to apply than to assemble; None of any other operator."""
     structure = op.structure
     if not op.domain.size or structure.separable or isinstance(structure, Matrix):
         return None
     if not structure.has_entries or op.dtype.kind == "c":
         return None
     try:
-        return _probed(op._flat.apply, grid, True)
-    except Unfit:
+        return _probe(op._flat.apply, grid, True)
+    except UnsuitableOperator:
         return None
 
 
-def _probed(product, grid, active):
-    """Product with a matrix, cells that are unknowns -> Stencil, read off the images of a few fields of 0 and 1.
+def _probe(product, grid, active):
+    """Read a stencil off the products of a matrix with a few fields of zeros and ones.
 
-    Along an axis, the image of every fourth plane shows on its two sides the links to it, and nothing else. On a
-    periodic axis plane 0 has a field of its own, for it is next to the last one. What has been read must then explain
-    the image of a random field: the matrix is symmetric and has no other entries.
+    The result is verified by the product with a random field: it agrees only if the matrix, with its rows scaled by
+    the cell volumes, is symmetric and has no other entries.
     """
     weights = active * grid.volumes
 
-    def image(x):
+    def apply(x):
         return weights * product(x.reshape(-1)).reshape(grid.shape)
 
-    links, magnitude = [], np.zeros(grid.shape)  # of a row without its extra
-    for axis, (n, flag) in enumerate(zip(grid.shape, grid.periodic)):
-        link = np.zeros(grid.shape)
-        to_next = np.moveaxis(link, axis, 0)
-        end = 1 if flag else n  # of the planes in one field with plane 0
-        for planes in filter(np.size, (np.arange(0, end, 4), np.arange(2, n, 4), np.arange(end + 3, n, 4))):
-            x = np.zeros(grid.shape)
-            np.moveaxis(x, axis, 0)[planes] = 1.0
-            y, inner = np.moveaxis(image(x), axis, 0), planes[planes < n - 1]
-            if np.any(y[planes[planes >= 4] - 2]):
-                raise Unfit("a row reaches beyond the neighbours")
-            to_next[planes - 1], to_next[inner] = -y[planes - 1], -y[inner + 1]
-        if not flag or n <= 2:  # a wall; or the one neighbour is linked already, or is the cell itself
-            to_next[-1:] = 0.0
+    links = []
+    magnitude = np.zeros(grid.shape)  # of the entries of each row, without its extra
+    for axis in range(grid.dim):
+        link = _probe_axis(apply, grid, axis)
         magnitude += 2.0 * (np.abs(link) + np.roll(np.abs(link), 1, axis))
         links.append(link)
-    rows = image(np.ones(grid.shape))
-    stencil = Stencil(grid, links, np.where(np.abs(rows) <= CLEAN * magnitude, 0.0, rows))
+    row_sums = apply(np.ones(grid.shape))
+    extra = np.where(np.abs(row_sums) <= ROW_SUM_ROUNDING * magnitude, 0.0, row_sums)
+    stencil = Stencil(grid, links, extra)
     x = np.random.default_rng(0).uniform(0.5, 1.5, grid.shape)
-    if not np.all(np.abs(stencil.apply(x) - image(x)) <= AGREES * (magnitude + np.abs(rows))):
-        raise Unfit("it is not a symmetric 5- or 7-point stencil")
-    return stencil.checked()
+    difference = np.abs(stencil.apply(x) - apply(x))
+    if not np.all(difference <= AGREEMENT * (magnitude + np.abs(row_sums))):
+        raise UnsuitableOperator("it is not a symmetric 5- or 7-point stencil")
+    return stencil.scaled()
+
+
+def _probe_axis(apply, grid, axis):
+    """Return the links along one axis.
+
+    The image of a field that is 1 on every fourth plane shows the links of these planes on their two sides. Along a
+    periodic axis plane 0 has a field of its own, because it is next to the last one.
+    """
+    n = grid.shape[axis]
+    periodic = grid.periodic[axis]
+    links = np.zeros(grid.shape)
+    link_of_plane = np.moveaxis(links, axis, 0)
+    if periodic:
+        choices = [np.array([0]), np.arange(2, n, 4), np.arange(4, n, 4)]
+    else:
+        choices = [np.arange(0, n, 4), np.arange(2, n, 4)]
+    for planes in choices:
+        if not planes.size:
+            continue
+        x = np.zeros(grid.shape)
+        np.moveaxis(x, axis, 0)[planes] = 1.0
+        image = np.moveaxis(apply(x), axis, 0)
+        if np.any(image[planes[planes >= 4] - 2]):
+            raise UnsuitableOperator("a row reaches beyond the neighbours")
+        link_of_plane[planes - 1] = -image[planes - 1]
+        planes_before_the_last = planes[planes < n - 1]
+        link_of_plane[planes_before_the_last] = -image[planes_before_the_last + 1]
+    if not periodic or n <= 2:  # no link beyond a wall; two cells of a periodic axis are linked already
+        link_of_plane[-1:] = 0.0
+    return links
