@@ -179,7 +179,7 @@ def measured(app):
     exact = 0.07367135328151
     for method in methods:
         membrane(method, 16)[0](1.0)  # compiling is no part of a set-up
-    table = dp.workprec(membrane, methods, over={"cells": [32, 64, 128, 256]}, reference=(exact, exact))
+    table = dp.work_precision(membrane, methods, over={"cells": [32, 64, 128, 256]}, reference=(exact, exact))
     lines = ["| method | cells | error of the gradient | set-up | forward | adjoint | iterations |", "|" + "---|" * 7]
     for row in table.rows:
         times = (f"{1e3 * row[f'seconds_{part}']:.3g} ms" for part in ("setup", "forward", "backward"))

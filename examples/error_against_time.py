@@ -71,7 +71,7 @@ def exact(p):
 # do. Stable are, for :math:`|u| \le 1`, the first with :math:`\Delta t \le h^2 / (2 \nu + h)`, the second with
 # :math:`\Delta t \le h^2 / (2 \nu)` and about :math:`h / 2`, the third with about :math:`2 h`.
 #
-# What `dp.workprec` takes is a function from settings to a loss, a point, and what else a row should say.
+# What `dp.work_precision` takes is a function from settings to a loss, a point, and what else a row should say.
 
 
 def burgers(scheme, cells):
@@ -154,8 +154,8 @@ for rtol in (1e-3, 1e-10):
     solvers[f"krylov {rtol:g}"] = {"method": "krylov", "rtol": rtol}
 
 tables = [
-    dp.workprec(burgers, schemes, {"cells": [4 * n, 8 * n, 16 * n]}, reference=dp.value_and_grad(exact)(START)),
-    dp.workprec(poisson, solvers, {"cells": [n // 4, n // 2, n]}, reference=(MIDDLE, MIDDLE)),
+    dp.work_precision(burgers, schemes, {"cells": [4 * n, 8 * n, 16 * n]}, reference=dp.value_and_grad(exact)(START)),
+    dp.work_precision(poisson, solvers, {"cells": [n // 4, n // 2, n]}, reference=(MIDDLE, MIDDLE)),
 ]
 for table in tables:
     best = table.best(1e-2)

@@ -48,7 +48,7 @@ _WINDOW = {
     "report.plots": "animate convergence plot v_curve",
     "report.certificate": "certified certify",
     "report.stress_table": "stress",
-    "report.work_precision": "workprec",
+    "report.work_precision": "work_precision",
     "report.explain": "explain",
     "interop.blackbox": "from_blackbox",
     "io.archive": "load save",
@@ -61,6 +61,7 @@ _DEPRECATED = {  # an old name: the name that replaces it, and the version that 
     "exponential": ("matrix_exponential", "0.5"),
     "function": ("matrix_function", "0.5"),
     "power": ("matrix_power", "0.5"),
+    "workprec": ("work_precision", "0.5"),
 }
 _SPARSE = "scipy.sparse.linalg.{0}; SciPy takes an Operator as a LinearOperator on flat arrays"
 _STEP = "dp.stepper('rk4', rate, dt), and dp.rollout(step, start, params, n) for n steps"

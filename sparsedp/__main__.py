@@ -155,7 +155,8 @@ COMMANDS = {  # what it runs, what it says of itself, its arguments
     "check": (run_check, "audit the gradient of a loss in a file. Exit code: 0 agrees, 1 disagrees, 3 inconclusive, "
               "2 refused, 130 interrupted", "scene --quick"),
     "report": (run_report, "audit, plan, certificate, error against run time and stress of a loss in a file, in one "
-               "folder; the file may hold dicts of arguments, workprec_options and stress_options. Exit code as check",
+               "folder; the file may hold dicts of arguments, work_precision_options and stress_options. "
+               "Exit code as check",
                "scene --out --force"),
     "compile": (run_compile, "compile all loops for this machine now, not at their first use", ""),
     "ranks": (run_ranks, "what of MPI and PETSc is here, and a test by two processes. Exit code: 0 works, 1 not", ""),

@@ -128,7 +128,11 @@ TABLE = [
     ),
     (lambda: dp.explain(1.0, U), TYPE, "explain takes a function, got float; write lambda x: np.sum(x**2)"),
     (lambda: dp.stress(1.0, U), TYPE, "stress takes a function, got float; write lambda x: np.sum(x**2)"),
-    (lambda: dp.workprec(1.0, {}), TYPE, "workprec takes a function, got float; write lambda cells: (loss, x)"),
+    (
+        lambda: dp.work_precision(1.0, {}),
+        TYPE,
+        "work_precision takes a function, got float; write lambda cells: (loss, x)",
+    ),
     (
         lambda: dp.update_direction(LAP.matrix, U),
         TYPE,

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.calls import deprecated_attribute
 from sparsedp._utils.html import Markup, curves, folded, paragraphs
 from sparsedp._utils.reconstruction import Frozen
 from sparsedp._utils.validation import number_beside
@@ -21,7 +22,8 @@ class Result(Frozen):
     """
 
     _plain: tuple = ()  # names of the attributes that are plain data; default: all that were given
-    left_out: tuple | list = ()  # sentences
+    skipped: tuple | list = ()  # sentences
+    left_out = deprecated_attribute("left_out", "skipped", "0.5")
 
     def __getattr__(self, name):  # also tells type checkers that there are attributes which no class body names
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
@@ -36,11 +38,14 @@ class Result(Frozen):
 
     def to_dict(self):
         """The result as plain numbers, strings, lists and dicts; None where an array holds NaN."""
-        return {name: _plain(getattr(self, name)) for name in self._plain or vars(self)}
+        data = {name: _plain(getattr(self, name)) for name in self._plain or vars(self)}
+        if "skipped" in data:
+            data["left_out"] = data["skipped"]  # deprecated
+        return data
 
     def omissions(self):
         """What was left out, with the reason: lines of its text."""
-        return [f"  left out: {sentence}" for sentence in self.left_out]
+        return [f"  left out: {sentence}" for sentence in self.skipped]
 
     def __str__(self):
         return "\n".join(map(str, self.parts()))
@@ -60,11 +65,11 @@ class Result(Frozen):
             A str that notebooks show as HTML.
         """
         title, *parts = self.parts()
-        left_out = self.omissions()
+        skipped = self.omissions()
         blocks = (
-            part.html() if isinstance(part, Table) else paragraphs([part]) for part in parts if part not in left_out
+            part.html() if isinstance(part, Table) else paragraphs([part]) for part in parts if part not in skipped
         )
-        return Markup("\n".join([paragraphs([title], "h4"), *blocks, folded("What was left out", self.left_out)]))
+        return Markup("\n".join([paragraphs([title], "h4"), *blocks, folded("What was left out", self.skipped)]))
 
     def curves(self):
         """What is drawn on logarithmic axes; nothing unless a kind of result says so.

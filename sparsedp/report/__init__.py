@@ -2,7 +2,7 @@
 
 explain.py           explain: what one gradient computes, and the work that was skipped
 certificate.py       certify, certified: the error that solves leave, from recorded solves
-work_precision.py    workprec: error against run time
+work_precision.py    work_precision: error against run time
 stress_table.py      stress: one word for each extreme case
 stress_cases.py      the table of those cases, and the judges of what comes out
 stability.py         the growth factor of a time step, and its map

@@ -42,7 +42,9 @@ ROUNDING = 1e-14  # of the value
 def distance(one, other, unit=None):
     """Euclidean distance of two trees, relative to a third: by default the second; None counts for nothing."""
     advice = "; give compare=function(result, exact)"
-    pairs = zip(paired(one, other, "result", " of workprec", advice, shapes=True, error=ValueError), leaves(other))
+    pairs = zip(
+        paired(one, other, "result", " of work_precision", advice, shapes=True, error=ValueError), leaves(other)
+    )
     gaps = [np.subtract(a, b) for a, b in pairs if a is not None]
     return norm(gaps) / (norm(other if unit is None else unit) or 1.0)
 

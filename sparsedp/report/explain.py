@@ -50,7 +50,7 @@ def explain(loss, x, gradient=True):
     -------
     Plan
         str() is the plan. `.counts`: dict of calls by (name, kind), a kind that never happened counts 0;
-        `.totals`: dict of their sums in words; `.left_out`: list of sentences; `.rows`: one dict for each
+        `.totals`: dict of their sums in words; `.skipped`: list of sentences; `.rows`: one dict for each
         operator, rule and solve; `.to_dict()`: all of it as plain data.
 
     Raises
@@ -100,7 +100,7 @@ def explain(loss, x, gradient=True):
     steps = sum(calls[name, "forward"] for name, kind in list(calls) if kind == "recomputed")
     return Plan(
         value=float(value), counts=calls, totals=totals, rows=_rows(calls), seconds=seconds, tape_nodes=tape_nodes,
-        left_out=list(dict.fromkeys([*_gradient(x, gradient), *_skipped(calls, before, gradient), *_extras()])),
+        skipped=list(dict.fromkeys([*_gradient(x, gradient), *_skipped(calls, before, gradient), *_extras()])),
         tape_bytes=tape_bytes + total(calls, "bytes"),
         recomputation=1.0 + totals["steps recomputed"] / steps if steps else 1.0,
     )  # fmt: skip
@@ -122,7 +122,7 @@ class Plan(Result):
         Calls by (name, kind).
     totals : dict
         Their sums in words.
-    left_out : list of str
+    skipped : list of str
     rows : list of dict
         name, form or method, counts and seconds of each operator, rule and solve, in the order of first use.
     tape_nodes, tape_bytes : int
@@ -133,7 +133,7 @@ class Plan(Result):
         Forward with taping, backward.
     """
 
-    _plain = ("value", "totals", "left_out", "rows", "tape_nodes", "tape_bytes", "recomputation", "seconds")
+    _plain = ("value", "totals", "skipped", "rows", "tape_nodes", "tape_bytes", "recomputation", "seconds")
 
     def to_dict(self):
         """The plan as plain numbers, strings, lists and dicts; counts nested by name and kind."""

@@ -77,7 +77,7 @@ def section(title, result, files, caption):
     return f'<section><h2>{cell(title)}</h2>{figure}<div class="wide">{result.html()}</div></section>'
 
 
-def page(title, verdict, meaning, sections, left_out):
+def page(title, verdict, meaning, sections, skipped):
     """Title, verdict with its meaning, sections, what was left out -> the page."""
     return f"""<!doctype html>
 <html lang="en">
@@ -91,7 +91,7 @@ def page(title, verdict, meaning, sections, left_out):
 <h1>{cell(title)}</h1>
 <p class="verdict {verdict}"><strong>{verdict}</strong>. {cell(meaning)}</p>
 {"".join(sections)}
-{folded("What was left out", left_out)}
+{folded("What was left out", skipped)}
 <script>{SORTING}</script>
 </body>
 </html>

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sparsedp import check
+from sparsedp._utils.calls import warn_deprecated
 from sparsedp.check.summary import Result, error_text
 from sparsedp.io.atomic_files import write_file
 from sparsedp.report import plots
@@ -23,14 +24,14 @@ from sparsedp.report.certificate import certify
 from sparsedp.report.explain import explain
 from sparsedp.report.html_page import page, section
 from sparsedp.report.stress_table import stress
-from sparsedp.report.work_precision import workprec
+from sparsedp.report.work_precision import work_precision
 
 __all__ = ["Source", "audited", "claim", "load", "write_report"]
 
 STARTS = ("start", "x")  # names of the point, the first that is there
-OPTIONS = "workprec", "stress"  # instruments whose arguments the file may hold, as dicts of the name NAME_options
+OPTIONS = "work_precision", "stress"  # instruments whose arguments the file may hold, as dicts of the name NAME_options
 PAGES = "report.md", "report.html"
-NO_PROBLEM = "the file gives no workprec_options (problem, methods, over)"
+NO_PROBLEM = "the file gives no work_precision_options (problem, methods, over)"
 MEANING = {  # the worst first: one that is wrong beats one that is open
     "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
     "inconclusive": "Nothing is proved: the reason stands below. This is no pass.",
@@ -57,7 +58,7 @@ def load(target):
     ----------
     target : str
         ``FILE.py[:loss[:start]]``. Without a name the loss is called `loss`, and the point `start` or `x`; a point
-        that is a tuple fills a loss of several arguments. Two dicts in the file are handed on: `workprec_options`
+        that is a tuple fills a loss of several arguments. Two dicts in the file are handed on: `work_precision_options`
         (problem, methods, ...) and `stress_options` (ranges, step, ...).
 
     Raises
@@ -76,6 +77,9 @@ def load(target):
     if place is None:
         raise ValueError(f"{file} has no {start or ' or '.join(STARTS)!r}, the point; write {file}:{loss}:NAME")
     name = file.stem if loss == "loss" else f"{file.stem}-{loss}"
+    if "workprec_options" in names:
+        names.setdefault("work_precision_options", names["workprec_options"])
+        warn_deprecated("workprec_options", "work_precision_options", "0.5")
     options = {key: names.get(f"{key}_options", {}) for key in OPTIONS}
     for key, given in options.items():
         if not isinstance(given, dict):
@@ -226,8 +230,8 @@ def _attempt(chapter, source):
         return error_text(error)
 
 
-def _workprec(loss, x, **options):
-    return workprec(**options) if options else NO_PROBLEM
+def _work_precision(loss, x, **options):
+    return work_precision(**options) if options else NO_PROBLEM
 
 
 class Chapter(NamedTuple):
@@ -247,7 +251,7 @@ CHAPTERS = (
             lambda audit: partial(plots.v_curve, audit),
             "Each curve is a direction. Of a right gradient it falls with the step, from the right to the left, until "
             "rounding lifts it: a V. Of a wrong one it stays up: a plateau."),
-    Chapter("workprec", "Which method for which error?", "error against run time: not measured", _workprec,
+    Chapter("work_precision", "Which method for which error?", "error against run time: not measured", _work_precision,
             lambda rows: rows.plot,
             "Further to the left is faster, further down is more exact. The grey band joins the best runs: no other "
             "one is both faster and more exact."),

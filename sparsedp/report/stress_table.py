@@ -44,7 +44,7 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     Returns
     -------
     Stress
-        `.rows`, `.counts`, `.failures`, `.left_out`, `.map` (time step against viscosity, or None), `.to_dict()`,
+        `.rows`, `.counts`, `.failures`, `.skipped`, `.map` (time step against viscosity, or None), `.to_dict()`,
         `.markdown()`, `.csv()`, `.plot(ax)`; str() is the table; true when nothing FAILED.
 
     Raises
@@ -95,7 +95,7 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     counts = {word: sum(row["outcome"] == word for row in rows) for word in WORDS}
     return Stress(
         rows=rows, counts=counts, failures=[row for row in rows if row["outcome"] == FAILED], map=growth,
-        verdict="disagrees" if counts[FAILED] else "agrees", left_out=[*skipped, *ELSEWHERE],
+        verdict="disagrees" if counts[FAILED] else "agrees", skipped=[*skipped, *ELSEWHERE],
         summary=f"stress: {', '.join(f'{many} {word}' for word, many in counts.items())}",
     )  # fmt: skip
 
@@ -120,12 +120,12 @@ class Stress(Result):
     verdict : "disagrees" when something FAILED, else "agrees"
     summary : str
         One line.
-    left_out : list of str
+    skipped : list of str
         Cases that do not apply, with the reason.
     map : StabilityMap or None
     """
 
-    _plain = ("counts", "rows", "left_out", "map")
+    _plain = ("counts", "rows", "skipped", "map")
 
     def parts(self):
         """All cases, what was left out, the map, the failures, and the counts."""

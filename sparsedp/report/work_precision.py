@@ -1,4 +1,4 @@
-"""workprec: error against run time, of values and of gradients, one row for each run."""
+"""work_precision: error against run time, of values and of gradients, one row for each run."""
 
 import csv
 import itertools
@@ -29,7 +29,7 @@ from sparsedp.report import plots
 from sparsedp.report.certificate import distance
 from sparsedp.report.explain import total
 
-__all__ = ["COLUMNS", "Rows", "workprec"]
+__all__ = ["COLUMNS", "Rows", "work_precision"]
 
 COLUMNS = (
     "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
@@ -48,7 +48,7 @@ GOALS = 0.1, 0.01, 1e-3, 1e-4, 1e-6  # errors that a method is recommended for, 
 FAILURES = (SparsedpError, ArithmeticError, ValueError, MemoryError, np.linalg.LinAlgError)
 
 
-def workprec(
+def work_precision(
     problem, methods, over=None, reference=None, compare=None, repeats=3, file=None, scene=None, skip=None, seed=0
 ):
     """Problem and methods -> error against run time: a table, one row for each method and setting.
@@ -83,7 +83,7 @@ def workprec(
     Returns
     -------
     Rows
-        `.rows` (dicts), `.markdown()`, `.csv()`, `.plot(ax)`, `.pareto()`, `.save(folder)`, `.left_out`; str() is
+        `.rows` (dicts), `.markdown()`, `.csv()`, `.plot(ax)`, `.pareto()`, `.save(folder)`, `.skipped`; str() is
         the table.
 
     Raises
@@ -106,19 +106,22 @@ def workprec(
     >>> def poisson(cells, method):
     ...     solve = inverse(-laplacian(Grid(cells, size=1.0), dirichlet), method)
     ...     return lambda s: solve(s * np.ones(cells)).mean(), 1.0
-    >>> table = workprec(poisson, {"direct": {"method": "direct"}}, {"cells": [8, 16, 32]}, reference=(1 / 12, 1 / 12))
+    >>> methods = {"direct": {"method": "direct"}}
+    >>> table = work_precision(poisson, methods, {"cells": [8, 16, 32]}, reference=(1 / 12, 1 / 12))
     >>> [f"{row['gradient_error']:.4f}" for row in table.rows]
     ['0.0313', '0.0078', '0.0020']
     """
-    check_function("workprec", problem, "lambda cells: (loss, x)")
+    check_function("work_precision", problem, "lambda cells: (loss, x)")
     if ranks() > 1:
-        raise TypeError("workprec repeats runs by the clock, which no two ranks share; run it on one process")
-    repeats = check_whole("repeats of workprec", repeats, 1, "; the default is 3")
+        raise TypeError("work_precision repeats runs by the clock, which no two ranks share; run it on one process")
+    repeats = check_whole("repeats of work_precision", repeats, 1, "; the default is 3")
     if not methods or not isinstance(methods, dict):
-        raise ValueError("workprec needs at least one method; write {'name': {settings}}")
+        raise ValueError("work_precision needs at least one method; write {'name': {settings}}")
     for name, values in (over or {}).items():
         if isinstance(values, str) or not isinstance(values, Iterable):
-            raise TypeError(f"over of workprec takes a list of values for {name!r}, got {values!r}; write [{values!r}]")
+            raise TypeError(
+                f"over of work_precision takes a list of values for {name!r}, got {values!r}; write [{values!r}]"
+            )
     scene, over, now, rows = scene or getattr(problem, "__name__", "scene"), over or {}, _versions(), []
     finished = {tuple(map(row.get, KEY)): row for row in _stored(file)}
     compare, known = compare or distance, {}
@@ -146,7 +149,7 @@ def workprec(
             if file:
                 write_file(file, table_of([*_stored(file), finished[key]], COLUMNS).csv())
         rows.append(finished[key])
-    return Rows(scene=scene, over=tuple(over), rows=rows, left_out=skipped)
+    return Rows(scene=scene, over=tuple(over), rows=rows, skipped=skipped)
 
 
 def words_of(settings):
@@ -289,7 +292,7 @@ def _exact(problem, given, compare, shared):
 
 
 class Rows(Result):
-    """Error against run time. Made by `workprec`.
+    """Error against run time. Made by `work_precision`.
 
     Attributes
     ----------
@@ -298,7 +301,7 @@ class Rows(Result):
         Names of the settings that vary.
     rows : list of dict
         Keys are COLUMNS; NaN where a figure does not exist.
-    left_out : list of str
+    skipped : list of str
         Runs that were not made, with the reason.
     """
 
@@ -407,7 +410,7 @@ def _stored(file):
     with stream:
         reader = csv.DictReader(stream)
         if reader.fieldnames not in (None, list(COLUMNS)):
-            raise ValueError(f"{Path(file).name} is no table of workprec; give another file name")
+            raise ValueError(f"{Path(file).name} is no table of work_precision; give another file name")
         whole = [row for row in reader if row[COLUMNS[-1]] is not None]
     return [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in whole]
 

@@ -291,7 +291,7 @@ def test_the_inner_function_of_admm_in_another_order():
 def test_references_of_workprec_in_another_order():
     x = {"a": np.ones(2), "b": np.zeros(3)}
     reference = 2.0, {"b": np.zeros(3), "a": 2.0 * np.ones(2)}
-    table = dp.workprec(
+    table = dp.work_precision(
         lambda n: (lambda x: anp.sum(x["a"] ** 2) + anp.sum(x["b"] ** 2), x),
         {"n": {"n": 1}},
         reference=reference,

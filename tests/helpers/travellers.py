@@ -305,7 +305,8 @@ def travellers():
 NOTHING_TO_CALL = {
     "Grid", "Space", "Operator", "dirichlet", "neumann", "robin", "no_slip", "free_slip", "inflow", "outflow",
     "rollout", "minimize", "update_direction",
-    "set_threads", "convergence", "v_curve", "animate", "plot", "certify", "stress", "workprec", "explain", "check",
+    "set_threads", "convergence", "v_curve", "animate", "plot", "certify", "stress", "work_precision", "explain",
+    "check",
     "errors", "report", "vjp", "jvp", "hvp", "sponge", "steady", "distribute", "gather",
     "flatten", "from_image", "interop", "load", "save",
 }  # fmt: skip

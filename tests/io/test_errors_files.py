@@ -25,7 +25,7 @@ import autograd.numpy as np
 start = np.linspace(0.5, 1.5, 40)
 loss = lambda u: np.sum(u**3)
 problem = lambda power: (lambda s: s**power, 1.0)
-workprec_options = dict(problem=problem, methods={"a": {}}, over={"power": [2, 3]}, repeats=1)
+work_precision_options = dict(problem=problem, methods={"a": {}}, over={"power": [2, 3]}, repeats=1)
 """
 LIMITED = """
 import resource, signal, sys
@@ -144,17 +144,17 @@ while True:
 
 WRITERS = {
     "network.save": "dp.network.save(path, {'w': np.arange(size) * 1.0})",
-    "table.save": "dp.workprec(lambda n: (lambda s: s**n, 1.0), {'a' * (size // 2): {}}, {'n': [2]}, repeats=1,"
+    "table.save": "dp.work_precision(lambda n: (lambda s: s**n, 1.0), {'a' * (size // 2): {}}, {'n': [2]}, repeats=1,"
                   " scene='path').save(folder)",
-    "workprec(file)": "dp.workprec(lambda n: (lambda s: s**n, 1.0), {'a' * (size // 8): {}}, {'n': [2, 3, 4]},"
-                      " repeats=1, file=path)",
+    "work_precision(file)": "dp.work_precision(lambda n: (lambda s: s**n, 1.0), {'a' * (size // 8): {}},"
+                            " {'n': [2, 3, 4]}, repeats=1, file=path)",
     "checkpoint": "dp.minimize(lambda x: (x**2).sum(), np.linspace(-1, 1, size), 'gd', maxiter=3, rate=0.1,"
                   " tolerance=0, checkpoint=folder)",
     "animate": "dp.animate(dp.Grid((size // 20, 9)), [np.eye(size // 20, 9)] * 3, path)",
 }  # fmt: skip
 
 
-ALIKE = {"table.save", "animate", "workprec(file)"}  # what they write goes the way of the others
+ALIKE = {"table.save", "animate", "work_precision(file)"}  # what they write goes the way of the others
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.whole] if n in ALIKE else []) for n in WRITERS])
@@ -183,7 +183,7 @@ def test_no_room(tmp_path, name):
     after = contents(tmp_path)
     assert running.returncode == 1 and "OSError: [Errno 27] File too large: " in printed.splitlines()[-1]
     assert before or name == "checkpoint"
-    if name == "workprec(file)":  # each row is a write of its own: those that found room are there, whole
+    if name == "work_precision(file)":  # each row is a write of its own: those that found room are there, whole
         rows = after.pop("path")
         assert rows.startswith(before.pop("path")) and rows.endswith(b"\n") and len(rows) < 3000
     assert after == before

@@ -184,7 +184,7 @@ def test_what_gather_does_not_take():
 # ------------------------------------------------------------ what one of several ranks raises
 
 PLANTED = {
-    "clock: TypeError": "workprec repeats runs by the clock, which no two ranks share; run it on one process",
+    "clock: TypeError": "work_precision repeats runs by the clock, which no two ranks share; run it on one process",
     "kernel in a gradient: MemoryError": "no room (on rank 1, whose block begins at cell (6, 0))",
     "argument: ValueError": (
         "argument 0['k'] of the loss is not the same on rank 1 as on rank 0; give all ranks the same numbers, random "

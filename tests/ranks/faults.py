@@ -178,7 +178,7 @@ FAULTS = {
         ValueError, "came to an error in laplacian where",
         within(cut._Cut, "product", MemoryError(), lambda: dp.grad(caught)(FIELD)),
     ),
-    "clock": (TypeError, "by the clock", lambda: dp.workprec(lambda: (misfit, U), [{}])),
+    "clock": (TypeError, "by the clock", lambda: dp.work_precision(lambda: (misfit, U), [{}])),
     "another way": (
         ValueError, "let nothing depend on the number of the rank", lambda: here(np.sum, np.max)(FIELD)
     ),

@@ -51,7 +51,7 @@ def point_load(method, cells):
 
 
 stress_options = {"ranges": (-2.0, 2.0), "only": ["as given", "not finite"]}
-workprec_options = dict(
+work_precision_options = dict(
     problem=point_load, methods={"direct": {"method": "direct"}}, over={"cells": [8, 16]},
     reference=(0.07367135328151, 0.07367135328151), repeats=1,
 )
@@ -148,7 +148,7 @@ def test_what_a_report_leaves_out_and_what_is_degraded(tmp_path, capsys):
     )
     main(["report", str(tmp_path / "cool.py"), "--out", str(tmp_path / "out")])
     printed = capsys.readouterr().out
-    line = "error against run time: not measured, the file gives no workprec_options (problem, methods, over)"
+    line = "error against run time: not measured, the file gives no work_precision_options (problem, methods, over)"
     assert line in printed.splitlines()
     degraded = int(re.search(r"(\d+) degraded", printed)[1])
     page = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
@@ -414,7 +414,7 @@ def test_a_name_of_5000_letters(tmp_path, monkeypatch, capsys, arguments, senten
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.py").write_text(
         f"import autograd.numpy as np\nstart = np.ones(3)\nloss = {'b' * 255} = lambda u: np.sum(u**2)\n"
-        f"workprec_options = dict(problem=lambda n: (loss, start), methods={{'a': {{'n': 1}}}}, scene='b' * 255)"
+        f"work_precision_options = dict(problem=lambda n: (loss, start), methods={{'a': {{'n': 1}}}}, scene='b' * 255)"
     )
     try:
         code = main(arguments)

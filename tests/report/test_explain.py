@@ -170,45 +170,45 @@ def plan_of(name):
     return dp.explain(*SCENES[name][:2])
 
 
-def left_out(plan, words):
-    return [sentence for sentence in plan.left_out if words in sentence]
+def skipped(plan, words):
+    return [sentence for sentence in plan.skipped if words in sentence]
 
 
 def test_what_a_scene_does_not_need_is_left_out():
     plan = plan_of("one operator")
     assert plan.totals["hierarchies built"] == plan.totals["set-ups built"] == plan.totals["forward solves"] == 0
-    assert left_out(plan, "solves: none") and left_out(plan, "JVPs")
-    assert left_out(plan_of("not on the tape"), "VJP of laplacian: never called")
-    assert left_out(plan_of("elliptic in k"), "elliptic_solver in b, shift: not asked")
-    assert left_out(plan_of("elliptic in b"), "elliptic_solver in k, shift: not asked")
-    assert not left_out(plan_of("elliptic in both: one adjoint"), "in k")
-    assert left_out(plan_of("two branches"), "1 leaves of x, which are not floating")
-    assert left_out(plan_of("value without gradient"), "adjoint solve of inverse(-laplacian): nothing asks for it")
-    assert left_out(plan_of("nothing to solve"), "1 solves of inverse(-laplacian): the right-hand side is 0")
-    assert left_out(plan_of("fixed operator, n steps"), "multigrid hierarchy for inverse")
+    assert skipped(plan, "solves: none") and skipped(plan, "JVPs")
+    assert skipped(plan_of("not on the tape"), "VJP of laplacian: never called")
+    assert skipped(plan_of("elliptic in k"), "elliptic_solver in b, shift: not asked")
+    assert skipped(plan_of("elliptic in b"), "elliptic_solver in k, shift: not asked")
+    assert not skipped(plan_of("elliptic in both: one adjoint"), "in k")
+    assert skipped(plan_of("two branches"), "1 leaves of x, which are not floating")
+    assert skipped(plan_of("value without gradient"), "adjoint solve of inverse(-laplacian): nothing asks for it")
+    assert skipped(plan_of("nothing to solve"), "1 solves of inverse(-laplacian): the right-hand side is 0")
+    assert skipped(plan_of("fixed operator, n steps"), "multigrid hierarchy for inverse")
 
 
 def test_gradient_not_asked_nothing_taped():
     plan = dp.explain(one_operator, U, gradient=False)
     assert plan.tape_nodes == plan.tape_bytes == plan.counts["laplacian", "vjp"] == 0
-    assert "the gradient: not asked, nothing taped" in plan.left_out
+    assert "the gradient: not asked, nothing taped" in plan.skipped
 
 
 def test_no_matrix_for_constant_coefficients_on_a_box():
     solve = dp.inverse(-L.matrix_free(), "separable")
     plan = dp.explain(lambda b: anp.sum(solve(b) ** 2), U)
     assert plan.totals["matrices assembled"] == 0 and plan.totals["hierarchies built"] == 0
-    assert left_out(plan, "set-up of inverse(-laplacian): made before, 2 solves reuse it")
+    assert skipped(plan, "set-up of inverse(-laplacian): made before, 2 solves reuse it")
     assert plan.counts["inverse(-laplacian)", "reused"] == 2
     free = dp.explain(lambda u: anp.sum(L.matrix_free()(u) ** 2), U)
-    assert free.totals["matrices assembled"] == 0 and left_out(free, "matrix of laplacian: not assembled")
+    assert free.totals["matrices assembled"] == 0 and skipped(free, "matrix of laplacian: not assembled")
     listed = dp.laplacian(GRID).matrix_free()
     assert dp.explain(lambda u: anp.sum(listed.explicit()(u) ** 2), U).totals["matrices assembled"] == 1
 
 
 def test_an_identity_is_no_arithmetic():
     plan = dp.explain(lambda u: anp.sum(dp.identity(GRID.cells)(u) ** 2), U)
-    assert left_out(plan, "arithmetic of identity: an identity, 1 copies")
+    assert skipped(plan, "arithmetic of identity: an identity, 1 copies")
 
 
 def test_bytes_on_the_tape():
@@ -226,7 +226,7 @@ def test_newton():
     (name,) = {name for name, kind in plan.counts if kind == "vjp" and name.startswith("implicit")}
     assert plan.counts[name, "forward"] == plan.counts[name, "vjp"] == 1
     assert plan.counts[f"{name}.jacobian", "adjoint"] == 1
-    assert left_out(plan, f"derivative of {name} in guess: not asked")
+    assert skipped(plan, f"derivative of {name} in guess: not asked")
     assert "Newton's method, Jacobian given" in str(plan)
 
 
@@ -244,7 +244,7 @@ def test_others_report_through_the_ledger():
     plan = dp.explain(lambda u: anp.sum(square(u)), U)
     assert plan.recomputation == 1.5 and plan.totals["steps recomputed"] == 5
     assert plan.tape_bytes == 1000 + U.nbytes
-    assert left_out(plan, "rollout: nu = 0, no diffusion solve (1 times)")
+    assert skipped(plan, "rollout: nu = 0, no diffusion solve (1 times)")
 
 
 def test_text_and_data():
@@ -254,7 +254,9 @@ def test_text_and_data():
         assert words in text
     data = json.loads(json.dumps(plan.to_dict()))
     assert data["counts"]["inverse(identity + -0.01 * laplacian)"]["adjoint"] == N
-    assert data["left_out"] == plan.left_out and repr(plan) == text
+    assert data["skipped"] == plan.skipped and repr(plan) == text
+    with pytest.warns(DeprecationWarning, match="left_out is deprecated"):
+        assert plan.left_out == data["left_out"] == plan.skipped
     assert all(row["seconds"] >= 0 for row in plan.rows)
     assert sum(row["seconds"] for row in plan.rows) <= sum(plan.seconds)
     with pytest.raises(AttributeError, match="Plan is frozen; make a new one instead of setting value"):
@@ -265,12 +267,12 @@ def test_text_and_data():
 def test_extras_are_not_imported():
     code = (
         "import numpy as np, autograd.numpy as anp, sparsedp as dp; g = dp.Grid((4, 4)); L = dp.laplacian(g)\n"
-        "print(*dp.explain(lambda u: anp.sum(L(u) ** 2), np.ones((4, 4))).left_out, sep='\\n')"
+        "print(*dp.explain(lambda u: anp.sum(L(u) ** 2), np.ones((4, 4))).skipped, sep='\\n')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     for name in ("pyamg", "matplotlib", "tqdm"):
         assert f"not imported: {name}" in done.stdout
-    assert not left_out(dp.explain(one_operator, U), "not imported: autograd")
+    assert not skipped(dp.explain(one_operator, U), "not imported: autograd")
 
 
 def test_what_the_loss_raises_passes_through():

@@ -39,7 +39,7 @@ def test_without_diffusion_no_diffusion_solve():
     spread = Resolvent(L, "diffusion", dict(method="auto", rtol=1e-10, maxiter=None, nullspace="raise", options={}))
     plan = dp.explain(lambda u: anp.sum(spread(0.0, u) ** 2), U)
     assert plan.totals["set-ups built"] == plan.totals["forward solves"] == plan.totals["adjoint solves"] == 0
-    assert any("no solve and no set-up" in sentence for sentence in plan.left_out)
+    assert any("no solve and no set-up" in sentence for sentence in plan.skipped)
 
 
 def test_comparisons_and_shapes_in_a_loss():
@@ -56,7 +56,7 @@ def test_each_scene_leaves_out_what_it_does_not_need():
     carried = dp.explain(lambda v: anp.sum(dp.rollout(lambda u, w: move(u, w, 0.01), U, v, n) ** 2), wind)
     for word in ("hierarchies built", "set-ups built", "matrices assembled", "forward solves", "adjoint solves"):
         assert carried.totals[word] == 0, word  # no projection: no pressure
-    assert any(sentence.startswith("solves: none") for sentence in carried.left_out)
+    assert any(sentence.startswith("solves: none") for sentence in carried.skipped)
 
     step = dp.stepper("backward_euler", L, 0.01)
     spread = lambda start, k: dp.explain(lambda u: anp.sum(dp.rollout(step, u, k, n) ** 2), start)
@@ -78,4 +78,4 @@ def test_an_operator_whose_transpose_ran_without_a_tape_is_not_called_independen
         return anp.sum(dp.rollout(step, step.start(v), None, 3)["v"] ** 2)
 
     plan = dp.explain(energy, np.arange(32.0) / 32)
-    assert not [sentence for sentence in plan.left_out if "does not depend on x" in sentence]
+    assert not [sentence for sentence in plan.skipped if "does not depend on x" in sentence]

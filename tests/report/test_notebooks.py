@@ -116,7 +116,7 @@ def test_plan_folds_what_was_left_out():
     plan = dp.explain(lambda u: anp.sum(dp.laplacian(GRID)(u) ** 2), np.ones(GRID.shape))
     tree = shown(plan)
     [folded] = tree.iter("details")
-    assert [line.text for line in folded.iter("li")] == list(plan.left_out)
+    assert [line.text for line in folded.iter("li")] == list(plan.skipped)
     assert "left out" not in "".join("".join(part.itertext()) for part in tree.iter("p"))
 
 
@@ -124,7 +124,7 @@ def test_work_precision_table():
     box = dp.Grid((8, 8))
     problem = lambda method: (lambda s: anp.sum(dp.inverse(dp.identity(box.cells) - dp.laplacian(box), method)(s)), S)
     S = np.ones(box.shape)
-    table = dp.workprec(
+    table = dp.work_precision(
         problem, {"a": {"method": "direct"}, "b": {"method": "krylov"}}, reference=(64.01, np.ones((8, 8)))
     )
     tree = shown(table)

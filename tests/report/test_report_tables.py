@@ -59,7 +59,7 @@ def test_a_failure_is_one_line_of_what_is_there():
     names = ("group", "parameter", "case", "outcome", "figure", "note")
     case = ("", "value and gradient", "FAILED", 1.0, "")
     rows = [dict(zip(names, ("as given", *case))), dict(zip(names, ("x", "dt", "low", "FAILED", 1.0, "grows")))]
-    found = Stress(rows=rows, counts={"FAILED": 2}, failures=rows, map=None, left_out=[], summary="two")
+    found = Stress(rows=rows, counts={"FAILED": 2}, failures=rows, map=None, skipped=[], summary="two")
     assert found.parts()[-3:] == ["FAILED: value and gradient", "FAILED: dt low: grows", "two"]
 
 

@@ -71,7 +71,7 @@ def test_a_legal_range_that_is_too_wide_is_found():
 
 def test_a_loop_without_rollout():
     x = {"dt": 0.6 / 24**2}
-    assert any("give step=" in sentence for sentence in dp.stress(by_hand, x, only=["as given"]).left_out)
+    assert any("give step=" in sentence for sentence in dp.stress(by_hand, x, only=["as given"]).skipped)
     found = dp.stress(by_hand, x, step=lambda p: (lambda u: u + p["dt"] * L(u), START), only=["as given"])
     assert found.failures[0]["case"] == "growth in one step"
 
@@ -269,7 +269,7 @@ def test_every_group_has_cases_and_a_reason_to_have_none():
     result = dp.stress(loss, x, ranges={"dt": (0.01, 0.2)})
     jumps = dp.stress(lambda u: anp.sum(u**2), START**2 + 1, only=["jumps"])
     assert {row["group"] for row in [*result.rows, *jumps.rows]} == set(GROUPS)
-    assert not any(sentence.startswith("kinds of arrays") for sentence in result.left_out)
+    assert not any(sentence.startswith("kinds of arrays") for sentence in result.skipped)
 
 
 def test_values_outside_a_stated_range_are_not_failures():

@@ -30,16 +30,16 @@ EXACT = (1 / 12, 1 / 12)
 
 
 def table(**options):
-    return dp.workprec(poisson, METHODS, {"cells": [8, 16]}, **{"reference": EXACT, "repeats": 2, **options})
+    return dp.work_precision(poisson, METHODS, {"cells": [8, 16]}, **{"reference": EXACT, "repeats": 2, **options})
 
 
 def test_names_that_tables_and_files_cannot_hold(tmp_path):
     methods = {"a|b": METHODS["direct"], 3: METHODS["krylov"]}
     options = {"reference": EXACT, "repeats": 1, "scene": "walls/x", "file": tmp_path / "rows.csv"}
-    found = dp.workprec(poisson, methods, {"cells": [8]}, **options)
+    found = dp.work_precision(poisson, methods, {"cells": [8]}, **options)
     assert "| a\\|b |" in found.markdown() and "| 3 |" in found.markdown()
     assert [path.name for path in found.save(tmp_path)[:2]] == ["walls-x.md", "walls-x.csv"]
-    again = dp.workprec(poisson, methods, {"cells": [8]}, **options)
+    again = dp.work_precision(poisson, methods, {"cells": [8]}, **options)
     assert [row["method"] for row in again.rows] == ["a|b", "3"] and again.markdown() == found.markdown()
 
 
@@ -78,7 +78,7 @@ def test_orders_of_schemes_and_their_ordering():
     """At equal steps the first order is behind the second, and the exponential is exact; Pareto takes the best."""
     schemes = {name: {"scheme": k} for k, name in enumerate(("euler", "heun", "exponential"), 1)}
     exact = (4 * math.exp(-2), 4 * math.exp(-2))
-    found = dp.workprec(heat, schemes, {"steps": [10, 20, 40]}, reference=exact, repeats=1)
+    found = dp.work_precision(heat, schemes, {"steps": [10, 20, 40]}, reference=exact, repeats=1)
     error = {(row["method"], row["steps"]): row["gradient_error"] for row in found.rows}
     for order, name in ((1, "euler"), (2, "heun")):
         assert math.log2(error[name, 20] / error[name, 40]) == pytest.approx(order, abs=0.1)
@@ -114,23 +114,23 @@ def test_failures_keep_their_row():
         return lambda b: b**2, np.arange(3.0) if kind == "shape" else 2.0
 
     kinds = ("stuck", "unstable", "nan", "fine")
-    found = dp.workprec(scene, {kind: {"kind": kind} for kind in kinds}, reference=(4.0, 4.0), repeats=1)
+    found = dp.work_precision(scene, {kind: {"kind": kind} for kind in kinds}, reference=(4.0, 4.0), repeats=1)
     status = {row["method"]: row["status"] for row in found.rows}
     assert status == {"stuck": "max_iterations", "unstable": "UnstableStepError", "nan": "nonfinite", "fine": "ok"}
     assert math.isnan(found.rows[0]["seconds_forward"]) and "max_iterations" in str(found)
     assert [row["method"] for row in found.pareto()] == ["fine"]
 
-    wide = dp.workprec(
+    wide = dp.work_precision(
         lambda n: (lambda x: anp.sum(x), np.ones(n)), {"n": {"n": 3}}, reference=(3.0, np.ones(4)), repeats=1
     )
     assert wide.rows[0]["status"].startswith("reference: ValueError")
     with pytest.raises(
         ValueError,
-        match=r"result of workprec: expected shape \(4,\), got \(3,\); give compare=function\(result, exact\)",
+        match=r"result of work_precision: expected shape \(4,\), got \(3,\); give compare=function\(result, exact\)",
     ):
         work_precision.distance(np.ones(3), np.ones(4))
     short = lambda found, wanted: abs(np.sum(found) - np.sum(wanted))
-    fair = dp.workprec(
+    fair = dp.work_precision(
         lambda n: (lambda x: anp.sum(x), np.ones(n)),
         {"n": {"n": 3}},
         reference=(3.0, np.ones(4)),
@@ -154,7 +154,7 @@ def test_caches_that_are_not_warm_are_refused(monkeypatch):
     def cold():
         return lambda s: calls.append(1) or s**2, 1.0
 
-    dp.workprec(cold, {"it": {}}, repeats=2)
+    dp.work_precision(cold, {"it": {}}, repeats=2)
     assert len(calls) >= 2 + 2 * 2 + 1  # warm-up, two of each kind, and the one that is weighed
 
 
@@ -165,12 +165,12 @@ def test_a_run_without_gradient_and_an_output():
         loss = lambda x: anp.sum((x - 3.0) ** 2)
         return lambda: dp.minimize(loss, np.zeros(2), method=method, maxiter=50).x, None
 
-    found = dp.workprec(fit, {"lbfgs": {"method": "lbfgs"}}, reference=(np.full(2, 3.0), None), repeats=1)
+    found = dp.work_precision(fit, {"lbfgs": {"method": "lbfgs"}}, reference=(np.full(2, 3.0), None), repeats=1)
     assert found.rows[0]["forward_error"] < 1e-6 and math.isnan(found.rows[0]["gradient_error"])
     assert found.pareto("forward_error") and not found.pareto()
 
     scene = lambda: (lambda x: anp.sum(x**2), np.ones(3), {"output": lambda x: 2 * x})
-    found = dp.workprec(scene, {"it": {}}, reference=(2 * np.ones(3), 2 * np.ones(3)), repeats=1)
+    found = dp.work_precision(scene, {"it": {}}, reference=(2 * np.ones(3), 2 * np.ones(3)), repeats=1)
     assert found.rows[0]["forward_error"] == found.rows[0]["gradient_error"] == 0.0
 
 
@@ -186,26 +186,26 @@ def test_a_file_is_continued(tmp_path):
 
     options = dict(over={"cells": [8, 16]}, reference=EXACT, repeats=1, file=file, scene="poisson")
     with pytest.raises(KeyboardInterrupt):
-        dp.workprec(counted, METHODS, **options)
+        dp.work_precision(counted, METHODS, **options)
     file.write_text(file.read_text()[:-30])  # the second row is torn
-    found = dp.workprec(counted, METHODS, **options)
+    found = dp.work_precision(counted, METHODS, **options)
     assert built[3:] == [(16, "direct"), (8, "krylov"), (16, "krylov")]
-    again = dp.workprec(counted, METHODS, **options)
-    assert len(built) == 6 and again.csv() == found.csv() and not again.left_out
+    again = dp.work_precision(counted, METHODS, **options)
+    assert len(built) == 6 and again.csv() == found.csv() and not again.skipped
     rows = list(csv.DictReader(io.StringIO(again.csv())))
     assert len(rows) == 4 and [row["method"] for row in rows] == ["direct", "direct", "krylov", "krylov"]
 
     file.write_text(file.read_text().replace("numpy ", "numpy 0."))
-    old = dp.workprec(counted, METHODS, **options)
-    assert len(built) == 10 and "4 rows of runs.csv from other versions: run again" in old.left_out
+    old = dp.work_precision(counted, METHODS, **options)
+    assert len(built) == 10 and "4 rows of runs.csv from other versions: run again" in old.skipped
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(ValueError, match="other.csv is no table of workprec; give another file name"):
+    with pytest.raises(ValueError, match="other.csv is no table of work_precision; give another file name"):
         table(file=tmp_path / "other.csv")
 
 
 def test_words_pictures_and_refusals(tmp_path):
     found = table(skip=lambda method, s: "too slow here" if (method, s["cells"]) == ("krylov", 16) else None)
-    assert len(found.rows) == 3 and found.left_out == ["krylov with cells=16, method=krylov, rtol=1e-08: too slow here"]
+    assert len(found.rows) == 3 and found.skipped == ["krylov with cells=16, method=krylov, rtol=1e-08: too slow here"]
     text = found.markdown()
     assert text.startswith("### poisson") and "| * |" in text and "- left out: krylov with" in text
     assert "left out: krylov" in str(found) and repr(found) == str(found)
@@ -220,16 +220,18 @@ def test_words_pictures_and_refusals(tmp_path):
     labels = [line.get_label() for line in ax.lines]
     assert "best so far" in labels and "direct" in labels
 
-    with pytest.raises(ValueError, match="repeats of workprec must be a whole number >= 1, got 0; the default is 3"):
+    with pytest.raises(
+        ValueError, match="repeats of work_precision must be a whole number >= 1, got 0; the default is 3"
+    ):
         table(repeats=0)
-    with pytest.raises(ValueError, match="workprec needs at least one method; write {'name': {settings}}"):
-        dp.workprec(poisson, {})
-    with pytest.raises(ValueError, match="workprec needs at least one method"):
-        dp.workprec(poisson, ["direct"])
+    with pytest.raises(ValueError, match="work_precision needs at least one method; write {'name': {settings}}"):
+        dp.work_precision(poisson, {})
+    with pytest.raises(ValueError, match="work_precision needs at least one method"):
+        dp.work_precision(poisson, ["direct"])
     with pytest.raises(
         TypeError, match=r"a problem gives \(loss, x\) or \(loss, x, facts\), got float; write return loss, x"
     ):
-        dp.workprec(lambda: 1.0, {"it": {}})
+        dp.work_precision(lambda: 1.0, {"it": {}})
 
 
 def test_a_star_needs_an_error_below_one():
@@ -243,6 +245,6 @@ def test_a_star_needs_an_error_below_one():
         "off": {"share": 9.0, "bend": 0.0},
         "fine": {"share": 1.01, "bend": 0.0},
     }
-    lines = dp.workprec(scene, methods, reference=(4.0, 4.0), repeats=1).markdown().splitlines()
+    lines = dp.work_precision(scene, methods, reference=(4.0, 4.0), repeats=1).markdown().splitlines()
     starred = [line for line in lines if line.startswith("|") and line.rstrip(" |").endswith("*")]
     assert len(starred) == 1 and "fine" in starred[0]
