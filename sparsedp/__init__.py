@@ -28,7 +28,7 @@ _WINDOW = {
     "operators.harmonic": "harmonic_average",
     "optimize.regularization": "smoothness total_variation",
     "operators.masks_and_lift": "diagonal identity interior lift mask",
-    "solvers.choose_method": "inverse",
+    "solvers.inverse": "inverse",
     "solvers.parametric": "elliptic_solver matrix_solver",
     "solvers.roots": "implicit steady",
     "solvers.spectral": "matrix_exponential matrix_function matrix_power",

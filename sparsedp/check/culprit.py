@@ -22,7 +22,7 @@ from sparsedp.check.summary import error_text
 from sparsedp.check.sweep import Point, Trials, generator
 from sparsedp.errors import DerivativeError
 from sparsedp.operators.operator import Operator
-from sparsedp.solvers.choose_method import Inverse
+from sparsedp.solvers.inverse import Inverse
 
 __all__ = ["culprit_of"]
 

@@ -61,7 +61,7 @@ from sparsedp.operators.difference import divergence, gradient, laplacian
 from sparsedp.operators.masks_and_lift import check_solid, identity, lift, mask
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.transfer import average
-from sparsedp.solvers.choose_method import inverse
+from sparsedp.solvers.inverse import inverse
 
 __all__ = ["FlowStep", "flow_step"]
 

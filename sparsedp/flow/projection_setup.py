@@ -21,7 +21,7 @@ from sparsedp.grid.boundary_conditions import inflow, no_slip, resolve
 from sparsedp.grid.grid import Grid
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.masks_and_lift import check_solid, diagonal, solid_faces
-from sparsedp.solvers.choose_method import build
+from sparsedp.solvers.inverse import build
 from sparsedp.solvers.scaling import exponent_of, in_range, largest, shifted
 
 __all__ = ["Setup", "faces_that", "pressure_conditions"]
@@ -94,7 +94,7 @@ class Setup(Remade):
 
         data, size = passes.net_flow(x, b)
         if in_range(reach * size):
-            p = solver.judged(b, data, reach * size, residual, transposed, turned) if self._exact else None
+            p = solver.solve_once(b, data, reach * size, residual, transposed, turned) if self._exact else None
             if p is not None:
                 return p
             passes.net_flow(x, b)

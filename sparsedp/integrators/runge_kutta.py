@@ -52,10 +52,10 @@ from sparsedp.integrators.problem import Sided, combine, later, unsided, untrace
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.operator import Operator
 from sparsedp.solvers.adjoint import solve_rule
-from sparsedp.solvers.choose_method import build
+from sparsedp.solvers.inverse import build
 from sparsedp.solvers.nullspace import Projector
+from sparsedp.solvers.records import SolveLog
 from sparsedp.solvers.roots import implicit
-from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.system import System
 
 __all__ = [

@@ -20,7 +20,7 @@ from sparsedp.operators.structure.kronecker import Kronecker, Term
 from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
 from sparsedp.parallel.exchange import Exchange, of_boxes
 from sparsedp.parallel.partition import lengths, slices
-from sparsedp.solvers.choose_method import Solution
+from sparsedp.solvers.inverse import Solution
 from sparsedp.solvers.nullspace import Projector
 
 __all__ = ["Columns", "OwnRows", "Rows", "localized", "reads"]

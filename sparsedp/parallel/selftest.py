@@ -15,7 +15,7 @@ from sparsedp.grid.boundary_conditions import dirichlet
 from sparsedp.grid.grid import Grid
 from sparsedp.operators.difference import laplacian
 from sparsedp.parallel.distribute import distribute
-from sparsedp.solvers.choose_method import inverse
+from sparsedp.solvers.inverse import inverse
 
 __all__ = ["report"]
 

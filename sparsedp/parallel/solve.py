@@ -16,8 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
 from sparsedp.parallel.cut import Rows
 from sparsedp.parallel.fields import DistributedField
+from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.nullspace import NullSpace
-from sparsedp.solvers.solve import Engine
 from sparsedp.solvers.system import System
 
 __all__ = ["PetscEngine", "RanksSystem"]

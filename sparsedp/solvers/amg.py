@@ -17,8 +17,8 @@ from scipy.sparse.csgraph import connected_components
 from sparsedp._utils.validation import check_choice, check_number, check_whole
 from sparsedp.errors import ConvergenceError
 from sparsedp.solvers.krylov import Krylov
+from sparsedp.solvers.records import failure
 from sparsedp.solvers.scaling import exponent_of
-from sparsedp.solvers.solve import failure
 
 __all__ = [
     "Hierarchy",

@@ -19,9 +19,10 @@ from scipy.sparse.linalg import splu
 from sparsedp._utils.validation import check_choice
 from sparsedp.errors import ConvergenceError
 from sparsedp.operators.structure.base import probes
+from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.nullspace import NullSpace
+from sparsedp.solvers.records import failure
 from sparsedp.solvers.scaling import exponent_of, in_range, largest, norm, shifted
-from sparsedp.solvers.solve import Engine, failure
 from sparsedp.solvers.substitution import BlockFactors
 from sparsedp.solvers.system import System
 
@@ -63,7 +64,8 @@ class Direct(Engine):
         self._solve, self.hierarchy, self._anchors, self.iterative = solve, words, anchors, single
         self._unknowns = unknowns
         if single:
-            self.rounds, self.shrink, self.advice = MOST_ROUNDS, MOST_LEFT, "; write precision='double'"
+            self.most_refinements, self.reduction = MOST_ROUNDS, MOST_LEFT
+            self.advice = "; write precision='double'"
 
     def solve(self, b, goal, transposed):
         """One pair of triangular solves."""

@@ -21,9 +21,9 @@ from sparsedp.operators.given import from_functions, from_matrix
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import rows_of
 from sparsedp.solvers.cache import Cache
-from sparsedp.solvers.choose_method import Inverse, Solution, build, build_dense
 from sparsedp.solvers.direct import DENSE_UP_TO
-from sparsedp.solvers.solve import failure
+from sparsedp.solvers.inverse import Inverse, Solution, build, build_dense
+from sparsedp.solvers.records import failure
 from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
 
 __all__ = ["Jacobians", "Linearisation"]

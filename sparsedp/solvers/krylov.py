@@ -13,9 +13,9 @@ from scipy.sparse.linalg import LinearOperator, gmres
 
 from sparsedp.autodiff.tape import plain
 from sparsedp.operators.structure.base import probes
+from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import dot, norm
-from sparsedp.solvers.solve import Engine
 
 __all__ = ["Krylov"]
 

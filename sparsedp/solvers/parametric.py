@@ -31,9 +31,10 @@ from sparsedp.operators.structure.lazy import Chain, Diagonal, Sum
 from sparsedp.operators.tensor import check_tensor, corners
 from sparsedp.solvers.adjoint import solve_rule
 from sparsedp.solvers.cache import Cache
-from sparsedp.solvers.choose_method import build, check_settings
+from sparsedp.solvers.choose_method import check_settings
+from sparsedp.solvers.inverse import build
+from sparsedp.solvers.records import SolveLog
 from sparsedp.solvers.scaling import exponent_of, shifted
-from sparsedp.solvers.solve import SolveLog
 from sparsedp.solvers.sparsity import pattern_like
 
 __all__ = ["Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]

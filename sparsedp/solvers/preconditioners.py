@@ -15,9 +15,9 @@ from sparsedp.operators.given import from_matrix
 from sparsedp.operators.operator import Operator
 from sparsedp.solvers.amg import Hierarchy, Level, ruge_stueben
 from sparsedp.solvers.direct import direct_engine
+from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.krylov import Krylov
 from sparsedp.solvers.scaling import exponent_of, inverted
-from sparsedp.solvers.solve import Engine
 from sparsedp.solvers.system import System
 
 __all__ = ["Near", "krylov_engine", "shifted_laplace"]

@@ -25,8 +25,9 @@ from sparsedp.solvers.adjoint import solve_rule, vary
 from sparsedp.solvers.choose_method import check_settings
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation, Layout, Newton
+from sparsedp.solvers.records import SolveLog
 from sparsedp.solvers.scaling import largest, length
-from sparsedp.solvers.solve import Run, SolveLog
+from sparsedp.solvers.solve import Run
 
 __all__ = ["Root", "implicit", "steady"]
 

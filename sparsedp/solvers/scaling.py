@@ -1,8 +1,13 @@
-"""Sizes of arrays and their scaling by powers of two, which is exact.
+"""Norms of arrays, and their scaling by powers of two, which is exact.
 
-Sums of squares are taken block by block: what the first look at a block loads, the second finds in the cache, and BLAS
-does not wake its threads for so few numbers: they would stall those of compiled kernels.
+Sums of squares are taken block by block: a block that was read for one sum is in the cache for the next, and BLAS does
+not wake its threads, which would stall those of compiled kernels.
 """
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +15,8 @@ from sparsedp._utils.validation import BLOCK
 from sparsedp.autodiff.fast_derivatives import ELSEWHERE
 
 __all__ = [
+    "LARGE",
+    "SMALL",
     "dot",
     "exponent_of",
     "in_range",
@@ -21,37 +28,38 @@ __all__ = [
     "shifted",
 ]
 
-SMALL, LARGE = 2.0**-200, 2.0**200  # norms between which nothing a solve computes leaves the range of floats
+# Between these norms of the data, squares and products in a solve stay in the range of floats.
+SMALL = 2.0**-200
+LARGE = 2.0**200
+LARGEST_POWER = 1000  # exponents below it have a power of two that is a normal float
 
 
-def _blocks(*arrays):
-    """Parts of flat arrays of one size that belong together; what is small, or lies on ranks, is one part itself."""
-    size = arrays[0].size
-    if size <= BLOCK or type(arrays[0]) in ELSEWHERE:
-        return (arrays,)
-    return ([x[i : i + BLOCK] for x in arrays] for i in range(0, size, BLOCK))
+def dot(x: Any, y: Any) -> Any:
+    """Return the sum of the products of the entries of two flat arrays, without conjugation."""
+    if x.size <= BLOCK or type(x) in ELSEWHERE:
+        return x @ y
+    total = 0.0
+    for start in range(0, x.size, BLOCK):
+        total = total + x[start : start + BLOCK] @ y[start : start + BLOCK]
+    return total
 
 
-def dot(x, y):
-    """Sum of the products of the entries of flat arrays."""
-    return sum(one @ other for one, other in _blocks(x, y))
+def norm(x: Any) -> float:
+    """Return the 2-norm of a flat array, in one pass.
 
-
-def _square(x):
-    """Sum of the squares of the magnitudes."""
-    return np.vdot(x, x).real
-
-
-def norm(x):
-    """2-norm of a flat array in one pass.
-
-    Squares may leave the range of floats (`tree.norm` does not let them); the caller asks `in_range`, and scales.
+    Squares may leave the range of floats, unlike those of `pytree.norm`: the caller tests with `in_range`, and scales.
     """
-    return float(np.sqrt(sum(_square(part) for (part,) in _blocks(x))))
+    if x.size <= BLOCK or type(x) in ELSEWHERE:
+        return sqrt(np.vdot(x, x).real)
+    squares = 0.0
+    for start in range(0, x.size, BLOCK):
+        part = x[start : start + BLOCK]
+        squares += np.vdot(part, part).real
+    return sqrt(squares)
 
 
-def length(x):
-    """2-norm of a flat real array of any magnitude; of a field on ranks, that of all of it."""
+def length(x: Any) -> float:
+    """Return the 2-norm of a flat real array of any magnitude; of a field on ranks, that of the whole field."""
     size = norm(x)
     if in_range(size):
         return size
@@ -59,49 +67,62 @@ def length(x):
     return float(np.ldexp(norm(shifted(x, -exponent)), exponent))
 
 
-def remainder(b, out, x):
-    """out = b - out, in place -> its norm and that of x. All flat."""
-    rest = solution = 0.0
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by the caller
-        for given, part, values in _blocks(b, out, x):
-            np.subtract(given, part, out=part)
-            rest, solution = rest + _square(part), solution + _square(values)
-    return float(np.sqrt(rest)), float(np.sqrt(solution))
+def remainder(b: np.ndarray, out: np.ndarray, x: np.ndarray) -> tuple[float, float]:
+    """Write b - out into `out`, and return its norm and the norm of x; all arrays are flat."""
+    residual_squares = 0.0
+    solution_squares = 0.0
+    with np.errstate(over="ignore", invalid="ignore"):  # the caller tests for NaN and infinity
+        for start in range(0, b.size, BLOCK):
+            block = slice(start, start + BLOCK)
+            residual = out[block]
+            solution = x[block]
+            np.subtract(b[block], residual, out=residual)
+            residual_squares += np.vdot(residual, residual).real
+            solution_squares += np.vdot(solution, solution).real
+    return sqrt(residual_squares), sqrt(solution_squares)
 
 
-def exponent_of(size):
-    """Exponent of the power of two next above a size."""
+def exponent_of(size: Any) -> int:
+    """Return the exponent of the smallest power of two above a size."""
     return int(np.frexp(size)[1])
 
 
-def in_range(size):
-    """Whether a norm is finite, not 0, and far from both ends of the range of floats."""
+def in_range(size: float) -> bool:
+    """Return whether a norm is finite, not 0, and far from both ends of the range of floats."""
     return SMALL < size < LARGE
 
 
-def largest(x):
-    """Largest magnitude of a real or imaginary part; NaN when there is one."""
-    x = _real_and_imaginary(x) if x.dtype.kind == "c" else x
-    top = float(x.max(initial=0.0))
-    return top if np.isnan(top) else max(top, -float(x.min(initial=0.0)))
+def largest(x: np.ndarray) -> float:
+    """Return the largest magnitude of a real or imaginary part; NaN if there is one."""
+    values = _real_and_imaginary(x) if x.dtype.kind == "c" else x
+    top = float(values.max(initial=0.0))
+    if np.isnan(top):
+        return top
+    return max(top, -float(values.min(initial=0.0)))
 
 
-def shifted(x, exponent):
-    """x * 2^exponent, one for all or one for each, exact unless it leaves the range of floats; always a fresh array."""
+def shifted(x: np.ndarray, exponent: Any) -> np.ndarray:
+    """Return x * 2^exponent as a fresh array: exact unless it leaves the range of floats.
+
+    `exponent` is one integer, or one for each entry.
+    """
     if x.dtype.kind == "c":
-        each = np.repeat(exponent, 2, axis=-1) if np.ndim(exponent) else exponent
-        return shifted(_real_and_imaginary(x), each).view(complex).reshape(x.shape)
-    with np.errstate(over="ignore", under="ignore"):  # what overflows is found by the caller
-        return x * 2.0**exponent if np.max(np.abs(exponent)) < 1000 else np.ldexp(x, exponent)
+        exponents = np.repeat(exponent, 2, axis=-1) if np.ndim(exponent) else exponent
+        return shifted(_real_and_imaginary(x), exponents).view(complex).reshape(x.shape)
+    with np.errstate(over="ignore", under="ignore"):  # the caller tests for overflow
+        if np.max(np.abs(exponent)) < LARGEST_POWER:
+            return x * 2.0**exponent
+        return np.ldexp(x, exponent)
 
 
-def _real_and_imaginary(x):
+def _real_and_imaginary(x: np.ndarray) -> np.ndarray:
     """Return real and imaginary parts in turn along the last axis; a 0-d array becomes an array of two."""
     return np.ascontiguousarray(x).view(float)
 
 
-def inverted(values, out=None):
-    """1 / values, and 0 where they are 0: the generalised inverse of a diagonal."""
-    out = np.empty_like(values) if out is None else out
+def inverted(values: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    """Return 1 / values, and 0 where they are 0: the generalised inverse of a diagonal."""
+    if out is None:
+        out = np.empty_like(values)
     out[...] = 0.0
     return np.divide(1.0, values, out=out, where=values != 0)

@@ -28,9 +28,9 @@ from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Turning
 from sparsedp.operators.structure.kronecker import Kronecker
 from sparsedp.operators.structure.lazy import Chain, Diagonal, Sum
+from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import inverted
-from sparsedp.solvers.solve import Engine
 
 __all__ = [
     "Separable",

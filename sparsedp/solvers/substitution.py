@@ -30,9 +30,10 @@ from scipy.sparse.linalg import splu
 from sparsedp import kernels
 from sparsedp.errors import ConvergenceError
 from sparsedp.operators.structure.base import probes, rows_of
+from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.nullspace import NullSpace
+from sparsedp.solvers.records import failure
 from sparsedp.solvers.scaling import norm, shifted
-from sparsedp.solvers.solve import Engine, failure
 
 __all__ = [
     "SMALL_BLOCK",
@@ -295,7 +296,7 @@ class BlockTriangular(Engine):
         words = f"substitution, {splitting.size} unknowns"
         self.hierarchy = f"{words}, {system.matrix.nnz} entries" if inner is None else f"{inner.hierarchy}; {words}"
         if inner is not None:
-            for name in ("iterative", "hierarchical", "refines", "rounds", "shrink", "advice"):
+            for name in ("iterative", "hierarchical", "refines", "most_refinements", "reduction", "advice"):
                 setattr(self, name, getattr(inner, name))
         if not self._growth() < LARGEST_GROWTH:
             raise ConvergenceError(

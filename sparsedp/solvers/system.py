@@ -45,6 +45,7 @@ class System:
     size_of, largest = staticmethod(norm), staticmethod(largest)
     here = property(lambda self: self.size)
     seed: Any = 0
+    side: Any = None  # (layout, parts) of fields on ranks
 
     def __init__(self, op, rtol=1e-10, maxiter=None):
         self.given = self.op = op
@@ -65,8 +66,9 @@ class System:
     def product(self, x, transposed=False):
         """A x or A^T x for the unknowns (x is 0 elsewhere), flat and fresh. Not counted as an application."""
         op = self.op.T if transposed else self.op
-        one_pass = "entries" in self.__dict__ and not isinstance(self.op.structure, Kronecker)  # a chain takes several
-        y = (op._matrix_structure if one_pass else op._acting).product(x)
+        has_matrix = "entries" in self.__dict__ and not isinstance(op.structure, Kronecker)
+        structure = op._matrix_structure if has_matrix else op._acting  # a product with the matrix is one pass
+        y = structure.matrix @ x if isinstance(structure, Matrix) else structure.product(x)
         if self.active is not None:
             y[~self.active] = 0.0
         return y
@@ -80,8 +82,10 @@ class System:
         return self.given._acting.product(x)
 
     def residual(self, x, b, transposed=False):
-        """(b - A x for the unknowns, fresh; its norm; that of x). b is 0 elsewhere."""
-        return (r := self.product(x, transposed)), *remainder(b, r, x)
+        """Return b - A x for the unknowns, as a fresh array, its norm, and the norm of x. b is 0 elsewhere."""
+        r = self.product(x, transposed)
+        size, length = remainder(b, r, x)
+        return r, size, length
 
     @cached_property
     def grid(self):

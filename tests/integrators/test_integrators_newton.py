@@ -13,7 +13,7 @@ from sparsedp._utils.counters import recording
 from sparsedp.autodiff.derivative import pullback, value_and_grad
 from sparsedp.errors import NonFiniteError
 from sparsedp.integrators.exponential import Function
-from sparsedp.solvers.choose_method import build_dense
+from sparsedp.solvers.inverse import build_dense
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Newton
 

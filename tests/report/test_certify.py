@@ -9,8 +9,10 @@ import pytest
 
 import sparsedp as dp
 from sparsedp._utils.counters import recording, thread
-from sparsedp.solvers.choose_method import Inverse, Solution
-from sparsedp.solvers.solve import Engine, SolveLog, Solver
+from sparsedp.solvers.engine import Engine
+from sparsedp.solvers.inverse import Inverse, Solution
+from sparsedp.solvers.records import SolveLog
+from sparsedp.solvers.solve import Solver
 from sparsedp.solvers.system import System
 
 GRID = dp.Grid((20, 20), size=1.0)

@@ -11,8 +11,8 @@ import sparsedp as dp
 from sparsedp._utils.counters import recording
 from sparsedp.autodiff.derivative import pullback, pushforward, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
+from sparsedp.solvers.records import STATUS_WORDS
 from sparsedp.solvers.roots import implicit
-from sparsedp.solvers.solve import STATUS_WORDS
 
 
 def square(x, p):

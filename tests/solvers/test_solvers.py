@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.solvers.choose_method import Inverse, Solution
-from sparsedp.solvers.solve import Engine, SolveLog, Solver
+from sparsedp.solvers.engine import Engine
+from sparsedp.solvers.inverse import Inverse, Solution
+from sparsedp.solvers.records import SolveLog
+from sparsedp.solvers.solve import Solver
 from sparsedp.solvers.system import System
 
 ITERATIVE = ("multigrid", "krylov")

@@ -18,10 +18,10 @@ import numpy as np
 from sparsedp import kernels
 from sparsedp._utils.validation import EPS
 from sparsedp.solvers.direct import check_precision
+from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.multigrid.stencil import UnsuitableOperator, component_labels, stencil_of_system
 from sparsedp.solvers.nullspace import NullSpace
-from sparsedp.solvers.scaling import exponent_of
-from sparsedp.solvers.solve import Engine, norm
+from sparsedp.solvers.scaling import exponent_of, norm
 
 if TYPE_CHECKING:
     from numpy.typing import DTypeLike, NDArray
