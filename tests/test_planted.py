@@ -456,8 +456,8 @@ BUGS = {
     ),
     "eigenvalues of a factor without its scale": Bug(
         "solvers",
-        "term.scale * axis.eigenvalues",
-        "axis.eigenvalues",
+        "term.scale * basis.eigenvalues",
+        "basis.eigenvalues",
         "tests/solvers/test_spectral.py",
     ),
     "cotangents of a trajectory at the step before": Bug(

@@ -37,7 +37,7 @@ from sparsedp.integrators.problem import combine, later
 from sparsedp.integrators.runge_kutta import Scheme, family
 from sparsedp.operators.masks_and_lift import identity
 from sparsedp.operators.operator import Operator
-from sparsedp.solvers.separable import SpectralFunction, diagonalised
+from sparsedp.solvers.separable import Eigenbasis, SpectralFunction, require_eigenbasis
 
 __all__ = ["Exponential", "Function", "PhiFunctions", "phi"]
 
@@ -106,7 +106,7 @@ class PhiFunctions:
 
     def __init__(self, op, name):
         self.op, self.name, self.space = op, name, Space(op.domain.shape, op.domain.kind)  # on no ranks
-        self.spectrum, self.eigenvalues = diagonalised(op, name, "; try imex or tr_bdf2")
+        self.spectrum, self.eigenvalues = require_eigenbasis(op, name, "; try imex or tr_bdf2")
         self._rule = lru_cache(None)(self._made)  # rules made once, for every z, step and adjoint
         self._operator = lru_cache(KEPT)(self._set_up)  # of a few z
 
@@ -134,7 +134,7 @@ class PhiFunctions:
         check_finite(
             f"{self.name}: exp({z:g} * {self.op.name})", values, advice="; take a smaller dt or the other sign"
         )
-        return self._named(SpectralFunction((self.spectrum, values), self.op.shape))
+        return self._named(SpectralFunction(Eigenbasis(self.spectrum, values), self.op.shape))
 
     def _named(self, structure):
         return Operator(structure, self.space, self.space, self.name)

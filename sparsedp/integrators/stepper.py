@@ -29,7 +29,7 @@ from sparsedp.integrators.runge_kutta import (
     Scheme,
 )
 from sparsedp.solvers.choose_method import check_settings
-from sparsedp.solvers.separable import spectrum
+from sparsedp.solvers.separable import compute_spectrum
 
 __all__ = ["METHODS", "Step", "stepper"]
 
@@ -467,7 +467,7 @@ def least_eigenvalue(op):
     """The most negative eigenvalue of an operator with real ones, or None when that is not known."""
     if op.dtype.kind == "c":
         return None
-    found = spectrum(op.structure) if op.separable else None
+    found = compute_spectrum(op.structure) if op.separable else None
     if found is not None:
         return float(np.min(found.eigenvalues))
     if not op.structure.has_entries:

@@ -17,7 +17,7 @@ from sparsedp.solvers.engine import EmptySystem
 from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
 from sparsedp.solvers.preconditioners import Near, krylov_engine
 from sparsedp.solvers.records import failure
-from sparsedp.solvers.separable import eigenbasis, separable_engine, transforming
+from sparsedp.solvers.separable import find_eigenbasis, separable_engine, transform_engine
 from sparsedp.solvers.substitution import BlockTriangular, largest_block
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 # Each method with the function that builds its engine: from a System, and options that are keyword-only.
-METHODS = {
+METHODS: dict[str, Any] = {
     "separable": separable_engine,
     "direct": direct_engine,
     "structured": structured_engine,
@@ -232,13 +232,13 @@ def _transforms(system: System, dimension: int) -> Engine | None:
     is_small = dimension < 2 or system.size < SEPARABLE_FROM
     if (structure.has_entries and is_small) or system.active is not None:
         return None
-    basis = eigenbasis(structure)
+    basis = find_eigenbasis(structure)
     if basis is None:
         return None
     lengths = [axis.eigenvalues.size for axis in basis[0].axes if axis.kind == "eigenvectors"]
     if max(lengths, default=0) > LONGEST_EIGENVECTORS:
         return None
-    return transforming(system, *basis)
+    return transform_engine(system, *basis)
 
 
 def _splitting(system: System) -> Splitting | None:

@@ -1,22 +1,36 @@
-"""separable: any Kronecker sum solved by transforms along its axes. Two transforms an axis, no iteration.
+"""Kronecker sums solved by transforms along their axes: two transforms an axis, no iteration.
 
-    A = sum over axes of (1 x F_a x 1) + shift,    F_a = S_a^-1 Q_a diag(e_a) Q_a^-1 S_a
+Notes
+-----
+A Kronecker sum and its functions are diagonalised by the eigenvectors of its 1-D factors::
+
+    A = sum over axes of (I x F_a x I) + shift,    F_a = S_a^-1 Q_a diag(e_a) Q_a^-1 S_a
     f(A) = (product of S_a^-1 Q_a) diag f(sum e_a + shift) (product of Q_a^-1 S_a)
 
-so one diagonalisation gives the inverse (1 / e, 0 for the null space), powers and exponentials. S_a is diagonal (on a
-stretched grid the square root of the cell widths) and Q_a orthogonal: a sine or cosine transform where the axis is
-uniform, else eigenvectors; or the discrete Fourier transform. The inverse
-needs no transform along a bounded first axis where elimination along it is as accurate and takes less time:
-T + e for each sum e of the eigenvalues of the other axes, T the factor of the first (see `Sweep`). Round a periodic
-one elimination is possible too, and only 1.1 to 1.7 times as fast as the transform: it is left out.
-Sources: Lynch, Rice, Thomas, Numer. Math. 6 (1964), direct solution by tensor products;
-Strang, SIAM Review 41 (1999), the discrete cosine transform; Hockney, J. ACM 12 (1965), transforms along one
-axis and elimination along the other; Grassmann, Taksar, Heyman, Operations Research 33 (1985), pivots without
-subtractions.
+so one diagonalisation gives the inverse (1 / e, and 0 for the null space), powers and exponentials. S_a is diagonal,
+on a stretched grid the square root of the cell widths. Q_a is orthogonal, a sine or cosine transform where the axis
+is uniform and a matrix of eigenvectors elsewhere; or it is the discrete Fourier transform.
+
+The inverse needs no transform along a bounded first axis where elimination along it is as accurate and faster: one
+tridiagonal system T + e for each sum e of the eigenvalues of the other axes, T the factor of the first axis (see
+`Elimination`). Elimination along a periodic axis would be at most 1.7 times as fast as the transform, and is omitted.
+
+References
+----------
+R. E. Lynch, J. R. Rice, D. H. Thomas, Direct solution of partial difference equations by tensor product methods,
+Numer. Math. 6 (1964) 185-199.
+G. Strang, The discrete cosine transform, SIAM Review 41 (1999) 135-147.
+R. W. Hockney, A fast direct solution of Poisson's equation using Fourier analysis, J. ACM 12 (1965) 95-113:
+transforms along one axis and elimination along the other.
+W. K. Grassmann, M. I. Taksar, D. P. Heyman, Regenerative analysis and steady state distributions for Markov chains,
+Operations Research 33 (1985) 1107-1116: pivots without subtractions.
 """
+
+from __future__ import annotations
 
 from functools import reduce
 from math import prod
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.fft as fft
@@ -32,26 +46,41 @@ from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import inverted
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from sparsedp.operators.structure.base import Structure
+    from sparsedp.operators.structure.factor import Factor
+    from sparsedp.solvers.system import System
+
 __all__ = [
+    "AxisBasis",
+    "Eigenbasis",
+    "Elimination",
     "Separable",
     "SpectralFunction",
     "Spectrum",
-    "diagonalised",
-    "eigenbasis",
+    "compute_spectrum",
+    "diagonalise",
+    "find_eigenbasis",
+    "require_eigenbasis",
     "separable_engine",
-    "spectrum",
-    "transforming",
+    "transform_engine",
 ]
 
-WORTH_THREADS = 131072  # unknowns below which a second thread costs more than it brings
-WIDE_COMPILED, WIDE_PLAIN = 16, 1024  # modes from which elimination along the first axis beats transforms
-ZERO = 4 * EPS  # a sum of eigenvalues below this share of the largest one is 0
-ROUNDING = 16 * EPS  # entries that should be equal may differ by this share
-WIDEST = 1e4  # largest ratio of scalings that keeps the digits of the eigenvectors
+THREADED_FROM = 131072  # unknowns below which a second thread costs more time than it saves
+# Number of tridiagonal systems from which elimination along the first axis is faster than transforms.
+ELIMINATION_FROM_COMPILED = 16
+ELIMINATION_FROM_NUMPY = 1024
+ZERO_EIGENVALUE = 4 * EPS  # a sum of eigenvalues below this share of the largest one is 0
+ROUNDING = 16 * EPS  # relative difference of entries that counts as rounding
+LARGEST_SCALING_RATIO = 1e4  # of the scaling S_a: beyond it eigenvectors lose digits
 
-TRANSFORMS = {"dct": (fft.dct, fft.idct), "dst": (fft.dst, fft.idst)}  # to the coefficients, and back
-# What the walls do to a wave at its lower and upper end -> its transform, and the shift of the frequencies.
-WAVES = {
+TRANSFORMS = {"dct": (fft.dct, fft.idct), "dst": (fft.dst, fft.idst)}  # to the coefficients, and from them
+# Boundary conditions at the lower and the upper end -> the transform, and the shift of its frequencies.
+TRANSFORM_OF_ENDS = {
     ("neumann", "neumann"): ("dct-2", 0.0),
     ("dirichlet", "dirichlet"): ("dst-2", 1.0),
     ("neumann", "dirichlet"): ("dct-4", 0.5),
@@ -62,39 +91,76 @@ WAVES = {
 # ---------------------------------------------------------------- one axis
 
 
-class Axis:
-    """One axis of a separable operator in its eigenvectors.
+class AxisBasis:
+    """The eigenvectors and eigenvalues of the factor along one axis.
 
     Parameters
     ----------
     kind : str
         "identity", "dct-2", "dst-2", "dct-4", "dst-4", "fourier" or "eigenvectors".
     eigenvalues : array, shape (n,)
-    matrices : (Q^-1 S, S^-1 Q), optional
-        Of eigenvectors.
+    matrices : tuple of two arrays of shape (n, n), optional
+        Q^-1 S and S^-1 Q, of kind "eigenvectors".
     """
 
-    def __init__(self, kind, eigenvalues, matrices=None):
-        self.kind, self.eigenvalues, self.matrices = kind, eigenvalues, matrices
+    def __init__(
+        self,
+        kind: str,
+        eigenvalues: NDArray[Any],
+        matrices: tuple[NDArray[Any], NDArray[Any]] | None = None,
+    ) -> None:
+        self.kind = kind
+        self.eigenvalues = eigenvalues
+        self.matrices = matrices
 
-    def turned(self, back, x, axis, transposed, workers, overwrite):
-        """Field along `axis` -> coefficients, or `back`; a Fourier axis is left as it is.
+    def to_coefficients(
+        self, x: NDArray[Any], axis: int, transposed: bool, workers: int, overwrite: bool
+    ) -> NDArray[Any]:
+        """Transform a field along `axis`; a Fourier axis is left as it is.
 
-        `overwrite`: whether the memory of x may be used.
+        Parameters
+        ----------
+        x : array
+        axis : int
+        transposed : bool
+            Whether the coefficients are those of the transposed factor.
+        workers : int
+            Number of threads.
+        overwrite : bool
+            Whether the memory of x may be reused.
+
+        Returns
+        -------
+        array
         """
+        return self._transform(x, axis, False, transposed, workers, overwrite)
+
+    def from_coefficients(self, y: NDArray[Any], axis: int, transposed: bool, workers: int) -> NDArray[Any]:
+        """Invert `to_coefficients`. May overwrite y."""
+        return self._transform(y, axis, True, transposed, workers, True)
+
+    def _transform(self, x, axis, backward, transposed, workers, overwrite):
         if self.matrices is not None:
-            matrix, n = self.matrices[1 - back].T if transposed else self.matrices[back], x.shape[axis]
-            if axis == x.ndim - 1:
-                return (x.reshape(-1, n) @ matrix.T).reshape(x.shape)
-            return np.matmul(matrix, x.reshape(-1, n, prod(x.shape[axis + 1 :]))).reshape(x.shape)
+            if transposed:
+                return _multiply_along(self.matrices[1 - backward].T, x, axis)
+            return _multiply_along(self.matrices[backward], x, axis)
         if self.kind in ("identity", "fourier"):
             return x
-        transform, number = TRANSFORMS[self.kind[:3]][back], int(self.kind[-1])
-        return transform(x, number, axis=axis, norm="ortho", overwrite_x=overwrite, workers=workers)
+        transform = TRANSFORMS[self.kind[:3]][backward]
+        type_of_transform = int(self.kind[-1])
+        return transform(x, type_of_transform, axis=axis, norm="ortho", overwrite_x=overwrite, workers=workers)
 
 
-def diagonalise(factor):
-    """Square 1-D factor -> Axis, or None when it cannot be diagonalised with all its digits.
+def _multiply_along(matrix, x, axis):
+    """Multiply the lines of a field along one axis with a matrix."""
+    n = x.shape[axis]
+    if axis == x.ndim - 1:
+        return (x.reshape(-1, n) @ matrix.T).reshape(x.shape)
+    return np.matmul(matrix, x.reshape(-1, n, prod(x.shape[axis + 1 :]))).reshape(x.shape)
+
+
+def diagonalise(factor: Factor) -> AxisBasis | None:
+    """Diagonalise a square 1-D factor.
 
     Parameters
     ----------
@@ -102,77 +168,102 @@ def diagonalise(factor):
 
     Returns
     -------
-    Axis or None
+    AxisBasis or None
+        None where the factor cannot be diagonalised to full accuracy.
     """
     if factor.shape[0] == 1:
-        return Axis("identity", np.array([factor.matrix[0, 0]]))
-    return (factor.tridiagonal and _by_transform(factor.tridiagonal)) or _by_eigenvectors(factor)
+        return AxisBasis("identity", np.array([factor.matrix[0, 0]]))
+    basis = None
+    if factor.tridiagonal:
+        basis = _basis_of_transform(factor.tridiagonal)
+    if basis is None:
+        basis = _basis_of_eigenvectors(factor)
+    return basis
 
 
-def _by_transform(bands):
-    """A sine, cosine or Fourier transform, if the entries are those of a uniform axis."""
+def _basis_of_transform(bands):
+    """Return a sine, cosine or Fourier basis if the entries are those of a uniform axis, else None."""
     n = bands.centre.size
     if n < 3:
         return None
-    lower, upper, side, middle = bands.lower, bands.upper, bands.lower[1], bands.centre[n // 2]
-    inner = np.concatenate([lower[1:] - side, upper[:-1] - side, bands.centre[1:-1] - middle])
-    if side == 0 or np.any(np.abs(inner) > ROUNDING * np.abs(side)):
+    side = bands.lower[1]
+    middle = bands.centre[n // 2]
+    differences = [bands.lower[1:] - side, bands.upper[:-1] - side, bands.centre[1:-1] - middle]
+    if side == 0 or np.any(np.abs(np.concatenate(differences)) > ROUNDING * np.abs(side)):
         return None
-    angle = np.arange(n)
-    ends = tuple(_end(bands.centre[i] - middle, side, link) for i, link in ((0, lower[0]), (-1, upper[-1])))
-    if ends == ("linked", "linked"):
-        return Axis("fourier", _cosines(middle, side, 2 * angle / n))
-    if ends not in WAVES:
+    lower_end = _condition_at_end(bands.centre[0] - middle, side, bands.lower[0])
+    upper_end = _condition_at_end(bands.centre[-1] - middle, side, bands.upper[-1])
+    frequency = np.arange(n)
+    if lower_end == upper_end == "periodic":
+        return AxisBasis("fourier", _cosine_eigenvalues(middle, side, 2 * frequency / n))
+    if (lower_end, upper_end) not in TRANSFORM_OF_ENDS:
         return None
-    kind, shift = WAVES[ends]
-    return Axis(kind, _cosines(middle, side, (angle + shift) / n))
+    kind, shift = TRANSFORM_OF_ENDS[lower_end, upper_end]
+    return AxisBasis(kind, _cosine_eigenvalues(middle, side, (frequency + shift) / n))
 
 
-def _cosines(middle, side, turns):
-    """middle + 2 side cos(pi turns), written so that no digits cancel where middle = -2 side."""
-    return (middle + 2 * side) - 4 * side * np.sin(0.5 * np.pi * turns) ** 2
+def _cosine_eigenvalues(middle, side, angle):
+    """Return middle + 2 side cos(pi angle), in a form that loses no digits where middle = -2 side."""
+    return (middle + 2 * side) - 4 * side * np.sin(0.5 * np.pi * angle) ** 2
 
 
-def _end(extra, side, link):
-    """What the wall adds to the diagonal: side mirrors the neighbour, -side mirrors it with its sign changed."""
+def _condition_at_end(extra, side, link):
+    """Name the boundary condition at one end of a uniform axis, or return None.
+
+    Parameters
+    ----------
+    extra : float
+        What the boundary condition adds to the diagonal: `side` for Neumann, -`side` for Dirichlet.
+    side : float
+        The off-diagonal entry inside.
+    link : float
+        The entry that links this end to the other one.
+    """
+    tolerance = ROUNDING * abs(side)
     if link != 0:
-        return "linked" if abs(link - side) + abs(extra) <= ROUNDING * abs(side) else None
-    for kind, wanted in (("neumann", side), ("dirichlet", -side)):
-        if abs(extra - wanted) <= ROUNDING * abs(side):
-            return kind
+        is_uniform = abs(link - side) + abs(extra) <= tolerance
+        return "periodic" if is_uniform else None
+    if abs(extra - side) <= tolerance:
+        return "neumann"
+    if abs(extra + side) <= tolerance:
+        return "dirichlet"
     return None
 
 
-def _by_eigenvectors(factor):
-    """The eigenvectors of a factor that is symmetric, after scaling its rows where it has three points a row."""
-    exponent = np.frexp(factor.largest)[1]  # products of entries stay within floats, whatever the unit of length
+def _basis_of_eigenvectors(factor):
+    """Return the eigenvectors of a factor that is symmetric, a tridiagonal one after scaling its rows, else None."""
+    exponent = np.frexp(factor.largest)[1]  # products of the entries stay in the range of floats in any unit of length
     dense = np.ldexp(factor.matrix.toarray(), -exponent)
-    scaling = np.ones(len(dense)) if factor.tridiagonal is None else _scaling(dense)
+    scaling = np.ones(len(dense)) if factor.tridiagonal is None else _symmetrising_scaling(dense)
     if scaling is None:
         return None
     dense = dense * scaling[:, None] / scaling
     if not np.allclose(dense, dense.T, rtol=1e-13, atol=1e-14 * np.max(np.abs(dense))):
-        return None  # or the link around a periodic axis does not fit the weights
+        return None  # not symmetric, or the link of a periodic axis does not fit the weights
     dense = 0.5 * (dense + dense.T)
     if len(dense) <= 2 or np.any(np.triu(dense, 2)):
-        values, vectors = scipy.linalg.eigh(dense, driver="evd")
+        eigenvalues, vectors = scipy.linalg.eigh(dense, driver="evd")
     else:
-        values, vectors = scipy.linalg.eigh_tridiagonal(np.diag(dense), np.diag(dense, 1))
-    rows, sizes = factor.matrix.sum(axis=1), abs(factor.matrix).sum(axis=1)
-    if np.all(np.abs(rows) <= 8 * EPS * sizes):  # constants have the eigenvalue 0, where round-off gives 1e-10
-        values[np.argmin(np.abs(values))] = 0.0
-    return Axis("eigenvectors", np.ldexp(values, exponent), (vectors.T * scaling, (1 / scaling)[:, None] * vectors))
+        eigenvalues, vectors = scipy.linalg.eigh_tridiagonal(np.diag(dense), np.diag(dense, 1))
+    row_sums = factor.matrix.sum(axis=1)
+    magnitudes = abs(factor.matrix).sum(axis=1)
+    if np.all(np.abs(row_sums) <= 8 * EPS * magnitudes):  # constants have the eigenvalue 0; rounding gives 1e-10
+        eigenvalues[np.argmin(np.abs(eigenvalues))] = 0.0
+    to_coefficients = vectors.T * scaling
+    from_coefficients = (1 / scaling)[:, None] * vectors
+    return AxisBasis("eigenvectors", np.ldexp(eigenvalues, exponent), (to_coefficients, from_coefficients))
 
 
-def _scaling(dense):
-    """Square roots of the weights w with w[i] F[i, i+1] = w[i+1] F[i+1, i], or None."""
-    up, down = dense.diagonal(1), dense.diagonal(-1)
+def _symmetrising_scaling(dense):
+    """Return the square roots of the weights w with w[i] F[i, i+1] = w[i+1] F[i+1, i], or None."""
+    up = dense.diagonal(1)
+    down = dense.diagonal(-1)
     linked = up != 0
     if np.any(linked != (down != 0)) or np.any(up * down < 0):
         return None
-    ratio = np.where(linked, up / np.where(linked, down, 1.0), 1.0)
-    weights = np.cumprod(np.concatenate([[1.0], ratio]))
-    if not np.all(np.isfinite(weights)) or weights.max() > WIDEST**2 * weights.min():
+    ratios = np.where(linked, up / np.where(linked, down, 1.0), 1.0)
+    weights = np.cumprod(np.concatenate([[1.0], ratios]))
+    if not np.all(np.isfinite(weights)) or weights.max() > LARGEST_SCALING_RATIO**2 * weights.min():
         return None
     return np.sqrt(weights / weights.max())
 
@@ -183,69 +274,90 @@ def _scaling(dense):
 class Spectrum:
     """A Kronecker sum in the eigenvectors of its factors.
 
+    Parameters
+    ----------
+    shape : tuple of int
+        Of the field.
+    axes : sequence of AxisBasis
+    shift : float
+        Multiple of the identity.
+
     Attributes
     ----------
-    shape : tuple
-    axes : tuple of Axis
     eigenvalues : array
-        Sum over the axes, in the shape of the coefficients (the last Fourier axis is halved), or one line of it.
+        Sums over the axes, in the shape of the coefficients: the last Fourier axis is halved, and the first axis has
+        length 1 where its factor is 0.
     """
 
-    def __init__(self, shape, axes, shift):
-        self.shape, self.axes, self.shift = shape, axes, shift
-        self.fourier = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier")
-        lines = [axis.eigenvalues for axis in axes]
-        for last in self.fourier[-1:]:
-            lines[last] = lines[last][: shape[last] // 2 + 1]
-        if len(axes) > 1 and not np.any(lines[0]):
-            lines[0] = lines[0][:1]  # one line of sums serves all
-        total = reduce(np.add.outer, lines, np.full((), float(shift)))
-        largest = sum(np.max(np.abs(axis.eigenvalues), initial=0.0) for axis in axes) + abs(shift)
-        # Eigenvalues that were computed, not written down, are only known to some rounding.
-        uncertain = 1.0 if any(axis.kind == "eigenvectors" for axis in axes) else 0.25
-        total[np.abs(total) <= ZERO * largest * uncertain] = 0.0
-        self.eigenvalues = total
-        self.workers = kernels.threads() if prod(shape) >= WORTH_THREADS else 1
+    def __init__(self, shape: tuple[int, ...], axes: tuple[AxisBasis, ...] | list[AxisBasis], shift: float) -> None:
+        self.shape = shape
+        self.axes = axes
+        self.shift = shift
+        self.fourier_axes = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier")
+        self.eigenvalues = self._sums_of_eigenvalues()
+        self.workers = kernels.threads() if prod(shape) >= THREADED_FROM else 1
 
-    def apply(self, weights, x, transposed=False):
-        """f(A) x for the given values of f on the eigenvalues, as a fresh array."""
-        y = self.forward(x, transposed)
+    def _sums_of_eigenvalues(self):
+        along_axes = [axis.eigenvalues for axis in self.axes]
+        if self.fourier_axes:
+            last = self.fourier_axes[-1]
+            along_axes[last] = along_axes[last][: self.shape[last] // 2 + 1]
+        if len(self.axes) > 1 and not np.any(along_axes[0]):
+            along_axes[0] = along_axes[0][:1]
+        sums = reduce(np.add.outer, along_axes, np.full((), float(self.shift)))
+        largest = sum(np.max(np.abs(axis.eigenvalues), initial=0.0) for axis in self.axes) + abs(self.shift)
+        tolerance = ZERO_EIGENVALUE
+        if not any(axis.kind == "eigenvectors" for axis in self.axes):
+            tolerance *= 0.25  # eigenvalues by a formula are more accurate than computed ones
+        sums[np.abs(sums) <= tolerance * largest] = 0.0
+        return sums
+
+    def apply(self, weights: NDArray[Any], x: NDArray[Any], transposed: bool = False) -> NDArray[Any]:
+        """Return f(A) x or f(A)^T x as a fresh flat array, given the values of f at the eigenvalues."""
+        y = self.to_coefficients(x, transposed)
         y *= weights
-        return self.backward(y, transposed)
+        return self.from_coefficients(y, transposed)
 
-    def forward(self, x, transposed):
-        """Flat field -> its coefficients, as a fresh array."""
-        x = y = x.reshape(self.shape)
-        for a, axis in enumerate(self.axes):
-            y = axis.turned(0, y, a, transposed, self.workers, y is not x)
-        if self.fourier:  # these axes are transformed together
-            return fft.rfftn(y, axes=self.fourier, workers=self.workers)
-        return y.copy() if y is x else y
+    def to_coefficients(self, x: NDArray[Any], transposed: bool) -> NDArray[Any]:
+        """Transform a flat field along all axes, into a fresh array."""
+        field = x.reshape(self.shape)
+        y = field
+        for number, axis in enumerate(self.axes):
+            y = axis.to_coefficients(y, number, transposed, self.workers, overwrite=y is not field)
+        if self.fourier_axes:  # transformed together
+            return fft.rfftn(y, axes=self.fourier_axes, workers=self.workers)
+        return y.copy() if y is field else y
 
-    def backward(self, y, transposed):
-        """Coefficients -> flat field. May overwrite y."""
-        if self.fourier:
-            lengths = [self.shape[a] for a in self.fourier]
-            y = fft.irfftn(y, s=lengths, axes=self.fourier, overwrite_x=True, workers=self.workers)
-        for a in reversed(range(len(self.axes))):
-            y = self.axes[a].turned(1, y, a, transposed, self.workers, True)
+    def from_coefficients(self, y: NDArray[Any], transposed: bool) -> NDArray[Any]:
+        """Transform coefficients to a flat field. May overwrite y."""
+        if self.fourier_axes:
+            lengths = [self.shape[number] for number in self.fourier_axes]
+            y = fft.irfftn(y, s=lengths, axes=self.fourier_axes, overwrite_x=True, workers=self.workers)
+        for number in reversed(range(len(self.axes))):
+            y = self.axes[number].from_coefficients(y, number, transposed, self.workers)
         return y.reshape(-1)
 
-    def same_basis(self, other):
-        """Whether the other one has the same eigenvectors."""
-        if self is other or self.words != other.words:
-            return self is other
-        pairs = zip(self.axes, other.axes, strict=True)
-        return all(np.array_equal(a.matrices, b.matrices) for a, b in pairs if a.matrices is not None)
+    def has_same_basis(self, other: Spectrum) -> bool:
+        """Whether another spectrum has the same eigenvectors."""
+        if self is other:
+            return True
+        if self.description != other.description:
+            return False
+        for axis, other_axis in zip(self.axes, other.axes, strict=True):
+            if axis.matrices is None or other_axis.matrices is None:  # transforms of the same kind and length
+                continue
+            if not np.array_equal(axis.matrices, other_axis.matrices):
+                return False
+        return True
 
     @property
-    def words(self):
-        """One line: what each axis is."""
+    def description(self) -> str:
+        """The kind and length of each axis, in one line."""
         return " x ".join(f"{axis.kind}({n})" for axis, n in zip(self.axes, self.shape, strict=True))
 
 
-def spectrum(structure):
-    """Kronecker sum -> Spectrum, or None when an axis cannot be diagonalised with all its digits.
+def compute_spectrum(structure: Kronecker) -> Spectrum | None:
+    """Diagonalise a Kronecker sum.
 
     Parameters
     ----------
@@ -255,183 +367,290 @@ def spectrum(structure):
     Returns
     -------
     Spectrum or None
+        None where an axis cannot be diagonalised to full accuracy.
     """
     shape = structure.out_parts[0]
-    axes = [Axis("identity", np.zeros(n)) for n in shape]
+    axes = [AxisBasis("identity", np.zeros(n)) for n in shape]
     for term in structure.terms:
-        for a in term.axes:  # without its scale: multiples have the same eigenvectors, to the same bits
-            axes[a] = axis = diagonalise(term.factors[a])
-            if axis is None:
+        for number in term.axes:
+            # The factor without its scale: multiples of an operator have the same eigenvectors, bit for bit.
+            basis = diagonalise(term.factors[number])
+            if basis is None:
                 return None
-            axis.eigenvalues = term.scale * axis.eigenvalues
+            basis.eigenvalues = term.scale * basis.eigenvalues
+            axes[number] = basis
     return Spectrum(shape, axes, structure.shift)
 
 
 # ---------------------------------------------------------------- elimination along the first axis
 
 
-class Sweep:
-    """(T + mode) x = b for all modes at once, T a three-point factor along a bounded first axis: elimination.
+class Elimination:
+    """Elimination for (T + mode) x = b, for all modes at once, T a tridiagonal factor along a bounded first axis.
 
-    With off-diagonal entries of one sign and rows that sum to the other, no pivot takes a subtraction: every digit of
-    a small sum is kept. The transpose has the same pivots.
+    The off-diagonal entries have one sign, and the rows sum to the other sign. Then the pivots are sums of numbers of
+    one sign: no digit of a small row sum is lost. The transpose has the same pivots.
 
     Parameters
     ----------
     bands : Tridiagonal
-    excess : array, shape (n,)
-        What the rows sum to, times `sign`; >= 0.
+    row_sums : array, shape (n,)
+        Sums of the rows of T times `sign`, >= 0.
     modes : array, shape (m,)
-        Numbers on the diagonal, times `sign`; >= 0.
+        Numbers added to the diagonal, times `sign`, >= 0.
     sign : 1.0 or -1.0
         Sign of the diagonal.
     """
 
-    def __init__(self, bands, excess, modes, sign):
-        self.lower, self.upper, rest = bands.lower, bands.upper, 0.0
-        self.inverses = np.zeros((len(excess), modes.size))  # of the pivots; 0 where the system is singular
-        for i, line in enumerate(self.inverses):
-            rest = excess[i] + modes + abs(self.lower[i]) * rest * self.inverses[i - 1]
-            inverted(abs(self.upper[i]) + rest, line)
-        self.inverses *= sign
+    def __init__(self, bands: Any, row_sums: NDArray[Any], modes: NDArray[Any], sign: float) -> None:
+        self.lower = bands.lower
+        self.upper = bands.upper
+        self.inverse_pivots = np.zeros((len(row_sums), modes.size))  # 0 where the system is singular
+        remainder: Any = 0.0  # of the pivot, without the upper off-diagonal entry
+        for i, line in enumerate(self.inverse_pivots):
+            remainder = row_sums[i] + modes + abs(self.lower[i]) * remainder * self.inverse_pivots[i - 1]
+            inverted(abs(self.upper[i]) + remainder, line)
+        self.inverse_pivots *= sign
 
-    def solve(self, x, transposed):
-        """x, shape (n, ...) with m numbers for each of the n, is overwritten with the solution."""
-        bands = (np.roll(self.upper, 1), np.roll(self.lower, -1)) if transposed else (self.lower, self.upper)
-        kernels.sweep(x.view(float).reshape(len(x), -1), *bands, self.inverses)
+    def solve(self, x: NDArray[Any], transposed: bool) -> None:
+        """Overwrite x, of shape (n, ...) with m numbers along the other axes, with the solution."""
+        if transposed:
+            lower = np.roll(self.upper, 1)
+            upper = np.roll(self.lower, -1)
+        else:
+            lower = self.lower
+            upper = self.upper
+        kernels.sweep(x.view(float).reshape(len(x), -1), lower, upper, self.inverse_pivots)
 
 
-def sweep(factor, modes):
-    """Square 1-D factor, numbers that are added to its diagonal -> Sweep, or None when it might lose digits.
+def _find_elimination(factor, modes):
+    """Return the Elimination for a square 1-D factor plus each mode, or None where it could lose digits.
 
-    Needed are three points a row, no link round the end, off-diagonal entries of one sign, and rows that sum to the
-    other one.
+    It needs a tridiagonal factor without a periodic link, off-diagonal entries of one sign, and row sums and modes of
+    the other sign.
     """
     bands = factor.tridiagonal
     if bands is None or bands.lower[0] or bands.upper[-1] or not np.any(bands.centre):
         return None
     sign = float(np.sign(bands.centre[np.argmax(np.abs(bands.centre))]))
-    links = np.abs(bands.lower) + np.abs(bands.upper)
-    excess = sign * bands.centre - links
-    excess[np.abs(excess) <= ROUNDING * links] = 0.0
-    against = np.concatenate([sign * bands.lower, sign * bands.upper])
-    if np.any(against > 0) or np.any(excess < 0) or np.any(sign * modes < 0):
+    off_diagonal = np.abs(bands.lower) + np.abs(bands.upper)
+    row_sums = sign * bands.centre - off_diagonal
+    row_sums[np.abs(row_sums) <= ROUNDING * off_diagonal] = 0.0
+    if np.any(sign * bands.lower > 0) or np.any(sign * bands.upper > 0):
         return None
-    return Sweep(bands, excess, sign * modes, sign)
+    if np.any(row_sums < 0) or np.any(sign * modes < 0):
+        return None
+    return Elimination(bands, row_sums, sign * modes, sign)
 
 
 # ---------------------------------------------------------------- the engine
 
 
 class Separable(Engine):
-    """The engine: forward transforms, division by the eigenvalues, backward transforms.
+    """The engine of method "separable": forward transforms, division by the eigenvalues, backward transforms.
 
     Parameters
     ----------
     spectrum : Spectrum
-        Of all axes; where elimination takes the place of division, of all but the first.
+        Of all axes; where elimination replaces the division, of all but the first.
     divide : callable
-        ``divide(y, transposed)``: coefficients, which are overwritten.
+        ``divide(y, transposed)`` overwrites the coefficients y with those of the solution.
     hierarchy : str
     """
 
     method = "separable"
     unit = "refinements"
 
-    def __init__(self, spectrum, divide, hierarchy):
-        self.spectrum, self.divide, self.hierarchy = spectrum, divide, hierarchy
+    def __init__(self, spectrum: Spectrum, divide: Callable[[NDArray[Any], bool], Any], hierarchy: str) -> None:
+        self.spectrum = spectrum
+        self.divide = divide
+        self.hierarchy = hierarchy
 
-    def solve(self, b, goal, transposed):
-        y = self.spectrum.forward(b, transposed)
+    def solve(self, b: NDArray[Any], goal: float, transposed: bool) -> tuple[NDArray[Any], int, str]:
+        """Solve A x = b or A^T x = b: see `Engine`."""
+        y = self.spectrum.to_coefficients(b, transposed)
         self.divide(y, transposed)
-        return self.spectrum.backward(y, transposed), 0, ""
+        return self.spectrum.from_coefficients(y, transposed), 0, ""
 
 
-def transforming(system, found, eigenvalues):
-    """System and its `eigenbasis` -> Separable, without transforms along the first axis unless they are as good."""
-    structure, first, wide = system.op.structure, found.shape[0], WIDE_COMPILED if kernels.compiled() else WIDE_PLAIN
-    if not structure.separable and np.all(eigenvalues):  # an eigenvalue 1 beside 1e16 would count as 0 in products
-        system.null_space = NullSpace.none(system.size)
-    if structure.separable and 0 in structure.lines and first >= 3 and found.eigenvalues[0].size >= wide:
-        rest = Spectrum(found.shape, (Axis("identity", np.zeros(first)), *found.axes[1:]), found.shift)
-        sums = rest.eigenvalues[0].reshape(-1)
-        elimination = sweep(structure.lines[0], np.repeat(sums, 2) if rest.fourier else sums)  # both parts of complex
-        if elimination is not None:
-            words = f"elimination({first}) x {found.words.split(' x ', 1)[1]}"
-            return Separable(rest, elimination.solve, words)
-    weights = inverted(eigenvalues)
-    return Separable(found, lambda y, transposed: np.multiply(y, weights, out=y), found.words)
+def transform_engine(system: System, spectrum: Spectrum, eigenvalues: NDArray[Any]) -> Separable:
+    """Build the engine from the eigenbasis of a system's operator.
 
-
-def separable_engine(system):
-    """Engine: transforms along the axes. For Kronecker sums whose factors can be diagonalised, and what is made of one.
+    Elimination replaces the transforms along the first axis where it is as accurate and faster.
 
     Parameters
     ----------
     system : System
+    spectrum : Spectrum
+    eigenvalues : array
+        Of the operator, in the basis of the spectrum.
+
+    Returns
+    -------
+    Separable
+    """
+    structure = system.op.structure
+    if not structure.separable and np.all(eigenvalues):  # an eigenvalue of 1 beside 1e16 would count as 0 in products
+        system.null_space = NullSpace.none(system.size)
+    if structure.separable:
+        engine = _elimination_engine(structure, spectrum)
+        if engine is not None:
+            return engine
+    reciprocals = inverted(eigenvalues)
+
+    def divide(y, transposed):
+        np.multiply(y, reciprocals, out=y)
+
+    return Separable(spectrum, divide, spectrum.description)
+
+
+def _elimination_engine(structure, spectrum):
+    """Return the engine with elimination along the first axis, or None where transforms are as good or better."""
+    first_length = spectrum.shape[0]
+    smallest_width = ELIMINATION_FROM_COMPILED if kernels.compiled() else ELIMINATION_FROM_NUMPY
+    if 0 not in structure.lines or first_length < 3 or spectrum.eigenvalues[0].size < smallest_width:
+        return None
+    first_axis = AxisBasis("identity", np.zeros(first_length))
+    other_axes = Spectrum(spectrum.shape, (first_axis, *spectrum.axes[1:]), spectrum.shift)
+    modes = other_axes.eigenvalues[0].reshape(-1)
+    if other_axes.fourier_axes:  # coefficients are complex: real and imaginary parts are separate systems
+        modes = np.repeat(modes, 2)
+    elimination = _find_elimination(structure.lines[0], modes)
+    if elimination is None:
+        return None
+    description = f"elimination({first_length}) x {spectrum.description.split(' x ', 1)[1]}"
+    return Separable(other_axes, elimination.solve, description)
+
+
+def separable_engine(system: System) -> Separable:
+    """Set up transforms along the axes, for Kronecker sums whose factors can be diagonalised, and their functions.
+
+    Parameters
+    ----------
+    system : System
+
+    Returns
+    -------
+    Separable
 
     Raises
     ------
     ValueError
         If the operator is not such a sum.
     """
-    found = eigenbasis(system.op.structure) if system.active is None else None
-    if found is None:
+    basis = None
+    if system.active is None:
+        basis = find_eigenbasis(system.op.structure)
+    if basis is None:
         raise ValueError(f"separable needs a sum of 1-D factors that can be diagonalised, got {system.given}")
-    return transforming(system, *found)
+    return transform_engine(system, *basis)
 
 
 # ---------------------------------------------------------------- functions of a Kronecker sum
 
 
-class SpectralFunction(Turning):
-    """f(A) for a Kronecker sum A, as a structure: one pair of transforms. `inner`: (Spectrum, f on the eigenvalues)."""
+class Eigenbasis(NamedTuple):
+    """The eigenvectors of a Kronecker sum, and the eigenvalues of one of its functions.
 
-    def act(self, x, out):
+    Attributes
+    ----------
+    spectrum : Spectrum
+    eigenvalues : array
+        Of the function, in the shape of `spectrum.eigenvalues`.
+    """
+
+    spectrum: Spectrum
+    eigenvalues: NDArray[Any]
+
+
+class SpectralFunction(Turning):
+    """The structure of a function f(A) of a Kronecker sum A: one pair of transforms.
+
+    Parameters
+    ----------
+    inner : Eigenbasis
+        The basis of A, and the values of f at its eigenvalues.
+    shape : tuple of int
+    transposed : bool
+    """
+
+    def act(self, x: NDArray[Any], out: NDArray[Any]) -> None:
+        """Set out = f(A) x, or the transpose of f(A) times x."""
         spectrum, weights = self.inner
         out[...] = spectrum.apply(weights, x, self.transposed)
 
-    def scaled(self, factor):
+    def scaled(self, factor: ArrayLike) -> SpectralFunction | None:
+        """Return the structure times a real factor; None for a complex one."""
+        if np.iscomplexobj(factor):
+            return None
         spectrum, weights = self.inner
-        real = not np.iscomplexobj(factor)
-        return SpectralFunction((spectrum, weights * factor), self.shape, self.transposed) if real else None
+        return SpectralFunction(Eigenbasis(spectrum, weights * factor), self.shape, self.transposed)
 
 
-def eigenbasis(structure):
-    """(Spectrum, eigenvalues) of a diagonal, a Kronecker sum, and what is made of one; None of others.
+def find_eigenbasis(structure: Structure) -> Eigenbasis | None:
+    """Return the eigenbasis of a diagonal, a Kronecker sum, or a function of one; None of other structures.
 
-    Made of one are its functions, and sums and products of these.
+    Sums and products of functions of one Kronecker sum are such functions too.
     """
     if isinstance(structure, Diagonal) and structure.dtype == float:
         size = structure.shape[0]
-        return Spectrum((size,), (Axis("identity", np.zeros(size)),), 0.0), structure.values
+        identity = AxisBasis("identity", np.zeros(size))
+        return Eigenbasis(Spectrum((size,), (identity,), 0.0), structure.values)
     if isinstance(structure, SpectralFunction) and not structure.transposed:
         return structure.inner
-    if isinstance(structure, (Sum, Chain)):
-        return _together(structure.members, np.add if isinstance(structure, Sum) else np.multiply)
-    found = spectrum(structure) if isinstance(structure, Kronecker) and structure.separable else None
-    return None if found is None else (found, found.eigenvalues)
+    if isinstance(structure, Sum):
+        return _combine_eigenbases(structure.members, np.add)
+    if isinstance(structure, Chain):
+        return _combine_eigenbases(structure.members, np.multiply)
+    if isinstance(structure, Kronecker) and structure.separable:
+        spectrum = compute_spectrum(structure)
+        if spectrum is not None:
+            return Eigenbasis(spectrum, spectrum.eigenvalues)
+    return None
 
 
-def _together(members, combined):
-    """The same of a sum or a product of structures, where one basis is that of all of them."""
-    basis, values = None, []
+def _combine_eigenbases(members, operation):
+    """Return the eigenbasis of a sum or a product of structures with a common basis, else None."""
+    spectrum = None
+    eigenvalues: list = []
     for member in members:
-        if isinstance(member, Kronecker) and member.separable and not member.lines:  # a number times the identity
-            values.append(float(member.shift))
+        if isinstance(member, Kronecker) and member.separable and not member.lines:  # a multiple of the identity
+            eigenvalues.append(float(member.shift))
             continue
-        found = eigenbasis(member)
-        if found is None or not (basis is None or basis.same_basis(found[0])):
+        basis = find_eigenbasis(member)
+        if basis is None or (spectrum is not None and not spectrum.has_same_basis(basis.spectrum)):
             return None
-        basis = found[0]
-        values.append(found[1])
-    return None if basis is None else (basis, reduce(combined, values))
+        spectrum = basis.spectrum
+        eigenvalues.append(basis.eigenvalues)
+    if spectrum is None:
+        return None
+    return Eigenbasis(spectrum, reduce(operation, eigenvalues))
 
 
-def diagonalised(op, name, advice=""):
-    """(Spectrum, eigenvalues) of an operator that is separable, or made of such ones; `name` needs them."""
+def require_eigenbasis(op: Operator, name: str, advice: str = "") -> Eigenbasis:
+    """Return the eigenbasis of an operator.
+
+    Parameters
+    ----------
+    op : Operator
+    name : str
+        Of the function that needs it, for messages.
+    advice : str
+        Appended to the message: what to write instead.
+
+    Returns
+    -------
+    Eigenbasis
+
+    Raises
+    ------
+    TypeError
+        If `op` is not an Operator.
+    ValueError
+        If it is neither separable nor a function of a separable operator, or cannot be diagonalised.
+    """
     check_type(name, op, Operator, "an Operator", "dp.from_matrix(...) first")
-    found = eigenbasis(op.structure)
-    if found is None:
+    basis = find_eigenbasis(op.structure)
+    if basis is None:
         raise ValueError(f"{name} needs a separable operator that can be diagonalised, got {op}{advice}")
-    return found
+    return basis

@@ -1,21 +1,30 @@
 """Functions of a separable operator as operators: exponentials, powers, and any function of its eigenvalues."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from sparsedp._utils.validation import check_finite, check_function, check_kind, check_number, check_shape
 from sparsedp.operators.operator import Operator
-from sparsedp.solvers.separable import SpectralFunction, diagonalised
+from sparsedp.solvers.separable import Eigenbasis, SpectralFunction, require_eigenbasis
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import ArrayLike, NDArray
 
 __all__ = ["matrix_exponential", "matrix_function", "matrix_power"]
 
 
-def matrix_exponential(op, time=1.0):
-    """Separable operator -> the operator exp(time * op): exact diffusion over a time, at any size of step.
+def matrix_exponential(op: Operator, time: float = 1.0) -> Operator:
+    """Return the operator exp(time * op), such as exact diffusion over any time.
 
     Parameters
     ----------
     op : Operator
-        A Kronecker sum from a space to itself (``op.separable``), such as a laplacian; or a power of one.
+        A Kronecker sum from a space to itself (``op.separable``), such as a laplacian; or a function of one.
     time : float
         Finite [1 / unit of the operator].
 
@@ -35,7 +44,7 @@ def matrix_exponential(op, time=1.0):
 
     Notes
     -----
-    With A = V diag(e) V^-1: exp(t A) = V diag(exp(t e)) V^-1. Transpose: exp(t A^T).
+    With A = V diag(e) V^-1: exp(t A) = V diag(exp(t e)) V^-1. Its transpose is exp(t A^T).
 
     Examples
     --------
@@ -44,24 +53,23 @@ def matrix_exponential(op, time=1.0):
     >>> print(np.round(spread(np.array([1.0, 3.0])), 6))
     [2. 2.]
     """
-    axes, values = diagonalised(op, "matrix_exponential")
+    basis = require_eigenbasis(op, "matrix_exponential")
     check_number("time of matrix_exponential", time)
     with np.errstate(over="ignore"):
-        weights = np.exp(time * values)
+        values = np.exp(time * basis.eigenvalues)
     name = f"exp({time:g} * {op.name})"
-    return _function(op, axes, weights, name, "; take a shorter time or the other sign")
+    return _function_of(op, basis, values, name, "; take a shorter time or the other sign")
 
 
-def matrix_power(op, exponent):
-    """Separable operator -> the operator op^exponent, such as a square root or a smoothing power.
+def matrix_power(op: Operator, exponent: float) -> Operator:
+    """Return the operator op^exponent, such as a square root or a smoothing power.
 
     Parameters
     ----------
     op : Operator
-        A Kronecker sum from a space to itself (``op.separable``); or an exponential of one.
+        A Kronecker sum from a space to itself (``op.separable``); or a function of one.
     exponent : float
-        Whole, or any number when no eigenvalue is negative. On the null space a negative exponent
-        gives 0: the generalised inverse.
+        An integer, or any number if no eigenvalue is negative.
 
     Returns
     -------
@@ -70,7 +78,8 @@ def matrix_power(op, exponent):
     Raises
     ------
     ValueError
-        If the operator is not separable, or a fractional power of a negative eigenvalue is asked for.
+        If the operator is not separable or cannot be diagonalised, or if the exponent is fractional and an eigenvalue
+        is negative.
     TypeError
         If `exponent` is not one real number.
     NonFiniteError
@@ -78,7 +87,8 @@ def matrix_power(op, exponent):
 
     Notes
     -----
-    A product with known numbers, not a solve: no residual is looked at. For the solution of op x = b write `inverse`.
+    A negative exponent gives 0 on the null space: the generalised inverse. No residual is computed; use `inverse` to
+    solve op x = b to a tolerance.
 
     Examples
     --------
@@ -87,45 +97,51 @@ def matrix_power(op, exponent):
     >>> print(np.round(root(root(np.array([1.0, 2.0, 4.0]))), 6))
     [-1. -1.  2.]
     """
-    axes, values = diagonalised(op, "matrix_power")
+    basis = require_eigenbasis(op, "matrix_power")
     check_number("exponent of matrix_power", exponent)
-    if exponent != int(exponent) and np.any(values < 0):
-        raise ValueError(f"{op.name} has eigenvalues down to {values.min():.1e}; a fractional power needs them >= 0")
-    zero = values == 0
+    eigenvalues = basis.eigenvalues
+    if exponent != int(exponent) and np.any(eigenvalues < 0):
+        smallest = eigenvalues.min()
+        raise ValueError(f"{op.name} has eigenvalues down to {smallest:.1e}; a fractional power needs them >= 0")
+    is_zero = eigenvalues == 0
+    power_of_zero = float(exponent == 0)
     with np.errstate(over="ignore"):
-        weights = np.where(zero, float(exponent == 0), np.where(zero, 1.0, values) ** float(exponent))
-    return _function(op, axes, weights, f"({op.name})^{exponent:g}", "; rescale the operator")
+        powers = np.where(is_zero, 1.0, eigenvalues) ** float(exponent)
+    values = np.where(is_zero, power_of_zero, powers)
+    return _function_of(op, basis, values, f"({op.name})^{exponent:g}", "; rescale the operator")
 
 
-def matrix_function(op, f):
-    """Separable operator -> the operator f(op): f of its eigenvalues, such as a polynomial in a Laplacian.
+def matrix_function(op: Operator, f: Callable[[NDArray[Any]], ArrayLike]) -> Operator:
+    """Return the operator f(op), f applied to the eigenvalues, such as a polynomial in a Laplacian.
 
     Parameters
     ----------
     op : Operator
         A Kronecker sum from a space to itself (``op.separable``); or a function of one.
     f : callable
-        ``f(e)``: an array of eigenvalues [unit of the operator] -> as many real numbers. It is called once.
+        ``f(e)`` takes an array of eigenvalues [unit of the operator] and returns a real number for each. It is
+        called once.
 
     Returns
     -------
     Operator
-        Matrix-free: two transforms for each application. As `linear` of ``stepper("etdrk4", ...)`` it is exact in time.
+        Matrix-free: two transforms for each application. As `linear` of ``stepper("etdrk4", ...)`` it is integrated
+        exactly.
 
     Raises
     ------
     ValueError
         If the operator is not separable or cannot be diagonalised.
     ShapeError
-        If f returns another shape.
+        If the result of f has another shape.
     TypeError
-        If f is no function, or returns what are no real numbers.
+        If f is not a function, or its values are not real numbers.
     NonFiniteError
         If a value is NaN or infinite.
 
     Notes
     -----
-    With A = V diag(e) V^-1: f(A) = V diag(f(e)) V^-1. Transpose: f(A^T).
+    With A = V diag(e) V^-1: f(A) = V diag(f(e)) V^-1. Its transpose is f(A^T).
 
     Examples
     --------
@@ -137,15 +153,16 @@ def matrix_function(op, f):
     [0. 0. 0.]
     """
     check_function("matrix_function", f, "lambda e: -e**2 - e")
-    axes, values = diagonalised(op, "matrix_function")
+    basis = require_eigenbasis(op, "matrix_function")
     with np.errstate(all="ignore"):  # NaN is refused below
-        weights = np.asarray(f(values.copy()))
-    check_shape("f(e) of matrix_function", weights, values.shape, "; give a number for each eigenvalue")
-    check_kind("f(e) of matrix_function", weights.dtype, "real numbers")
-    return _function(op, axes, weights.astype(float), f"f({op.name})", "; check f there")
+        values = np.asarray(f(basis.eigenvalues.copy()))
+    advice = "; give a number for each eigenvalue"
+    check_shape("f(e) of matrix_function", values, basis.eigenvalues.shape, advice)
+    check_kind("f(e) of matrix_function", values.dtype, "real numbers")
+    return _function_of(op, basis, values.astype(float), f"f({op.name})", "; check f there")
 
 
-def _function(op, axes, weights, name, advice):
-    """The Operator with these weights in place of the eigenvalues; refused when they are beyond the range of floats."""
-    check_finite(name, weights, "must be finite at the eigenvalues", advice=advice)
-    return Operator(SpectralFunction((axes, weights), op.shape), op.domain, op.codomain, name)
+def _function_of(op, basis, values, name, advice):
+    """Return the Operator with these values for the eigenvalues; refuse values beyond the range of floats."""
+    check_finite(name, values, "must be finite at the eigenvalues", advice=advice)
+    return Operator(SpectralFunction(Eigenbasis(basis.spectrum, values), op.shape), op.domain, op.codomain, name)

@@ -6,7 +6,7 @@ import pytest
 from sparsedp import kernels
 from sparsedp.kernels.reference import Tridiagonal
 from sparsedp.solvers.scaling import norm, remainder
-from sparsedp.solvers.separable import Sweep
+from sparsedp.solvers.separable import Elimination
 
 NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
 SIZES = (0, 1, 4097, 40_000)
@@ -49,7 +49,7 @@ def test_elimination_solves_every_mode(n, transposed, compiled, rng, monkeypatch
         line, dense = bands(rng, n, uniform)
         modes = np.array([1e-9, 0.3, 7.0, 1e4] * 10)
         b = rng.standard_normal((n, modes.size))
-        Sweep(line, np.zeros(n), modes, 1.0).solve(x := b.copy(), transposed)
+        Elimination(line, np.zeros(n), modes, 1.0).solve(x := b.copy(), transposed)
         for j, mode in enumerate(modes):
             matrix = (dense.T if transposed else dense) + mode * np.eye(n)
             rest = np.abs(matrix @ x[:, j] - b[:, j])
@@ -60,5 +60,5 @@ def test_a_singular_mode_is_solved_up_to_its_null_vector(rng):
     line, dense = bands(rng, 40, True)
     b = rng.standard_normal((40, 16))
     b = b - b.mean(axis=0)
-    Sweep(line, np.zeros(40), np.zeros(16), 1.0).solve(x := b.copy(), False)
+    Elimination(line, np.zeros(40), np.zeros(16), 1.0).solve(x := b.copy(), False)
     assert np.max(np.abs(dense @ x - b)) <= 1e-12 * np.max(np.abs(x))
