@@ -76,6 +76,7 @@ LESS = 0.0, EPSILON, 0.0  # how much less the steps that count and both shadows 
 UNCERTAIN = 6.0  # error of a derivative without extrapolation, in units of tolerance^(p / (p + 1)), that is taken
 TIMES = 10.0  # error of a derivative in units of the tolerance: aim with extrapolation, limit without
 STEEP = 0.1  # relative uncertainty of the rate of change of an event, from which on it grazes its surface
+ROUNDING = 1e-12  # of the largest first derivative, below which a second one is 0 to rounding
 SHARE = 1e-4  # of what goes in: derivatives that are smaller are judged by it
 
 
@@ -504,10 +505,11 @@ class Adaptive(Scheme):
         """(spread, judge): where the three runs part, and where they meet; on plain arrays."""
         share = self.compared / (self.compared + 1)
         limit = UNCERTAIN * self.tolerance**share if self.weight else TIMES * self.tolerance
-        unit, scale = EPSILON * self.ratio, [0.0]
+        unit, scale, largest = EPSILON * self.ratio, [0.0], [0.0]  # of the last values, and of all
 
         def spread(x):
             scale[0] = np.max(np.abs(x), initial=0.0)
+            largest[0] = max(largest[0], scale[0])
             return np.stack([x, x, x * (1 + unit * limit / TIMES * np.random.default_rng(0).uniform(-1, 1, x.size))])
 
         def judge(arrived):
@@ -519,6 +521,12 @@ class Adaptive(Scheme):
                 return derivative.copy()
             # Without extrapolation errors fall more slowly than the tolerance: a smaller one is refused all the more.
             cure = "give a smaller floor or tolerance" if self.weight else "take tr_bdf2, which extrapolates"
+            if size < ROUNDING * largest[0]:
+                raise DerivativeError(
+                    f"a second derivative of {self.name} over {count} steps is 0 to rounding, which error control "
+                    "cannot tell from an error: the result does not depend on it to second order, as that of a ball "
+                    "before its first bounce; leave it out, or take fixed steps"
+                )
             share = number_beside(error / size, limit, float(f"{limit:.1e}"), digits=1, style="e")
             raise DerivativeError(
                 f"the derivative of {self.name} over {count} steps is uncertain by {share} of its "

@@ -103,7 +103,9 @@ class Inspector:
             return None
         if larger > UNEVEN * smaller and larger > NEGLIGIBLE * part.scale:
             ends = (0.0, part.between) if first > last else (part.between, 1.0)
-            return self._followed(part, *ends)
+            share = self._followed(part, *ends)
+            if share is not None:
+                return share
         return self._probed(part, first + last)
 
     def _probed(self, part, change):

@@ -29,6 +29,7 @@ Ordinary Differential Equations I (1993), II.6.
 """
 
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import autograd.numpy as anp
@@ -40,7 +41,7 @@ from sparsedp._utils.validation import EPS, check_function, check_number, check_
 from sparsedp.autodiff.derivative import pullback, push
 from sparsedp.autodiff.tape import dtype_of, is_variable, isbox, linear, plain, traces_of
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
-from sparsedp.integrators.adaptive import Adaptive, Moving, relative
+from sparsedp.integrators.adaptive import Adaptive, Moving, inner, relative
 from sparsedp.integrators.problem import Side, Sided, combine, of_fields, takes, unsided, untraced
 from sparsedp.integrators.runge_kutta import Scheme
 
@@ -50,6 +51,7 @@ MOST_EVENTS = 10_000  # in one interval
 REPEATS = 8  # of one event within rounding of the time: it never ends
 SHIFTS = 12  # attempts to move a state to the right side of a surface
 DIP = 0.3  # share of the values of an event in a step to which a minimum between them is followed
+SAME = 1e-9  # difference of two states, relative to their size, that is taken for rounding
 HALVINGS = 60  # of a step, to find a point before the crossing
 
 
@@ -131,7 +133,7 @@ def check_event_function(name, function):
 
 
 def _terminal(name, value):
-    if value not in (False, True):
+    if np.ndim(value) or value not in (False, True):
         raise ValueError(f"the attribute terminal of {name} must be True or False, got {value!r}")
     return bool(value)
 
@@ -269,6 +271,7 @@ class Watch:
         self.eps = max([EPS, *(float(np.finfo(dtype_of(leaf)).eps) for leaf in leaves(u) if is_variable(leaf))])
         self.signs = [self._sign(event, u, t) for event in events]
         self.last = 0.0  # sign of the last event that was found, before it
+        self.simultaneous: list = []  # other events at the time of the last one, and their signs before it
 
     def surfaces(self):
         """The surfaces that the rate must not see beyond."""
@@ -290,7 +293,13 @@ class Watch:
         return float(np.sign(change))
 
     def passed(self, event, before, after, t):
-        """Note the new signs after the last event that was found: the states before and after its jump."""
+        """Note the new signs after the last event that was found: the states before and after its jump.
+
+        Returns
+        -------
+        list of Event
+                Those at the same time that the next step would not find: beyond the jump they do not change their sign.
+        """
         residual = abs(event.number(before, self.params, t))
         for place, other in enumerate(self.events):
             if other is event and event.jump is None:
@@ -301,22 +310,30 @@ class Watch:
                 values = [other.number(u, self.params, t) for u in (before, after)]
                 if values[0] != values[1] and np.sign(values[1]) != self.signs[place]:
                     self.signs[place] = self._sign(other, after, t)
+        return [other for other, sign in self.simultaneous if self._sign(other, after, t) != -sign]
+
+    def passed_at_once(self, event, after, t):
+        """Note the new sign of an event at the same time as the last one."""
+        self.signs[self.events.index(event)] = self._sign(event, after, t)
 
     def pending(self, u, t):
         """An event at the end of an interval that the next interval would take for one before its start, or None."""
-        for place, event in enumerate(self.events):
-            sign = self.signs[place]
+        pending = []
+        for event, sign in zip(self.events, self.signs):
             if event.located(sign) and self._sign(event, u, t) == -sign:
-                self.last = sign
-                return event
-        return None
+                pending.append((event, sign))
+        if not pending:
+            return None
+        event, self.last = pending[0]
+        self.simultaneous = pending[1:]
+        return event
 
     def crossing(self, scheme, step, known):
         """The first event in a step, or None; `known`: what the scheme was given, plain."""
         t, h = known[2:]
         start = t + step.done * h
         middle, share = scheme.inner_state(step)
-        first, changed = None, []
+        crossings, changed = [], []
         for place, event in enumerate(self.events):
             values = [
                 event.number(scheme.tree(step.u), self.params, start),
@@ -343,14 +360,22 @@ class Watch:
                     continue
                 sign, lower, length = -sign, length, step.length
             found = self._located(scheme, step, known, event, sign, lower, length)
-            if found is not None and (first is None or found.step.length < first.step.length):
-                first = found
+            if found is not None:
+                crossings.append(found)
+        first = min(crossings, key=lambda crossing: crossing.step.length, default=None)
         last = step if first is None else first.step
         for place in changed:  # the signs where the next step begins
             value = self.events[place].number(scheme.tree(last.new), self.params, start + last.length * h)
             self.signs[place] = float(np.sign(value)) or self.signs[place]
         if first is not None:
             self.last = first.sign
+            # Times that differ by rounding; where the first of them jumps, the others might not be found again.
+            latest = first.step.length + 64 * EPS * max(abs(start), h) / h
+            self.simultaneous = [
+                (crossing.event, crossing.sign)
+                for crossing in crossings
+                if crossing is not first and crossing.step.length <= latest
+            ]
         return first
 
     def _value(self, scheme, step, known, event, length):
@@ -464,16 +489,34 @@ class Interrupted(Scheme):
         spread, judge = linear(f"{self.name}.variation", *scheme.doors(count))
         entered = spread(start.off(given))
         runs = [start.at(entered[number]) for number in range(len(entered))]
-        stops = [(*self._traced_times(params, pieces), t + h) for _, params, t, h in runs]
+        is_first_order = len(traces_of(leaves(given))) == 1
+        smooth = self._smooth_breaks(pieces, known[1], known[3]) if is_first_order and callable(self.breaks) else set()
+        stops = [(*self._traced_times(params, pieces, smooth), t + h) for _, params, t, h in runs]
         states = [(u, t) for u, _, t, _ in runs]
         for piece in pieces:
             states = self._again(piece, states, [run[1] for run in runs], [times[piece.stop] for times in stops])
         return end.at(judge(anp.array([*map(end.off, states)])))
 
-    def _traced_times(self, params, pieces):
+    def _smooth_breaks(self, pieces, params, length):
+        """The places of the breaks at which the rate does not jump: the state has the derivative 0 in these times.
+
+        That of the discrete steps is an error, as large as the tolerance. Second derivatives need not be 0 there.
+        """
+        smooth = set()
+        for piece, following in pairwise(pieces):
+            if piece.stop < 0 or piece.event or piece.end is None:
+                continue
+            sides = [self.problem(piece.end, Sided(params, side), piece.time) for side in (piece.side, following.side)]
+            rows = zip(*map(leaves, sides), leaves(piece.end), strict=True)
+            if all(leaf is None or _is_continuous(before, after, leaf / length) for before, after, leaf in rows):
+                smooth.add(piece.stop)
+        return smooth
+
+    def _traced_times(self, params, pieces, smooth):
         if not callable(self.breaks):
             return self.breaks
         times = self.times(params)
+        times = [plain(time) if place in smooth else time for place, time in enumerate(times)]
         reached = [piece.stop for piece in pieces if piece.stop >= 0]
         for place in reached:
             for other, time in enumerate(times):
@@ -536,7 +579,7 @@ class Piece(NamedTuple):
 
     path: the steps, none where it is of rounding length. side: where the rate is evaluated. stop: the place of the
     break at its end, -1 for the end of the interval. event: what ended it before that, or None. length: of the piece
-    up to its stop.
+    up to its stop. end, time: the state and the time at a break.
     """
 
     path: list
@@ -544,6 +587,14 @@ class Piece(NamedTuple):
     stop: int
     event: Event | None
     length: float
+    end: Any = None
+    time: float = 0.0
+
+
+def _is_continuous(before, after, slow):
+    """Whether a rate on both sides of a break differs by rounding, of its size or of that which moves the state."""
+    size = max(np.max(np.abs(rate), initial=0.0) for rate in (before, after, slow))
+    return np.max(np.abs(np.subtract(before, after)), initial=0.0) <= 64 * EPS * size
 
 
 class _Run:
@@ -585,6 +636,7 @@ class _Run:
                 event = self._at_the_end(side, stop)
             if event is None:
                 self.t = stop
+                self.pieces[-1] = self.pieces[-1]._replace(end=self.u, time=stop)
                 return False
             count += 1
             before, self.t = self.t, self.t + self.crossed
@@ -594,11 +646,51 @@ class _Run:
                     f"{event.name} of {self.parent.name} occurs again and again at t = {self.t:.12g}; let it be "
                     "terminal, or return from its jump a state that leaves the surface"
                 )
-            self.times[self.parent.events.index(event)].append(self.t)
-            state, self.u = self.u, event.after(self.u, self.params, self.t)
-            if event.terminal:
+            if self._passed(event, side):
                 return True
-            self.watch.passed(event, state, self.u, self.t)
+
+    def _passed(self, event, side):
+        """Record an event and others at the same time, with their jumps in order; whether one of them is terminal."""
+        self.times[self.parent.events.index(event)].append(self.t)
+        before, self.u = self.u, event.after(self.u, self.params, self.t)
+        hidden = self.watch.passed(event, before, self.u, self.t)
+        if event.terminal:
+            hidden = [other for other, _ in self.watch.simultaneous]
+        is_terminal = event.terminal
+        for other in hidden:
+            self._check_order(event, other, before)
+            self.times[self.parent.events.index(other)].append(self.t)
+            self.pieces.append(Piece([], side, -1, other, 0.0))
+            self.u = other.after(self.u, self.params, self.t)
+            self.watch.passed_at_once(other, self.u, self.t)
+            is_terminal = is_terminal or other.terminal
+        return is_terminal
+
+    def _check_order(self, first, second, u):
+        """Refuse two events at one time where the state after them, or its derivative, depends on their order."""
+        params, t = self.params, self.t
+        one = second.after(first.after(u, params, t), params, t)
+        other = first.after(second.after(u, params, t), params, t)
+        sizes = Adaptive.sizes(self.parent.scheme, u, one)
+        words = f"{first.name} and {second.name} of {self.parent.name} occur at the same time t = {t:.12g}, and the "
+        for a, b, size in zip(leaves(one), leaves(other), sizes, strict=True):
+            if a is not None and np.any(np.abs(a - b) > SAME * size):
+                raise ValueError(f"{words}state after their jumps depends on their order; write one event for both")
+        if self.traced and not self._moves_alike(first, second, u):
+            raise DerivativeError(f"{words}derivative of the state depends on their order; write one event for both")
+
+    def _moves_alike(self, first, second, u):
+        """Whether the times of two events have the same derivative in the state, the params and the time."""
+        rates = self.parent.problem(u, self.params, self.t)
+        rows = []
+        for event in (first, second):
+            point = (u, self.params, float(self.t))
+            back = pullback(lambda point, event=event: 1.0 * event.value(*point), point)[1]
+            of_state, of_params, of_time = back(np.float64(1.0))
+            change = inner(of_state, rates) + of_time
+            row = [np.ravel(leaf) for leaf in (*leaves(of_state), *leaves(of_params), of_time) if leaf is not None]
+            rows.append(np.concatenate(row) / (change or 1.0))
+        return rows[0].shape == rows[1].shape and np.allclose(*rows, rtol=1e-6, atol=0.0)
 
     def _at_the_end(self, side, stop):
         """An event within rounding of the end of the interval, or None."""

@@ -28,6 +28,7 @@ class Scene(NamedTuple):
     end: float
     of_start: bool
     slope: float
+    max_step: float | None = None  # where something brief could fall between two evaluations of the rate
 
 
 def layer(c, s, w, end):
@@ -60,7 +61,14 @@ def jumping(rng):
         w = 10 ** rng.uniform(-2.5, -0.5)
         rate = lambda u, x, t: anp.where((t > x) & (t < x + w), a / w, 0.0) - c * u
         return Scene(
-            "pulse", rate, one, np.array([s]), end, False, a / w * np.exp(-c * (end - s)) * (np.exp(c * w) - 1)
+            "pulse",
+            rate,
+            one,
+            np.array([s]),
+            end,
+            False,
+            a / w * np.exp(-c * (end - s)) * (np.exp(c * w) - 1),
+            max_step=w if w < 0.01 * end else None,
         )
     if kind == 3:
         rate = lambda u, x, t: anp.where(t > s, a, 0.0) - c * u
@@ -103,9 +111,9 @@ def smooth(rng):
     return Scene("logistic", rate, np.array([u0]), np.array([p]), end, False, end * value * (1 - value))
 
 
-def outcome(scene, method, tolerance, **options):
+def outcome(scene, method, tolerance):
     """ "refused", "right" or "wrong" (by more than 1 %)."""
-    step = dp.stepper(method, scene.rate, scene.end, timed=True, tolerance=tolerance, **options)
+    step = dp.stepper(method, scene.rate, scene.end, timed=True, tolerance=tolerance, max_step=scene.max_step)
 
     def loss(x):
         start, p = (x, scene.p) if scene.of_start else (scene.start, x)

@@ -14,6 +14,8 @@ from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, S
 
 NO_END = event(lambda u, g: u[0], terminal="yes")
 UP = event(lambda u, g: u[0], direction="up")
+PAIR = event(lambda u, g: u[0], terminal=np.array([1, 2]))
+FASTER = (lambda u, g: 2.0 * u[0], lambda u, g: anp.array([u[0], u[1] + 1.0]))
 APEX = event(lambda u, g: u[0] - 1.0, terminal=True)
 BALL = lambda events, **options: dp.stepper("rk4", falling, 2.0, **{"tolerance": 1e-6, "events": events, **options})
 FALL = lambda events: BALL(events)((np.array([1.0, 0.0]), 0.0), 9.81)
@@ -24,6 +26,17 @@ def thrown(speed, method="rk4"):
     """The derivative, in the speed, of the time at which a ball reaches 1."""
     step = dp.stepper(method, falling, 2.0, tolerance=1e-6, events=APEX)
     return value_and_grad(lambda v: step((anp.array([0.0, v]), 0.0), 9.81)[1])(speed)
+
+
+def weighed(u, g):
+    """An event whose time has another derivative than that of the bounce at the same time."""
+    return u[0] + 0.1 * (g - 9.81)
+
+
+def before_the_bounce(g):
+    """A Hessian product of a height that is linear in g: its interval ends just before the bounce."""
+    step = dp.stepper("heun", falling, 0.25 * (1 - 1e-12) * np.sqrt(2 / 9.81), tolerance=1e-1, events=(ground, bounce))
+    return dp.hvp(lambda g: dp.rollout(step, (np.array([1.0, 0.0]), 0.0), g, 4)[0][0], g, 1.0)
 
 
 def closed(u, p, t):
@@ -117,6 +130,30 @@ TABLE = [
         lambda: BALL([NO_END]),
         ValueError,
         "the attribute terminal of events[0] must be True or False, got 'yes'",
+    ),
+    (
+        lambda: BALL([PAIR]),
+        ValueError,
+        "the attribute terminal of events[0] must be True or False, got array([1, 2])",
+    ),
+    (
+        lambda: FALL([(ground, bounce), FASTER]),
+        ValueError,
+        "events[0] and events[1] of stepper(rk4) occur at the same time t = 0.451523640986, and the state after their "
+        "jumps depends on their order; write one event for both",
+    ),
+    (
+        lambda: value_and_grad(lambda g: BALL([(ground, bounce), weighed])((np.array([1.0, 0.0]), 0.0), g)[0][1])(9.81),
+        DerivativeError,
+        "events[0] and events[1] of stepper(rk4) occur at the same time t = 0.451523640986, and the derivative of the "
+        "state depends on their order; write one event for both",
+    ),
+    (
+        lambda: before_the_bounce(9.81),
+        DerivativeError,
+        "a second derivative of stepper(heun) over 6 steps is 0 to rounding, which error control cannot tell from an "
+        "error: the result does not depend on it to second order, as that of a ball before its first bounce; leave it "
+        "out, or take fixed steps",
     ),
     (
         lambda: BALL([UP]),

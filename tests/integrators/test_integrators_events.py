@@ -73,8 +73,7 @@ def landing_time(drag, speed=30.0):
     [
         ("heun", 1e-1),
         ("radau", 1e-6),
-        *(pytest.param(m, 1e-3, marks=pytest.mark.whole) for m in ("rk4", "ssprk3")),
-        *(pytest.param(m, 1e-3, marks=pytest.mark.slow) for m in ("tr_bdf2", "crank_nicolson")),
+        *(pytest.param(m, 1e-3, marks=pytest.mark.whole) for m in ("rk4", "ssprk3", "tr_bdf2", "crank_nicolson")),
     ],
 )
 def test_a_bouncing_ball(method, tolerance):
@@ -101,7 +100,7 @@ def test_a_bouncing_ball_bends():
         ("rk4", 1e-6, 1e-5),
         ("radau", 1e-6, 1e-6),
         pytest.param("heun", 1e-5, 1e-4, marks=pytest.mark.whole),
-        pytest.param("tr_bdf2", 1e-5, 1e-4, marks=pytest.mark.slow),
+        pytest.param("tr_bdf2", 1e-5, 1e-4, marks=pytest.mark.whole),
     ],
 )
 def test_the_landing_time_of_a_cannonball(method, tolerance, near):
@@ -130,7 +129,7 @@ def switching(u, p, t):
         ("rk4", 1e-6, 1e-5),
         ("radau", 1e-6, 1e-6),
         pytest.param("heun", 1e-3, 1e-3, marks=pytest.mark.whole),
-        pytest.param("tr_bdf2", 1e-4, 1e-4, marks=pytest.mark.slow),
+        pytest.param("tr_bdf2", 1e-4, 1e-4, marks=pytest.mark.whole),
     ],
 )
 def test_a_rate_that_switches_with_the_state(method, tolerance, near):
@@ -194,6 +193,35 @@ def test_events_in_a_rollout_under_a_budget():
     found = value_and_grad(loss)(9.81)
     assert found == pytest.approx((value, slope), rel=1e-9)
     assert value_and_grad(lambda g: loss(g, memory=200))(9.81) == found
+
+
+def halve(u, g):
+    return anp.array([u[0], 0.5 * u[1]])
+
+
+@pytest.mark.parametrize(
+    "events, factor",
+    [
+        ([(ground, bounce), lambda u, g: 2.0 * u[0]], 0.8),
+        ([(ground, bounce), (lambda u, g: 2.0 * u[0], halve)], 0.4),
+        ([(lambda u, g: 2.0 * u[0], halve), (ground, bounce)], 0.4),
+        ([event(lambda u, g: 2.0 * u[0], terminal=True), (ground, bounce)], None),
+        ([(ground, bounce), event(lambda u, g: 2.0 * u[0], terminal=True)], None),
+    ],
+)
+def test_events_at_the_same_time_are_all_recorded(events, factor):
+    """Their jumps act in the order of `events`; the first one moved the state off the surface of the second."""
+    step = dp.stepper("rk4", falling, 0.5, tolerance=1e-6, events=events)
+    loss = lambda g: step((np.array([1.0, 0.0]), 0.0), g)[0][1]
+    time, root = np.sqrt(2 / 9.81), np.sqrt(2 * 9.81)
+    if factor is None:  # the speed after the bounce, at which the step ends
+        value, slope = 0.8 * root, 0.8 / root
+    else:
+        value = factor * root - 9.81 * (0.5 - time)
+        slope = factor / root - 0.5 + 0.5 * time
+    assert loss(9.81) == pytest.approx(value, rel=1e-9)
+    assert [times == pytest.approx([time], rel=1e-12) for times in step.t_events] == [True, True]
+    assert value_and_grad(loss)(9.81) == pytest.approx((value, slope), rel=1e-9)
 
 
 def test_an_event_at_the_start_is_left():

@@ -37,6 +37,14 @@ def test_a_pulse_is_seen(method, tolerance):
     assert step((np.ones(1), 0.0))[0][0] == pytest.approx(0.505060, abs=max(tolerance, 1e-6))
 
 
+def test_a_pulse_is_seen_in_a_step_over_an_uneven_rate():
+    """Such a step was searched where the smooth part of the rate changes, and nowhere else."""
+    pulse = lambda u, x, t: anp.where((t > x) & (t < x + 0.0125), 200.0, 0.0) - 1.34 * u
+    step = dp.stepper("radau", pulse, 2.03, tolerance=6e-3)
+    exact = np.exp(-1.34 * 2.03) + 200 / 1.34 * np.exp(-1.34 * (2.03 - 0.975)) * np.expm1(1.34 * 0.0125)
+    assert step((np.ones(1), 0.0), 0.975)[0][0] == pytest.approx(exact, rel=6e-3)
+
+
 @pytest.mark.whole
 def test_a_narrow_bell_is_seen():
     bell = lambda u, p, t: anp.exp(-(((t - 1.0) / 0.01) ** 2)) - u
