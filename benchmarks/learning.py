@@ -16,8 +16,8 @@ from benchmarks.triad import best_times
 from sparsedp import network
 from sparsedp._utils import pytree
 from sparsedp.autodiff.flattening import Packing
-from sparsedp.optimize.directions import Family
-from sparsedp.optimize.linearised import Linearised
+from sparsedp.optimize.linearization import Linearization
+from sparsedp.optimize.update_direction import DirectionFamily
 
 SIZES = (64, 64), (64, 128), (128, 64), (64, 64)  # 24896 weights
 
@@ -92,7 +92,7 @@ def oscillators(rng):
 def by_svd(quick):
     """A half-inverse direction for the 128 x 1444 Jacobian of the oscillators: limit 4 x a dense SVD."""
     misses, weights = oscillators(np.random.default_rng(0))
-    packing, family = Packing(weights), Family()
+    packing, family = Packing(weights), DirectionFamily()
     point = packing.pack(weights)
 
     def by_hand(jacobian, g):
@@ -101,10 +101,10 @@ def by_svd(quick):
         return right[kept].T @ (left.T[kept] @ g / np.sqrt(s[kept]))
 
     def dense(apart):
-        linearised = Linearised(misses, packing, point, apart=apart)
+        linearised = Linearization(misses, packing, point, apart=apart)
         return by_hand(linearised.rows(), linearised.flat)
 
-    linearised = Linearised(misses, packing, point, apart=True)
+    linearised = Linearization(misses, packing, point, apart=True)
     jacobian, g = linearised.rows(), linearised.flat
     known = by_hand(jacobian, g)
     gap = np.linalg.norm(family(linearised, g).step - known) / np.linalg.norm(known)

@@ -56,11 +56,11 @@ from .operators.transfer import component as component
 from .operators.transfer import prolong as prolong
 from .operators.transfer import restrict as restrict
 from .operators.transfer import sample as sample
-from .optimize.directions import update_direction as update_direction
 from .optimize.minimize import minimize as minimize
-from .optimize.physical import physical_gradient as physical_gradient
+from .optimize.physical_gradient import physical_gradient as physical_gradient
 from .optimize.regularization import smoothness as smoothness
 from .optimize.regularization import total_variation as total_variation
+from .optimize.update_direction import update_direction as update_direction
 from .parallel.distribute import distribute as distribute
 from .parallel.distribute import gather as gather
 from .parallel.scenes import ensemble as ensemble

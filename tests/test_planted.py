@@ -475,14 +475,14 @@ BUGS = {
     # ---- optimize, blackbox, network
     "a running mean without the correction of its start": Bug(
         "optimize",
-        "np.sqrt(square / (1 - b2**count))",
-        "np.sqrt(square)",
+        "np.sqrt(mean_square / (1 - b2**count))",
+        "np.sqrt(mean_square)",
         "tests/optimize/test_minimize.py tests/optimize/test_minimize_inside.py",
     ),
     "a wrong derivative that passes for rounding": Bug(
         "optimize",
-        "hopeless = falls[0] <= 100",
-        "hopeless = falls[-1] <= 100",
+        "lost_in_rounding = decreases[0] <= ROUNDINGS",
+        "lost_in_rounding = decreases[-1] <= ROUNDINGS",
         "tests/optimize/test_minimize_refusals.py",
     ),
     "a step across a bound": Bug(

@@ -1,9 +1,11 @@
-"""A run of minimize written down as it goes, whole or not at all, and taken up again."""
+"""Checkpoints of a run of `minimize`: each state is one file, written whole or not at all."""
+
+from __future__ import annotations
 
 import hashlib
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,13 +13,19 @@ from sparsedp._utils.pytree import flatten, leaves, norm
 from sparsedp.autodiff.fast_derivatives import ranks, whole
 from sparsedp.io.atomic_files import UNFINISHED, load_tree, path_errors, save_tree
 from sparsedp.optimize.checkpoint_upgrade import FORMAT_0_2, upgraded
-from sparsedp.optimize.result import Failure, Record, Trial
+from sparsedp.optimize.result import Evaluation, Failure, Record
+
+if TYPE_CHECKING:
+    import os
+
+    from sparsedp.optimize.monitor import Monitor
+    from sparsedp.optimize.objective import Objective
 
 __all__ = ["Checkpoint"]
 
 FORMAT = "sparsedp optimization 5"
-KEPT = 2
-NEAR = 1e-6  # share of loss and gradient at the start by which other ranks or another version may differ
+STATES = 2  # how many are kept
+ROUNDING = 1e-6  # share of loss and gradient at the start by which other ranks or another version may differ
 SHARE = 0.1  # a state is written when that takes at most this share of the time since the last one
 
 
@@ -28,25 +36,39 @@ class Checkpoint:
     ----------
     folder : path or None
     settings : dict
-        What the run depends on, beside the loss and the batches: name -> any value. A folder of another run is refused.
+        What the run depends on beside the loss and the batches: name and any value. A folder of a run with other
+        settings is refused.
+
+    Attributes
+    ----------
+    resumed : str
+        Whether the run continued from the folder; empty without one.
     """
 
-    def __init__(self, folder, settings):
-        self._folder: Any = None if folder is None else Path(folder)
+    def __init__(self, folder: str | os.PathLike[str] | None, settings: dict[str, Any]):
+        self._folder: Any = None
+        if folder is not None:
+            self._folder = Path(folder)
         self._settings = settings
-        self._latest: Any = None  # what is to be written
-        self._written, self._cost = -np.inf, 0.0
+        self._unwritten: Any = None  # content of the last state, until it is written
+        self._last_write_time = -np.inf
+        self._last_write_seconds = 0.0
         self.resumed = ""
 
-    def resume(self, template, trials, watch):
-        """The last state of the folder, put into trials and watch too; None when there is none.
+    def resume(self, template: Any, objective: Objective, monitor: Monitor) -> Any:
+        """Return the last state of the folder, None if there is none; objective and monitor continue from it.
 
-        `template` is the state at the start: what a state looks like, and proof that the loss is the same there.
+        Parameters
+        ----------
+        template : state
+            At the start. Its structure is that of every state; its loss is compared with that of the folder.
+        objective : Objective
+        monitor : Monitor
 
         Raises
         ------
         ValueError
-            If the folder holds another run, or one with other batches or with another loss at its last point.
+            If the folder holds a run with other settings, batches, or another loss at its last point.
         """
         if self._folder is None:
             return None
@@ -55,44 +77,58 @@ class Checkpoint:
         self._settings = {name: fingerprint(value) for name, value in self._settings.items()}
         self._settings["list of batches"] = ""
         content, skipped = self._load()
-        for number in range(content["iteration"] + 1 if content else 1):
-            self._pass(trials.batches, number)
+        past_iterations = content["iteration"] + 1 if content else 1
+        for number in range(past_iterations):
+            self._add_batch(objective.batches.at(number))
         if not content:
             self.resumed = f"nothing to resume in {self._folder}{skipped}"
             return None
         self.resumed = f"resumed from iteration {content['iteration']} in {self._folder}{skipped}"
         for name, setting in self._settings.items():
-            self._check(name, setting == content["settings"].get(name))
-        history, start = [_record(row) for row in content["history"]], template.trial
-        value, size = history[0].value, history[0].gradient_norm
-        rounds_alike = content["ranks"] == ranks() and content["format"] == FORMAT
-
-        def same(now, then, size):
-            """Whether two numbers or vectors agree bit for bit; with other ranks or versions up to rounding."""
-            if np.array_equal(now, then):
-                return True
-            return not rounds_alike and norm(now - then) <= NEAR * abs(size)
-
-        same_norm = same(trials.as_given(norm(trials.downhill(start))), size, size)
-        self._check("loss at the start", same_norm and same(trials.as_given(start.value), value, value))
-        if content["format"] == FORMAT_0_2:
-            state, best = upgraded(content["state"], content["best"], template, trials.residual_scale)
-        else:
+            self._check_same(name, setting == content["settings"].get(name))
+        history = [_record(fields) for fields in content["history"]]
+        start = template.current
+        exact = content["ranks"] == ranks() and content["format"] == FORMAT
+        self._check_start(start, history[0], objective, exact)
+        if content["format"] == FORMAT:
             state = flatten(template)[1](content["state"])
-            best = Trial(*content["best"])
-        trials.iteration = content["iteration"]
-        again, last = trials(state.trial.vector), state.trial
-        same_value = same(again.value, last.value, start.value)
-        same_slope = same(again.slope, last.slope, norm(trials.downhill(start)))
-        self._check("loss at the last point", same_value and same_slope)
-        trials.best, trials.count = best, content["evaluations"]
-        watch.resume(history, start, last)
+            best = Evaluation(*content["best"])
+        else:
+            state, best = upgraded(content["state"], content["best"], template, objective.residual_scale)
+        objective.iteration = content["iteration"]
+        self._check_last_point(state.current, start, objective, exact)
+        objective.best = best
+        objective.count = content["evaluations"]
+        monitor.resume(history, start, state.current)
         return state
 
+    def _check_start(self, start, record, objective, exact):
+        """Refuse another loss than that of the first record."""
+        value = objective.in_units_of_loss(start.value)
+        gradient_norm = objective.in_units_of_loss(norm(objective.projected_gradient(start)))
+        same = _agree(value, record.value, record.value, exact)
+        same = same and _agree(gradient_norm, record.gradient_norm, record.gradient_norm, exact)
+        self._check_same("loss at the start", same)
+
+    def _check_last_point(self, last, start, objective, exact):
+        """Refuse another loss at the last point than the stored one."""
+        again = objective(last.point)
+        same = _agree(again.value, last.value, start.value, exact)
+        same = same and _agree(again.gradient, last.gradient, norm(objective.projected_gradient(start)), exact)
+        self._check_same("loss at the last point", same)
+
+    def _check_same(self, name, same):
+        """Refuse a folder of a run in which something differs."""
+        if not same:
+            raise ValueError(
+                f"{self._folder} holds a run with another {name} than the one given; give what it was begun with, or "
+                "write another checkpoint folder"
+            )
+
     def _load(self):
-        """The newest state that is whole, empty without one, and words on files that were skipped."""
+        """Return the content of the newest valid file, empty without one, and words on files that were skipped."""
         skipped = [f"; skipped {path.name}: an unfinished write" for path in self._folder.glob(f"*{UNFINISHED}")]
-        for path in self._states():
+        for path in self._files():
             for version in (FORMAT, FORMAT_0_2):
                 content = load_tree(path, version)
                 if content:
@@ -100,65 +136,81 @@ class Checkpoint:
             skipped.append(f"; skipped {path.name}: damaged, or not a state of sparsedp")
         return {}, "".join(skipped)
 
-    def _states(self):
+    def _files(self):
+        """Return the files of states, newest first."""
         return sorted(self._folder.glob("state-*.npz"), reverse=True)
 
-    def _check(self, name, same):
-        if not same:
-            raise ValueError(
-                f"{self._folder} holds a run with another {name} than the one given; give what it was begun with, or "
-                "write another checkpoint folder"
-            )
-
-    def _pass(self, batches, number):
-        so_far = self._settings["list of batches"] + fingerprint(batches.at(number))
+    def _add_batch(self, batch):
+        """Add the batch of an iteration to the fingerprint of all batches so far."""
+        so_far = self._settings["list of batches"] + fingerprint(batch)
         self._settings = {**self._settings, "list of batches": _digest(so_far.encode())}
 
-    def save(self, state, trials, watch):
-        """Write the state down, unless that was done a moment ago and the run goes on."""
+    def save(self, state: Any, objective: Objective, monitor: Monitor) -> None:
+        """Write the state, unless one was written a moment ago and the run continues."""
         if self._folder is None:
             return
-        self._pass(trials.batches, watch.iteration)
-        self._latest = {
-            "iteration": watch.iteration, "settings": self._settings, "ranks": ranks(),
-            "evaluations": trials.count, "state": leaves(state), "best": list(trials.best),
-        }  # fmt: skip
-        if SHARE * (time.perf_counter() - self._written) >= self._cost or watch.message:
-            self.write(watch.history)
+        self._add_batch(objective.batches.at(monitor.iteration))
+        self._unwritten = {
+            "iteration": monitor.iteration,
+            "settings": self._settings,
+            "ranks": ranks(),
+            "evaluations": objective.count,
+            "state": leaves(state),
+            "best": list(objective.best),
+        }
+        seconds_since_write = time.perf_counter() - self._last_write_time
+        if SHARE * seconds_since_write >= self._last_write_seconds or monitor.message:
+            self.write(monitor.history)
 
-    def write(self, history):
-        """Write down the state of the last iteration that is complete, unless that was done."""
-        if self._latest is None:
+    def write(self, history: list[Record]) -> None:
+        """Write the state of the last complete iteration, unless it is written."""
+        if self._unwritten is None:
             return
-        begun, number = time.perf_counter(), self._latest["iteration"]
+        begin = time.perf_counter()
+        number = self._unwritten["iteration"]
         path = self._folder / f"state-{number:09d}.npz"
-        save_tree(path, {**self._latest, "history": history[: number + 1]}, FORMAT)
-        for older in [state for state in self._states() if state <= path][KEPT:]:  # newer ones are damaged
-            older.unlink(missing_ok=True)
-        self._latest, self._written = None, time.perf_counter()
-        self._cost = self._written - begun
+        save_tree(path, {**self._unwritten, "history": history[: number + 1]}, FORMAT)
+        up_to_this = [file for file in self._files() if file <= path]  # newer ones are damaged
+        for file in up_to_this[STATES:]:
+            file.unlink(missing_ok=True)
+        self._unwritten = None
+        self._last_write_time = time.perf_counter()
+        self._last_write_seconds = self._last_write_time - begin
+
+
+def fingerprint(tree: Any) -> str:
+    """Return a hash of any value: of its structure, of the type and content of every leaf, of a function its name."""
+    entries, rebuild = flatten(tree)
+    structure = repr(rebuild(range(len(entries))))
+    return _digest("\n".join([structure, *map(_description, entries)]).encode())
 
 
 def _digest(content):
+    """Return the SHA-256 hash of bytes."""
     return hashlib.sha256(content).hexdigest()
 
 
-def fingerprint(tree):
-    """Any value -> a hash of its kind and content: of its structure, of every leaf, of a function its name."""
-    entries, rebuild = flatten(tree)
-    return _digest("\n".join([repr(rebuild(range(len(entries)))), *map(_word, entries)]).encode())
-
-
-def _word(leaf):
+def _description(leaf):
+    """Return the type and content of a leaf in words that are the same in every process."""
     leaf = whole(leaf)
     kind = type(leaf).__qualname__
     if isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype != object:
         return f"{kind} {leaf.dtype} {leaf.shape} {_digest(leaf.tobytes())}"
     if callable(leaf):
         return f"{getattr(leaf, '__module__', '')} {getattr(leaf, '__qualname__', kind)}"
-    return kind if " at 0x" in repr(leaf) else f"{kind} {leaf!r}"  # an address is another one in the next process
+    if " at 0x" in repr(leaf):  # an address differs in the next process
+        return kind
+    return f"{kind} {leaf!r}"
 
 
-def _record(row):
-    record = Record(*row)
-    return record._replace(failed=tuple(Failure(*words) for words in record.failed))
+def _agree(value, stored, size, exact):
+    """Return whether two numbers or vectors agree: bit for bit, or if not `exact` up to rounding of a size."""
+    if np.array_equal(value, stored):
+        return True
+    return not exact and norm(value - stored) <= ROUNDING * abs(size)
+
+
+def _record(fields):
+    """Return a record of the history from its stored fields."""
+    record = Record(*fields)
+    return record._replace(failed=tuple(Failure(*failure) for failure in record.failed))

@@ -6,19 +6,19 @@ from typing import Any
 
 from sparsedp.optimize.first_order import DescentState
 from sparsedp.optimize.least_squares import SquaresState
-from sparsedp.optimize.newton import NewtonState
-from sparsedp.optimize.result import Trial
-from sparsedp.optimize.trials import SMALLEST
+from sparsedp.optimize.newton_cg import NewtonState
+from sparsedp.optimize.objective import SMALLEST
+from sparsedp.optimize.result import Evaluation
 
 __all__ = ["FORMAT_0_2", "upgraded"]
 
 FORMAT_0_2 = "sparsedp optimization 4"
-TRIAL_FIELDS = 5  # a state begins with the fields of its point
+POINT_FIELDS = 5  # a state begins with the fields of its point
 
 
 def upgraded(
     state_fields: list[Any], best_fields: list[Any], template: Any, residual_scale: float | None
-) -> tuple[Any, Trial]:
+) -> tuple[Any, Evaluation]:
     """Return the state and the best point of a checkpoint of version 0.2.
 
     Parameters
@@ -33,33 +33,33 @@ def upgraded(
     Returns
     -------
     state : named tuple like template
-    best : Trial
+    best : Evaluation
     """
     residual_scale = residual_scale or 1.0
-    trial = _trial(state_fields[:TRIAL_FIELDS], residual_scale)
-    state = _state(trial, state_fields[TRIAL_FIELDS:], template, residual_scale)
-    return state, _trial(best_fields, residual_scale)
+    current = _evaluation(state_fields[:POINT_FIELDS], residual_scale)
+    state = _state(current, state_fields[POINT_FIELDS:], template, residual_scale)
+    return state, _evaluation(best_fields, residual_scale)
 
 
-def _trial(fields, residual_scale):
+def _evaluation(fields, residual_scale):
     """Return a point with its loss and gradient, given those of residuals that were not divided."""
-    vector, value, slope, rounding, iteration = fields
+    vector, value, gradient, rounding, iteration = fields
     value = value / residual_scale / residual_scale
-    slope = slope / residual_scale / residual_scale
+    gradient = gradient / residual_scale / residual_scale
     rounding = max(rounding / residual_scale / residual_scale, SMALLEST)
-    return Trial(vector, value, slope, rounding, iteration)
+    return Evaluation(vector, value, gradient, rounding, iteration)
 
 
-def _state(trial, fields, template, residual_scale):
+def _state(current, fields, template, residual_scale):
     """Return the state of a method from its fields in version 0.2 after the point."""
     if isinstance(template, DescentState):
         velocity, rate, share = fields  # the rate belonged to the gradient itself
-        return DescentState(trial, velocity, rate * template.height, share, template.height)
+        return DescentState(current, velocity, rate * template.gradient_unit, share, template.gradient_unit)
     if isinstance(template, NewtonState):
         radius, size = fields  # the radius was in the units of x
-        return NewtonState(trial, radius / template.length, size, template.length)
+        return NewtonState(current, radius / template.length_unit, size, template.length_unit)
     if isinstance(template, SquaresState):
         damping, share = fields  # the damping belonged to the Jacobian itself
         unit = 1.0 if damping else 0.0
-        return SquaresState(trial, damping / residual_scale / residual_scale, share, unit)
-    return type(template)(trial, *fields)
+        return SquaresState(current, damping / residual_scale / residual_scale, share, unit)
+    return type(template)(current, *fields)

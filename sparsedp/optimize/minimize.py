@@ -1,7 +1,12 @@
-"""minimize(): the loop around every method."""
+"""minimize(): checks of the arguments, and the loop around the methods."""
 
-import inspect
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from inspect import signature
 from math import inf
+from typing import TYPE_CHECKING, Any
 
 from sparsedp._utils.calls import advice_near, foreign_keyword_advice
 from sparsedp._utils.progress import shown_steps
@@ -9,72 +14,81 @@ from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_choice, check_function, check_number, check_whole, is_number
 from sparsedp.autodiff.fast_derivatives import ELSEWHERE, together
 from sparsedp.autodiff.flattening import Packing
+from sparsedp.optimize.admm import ADMM
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.checkpoint import Checkpoint
-from sparsedp.optimize.first_order import Adam, Descent
+from sparsedp.optimize.first_order import Adam, GradientDescent
+from sparsedp.optimize.lbfgs import LBFGS
 from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
-from sparsedp.optimize.newton import NewtonCG
-from sparsedp.optimize.physical import PhysicalGradient
+from sparsedp.optimize.monitor import Monitor
+from sparsedp.optimize.newton_cg import NewtonCG
+from sparsedp.optimize.objective import Objective
+from sparsedp.optimize.physical_gradient import PhysicalGradient
 from sparsedp.optimize.projection import Projection
-from sparsedp.optimize.quasi_newton import Quasi
-from sparsedp.optimize.result import NO_RESIDUALS, Stuck
-from sparsedp.optimize.sparse_terms import admm
-from sparsedp.optimize.trials import Trials
-from sparsedp.optimize.watch import Watch
+from sparsedp.optimize.result import NO_RESIDUALS, Minimum, NoStepFound, Record
 
-__all__ = ["minimize"]
+if TYPE_CHECKING:
+    import os
 
-INTERRUPTED = "minimize was interrupted; call it once more, with start=best.x"
-METHODS = {
-    "lbfgs": Quasi,
-    "gd": Descent,
-    "adam": Adam,
-    "newton_cg": NewtonCG,
-    "gauss_newton": GaussNewton,
-    "levenberg_marquardt": LevenbergMarquardt,
-    "half_inverse": HalfInverse,
-    "physical_gradient": PhysicalGradient,
+    from sparsedp.optimize.method import Method
+
+__all__ = ["METHODS", "minimize"]
+
+INTERRUPTED = "minimize was interrupted; call it again, with start=best.x"
+METHODS: dict[str, type[Method] | type[ADMM]] = {
+    method.name: method
+    for method in (
+        LBFGS,
+        GradientDescent,
+        Adam,
+        NewtonCG,
+        GaussNewton,
+        LevenbergMarquardt,
+        HalfInverse,
+        PhysicalGradient,
+        ADMM,
+    )
 }
 
 
 def minimize(
-    loss,
-    start,
-    method="lbfgs",
-    maxiter=100,
-    tolerance=1e-8,
-    callback=None,
-    progress=False,
-    gradient=None,
-    bounds=None,
-    project=None,
-    batches=None,
-    checkpoint=None,
-    **options,
-):
-    """Loss and start -> the best point found: any nesting of arrays in, the same nesting out.
+    loss: Callable[..., Any],
+    start: Any,
+    method: str = "lbfgs",
+    maxiter: int = 100,
+    tolerance: float | Callable[[Record, Record], Any] = 1e-8,
+    callback: Callable[[Record, Any], Any] | None = None,
+    progress: bool | str = False,
+    gradient: Callable[..., Any] | None = None,
+    bounds: Any = None,
+    project: Callable[[Any], Any] | None = None,
+    batches: Sequence[Any] | Callable[[int], Any] | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    **options: Any,
+) -> Minimum:
+    """Minimize a loss of any nesting of arrays; the result has the nesting of the start.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x) -> real scalar``; with batches ``loss(x, batch)``. For gauss_newton, levenberg_marquardt and
+        ``loss(x)``, a real scalar; with batches ``loss(x, batch)``. For gauss_newton, levenberg_marquardt and
         half_inverse it returns residuals, an array, and half the sum of their squares is minimized. For
         physical_gradient it is a function of the end state ``physics(x)``.
     start : array, number, or any nesting of them in tuples, lists and dicts
-        Not modified. Leaves that are not floating stay as they are. Where one is a field on ranks, PETSc's TAO does
-        the search, by lbfgs, with bounds that are numbers, and without the other options.
+        Not modified. Leaves that are not floating are kept. Where a leaf is a field on ranks, PETSc's TAO minimizes,
+        by lbfgs, with bounds that are numbers, and without the other options.
     method : str
         "lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "levenberg_marquardt", "half_inverse",
-        "physical_gradient"; or "admm", which adds weight |K x|_1 to the loss: few entries, few jumps.
+        "physical_gradient"; or "admm", which adds weight |K x|_1 to the loss, for results with few entries or jumps.
     maxiter : int
-        Most iterations; 0 evaluates the start and returns it.
+        Most iterations; with 0 the start is evaluated and returned.
     tolerance : float or callable
         Converged when the Euclidean norm of the gradient has fallen to `tolerance` times its value at the
-        start; nothing in the test is absolute. A callable is asked ``tolerance(record, first_record)``; one
-        such as `certified` also chooses how far the solves of the loss go.
+        start; nothing in the test is absolute. A callable ``tolerance(record, first_record)`` returns whether the run
+        has converged; `certified` also chooses the accuracy of the solves in the loss.
     callback : callable, optional
-        ``callback(record, x)`` after every iteration; a true answer stops the run.
+        ``callback(record, x)`` is called after every iteration; a true result stops the run.
     progress : bool or str
         A progress bar on standard error, a string is its label; needs the extra `plot`.
     gradient : callable, optional
@@ -82,7 +96,7 @@ def minimize(
     bounds : (lower, upper), optional
         Each a number, None for none, or a tree like start, in which a number or None may stand for a whole branch;
         entries of dicts are paired by key. Points are moved onto the box. half_inverse compares
-        no losses and may settle elsewhere on the box than the others.
+        no losses and may converge to another point of the box than the other methods.
     project : callable, optional
         ``project(x)``, a differentiable projection onto a linear or affine space, such as dp.projection(grid): the
         loss is that of project(x), and the result is project(x). The map is tested at the start and at the result:
@@ -92,18 +106,18 @@ def minimize(
         rate, adam and half_inverse; the result is the last point, not the best one. Converged when the gradient has
         been small in as many iterations on end as there are batches, 10 for a function.
     checkpoint : path, optional
-        A folder that keeps the last two states. The same call goes on from the last one, to the same bits, when the
-        run was killed, interrupted, stopped by its callback or by maxiter; a new problem needs a new folder.
+        A folder that keeps the last two states. If the run was killed, interrupted, or stopped by its callback or by
+        maxiter, the same call continues from the last state, to the same bits. A new problem needs a new folder.
     **options
-        Of the method; any other option is refused.
+        Of the method, see the table; any other option is refused.
 
         ===================  ==============  ============  =============================================================
         method               option          default       meaning
         ===================  ==============  ============  =============================================================
-        lbfgs                memory          10            steps that the curvature is taken from
+        lbfgs                memory          10            steps from which the curvature is estimated
         lbfgs                line_search     20            most trial points in one line search
         gd                   rate            None          step per gradient; None: found by backtracking
-        gd                   momentum        0.0           share of the last step that is added, from 0 to below 1
+        gd                   momentum        0.0           share of the last step that is added, 0 <= momentum < 1
         gd                   line_search     None          "backtracking": halve the step until the loss falls
         adam                 rate            1e-3          size of a step in every entry
         adam                 betas           (0.9, 0.999)  memory of the mean of the gradient and of its square
@@ -132,11 +146,11 @@ def minimize(
         admm                 prox            None          ``prox(v, t)`` in place of the soft threshold
         ===================  ==============  ============  =============================================================
 
-        apart=True is the fast way for samples: the loss takes every leaf of x with a leading axis of copies, one for
+        apart=True is the fast form for samples: the loss takes every leaf of x with a leading axis of copies, one for
         each sample, and a few products give the whole Jacobian.
         absolute_sigma: whether the residuals are divided by their standard deviations; it decides what `covariance` is,
         as in scipy.optimize.curve_fit.
-        weight: few jumps on a uniform grid are asked for by operator=dp.gradient(grid) and a weight times the volume
+        weight: for few jumps on a uniform grid write operator=dp.gradient(grid) and a weight times the volume
         of a cell. inner: ``inner(target, rho, x)`` returns the x that minimizes loss(x) plus rho / 2 times the sum of
         (K x - target)^2; then without bounds. With prox the values are those of the loss alone. Iterations of admm are
         rounds, and a tolerance of 1e-4 is usual.
@@ -147,7 +161,7 @@ def minimize(
         `.x`, `.value`, `.history` (a record for each iteration), `.message`, `.converged`,
         `.evaluations`; str() is a table. `.x` is the best point seen. `.covariance` of a least-squares problem:
         s^2 (J^T J)^(-1) with s^2 = |r|^2 / (m - n), or (J^T J)^(-1) with absolute_sigma=True.
-        Ctrl-C ends the run with the best point so far and the message "interrupted"; a second one stops at once.
+        Ctrl-C ends the run with the best point so far and the message "interrupted"; a second Ctrl-C stops at once.
 
     Raises
     ------
@@ -160,12 +174,12 @@ def minimize(
     KeyboardInterrupt
         If Ctrl-C comes before the loss is known at the start, or a second time.
     TypeError
-        If the method has no such option, or what must be a number is none.
+        If the method has no such option, or an argument that must be a number is something else.
     UnstableStepError, ConvergenceError, NonFiniteError
         If the loss raises one of them, or is NaN or infinite, at the start. At a trial point the same
-        counts as an infinite loss: the search goes back, and the record of the iteration lists it.
+        counts as an infinite loss: the method tries a nearer point, and the record of the iteration lists it.
     ImportError
-        If a progress bar is wanted and tqdm is not installed.
+        If `progress` is given and tqdm is not installed.
 
     Examples
     --------
@@ -180,110 +194,126 @@ def minimize(
     check_function("minimize", loss, "lambda x: np.sum(x**2)")
     if callback is not None:
         check_function("callback of minimize", callback, "lambda record, x: False")
-    stepper = _stepper(method, options) if method != "admm" else None
+    chosen = _method(method, options)
     maxiter = check_whole("maxiter of minimize", maxiter, 0, "; the default is 100")
-    if not callable(tolerance) and not (is_number(tolerance) and tolerance == inf):  # inf: any gradient will do
-        check_number("tolerance of minimize", tolerance, ">= 0", "; the default is 1e-8")
-    unused = dict(progress=progress, gradient=gradient, project=project, batches=batches, checkpoint=checkpoint)
+    _check_tolerance(tolerance)
+    other_arguments = {
+        "progress": progress,
+        "gradient": gradient,
+        "project": project,
+        "batches": batches,
+        "checkpoint": checkpoint,
+    }
     for leaf in leaves(start):
-        if type(leaf) in ELSEWHERE:
-            return leaf.layout.minimize(loss, start, method, maxiter, tolerance, callback, bounds, options | unused)
-    if stepper is None:
-        for name, given in {**unused, "tolerance": callable(tolerance)}.items():
-            if given:
+        if type(leaf) in ELSEWHERE:  # a field on ranks
+            other_arguments = {**options, **other_arguments}
+            return leaf.layout.minimize(loss, start, method, maxiter, tolerance, callback, bounds, other_arguments)
+    if isinstance(chosen, ADMM):
+        for name, value in {**other_arguments, "tolerance": callable(tolerance)}.items():
+            if value:
                 raise TypeError(f"admm does not use {name}; leave it out")
-        _check_options(method, options, list(inspect.signature(admm).parameters)[7:])
-        if "weight" not in options:
-            raise TypeError("admm needs the weight of the sum of absolute values; write weight=0.1")
-        return admm(minimize, loss, start, maxiter, tolerance, callback, bounds, **options)
-    if hasattr(tolerance, "inside"):  # it takes part in the evaluations
+        return chosen.minimize(loss, start, maxiter, tolerance, callback, bounds, minimize)
+
+    if hasattr(tolerance, "inside"):  # `certified` takes part in the evaluations
         if checkpoint is not None:
             raise ValueError(
                 "certified keeps answers that a checkpoint does not hold; leave checkpoint out, or give tolerance a "
                 "number"
             )
         loss, gradient = tolerance.inside(loss, gradient)
-    packing, batches = Packing(start, "start"), Batches(batches)
-    if batches.varied and stepper.searches:
+    packing = Packing(start, "start")
+    batches_by_iteration = Batches(batches)
+    if batches_by_iteration.varied and chosen.compares_losses:
         raise ValueError(f"{method} compares losses and cannot use batches; write method='adam', or give gd a rate")
-    if getattr(stepper, "rule", None) is not None:
-        loss = _composed(loss, stepper.rule)
+    loss = chosen.composed(loss)
     box = Box(bounds, packing)
+    projection = None
     if project is not None:
         if box.bounded:
             raise ValueError(
                 "project and bounds cannot be used together: a projected point may be outside of the bounds; leave one "
                 "of them out"
             )
-        project = Projection(project, packing, start)
-        loss, gradient = project.loss(loss), gradient and project.gradient(gradient)
-    trials = Trials(loss, gradient, packing, box, batches, stepper if stepper.residuals else None)
+        projection = Projection(project, packing, start)
+        loss = projection.loss(loss)
+        if gradient is not None:
+            gradient = projection.gradient(gradient)
+    residual_options = chosen if chosen.uses_residuals else None
+    objective = Objective(loss, gradient, packing, box, batches_by_iteration, residual_options)
     settings = {
-        "method": method, "set of options": sorted(options.items()), "pair of bounds": (box.lower, box.upper),
+        "method": method,
+        "set of options": sorted(options.items()),
+        "pair of bounds": (box.lower, box.upper),
         "start": start,
-    }  # fmt: skip
-    kept = Checkpoint(checkpoint, settings)
-    covariance = INTERRUPTED if stepper.residuals else NO_RESIDUALS
-    watch = Watch(trials, packing, tolerance, callback)
+    }
+    checkpoints = Checkpoint(checkpoint, settings)
+    monitor = Monitor(objective, packing, tolerance, callback)
     steps = shown_steps(progress, range(maxiter), "minimize")
+    covariance: Any = INTERRUPTED if chosen.uses_residuals else NO_RESIDUALS
     try:
-        begin = box.inside(packing.pack(start))
-        together("minimize", (start,), _run, stepper, trials, watch, kept, begin, steps)
-        covariance = trials.covariance(trials.best)
+        first_point = box.nearest(packing.pack(start))
+        together("minimize", (start,), _run, chosen, objective, monitor, checkpoints, first_point, steps)
+        covariance = objective.covariance(objective.best)
     except KeyboardInterrupt:
-        if not watch.history:
+        if not monitor.history:
             raise
-        watch.message = watch.message or "interrupted"
+        monitor.message = monitor.message or "interrupted"
     finally:
-        kept.write(watch.history)
-    x = packing.unpack(trials.best.vector)
-    if project is not None:
-        x = project.result(trials.best.vector)
-    return watch.minimum(x, method, resumed=kept.resumed, _covariance=covariance)
-
-
-def _run(stepper, trials, watch, kept, start, steps):
-    """Begin or resume, and advance until the steps are over, the watch stops it or it is stuck."""
-    state = stepper.begin(trials.first(start))
-    resumed = kept.resume(state, trials, watch)
-    if resumed is None:
-        watch(state.trial)
+        checkpoints.write(monitor.history)
+    if projection is None:
+        x = packing.unpack(objective.best.point)
     else:
-        state = resumed
+        x = projection.result(objective.best.point)
+    return monitor.minimum(x, method, checkpoints.resumed, covariance)
+
+
+def _run(method, objective, monitor, checkpoints, first_point, steps):
+    """Begin or resume a run, and iterate until the steps are used up, the monitor stops it or no step is found."""
+    state = method.begin(objective.evaluate_start(first_point))
+    resumed_state = checkpoints.resume(state, objective, monitor)
+    if resumed_state is None:
+        monitor(state.current)
+    else:
+        state = resumed_state
     for _ in steps:
-        if watch.message or watch.iteration >= len(steps):
+        if monitor.message or monitor.iteration >= len(steps):
             return
-        trials.iteration = watch.iteration + 1  # a new point is seen by the next batch
+        objective.iteration = monitor.iteration + 1  # selects the batch of new points
         try:
-            state = stepper.advance(state, trials)
-        except Stuck as reason:
-            watch.give_up(str(reason))
+            state = method.advance(state, objective)
+        except NoStepFound as error:
+            monitor.stop(error)
             return
-        watch(state.trial)
-        kept.save(state, trials, watch)
-        if not isinstance(steps, range):
-            steps.set_postfix_str(watch.history[-1].summary())
+        monitor(state.current)
+        checkpoints.save(state, objective, monitor)
+        if not isinstance(steps, range):  # a progress bar
+            steps.set_postfix_str(monitor.history[-1].summary())
 
 
-def _composed(loss, inner):
-    return lambda x, *rest: loss(inner(x), *rest)
+def _method(name, options):
+    """Return the method with its options."""
+    check_choice("method", name, METHODS)
+    method_class: Any = METHODS[name]
+    _check_names(name, options, [field.name for field in fields(method_class)])
+    return method_class(**options)
 
 
-def _stepper(method, options):
-    check_choice("method", method, (*METHODS, "admm"))
-    _check_options(method, options, list(inspect.signature(METHODS[method]).parameters))
-    return METHODS[method](**options)
-
-
-def _check_options(method, options, names):
+def _check_names(method, options, names):
     """Refuse options that a method does not have."""
-    parameters = [parameter for parameter in inspect.signature(minimize).parameters if parameter != "options"]
-    for name in options:
-        if name in names:
+    parameters = [parameter for parameter in signature(minimize).parameters if parameter != "options"]
+    for option in options:
+        if option in names:
             continue
-        advice = foreign_keyword_advice(name, parameters)
+        advice = foreign_keyword_advice(option, parameters)
         if advice:
             advice = f"; write {advice}"
         else:
-            advice = advice_near(name, [*names, *parameters])
-        raise TypeError(f"{method} has no option {name!r}; it has {', '.join(names)}{advice}")
+            advice = advice_near(option, [*names, *parameters])
+        raise TypeError(f"{method} has no option {option!r}; it has {', '.join(names)}{advice}")
+
+
+def _check_tolerance(tolerance):
+    """Refuse a tolerance that is neither a function nor a number >= 0; infinity accepts any gradient."""
+    infinite = is_number(tolerance) and tolerance == inf
+    if not callable(tolerance) and not infinite:
+        check_number("tolerance of minimize", tolerance, ">= 0", "; the default is 1e-8")

@@ -1,13 +1,24 @@
 """The option project= of minimize: an affine projection of the unknowns."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from sparsedp._utils.pytree import flatten, norm, paired
 from sparsedp.autodiff.derivative import vjp
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from sparsedp.autodiff.flattening import Packing
+
 __all__ = ["Projection"]
 
-FAR = 2.0**20  # length of the longest test direction, in units of the start
+TEST_LENGTH = 2.0**20  # of the longest test direction, in units of the start
 ACCURACY = 1e-6  # relative difference from an affine map that a projection by an iterative solve may have
 NOT_AFFINE = (
     "project must be a projection onto a linear or affine space, but {}; with other maps a search may stop where the "
@@ -16,10 +27,7 @@ NOT_AFFINE = (
 
 
 class Projection:
-    """A map P of trees like start, with P(P(x)) = P(x), affine: P(a x + (1 - a) y) = a P(x) + (1 - a) P(y).
-
-    The loss of P(x) then is smooth where the loss is, its gradient is P^T times that of the loss, and where it is 0 the
-    point P(x) is stationary among all points of the range of P. Of other maps, such as np.clip, this is not so.
+    """A map P of trees like start with P(P(x)) = P(x) that is affine: P(a x + (1 - a) y) = a P(x) + (1 - a) P(y).
 
     Parameters
     ----------
@@ -33,49 +41,69 @@ class Projection:
         If the function does not return a tree like start.
     ValueError
         If it is not affine or not idempotent at a few test points.
+
+    Notes
+    -----
+    The loss of P(x) is smooth where the loss is, and its gradient is P^T times that of the loss. Where that is 0, the
+    point P(x) is stationary among all points of the range of P. This does not hold for other maps, such as np.clip.
     """
 
-    def __init__(self, function, packing, start):
-        self._function, self._packing = function, packing
-        self._origin = packing.pack(start)
-        self._image = self._at(self._origin)
-        size = norm(self._origin) / np.sqrt(self._origin.size) or 1.0
-        direction = size * np.random.default_rng(0).standard_normal(self._origin.size)
-        near = self._at(self._origin + direction)
-        for factor in (FAR, -FAR):
-            far, predicted = self._at(self._origin + factor * direction), self._image + factor * (near - self._image)
+    def __init__(self, function: Callable[[Any], Any], packing: Packing, start: Any):
+        self._function = function
+        self._packing = packing
+        self._start = packing.pack(start)
+        self._start_image = self._image(self._start)
+        size = norm(self._start) / np.sqrt(self._start.size) or 1.0
+        direction = size * np.random.default_rng(0).standard_normal(self._start.size)
+        near = self._image(self._start + direction)
+        for factor in (TEST_LENGTH, -TEST_LENGTH):
+            far = self._image(self._start + factor * direction)
+            predicted = self._start_image + factor * (near - self._start_image)
             self._compare(far, predicted, norm(factor * direction), "it is not affine near the start")
-        self._compare(self._at(near), near, norm(near), "project(project(x)) is not project(x)")
+        self._compare(self._image(near), near, norm(near), "project(project(x)) is not project(x)")
 
-    def result(self, vector):
-        """Return P of a flat point as a tree; refuse what is not affine between the start and there."""
-        middle, image = self._at(self._origin + 0.5 * (vector - self._origin)), self._at(vector)
-        self._compare(
-            middle, self._image + 0.5 * (image - self._image), norm(vector), "it is not affine near the result"
-        )
-        return self._tree(self._packing.unpack(vector))
+    def result(self, vector: NDArray[np.float64]) -> Any:
+        """Return P of a flat point as a tree.
 
-    def loss(self, loss):
-        """Return the function x, *rest -> loss(P(x), *rest)."""
-        return lambda x, *rest: loss(self._function(x), *rest)
+        Raises
+        ------
+        ValueError
+            If P is not affine between the start and this point.
+        """
+        middle = self._image(self._start + 0.5 * (vector - self._start))
+        image = self._image(vector)
+        predicted = self._start_image + 0.5 * (image - self._start_image)
+        self._compare(middle, predicted, norm(vector), "it is not affine near the result")
+        return self._projected(self._packing.unpack(vector))
 
-    def gradient(self, gradient):
-        """Return the gradient of `loss`, given that of the user's loss."""
+    def loss(self, loss: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the loss of P(x), given the loss of the user."""
 
-        def composed(x, *rest):
+        def loss_of_projection(x, *batch):
+            return loss(self._function(x), *batch)
+
+        return loss_of_projection
+
+    def gradient(self, gradient: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the gradient of the loss of P(x), given the gradient of the user's loss."""
+
+        def gradient_of_projection(x, *batch):
             image, pull = vjp(self._function, x)
-            return pull(gradient(image, *rest))
+            return pull(gradient(image, *batch))
 
-        return composed
+        return gradient_of_projection
 
-    def _tree(self, x):
+    def _projected(self, x):
+        """Return P of a tree, with the entries of dicts in the order of the start."""
         entries = paired(self._function(x), x, "project(x)", advice="; return a tree like start", shapes=True)
         return flatten(x)[1](entries)
 
-    def _at(self, vector):
-        return self._packing.pack(self._tree(self._packing.unpack(vector)))
+    def _image(self, vector):
+        """Return P of a flat point as a flat point."""
+        return self._packing.pack(self._projected(self._packing.unpack(vector)))
 
     def _compare(self, values, predicted, size, reason):
+        """Raise ValueError with a reason if two flat points differ by more than rounding."""
         accuracy = max(ACCURACY, 1e3 * self._packing.eps)
-        if not norm(values - predicted) <= accuracy * max(size, norm(predicted), norm(self._origin)):
+        if not norm(values - predicted) <= accuracy * max(size, norm(predicted), norm(self._start)):
             raise ValueError(NOT_AFFINE.format(reason))

@@ -1,36 +1,46 @@
-"""What an optimization hands around and gives back: trials, the history, the best point and why it stopped."""
+"""Evaluations of a loss, the history of a run, and its result."""
 
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sparsedp._utils.html import curves, facts
 from sparsedp._utils.reconstruction import Frozen
 
-__all__ = ["Failure", "Minimum", "Record", "Stuck", "Trial"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-NO_RESIDUALS = "it is that of least-squares problems; give minimize the residuals and method='levenberg_marquardt'"
-SHOWN = 6  # lines of the history at each end
+__all__ = ["Evaluation", "Failure", "Minimum", "NoStepFound", "Record", "RoundingReached"]
+
+NO_RESIDUALS = "only least-squares problems have one; return the residuals and write method='levenberg_marquardt'"
+SHOWN = 6  # lines of the history that are printed at each end
 
 
-class Stuck(Exception):
-    """No admissible point was found; the message says why."""
+class NoStepFound(Exception):
+    """Signals that a method found no acceptable point; the message says why. Never reaches the user."""
 
 
-class Trial(NamedTuple):
-    """A point, the loss and the flat gradient there. A refused point has the value infinity, and the gradient NaN.
+class RoundingReached(NoStepFound):
+    """Signals that a method found no lower point because the predicted decrease is lost in the rounding of the loss."""
 
-    A point that is not low enough for whoever asked may have no gradient.
+
+class Evaluation(NamedTuple):
+    """A point with the loss and its gradient, as flat vectors of doubles.
+
+    A refused point has the value infinity and a gradient of NaN. The gradient of residuals is None where the loss is
+    not below the bound that the caller gave.
     """
 
-    vector: np.ndarray
+    point: np.ndarray
     value: float
-    slope: Any
-    rounding: float = 0.0  # a smaller change of the loss is not seen
-    iteration: int = 0  # whose batch the loss was given
+    gradient: Any
+    rounding: float = 0.0  # smallest visible change of the loss
+    iteration: int = 0  # selects the batch that the loss was given
 
     @property
-    def refused(self):
+    def refused(self) -> bool:
         """Whether the loss has no value here."""
         return self.value == np.inf
 
@@ -45,10 +55,22 @@ class Failure(NamedTuple):
 class Record(NamedTuple):
     """One iteration; number 0 is the start.
 
-    `gradient_norm` is that of the gradient; with bounds of the projected gradient, which is 0 in entries that bounds
-    hold. It and `value` are infinite or 0 where they leave the range of floating-point numbers.
-    `seconds`, `evaluations` and `solves` (forward and adjoint, of every inverse, in this thread) count from the start
-    of the run; `failed` lists the trial points that the loss refused in this iteration, as (error, message).
+    Attributes
+    ----------
+    iteration : int
+    value : float
+        The loss; infinite or 0 where it leaves the range of floating-point numbers.
+    gradient_norm : float
+        Euclidean norm of the gradient; with bounds of the projected gradient, which is 0 in entries that bounds hold.
+        Infinite or 0 where it leaves the range of floating-point numbers.
+    seconds : float
+        Since the start of the run.
+    evaluations : int
+        Of the loss, since the start of the run.
+    failed : tuple of Failure
+        The trial points that the loss refused in this iteration, as (error, message).
+    solves : int
+        Forward and adjoint solves of every inverse in this thread, since the start of the run.
     """
 
     iteration: int
@@ -59,10 +81,12 @@ class Record(NamedTuple):
     failed: tuple[Failure, ...] = ()
     solves: int = 0
 
-    def summary(self):
-        """A few words for a progress bar."""
-        refused = f", {len(self.failed)} refused" if self.failed else ""
-        return f"loss {self.value:.6g}, gradient {self.gradient_norm:.1e}{refused}"
+    def summary(self) -> str:
+        """Return a few words for a progress bar."""
+        words = f"loss {self.value:.6g}, gradient {self.gradient_norm:.1e}"
+        if self.failed:
+            words += f", {len(self.failed)} refused"
+        return words
 
 
 class Minimum(Frozen):
@@ -77,23 +101,23 @@ class Minimum(Frozen):
     history : tuple of Record
     method : str
     message : str
-        Why it stopped.
+        Why the run stopped.
     converged : bool
-        Whether the tolerance was met, or the loss cannot fall further in floating point numbers.
+        Whether the tolerance was met, or the loss cannot fall further in floating-point numbers.
     evaluations : int
-        Evaluations of loss and gradient, refused ones included.
+        Evaluations of loss and gradient, including refused ones.
     resumed : str
-        What was found in the checkpoint folder; empty without one.
+        Whether the run continued from the checkpoint folder; empty without one.
     covariance : (n, n) array
-        Of the n unknowns of a least-squares problem, in the order of the leaves of x. Of m residuals r with the
-        Jacobian J at x it is
+        Of the n unknowns of a least-squares problem, in the order of the leaves of x. With the m residuals r and
+        their Jacobian J at x it is
 
             s^2 (J^T J)^(-1)  with  s^2 = |r|^2 / (m - n),    or  (J^T J)^(-1)  with absolute_sigma=True.
 
-        The first form estimates the variance of the data from the residuals; the second takes residuals that were
-        divided by known standard deviations, and is the posterior covariance for a flat prior. Infinite where J has
-        a rank below n; bounds are ignored. Access raises ValueError where it is not known, and says what to write:
-        for other methods, with batches, where J is not formed, when n > 4000, and when m <= n without absolute_sigma.
+        The first form estimates the variance of the data from the residuals. The second is for residuals that were
+        divided by known standard deviations; it is the posterior covariance for a flat prior. Infinite where J has
+        a rank below n; bounds are ignored. Access raises ValueError with the reason where it is not known: for other
+        methods, with batches, where J is not formed, when n > 4000, and when m <= n without absolute_sigma.
     """
 
     x: Any
@@ -104,7 +128,7 @@ class Minimum(Frozen):
     converged: bool
     evaluations: int
     resumed: str = ""
-    _covariance: Any = NO_RESIDUALS  # the array, or why there is none
+    _covariance: Any = NO_RESIDUALS  # the array, or the reason why it is not known
     meant = {
         "fun": "best.value",
         "point": "best.x",
@@ -115,7 +139,7 @@ class Minimum(Frozen):
     }
 
     @property
-    def covariance(self):
+    def covariance(self) -> NDArray[np.float64]:
         """The covariance of the unknowns."""
         if isinstance(self._covariance, str):
             raise ValueError(f"the covariance is not known: {self._covariance}")
@@ -125,7 +149,7 @@ class Minimum(Frozen):
         last = self.history[-1]
         head = f"{self.method}: loss {self.value:.6g} after {last.iteration} iterations, {self.evaluations} evaluations"
         lines = [f"{'n':>6}  {'loss':>13}  {'gradient':>9}  {'seconds':>8}  evaluations  solves"]
-        lines += map(_line, self.history)
+        lines += [_history_line(record) for record in self.history]
         if len(self.history) > 2 * SHOWN + 1:
             lines[SHOWN + 1 : -SHOWN] = [f"{'...':>6}"]
         return "\n".join(filter(None, [head, *lines, self.message, self.resumed]))
@@ -133,22 +157,28 @@ class Minimum(Frozen):
     __repr__ = __str__
 
     def _repr_html_(self):
-        """For a notebook: how it ended, and how the loss fell."""
-        path = [(one.iteration, one.value) for one in self.history]
+        """Return a table of how the run ended and a curve of the loss, for notebooks."""
+        losses = [(record.iteration, record.value) for record in self.history]
+        converged = "yes" if self.converged else "no"
         entries = {
             "loss": f"{self.value:.6g}",
-            "converged": "yes" if self.converged else "no",
+            "converged": converged,
             "why it stopped": self.message,
             "iterations": self.history[-1].iteration,
             "evaluations": self.evaluations,
             "resumed": self.resumed or None,
-            "convergence": curves({"loss": path}, "iteration", "loss") or None,
+            "convergence": curves({"loss": losses}, "iteration", "loss") or None,
         }
         return facts(self.method, entries)
 
 
-def _line(record):
-    text = f"{record.iteration:6d}  {record.value:13.6e}  {record.gradient_norm:9.2e}  {record.seconds:8.2f}"
-    words = sorted({failure.error for failure in record.failed})
-    refused = f"  {len(record.failed)} refused: {', '.join(words)}" if record.failed else ""
-    return f"{text}  {record.evaluations:11d}  {record.solves:6d}{refused}"
+def _history_line(record):
+    """Return the line of a record in the table of a result."""
+    line = (
+        f"{record.iteration:6d}  {record.value:13.6e}  {record.gradient_norm:9.2e}  {record.seconds:8.2f}  "
+        f"{record.evaluations:11d}  {record.solves:6d}"
+    )
+    if record.failed:
+        errors = sorted({failure.error for failure in record.failed})
+        line += f"  {len(record.failed)} refused: {', '.join(errors)}"
+    return line

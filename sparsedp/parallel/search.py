@@ -13,9 +13,9 @@ from sparsedp.autodiff.flattening import FINITE, Packing
 from sparsedp.autodiff.tape import is_variable
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
-from sparsedp.optimize.result import Trial
-from sparsedp.optimize.trials import Trials
-from sparsedp.optimize.watch import Watch
+from sparsedp.optimize.monitor import Monitor
+from sparsedp.optimize.objective import Objective
+from sparsedp.optimize.result import Evaluation, NoStepFound, RoundingReached
 from sparsedp.parallel.fields import DistributedField
 
 __all__ = ["minimized"]
@@ -50,14 +50,14 @@ class Blocks:
         return self.comm.bcast(block) if is_variable(leaf) else leaf
 
 
-class Spread(Trials):
+class Spread(Objective):
     """The loss on what the ranks hold; its gradient comes with it, and is judged by all of them together."""
 
     def __init__(self, loss, blocks, packing, box):
         super().__init__(loss, None, packing, box, Batches(None))
         self.blocks = blocks
 
-    def _both(self, vector):
+    def _value_and_gradient(self, vector):
         with unwarned():  # a gradient that is not finite is refused below
             value, slopes = value_and_grad(self._loss)(self.blocks.tree(self._packing.unpack(vector)))
         for name, g, x in zip(labels(self.blocks.start, "start"), leaves(slopes), leaves(self.blocks.start)):
@@ -65,9 +65,10 @@ class Spread(Trials):
                 check_finite(f"the gradient of {name}", g, FINITE)
         return float(value), self._packing.pack_gradient(self.blocks.of(slopes))
 
-    def downhill(self, trial):
+    def projected_gradient(self, evaluation):
         """The gradient as fields, 0 where the bounds hold an unknown."""
-        return [*filter(is_variable, leaves(self.blocks.tree(self._packing.unpack(super().downhill(trial)))))]
+        blocks = self._packing.unpack(super().projected_gradient(evaluation))
+        return [*filter(is_variable, leaves(self.blocks.tree(blocks)))]
 
 
 def minimized(comm, loss, start, method, maxiter, tolerance, callback, bounds, more):
@@ -84,26 +85,26 @@ def minimized(comm, loss, start, method, maxiter, tolerance, callback, bounds, m
     blocks = Blocks(comm, start)
     packing = Packing(blocks.of(start), "start")
     trials = Spread(loss, blocks, packing, Box(bounds, packing))
-    watch = Watch(trials, packing, tolerance, callback and (lambda record, x: callback(record, blocks.tree(x))))
-    _search(comm, trials, watch, trials.box.inside(packing.pack(blocks.of(start))), int(maxiter))
-    return watch.minimum(blocks.tree(packing.unpack(trials.best.vector)), method)
+    watch = Monitor(trials, packing, tolerance, callback and (lambda record, x: callback(record, blocks.tree(x))))
+    _search(comm, trials, watch, trials.box.nearest(packing.pack(blocks.of(start))), int(maxiter))
+    return watch.minimum(blocks.tree(packing.unpack(trials.best.point)), method)
 
 
 def _search(comm, trials, watch, x, maxiter):
     """TAO from x until the watch stops it; inside the bounds, by a quasi-Newton method of limited memory."""
-    evaluated = [trials.first(x)]  # where TAO begins
+    evaluated = [trials.evaluate_start(x)]  # where TAO begins
     highest = [max(evaluated[0].value, 1.0)]
 
     def objective(tao, x, g):
         trial = evaluated.pop() if evaluated else trials(x.array.copy())
-        g.setArray(np.zeros(x.local_size) if trial.refused else trial.slope)
+        g.setArray(np.zeros(x.local_size) if trial.refused else trial.gradient)
         if trial.refused:  # TAO goes back from what is high, not from what is infinite
             return 2 * highest[0]
         highest[0] = max(highest[0], trial.value)
         return trial.value
 
     def judge(tao):
-        watch(Trial(tao.solution.array.copy(), tao.function, tao.gradient.array.copy()))
+        watch(Evaluation(tao.solution.array.copy(), tao.function, tao.gradient.array.copy()))
         if watch.message or watch.iteration >= maxiter:
             tao.setConvergedReason(PETSc.TAO.Reason.CONVERGED_USER)
 
@@ -121,4 +122,5 @@ def _search(comm, trials, watch, x, maxiter):
     tao.solve(solution)
     if tao.getConvergedReason() < 0 and not watch.message and watch.iteration < maxiter:
         flat = watch.history[-1].gradient_norm <= FLAT * watch.history[0].gradient_norm
-        watch.give_up("rounding" if flat else "the line search found no lower point")
+        error = RoundingReached if flat else NoStepFound
+        watch.stop(error("the line search found no lower point"))

@@ -78,7 +78,7 @@ WRONG = [
     ),
     (
         lambda: run(maxiter=0)().covariance, ValueError,
-        "the covariance is not known: it is that of least-squares problems; give minimize the residuals and "
+        "the covariance is not known: only least-squares problems have one; return the residuals and write "
         "method='levenberg_marquardt'",
     ),
     (

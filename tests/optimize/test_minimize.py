@@ -13,8 +13,8 @@ from sparsedp.autodiff.tape import plain
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box
-from sparsedp.optimize.first_order import Adam, Descent
-from sparsedp.optimize.trials import Trials
+from sparsedp.optimize.first_order import Adam, GradientDescent
+from sparsedp.optimize.objective import Objective
 
 Rest = namedtuple("Rest", "b nothing")
 
@@ -230,13 +230,13 @@ def test_progress_bar(capsys, monkeypatch):
 
 def test_states_are_values_that_can_be_resumed():
     """Every step depends on its state alone: continuing from a stored state gives the same bits."""
-    for stepper in (Adam(rate=0.05), Descent(rate=1e-3, momentum=0.9), Descent()):
+    for method in (Adam(rate=0.05), GradientDescent(rate=1e-3, momentum=0.9), GradientDescent()):
         packing = Packing(np.array([-1.2, 1.0]))
-        trials = Trials(valley, None, packing, Box(), Batches())
-        state = stepper.begin(trials.first(np.array([-1.2, 1.0])))
+        objective = Objective(valley, None, packing, Box(), Batches())
+        state = method.begin(objective.evaluate_start(np.array([-1.2, 1.0])))
         states = [state]
         for _ in range(6):
-            states.append(stepper.advance(states[-1], trials))
-        again = stepper.advance(states[3], trials)
+            states.append(method.advance(states[-1], objective))
+        again = method.advance(states[3], objective)
         assert all(np.array_equal(a, b) for a, b in zip(again[1:], states[4][1:]))
-        assert np.array_equal(again.trial.vector, states[4].trial.vector)
+        assert np.array_equal(again.current.point, states[4].current.point)

@@ -117,7 +117,7 @@ def test_covariance_where_it_is_not_known(rng):
             r"the Jacobian is not formed \(dense=False.*dp.vjp\(residuals, x\).*cg.*dense=True forms it",
         ),
         (run(np.zeros((1, 5000)), many, maxiter=0), "there are 5000 unknowns, and it is formed for up to 4000"),
-        (dp.minimize(lambda x: anp.sum(x**2), np.ones(2)), "give minimize the residuals"),
+        (dp.minimize(lambda x: anp.sum(x**2), np.ones(2)), "return the residuals"),
         (dp.minimize(lambda x, _: x, np.ones(2), "half_inverse", batches=[0], maxiter=1), "without batches"),
     ]
     for best, reason in unknown:

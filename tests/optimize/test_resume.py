@@ -394,7 +394,7 @@ def test_interrupted_inside_an_evaluation(tmp_path, monkeypatch, method, loss, a
         return
     best = dp.minimize(cut, **run, checkpoint=tmp_path)
     assert best.message == "interrupted" and not best.converged
-    reason = "minimize was interrupted" if method == "levenberg_marquardt" else "is that of least-squares problems"
+    reason = "minimize was interrupted" if method == "levenberg_marquardt" else "only least-squares problems have one"
     with pytest.raises(ValueError, match=reason):
         best.covariance
     whole = dp.minimize(loss, **run)

@@ -8,7 +8,7 @@ import sparsedp as dp
 from sparsedp.autodiff import derivative
 from sparsedp.autodiff.tape import linear
 from sparsedp.errors import NonFiniteError
-from sparsedp.optimize.linearised import singular
+from sparsedp.optimize.linearization import left_singular
 
 SHAPES = [(12, 30), (30, 12), (9, 9), (1, 5), (5, 1)]
 
@@ -61,7 +61,7 @@ SCALES = [1.0, 1e-200, 1e180]
 def test_singular_values_from_gram_matrices(rng, decades, digits, scale):
     """One Gram matrix would lose what is below 1e-8; group by group they are as exact as Householder's."""
     matrix = scale * jacobian(rng, (20, 50), decades)
-    left, values = singular(matrix)
+    left, values = left_singular(matrix)
     u, s, v = np.linalg.svd(matrix, full_matrices=False)
     kept = s > 1e-10 * s[0]
     assert np.allclose(left.T @ left, np.eye(20), atol=1e-13)
@@ -75,9 +75,9 @@ def test_singular_values_from_gram_matrices(rng, decades, digits, scale):
 
 
 def test_singular_values_of_nothing_and_of_zeros():
-    assert np.array_equal(singular(np.zeros((3, 5)))[1], np.zeros(3))
+    assert np.array_equal(left_singular(np.zeros((3, 5)))[1], np.zeros(3))
     matrix = np.ones((3, 5))
-    left, values = singular(matrix)
+    left, values = left_singular(matrix)
     assert np.isclose(values[0], np.sqrt(15)) and np.all(values[1:] <= 1e-15)
     assert np.allclose(left[:, :1] @ (left[:, :1].T @ matrix), matrix)
 
@@ -94,7 +94,7 @@ def test_a_jacobian_that_is_not_finite(rng, size, wrong):
             match="products of the Jacobian must be finite, got .*; start where every output has a finite derivative",
         ),
     ):
-        singular(matrix)
+        left_singular(matrix)
 
 
 def test_power_zero_is_the_gradient_to_the_last_digits(rng):
